@@ -23,7 +23,7 @@ from edgevpr.mavlink.vehicle import Readiness
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.notifier import Notifier
 
 _STATES = {
     Condition.LOST: "lost, reopening in 0.5 s",
@@ -132,7 +132,7 @@ def to_autopilot(link, navigator, clock: "FakeClock", flight_log: FlightLog | No
     """An autopilot at a link, with keys of the section `mavlink`."""
     config = load_config(None, {f"mavlink.{key}": value for key, value in settings.items()}).mavlink
     return ToAutopilot(
-        link, navigator, Herald(flight_log or FlightLog(None), link), settings=config, cores=4, clock=clock.clock
+        link, navigator, Notifier(flight_log or FlightLog(None), link), settings=config, cores=4, clock=clock.clock
     )
 
 

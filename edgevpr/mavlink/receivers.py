@@ -67,10 +67,11 @@ class Receivers:
         return replace(best.report, steady_for_s=best.report.t_s - best.steady_since_s)
 
 
-def extrapolate(receiver: Receiver, t_s: float) -> tuple[float, float]:
-    """Return latitude and longitude of a receiver at `t_s`: its report, moved on by its velocity and its lag."""
+def extrapolate(receiver: Receiver, t_s: float, velocity_m_s: tuple[float, float] | None = None) -> tuple[float, float]:
+    """Return latitude and longitude of a receiver at `t_s`: its report, moved on by its lag with `velocity_m_s`, m/s
+    (east, north; None: with its own velocity)."""
     since_s = t_s - receiver.t_s + RECEIVER_LAG_S
-    east_m, north_m = (since_s * speed_m_s for speed_m_s in receiver.velocity_m_s or (0.0, 0.0))
+    east_m, north_m = (since_s * speed_m_s for speed_m_s in velocity_m_s or receiver.velocity_m_s or (0.0, 0.0))
     return moved(receiver.lat_deg, receiver.lon_deg, east_m, north_m)
 
 

@@ -21,11 +21,11 @@ from edgevpr.mavlink.wire import untapped
 from edgevpr.power.boards import Board
 from edgevpr.review.compare import Line, Packets
 from edgevpr.review.tape import Playback, ReplayedGround, ReplayedLink, ReplayedSigning, Supposed, TapeEnded, read_tape
-from edgevpr.runtime.flight.clock import Clock, taped
+from edgevpr.runtime.flight.clock import Clock, record_clock
 from edgevpr.runtime.flight.flight import Flight
+from edgevpr.runtime.flight.flightio import FlightIO, Stop
 from edgevpr.runtime.flight.flightlog import flight_of, read_log
 from edgevpr.runtime.flight.recording import MAP, TAPE, frame_path, recording_of
-from edgevpr.runtime.flight.world import Stop, World
 
 _log = logging.getLogger(__name__)
 
@@ -61,12 +61,12 @@ def replay(log: str | Path, place_map: str | None = None, changes: Path | None =
     why_ended = None
     with TemporaryDirectory(prefix="edgevpr-replay-") as temporary:
         again_log = f"{temporary}/flight.jsonl" if config.log.path else None
-        world = World(
+        io = FlightIO(
             board=build(Board, header["board"], "the board of the flight"),
             place_map=_map_of(folder, Path(temporary), config, place_map or config.map),
             log=replace(config.log, path=again_log, max_mb=None),
             tape=playback,
-            clock=taped(Clock(sleep=playback.sleep), playback),
+            clock=record_clock(Clock(sleep=playback.sleep), playback),
             open_source=lambda step_s: ReplayedSource(playback, partial(_picture, folder)),
             link=ReplayedLink,
             ground=ReplayedGround,
@@ -77,7 +77,7 @@ def replay(log: str | Path, place_map: str | None = None, changes: Path | None =
             recording=header["recording"],
         )
         try:
-            with _quiet(), closing(Flight.open(config, world)) as again:
+            with _quiet(), closing(Flight.open(config, io)) as again:
                 again.run()
         except TapeEnded as end:
             why_ended = str(end) or "the recording ends there"

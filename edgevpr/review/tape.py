@@ -23,7 +23,7 @@ from edgevpr.mavlink.ports import LOST
 from edgevpr.mavlink.signing import Signing
 from edgevpr.mavlink.wire import Message
 from edgevpr.review.compare import Packets
-from edgevpr.runtime.flight.world import StopNow
+from edgevpr.runtime.flight.flightio import StopNow
 
 Note = list[Any]  # a line of the tape: a kind, and its values
 _CLOCKS = ("mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s")

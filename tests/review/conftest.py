@@ -12,7 +12,7 @@ from pictures import textured
 
 from edgevpr.cli.main import main
 from edgevpr.core.types import Frame, Vehicle
-from edgevpr.runtime.flight.aboard import start_fields
+from edgevpr.runtime.flight.startup import start_fields
 
 PLACES, SEEN = 8, 10  # the last pictures are of nothing in the map
 STEP_DEG = 0.001  # of latitude: 111 m

@@ -19,8 +19,8 @@ from edgevpr.mavlink.wire import PacketReader, mavlink
 from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.flight.notifier import Notifier
 
 STEP_S = 0.025
 FIX_SD_M = 1.0
@@ -43,9 +43,9 @@ class Controlled:
         url = f"udpout:127.0.0.1:{self._sock.getsockname()[1]}"
         self.link = link_to(url, clock=self.clock, listener=self.navigator)
         settings = replace(load_config(None).mavlink, send_fixes=send_fixes, source_sets=source_sets)
-        herald = Herald(FlightLog(None), self.link)
+        notifier = Notifier(FlightLog(None), self.link)
         self.autopilot = ToAutopilot(
-            self.link, self.navigator, herald, settings=settings, cores=4, clock=self.clock.clock
+            self.link, self.navigator, notifier, settings=settings, cores=4, clock=self.clock.clock
         )
         self._packer, self._receiver = mavlink.MAVLink(None, 1, 1), PacketReader()
         self._to, self._said, self._steps = None, 0, 0
@@ -101,7 +101,7 @@ class Controlled:
         here = Position(*moved(truth.lat_deg, truth.lon_deg, *self.rng.normal(0, FIX_SD_M, 2)))
         vehicle = self.link.vehicle_at(now_s)
         event = match_at(here, now_s, vehicle, FIX_SD_M, (self._steps,))
-        self.reports.append(self.autopilot.told(event, 0.0).fix)
+        self.reports.append(self.autopilot.report_match(event, 0.0).fix)
 
     def _say(self, messages):
         for message in messages:

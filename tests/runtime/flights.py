@@ -2,22 +2,27 @@
 
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 
+import pytest
 from fakes import FakeClock, FakeLink, FakeSource
+from pictures import textured
 
+from edgevpr.core.arrays import Image
 from edgevpr.core.config import Config, load_config
 from edgevpr.core.types import NO_TAPE
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.flight import flight as flight_module
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flight import Flight as FlightItself
+from edgevpr.runtime.flight.flightio import FlightParts, Stop
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
-from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.flight.tiles import tiles_of
-from edgevpr.runtime.flight.world import Crew, Stop
+from edgevpr.runtime.flight.notifier import Notifier
+from edgevpr.runtime.flight.tiles import open_tiles
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -75,17 +80,17 @@ class Flight:
             flight_log = opened.enter_context(FlightLog(self.log, clock=self.clock))
             if start:
                 flight_log.write("start", **start)
-            herald, autopilot = Herald(flight_log, self.link), None
-            if tiles := tiles_of(self.recogniser, self.config.match, herald, NO_TAPE):
+            notifier, autopilot = Notifier(flight_log, self.link), None
+            if tiles := open_tiles(self.recogniser, self.config.match, notifier, NO_TAPE):
                 opened.callback(tiles.close)
             if self.link:
                 navigator = self.navigator
                 if navigator is None:  # of a real link it is the listener from the start
                     navigator = self.link.listener = Navigator(settings.min_accuracy_m, 1.0)
                 autopilot = ToAutopilot(
-                    self.link, navigator, herald, settings=settings, cores=self.board.cores, clock=clock
+                    self.link, navigator, notifier, settings=settings, cores=self.board.cores, clock=clock
                 )
-            crew = Crew(
+            parts = FlightParts(
                 recogniser=self.recogniser,
                 learner=self.learner,
                 tiles=tiles,
@@ -93,16 +98,25 @@ class Flight:
                 link=self.link,
                 autopilot=autopilot,
                 flight_log=flight_log,
-                herald=herald,
+                notifier=notifier,
                 meter=meter or FlightMeter(self.config.battery, self.board, clock),
-                clock=clock,
-                stop=self.stop,
-                status=status,
-                fewer_candidates=fewer_candidates,
+                io=SimpleNamespace(clock=clock, stop=self.stop, status=status),
             )
-            FlightItself(self.config, crew).run()
+            patch = opened.enter_context(pytest.MonkeyPatch.context())
+            patch.setattr(flight_module, "trusted_candidates", lambda technique: fewer_candidates)
+            FlightItself(self.config, parts).run()
         *lines, self.end = read_log(self.log)
         return lines
+
+
+def flight_over(folder: Path, tmp_path: Path, link: FakeLink | None, clock: FakeClock, technique="cohog", **settings):
+    """A flight of a query a second with the map of a technique."""
+    settings = {"source.rate_hz": 1.0} | settings
+    return Flight(folder / f"{technique}.gpkg", tmp_path / "log", clock, link, **settings)
+
+
+def pictures(count: int, first: int = 0) -> list[Image]:
+    return [textured(first + number, 240, 320) for number in range(count)]
 
 
 def metered(config: Config, recogniser: Recogniser, clock: FakeClock) -> QueryMeter:

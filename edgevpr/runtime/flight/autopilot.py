@@ -15,8 +15,8 @@ from edgevpr.mavlink.messages import Fix
 from edgevpr.places.tilemap import own_number
 from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
-from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.flight.output import Output
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -33,15 +33,14 @@ _log = logging.getLogger(__name__)
 
 
 class ToAutopilot:
-    """Sends fixes and other messages over an open link. An accepted match with a position is sent as a fix if the
-    `navigator` advises to send one; without `mavlink.send_fixes` (a dry run) only the sending itself is left out.
-    `cores` is the number of the board's cores. State that the link's thread uses too is accessed inside turns only
-    (`Link.turn`), during which that thread does nothing."""
+    """Sends fixes and other messages over an open link: a match as a fix if the `navigator` advises so; in a dry run
+    only the sending is left out. `cores` is the number of the board's cores. What the link's thread uses too is
+    accessed in turns only (`Link.turn`)."""
 
     def __init__(
-        self, link: Link, navigator: Navigator, herald: Herald, *, settings: MavlinkConfig, cores: int, clock: Clock
+        self, link: Link, navigator: Navigator, notifier: Notifier, *, settings: MavlinkConfig, cores: int, clock: Clock
     ) -> None:
-        self._link, self._navigator, self._herald, self._cores, self._clock = link, navigator, herald, cores, clock
+        self._link, self._navigator, self._notifier, self._cores, self._clock = link, navigator, notifier, cores, clock
         self._send_fixes, self._source_sets = settings.send_fixes, SourceSets(settings.source_sets)
         self._last: tuple[str, Sending] | None = None
         self._unanswered: list[tuple[str, Sending]] = []
@@ -70,11 +69,9 @@ class ToAutopilot:
         return ", ".join([sent, *(f"{count} {what}" for count, what in counts if count)])
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the link for the status, a dict:
-        - `trouble`: why the port could not be opened or was lost (None: data arrives)
-        - `autopilot`: system id of the one heard (None: none is); `channel`: name of the `Channel` of positions
-        - `fixes`: see `summary`; `accuracy_m`: see `Navigator.accuracy_m`.
-        """
+        """Return the state of the link for the status: `trouble`, why the port could not be opened or was lost (None:
+        data arrives); `autopilot`, the system id of the one heard (None: none is); the name of the `channel` of
+        positions; `fixes`, a summary; and `accuracy_m` of our position."""
         with self._link.turn("state"):
             stats = self._link.stats()
             return {
@@ -86,23 +83,18 @@ class ToAutopilot:
             }
 
     def log_answers(self) -> None:
-        """Write a log line of kind "answer" for each fix that, since the last call, was answered, was not answered in
-        time, or was given up before it was sent. Its fields that need a word:
-        - result: name of a MAV_RESULT (null: no answer); why: the reason, in words (null: the fix was accepted)
-        - latency_ms: from sending to answer (null: no answer); t_sent_s: time of sending, on the clock of t_mono_s.
-
-        And one of kind "between" for each fix sent between two matches, with its position.
-        """
+        """Write a log line "answer" for each fix that, since the last call, was answered, was not answered in time, or
+        was given up before it was sent; and a line "between" for each fix that was sent between two matches."""
         with self._link.turn("answers"):
             for sending in self._link.take_between():
-                self._herald.note("between", t_sent_s=sending.t_sent_s, **_place_of(sending.fix))
+                self._notifier.log("between", t_sent_s=sending.t_sent_s, **_place_of(sending.fix))
             # An answer can arrive a moment before the link has noted that the fix was sent.
             settled = [each for each in self._unanswered if each[1].sent is False or (each[1].sent and each[1].outcome)]
             for query, sending in settled:
                 self._unanswered.remove((query, sending))
                 outcome = sending.outcome
                 latency_s = outcome.latency_s if outcome else None
-                self._herald.note(
+                self._notifier.log(
                     "answer",
                     query=query,
                     sent=sending.sent,
@@ -112,10 +104,9 @@ class ToAutopilot:
                     t_sent_s=sending.t_sent_s,
                 )
 
-    def told(self, event: Recognition, used_mah: float) -> Recognition:
-        """Tell the autopilot and the ground station about an event: send its fix, if there is one to send, and its
-        figures. Return the event with the reports of this fix (`fix`) and of the fix before it (`last_fix`), each None
-        if there is none. `used_mah` is the charge that the board has drawn so far."""
+    def report_match(self, event: Recognition, used_mah: float) -> Recognition:
+        """Send the fix of an event, if there is one to send, and its figures. Return the event with the reports of this
+        fix and of the fix before it (`fix`, `last_fix`). `used_mah` is the charge that the board has drawn so far."""
         with self._link.turn("told"):
             last = _reported(*self._last) if self._last else None
             fix, sending = None, None
@@ -136,12 +127,12 @@ class ToAutopilot:
             self._tell(event, used_mah)
         return replace(event, fix=fix, last_fix=last)
 
-    def saw(self, event: Recognition) -> None:
-        """Let the navigator know the motion that a picture shows which is no query."""
+    def add_motion(self, event: Recognition) -> None:
+        """Report to the navigator the motion that a picture shows which is no query."""
         with self._link.turn("saw"):
             self._navigator.hear_frame(event, is_query=False)
 
-    def wants_strides(self) -> bool:
+    def needs_motion_frames(self) -> bool:
         """Tell whether the position rests on matches, so that the motion between two of them is of use."""
         with self._link.turn("wants strides"):
             return not self._navigator.has_gps
@@ -150,16 +141,16 @@ class ToAutopilot:
         now_s = self._clock.mono_s()
         if event.accepted and (best := event.best):
             place, score = own_number(best.place.place_id), best.match.score
-            found = messages.named_values(now_s, vpr_place=place, vpr_score=score, vpr_conf=confidence_of(event))
+            found = messages.named_values(now_s, vpr_place=place, vpr_score=score, vpr_conf=combine_confidence(event))
             self._link.send(*found)
         if event.is_query:
             cpu_share = event.cost.whole.utilisation(self._cores)
             self._link.send(*messages.named_values(now_s, vpr_cpu=float(cpu_share), vpr_mah=float(used_mah)))
 
     def compare_gps(self, off_m: float, is_wrong: bool, have_agreed: bool) -> None:
-        """Send the distance `off_m` (metres) from the GPS position to a match. `is_wrong` is the judgement that GPS
-        contradicts the map: while it is True, the navigator does not use GPS. Where they never `have_agreed`, the map
-        is as likely to be wrong: then GPS is used, and no position is sent."""
+        """Send the distance `off_m` (metres) from GPS to a match. While GPS `is_wrong`, since it contradicts the map,
+        the navigator does not use it. Where they never `have_agreed`, the map is as likely to be wrong: then GPS is
+        used, and no position is sent."""
         with self._link.turn("gps"):
             self._link.send(*messages.named_values(self._clock.mono_s(), vpr_gps_m=float(off_m)))
             self._navigator.believe_gps(not is_wrong or not have_agreed)
@@ -176,8 +167,8 @@ class ToAutopilot:
             self._navigator.begin_anew()
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
-        """Send the health, load and temperature (None: unknown) of this companion computer, and ask the autopilot for
-        another source set if that is wanted (see `SourceSets`). Call it once a second."""
+        """Send health, load and temperature (None: unknown) of this computer, and ask for another source set if that is
+        wanted. Call it once a second."""
         with self._link.turn("report"):
             self._link.set_health(health)
             self._ask_for_sources()
@@ -195,7 +186,7 @@ class ToAutopilot:
         has_own, stats = self._navigator.knows_position(now_s), self._link.stats()
         answered_s = stats.answered_s.get(messages.SOURCE_SET, -math.inf)
         if number := self._source_sets.wanted(now_s, self._navigator.has_gps, has_own, answered_s):
-            self._herald.say(messages.Severity.WARNING, f"source set {number} asked for", topic="sources")
+            self._notifier.announce(messages.Severity.WARNING, f"source set {number} asked for", topic="sources")
             self._link.send(messages.source_set(number, stats.autopilot_system_id or 0))
 
     def _report_output(self) -> None:
@@ -203,7 +194,7 @@ class ToAutopilot:
         output = self._navigator.output
         if self._link.channel.is_continuous and output is not self._output:
             self._output = output
-            self._herald.tell("output", output.severity, output.text, state=output.name)
+            self._notifier.report("output", output.severity, output.text, state=output.name)
 
     def _fixed(self, event: Recognition) -> tuple[FixReport | None, Sending | None]:
         """Send the fix of an accepted match. Return (None, the sending), or (a report of why it is not sent, None)."""
@@ -211,28 +202,29 @@ class ToAutopilot:
             advice = self._navigator.advise(event, self._clock.mono_s())
         except ValueError as error:  # another program wrote an invalid position
             _log.warning("%s: %s; no fix is sent", event.name, error)
-            return unsent(event, str(error)), None
-        self._say_held(advice.why if advice.is_held else None)
+            return report_unsent(event, str(error)), None
+        self._report_held(advice.why if advice.is_held else None)
         if advice.fix is None or not self._send_fixes:
-            return unsent(event, advice.why or DRY_RUN), None
+            return report_unsent(event, advice.why or DRY_RUN), None
         return None, self._link.send_fix(advice.fix)
 
-    def _say_held(self, objection: str | None) -> None:
+    def _report_held(self, objection: str | None) -> None:
         """Count a fix that is held back because of `objection`, and report when a row of them begins and ends."""
         before, self._is_holding = self._is_holding, objection is not None
         self._held += self._is_holding
         if self._is_holding and not before:
             ground = "fix held back, contradicts autopilot"
-            self._herald.say(messages.Severity.WARNING, f"a fix is {objection}", ground=ground, topic="held back")
+            self._notifier.announce(
+                messages.Severity.WARNING, f"a fix is {objection}", ground=ground, topic="held back"
+            )
         elif before and not self._is_holding:
-            self._herald.say(messages.Severity.INFO, "fixes agree again", topic="held back")
+            self._notifier.announce(messages.Severity.INFO, "fixes agree again", topic="held back")
 
 
 class SourceSets:
-    """Decides which source set, a numbered choice of sensors in the autopilot, the autopilot is asked to navigate by.
-    The set `no_gps` is asked for when GPS is lost or wrong and we know the position; the set `gps`, after that, once
-    GPS has been good for ten seconds. Each is asked for again until it is answered. Unless both numbers are
-    configured, nothing is asked for."""
+    """Decides which numbered set of sensors the autopilot is asked to navigate by: `no_gps` when GPS is lost or wrong
+    and we know the position, after that `gps` once GPS has been good for ten seconds, each until it is answered. Unless
+    both numbers are configured, nothing is asked for."""
 
     def __init__(self, settings: SourceSetsConfig) -> None:
         self._with_gps, self._without = settings.gps, settings.no_gps
@@ -246,9 +238,8 @@ class SourceSets:
         return self._with_gps is not None and self._without is not None
 
     def wanted(self, now_s: float, has_gps: bool, has_own: bool, answered_s: float) -> int | None:
-        """Return the number of the set to ask for now (None: ask for nothing). `has_gps`: the autopilot has a GPS that
-        is believed; `has_own`: our own position is known well enough; `answered_s`: when it last answered such a
-        question."""
+        """Return the number of the set to ask for now (None: none). `has_gps`: there is a GPS that is believed;
+        `has_own`: our own position is known well enough; `answered_s`: when such a question was last answered."""
         if not has_gps:
             self._bad_s = now_s
         wanted = self._without if not has_gps and has_own else None
@@ -276,14 +267,13 @@ def _place_of(fix: Fix) -> dict[str, float]:
     return {**at, "accuracy_m": round(fix.accuracy_m, 2)}
 
 
-def unsent(event: Recognition, why: str) -> FixReport:
+def report_unsent(event: Recognition, why: str) -> FixReport:
     """Return the report of a fix that was not sent, and why."""
     return FixReport(query=event.name, sent=False, why=why)
 
 
-def confidence_of(event: Recognition) -> float | None:
-    """Return the confidence of a match: that of the match alone or, if higher, that of the belief over the flight so
-    far. None: the technique has no model of confidence."""
+def combine_confidence(event: Recognition) -> float | None:
+    """Return the confidence of a match, alone or by the flight so far, the higher (None: it is unknown)."""
     if event.confidence is None:
         return None
     return max(event.confidence, event.followed.confidence if event.followed else 0.0)

@@ -9,7 +9,7 @@ import numpy as np
 
 from edgevpr.core.config import Config, SourceConfig
 from edgevpr.mavlink.messages import Severity
-from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.opening import meter_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -31,11 +31,11 @@ class ScaleWatch:
     """Says once if pictures show clearly more or less ground than those that were cut from an orthophoto for the map: a
     map cut to the right size finds more. It goes by the first matches that are accepted."""
 
-    def __init__(self, herald: Herald) -> None:
-        self._herald = herald
+    def __init__(self, notifier: Notifier) -> None:
+        self._notifier = notifier
         self._seen: list[tuple[float, float]] = []  # ground along a picture in flight, and in the map, metres
 
-    def tell(self, event: Recognition) -> None:
+    def update(self, event: Recognition) -> None:
         """Take the ground that the match of an event shows."""
         pose, where = event.best and event.best.place.pose, event.located
         if len(self._seen) == _SCALED_BY or not (where and where.height_ratio and pose and pose.is_surveyed):
@@ -48,7 +48,7 @@ class ScaleWatch:
             text = f"a picture shows {flown_m:.0f} m of ground, the map was cut for {cut_m:.0f} m"
             ground = f"footprint {flown_m:.0f} m, map's {cut_m:.0f} m"
             said = f"{text}: --footprint-m {flown_m:.0f} finds more"
-            self._herald.tell("camera", Severity.WARNING, said, ground=ground, said=said)
+            self._notifier.report("camera", Severity.WARNING, said, ground=ground, said=said)
 
 
 class TurnWatch:
@@ -56,11 +56,11 @@ class TurnWatch:
     heading keeps matches from being found. Either the camera's top points elsewhere than `source.up_deg` says, or the
     compass is wrong."""
 
-    def __init__(self, herald: Herald, source: SourceConfig) -> None:
-        self._herald, self._up_deg, self._is_said = herald, source.up_deg, False
+    def __init__(self, notifier: Notifier, source: SourceConfig) -> None:
+        self._notifier, self._up_deg, self._is_said = notifier, source.up_deg, False
         self._turned: deque[complex] = deque(maxlen=_TURNED_BY)  # each of length 1
 
-    def tell(self, event: Recognition) -> None:
+    def update(self, event: Recognition) -> None:
         """Take the direction that the match of an event shows."""
         where, told_deg = event.located, event.view.up_deg
         if self._is_said or where is None or where.heading_deg is None or told_deg is None or event.view.reason:
@@ -73,20 +73,20 @@ class TurnWatch:
         self._is_said, up_deg = True, (self._up_deg + turn_deg) % 360
         turned = f"turned {turn_deg:.0f} degrees"
         said = f"pictures are {turned} against the heading: if the compass is right, set source.up_deg: {up_deg:.0f}"
-        self._herald.tell("camera", Severity.WARNING, said, ground=f"pictures {turned}", topic="turn", said=said)
+        self._notifier.report("camera", Severity.WARNING, said, ground=f"pictures {turned}", topic="turn", said=said)
 
 
 class MirrorWatch:
     """Reports once if pictures are mirrored, as by a setting of the camera: they never match. Where many queries in a
     row have no match, and none had one before, a picture is tried flipped left to right, and top to bottom."""
 
-    def __init__(self, herald: Herald, recogniser: Recogniser, config: Config) -> None:
-        self._herald, self._recogniser = herald, recogniser
+    def __init__(self, notifier: Notifier, recogniser: Recogniser, config: Config) -> None:
+        self._notifier, self._recogniser = notifier, recogniser
         self._meter = meter_of(config, recogniser.meter.board)  # its own: that of the flight may be recorded
         self._misses = self._tries = self._matches = 0
         self._next_try = _MISSES_TO_TRY
 
-    def tell(self, event: Recognition) -> None:
+    def update(self, event: Recognition) -> None:
         """Count a query without a match, and try its picture mirrored if it is time to."""
         if event.accepted:
             self._tries = _MAX_TRIES
@@ -103,7 +103,7 @@ class MirrorWatch:
         if self._matches == _MIRRORED_TO_REPORT:
             self._tries = _MAX_TRIES
             said = "pictures are mirrored, so none can match: switch mirror or flip off in the camera's settings"
-            self._herald.tell(
+            self._notifier.report(
                 "camera", Severity.WARNING, said, ground="pictures are mirrored", topic="mirror", said=said
             )
 

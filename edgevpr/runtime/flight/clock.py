@@ -14,9 +14,8 @@ _APART_S, _STRIDE_S = 4.0, 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
-    """Clocks, in seconds. `mono_s` is the monotonic clock, which stamps every frame and message of a flight; `wall_s`
-    times the steps of a query; `utc_s` counts from 1970. The CPU times are of all threads of this process, and of the
-    calling one. `sleep` waits for some seconds."""
+    """Clocks, in seconds. The monotonic `mono_s` stamps frames and messages; `wall_s` times the steps of a query;
+    `utc_s` counts from 1970. CPU times are those of this process, and of the calling thread."""
 
     mono_s: Callable[[], float] = time.monotonic
     wall_s: Callable[[], float] = time.perf_counter
@@ -26,15 +25,15 @@ class Clock:
     sleep: Callable[[float], None] = time.sleep
 
 
-def taped(clock: Clock, tape: Tape) -> Clock:
+def record_clock(clock: Clock, tape: Tape) -> Clock:
     """Return the same clocks with each reading recorded on the `tape`, or played back from it."""
     names = [each.name for each in fields(clock) if each.name != "sleep"]
     return replace(clock, **{name: partial(tape.read, name, getattr(clock, name)) for name in names})
 
 
 class Pace:
-    """Decides when to take the next frame: `rate_hz` frames per second, evenly spaced or by the steps of a recording.
-    After a delay, missed frames are not made up for."""
+    """Decides when to take the next frame: `rate_hz` a second, or by the steps of a recording; never more after a
+    delay."""
 
     def __init__(self, rate_hz: float, clock: Clock) -> None:
         self._clock = clock
@@ -47,8 +46,8 @@ class Pace:
         return self._due_s - self._clock.mono_s()
 
     def taken(self, step_s: float | None = None) -> None:
-        """Note that a frame has been taken, and set the time at which the next one is due: after `step_s` (None: by the
-        rate), or later by as much as the rate has been lowered since the start."""
+        """Note that a frame has been taken. The next is due after `step_s` (None: by the rate), or later by as much as
+        the rate has been lowered."""
         wait_s = 1 / self.rate_hz if step_s is None else step_s * self._asked_hz / self.rate_hz
         self._due_s = max(self._due_s + wait_s, self._clock.mono_s())
         self._stride_s = self._clock.mono_s() + _STRIDE_S

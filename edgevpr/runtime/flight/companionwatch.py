@@ -4,7 +4,7 @@ import math
 
 from edgevpr.mavlink.messages import Severity
 from edgevpr.power.thermal import ThermalState
-from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.notifier import Notifier
 
 # Seconds between two reports of a problem at least, and without it until it counts as over: an under-voltage blinks.
 _REPORT_EVERY_S = 30.0
@@ -17,11 +17,10 @@ _TEXTS = {
 
 
 class CompanionWatch:
-    """Reports each problem of the companion computer once when it begins and once when it is over, to flight log,
-    journal and ground station."""
+    """Reports each problem of the companion computer once when it begins and once when it is over."""
 
-    def __init__(self, herald: Herald) -> None:
-        self._herald = herald
+    def __init__(self, notifier: Notifier) -> None:
+        self._notifier = notifier
         self._seen_s: dict[str, float] = {}  # when each problem was last seen
         self._reported_s: dict[str, float] = {}  # when each problem was last reported, as begun or as over
         self._holding: dict[str, str] = {}  # problems that were reported and are not over, with their texts
@@ -32,8 +31,7 @@ class CompanionWatch:
         return tuple(self._holding.values())
 
     def take(self, now_s: float, state: ThermalState) -> None:
-        """Take a reading, and report what has changed. A value that is unknown (None) changes nothing. Call it about
-        once a second."""
+        """Take a reading once a second, and report what has changed. An unknown value (None) changes nothing."""
         for problem in _TEXTS:
             value: bool | None = getattr(state, problem)
             if value:
@@ -52,7 +50,7 @@ class CompanionWatch:
         else:
             del self._holding[problem]
         text = begun if holds else over
-        self._herald.tell(
+        self._notifier.report(
             "companion",
             Severity.WARNING if holds else Severity.INFO,
             text,

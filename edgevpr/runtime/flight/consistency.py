@@ -1,5 +1,4 @@
-"""The fixes of accepted matches, and the check of each against where the path says that the aircraft is. `navigation`
-compares them, `navigator` asks."""
+"""The check of each fix against where the path says that the aircraft is. `navigator` uses it."""
 
 import math
 from dataclasses import dataclass
@@ -8,12 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
-from edgevpr.core.geodesy import shorter_deg
-from edgevpr.core.types import Position
-from edgevpr.runtime.recognise.locate import in_sd, matrix_of
-from edgevpr.runtime.recognise.perspective import Lean
-from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.stride import Stride
+from edgevpr.runtime.flight.measurements import PositionedMatch
+from edgevpr.runtime.recognise.locate import in_sd
 
 # Limits in standard deviations. A right fix is more than _CONTRADICTS from the expected position once in 3000 times. A
 # second right fix is within _AGREES of the first seven times in eight; otherwise the one after it is.
@@ -21,60 +16,7 @@ _CONTRADICTS, _AGREES = 4.0, 2.0
 _GOOD_FOR_S = 30.0  # a fix held back for longer is not compared: the path may have drifted too far
 _JOINED_WITHIN_S = 2.5
 _DRIFT_M_S, _FOLLOWED_DRIFT_M_S = 2.5, 0.5  # drift of the path that is allowed for between two fixes that agree
-_TURNED_DEG = 45.0  # so far a compass does not turn from one fix to the next
 _IN_A_ROW, _ROW_WITHIN_S, _FASTEST_M_S = 4, 10.0, 30.0  # of fixes that are believed against a path that is lost
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HeardFrame:
-    """A frame taken at `t_s`. `sd_m` is the standard deviation, of each axis, by which its picture puts the aircraft
-    wrongly, beside what `lean_s2` says that an error of the attitude does (see `DriftFilter` in `drift`). `stride` is
-    the motion since the frame before (None: unknown), whose scale is wrong by `scale_sd` where heights contradict each
-    other. `alike_m` is how far apart pictures are whose fixes do not err
-    alike."""
-
-    t_s: float
-    sd_m: float
-    lean_s2: float = 0.0
-    stride: Stride | None = None
-    scale_sd: float = 0.0
-    alike_m: float = 0.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PositionedMatch:
-    """An accepted match with a position: its `frame`; `position` of the aircraft then; `accuracy_m`, to be sent with
-    it; `covariance_m2` (2, 2), without the error that all fixes share and that of the frame; numbers of the `places` it
-    comes from; `lean`, what its picture shows of the error of the attitude; and `turn_deg`, by how much the heading
-    that it shows exceeds the autopilot's."""
-
-    frame: HeardFrame
-    position: Position
-    accuracy_m: float
-    covariance_m2: Doubles
-    places: tuple[int, ...]
-    lean: Lean | None = None
-    turn_deg: float | None = None
-
-    @property
-    def t_s(self) -> float:
-        """Time of the frame."""
-        return self.frame.t_s
-
-    @property
-    def scatter_m2(self) -> Doubles:
-        """Covariance (2, 2) by which the fixes of two frames differ."""
-        return self.covariance_m2 + self.frame.sd_m**2 * np.eye(2)
-
-    def is_of_other_places(self, other: "PositionedMatch") -> bool:
-        """Tell whether it comes from none of the places that the other one comes from."""
-        return set(self.places).isdisjoint(other.places)
-
-    def is_turned_like(self, turn_deg: float | None) -> bool:
-        """Tell whether its picture is turned against the compass by about `turn_deg`, where both are known."""
-        if self.turn_deg is None or turn_deg is None:
-            return True
-        return abs(shorter_deg(self.turn_deg - turn_deg)) <= _TURNED_DEG
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,7 +37,7 @@ class ComparedFix:
         return self.off_m - self.expected_m
 
 
-class Weighed(NamedTuple):
+class GateResult(NamedTuple):
     """Verdict on a fix: `why` it is not believed (None: it is). `is_against`: it contradicts the expected position,
     and other fixes agree with it; `is_lost`: the path's velocity is wrong too."""
 
@@ -104,7 +46,7 @@ class Weighed(NamedTuple):
     is_lost: bool = False
 
 
-BELIEVED = Weighed()
+BELIEVED = GateResult()
 
 
 class Consistency:
@@ -129,7 +71,7 @@ class Consistency:
         good_for_s = _JOINED_WITHIN_S if is_followed else _GOOD_FOR_S
         return self._held is not None and now_s - self._against_s <= good_for_s
 
-    def weighed(self, fix: ComparedFix, has_gps: bool, is_followed: bool) -> Weighed:
+    def judge(self, fix: ComparedFix, has_gps: bool, is_followed: bool) -> GateResult:
         """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed; `is_followed`: the path
         is known from frame to frame, so that it takes several to be wrong."""
         step_m, is_turned = fix.beside_m, not fix.seen.is_turned_like(self._turn_deg)
@@ -140,14 +82,14 @@ class Consistency:
         if has_gps:
             self._held, self._row = None, []
             there = f"held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is"
-            return Weighed(turned if is_turned else there)
+            return GateResult(turned if is_turned else there)
         self._row = [each for each in self._row if _could_follow(each, fix)]
         if all(fix.seen.is_of_other_places(each.seen) for each in self._row):  # neighbours share places
             self._row.append(fix)
         if len(self._row) == _IN_A_ROW:
-            return self._believed(fix, Weighed(is_against=True, is_lost=True))
+            return self._believed(fix, GateResult(is_against=True, is_lost=True))
         if is_turned:
-            return Weighed(turned)
+            return GateResult(turned)
         drift_m_s = _FOLLOWED_DRIFT_M_S if is_followed else _DRIFT_M_S
         self._against_s = fix.seen.t_s
         if self._held is None or _differ(self._held, fix, drift_m_s) > _AGREES:
@@ -155,38 +97,15 @@ class Consistency:
         else:
             self._joined += 1
             if _is_independent(self._held, fix, drift_m_s) and self._joined >= (_IN_A_ROW if is_followed else 2):
-                return self._believed(fix, Weighed(is_against=True))
+                return self._believed(fix, GateResult(is_against=True))
         there = "where the aircraft is by the autopilot's reckoning and the fixes before"
-        return Weighed(f"held back: {off_m:.0f} m from {there}, good to {good_to_m:.0f} m: another fix has to agree")
+        return GateResult(f"held back: {off_m:.0f} m from {there}, good to {good_to_m:.0f} m: another fix has to agree")
 
-    def _believed(self, fix: ComparedFix, verdict: Weighed) -> Weighed:
+    def _believed(self, fix: ComparedFix, verdict: GateResult) -> GateResult:
         self._held, self._row = None, []
         if fix.seen.turn_deg is not None:
             self._turn_deg = fix.seen.turn_deg
         return verdict
-
-
-def worst_sd(covariance: Doubles) -> float:
-    """Return the standard deviation along the worst direction of a covariance (2, 2)."""
-    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
-
-
-def positioned(event: Recognition, frame: HeardFrame) -> PositionedMatch | None:
-    """Return the positioned match of an event and its frame; None if no match with a position was accepted."""
-    if event.best is None or event.located is None or event.accuracy_m is None:
-        return None
-    turn_deg, shown_deg, told_deg = None, event.located.heading_deg, event.view.up_deg
-    if shown_deg is not None and told_deg is not None:
-        turn_deg = shorter_deg(shown_deg - told_deg)
-    return PositionedMatch(
-        frame=frame,
-        position=event.located.position,
-        accuracy_m=event.accuracy_m,
-        covariance_m2=matrix_of(event.located.covariance_m2),
-        places=event.located.places or (event.best.place.place_id,),
-        lean=event.located.lean,
-        turn_deg=turn_deg,
-    )
 
 
 def _differ(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> float:
@@ -194,7 +113,7 @@ def _differ(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> float:
     they are 30 s apart."""
     if abs(other.seen.t_s - one.seen.t_s) > _GOOD_FOR_S:
         return math.inf
-    return in_sd(other.beside_m - one.beside_m, _of_both(one, other, drift_m_s))
+    return in_sd(other.beside_m - one.beside_m, _sum_covariances(one, other, drift_m_s))
 
 
 def _could_follow(one: ComparedFix, other: ComparedFix) -> bool:
@@ -211,10 +130,10 @@ def _is_independent(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> b
     if other.seen.is_of_other_places(one.seen):
         return True
     flown_m = other.path_m + other.expected_m - one.path_m - one.expected_m
-    return in_sd(flown_m, _of_both(one, other, drift_m_s)) > _CONTRADICTS
+    return in_sd(flown_m, _sum_covariances(one, other, drift_m_s)) > _CONTRADICTS
 
 
-def _of_both(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> Doubles:
+def _sum_covariances(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> Doubles:
     drift_m = drift_m_s * abs(other.seen.t_s - one.seen.t_s)
     both: Doubles = one.seen.scatter_m2 + other.seen.scatter_m2 + drift_m**2 * np.eye(2)
     return both

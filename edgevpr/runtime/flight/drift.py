@@ -35,10 +35,9 @@ _OF_FRAME[:, _F] = _FIX[:, _F] = _FIX[:, _M] = _EYE
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drift:
-    """Size of the errors of a path. `velocity_sd` (m/s) and `acceleration_sd` (m/s2) are the standard deviations, of
-    one axis, for a path that nothing corrects. `position_noise` (m), `velocity_noise` (m/s) and `acceleration_noise`
-    (m/s2) are the standard deviations of the random change of the error of position, velocity and acceleration in one
-    second."""
+    """Size of the errors of a path, standard deviations of one axis: `velocity_sd` (m/s) and `acceleration_sd` (m/s2)
+    of one that nothing corrects; `position_noise` (m), `velocity_noise` (m/s) and `acceleration_noise` (m/s2) of the
+    random change in one second."""
 
     velocity_sd: float
     acceleration_sd: float
@@ -66,7 +65,7 @@ INERTIAL_PX4 = replace(INERTIAL, attitude_follows_positions=True)
 
 
 @dataclass(frozen=True, slots=True)
-class Strode:
+class OdometryMeasurement:
     """A stride (see `recognise.stride`): by `moved_m` (2,), which exceeds the motion of the path by `off_m` (2,).
     `sd_m` is the standard deviation of each axis."""
 
@@ -105,7 +104,7 @@ class DriftFilter:
         of_parts = sd_m, velocity_sd_m_s, self._drift.acceleration_sd, self._map_sd_m, 0.0, _STRIDE_SD
         self._p = np.diag(np.repeat(np.square(of_parts), 2))
 
-    def go_on(self, step_s: float) -> None:
+    def predict(self, step_s: float) -> None:
         """Predict the state `step_s` seconds later."""
         move = np.eye(_SIZE)
         move[_C, _S] = step_s * _EYE
@@ -137,7 +136,7 @@ class DriftFilter:
         if self._drift.attitude_follows_positions:
             self._shown = max(self._shown, _ROUGH)
 
-    def hear_gps(
+    def correct_by_gps(
         self, off_m: Doubles, sd_m: float, off_m_s: Doubles | None, velocity_sd_m_s: float, age_s: float = 0.0
     ) -> None:
         """Correct the state by GPS, whose position is `off_m` (2,) metres beside the path and whose velocity exceeds
@@ -148,7 +147,7 @@ class DriftFilter:
         variances = [sd_m**2] * 2 + [velocity_sd_m_s**2] * 2
         self._correct(look[: off.size], off, np.diag(variances[: off.size]))
 
-    def hear_frame(self, age_s: float, lean_s2: float, sd_m: float, stride: Strode | None = None) -> bool:
+    def add_frame(self, age_s: float, lean_s2: float, sd_m: float, stride: OdometryMeasurement | None = None) -> bool:
         """Note a frame taken `age_s` ago. `sd_m` is the standard deviation, of each axis, by which its picture puts the
         aircraft wrongly, beside what `lean_s2` does. Correct the state by the `stride` from the frame before (None: it
         is unknown). Returns False if that contradicts the state, and is not used."""
@@ -168,7 +167,7 @@ class DriftFilter:
         self._correct(look, np.zeros(2), variance_m2 * _EYE)
         return True
 
-    def hear_turn(self, turn: float) -> None:
+    def correct_by_turn(self, turn: float) -> None:
         """Correct the direction of strides by a match, whose picture is turned by `turn` (radians, clockwise) against
         the compass. One that is turned by far does not count: then strides contradict the path, and are not used. Nor
         does one beside a path of accelerations, which the same compass has turned."""
@@ -177,11 +176,11 @@ class DriftFilter:
             look[0, _TURN] = 1.0
             self._correct(look, np.array([turn]), np.array([[_TURN_SD**2]]))
 
-    def hear_fix(self, off_m: Doubles, covariance_m2: Doubles) -> None:
+    def correct_by_fix(self, off_m: Doubles, covariance_m2: Doubles) -> None:
         """Correct the state by the fix of the last frame, of covariance (2, 2), `off_m` (2,) metres from the path."""
         self._correct(_FIX, off_m, covariance_m2)
 
-    def hear_lean(self, over_height: Doubles, sd: float) -> None:
+    def correct_by_attitude_error(self, over_height: Doubles, sd: float) -> None:
         """Correct the state by the error of the attitude that a picture shows (see `recognise.perspective`). Where
         pictures show more than they may be wrong by, the gyros are poor and the error wanders faster."""
         shown = float(np.mean(np.square(over_height))) / sd**2
@@ -190,15 +189,15 @@ class DriftFilter:
         look[:, _B] = _EYE / GRAVITY_M_S2
         self._correct(look, over_height, sd**2 * _EYE)
 
-    def trust_fix(self, off_m: Doubles, covariance_m2: Doubles) -> None:
+    def reset_to_fix(self, off_m: Doubles, covariance_m2: Doubles) -> None:
         """Correct the state by a fix that contradicts it: what was known of the position is forgotten."""
         self._p[_C] = self._p[:, _C] = 0.0
         self._p[_C, _C] = 1e6 * _EYE
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
         self._begin_frame()
-        self.hear_fix(off_m, covariance_m2)
+        self.correct_by_fix(off_m, covariance_m2)
 
-    def expected_fix(self) -> tuple[Doubles, Doubles]:
+    def predict_fix(self) -> tuple[Doubles, Doubles]:
         """Predict the fix of the last frame. Returns its offset (2,) from the path, metres, and the covariance (2, 2)
         of this prediction, without that of the fix itself."""
         return _FIX @ self._x, _FIX @ self._p @ _FIX.T

@@ -1,9 +1,5 @@
-"""A flight from start to end: `Flight.open` opens everything, `run` flies, and `close` closes everything.
-
-Each pass of the loop takes the newest frame, recognises it, and reports the event, the `Recognition` of this frame, to
-the autopilot and to observers (functions that count, watch, log and learn). The same code flies in the air and in a
-replay: only its `World`, all that is outside of it, differs.
-"""
+"""A flight from start to end. Each pass of the loop takes the newest frame, recognises it, and reports the event, the
+`Recognition` of this frame, to the autopilot and to observers: functions that count, watch, log and learn."""
 
 import logging
 from collections.abc import Callable
@@ -22,38 +18,44 @@ from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight import systemd
-from edgevpr.runtime.flight.aboard import at_recorded_rate, find_origin, look_ahead, open_map, rate_hz, say_start
-from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, unsent
+from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, report_unsent
 from edgevpr.runtime.flight.camerawatch import MirrorWatch, ScaleWatch, TurnWatch
 from edgevpr.runtime.flight.clock import Pace
+from edgevpr.runtime.flight.flightio import FlightIO, FlightParts, StopNow, open_real_io
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.frozenwatch import FrozenWatch, read_optics
-from edgevpr.runtime.flight.governor import Governing
+from edgevpr.runtime.flight.governor import GovernorActuator
 from edgevpr.runtime.flight.heightwatch import HeightWatch
-from edgevpr.runtime.flight.herald import Commands, Herald
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.flight.tiles import tiles_of
+from edgevpr.runtime.flight.notifier import Commands, Notifier
+from edgevpr.runtime.flight.startup import (
+    apply_recorded_rate,
+    choose_rate_hz,
+    find_origin,
+    log_start,
+    measure_speed,
+    open_map,
+)
+from edgevpr.runtime.flight.tiles import open_tiles
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Surveyor, Tally
-from edgevpr.runtime.flight.world import Crew, StopNow, World, in_the_air
 from edgevpr.runtime.preflight.pick import trusted_candidates
 from edgevpr.runtime.recognise.recognition import Recognition, fields_of
 
-_TURN_S = 0.2  # a pass of the loop waits no longer than this for a frame
+_MAX_WAIT_S = 0.2  # a pass of the loop waits no longer than this for a frame
 
 _log = logging.getLogger(__name__)
 
 
 def fly(config: Config, positions: Path | None = None) -> int:
-    """Fly in the air, and return the exit code: 1 if any frame failed, else 0. `positions` is a file with the positions
-    of the frames, if the source is a recording (None: there is none). Raises an EdgevprError, one sentence, if the
-    flight cannot start."""
+    """Fly, and return the exit code: 1 if any frame failed, else 0. `positions` is a file with the positions of the
+    frames of a recording (None: there is none). Raises EdgevprError if the flight cannot start."""
     steps_s = recorded_steps(config.source.uri, positions)
-    config = at_recorded_rate(config, steps_s)
-    with in_the_air(config, positions, steps_s) as world:
+    config = apply_recorded_rate(config, steps_s)
+    with open_real_io(config, positions, steps_s) as io:
         try:
-            with closing(Flight.open(config, world)) as flight:
+            with closing(Flight.open(config, io)) as flight:
                 return flight.run()
         except StopNow:
             _log.info("stopped before the flight began")
@@ -61,72 +63,71 @@ def fly(config: Config, positions: Path | None = None) -> int:
 
 
 class Flight:
-    """A flight whose map, log, links and source of frames are open. `open` makes it; close it after `run`."""
+    """A flight whose parts are open. `open` makes it; close it after `run`."""
 
-    def __init__(self, config: Config, crew: Crew) -> None:
-        self._config, self._crew, self._opened = config, crew, ExitStack()
-        herald, self._map_watch, self._tally = crew.herald, MapWatch(crew.herald), Tally()
-        self._pace = Pace(rate_hz(config, crew.recogniser), crew.clock)
-        self._governing = Governing(crew, self._pace)
-        self._commands = Commands(crew.link, herald, crew.learner)
-        self._frozen = FrozenWatch(herald, read_optics(config.source, crew.recogniser), crew.autopilot)
+    def __init__(self, config: Config, parts: FlightParts) -> None:
+        self._config, self._parts, self._opened = config, parts, ExitStack()
+        notifier, self._map_watch, self._tally = parts.notifier, MapWatch(parts.notifier), Tally()
+        self._pace = Pace(choose_rate_hz(config, parts.recogniser), parts.io.clock)
+        fewer_candidates = () if config.match.candidates else trusted_candidates(parts.recogniser.technique)
+        self._governing = GovernorActuator(parts, self._pace, fewer_candidates)
+        self._commands = Commands(parts.link, notifier, parts.learner)
+        self._frozen = FrozenWatch(notifier, read_optics(config.source, parts.recogniser), parts.autopilot)
         self._vitals = Vitals(
-            crew, self._frozen, tally=self._tally, pace=self._pace, commands=self._commands, remarks=self._remarks
+            parts, self._frozen, tally=self._tally, pace=self._pace, commands=self._commands, remarks=self._remarks
         )
-        gps = GpsWatch(config.mavlink.min_accuracy_m, herald, crew.autopilot)
-        self._surveyor = Surveyor(herald, gps, config.source, self._look)
+        gps = GpsWatch(config.mavlink.min_accuracy_m, notifier, parts.autopilot)
+        self._surveyor = Surveyor(notifier, gps, config.source, self._set_mount)
         self._observers: tuple[Callable[[Recognition], None], ...] = (
-            self._tally.tell,
-            self._vitals.tell,
-            self._map_watch.tell,
-            Sight(herald).tell,
-            ScaleWatch(herald).tell,
-            TurnWatch(herald, config.source).tell,
-            MirrorWatch(herald, crew.recogniser, config).tell,
-            HeightWatch(herald, crew.autopilot).tell,
-            gps.tell,
-            self._surveyor.tell,
+            self._tally.update,
+            self._vitals.update,
+            self._map_watch.update,
+            Sight(notifier).update,
+            ScaleWatch(notifier).update,
+            TurnWatch(notifier, config.source).update,
+            MirrorWatch(notifier, parts.recogniser, config).update,
+            HeightWatch(notifier, parts.autopilot).update,
+            gps.update,
+            self._surveyor.update,
             self._log_event,
             self._learn,
-            *([crew.tiles.tell] if crew.tiles else []),
+            *([parts.tiles.update] if parts.tiles else []),
         )
 
     @classmethod
-    def open(cls, config: Config, world: World) -> "Flight":
-        """Open the map, the log, the links and the source, in this order. Raises an EdgevprError if one of them cannot
-        be opened, and StopNow if a signal ends the flight before it has begun."""
+    def open(cls, config: Config, io: FlightIO) -> "Flight":
+        """Open map, log, links and source. Raises EdgevprError, and StopNow if a signal ends the flight before it
+        begins."""
         systemd.notify(EXTEND_TIMEOUT_USEC=systemd.LONGEST_START_US)
         with ExitStack() as stack:
-            with world.stop.beginning():
-                recogniser, learner, cannot_learn = open_map(config, world)
+            with io.stop.beginning():
+                recogniser, learner, cannot_learn = open_map(config, io)
                 stack.callback(recogniser.place_map.close)
-                flight_log = _open_log(world)
-                stack.enter_context(flight_log)
-                found = look_ahead(recogniser, config, world)
-            flight_log.write("start", **say_start(config, world, recogniser, found))
-            step_s = 1 / rate_hz(config, recogniser)
-            is_muted, is_level = not config.mavlink.send_fixes, config.source.gimbal
-            navigator = Navigator(config.mavlink.min_accuracy_m, step_s, is_muted, is_level)
-            origin = find_origin(recogniser.place_map, config.source) if config.mavlink.set_origin else None
-            link, ground = open_links(config.mavlink, world, navigator, origin, stack)
-            source, source_uri = world.open_source(step_s), config.source.uri
+                flight_log = stack.enter_context(_open_log(io))
+                found = measure_speed(recogniser, config, io)
+            flight_log.write("start", **log_start(config, io, recogniser, found))
+            step_s, settings = 1 / choose_rate_hz(config, recogniser), config.mavlink
+            navigator = Navigator(settings.min_accuracy_m, step_s, not settings.send_fixes, config.source.gimbal)
+            origin = find_origin(recogniser.place_map, config.source) if settings.set_origin else None
+            link, ground = open_links(settings, io, navigator, origin, stack)
+            source = io.open_source(step_s)
             stack.callback(source.close)
-            if link and not source.is_live and (learner or config.mavlink.send_fixes):
-                _log.warning("%s is a recording: its fixes, and what it learns, do not say where you are", source_uri)
-            herald = Herald(flight_log, link)
-            if tiles := tiles_of(recogniser, config.match, herald, world.tape):
+            if link and not source.is_live and (learner or settings.send_fixes):
+                text = "%s is a recording: its fixes, and what it learns, do not say where you are"
+                _log.warning(text, config.source.uri)
+            notifier = Notifier(flight_log, link)
+            if tiles := open_tiles(recogniser, config.match, notifier, io.tape):
                 stack.callback(tiles.close)
             autopilot = None
             if link:
-                settings, cores = config.mavlink, world.board.cores
-                autopilot = ToAutopilot(link, navigator, herald, settings=settings, cores=cores, clock=world.clock)
-            if not config.mavlink.send_fixes:
-                herald.say(Severity.WARNING, DRY_RUN)
+                cores = io.board.cores
+                autopilot = ToAutopilot(link, navigator, notifier, settings=settings, cores=cores, clock=io.clock)
+            if not settings.send_fixes:
+                notifier.announce(Severity.WARNING, DRY_RUN)
             if cannot_learn:
-                _say_learning_stopped(herald, cannot_learn)
-            herald.say(Severity.INFO, f"started, {len(recogniser.place_map)} places", topic="start")
-            meter = FlightMeter(config.battery, world.board, world.clock, tape=world.tape)
-            crew = Crew(
+                _report_learning_stopped(notifier, cannot_learn)
+            notifier.announce(Severity.INFO, f"started, {len(recogniser.place_map)} places", topic="start")
+            parts = FlightParts(
                 recogniser=recogniser,
                 learner=learner,
                 tiles=tiles,
@@ -135,14 +136,11 @@ class Flight:
                 ground=ground,
                 autopilot=autopilot,
                 flight_log=flight_log,
-                herald=herald,
-                meter=meter,
-                clock=world.clock,
-                stop=world.stop,
-                status=world.status,
-                fewer_candidates=() if config.match.candidates else trusted_candidates(recogniser.technique),
+                notifier=notifier,
+                meter=FlightMeter(config.battery, io.board, io.clock, tape=io.tape),
+                io=io,
             )
-            flight = cls(config, crew)
+            flight = cls(config, parts)
             flight._opened = stack.pop_all()
         systemd.notify(READY=1)
         return flight
@@ -154,18 +152,18 @@ class Flight:
     def run(self) -> int:
         """Fly until the source has ended or a signal ends the flight. Return 1 if any frame failed, else 0."""
         with suppress(StopNow):
-            while not (self._crew.stop.asked or self._crew.source.ended):
-                self._turn()
+            while not (self._parts.io.stop.asked or self._parts.source.ended):
+                self._run_pass()
         self._end()
         return 1 if self._tally.unusable + self._tally.failed else 0
 
     def totals(self) -> dict[str, Any]:
-        """Return the counts and costs of the flight so far: those of `FlightMeter.totals`; `queries`; those of the
-        `Source` (`dropped`, `refused`, `latency_s`); `left_out`, the number of places that cannot be read."""
-        source = self._crew.source
+        """Return the counts and costs of the flight so far: those of `FlightMeter.totals` and of the `Source`, the
+        number of `queries`, and `left_out`, that of places that cannot be read."""
+        source = self._parts.source
         return {
             "queries": self._tally.queries,
-            **self._crew.meter.totals(),
+            **self._parts.meter.totals(),
             "dropped": source.dropped,
             "refused": dict(source.refused),
             "latency_s": source.latency_s,
@@ -174,22 +172,22 @@ class Flight:
 
     def _remarks(self) -> tuple[str | None, ...]:
         """Return what people should know beside the counts, each a few words (None: nothing)."""
-        learnt = self._crew.learner.summary if self._crew.learner else None
-        held, left_out = self._governing.governor.held, self._map_watch.summary
-        return self._commands.summary, held, learnt, left_out, self._crew.flight_log.state
+        learnt = self._parts.learner.summary if self._parts.learner else None
+        held = self._governing.governor.held
+        return self._commands.summary, held, learnt, self._map_watch.summary, self._parts.flight_log.state
 
-    def _turn(self) -> None:
+    def _run_pass(self) -> None:
         """Run one pass of the loop, with one frame at most."""
-        source, clock, meter, pace = self._crew.source, self._crew.clock, self._crew.meter, self._pace
+        source, clock, meter, pace = self._parts.source, self._parts.io.clock, self._parts.meter, self._pace
         self._vitals.beat()
         self._commands.obey()
         is_paused, is_query = self._commands.is_paused, (wait_s := pace.wait_s()) <= 0
         if (not is_query and not self._is_time_for_stride()) or (is_paused and not source.is_live):  # a recording waits
-            clock.sleep(_TURN_S if is_query else min(wait_s, _TURN_S))
+            clock.sleep(_MAX_WAIT_S if is_query else min(wait_s, _MAX_WAIT_S))
             return
         with meter.timed() as reading:
             try:
-                frame: Frame | ImageError | None = source.read(_TURN_S)
+                frame: Frame | ImageError | None = source.read(_MAX_WAIT_S)
             except ImageError as error:
                 frame = error
         if not source.is_live:  # of a live source, reading is mostly waiting
@@ -201,60 +199,61 @@ class Flight:
         if is_paused:  # the newest picture is dropped, so that none is old when the flight goes on
             return
         with meter.timed(thread_only=True) as work:
-            with self._crew.stop.breaks_off():
+            with self._parts.io.stop.breaks_off():
                 event = self._recognise(frame, is_query)
             event = replace(event, steps=replace(event.steps, read=reading.cost))
             if is_query:
-                self._tell(event)
-            elif self._crew.autopilot:
+                self._publish(event)
+            elif self._parts.autopilot:
                 meter.count(event)
-                self._crew.autopilot.saw(event)
+                self._parts.autopilot.add_motion(event)
         meter.load.busy(work.cost)
-        self._governing.look()  # here, so that each reading covers a whole number of queries
+        self._governing.update()  # here, so that each reading covers a whole number of queries
 
     def _recognise(self, frame: Frame | ImageError, is_query: bool) -> Recognition:
         """Recognise a frame or, unless it `is_query`, measure its stride; refuse one of pictures that are frozen."""
         if isinstance(frame, ImageError):
-            return self._crew.recogniser.report_unread(frame)
-        vehicle = self._crew.link.vehicle_at(frame.t_mono_s) if self._crew.link else None
-        if self._crew.source.is_live and (reason := self._frozen.judge(frame, vehicle)):
+            return self._parts.recogniser.report_unread(frame)
+        vehicle = self._parts.link.vehicle_at(frame.t_mono_s) if self._parts.link else None
+        if self._parts.source.is_live and (reason := self._frozen.judge(frame, vehicle)):
             return Recognition(frame=frame, vehicle=vehicle, reason=reason)
-        return (self._crew.recogniser.step if is_query else self._crew.recogniser.measure_motion)(frame, vehicle)
+        return (self._parts.recogniser.step if is_query else self._parts.recogniser.measure_motion)(frame, vehicle)
 
     def _is_time_for_stride(self) -> bool:
-        """Tell whether to take a picture that is no query, for the motion that it shows: between rare queries, while
-        the autopilot has no GPS. The pictures of a recording are all queries."""
-        crew = self._crew
-        if crew.autopilot is None or not crew.source.is_live or not crew.recogniser.measures_strides:
+        """Tell whether to take a picture that is no query, for its motion: between rare queries, without GPS. The
+        pictures of a recording are all queries."""
+        parts = self._parts
+        if parts.autopilot is None or not parts.source.is_live or not parts.recogniser.measures_strides:
             return False
-        return not self._commands.is_paused and self._pace.is_time_for_stride() and crew.autopilot.wants_strides()
+        return (
+            not self._commands.is_paused and self._pace.is_time_for_stride() and parts.autopilot.needs_motion_frames()
+        )
 
-    def _tell(self, event: Recognition) -> None:
-        """Report an event to the autopilot, then to all observers, which also get the report of its fix. An exception
-        in one of these is logged: it must not end the flight."""
-        meter = self._crew.meter
+    def _publish(self, event: Recognition) -> None:
+        """Report an event to the autopilot, then to all observers, with the report of its fix. An exception is logged:
+        it must not end the flight."""
+        meter = self._parts.meter
         meter.count(event)
-        with meter.timed() as telling:
+        with meter.timed() as reporting:
             try:
-                if self._crew.autopilot:
-                    event = self._crew.autopilot.told(event, meter.totals()["used_mah"])
+                if self._parts.autopilot:
+                    event = self._parts.autopilot.report_match(event, meter.totals()["used_mah"])
                 elif event.accepted:
-                    event = replace(event, fix=unsent(event, "there is no link"))
+                    event = replace(event, fix=report_unsent(event, "there is no link"))
             except Exception:
-                _log.exception("the autopilot could not be told")
-            for tell in self._observers:
+                _log.exception("the autopilot could not be informed")
+            for update in self._observers:
                 try:
-                    tell(event)
+                    update(event)
                 except Exception:
-                    _log.exception("%s could not be told", tell.__qualname__)
-        meter.energy.add(telling.cost)
+                    _log.exception("%s failed", update.__qualname__)
+        meter.energy.add(reporting.cost)
 
     def _log_event(self, event: Recognition) -> None:
-        """Write the log line of an event: of kind "query", or "unusable" for a frame that could not become a query."""
         if event.frame is None or not event.is_query:
-            self._crew.flight_log.write("unusable", problem=event.reason)
+            self._parts.flight_log.write("unusable", problem=event.reason)
             return
-        self._crew.flight_log.write(
+        self._parts.flight_log.write(
             "query",
             t_frame_s=event.frame.t_mono_s,
             **fields_of(event),
@@ -262,71 +261,68 @@ class Flight:
             last_fix=event.last_fix,
             reading=event.steps.read,
             vehicle=event.vehicle,
-            board=self._crew.meter.thermal,
+            board=self._parts.meter.thermal,
             hints=event.hints.fields() if event.hints else None,
             totals=self.totals(),
         )
 
-    def _look(self, mount: Mount) -> None:
+    def _set_mount(self, mount: Mount) -> None:
         """Level the pictures to come as those of a camera that looks there, and navigate by their fixes only."""
-        self._crew.recogniser.change(mount=mount)
-        if self._crew.autopilot:
-            self._crew.autopilot.begin_anew()
+        self._parts.recogniser.change(mount=mount)
+        if self._parts.autopilot:
+            self._parts.autopilot.begin_anew()
 
     def _learn(self, event: Recognition) -> None:
-        """Add the frame of an event to the map as a new place, if `Learner` finds it worth remembering."""
-        learner = self._crew.learner
+        learner = self._parts.learner
         if learner is None:
             return
-        well = learner.trouble is None
-        place = learner.learn(event)
-        if place:
-            self._crew.flight_log.write(
+        was_well = learner.trouble is None
+        if place := learner.learn(event):
+            self._parts.flight_log.write(
                 "learnt",
                 place=place.place_id,
                 query=event.name,
                 position=place.position and asdict(place.position),
                 quality=place.quality,
             )
-        if well and learner.trouble:
-            _say_learning_stopped(self._crew.herald, learner.trouble)
+        if was_well and learner.trouble:
+            _report_learning_stopped(self._parts.notifier, learner.trouble)
 
     def _end(self) -> None:
-        crew, totals = self._crew, self.totals()
+        parts, totals = self._parts, self.totals()
         systemd.notify(STOPPING=1)
         try:
             self._surveyor.end()
         except Exception:
-            _log.exception("the end of the survey could not be told")
-        if crew.link and crew.autopilot:
-            crew.link.close()  # sends waiting messages first, so that the log's last line counts them
-            crew.autopilot.log_answers()
-        crew.flight_log.write(
+            _log.exception("the end of the survey could not be reported")
+        if parts.link and parts.autopilot:
+            parts.link.close()  # sends waiting messages first, so that the log's last line counts them
+            parts.autopilot.log_answers()
+        parts.flight_log.write(
             "end",
             accepted=self._tally.accepted,
             unusable=self._tally.unusable + self._tally.failed,
             **totals,
-            mavlink=crew.link.stats() if crew.link else None,
-            **({"ground": crew.ground.stats()} if crew.ground else {}),
-            **({"learnt": crew.learner.totals} if crew.learner else {}),
+            mavlink=parts.link.stats() if parts.link else None,
+            **({"ground": parts.ground.stats()} if parts.ground else {}),
+            **({"learnt": parts.learner.totals} if parts.learner else {}),
         )
-        fixes = f", {crew.autopilot.summary}" if crew.autopilot else ""
+        fixes = f", {parts.autopilot.summary}" if parts.autopilot else ""
         counts = f"{self._tally.queries} queries, {self._tally.accepted} accepted{fixes}"
         _log.info("%s, %.3f mAh (%.3f of them for recognising)", counts, totals["used_mah"], totals["marginal_mah"])
-        if crew.learner:
-            _log.info("%s, %d in %s", crew.learner.summary, len(crew.recogniser.place_map), self._config.map)
+        if parts.learner:
+            _log.info("%s, %d in %s", parts.learner.summary, len(parts.recogniser.place_map), self._config.map)
 
 
-def _open_log(world: World) -> FlightLog:
-    log, clock, is_service = world.log, world.clock, systemd.is_there()
-    return FlightLog(log.path, clock.mono_s, clock.utc_s, wait=is_service, max_mb=log.max_mb, tape=world.tape)
+def _open_log(io: FlightIO) -> FlightLog:
+    log, clock, is_service = io.log, io.clock, systemd.is_there()
+    return FlightLog(log.path, clock.mono_s, clock.utc_s, wait=is_service, max_mb=log.max_mb, tape=io.tape)
 
 
 def open_links(
-    settings: MavlinkConfig, world: World, navigator: Navigator, origin: Position | None, stack: ExitStack
+    settings: MavlinkConfig, io: FlightIO, navigator: Navigator, origin: Position | None, stack: ExitStack
 ) -> tuple[Link | None, Link | None]:
-    """Open the links to flight controller and ground station (None: not configured), which `stack` closes. `origin`: as
-    in `LinkSettings`."""
+    """Open the links to flight controller and ground station (None: not configured), which `stack` closes."""
     address, ground_address = parse_links(settings.link, settings.ground)
     if address is None:
         return None, None
@@ -335,16 +331,16 @@ def open_links(
         system_id=settings.system_id,
         max_fix_age_s=settings.max_fix_age_s,
         listener=navigator,
-        tap=world.tap,
+        tap=io.tap,
         origin=origin,
-        signing=world.signing,
-        tape=world.tape,
+        signing=io.signing,
+        tape=io.tape,
     )
-    link = stack.enter_context(world.link(address, link_settings))
+    link = stack.enter_context(io.link(address, link_settings))
     link.want_position()
-    return link, stack.enter_context(world.ground(ground_address, link)) if ground_address else None
+    return link, stack.enter_context(io.ground(ground_address, link)) if ground_address else None
 
 
-def _say_learning_stopped(herald: Herald, problem: str) -> None:
+def _report_learning_stopped(notifier: Notifier, problem: str) -> None:
     text, ground = f"nothing more is learnt: {problem}", "nothing more is learnt, see its log"
-    herald.tell("learning stopped", Severity.WARNING, text, ground=ground, topic="learning", problem=problem)
+    notifier.report("learning stopped", Severity.WARNING, text, ground=ground, topic="learning", problem=problem)

@@ -39,20 +39,19 @@ _SYNC_EVERY_S = 1.0
 
 
 class FlightLog:
-    """Writer of a flight log; with `path` None nothing is written. Close it (it is a context manager).
+    """Writer of a flight log (a context manager); with `path` None nothing is written.
 
-    `path` is the log of the newest flight. The file of an earlier flight is set aside, that is renamed to the next
-    number (see `core.appending`), and so is a file that reaches a quarter of `max_mb` (None: no limit). The numbered
-    files share the other three quarters: the oldest are deleted. Each further file of a flight begins with a copy of
-    the start line and two more fields: `repeated` (true) and `part`, the number of the file within the flight.
+    `path` is the log of the newest flight. The file of an earlier one is set aside: renamed to the next number (see
+    `core.appending`), and so is a file that reaches a quarter of `max_mb` (None: no limit). The numbered files share
+    the rest: the oldest are deleted. Each further file of a flight begins with a copy of the start line and two more
+    fields: `repeated` (true) and `part`, the number of the file within the flight.
 
-    Each line is passed to the operating system at once: if this process ends, however suddenly, no line is lost. Lines
-    are synced to the disk by the first line written a second or more after the last sync, or by the next call of
-    `sync_due`: a pulled battery costs at most the lines of the last two seconds.
+    Each line is passed to the operating system at once: if this process ends, no line is lost. Lines are synced at most
+    once a second: a pulled battery costs the lines of the last two seconds.
 
-    `state` is None while lines are written, else a sentence that says why not. `lost_lines` counts the lines that could
-    not be written. Every write tries again, and the first one that succeeds is preceded by a line of kind "gap". If the
-    log is deleted or moved in flight, it goes on in a new file of the same name.
+    `state` is None while lines are written, else a sentence that says why not; `lost_lines` could not be written. Every
+    write tries again, and the first one that succeeds is preceded by a line of kind "gap". A log that is deleted or
+    moved in flight goes on in a new file.
     """
 
     def __init__(
@@ -65,9 +64,8 @@ class FlightLog:
         max_mb: float | None = None,
         tape: Tape = NO_TAPE,
     ) -> None:
-        """Open the file for appending. Raises EdgevprError if that fails. With `wait`, for a service that may be
-        restarted in the air, it does not raise: every line tries to open the file again. `clock` gives monotonic
-        seconds."""
+        """Open the file. Raises EdgevprError if that fails; with `wait`, for a service that may be restarted in the
+        air, every line tries again. `clock` gives monotonic seconds."""
         self.path = path
         self.state: str | None = None
         self.lost_lines = 0
@@ -103,8 +101,8 @@ class FlightLog:
         self.close()
 
     def write(self, kind: str, **fields: Any) -> None:
-        """Append one line: `kind`, the time (UTC), `t_mono_s` (now, unless given) and the fields. Dataclasses become
-        objects, NaN and infinities null. The line is in the file on return. Never raises OSError."""
+        """Append one line: `kind`, the time (UTC), `t_mono_s` (now, unless given) and the fields; NaN becomes null.
+        Never raises OSError."""
         if self.path is None:
             return
         if self._file is not None and not is_at(self._file, self._at):
@@ -156,8 +154,8 @@ class FlightLog:
         self._file = None
 
     def _writable(self, more_bytes: int) -> FileIO:
-        """Return the file to be written, open and with room for `more_bytes`; a full file, or one of an earlier flight,
-        is set aside first. If that fails, it is written further: lines matter more than the limit. Raises OSError."""
+        """Return the open file; one without room for `more_bytes`, or of an earlier flight, is set aside first. If that
+        fails, it is written further: lines matter more than the limit. Raises OSError."""
         file = self._file or self._open()
         size, is_ours = _size_of(file), _identity(file) == self._ours
         if not size or (is_ours and size + more_bytes <= self._part_bytes):
@@ -262,9 +260,9 @@ def _record_of(line: bytes) -> Line | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightLines:
-    """The lines of one flight; iterate over them as often as needed. They are read from the `files`, in order. `flight`
-    identifies the flight by its start line: (time in UTC, time on the monotonic clock), None without one. `missing` is
-    a sentence about files that are missing (None: none are)."""
+    """The lines of one flight, read from its `files`; iterate over them as often as needed. `flight` identifies it by
+    its start line: (time in UTC, time on the monotonic clock), None without one. `missing` is a sentence about files
+    that are missing (None: none are)."""
 
     files: tuple[Path, ...]
     flight: tuple[object, object] | None
@@ -286,9 +284,8 @@ class FlightLines:
 
 
 def flight_of(path: str | Path) -> FlightLines:
-    """Find the lines of the last flight in a file of a log. If the flight has several files, it is read from its start
-    to the end of this file. Raises UsageError if there is no such file, and EdgevprError if it has no line of a
-    flight."""
+    """Find the lines of the last flight in a file of a log, from its start in earlier files to the end of this one.
+    Raises UsageError if there is no such file, and EdgevprError if it has no line of a flight."""
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"{path}: there is no such flight log: give the file that `log.path` names.")

@@ -1,11 +1,10 @@
 """Watch over the camera's pictures: while the aircraft moves, pictures that stay the same are frozen, whatever noise,
 clock or display they carry, and so are those that repeat earlier ones of this flight, as a clip that is played again.
 
-The measure of both is the same: a picture that equals an earlier one, although the aircraft has turned or flown on so
-far that it cannot. Rotation is the soundest witness, since gyroscopes measure it for every camera: about the optical
-axis it turns a picture, about another one it shifts it. Velocity times time over height is the second, for a camera
-that looks down, as far as an autopilot that is led by our own positions can be trusted. Nothing is said of a picture
-whose texture cannot show a motion, as over water, in fog or in the dark.
+Both are pictures that equal an earlier one, although the aircraft has turned or flown on so far that they cannot.
+Rotation is the soundest witness, since gyroscopes measure it for every camera. Velocity times time over height is the
+second, for a camera that looks down, as far as an autopilot that is led by our own positions can be trusted. A picture
+whose texture cannot show a motion, as over water, in fog or in the dark, is not judged.
 """
 
 import math
@@ -21,7 +20,7 @@ from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.sameness import BLOCKS, CoarsePicture, make_coarse
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
-from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.levelling import lens_of
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
@@ -82,8 +81,8 @@ class Optics:
         if self.is_level:
             roll_deg = pitch_deg = 0.0
         across_deg, about_deg = (roll_deg, yaw_deg) if self.looks_down else (yaw_deg, roll_deg)
-        shift = self.focal_share * _beyond_doubt(math.hypot(across_deg, pitch_deg))
-        return math.hypot(min(1.0, shift), _AXIS_SHARE * _beyond_doubt(about_deg))
+        shift = self.focal_share * _exceed_doubt(math.hypot(across_deg, pitch_deg))
+        return math.hypot(min(1.0, shift), _AXIS_SHARE * _exceed_doubt(about_deg))
 
     def travel_share(self, moved_m: float, height_m: float | None) -> float:
         """Return by how much a picture moves at least if the aircraft has moved by `moved_m`; 0 if the camera does not
@@ -102,7 +101,7 @@ def read_optics(source: SourceConfig, recogniser: Recogniser) -> Optics:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sighting:
+class TimedPicture:
     """A picture, and what is known of the aircraft when it was taken (`vehicle` None: nothing). `path_m` (2,): way
     flown since the start of the flight, by velocities, metres east and north."""
 
@@ -113,21 +112,21 @@ class Sighting:
 
 
 class FrozenWatch:
-    """Judges each picture of a live camera before it is recognised, and reports once when pictures are frozen, and once
-    when they move again. Some have been recognised before that is known: the `autopilot` (None: there is no link) then
-    navigates anew, so that nothing that is sent rests on them. `is_frozen`: pictures are frozen."""
+    """Judges each picture of a live camera before it is recognised, and reports once when pictures are frozen
+    (`is_frozen`) and once when they move again. Some have been recognised by then: the `autopilot` (None: there is no
+    link) navigates anew, so that nothing that is sent rests on them."""
 
-    def __init__(self, herald: Herald, optics: Optics, autopilot: ToAutopilot | None = None) -> None:
+    def __init__(self, notifier: Notifier, optics: Optics, autopilot: ToAutopilot | None = None) -> None:
         self.is_frozen = False
-        self._herald, self._optics, self._autopilot = herald, optics, autopilot
-        self._first: Sighting | None = None  # of the pictures in a row that are the same
-        self._newest: Sighting | None = None
+        self._notifier, self._optics, self._autopilot = notifier, optics, autopilot
+        self._first: TimedPicture | None = None  # of the pictures in a row that are the same
+        self._newest: TimedPicture | None = None
         self._turned_from: Vehicle | None = None
         self._flown_share = 0.0
         self._rotations: deque[tuple[float, float]] = deque()  # of this row: time and share of each
         self._repeats: deque[tuple[float, float]] = deque()
         self._stays = np.zeros(BLOCKS)  # share of the latest pictures in which a block stayed while others moved
-        self._remembered: deque[Sighting] = deque(maxlen=_REMEMBERED)
+        self._remembered: deque[TimedPicture] = deque(maxlen=_REMEMBERED)
         self._repeats_in_a_row = self._new_in_a_row = self._new_needed = 0
 
     @property
@@ -139,7 +138,7 @@ class FrozenWatch:
         """Judge the next picture, with the autopilot's report at its time. Return why it is refused, or None."""
         if vehicle and not vehicle.is_fresh_at(frame.t_mono_s):
             vehicle = None
-        now = self._sighting(make_coarse(frame.image), frame.t_mono_s, vehicle)
+        now = self._locate_picture(make_coarse(frame.image), frame.t_mono_s, vehicle)
         is_same = None if self._first is None else self._is_same(self._first.picture, now.picture, learns=True)
         if self._first and is_same:
             self._stay(self._first, now)
@@ -153,7 +152,7 @@ class FrozenWatch:
         self._decide(now.t_s)
         return None if self.state is None else f"not used: {self.state}"
 
-    def _sighting(self, picture: CoarsePicture, t_s: float, vehicle: Vehicle | None) -> Sighting:
+    def _locate_picture(self, picture: CoarsePicture, t_s: float, vehicle: Vehicle | None) -> TimedPicture:
         before, path_m = self._newest, np.zeros(2)
         if before:
             path_m = before.path_m
@@ -162,16 +161,16 @@ class FrozenWatch:
                 path_m = path_m + (t_s - before.t_s) * np.mean([was_m_s, is_m_s], axis=0)
             if _has_jumped(before, vehicle, t_s):
                 self._remembered.clear()
-        return Sighting(picture=picture, t_s=t_s, vehicle=vehicle, path_m=path_m)
+        return TimedPicture(picture=picture, t_s=t_s, vehicle=vehicle, path_m=path_m)
 
-    def _begin_row(self, now: Sighting) -> None:
+    def _begin_row(self, now: TimedPicture) -> None:
         self._first, self._turned_from, self._flown_share = now, now.vehicle, 0.0
         self._rotations.clear()
         last = self._remembered[-1] if self._remembered else None
         if last is None or now.t_s - last.t_s >= _REMEMBER_EVERY_S:
             self._remembered.append(replace(now, picture=CoarsePicture(now.picture.grey)))
 
-    def _stay(self, first: Sighting, now: Sighting) -> None:
+    def _stay(self, first: TimedPicture, now: TimedPicture) -> None:
         """Process a picture that equals the first one of its row."""
         self._new_in_a_row = 0
         self._flown_share = max(self._flown_share, self._flown_by(first, now, _SPEED_DOUBT_M_S))
@@ -181,7 +180,7 @@ class FrozenWatch:
         if turned_share >= WITNESS_SHARE or self._turned_from is None:
             self._turned_from = now.vehicle
 
-    def _look_back(self, now: Sighting) -> bool:
+    def _look_back(self, now: TimedPicture) -> bool:
         """Return whether a picture equals an earlier one of the flight, and count what contradicts that."""
         if not self._remembered:
             return False
@@ -194,7 +193,7 @@ class FrozenWatch:
                 return True
         return False
 
-    def _repeat(self, then: Sighting, now: Sighting) -> None:
+    def _repeat(self, then: TimedPicture, now: TimedPicture) -> None:
         self._new_in_a_row = 0
         if now.t_s - then.t_s < _LEAST_S:
             return
@@ -207,7 +206,7 @@ class FrozenWatch:
         if share >= WITNESS_SHARE:
             self._repeats.append((now.t_s, min(share, _MOST_OF_ONE)))
 
-    def _flown_by(self, then: Sighting, now: Sighting, doubt_m_s: float) -> float:
+    def _flown_by(self, then: TimedPicture, now: TimedPicture, doubt_m_s: float) -> float:
         moved_m = float(np.hypot(*(now.path_m - then.path_m))) - doubt_m_s * (now.t_s - then.t_s)
         return self._optics.travel_share(moved_m, now.vehicle.height_m if now.vehicle else None)
 
@@ -233,7 +232,7 @@ class FrozenWatch:
             self._report(_NEW_AFTER_REPEATS)
         elif self.is_frozen and self._new_in_a_row >= self._new_needed:
             self.is_frozen = False
-            self._herald.tell("source", Severity.INFO, BACK_TEXT, topic="frozen", state=BACK_TEXT)
+            self._notifier.report("source", Severity.INFO, BACK_TEXT, topic="frozen", state=BACK_TEXT)
 
     def _report(self, new_needed: int) -> None:
         was_frozen, self.is_frozen = self.is_frozen, True
@@ -242,7 +241,7 @@ class FrozenWatch:
             return
         if self._autopilot:
             self._autopilot.begin_anew()
-        self._herald.tell("source", Severity.WARNING, self.state, topic="frozen", state=self.state)
+        self._notifier.report("source", Severity.WARNING, self.state, topic="frozen", state=self.state)
 
 
 def _velocity(vehicle: Vehicle | None) -> tuple[float, float] | None:
@@ -259,11 +258,11 @@ def _change_deg(then: Vehicle, now: Vehicle, name: str) -> float:
     return float(shorter_deg(after - before))
 
 
-def _beyond_doubt(angle_deg: float) -> float:
+def _exceed_doubt(angle_deg: float) -> float:
     return math.radians(max(0.0, abs(angle_deg) - _ROTATION_DOUBT_DEG))
 
 
-def _has_jumped(before: Sighting, vehicle: Vehicle | None, t_s: float) -> bool:
+def _has_jumped(before: TimedPicture, vehicle: Vehicle | None, t_s: float) -> bool:
     """Tell whether the heading has changed faster than an aircraft turns."""
     if before.vehicle is None or vehicle is None:
         return False

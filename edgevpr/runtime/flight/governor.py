@@ -1,9 +1,8 @@
 """The governor keeps CPU share, memory and temperature within the board's profile. It first compares fewer candidates,
-which find nearly as much for less, then makes fewer queries per second. When there is room again, it returns step by
-step to the setting that was asked for. The loop of `flight` uses `Governing`.
+which find nearly as much for less, then makes fewer queries per second, and returns step by step when there is room.
 
-Two rules keep it from switching back and forth. It goes back up only if the load, scaled to the higher setting, stays
-clearly below every limit. After a step up that soon had to be undone, it waits twice as long before the next one.
+It goes back up only if the load, scaled to the higher setting, stays clearly below every limit. After a step up that
+soon had to be undone, it waits twice as long before the next one.
 """
 
 import math
@@ -13,8 +12,8 @@ from dataclasses import asdict, dataclass, replace
 from edgevpr.mavlink.messages import Severity
 from edgevpr.power.boards import Board
 from edgevpr.runtime.flight.clock import Pace
+from edgevpr.runtime.flight.flightio import FlightParts
 from edgevpr.runtime.flight.metering import LoadReading
-from edgevpr.runtime.flight.world import Crew
 
 GOVERN_S = 1.0
 _PATIENCE_S = 3.0  # a limit must be exceeded for so long before anything changes
@@ -31,8 +30,8 @@ _OF_CANDIDATES = 0.6  # share of a query's time for comparing candidates, in a l
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Settings of recognition: `rate_hz`, queries per second; `candidates`, places compared per query; and `form`, what
-    a number of a descriptor takes in RAM (see the glossary), which never changes (None: the technique has no forms)."""
+    """Settings of recognition: `rate_hz`, queries per second; `candidates`, places compared per query; and `form`, that
+    of descriptors in RAM, which never changes (None: the technique has no forms)."""
 
     rate_hz: float
     candidates: int
@@ -41,8 +40,8 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Change from the setting `before` to `after`, and the reason `why`. `back`: it is a change up. If a limit is
-    exceeded and nothing is left to lower, both settings are the same."""
+    """Change from the setting `before` to `after`, and why. `back`: it is a change up. Both are the same if a limit is
+    exceeded and nothing is left to lower."""
 
     before: Setting
     after: Setting
@@ -51,9 +50,9 @@ class Change:
 
 
 def steps(asked: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[Setting, ...]:
-    """Return the settings from the one `asked` for down to the lowest. First the candidates are lowered to each number
-    in `fewer`, numbers that are known to accept no wrong place, largest first. Then the rate is halved, down to an
-    eighth. With `keeps_rate` the rate stays as it is: a sequence needs queries as often as the map was made."""
+    """Return the settings from the one `asked` for down to the lowest. First the candidates are lowered to the numbers
+    in `fewer`, largest first, which accept no wrong place; then the rate is halved, down to an eighth, unless it
+    `keeps_rate`."""
     found = [asked]
     found += [replace(asked, candidates=count) for count in fewer if count < asked.candidates]
     while not keeps_rate and found[-1].rate_hz > asked.rate_hz / _SLOWEST:
@@ -62,16 +61,15 @@ def steps(asked: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[
 
 
 class Governor:
-    """Decides which of the `settings` (from `steps`, highest first) is in force, from measurements of the load: it goes
-    down one setting when a limit of the `board`, or its temperature `limit_c` (degrees Celsius), is exceeded, and up
-    when there is room again."""
+    """Decides which of the `settings` (from `steps`, highest first) is in force: it goes down when a limit of the
+    `board`, or its temperature `limit_c` (degrees Celsius), is exceeded, and up when there is room again."""
 
     def __init__(self, board: Board, limit_c: float, settings: Sequence[Setting]) -> None:
         self._board, self._limit_c, self._settings, self._at = board, limit_c, list(settings), 0
         self._since_s: dict[str, float] = {}  # when each condition that holds has begun to hold
         self._changed_s = self._raised_s = -math.inf
         self._wait_s = _FIRST_WAIT_S
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
 
     @property
     def setting(self) -> Setting:
@@ -88,19 +86,19 @@ class Governor:
         )
         return f"held to {', '.join(filter(None, parts))}" if now != asked else None
 
-    def look(self, now_s: float, reading: LoadReading) -> Change | None:
-        """Judge a measurement, and return the change to be made (None: no change). Call it about once a second; each
-        measurement must cover a whole number of queries."""
+    def update(self, now_s: float, reading: LoadReading) -> Change | None:
+        """Judge the measurement of a second, which must cover a whole number of queries; return the change to be
+        made."""
         hot, over = self._load(reading)
         most_mb = self._board.memory_max_mb
         has_room = self._has_room(reading, self._settings[max(0, self._at - 1)])
         over_s, room_s = self._held_s("over", now_s, over is not None), self._held_s("room", now_s, has_room)
         full_s = self._held_s("full", now_s, reading.rss_mb >= _NEAR_MEMORY * most_mb)
         if has_room:
-            self._told.discard("load")
+            self._reported.discard("load")
         if reading.rss_mb <= _MEMORY_ROOM * most_mb:
-            self._told.discard("memory")
-        if full_s >= _PATIENCE_S and "memory" not in self._told:
+            self._reported.discard("memory")
+        if full_s >= _PATIENCE_S and "memory" not in self._reported:
             return self._nothing_left("memory", f"{reading.rss_mb:.0f} MB of memory taken, and {most_mb:.0f} allowed")
         if over is not None and over_s >= _PATIENCE_S and not (hot and now_s - self._changed_s < _HEAT_PATIENCE_S):
             if hot:
@@ -108,7 +106,7 @@ class Governor:
             below = self._below(hot)
             if below is not None:
                 return self._down(now_s, below, over)
-            return None if "load" in self._told else self._nothing_left("load", over)
+            return None if "load" in self._reported else self._nothing_left("load", over)
         if self._at > 0 and room_s >= self._wait_s:
             self._raised_s = now_s
             return self._changed(now_s, self._at - 1, "there is room again", back=True)
@@ -155,7 +153,7 @@ class Governor:
 
     def _nothing_left(self, what: str, why: str) -> Change:
         """Return a change between equal settings: a limit ("memory" or "load") is exceeded, and nothing is lowered."""
-        self._told.add(what)
+        self._reported.add(what)
         return Change(self.setting, self.setting, f"{why}, and nothing is left to lower")
 
     def _down(self, now_s: float, at: int, why: str) -> Change:
@@ -173,24 +171,24 @@ class Governor:
         return Change(before, self.setting, why, back)
 
 
-class Governing:
-    """Applies a `Governor` to a recogniser and its `pace`. Every change is reported once. In a sequence neither rate
-    nor candidates are lowered: it needs queries as often as the map was made, and compares all candidates."""
+class GovernorActuator:
+    """Applies a `Governor` to a recogniser and its `pace`, and reports each change. In a sequence neither rate nor
+    candidates are lowered: it needs queries as often as the map was made, and compares all candidates."""
 
-    def __init__(self, crew: Crew, pace: Pace) -> None:
-        self._crew, self._pace = crew, pace
-        recogniser, technique = crew.recogniser, crew.recogniser.technique
+    def __init__(self, parts: FlightParts, pace: Pace, fewer_candidates: tuple[int, ...]) -> None:
+        self._parts, self._pace = parts, pace
+        recogniser, technique = parts.recogniser, parts.recogniser.technique
         in_sequence = recogniser.sequence > 1
         asked = Setting(pace.rate_hz, recogniser.candidates or technique.candidates, technique.spec.form)
-        settings = steps(asked, in_sequence, () if in_sequence else crew.fewer_candidates)
-        self.governor = Governor(recogniser.meter.board, crew.meter.limit_c, settings)
+        settings = steps(asked, in_sequence, () if in_sequence else fewer_candidates)
+        self.governor = Governor(recogniser.meter.board, parts.meter.limit_c, settings)
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Measure the load, at most once a second, and change the settings if needed."""
-        crew = self._crew
-        if crew.meter.load.age_s < GOVERN_S:
+        parts = self._parts
+        if parts.meter.load.age_s < GOVERN_S:
             return
-        change = self.governor.look(crew.clock.mono_s(), crew.meter.reading())
+        change = self.governor.update(parts.io.clock.mono_s(), parts.meter.reading())
         if change is None:
             return
         text = ground = self.governor.held or "back to what was asked"
@@ -198,6 +196,6 @@ class Governing:
             text, ground = "over a limit of the board", "over a limit of its board, see its log"
         severity = Severity.INFO if change.back else Severity.WARNING
         fields = {"from": asdict(change.before), "to": asdict(change.after), "why": change.why}
-        crew.herald.tell("governor", severity, f"{text}: {change.why}", ground=ground, topic="limits", **fields)
+        parts.notifier.report("governor", severity, f"{text}: {change.why}", ground=ground, topic="limits", **fields)
         self._pace.rate_hz = change.after.rate_hz
-        crew.recogniser.change(candidates=change.after.candidates)
+        parts.recogniser.change(candidates=change.after.candidates)

@@ -6,7 +6,7 @@ from collections import deque
 
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
-from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.recognition import Recognition
 
 CONTRADICTION_RATIO = 1.25
@@ -16,23 +16,22 @@ LOWEST_M = 1.0  # a height below this, as on the ground, is compared as this
 
 
 class HeightWatch:
-    """Compares the height that accepted matches give with the reported one, and reports once when they contradict each
-    other in five matches in a row, and once when five agree again. A match gives a height only if the lens is known.
-    The `autopilot` (None: there is no link) gets the ratio, by which motion between pictures is corrected.
+    """Reports once when the heights of five matches in a row contradict the reported one, and once when five agree
+    again. A match gives a height only if the lens is known. The `autopilot` (None: there is no link) gets the ratio.
 
     `by_pictures_m`, `by_autopilot_m`: medians of the last five matches (None: they do not contradict each other)."""
 
-    def __init__(self, herald: Herald, autopilot: ToAutopilot | None = None) -> None:
+    def __init__(self, notifier: Notifier, autopilot: ToAutopilot | None = None) -> None:
         self.by_pictures_m: float | None = None
         self.by_autopilot_m: float | None = None
-        self._herald, self._autopilot = herald, autopilot
+        self._notifier, self._autopilot = notifier, autopilot
         self._heights_m: deque[tuple[float, float]] = deque(maxlen=MATCHES_IN_A_ROW)  # by pictures, by the autopilot
         self._last_s: float | None = None
 
     @property
     def ratio(self) -> float:
-        """Height by the pictures over that by the autopilot, median of the last five matches; 1.0 unless all five are
-        more than a tenth above it, or below."""
+        """Height by the pictures over that by the autopilot, median of the last five matches; 1.0 unless all are
+        off."""
         ratios = self._ratios
         is_off = len(ratios) == MATCHES_IN_A_ROW and _are_beyond(CORRECTION_RATIO, ratios)
         return statistics.median(ratios) if is_off else 1.0
@@ -41,7 +40,7 @@ class HeightWatch:
     def _ratios(self) -> list[float]:
         return [by_pictures_m / by_autopilot_m for by_pictures_m, by_autopilot_m in self._heights_m]
 
-    def tell(self, event: Recognition) -> None:
+    def update(self, event: Recognition) -> None:
         """Compare the height of an event's match, if it has one, with the reported height."""
         frame, vehicle, where = event.frame, event.vehicle, event.located
         if frame is None or vehicle is None or where is None or not event.accepted or event.view.reason:
@@ -70,11 +69,11 @@ class HeightWatch:
     def _report(self) -> None:
         if self.by_pictures_m is None or self.by_autopilot_m is None:
             said = "height by the autopilot agrees with the pictures again"
-            self._herald.tell("height", Severity.INFO, said, ground="height agrees with pictures again", said=said)
+            self._notifier.report("height", Severity.INFO, said, ground="height agrees with pictures again", said=said)
             return
         said = f"height: {self.by_autopilot_m:.0f} m by the autopilot, {self.by_pictures_m:.0f} m by the pictures"
         ground = f"height {self.by_autopilot_m:.0f} m, by pictures {self.by_pictures_m:.0f} m"
-        self._herald.tell("height", Severity.WARNING, said, ground=ground, said=said, ratio=round(self.ratio, 2))
+        self._notifier.report("height", Severity.WARNING, said, ground=ground, said=said, ratio=round(self.ratio, 2))
 
 
 def _are_beyond(limit: float, ratios: list[float]) -> bool:

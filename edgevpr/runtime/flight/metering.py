@@ -1,5 +1,4 @@
-"""Metering of what a flight takes from its board: charge, CPU time, memory, heat. The loop of `flight`, `vitals` and
-`governor` use it."""
+"""What a flight takes from its board: charge, CPU time, memory, heat."""
 
 from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass, fields
@@ -17,9 +16,9 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadReading:
-    """One measurement for the governor. `cpu_share` (0..1) is the share of all cores that this process has used since
-    the last measurement. `late_share` (0..1) is the share of that time that queries took, if other programs or the disk
-    kept them waiting, else 0. `rss_mb` is the memory of this process; the rest is of the board (None: unknown)."""
+    """One measurement for the governor. `cpu_share` (0..1): of all cores, by this process since the last measurement.
+    `late_share` (0..1): of that time, by queries, if other programs or the disk kept them waiting, else 0. `rss_mb`: of
+    this process; the rest is of the board (None: unknown)."""
 
     cpu_share: float
     late_share: float
@@ -29,9 +28,9 @@ class LoadReading:
 
 
 class FlightMeter:
-    """Meter of the charge, CPU time, memory and heat of a flight; it starts when it is made. `energy` sums up the costs
-    of queries, `load` the time for which the loop is busy. `thermal` is the newest measurement of its heat and supply,
-    `limit_c` the temperature at which the board slows itself down. All measurements are recorded on the `tape`."""
+    """Meter of a flight, from when it is made. `energy` sums up the costs of queries, `load` the time for which the
+    loop is busy. `thermal` is the newest measurement of heat and supply, `limit_c` the temperature at which the board
+    slows itself down. All measurements are recorded on the `tape`."""
 
     def __init__(
         self,
@@ -47,13 +46,13 @@ class FlightMeter:
         self.energy = RunningEnergy(board, clock.mono_s, clock.process_cpu_s)
         self.load = OwnLoad(board.cores, clock.mono_s, clock.process_cpu_s)
         self._watch = watch or ThermalWatch(hot_c=board.thermal_limit_c)
-        self.look_at_heat()
+        self.measure_heat()
         self.limit_c = self._tape.read("limit_c", limit_c) if board.thermal_limit_c is None else board.thermal_limit_c
         self.queries_throttled = 0
 
     def timed(self, thread_only: bool = False) -> AbstractContextManager[Stage]:
-        """Return a context manager that measures the code inside it: its time, and the CPU time of all threads or,
-        with `thread_only`, of the calling one."""
+        """Return a context manager that measures time and CPU time: of all threads or, with `thread_only`, of this
+        one."""
         return stage(self._clock.mono_s, self._clock.thread_cpu_s if thread_only else self._clock.process_cpu_s)
 
     def count(self, event: Recognition) -> None:
@@ -62,13 +61,10 @@ class FlightMeter:
         self.queries_throttled += event.is_query and bool(self.thermal.throttled)
 
     def totals(self) -> dict[str, float]:
-        """Return the totals since the start:
-        - `used_mah`: charge drawn from the pack by the idle board and by this process (other programs are not counted)
-        - `process_mah`: the part of it that this process added to the idle board; `process_cpu_s`: its CPU time
-        - `marginal_mah`: the part of `process_mah` that queries added (reading a frame, recognising it, reporting the
-          result); `stages_cpu_s`: their CPU time
-        - `queries_throttled`: number of queries while the board slowed itself down.
-        """
+        """Return the totals since the start: charge drawn by idle board and this process (`used_mah`), the part of this
+        process (`process_mah`, `process_cpu_s`), and of it that of queries: reading, recognising, reporting
+        (`marginal_mah`, `stages_cpu_s`); `queries_throttled`, the number of those while the board slowed itself
+        down."""
         process, board = self.energy.process(), self._board
         process_j = marginal_energy_j(board.idle_w, board.full_w, process.utilisation(board.cores), process.wall_s)
         return {
@@ -81,7 +77,7 @@ class FlightMeter:
             "stages_cpu_s": self.energy.stages_cpu_s,
         }
 
-    def look_at_heat(self) -> None:
+    def measure_heat(self) -> None:
         """Measure the heat of the board. Call it about once a second."""
         names = [field.name for field in fields(ThermalState)]
         values = self._tape.read("heat", lambda: astuple(self._watch.look()))

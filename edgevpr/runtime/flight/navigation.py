@@ -9,8 +9,9 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position, Receiver, Vehicle
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S, RECEIVER_LAG_SD_S, extrapolate
-from edgevpr.runtime.flight.consistency import BELIEVED, ComparedFix, HeardFrame, PositionedMatch, Weighed, worst_sd
-from edgevpr.runtime.flight.drift import Drift, DriftFilter, Strode
+from edgevpr.runtime.flight.consistency import BELIEVED, ComparedFix, GateResult
+from edgevpr.runtime.flight.drift import Drift, DriftFilter, OdometryMeasurement
+from edgevpr.runtime.flight.measurements import FrameMeasurement, PositionedMatch, worst_sd
 from edgevpr.runtime.flight.output import PROOF_S
 from edgevpr.runtime.flight.path import Path, Point
 from edgevpr.runtime.recognise.locate import in_sd
@@ -37,7 +38,7 @@ _START_STEADY_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Whereabouts:
+class NavState:
     """Position and velocity (m/s, east and north) of the aircraft at `t_s`. The accuracies (metres, m/s) are standard
     deviations along the worst direction."""
 
@@ -49,13 +50,13 @@ class Whereabouts:
 
 
 class Navigation:
-    """Estimates the aircraft's position from the autopilot's motion and our fixes. `drift` says what the path is summed
-    up from: the autopilot's velocities (`RECKONED`) or accelerations (`INERTIAL`, `INERTIAL_PX4`). `map_sd_m` is the
+    """Estimates the aircraft's position from the autopilot's motion and our fixes. `drift`: the path is summed up from
+    the autopilot's velocities (`RECKONED`) or from accelerations (`INERTIAL`, `INERTIAL_PX4`). `map_sd_m` is the
     standard deviation, of one axis, of the error that all fixes share.
 
-    Beside accelerations, which go with positions that are sent all the time, the autopilot's estimate may be made of
-    those: GPS is then what its receiver reports itself. `has_gps`: there is a GPS that is believed. `is_in_doubt`: a
-    GPS contradicts our position, and no match proves ours."""
+    Accelerations go with positions that are sent all the time, of which the autopilot's estimate may be made: GPS is
+    then what its receiver reports itself. `has_gps`: there is a GPS that is believed. `is_in_doubt`: a GPS contradicts
+    our position, and no match proves ours."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
@@ -89,30 +90,29 @@ class Navigation:
         are so frequent that several can contradict it soon."""
         return max(t_s - self._strode_s, self._asks_every_s) <= _FOLLOWED_S
 
-    def hear_vehicle(self, vehicle: Vehicle, believes_gps: bool = True, is_estimate_ours: bool = False) -> None:
-        """Process a report of the autopilot. A path of velocities (`RECKONED`) goes on with the reported velocity. If
-        there is GPS, and `believes_gps`, it corrects ours: as reported by the autopilot, or beside accelerations by the
-        receiver. `is_estimate_ours`: the reported position may be made of positions that we have sent. A report without
-        velocity is ignored."""
+    def add_report(self, vehicle: Vehicle, believes_gps: bool = True, is_estimate_ours: bool = False) -> None:
+        """Process a report of the autopilot; one without velocity is ignored. If there is GPS, and `believes_gps`, it
+        corrects ours: as reported by the autopilot, or beside accelerations by the receiver. `is_estimate_ours`: the
+        reported position may be made of positions that we have sent."""
         if vehicle.velocity_m_s is None:
             return
-        has_gps = reckons_by_gps(vehicle) and believes_gps
+        has_gps = rests_on_gps(vehicle) and believes_gps
         if self._drift.is_of_attitude:
-            self._hear_receiver(vehicle, vehicle.gps if has_gps else None, is_estimate_ours)
+            self._follow_receiver(vehicle, vehicle.gps if has_gps else None, is_estimate_ours)
         else:
-            self._hear_estimate(vehicle, has_gps)
+            self._follow_estimate(vehicle, has_gps)
 
-    def _hear_estimate(self, vehicle: Vehicle, has_gps: bool) -> None:
+    def _follow_estimate(self, vehicle: Vehicle, has_gps: bool) -> None:
         had_gps, self.has_gps = self.has_gps, has_gps
         if vehicle.position_sd_m is None:
             self._path = None  # it has lost its position, so its velocity is even less reliable
             return
         velocity_m_s, t_s = np.array(vehicle.velocity_m_s), vehicle.t_heard_s
-        path = self._unbroken
+        path = self._valid_path
         if path is None:
             self._start_at_estimate(vehicle)
             return
-        self._filter.go_on(path.fly(t_s, velocity_m_s))
+        self._filter.predict(path.fly(t_s, velocity_m_s))
         if had_gps and not self.has_gps:
             self._filter.lose_gps()
         there = path.at(t_s)
@@ -120,17 +120,17 @@ class Navigation:
             self._note_gps(t_s)
             off_m = path.from_origin(vehicle.lat_deg, vehicle.lon_deg) - there.at_m
             sd_m = _GPS_ALIKE * (vehicle.position_sd_m or _UNKNOWN_M)
-            self._filter.hear_gps(off_m, sd_m, velocity_m_s - there.velocity_m_s, _GPS_VELOCITY_SD)
+            self._filter.correct_by_gps(off_m, sd_m, velocity_m_s - there.velocity_m_s, _GPS_VELOCITY_SD)
 
-    def _hear_receiver(self, vehicle: Vehicle, receiver: Receiver | None, is_estimate_ours: bool) -> None:
+    def _follow_receiver(self, vehicle: Vehicle, receiver: Receiver | None, is_estimate_ours: bool) -> None:
         """Correct the path of accelerations by a receiver (None: there is no GPS that is believed)."""
-        path, had_gps = self._unbroken, self.has_gps
+        path, had_gps = self._valid_path, self.has_gps
         if path is None:
             self.has_gps = receiver is not None and self._start_at_receiver(receiver, vehicle.t_heard_s)
             if receiver is None and not is_estimate_ours:
                 self._start_at_estimate(vehicle)
             return
-        off = None if receiver is None else self._beside_receiver(path, receiver)
+        off = None if receiver is None else self._compare_receiver(path, receiver)
         if receiver is None or off is None:
             self.has_gps = self.is_in_doubt = False
             self._contradicted_since_s = None
@@ -145,7 +145,7 @@ class Navigation:
         self.has_gps, self.is_in_doubt, self._contradicted_since_s = True, False, None
         if vehicle.t_heard_s - self._gps_s >= _GPS_EVERY_S:
             self._note_gps(vehicle.t_heard_s)
-            self._filter.hear_gps(off_m, sd_m, off_m_s, sd_m_s, age_s)
+            self._filter.correct_by_gps(off_m, sd_m, off_m_s, sd_m_s, age_s)
 
     def _contradict(self, receiver: Receiver, now_s: float) -> None:
         """Process a receiver that contradicts our position: where it goes on and no match proves ours, begin there."""
@@ -156,12 +156,11 @@ class Navigation:
         if self.is_in_doubt and lasts_s >= _OVERRULES_S:
             self.has_gps = self._start_at_receiver(receiver, now_s)
 
-    def _beside_receiver(
+    def _compare_receiver(
         self, path: Path, receiver: Receiver
     ) -> tuple[Doubles, float, Doubles | None, float, float] | None:
-        """Return the offset (2,) from the path to a receiver's position, its standard deviation, by how much the
-        receiver's velocity exceeds the path's (2,; None: unknown), its standard deviation, and the age of both; None if
-        the path then is unknown."""
+        """Return the offset (2,) from the path to a receiver, its standard deviation, by how much the receiver's
+        velocity exceeds the path's (2,; None: unknown), its standard deviation, and the age of both (None: unknown)."""
         measured_s = receiver.t_s - RECEIVER_LAG_S
         there, before = path.at(measured_s), path.at(measured_s - RECEIVER_LAG_SD_S)
         if there is None or before is None:
@@ -196,58 +195,58 @@ class Navigation:
     def _note_gps(self, now_s: float) -> None:
         self._gps_s, self._strides_since_fix = now_s, _StridesSinceFix(now_s)
 
-    def hear_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
+    def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
         """Process the mean acceleration (2,) over the ground, east and north, since the last call."""
-        if (path := self._unbroken) and self._drift.is_of_attitude:
-            self._filter.go_on(path.accelerate(t_s, acceleration_m_s2))
+        if (path := self._valid_path) and self._drift.is_of_attitude:
+            self._filter.predict(path.accelerate(t_s, acceleration_m_s2))
 
-    def hear_frame(self, frame: HeardFrame, is_query: bool = True, turn_deg: float | None = None) -> None:
+    def add_frame(self, frame: FrameMeasurement, is_query: bool = True, turn_deg: float | None = None) -> None:
         """Process a frame, whatever is recognised in it, or one that is no query and only shows its stride. `turn_deg`
         is that of its match (see `PositionedMatch`)."""
         if is_query:
             self._asks_every_s, self._asked_s = frame.t_s - self._asked_s, frame.t_s
-        path, before = self._unbroken, self._framed
+        path, before = self._valid_path, self._framed
         self._framed = there = path.at(frame.t_s) if path else None
         if path is None or there is None:
             return
         if turn_deg is not None:
-            self._filter.hear_turn(math.radians(turn_deg))
+            self._filter.correct_by_turn(math.radians(turn_deg))
         stride, strode = frame.stride, None
         if stride and before and before.t_s == stride.from_s:
             moved_m = np.array(stride.moved_m)
-            strode = Strode(moved_m, moved_m - (there.at_m - before.at_m), stride.sd_m)
-        is_used = self._filter.hear_frame(path.now.t_s - frame.t_s, frame.lean_s2, frame.sd_m, strode)
+            strode = OdometryMeasurement(moved_m, moved_m - (there.at_m - before.at_m), stride.sd_m)
+        is_used = self._filter.add_frame(path.now.t_s - frame.t_s, frame.lean_s2, frame.sd_m, strode)
         if stride and strode and is_used:
             self._strides_since_fix.add(strode.moved_m, stride.zoom, frame)
             self._strode_s = frame.t_s
 
-    def compared(self, seen: PositionedMatch) -> ComparedFix | None:
+    def compare(self, seen: PositionedMatch) -> ComparedFix | None:
         """Compare the fix of a match with its prediction; None if the path at that time is not known. The match is of
         the last frame heard, or of a new one."""
         if self._framed is None or self._framed.t_s != seen.t_s:
-            self.hear_frame(seen.frame, turn_deg=seen.turn_deg)
-        path, there = self._unbroken, self._framed
+            self.add_frame(seen.frame, turn_deg=seen.turn_deg)
+        path, there = self._valid_path, self._framed
         if path is None or there is None:
             return None
-        expected_m, covariance_m2 = self._filter.expected_fix()
+        expected_m, covariance_m2 = self._filter.predict_fix()
         off_m = path.from_origin(seen.position.lat_deg, seen.position.lon_deg) - there.at_m
         return ComparedFix(
             seen=seen, path_m=there.at_m, off_m=off_m, expected_m=expected_m, covariance_m2=covariance_m2
         )
 
-    def hear_fix(self, fix: ComparedFix, verdict: Weighed = BELIEVED) -> None:
+    def correct_by_fix(self, fix: ComparedFix, verdict: GateResult = BELIEVED) -> None:
         """Correct our position by a fix of which `Consistency` has given a verdict."""
         if self._path and verdict.is_lost and self._drift.is_of_attitude:
             self.begin(fix.seen.position, worst_sd(fix.seen.scatter_m2), fix.seen.t_s, self._path.now.t_s)
         elif self._path:
-            hear = self._filter.trust_fix if verdict.is_against else self._filter.hear_fix
-            hear(fix.off_m, self._repeats(fix) * fix.seen.covariance_m2)
+            correct = self._filter.reset_to_fix if verdict.is_against else self._filter.correct_by_fix
+            correct(fix.off_m, self._repetition_factor(fix) * fix.seen.covariance_m2)
             if fix.seen.frame.lean_s2 and (lean := fix.seen.lean):
-                self._filter.hear_lean(np.array(lean.over_height), lean.sd)
+                self._filter.correct_by_attitude_error(np.array(lean.over_height), lean.sd)
             self._fixed_s = max(self._fixed_s, fix.seen.t_s)
             self._strides_since_fix = _StridesSinceFix(self._fixed_s)
 
-    def _repeats(self, fix: ComparedFix) -> float:
+    def _repetition_factor(self, fix: ComparedFix) -> float:
         """Return the factor of the covariance of a fix: the nearer it is to the last one, the more it repeats of its
         error. It is 1 without a stride: then the last one does not last, since nothing carries it on."""
         at_m, before_m = fix.path_m + fix.off_m, self._fixed_m
@@ -266,16 +265,16 @@ class Navigation:
             self._start(position, sd_m, np.zeros(2), now_s, _ANY_M_S)
             self._fixed_s = t_s
 
-    def at(self, t_s: float) -> Whereabouts | None:
+    def state_at(self, t_s: float) -> NavState | None:
         """Return where the aircraft is, or was, at `t_s`; None if that is not known."""
-        path = self._unbroken
+        path = self._valid_path
         there = path.at(t_s) if path else None
         if path is None or there is None:
             return None
         off_m, off_m_s, covariance = self._filter.errors(path.now.t_s - t_s)
         at_m = there.at_m + off_m
         velocity_m_s = there.velocity_m_s + off_m_s
-        return Whereabouts(
+        return NavState(
             t_s=t_s,
             position=Position(*moved(path.origin.lat_deg, path.origin.lon_deg, *at_m.tolist())),
             velocity_m_s=(float(velocity_m_s[0]), float(velocity_m_s[1])),
@@ -295,7 +294,7 @@ class Navigation:
         self._filter.start(sd_m, velocity_sd_m_s)
 
     @property
-    def _unbroken(self) -> Path | None:
+    def _valid_path(self) -> Path | None:
         return self._path if self._path and not self._path.is_broken else None
 
 
@@ -306,7 +305,7 @@ class _StridesSinceFix:
         self._moved_m, self._zoom, self._last_s = np.zeros(2), 0.0, fixed_s
         self._has_gap, self._scale_sd = False, 0.0
 
-    def add(self, moved_m: Doubles, zoom: float, frame: HeardFrame) -> None:
+    def add(self, moved_m: Doubles, zoom: float, frame: FrameMeasurement) -> None:
         """Add a stride by `moved_m` (2,) metres to a frame."""
         self._has_gap |= frame.t_s - self._last_s > _STRIDE_GAP_S
         self._scale_sd = max(self._scale_sd, frame.scale_sd)
@@ -319,6 +318,6 @@ class _StridesSinceFix:
         return float(np.hypot(*self._moved_m)) * max(unseen, self._scale_sd, abs(self._zoom) - _UNTOLD_ZOOM)
 
 
-def reckons_by_gps(vehicle: Vehicle) -> bool:
+def rests_on_gps(vehicle: Vehicle) -> bool:
     """Tell whether a reported position rests on GPS: a receiver has a fix near that position, at most 0.7 s old."""
     return vehicle.has_gps and vehicle.gps is not None and vehicle.t_heard_s - vehicle.gps.t_s <= _GPS_NEW_S

@@ -1,32 +1,34 @@
 """Navigation in flight: takes the vehicle's motion from the link and the matches from the loop, and decides which
 position is sent to the autopilot. Through a continuous channel (GPS_INPUT, ODOMETRY) a position is sent many times a
 second, otherwise single fixes. The link calls it in its own thread, the loop of `flight` (through `autopilot`) in the
-main one."""
+main one, each within a turn (`mavlink/turns.py`): it needs no lock."""
 
 import math
 from dataclasses import dataclass
-from threading import Lock
 
 from edgevpr.core.geodesy import distance_m, moved
-from edgevpr.core.types import FRAME_TIME_SD_S, Vehicle
+from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import BETWEEN_S
 from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.receivers import PLAUSIBLE_SD_M
 from edgevpr.mavlink.vehicle import Attitude
-from edgevpr.runtime.flight.consistency import Consistency, HeardFrame, positioned, worst_sd
-from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, INERTIAL_PX4, RECKONED, Drift
-from edgevpr.runtime.flight.navigation import Navigation, Whereabouts, reckons_by_gps
+from edgevpr.runtime.flight.consistency import Consistency
+from edgevpr.runtime.flight.drift import INERTIAL, INERTIAL_PX4, RECKONED, Drift
+from edgevpr.runtime.flight.measurements import (
+    FrameMeasurement,
+    measure_frame,
+    position_match,
+    shared_time_error_m,
+    worst_sd,
+)
+from edgevpr.runtime.flight.navigation import Navigation, NavState, rests_on_gps
 from edgevpr.runtime.flight.output import Output, OutputWatch
-from edgevpr.runtime.flight.path import over_ground
+from edgevpr.runtime.flight.path import to_ground_acceleration
 from edgevpr.runtime.flight.slew import Slew
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# Standard deviation that is added to that of a fix, beside that of the time of its frame: half a degree.
-_ATTITUDE_SD = math.tan(math.radians(0.5))
-_UNTOLD_ATTITUDE_SD = math.tan(math.radians(15.0))  # without a reported attitude: a turning aircraft banks
-_UNKNOWN_SPEED_M_S = 15.0  # of an aircraft that reports none
 _LOST_M = 50.0  # a position is sent up to this error
 _LOST_S = 60.0  # and, as a single fix, for so long after a match
 # By accelerations alone we know no more than the autopilot, which has them too. So a continuous position ends so long
@@ -39,17 +41,15 @@ _ALT_SD_M = 3.0
 # An autopilot takes the ten positions of a second as independent. Their errors are correlated for about five seconds:
 # fifty of them say as much as one, so each is sent with its error times this. Without it, they outweighed the gyros:
 # an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
-_ALIKE = math.sqrt(50)
-_PX4_ALIKE = 1.5
-_LEAN_GOOD_FOR_S = 5.0
+_CORRELATION_FACTOR = math.sqrt(50)
+_PX4_CORRELATION_FACTOR = 1.5
+_ATTITUDE_ERROR_VALID_S = 5.0
 _PX4_CHANNELS = Channel.SENSOR, Channel.VISION
 _OURS_FOR_S = 10.0  # so long after our last position an autopilot that has GPS may still be where that put it
 # A receiver that has been lost and is steady for so long is left to the autopilot; until the second time "no fix" is
 # sent as GPS_INPUT, by which ArduPilot returns to its receiver at once (AP_GPS::update_primary).
 _BACK_S = 1.0
 _TAKEN_BACK_S = 3.0
-_MOST_CORRECTED = 2.0  # beyond this ratio of heights, motion between pictures is not used
-_ALIKE_SHARE = 0.25  # of the footprint: fixes of pictures nearer to each other err alike, by changes of the ground
 _UNHEARD = "nothing is heard of the vehicle"
 _UNHEARD_S = 5.0
 _CONTINUOUS = "taken into the continuous position"
@@ -76,17 +76,16 @@ class Navigator(Listener):
 
     def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False, is_level: bool = False) -> None:
         self._is_muted, self._is_level = is_muted, is_level
-        self._lock = Lock()
         self._map_sd_m, self._next_s = map_sd_m, min(every_s, BETWEEN_S)  # from one fix to the next
         self._navigation = Navigation(RECKONED, map_sd_m)
         self._consistency = Consistency()
         self._slew = Slew()
         self._vehicle: Vehicle | None = None
         self._attitude: Attitude | None = None
-        self._appeared_s = self._lean_s = -math.inf
+        self._appeared_s = self._attitude_error_s = -math.inf
         self._channel, self._believes_gps, self._doubts_map = Channel.COMMAND, True, False
         self.output = Output.STARTING  # what a continuous channel carries
-        self._watch, self._given_s = OutputWatch(), -math.inf
+        self._watch, self._sent_s = OutputWatch(), -math.inf
         self._height_ratio = 1.0
         self._shared_sd_m = map_sd_m  # of the error that the last fixes share
 
@@ -102,8 +101,7 @@ class Navigator(Listener):
     def doubt_map(self, doubts: bool) -> None:
         """Set whether the map has contradicted GPS from the first match on. One of them is wrong, and nothing shows
         which: no position is sent, also after GPS is lost."""
-        with self._lock:
-            self._doubts_map = doubts
+        self._doubts_map = doubts
 
     def believes_gps(self) -> bool:
         return self._believes_gps
@@ -111,143 +109,132 @@ class Navigator(Listener):
     def correct_height(self, ratio: float) -> None:
         """Set the height above ground by the pictures over that by the autopilot (1.0: they agree). Where they do not,
         motion between pictures is corrected by it. The ground may change back at once, so positions claim as much."""
-        with self._lock:
-            self._height_ratio = ratio
+        self._height_ratio = ratio
 
     def hear_channel(self, channel: Channel) -> None:
         """Note the channel by which positions are sent. With a continuous one, the autopilot's velocity comes from our
         positions, and we must not use it: the path is then summed up from accelerations."""
-        with self._lock:
-            before, self._channel = self._channel, channel
-            if _choose_drift(channel) is not _choose_drift(before):
-                self._begin()
+        before, self._channel = self._channel, channel
+        if _choose_drift(channel) is not _choose_drift(before):
+            self.begin_anew()
 
     def begin_anew(self) -> None:
         """Note that from now on fixes err otherwise than those before: begin again at the autopilot's position."""
-        with self._lock:
-            self._begin()
+        self._navigation, self._consistency = Navigation(_choose_drift(self._channel), self._map_sd_m), Consistency()
+        self._watch = OutputWatch()
 
     def hear_autopilot(self, t_s: float) -> None:
         """Note that at `t_s` an autopilot was first heard, or that another one has taken its place."""
-        with self._lock:
-            self._appeared_s, self._vehicle = t_s, None
+        self._appeared_s, self._vehicle = t_s, None
 
     def hear_vehicle(self, vehicle: Vehicle) -> None:
         """Process a report of position and velocity."""
-        with self._lock:
-            self._vehicle = vehicle
-            if reckons_by_gps(vehicle) and vehicle.t_heard_s - self._given_s > _OURS_FOR_S:
-                self._given_s = -math.inf  # nothing of ours is left in its estimate
-            navigation = self._navigation
-            navigation.hear_vehicle(vehicle, self._believes_gps, self._given_s > -math.inf)
-            self._watch.update(vehicle, navigation.fixed_s, navigation.has_gps)
+        self._vehicle = vehicle
+        if rests_on_gps(vehicle) and vehicle.t_heard_s - self._sent_s > _OURS_FOR_S:
+            self._sent_s = -math.inf  # nothing of ours is left in its estimate
+        navigation = self._navigation
+        navigation.add_report(vehicle, self._believes_gps, self._sent_s > -math.inf)
+        self._watch.update(vehicle, navigation.fixed_s, navigation.has_gps)
 
     def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Process the specific force that the accelerometers measure, m/s2 (nose, right, down), and the attitude."""
-        acceleration_m_s2 = over_ground(force_m_s2, attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
-        with self._lock:
-            self._attitude = attitude
-            self._navigation.hear_acceleration(t_s, acceleration_m_s2)
+        acceleration_m_s2 = to_ground_acceleration(force_m_s2, attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
+        self._attitude = attitude
+        self._navigation.add_acceleration(t_s, acceleration_m_s2)
 
     def hear_frame(self, event: Recognition, is_query: bool = True) -> None:
         """Process the frame of an event without an accepted match, or of one that is no query: its motion since the
         frame before."""
-        with self._lock:
-            if frame := self._frame(event):
-                self._navigation.hear_frame(frame, is_query)
+        if frame := self._measure(event):
+            self._navigation.add_frame(frame, is_query)
 
     def advise(self, event: Recognition, now_s: float) -> Advice:
         """Process an accepted match, and advise what to send for it. Raises ValueError for a position off the Earth."""
-        frame = self._frame(event)
-        seen = positioned(event, frame) if frame else None
+        frame = self._measure(event)
+        seen = position_match(event, frame) if frame else None
         if seen is None:
             return Advice(None, "the place has no position")
         if event.view.reason:
             return Advice(None, f"not sent: {event.view.reason}, so it does not show what is under the aircraft")
-        with self._lock:
-            vehicle, late_m = self._vehicle, self._late_m(event)
-            accuracy_m = math.hypot(seen.accuracy_m, late_m)
-            fix = Fix(seen.position.lat_deg, seen.position.lon_deg, accuracy_m, seen.t_s)
-            if vehicle is None or not vehicle.is_fresh_at(now_s):
-                return self._unheard(fix, now_s)
-            if vehicle.velocity_m_s is None:
-                return Advice(None, _UNHEARD) if self._channel.is_continuous else Advice(fix)
-            compared = self._navigation.compared(seen)
-            if compared is None:
-                self._navigation.begin(seen.position, worst_sd(seen.scatter_m2), seen.t_s, vehicle.t_heard_s)
-                return Advice(None, _CONTINUOUS) if self._channel.is_continuous else Advice(fix)
-            is_followed = self._navigation.is_followed_at(seen.t_s)
-            verdict = self._consistency.weighed(compared, self.has_gps, is_followed)
-            if verdict.why:
-                return Advice(None, verdict.why, is_held=True)
-            self._navigation.hear_fix(compared, verdict)
-            self._shared_sd_m = math.hypot(self._map_sd_m, late_m)
-            if seen.lean:
-                self._lean_s = seen.t_s
-            return self._improved(vehicle, vehicle.velocity_m_s, now_s)
+        vehicle, late_m = self._vehicle, shared_time_error_m(event, event.vehicle or self._vehicle)
+        accuracy_m = math.hypot(seen.accuracy_m, late_m)
+        fix = Fix(seen.position.lat_deg, seen.position.lon_deg, accuracy_m, seen.t_s)
+        if vehicle is None or not vehicle.is_fresh_at(now_s):
+            return self._advise_unheard(fix, now_s)
+        if vehicle.velocity_m_s is None:
+            return Advice(None, _UNHEARD) if self._channel.is_continuous else Advice(fix)
+        compared = self._navigation.compare(seen)
+        if compared is None:
+            self._navigation.begin(seen.position, worst_sd(seen.scatter_m2), seen.t_s, vehicle.t_heard_s)
+            return Advice(None, _CONTINUOUS) if self._channel.is_continuous else Advice(fix)
+        is_followed = self._navigation.is_followed_at(seen.t_s)
+        verdict = self._consistency.judge(compared, self.has_gps, is_followed)
+        if verdict.why:
+            return Advice(None, verdict.why, is_held=True)
+        self._navigation.correct_by_fix(compared, verdict)
+        self._shared_sd_m = math.hypot(self._map_sd_m, late_m)
+        if seen.lean:
+            self._attitude_error_s = seen.t_s
+        return self._advise_improvement(vehicle, vehicle.velocity_m_s, now_s)
 
     def fix_between(self, now_s: float) -> Fix | None:
         """Return a fix by what the matches before have shown, for the time in which none is accepted; None where the
         autopilot is no better off with it, or a match has contradicted what is known."""
-        with self._lock:
-            vehicle = self._vehicle
-            if self._is_muted or self._channel is not Channel.COMMAND:
-                return None
-            if self._consistency.is_contradicted(now_s, self._navigation.is_followed_at(now_s)):
-                return None
-            if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh_at(now_s):
-                return None
-            if reckons_by_gps(vehicle) or self._known(now_s) is None:
-                return None
-            return self._improved(vehicle, vehicle.velocity_m_s, now_s).fix
+        vehicle = self._vehicle
+        if self._is_muted or self._channel is not Channel.COMMAND:
+            return None
+        if self._consistency.is_contradicted(now_s, self._navigation.is_followed_at(now_s)):
+            return None
+        if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh_at(now_s):
+            return None
+        if rests_on_gps(vehicle) or self._estimate(now_s) is None:
+            return None
+        return self._advise_improvement(vehicle, vehicle.velocity_m_s, now_s).fix
 
     def knows_position(self, now_s: float) -> bool:
         """Tell whether the position is known well enough to be sent through a continuous channel."""
-        with self._lock:
-            return self._known(now_s) is not None
+        return self._estimate(now_s) is not None
 
     def accuracy_m(self, now_s: float) -> float | None:
         """Return how well the position is known: metres, standard deviation of one axis (None: it is not known)."""
-        with self._lock:
-            estimate = self._navigation.at(now_s)
-            return None if estimate is None else self._claimed_m(estimate)
+        estimate = self._navigation.state_at(now_s)
+        return None if estimate is None else self._claimed_m(estimate)
 
     def state_at(self, t_s: float) -> MotionState | None:
         """Return position and motion at `t_s`, to be sent through a continuous channel; None if they are not known well
         enough. `t_s` must be later than in the last call."""
         if self._is_muted:
             return None
-        with self._lock:
-            vehicle, estimate = self._vehicle, self._known(t_s)
-            self.output = self._next_output(vehicle, estimate)
-            if estimate is None or vehicle is None or not self.output.is_sent:
-                self._slew.reset()
-                return None
-            self._given_s = t_s
-            self._watch.note_sent(t_s)
-            lat_deg, lon_deg, lag_m = self._slew.follow(estimate)
-            east, north = estimate.velocity_m_s
-            attitude, alike = self._attitude, self._alike(t_s)
-            is_reserve, receiver = self.output is Output.RESERVE, vehicle.gps
-            return MotionState(
-                t_mono_s=t_s,
-                lat_deg=lat_deg,
-                lon_deg=lon_deg,
-                # The autopilot's own altitude may come from us: beside a receiver it is the receiver's.
-                alt_m=receiver.alt_m if is_reserve and receiver and receiver.alt_m is not None else vehicle.alt_m,
-                velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
-                accuracy_m=alike * math.hypot(self._claimed_m(estimate), lag_m),
-                alt_accuracy_m=_ALT_SD_M,
-                speed_accuracy_m_s=alike * estimate.speed_accuracy_m_s,
-                attitude=None if attitude is None else _in_radians(attitude),
-                is_reserve=is_reserve,
-            )
+        vehicle, estimate = self._vehicle, self._estimate(t_s)
+        self.output = self._next_output(vehicle, estimate)
+        if estimate is None or vehicle is None or not self.output.is_sent:
+            self._slew.reset()
+            return None
+        self._sent_s = t_s
+        self._watch.note_sent(t_s)
+        lat_deg, lon_deg, lag_m = self._slew.follow(estimate)
+        east, north = estimate.velocity_m_s
+        attitude, alike = self._attitude, self._correlation_factor(t_s)
+        is_reserve, receiver = self.output is Output.RESERVE, vehicle.gps
+        return MotionState(
+            t_mono_s=t_s,
+            lat_deg=lat_deg,
+            lon_deg=lon_deg,
+            # The autopilot's own altitude may come from us: beside a receiver it is the receiver's.
+            alt_m=receiver.alt_m if is_reserve and receiver and receiver.alt_m is not None else vehicle.alt_m,
+            velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
+            accuracy_m=alike * math.hypot(self._claimed_m(estimate), lag_m),
+            alt_accuracy_m=_ALT_SD_M,
+            speed_accuracy_m_s=alike * estimate.speed_accuracy_m_s,
+            attitude=None if attitude is None else _in_radians(attitude),
+            is_reserve=is_reserve,
+        )
 
-    def _next_output(self, vehicle: Vehicle | None, estimate: Whereabouts | None) -> Output:
+    def _next_output(self, vehicle: Vehicle | None, estimate: NavState | None) -> Output:
         """Decide what is sent now."""
         if vehicle is None:
             return Output.STARTING
-        uses_gps = reckons_by_gps(vehicle)
+        uses_gps = rests_on_gps(vehicle)
         if uses_gps and not self._channel.is_beside_gps:
             return Output.GPS_IN_USE
         if estimate is None:
@@ -266,53 +253,19 @@ class Navigator(Listener):
             return Output.GPS_BACK if receiver.steady_for_s >= _BACK_S else Output.SENDING
         return Output.RESERVE
 
-    def _begin(self) -> None:
-        self._navigation, self._consistency = Navigation(_choose_drift(self._channel), self._map_sd_m), Consistency()
-        self._watch = OutputWatch()
-
-    def _unheard(self, fix: Fix, now_s: float) -> Advice:
+    def _advise_unheard(self, fix: Fix, now_s: float) -> Advice:
         """Advise on a fix without a recent report: the autopilot has no position, or its report is still to come."""
         if self._channel.is_continuous:
             return Advice(None, _UNHEARD)
         since_s = max(self._appeared_s, self._vehicle.t_heard_s if self._vehicle else -math.inf)
         return Advice(fix) if now_s - since_s > _UNHEARD_S else Advice(None, f"not sent yet: {_UNHEARD}")
 
-    def _frame(self, event: Recognition) -> HeardFrame | None:
-        """Return the frame of an event; None for one that could not be read. An error of the attitude does not move the
-        picture of a level camera, nor one that leans by no reported attitude. An error of the time moves the point
-        under the camera, as the aircraft flies and as it rolls."""
-        if event.frame is None:
-            return None
+    def _measure(self, event: Recognition) -> FrameMeasurement | None:
         vehicle = event.vehicle or self._vehicle
-        height_m, has_attitude, speed_m_s = 0.0, False, 0.0
-        if vehicle:
-            height_m, has_attitude = self._height_ratio * (vehicle.height_m or 0.0), vehicle.roll_deg is not None
-            tilting_m_s = height_m * math.radians(0.0 if self._is_level else vehicle.tilting_deg_s)
-            speed_m_s = math.hypot(tilting_m_s, *(vehicle.velocity_m_s or (0.0, 0.0)))
-        is_apart = self._is_level or not has_attitude or not (event.view.aside or event.view.lean_m)
-        ratio, stride = self._height_ratio, None
-        if event.stride and 1 / _MOST_CORRECTED < ratio < _MOST_CORRECTED:
-            stride = event.stride.scale(ratio)
-        tilt_sd = _ATTITUDE_SD if has_attitude else _UNTOLD_ATTITUDE_SD
-        return HeardFrame(
-            t_s=event.frame.t_mono_s,
-            sd_m=math.hypot(tilt_sd * height_m, event.frame.t_sd_s * speed_m_s),
-            lean_s2=0.0 if is_apart else height_m / GRAVITY_M_S2,
-            stride=stride,
-            scale_sd=abs(ratio - 1.0),
-            alike_m=_ALIKE_SHARE * (event.view.footprint_m or 0.0),
-        )
+        return measure_frame(event, vehicle, is_level=self._is_level, height_ratio=self._height_ratio)
 
-    def _late_m(self, event: Recognition) -> float:
-        """Return by how much (metres, standard deviation) frames put the aircraft wrongly whose time is known worse
-        than usual: in one direction, so that several of them say no more than one."""
-        vehicle, t_sd_s = event.vehicle or self._vehicle, event.frame.t_sd_s if event.frame else 0.0
-        known = vehicle and vehicle.velocity_m_s
-        speed_m_s = math.hypot(*known) if known else _UNKNOWN_SPEED_M_S
-        return speed_m_s * math.sqrt(max(0.0, t_sd_s**2 - FRAME_TIME_SD_S**2))
-
-    def _known(self, t_s: float) -> Whereabouts | None:
-        estimate = self._navigation.at(t_s)
+    def _estimate(self, t_s: float) -> NavState | None:
+        estimate = self._navigation.state_at(t_s)
         if estimate is None or estimate.accuracy_m > _LOST_M:
             return None
         shown_s, gps_s = self._navigation.shown_s, self._navigation.gps_s
@@ -325,15 +278,15 @@ class Navigator(Listener):
             is_known = t_s - max(shown_s, gps_s) <= _LOST_S
         return estimate if is_known else None
 
-    def _improved(self, vehicle: Vehicle, velocity_m_s: tuple[float, float], now_s: float) -> Advice:
+    def _advise_improvement(self, vehicle: Vehicle, velocity_m_s: tuple[float, float], now_s: float) -> Advice:
         """Advise what to send to an autopilot that reports a position of its own: a fix only if ours is better."""
         if self._channel.is_continuous:
             return Advice(None, _CONTINUOUS)
-        if reckons_by_gps(vehicle):
+        if rests_on_gps(vehicle):
             return Advice(None, _HAS_GPS if self._believes_gps else _HAS_WRONG_GPS)
         if self._doubts_map:
             return Advice(None, _DOUBTED)
-        estimate = self._navigation.at(now_s)
+        estimate = self._navigation.state_at(now_s)
         if estimate is None:
             return Advice(None, _UNHEARD)
         here, claimed_m = estimate.position, self._claimed_m(estimate)
@@ -353,13 +306,13 @@ class Navigator(Listener):
         at = moved(here.lat_deg, here.lon_deg, *ahead_m)
         return Advice(Fix(*at, math.hypot(claimed_m, math.hypot(*ahead_m) / math.sqrt(2)), now_s))
 
-    def _alike(self, t_s: float) -> float:
+    def _correlation_factor(self, t_s: float) -> float:
         """Return the factor of the errors of a continuous position. PX4 is told them as they are, while pictures show
         how wrong its attitude is, or need none: then our errors are not those that our own positions have caused."""
-        is_apart = self._is_level or t_s - self._lean_s <= _LEAN_GOOD_FOR_S
-        return _PX4_ALIKE if self._channel in _PX4_CHANNELS and is_apart else _ALIKE
+        is_apart = self._is_level or t_s - self._attitude_error_s <= _ATTITUDE_ERROR_VALID_S
+        return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_apart else _CORRELATION_FACTOR
 
-    def _claimed_m(self, estimate: Whereabouts) -> float:
+    def _claimed_m(self, estimate: NavState) -> float:
         """Return the accuracy to be sent with an estimate: never better than the error that all fixes share."""
         return max(self._shared_sd_m, estimate.accuracy_m)
 

@@ -1,7 +1,5 @@
-"""What a continuous channel carries at a moment, and the watch that withdraws it. The `navigator` uses both.
-
-An autopilot that flies by our positions is led by their errors. So they are withdrawn where they cannot be right, and
-come back with a match that proves them, or with GPS."""
+"""What a continuous channel carries at a moment, and the watch that withdraws it: an autopilot that flies by our
+positions is led by their errors."""
 
 import math
 from enum import Enum
@@ -49,10 +47,8 @@ class Output(Enum):
 
 
 class OutputWatch:
-    """Watches what the autopilot makes of our positions: `withdrawn` says why none may be sent (None: they may).
-
-    They are withdrawn where its filter refuses them, and where its estimate leaves a good receiver while they are sent.
-    """
+    """Withdraws our positions where the autopilot's filter refuses them, or its estimate leaves a good receiver while
+    they are sent, until a match or GPS proves them. `withdrawn` says why none may be sent (None: they may)."""
 
     def __init__(self) -> None:
         self.withdrawn: Output | None = None

@@ -1,9 +1,6 @@
-"""The path of an aircraft, which is its velocities or accelerations summed up. `navigation` uses it, with the filter of
-its errors in `drift`.
-
-A path starts at a known position and drifts from it. It never jumps, so that offsets from it can be compared at any two
-times; the position that an autopilot reports jumps whenever it is corrected.
-"""
+"""The path of an aircraft: its velocities or accelerations summed up from a known position. It never jumps, so that
+offsets from it can be compared at any two times; the position that an autopilot reports jumps whenever it is
+corrected."""
 
 import math
 from bisect import bisect_left
@@ -85,7 +82,9 @@ class Path:
         return Point(t_s, at_m, velocity_m_s)
 
 
-def over_ground(force_m_s2: tuple[float, float, float], roll_deg: float, pitch_deg: float, yaw_deg: float) -> Doubles:
+def to_ground_acceleration(
+    force_m_s2: tuple[float, float, float], roll_deg: float, pitch_deg: float, yaw_deg: float
+) -> Doubles:
     """Return the acceleration over the ground (2,), east and north, from the specific force that accelerometers measure
     (nose, right, down) at an attitude. Gravity, being vertical, has no part in it."""
     roll, pitch, yaw = map(math.radians, (roll_deg, pitch_deg, yaw_deg))

@@ -1,11 +1,8 @@
-"""The recording of a flight: its tape (the record of all that comes in from outside) and its frames, with which
-`review` can fly it again on the ground.
+"""The recording of a flight, with which `review` can fly it again: a folder with `tape.jsonl`, one line for each input,
+`frames/`, the pictures as JPEG, and if the flight learns `map.gpkg`, the map as it was at the start.
 
-Each flight has a folder: `tape.jsonl`, one line for each input, and `frames/`, the pictures as JPEG. If the flight
-learns, `map.gpkg` is the map as it was at the start.
-
-A thread of its own writes, so that a slow disk delays nobody. A recording is of no use after a gap. So nothing is ever
-left out: if the disk is too slow or full, or the recording too large, the recording ends and the flight goes on.
+A thread of its own writes, so that a slow disk delays nobody. A recording is of no use after a gap: if the disk is too
+slow or full, or the recording too large, it ends and the flight goes on.
 """
 
 import errno
@@ -40,12 +37,12 @@ _log = logging.getLogger(__name__)
 
 
 class Recording(Tape):
-    """An open recording: the `Tape` to which a flight writes all its input, and its frames. `path` is its folder.
-    `state` is None while it goes on, else a sentence that says why it has ended. Close it (it is a context manager)."""
+    """An open recording (a context manager) in the folder `path`: the `Tape` of all input, and frames. `state` is None
+    while it goes on, else a sentence that says why it has ended."""
 
     def __init__(self, folder: str | Path, max_mb: float) -> None:
-        """Make a folder for this flight in `folder`. The oldest recordings there are deleted until they take at most
-        half of `max_mb`; the new one may take the other half. Raises EdgevprError."""
+        """Make a folder for this flight in `folder`. Recordings there take at most half of `max_mb`, the oldest are
+        deleted; the new one may take the other half. Raises EdgevprError."""
         self.state: str | None = None
         self._most_bytes = 1e6 * max_mb / 2
         self._waiting: deque[bytes | tuple[int, bytes]] = deque()  # a note, or a frame with its number
@@ -171,8 +168,8 @@ def frame_path(folder: Path, number: int) -> Path:
 
 
 def recording_of(said: str | None, log: str | Path) -> Path | None:
-    """Find the recording that the log file `log` names as `said` (None: it names none): at that path, or in a folder of
-    the same name beside the log. None if it is in neither."""
+    """Find the recording that the file `log` names as `said` (None: none): there, or in a folder of that name beside
+    it."""
     if not said:
         return None
     here = Path(said)

@@ -3,7 +3,7 @@
 import math
 
 from edgevpr.core.geodesy import moved, offset_m
-from edgevpr.runtime.flight.navigation import Whereabouts
+from edgevpr.runtime.flight.navigation import NavState
 
 MAX_CORRECTION_M_S = 2.0  # ArduPilot did not follow a jump of 25 m for 8 s
 # A position that lags farther behind jumps: a filter refuses it for seven to ten seconds, then resets to it. That is
@@ -12,18 +12,18 @@ MAX_LAG_M = 40.0
 
 
 class Slew:
-    """A position that does not jump, since autopilots do not follow jumps: it moves with the velocity of the estimates,
-    and its error against them shrinks by 2 m/s at most. One that is more than 40 m behind begins anew."""
+    """A position that does not jump: it moves with the velocity of the estimates, and its error against them shrinks by
+    2 m/s at most. One that is more than 40 m behind begins anew."""
 
     def __init__(self) -> None:
-        self._last: Whereabouts | None = None
+        self._last: NavState | None = None
         self._at = 0.0, 0.0
 
     def reset(self) -> None:
         """Restart at the next estimate."""
         self._last = None
 
-    def follow(self, estimate: Whereabouts) -> tuple[float, float, float]:
+    def follow(self, estimate: NavState) -> tuple[float, float, float]:
         """Move towards an estimate that is later than the last one. Returns latitude and longitude in degrees, and the
         remaining distance to the estimate in metres."""
         here = estimate.position

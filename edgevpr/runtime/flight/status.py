@@ -1,5 +1,5 @@
-"""The file with the status of a flight, for people and programs beside it: one JSON object, replaced as a whole once a
-second. `vitals` writes it and says what its keys mean, the command `edgevpr top` reads it."""
+"""The file with the status of a flight: one JSON object, replaced as a whole once a second. `vitals` writes it and says
+what its keys mean, the command `edgevpr top` reads it."""
 
 import json
 import os
@@ -20,7 +20,7 @@ class StatusFile:
     """Writes the status of a flight (see `Vitals._status`) to a file, which is removed when it is closed."""
 
     def __init__(self, path: str | Path) -> None:
-        """Check that the file `path` can be written; `tell` writes it. Raises EdgevprError if it cannot be made."""
+        """Check that the file `path` can be written; `write` writes it. Raises EdgevprError if it cannot be made."""
         self._path, self._new = Path(path), Path(f"{path}.new")
         try:
             if self._path.exists() and not self._path.is_file():
@@ -40,7 +40,7 @@ class StatusFile:
         with suppress(OSError):
             self._path.unlink()
 
-    def tell(self, status: dict[str, Any]) -> None:
+    def write(self, status: dict[str, Any]) -> None:
         """Replace the status in the file. Never raises OSError."""
         with suppress(OSError):
             self._write(json_line(status))
@@ -54,8 +54,8 @@ class StatusFile:
 
 
 def read_status(path: str | Path) -> tuple[dict[str, Any], float] | None:
-    """Return the status in a file, and its age in seconds; None if there is no such file. Raises EdgevprError if the
-    file may not be read, or holds no status of this version."""
+    """Return the status in a file, and its age in seconds; None if there is none. Raises EdgevprError if it cannot be
+    read, or is of another version."""
     try:
         with open(path, "rb") as file:
             age_s = time.time() - os.fstat(file.fileno()).st_mtime
@@ -76,7 +76,7 @@ def read_status(path: str | Path) -> tuple[dict[str, Any], float] | None:
     return status, age_s
 
 
-def usual_path() -> str | None:
+def default_path() -> str | None:
     """Return the path of the status file in the folder that systemd makes for the service; None if there is none."""
     folder = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
     return str(Path(folder) / NAME) if folder else None

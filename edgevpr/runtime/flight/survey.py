@@ -1,14 +1,12 @@
-"""The survey of map and camera: while GPS is good, a flight finds out by how much the map lies beside GPS, by how much
-it is too large, and where the camera looks beside straight down.
+"""The survey of map and camera: while GPS is good, a flight finds the offset of the map from GPS, its error of scale,
+and the mount of the camera.
 
-The match of a picture is off the receiver by the sum of all three, and they are told apart by what they turn with: an
-offset of the map stays, a mount turns with the heading and grows with the height, a scale grows across the map. Where a
-flight cannot tell two of them apart, as the offset and the mount on a straight line, the standard deviations of both
-are large, and neither is told.
+The offset of a match from the receiver is the sum of all three. They are told apart by what they turn with: the map's
+offset stays, a mount turns with the heading and grows with the height, a scale grows across the map. Where a flight
+cannot tell two of them apart, the standard deviations of both are large, and neither is reported.
 
 A mount alone makes receiver and map contradict each other as soon as the aircraft turns. So matches count while GPS is
-held to be wrong too; but then all of the flight must say the same, what came before such doubts and what came after.
-"""
+held to be wrong too; but then those before such doubts and those after must agree."""
 
 import math
 from collections import deque
@@ -21,9 +19,9 @@ from edgevpr.core.arrays import Bools, Doubles
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position, Vehicle
 from edgevpr.frames.level import Mount
-from edgevpr.mavlink.receivers import RECEIVER_LAG_S
-from edgevpr.runtime.flight.consistency import HeardFrame, positioned
-from edgevpr.runtime.flight.navigation import reckons_by_gps
+from edgevpr.mavlink.receivers import extrapolate
+from edgevpr.runtime.flight.measurements import FrameMeasurement, picture_error_m, position_match
+from edgevpr.runtime.flight.navigation import rests_on_gps
 from edgevpr.runtime.recognise.locate import in_sd
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -33,7 +31,7 @@ _MOST = 720  # the newest hour of matches
 _GPS_LASTS_S = 180.0
 _WORST_GPS_M = 5.0  # a receiver that says less of itself is not good enough to hold a map against
 _OURS_S = 60.0  # so long after a fix of ours the autopilot's position may still be that, and the receiver's is taken
-_ATTITUDE_SD, _LEVEL_SD_DEG = math.tan(math.radians(0.5)), 0.3  # for one picture; what all of a flight have in common
+_LEVEL_SD_DEG = 0.3  # of a mount: what all pictures of a flight have in common
 # Before the first match: the standard deviations of offset (2, metres), mount (2, tangents), scale, and of the time
 # between frames and positions (s), which on a straight line does the same as a camera that looks ahead.
 _BEFORE = np.diag(1 / np.square([1e4, 1e4, 0.5, 0.5, 0.02, 0.1]))
@@ -49,11 +47,11 @@ _RAYLEIGH = math.sqrt(2 * math.log(2))  # median length of a deviation on two ax
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sighting:
-    """A match beside GPS: it is `off_m` (2,) metres east and north of it, which is the product of `look` (2, 6) and
-    what is sought. The variance of each axis, m2, has a part `own_m2` and one that it shares with its neighbours in
-    time, `shared_m2`, of which it says as much as one of `alike` matches. `is_doubted`: GPS was held to be wrong."""
+    """A match `off_m` (2,) metres east and north of GPS, which is the product of `jacobian` (2, 6) and what is sought.
+    The variance of each axis, m2, has a part `own_m2` and one that it shares with its neighbours in time, `shared_m2`,
+    of which it says as much as one of `alike` matches. `is_doubted`: GPS was held to be wrong."""
 
-    look: Doubles
+    jacobian: Doubles
     off_m: Doubles
     own_m2: float
     shared_m2: float
@@ -82,22 +80,13 @@ class Measure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surveyed:
-    """The result of so many `matches`. `off_m` is the offset of the map from GPS (east, north), at the `middle` of the
-    ground that they cover; `scale` is the share by which the map is too large, around there; `ahead_deg` and
-    `right_deg` are the angles by which the camera looks ahead and to the right of straight down."""
+    """The result of so many `matches`. Its `measures` by name: `off_m`, the offset of the map from GPS (east, north) at
+    the `middle` of the ground that they cover; `scale`, the share by which the map is too large, around there;
+    `ahead_deg` and `right_deg`, by how much the camera looks ahead and to the right of straight down."""
 
     matches: int
     middle: Position
-    off_m: Measure
-    scale: Measure
-    ahead_deg: Measure
-    right_deg: Measure
-
-    @property
-    def measures(self) -> dict[str, Measure]:
-        """Return the results by their names."""
-        names = "off_m", "scale", "ahead_deg", "right_deg"
-        return {name: getattr(self, name) for name in names}
+    measures: dict[str, Measure]
 
     def fields(self) -> dict[str, Any]:
         """Return this result as fields of the flight log; what is not known well enough is null."""
@@ -126,38 +115,41 @@ class Sightings:
         vehicle, where, view = event.vehicle, event.located, event.view
         if event.frame is None or event.frame.t_mono_s - self._taken_s < _EVERY_S:
             return False
-        if vehicle is None or vehicle.gps is None or vehicle.gps.sd_m > _WORST_GPS_M or not reckons_by_gps(vehicle):
+        if vehicle is None or vehicle.gps is None or vehicle.gps.sd_m > _WORST_GPS_M or not rests_on_gps(vehicle):
             return False
         # Without a view or a pose, the match may be metres beside the point that is taken to be under the camera.
         if view.reason or (view.aside is None and view.lean_m is None) or where is None or where.heading_deg is None:
             return False
         t_s, height_m = event.frame.t_mono_s, where.height_m or vehicle.height_m
-        in_time_m = event.frame.t_sd_s * math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
-        frame_sd_m = math.hypot(_ATTITUDE_SD * (height_m or 0.0), in_time_m)
-        seen = positioned(event, HeardFrame(t_s=t_s, sd_m=frame_sd_m))
-        look = self._look(vehicle, height_m, seen.turn_deg or 0.0) if seen else None
-        if seen is None or look is None or not vehicle.is_fresh_at(t_s):
+        frame_sd_m = picture_error_m(vehicle, height_m or 0.0, event.frame.t_sd_s)
+        seen = position_match(event, FrameMeasurement(t_s=t_s, sd_m=frame_sd_m))
+        jacobian = self._derive(vehicle, height_m, seen.turn_deg or 0.0) if seen else None
+        if seen is None or jacobian is None or not vehicle.is_fresh_at(t_s):
             return False
-        at = _beside(vehicle, t_s)
+        at = Position(vehicle.lat_deg, vehicle.lon_deg)  # by the autopilot, which knows how late its receiver is
+        if t_s - vehicle.t_fix_s <= _OURS_S:  # it may repeat us
+            at = Position(*extrapolate(vehicle.gps, t_s, vehicle.velocity_m_s or (0.0, 0.0)))
         alike = max(1.0, _GPS_LASTS_S / min(t_s - self._taken_s, _GPS_LASTS_S))
         self._origin = self._origin or at
-        look[:, 4] = offset_m(self._origin.lat_deg, self._origin.lon_deg, at.lat_deg, at.lon_deg)
+        jacobian[:, 4] = offset_m(self._origin.lat_deg, self._origin.lon_deg, at.lat_deg, at.lon_deg)
         off_m = np.array(offset_m(at.lat_deg, at.lon_deg, seen.position.lat_deg, seen.position.lon_deg))
         own_m2 = float(np.trace(seen.scatter_m2)) / 2
         shared_m2 = vehicle.gps.sd_m**2
         self._kept.append(
-            Sighting(look=look, off_m=off_m, own_m2=own_m2, shared_m2=shared_m2, alike=alike, is_doubted=is_doubted)
+            Sighting(
+                jacobian=jacobian, off_m=off_m, own_m2=own_m2, shared_m2=shared_m2, alike=alike, is_doubted=is_doubted
+            )
         )
         self._taken_s = t_s
         return True
 
-    def look(self, mount: Mount) -> None:
+    def set_mount(self, mount: Mount) -> None:
         """Note that the next pictures are levelled by another mount, and keep the sightings as if all had been."""
         by = _tangents(mount) - _tangents(self._mount)
-        kept = [replace(each, off_m=each.off_m - each.look[:, 2:4] @ by) for each in self._kept]
+        kept = [replace(each, off_m=each.off_m - each.jacobian[:, 2:4] @ by) for each in self._kept]
         self._mount, self._kept = mount, deque(kept, maxlen=_MOST)
 
-    def _look(self, vehicle: Vehicle, height_m: float | None, turn_deg: float) -> Doubles | None:
+    def _derive(self, vehicle: Vehicle, height_m: float | None, turn_deg: float) -> Doubles | None:
         """Return how offset, mount, scale and time move a match (2, 6), but for the scale; None if it is unknown. The
         mount turns with the picture, which is turned by `turn_deg` against a compass that is wrong."""
         roll_deg, pitch_deg = (0.0, 0.0) if self._is_level else (vehicle.roll_deg, vehicle.pitch_deg)
@@ -181,27 +173,23 @@ class Sightings:
         if len(kept) < _FEWEST or self._origin is None:
             return None
         way, covariance, counts = fitted(kept)
-        middle_m = np.mean([each.look[:, 4] for each in kept], axis=0)
+        middle_m = np.mean([each.jacobian[:, 4] for each in kept], axis=0)
         there = np.eye(6)
         there[:2, 4] = middle_m
         if counts.mean() < _LEAST_ALIKE or not _explains_doubts(kept, counts, there, way[2:4]):
             return None
         way, covariance = there @ way, there @ covariance @ there.T
         sd = np.sqrt(np.diag(covariance))
-        angles_deg = np.degrees(np.arctan(way[2:4] + _tangents(self._mount)))
-        sds_deg = np.hypot(np.degrees(sd[2:4]), _LEVEL_SD_DEG)
-        ahead, right = (
-            Measure((angle_deg,), sd_deg, 1.5, 1.0)
-            for angle_deg, sd_deg in zip(angles_deg.tolist(), sds_deg.tolist(), strict=True)
-        )
-        return Surveyed(
-            matches=int(counts.sum()),
-            middle=Position(*moved(self._origin.lat_deg, self._origin.lon_deg, *middle_m.tolist())),
-            off_m=Measure((float(way[0]), float(way[1])), float(max(sd[:2])), 1.0, 1.0),
-            scale=Measure((float(way[4]),), float(sd[4]), 0.003, 0.005),
-            ahead_deg=ahead,
-            right_deg=right,
-        )
+        ahead_deg, right_deg = np.degrees(np.arctan(way[2:4] + _tangents(self._mount))).tolist()
+        ahead_sd_deg, right_sd_deg = np.hypot(np.degrees(sd[2:4]), _LEVEL_SD_DEG).tolist()
+        measures = {
+            "off_m": Measure((float(way[0]), float(way[1])), float(max(sd[:2])), 1.0, 1.0),
+            "scale": Measure((float(way[4]),), float(sd[4]), 0.003, 0.005),
+            "ahead_deg": Measure((ahead_deg,), ahead_sd_deg, 1.5, 1.0),
+            "right_deg": Measure((right_deg,), right_sd_deg, 1.5, 1.0),
+        }
+        middle = Position(*moved(self._origin.lat_deg, self._origin.lon_deg, *middle_m.tolist()))
+        return Surveyed(matches=int(counts.sum()), middle=middle, measures=measures)
 
 
 def fitted(sightings: list[Sighting]) -> tuple[Doubles, Doubles, Bools]:
@@ -210,15 +198,15 @@ def fitted(sightings: list[Sighting]) -> tuple[Doubles, Doubles, Bools]:
     The first rounds let no sighting pull much harder than the others, the last leave out what is far off. Scatter that
     is larger than the matches claim makes the covariance larger.
     """
-    look = np.array([each.look for each in sightings])
+    jacobian = np.array([each.jacobian for each in sightings])
     off_m = np.array([each.off_m for each in sightings])
     own_m2, shared_m2, alike = np.array([(each.own_m2, each.shared_m2, each.alike) for each in sightings]).T
     counts, scatter = np.ones(len(sightings)), 1.0
     for nth in range(_SOFT_ROUNDS + _HARD_ROUNDS):
         weight = counts / (own_m2 + alike * shared_m2)
-        normal = np.einsum("n,nij,nik->jk", weight, look, look) + _BEFORE
-        way = np.linalg.solve(normal, np.einsum("n,nij,ni->j", weight, look, off_m))
-        miss = np.linalg.norm(off_m - look @ way, axis=1) / np.sqrt(own_m2 + shared_m2)
+        normal = np.einsum("n,nij,nik->jk", weight, jacobian, jacobian) + _BEFORE
+        way = np.linalg.solve(normal, np.einsum("n,nij,ni->j", weight, jacobian, off_m))
+        miss = np.linalg.norm(off_m - jacobian @ way, axis=1) / np.sqrt(own_m2 + shared_m2)
         scatter = max(1.0, float(np.median(miss)) / _RAYLEIGH)
         if nth < _SOFT_ROUNDS:
             counts = np.minimum(1.0, _SOFT * scatter / np.maximum(miss, 1e-9))
@@ -242,7 +230,7 @@ def _explains_doubts(sightings: list[Sighting], counts: Bools, there: Doubles, m
     doubted = np.array([each.is_doubted for each in sightings])
     if not doubted.any():
         return True
-    left_m = np.array([each.off_m - each.look[:, 2:4] @ mount for each in sightings])
+    left_m = np.array([each.off_m - each.jacobian[:, 2:4] @ mount for each in sightings])
     doubted &= np.linalg.norm(left_m, axis=1) > _NO_DOUBT_M
     halves = np.array_split(np.arange(len(sightings)), 2)
     if min(np.mean(~doubted[half]) for half in halves) < _UNDOUBTED or counts[~doubted].mean() < _LEAST_ALIKE:
@@ -251,14 +239,3 @@ def _explains_doubts(sightings: list[Sighting], counts: Bools, there: Doubles, m
     worst_m2 = max(np.diag(there @ covariance @ there.T)[:2].max() for covariance in (of_one, of_other))
     off_sd = in_sd(there @ (one - other), there @ (of_one + of_other) @ there.T)
     return worst_m2 <= _HALF_KNOWS_M**2 and off_sd <= _HALVES_AGREE
-
-
-def _beside(vehicle: Vehicle, t_s: float) -> Position:
-    """Return where GPS says that the aircraft was at `t_s`, the time to which the vehicle's position was moved: by the
-    autopilot, which knows how late its receiver is, or by the receiver if the autopilot may repeat us."""
-    gps = vehicle.gps
-    if gps is None or t_s - vehicle.t_fix_s > _OURS_S:
-        return Position(vehicle.lat_deg, vehicle.lon_deg)
-    east_m_s, north_m_s = vehicle.velocity_m_s or (0.0, 0.0)
-    since_s = t_s - gps.t_s + RECEIVER_LAG_S
-    return Position(*moved(gps.lat_deg, gps.lon_deg, since_s * east_m_s, since_s * north_m_s))

@@ -1,7 +1,4 @@
-"""Messages to systemd. Without systemd nothing is sent. `flight` and `vitals` use it.
-
-The protocol is sd_notify(3): `KEY=value` lines in one datagram to the socket that $NOTIFY_SOCKET names.
-"""
+"""Messages to systemd by sd_notify(3): `KEY=value` lines in one datagram to $NOTIFY_SOCKET. Without it none is sent."""
 
 import os
 import socket
@@ -9,8 +6,7 @@ from contextlib import suppress
 
 from edgevpr.core.text import shown
 
-# The time to ask for at the start: measuring a technique or loading a map takes minutes on a slow board, and if systemd
-# stopped that, it would start again from nothing.
+# Asked for at the start: measuring a technique or loading a map takes minutes on a slow board.
 LONGEST_START_US = 1_800_000_000
 _SEND_TIMEOUT_S = 0.5
 
@@ -21,8 +17,8 @@ def is_there() -> bool:
 
 
 def notify(**assignments: object) -> None:
-    """Send assignments, such as READY=1, WATCHDOG=1 or STATUS="12 places". Never raises: a flight must not end because
-    nobody listens."""
+    """Send assignments, such as READY=1 or STATUS="12 places". Never raises: a flight must not end for want of a
+    reader."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return
@@ -36,8 +32,8 @@ def notify(**assignments: object) -> None:
 
 
 def watchdog_interval_s() -> float | None:
-    """Return the seconds between two WATCHDOG messages, half the unit's WatchdogSec, as sd_watchdog_enabled(3) advises;
-    None if systemd does not watch this process."""
+    """Return the seconds between two WATCHDOG messages, half the unit's WatchdogSec (sd_watchdog_enabled(3)); None if
+    systemd does not watch this process."""
     try:
         watched = int(os.environ.get("WATCHDOG_PID", os.getpid())) == os.getpid()
         timeout_us = int(os.environ["WATCHDOG_USEC"])

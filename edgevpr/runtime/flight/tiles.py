@@ -18,7 +18,7 @@ from edgevpr.core.types import Position, Tape
 from edgevpr.mavlink.messages import Severity
 from edgevpr.places.layers import layers_of
 from edgevpr.places.tilemap import Loaded, TileMap, tile_of_place
-from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.decide import Matcher
 from edgevpr.runtime.recognise.evidence import calibration_of
 from edgevpr.runtime.recognise.hints import RECORDED_REACH_M, Reach
@@ -36,12 +36,18 @@ _HELD_NEARER = 0.25  # by this share of its side a tile in RAM counts as nearer:
 
 class Tiles:
     """The tiles of a flight over `tile_map`, of which one is in RAM and searched by the `recogniser`. Give every event
-    to `tell`, and `close` it before the map."""
+    to `update`, and `close` it before the map."""
 
     def __init__(
-        self, tile_map: TileMap, recogniser: Recogniser, match: MatchConfig, *, herald: Herald, tape: Tape
+        self, tile_map: TileMap, recogniser: Recogniser, match: MatchConfig, *, notifier: Notifier, tape: Tape
     ) -> None:
-        self._map, self._recogniser, self._match, self._herald, self._tape = tile_map, recogniser, match, herald, tape
+        self._map, self._recogniser, self._match, self._notifier, self._tape = (
+            tile_map,
+            recogniser,
+            match,
+            notifier,
+            tape,
+        )
         self._thread = ThreadPoolExecutor(1, "tiles")
         self._loading: tuple[int, Future[tuple[Loaded, AcceptRule]]] | None = None
         self._rules = dict.fromkeys(tile_map.ram.tiles, recogniser.rule)
@@ -53,7 +59,7 @@ class Tiles:
         self._layers = layers_of(tile_map)
         self._note_held()
 
-    def tell(self, event: Recognition) -> None:
+    def update(self, event: Recognition) -> None:
         """Load, drop and search tiles by what an event says of the aircraft's position."""
         if event.frame is None:
             return
@@ -161,7 +167,7 @@ class Tiles:
         except MapError as error:
             self._unusable.add(tile)
             ground = "a tile of the map cannot be used, see its log"
-            self._herald.tell("tile", Severity.WARNING, str(error), ground=ground, problem=str(error))
+            self._notifier.report("tile", Severity.WARNING, str(error), ground=ground, problem=str(error))
         else:
             self._map.take(loaded)
 
@@ -184,11 +190,11 @@ class Tiles:
         )
 
     def _note_held(self) -> None:
-        self._herald.note("tiles", held=[self._map.keys[tile] for tile in self._map.ram.tiles])
+        self._notifier.log("tiles", held=[self._map.keys[tile] for tile in self._map.ram.tiles])
 
 
-def tiles_of(recogniser: Recogniser, match: MatchConfig, herald: Herald, tape: Tape) -> Tiles | None:
+def open_tiles(recogniser: Recogniser, match: MatchConfig, notifier: Notifier, tape: Tape) -> Tiles | None:
     """Return the tiles of a recogniser's map; None if it is a single map."""
     if not isinstance(recogniser.place_map, TileMap):
         return None
-    return Tiles(recogniser.place_map, recogniser, match, herald=herald, tape=tape)
+    return Tiles(recogniser.place_map, recogniser, match, notifier=notifier, tape=tape)

@@ -1,5 +1,4 @@
-"""Reporting of how a flight goes, once a second: to systemd (with its watchdog), to the autopilot, and to the status
-file. The loop of `flight` uses it."""
+"""Reports once a second how a flight goes: to systemd (with its watchdog), the autopilot and the status file."""
 
 import logging
 import math
@@ -13,13 +12,13 @@ from edgevpr.frames.shot import Condition
 from edgevpr.mavlink.messages import Health, Severity
 from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight import systemd
-from edgevpr.runtime.flight.autopilot import confidence_of
+from edgevpr.runtime.flight.autopilot import combine_confidence
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.companionwatch import CompanionWatch
+from edgevpr.runtime.flight.flightio import FlightParts
 from edgevpr.runtime.flight.frozenwatch import FrozenWatch
-from edgevpr.runtime.flight.herald import Commands, Trouble
+from edgevpr.runtime.flight.notifier import Commands, Trouble
 from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW, NOTHING_IN_A_ROW, Tally
-from edgevpr.runtime.flight.world import Crew
 from edgevpr.runtime.recognise.recognition import Recognition, fields_of
 
 _HEALTH_S, _MINUTE_S = 1.0, 60.0
@@ -35,15 +34,13 @@ _log = logging.getLogger(__name__)
 
 class Vitals:
     """Pings the watchdog of systemd while queries come, or what keeps them off is reported. Reports once a second how
-    the flight goes to systemd and to the status file, and the state of this computer to the autopilot; once a minute
-    also to the terminal, if it was started on one. It reports once, through the herald, when the camera is lost,
-    frozen, damaged or shows nothing, when nothing can be recognised any more, when this computer is hot, throttled or
-    short of voltage, and when each of these is over. `remarks` returns sentences for the status; those that are None
-    are left out."""
+    the flight goes, and once a minute also to a terminal. It notifies once when the camera is lost, frozen, damaged or
+    shows nothing, when nothing can be recognised any more, when this computer is hot, throttled or short of voltage,
+    and when each of these is over. `remarks` returns sentences for the status (None: left out)."""
 
     def __init__(
         self,
-        crew: Crew,
+        parts: FlightParts,
         frozen: FrozenWatch,
         *,
         tally: Tally,
@@ -51,70 +48,70 @@ class Vitals:
         commands: Commands,
         remarks: Callable[[], Sequence[str | None]],
     ) -> None:
-        self._crew, self._frozen, self._tally, self._pace = crew, frozen, tally, pace
+        self._parts, self._frozen, self._tally, self._pace = parts, frozen, tally, pace
         self._commands, self._remarks = commands, remarks
         self._watchdog_s = systemd.watchdog_interval_s()
-        self._watchdog_due_s = self._health_due_s = crew.clock.mono_s()
+        self._watchdog_due_s = self._health_due_s = parts.io.clock.mono_s()
         self._minute_due_s = self._health_due_s + _MINUTE_S if sys.stderr.isatty() else math.inf
         self._source_trouble: str | None = None
         self._start_s = self._explained_s = self._health_due_s
         self._has_log = True
         failing = f"{FAILURES_IN_A_ROW} frames in a row have failed"
-        self._failing = Trouble(crew.herald, "failing", failing, "frames are recognised again")
-        self._blind = Trouble(crew.herald, "camera", "camera shows nothing", "camera shows ground again")
-        self._companion = CompanionWatch(crew.herald)
+        self._failing = Trouble(parts.notifier, "failing", failing, "frames are recognised again")
+        self._blind = Trouble(parts.notifier, "camera", "camera shows nothing", "camera shows ground again")
+        self._companion = CompanionWatch(parts.notifier)
         self._has_event = False
         self._newest: dict[str, Any] | None = None
         self._match: dict[str, Any] | None = None
 
-    def tell(self, event: Recognition) -> None:
+    def update(self, event: Recognition) -> None:
         """Keep an event for the status, if it is a query."""
         self._has_event = True
         if event.frame and event.is_query:
-            self._newest = {"t_frame_s": event.frame.t_mono_s, **_seen(event)}
+            self._newest = {"t_frame_s": event.frame.t_mono_s, **_summarise(event)}
             self._match = self._newest if event.accepted else self._match
 
     def beat(self) -> None:
         """Ping the watchdog and report, if due, and log the answers to fixes. Call it in every pass of the loop."""
-        now_s = self._crew.clock.mono_s()
+        now_s = self._parts.io.clock.mono_s()
         if self._watchdog_s and now_s >= self._watchdog_due_s and self._is_explained(now_s):
             systemd.notify(WATCHDOG=1)
             self._watchdog_due_s = now_s + self._watchdog_s
-        if self._crew.autopilot:
-            self._crew.autopilot.log_answers()
+        if self._parts.autopilot:
+            self._parts.autopilot.log_answers()
         if now_s >= self._health_due_s:
             self._health_due_s = now_s + _HEALTH_S
-            self._crew.flight_log.sync_due(now_s)
+            self._parts.flight_log.sync_due(now_s)
             self._report()
 
     def _is_explained(self, now_s: float) -> bool:
         """Tell whether queries come, or something that is reported explains that none does."""
-        is_awaited = self._crew.source.is_live and not (self._source_trouble or self._commands.is_paused)
+        is_awaited = self._parts.source.is_live and not (self._source_trouble or self._commands.is_paused)
         if self._has_event or not is_awaited:
             self._explained_s, self._has_event = now_s, False
         return now_s - self._explained_s < max(_UNEXPLAINED_S, _UNEXPLAINED_QUERIES / self._pace.rate_hz)
 
     def _report(self) -> None:
-        crew = self._crew
-        crew.meter.look_at_heat()
-        self._companion.take(crew.clock.mono_s(), crew.meter.thermal)
-        self._look_at_source()
-        self._failing.note(self._tally.failed_in_a_row >= FAILURES_IN_A_ROW)
-        self._look_at_log()
-        self._blind.note(self._tally.nothing_in_a_row >= NOTHING_IN_A_ROW)
-        health, load = self._health(), crew.meter.machine_load()
+        parts = self._parts
+        parts.meter.measure_heat()
+        self._companion.take(parts.io.clock.mono_s(), parts.meter.thermal)
+        self._check_source()
+        self._failing.update(self._tally.failed_in_a_row >= FAILURES_IN_A_ROW)
+        self._check_log()
+        self._blind.update(self._tally.nothing_in_a_row >= NOTHING_IN_A_ROW)
+        health, load = self._health(), parts.meter.machine_load()
         status = self._status(health, load)
         systemd.notify(STATUS=status["summary"])
         if status["t_mono_s"] >= self._minute_due_s:
             self._minute_due_s += _MINUTE_S
-            _log.info("%s", _so_far(status))
-        if crew.status:
-            crew.status.tell(status)
-        if crew.autopilot:
-            crew.autopilot.report(health, load, crew.meter.thermal.temperature_c)
+            _log.info("%.0f min: %s", status["elapsed_s"] / 60, status["summary"])
+        if parts.io.status:
+            parts.io.status.write(status)
+        if parts.autopilot:
+            parts.autopilot.report(health, load, parts.meter.thermal.temperature_c)
 
-    def _look_at_source(self) -> None:
-        source = self._crew.source
+    def _check_source(self) -> None:
+        source = self._parts.source
         condition = source.condition
         trouble = _TROUBLES.get(condition)
         if condition is Condition.OPENING and self._health_due_s - self._start_s > _START_S:
@@ -123,7 +120,7 @@ class Vitals:
             return
         self._source_trouble = trouble
         is_unopened = source.condition is Condition.LOST and not self._tally.queries  # then its state has the cause
-        self._crew.herald.tell(
+        self._parts.notifier.report(
             "source",
             Severity.WARNING if trouble else Severity.INFO,
             f"source: {source.state}",
@@ -132,14 +129,14 @@ class Vitals:
             refused=source.refused,
         )
 
-    def _look_at_log(self) -> None:
-        """Tell the ground station if the flight log cannot be written, and when it can; the journal has the reason."""
-        has_log = self._crew.flight_log.is_written
+    def _check_log(self) -> None:
+        """Report to the ground station if the log cannot be written, and when it can; the journal has the reason."""
+        has_log = self._parts.flight_log.is_written
         if has_log != self._has_log:
             self._has_log = has_log
             text = f"flight log {'is written again' if has_log else 'cannot be written'}"
-            if self._crew.link:
-                self._crew.link.announce(Severity.INFO if has_log else Severity.WARNING, text, "log")
+            if self._parts.link:
+                self._parts.link.announce(Severity.INFO if has_log else Severity.WARNING, text, "log")
 
     def _health(self) -> Health:
         if self._source_trouble or self._frozen.is_frozen:
@@ -150,16 +147,15 @@ class Vitals:
 
     def _status(self, health: Health, load: MachineLoad) -> dict[str, Any]:
         """Return the status of the flight. Its keys that need a word (null: unknown):
-        - `t_mono_s`: the `time` on the clock of the frames; `health`: the state that heartbeats tell
-        - `latency_s`: age of the newest picture when it could be read, and while no newer one comes, now
+        - `t_mono_s`: the `time` on the clock of the frames; `latency_s`: age of the newest picture
         - `asked_rate_hz`: queries per second that the flight tries to keep
         - `machine_cpu_share` (0..1), `machine_ram_mb` (of `machine_ram_total_mb`): those of all programs
         - `newest`: the last query; `match`: the last accepted one; `link`: see `ToAutopilot.state` (null: no link)
         - `remarks`: sentences on what else people should know; `summary`: the most important values in one line.
         """
-        crew, tally, thermal = self._crew, self._tally, self._crew.meter.thermal
-        totals, now_s = crew.meter.totals(), crew.clock.mono_s()
-        utc = datetime.fromtimestamp(crew.clock.utc_s(), timezone.utc)
+        parts, tally, thermal = self._parts, self._tally, self._parts.meter.thermal
+        totals, now_s = parts.meter.totals(), parts.io.clock.mono_s()
+        utc = datetime.fromtimestamp(parts.io.clock.utc_s(), timezone.utc)
         status: dict[str, Any] = {
             "version": __version__,
             "time": utc.isoformat(timespec="seconds").replace("+00:00", "Z"),
@@ -167,13 +163,13 @@ class Vitals:
             "elapsed_s": totals["elapsed_s"],
             "health": health.name,
             "paused": self._commands.is_paused,
-            "source": self._frozen.state or crew.source.state,
-            "latency_s": crew.source.latency_s,
+            "source": self._frozen.state or parts.source.state,
+            "latency_s": parts.source.latency_s,
             "queries": tally.queries,
             "accepted": tally.accepted,
             "failed": tally.failed + tally.unusable,
             "asked_rate_hz": self._pace.rate_hz,
-            "rss_mb": crew.meter.rss_mb(),
+            "rss_mb": parts.meter.rss_mb(),
             "machine_cpu_share": sum(load.core_shares) / max(1, len(load.core_shares)),
             "machine_ram_mb": load.ram_used_bytes / 1e6,
             "machine_ram_total_mb": load.ram_total_bytes / 1e6,
@@ -184,7 +180,7 @@ class Vitals:
             "under_voltage": thermal.under_voltage,
             "newest": self._newest,
             "match": self._match,
-            "link": crew.autopilot.state() if crew.autopilot else None,
+            "link": parts.autopilot.state() if parts.autopilot else None,
             "remarks": [remark for remark in (*self._companion.remarks, *self._remarks()) if remark],
         }
         counts = f"{tally.queries} queries, {tally.accepted} accepted, {totals['used_mah']:.2f} mAh"
@@ -192,19 +188,8 @@ class Vitals:
         return {**status, "summary": "; ".join((status["source"], counts, *fixes, *status["remarks"]))}
 
 
-def _so_far(status: dict[str, Any]) -> str:
-    """Return in one line how the flight of a status goes, for who has started it by hand."""
-    match, fixes = status["match"], [status["link"]["fixes"]] if status["link"] else []
-    last = "no place found yet"
-    if match:
-        ago_s = status["t_mono_s"] - match["t_frame_s"]
-        last = f"last place {match['place']} ({match['reference_image']}), {ago_s:.0f} s ago"
-    counts = f"{status['queries']} queries, {status['accepted']} accepted"
-    return "; ".join((f"{status['elapsed_s'] / 60:.0f} min: {counts}", last, *fixes))
-
-
-def _seen(event: Recognition) -> dict[str, Any]:
+def _summarise(event: Recognition) -> dict[str, Any]:
     """Return the fields of the status about a query (None: unknown)."""
     fields = fields_of(event)
     names = ("query", "accepted", "reason", "place", "reference_image", "score", "accuracy_m")
-    return {name: fields[name] for name in names} | {"confidence": confidence_of(event)}
+    return {name: fields[name] for name in names} | {"confidence": combine_confidence(event)}

@@ -12,13 +12,12 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.text import beside
-from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.frames.level import Mount
 from edgevpr.mavlink.messages import Severity
-from edgevpr.mavlink.receivers import RECEIVER_LAG_S
+from edgevpr.mavlink.receivers import extrapolate
 from edgevpr.runtime.flight.autopilot import ToAutopilot
-from edgevpr.runtime.flight.consistency import HeardFrame, PositionedMatch, positioned, worst_sd
-from edgevpr.runtime.flight.herald import Herald, Trouble
+from edgevpr.runtime.flight.measurements import PositionedMatch, measure_for_gps, worst_sd
+from edgevpr.runtime.flight.notifier import Notifier, Trouble
 from edgevpr.runtime.flight.survey import Measure, Sightings, Surveyed
 from edgevpr.runtime.recognise.levelling import mount_of
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -45,25 +44,23 @@ _GPS_WITHIN_S = 30.0  # the matches in a row must be no older
 _GPS_IN_TURN, _GPS_IN_TURN_S = 5, 20.0  # so many, with others between them that agree
 _GPS_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
 _REPORTED_AGAIN = 2.0  # times the distance that was last reported
-_GPS_TIME_SD_S = 0.1  # of a position of the receiver, beside that of the frame
-_ATTITUDE_SD = math.tan(math.radians(1.0))
 _SURVEYED_EVERY = 6  # sightings from one look at the survey to the next
 _MOUNT = "ahead_deg", "right_deg"
-_ANEW = 3.0  # times the least that counts: a result that was told is told anew when it has changed by more
+_ANEW = 3.0  # times the least that counts: a result is reported anew when it has changed by more
 
 _log = logging.getLogger(__name__)
 
 
 class Tally:
-    """Counts the events of a flight: `queries`, of them `accepted` and `failed` ones; `unusable` frames, which failed
-    before they became queries; events that failed in a row; and pictures in a row that hold too little."""
+    """Counts `queries`, of them `accepted` and `failed` ones; `unusable` frames, which failed before they became
+    queries; events that failed in a row; and pictures in a row that hold too little."""
 
     def __init__(self) -> None:
         self._trouble: str | None = None
         self.queries = self.accepted = self.unusable = self.failed = 0
         self.failed_in_a_row = self.nothing_in_a_row = 0
 
-    def tell(self, event: Recognition) -> None:
+    def update(self, event: Recognition) -> None:
         """Count an event. A failure is logged, but only once for failures in a row with the same reason."""
         trouble = event.reason if event.failed else None
         if trouble and trouble != self._trouble:
@@ -78,28 +75,27 @@ class Tally:
 
 
 class MapWatch:
-    """Watches the map for damage. Each place that is left out because it cannot be read gets a log line of kind "left
-    out"; only the first is said. That the whole file cannot be read, or can again, is reported with the kind "map".
-    `left_out` is the number of places left out."""
+    """Reports damage of the map: each place that cannot be read in the log, only the first in words; and when the whole
+    file cannot be read, or can again. `left_out` is the number of places left out."""
 
-    def __init__(self, herald: Herald) -> None:
+    def __init__(self, notifier: Notifier) -> None:
         self.left_out = 0
-        self._herald, self._is_lost = herald, False
+        self._notifier, self._is_lost = notifier, False
 
     @property
     def summary(self) -> str | None:
         """Number of places left out, in a few words; None if there are none."""
         return f"{self.left_out} places of the map left out" if self.left_out else None
 
-    def tell(self, event: Recognition) -> None:
+    def update(self, event: Recognition) -> None:
         """Check an event for unreadable places."""
         for place_id, problem in event.left_out:
-            self._herald.note("left out", place=place_id, problem=problem)
+            self._notifier.log("left out", place=place_id, problem=problem)
         if event.left_out and not self.left_out:
             count = len(event.left_out)
             ground = f"map damaged, {count} place{'' if count == 1 else 's'} left out"
             text = f"the map is damaged, place {event.left_out[0][0]} is the first to be left out"
-            self._herald.say(Severity.WARNING, text, ground=ground, topic="left out")
+            self._notifier.announce(Severity.WARNING, text, ground=ground, topic="left out")
         self.left_out += len(event.left_out)
         if event.is_query and event.map_lost != self._is_lost:
             self._is_lost = event.map_lost
@@ -107,40 +103,38 @@ class MapWatch:
                 text, severity, state = "its map cannot be read, see its log", Severity.WARNING, "cannot be read"
             else:
                 text, severity, state = "its map is read again", Severity.INFO, "read again"
-            self._herald.tell("map", severity, text, state=state, why=event.reason)
+            self._notifier.report("map", severity, text, state=state, why=event.reason)
 
 
 class Sight:
-    """Reports once when the aircraft leaves the map or the camera is tilted too far, and once when that is over.
+    """Reports once when the aircraft leaves the map or the camera is tilted too far, and once when that is over. The
+    map counts as left after many queries in a row that are not accepted; pictures that cannot be recognised do not
+    count."""
 
-    The map counts as left after many queries in a row that are not accepted. A picture that shows nothing, is not worth
-    a search, could not be used or is tilted too far is not counted among them.
-    """
-
-    def __init__(self, herald: Herald) -> None:
-        self._map = Trouble(herald, "sight", "map left", "map found again")
-        self._tilt = Trouble(herald, "tilt", "tilt too large", "tilt is fine again")
+    def __init__(self, notifier: Notifier) -> None:
+        self._map = Trouble(notifier, "sight", "map left", "map found again")
+        self._tilt = Trouble(notifier, "tilt", "tilt too large", "tilt is fine again")
         self._accepted = self._misses = self._misses_lost = 0
         self._is_tilted, self._tilt_since_s = False, 0.0
 
-    def tell(self, event: Recognition) -> None:
+    def update(self, event: Recognition) -> None:
         """Check the tilt of a query, and whether it was found in the map."""
         if event.is_query and event.frame:
-            self._look_at_tilt(event.view.reason is not None, event.frame.t_mono_s)
-            self._look_for_map(event)
+            self._check_tilt(event.view.reason is not None, event.frame.t_mono_s)
+            self._check_map(event)
 
-    def _look_at_tilt(self, is_tilted: bool, now_s: float) -> None:
+    def _check_tilt(self, is_tilted: bool, now_s: float) -> None:
         if is_tilted != self._is_tilted:
             self._is_tilted, self._tilt_since_s = is_tilted, now_s
         if now_s - self._tilt_since_s >= _TILT_LASTS_S:
-            self._tilt.note(is_tilted)
+            self._tilt.update(is_tilted)
 
-    def _look_for_map(self, event: Recognition) -> None:
+    def _check_map(self, event: Recognition) -> None:
         if event.accepted:
             self._accepted += 1
             self._misses = self._misses_lost = 0
             if self._accepted >= _FOUND_WITH:
-                self._map.note(False)
+                self._map.update(False)
             return
         if event.failed or event.says_nothing or event.view.reason or (event.worth and event.worth.reason):
             return
@@ -152,13 +146,12 @@ class Sight:
                 self._accepted = 0
         elif self._accepted >= _KNOWN_WITH and (self._misses >= _LEFT_AFTER or self._misses_lost >= _LOST_AFTER):
             self._accepted = 0
-            self._map.note(True)
+            self._map.update(True)
 
 
 class GpsWatch:
-    """Compares GPS with the matches: a receiver far from them is jammed, spoofed, or wrong for a moment. It reports
-    when they contradict each other, whenever the distance has doubled, and when they agree again. Every comparison is
-    sent to the autopilot, and the navigation does not use a GPS that is wrong.
+    """Compares GPS with the matches. It reports when they contradict each other, whenever the distance has doubled, and
+    when they agree again. Every comparison is sent to the autopilot, and navigation does not use a GPS that is wrong.
 
     GPS `is_wrong` after three matches in a row that contradict it, of different places and with about the same offset
     from GPS; it is right again after three matches in a row that agree with it. A match contradicts GPS that is far
@@ -167,8 +160,8 @@ class GpsWatch:
     twenty seconds, whatever lies between, and GPS is not right again before there are fewer. `map_sd_m` is the standard
     deviation of the error that all matches share."""
 
-    def __init__(self, map_sd_m: float, herald: Herald, autopilot: ToAutopilot | None) -> None:
-        self._map_sd_m, self._herald, self._autopilot = map_sd_m, herald, autopilot
+    def __init__(self, map_sd_m: float, notifier: Notifier, autopilot: ToAutopilot | None) -> None:
+        self._map_sd_m, self._notifier, self._autopilot = map_sd_m, notifier, autopilot
         self._against: list[tuple[PositionedMatch, Doubles]] = []  # matches with their offset (2,) from GPS
         self._doubts: list[PositionedMatch] = []  # the last matches that contradicted it
         self._agreeing = 0
@@ -179,25 +172,23 @@ class GpsWatch:
         self.is_wrong = False
 
     def begin_anew(self) -> None:
-        """Forget what matches were beside GPS, since they are from now on."""
+        """Forget the offsets from GPS so far, since matches err otherwise from now on."""
         self._against.clear()
         self._doubts.clear()
         self._usual_m, self._usual_of = np.zeros(2), 0
 
-    def tell(self, event: Recognition) -> None:
+    def update(self, event: Recognition) -> None:
         """Compare GPS with the match of an event, if that has a position."""
         vehicle = event.vehicle
         if event.frame is None or event.view.reason or vehicle is None or vehicle.gps is None:
             return
-        in_time_m = math.hypot(_GPS_TIME_SD_S, event.frame.t_sd_s) * math.hypot(*(vehicle.velocity_m_s or (0.0, 0.0)))
-        tilt_m = _ATTITUDE_SD * (vehicle.height_m or 0.0)
-        frame = HeardFrame(t_s=event.frame.t_mono_s, sd_m=math.hypot(tilt_m, in_time_m))
-        seen = positioned(event, frame)
+        seen = measure_for_gps(event, vehicle)
         if seen is None or not vehicle.is_fresh_at(seen.t_s):
             return
-        off_m, was_wrong = _beside(seen, vehicle, vehicle.gps), self.is_wrong
-        tilted_m = (vehicle.height_m or 0.0) * _attitude_error_shown(seen)
-        sd_m = math.hypot(worst_sd(seen.covariance_m2), vehicle.gps.sd_m, frame.sd_m, tilted_m)
+        gps_deg = extrapolate(vehicle.gps, seen.t_s, vehicle.velocity_m_s or (0.0, 0.0))
+        off_m = np.array(offset_m(*gps_deg, seen.position.lat_deg, seen.position.lon_deg))
+        was_wrong, tilted_m = self.is_wrong, (vehicle.height_m or 0.0) * _attitude_error_shown(seen)
+        sd_m = math.hypot(worst_sd(seen.covariance_m2), vehicle.gps.sd_m, seen.frame.sd_m, tilted_m)
         self._weigh(seen, off_m, sd_m)
         away_m = math.hypot(*off_m)
         if self._autopilot:
@@ -209,7 +200,7 @@ class GpsWatch:
             news = (
                 f"GPS is {away_m:.0f} m from the map's position" if self.is_wrong else "GPS agrees with the map again"
             )
-            self._herald.tell("gps", severity, news, said=news, off_m=round(away_m, 1), is_wrong=self.is_wrong)
+            self._notifier.report("gps", severity, news, said=news, off_m=round(away_m, 1), is_wrong=self.is_wrong)
 
     def _weigh(self, seen: PositionedMatch, off_m: Doubles, sd_m: float) -> None:
         """Judge GPS anew by a match that is `off_m` (2,) metres from it, with a standard deviation of `sd_m` but for
@@ -247,67 +238,68 @@ class GpsWatch:
 
 
 class Surveyor:
-    """Reports where the map lies and where the camera looks (see `survey`), once each is known and is not as it should
-    be, again when that has clearly changed, and all of it at the end. `gps` tells when GPS is held to be wrong: what
-    was reported of the map is taken back where that contradicts it. `look` is called when the camera is found to look
-    elsewhere: the pictures to come are levelled by that."""
+    """Reports what `survey` finds of map and camera: each once it is known and not as it should be, again when it has
+    clearly changed, and all of it at the end. What was reported of the map is taken back where `gps` contradicts it.
+    `set_mount` is called with a mount of the camera by which the pictures to come are to be levelled."""
 
-    def __init__(self, herald: Herald, gps: GpsWatch, source: SourceConfig, look: Callable[[Mount], None]) -> None:
+    def __init__(
+        self, notifier: Notifier, gps: GpsWatch, source: SourceConfig, set_mount: Callable[[Mount], None]
+    ) -> None:
         mount = mount_of(source)
-        self._herald, self._gps, self._taken, self._on_look = herald, gps, 0, look
+        self._notifier, self._gps, self._taken, self._set_mount = notifier, gps, 0, set_mount
         self._sightings = Sightings(mount, source.gimbal)
         self._expected = {"off_m": (0.0, 0.0), "scale": (0.0,)}
         self._expected |= {"ahead_deg": (mount.ahead_deg,), "right_deg": (mount.right_deg,)}
-        self._told: dict[str, tuple[float, ...]] = {}
+        self._reported: dict[str, tuple[float, ...]] = {}
 
-    def tell(self, event: Recognition) -> None:
+    def update(self, event: Recognition) -> None:
         """Take the match of an event, and report what has become known by it."""
         if self._sightings.take(event, self._gps.is_wrong):
             self._taken += 1
             if self._taken % _SURVEYED_EVERY == 0:
-                self._look(is_end=False)
+                self._check(is_end=False)
 
     def end(self) -> None:
         """Report everything that is known now."""
-        self._look(is_end=True)
+        self._check(is_end=True)
 
-    def _look(self, is_end: bool) -> None:
+    def _check(self, is_end: bool) -> None:
         found, names = self._sightings.result(), set[str]()
         if found is None:
-            if of_map := self._told.keys() - set(_MOUNT):
-                self._told = {name: value for name, value in self._told.items() if name not in of_map}
+            if of_map := self._reported.keys() - set(_MOUNT):
+                self._reported = {name: value for name, value in self._reported.items() if name not in of_map}
                 said = "what was said of the map is taken back, GPS contradicts it"
-                self._herald.tell(
+                self._notifier.report(
                     "survey", Severity.WARNING, said, ground="the map's place is unknown again", said=said
                 )
             return
         for name, each in found.measures.items():
-            before = self._told.get(name)
+            before = self._reported.get(name)
             is_news = each.differs_from(self._expected[name]) if before is None else each.differs_from(before, _ANEW)
             if is_news or (is_end and each.is_known):
                 names.add(name)
-        if names or (is_end and self._told):
+        if names or (is_end and self._reported):
             self._report(found, names)
         if names.intersection(_MOUNT) and not is_end:
-            self._look_as_found()
+            self._apply_mount()
 
     def _report(self, found: Surveyed, names: set[str]) -> None:
         """Write a line of all that is known, and say what of `names` is not as it should be."""
         clear = {name: each for name, each in found.measures.items() if each.differs_from(self._expected[name])}
         sentences = {name: _surveyed(name, each) for name, each in clear.items()}
         said = "; ".join(sentence for sentence, _ in sentences.values()) or "map and camera are as GPS says"
-        self._herald.note("survey", said=said, **found.fields())
-        self._told |= {name: found.measures[name].value for name in names}
+        self._notifier.log("survey", said=said, **found.fields())
+        self._reported |= {name: found.measures[name].value for name in names}
         for name, (sentence, ground) in sentences.items():
             if name in names:
-                self._herald.say(Severity.INFO, sentence, ground=ground, topic=f"survey {name}")
+                self._notifier.announce(Severity.INFO, sentence, ground=ground, topic=f"survey {name}")
 
-    def _look_as_found(self) -> None:
-        """Level the pictures to come by what was told of the camera; what has been compared with GPS is void."""
-        mount = Mount(*(self._told.get(name, self._expected[name])[0] for name in _MOUNT))
-        self._sightings.look(mount)
+    def _apply_mount(self) -> None:
+        """Level the pictures to come by what was found of the camera; what has been compared with GPS is void."""
+        mount = Mount(*(self._reported.get(name, self._expected[name])[0] for name in _MOUNT))
+        self._sightings.set_mount(mount)
         self._gps.begin_anew()
-        self._on_look(mount)
+        self._set_mount(mount)
 
 
 def _surveyed(name: str, found: Measure) -> tuple[str, str]:
@@ -333,11 +325,3 @@ def _attitude_error_shown(seen: PositionedMatch) -> float:
 
 def _is_beyond(off_m: Doubles, *limits_m: float) -> bool:
     return math.hypot(*off_m) > max(limits_m)
-
-
-def _beside(seen: PositionedMatch, vehicle: Vehicle, gps: Receiver) -> Doubles:
-    """Return the offset (2,) of the match from the receiver at the time of the frame, metres east and north."""
-    here = seen.position
-    off_m = np.array(offset_m(gps.lat_deg, gps.lon_deg, here.lat_deg, here.lon_deg))
-    flown_m: Doubles = (seen.t_s - gps.t_s + RECEIVER_LAG_S) * np.array(vehicle.velocity_m_s or (0.0, 0.0))
-    return off_m - flown_m

@@ -17,7 +17,7 @@ from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
 from edgevpr.runtime.recognise.levelling import TILT_SD_WITHOUT_ATTITUDE
-from edgevpr.runtime.recognise.perspective import Lean, fit_lean
+from edgevpr.runtime.recognise.perspective import AttitudeError, fit_attitude_error
 
 # Chosen on aerial_caliterra and aerial_garfield28. Standard deviations along one axis of a shift, as shares of the
 # longest side, added to the covariance of a match: tilt and relief shift the parts of a picture differently.
@@ -50,7 +50,7 @@ class Located:
     height_m: float | None = None
     places: tuple[int, ...] = ()
     objection: str | None = None
-    lean: Lean | None = None
+    lean: AttitudeError | None = None
 
     @property
     def accuracy_m(self) -> float:
@@ -112,7 +112,7 @@ def locate(
         first = _estimate(places[0], best, cells, aside, proof) or first
         estimates.insert(0, first)
         if proof.coinciding:
-            lean = fit_lean(*proof.coinciding, view, pose.up_deg + first.rotation_deg)
+            lean = fit_attitude_error(*proof.coinciding, view, pose.up_deg + first.rotation_deg)
     least = _MIN_SCORE_SHARE * first.score
     agreeing = [estimate for estimate in estimates if first.agrees_with(estimate)]
     at_m, covariance = _average([each for each in agreeing if each.score >= least][:_MAX_PLACES_AVERAGED])

@@ -22,7 +22,7 @@ _ALIKE, _PLACE_SD = 5.0, math.tan(math.radians(0.5))
 
 
 @dataclass(frozen=True, slots=True)
-class Lean:
+class AttitudeError:
     """By how much the camera leans more than was reported. `over_height` (east, north) is a share of the height above
     the ground: the point under the camera is that far from where the reported attitude puts it. `sd` is the standard
     deviation of each axis."""
@@ -31,7 +31,7 @@ class Lean:
     sd: float
 
 
-def fit_lean(asked: Array, known: Array, view: View, up_deg: float) -> Lean | None:
+def fit_attitude_error(asked: Array, known: Array, view: View, up_deg: float) -> AttitudeError | None:
     """Return the lean that landmarks show; None if they are too few, or the view has no attitude or focal length.
 
     `asked` and `known`, complex (n,), are the landmarks of query and place that agree, as in `agreement`. `up_deg` is
@@ -62,4 +62,4 @@ def fit_lean(asked: Array, known: Array, view: View, up_deg: float) -> Lean | No
     variance = float(left @ left) / (2 * count - len(way)) * _ALIKE * float(inverse[6, 6] + inverse[7, 7]) / 2
     right, down = way[6:]
     east, north = axes_of(up_deg) @ (-right, down)
-    return Lean((float(east), float(north)), math.hypot(math.sqrt(variance), _PLACE_SD))
+    return AttitudeError((float(east), float(north)), math.hypot(math.sqrt(variance), _PLACE_SD))

@@ -19,8 +19,8 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path
 from edgevpr.power.boards import Board, load_board
 from edgevpr.power.equations import parse_pack
-from edgevpr.runtime.flight.aboard import at_recorded_rate
 from edgevpr.runtime.flight.autopilot import DRY_RUN
+from edgevpr.runtime.flight.startup import apply_recorded_rate
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise.evidence import calibration_of, not_calibrated
@@ -39,7 +39,7 @@ def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
         config = load_config(config_path)
     except EdgevprError as error:
         return [wrong("configuration", str(error), exit_code=error.exit_code)]
-    config = at_recorded_rate(config, recorded_steps(config.source.uri))
+    config = apply_recorded_rate(config, recorded_steps(config.source.uri))
     findings = [fine("configuration", str(config_path))]
     try:
         board = load_board(config.board)

@@ -13,7 +13,7 @@ from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photogra
 from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.frozenwatch import FrozenWatch, Optics
-from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.notifier import Notifier
 
 HEIGHT_M = 80.0
 METRES_PER_PIXEL = 0.4
@@ -26,14 +26,14 @@ def make_ground() -> np.ndarray:
     return lit(make_scene(3, 400, 240, metres_per_pixel=METRES_PER_PIXEL), LIGHT, 3)
 
 
-class Notes(Herald):
+class Notes(Notifier):
     """Keeps what is reported."""
 
     def __init__(self) -> None:
         super().__init__(FlightLog(None), None)
         self.texts = []
 
-    def tell(self, kind, severity, text, **fields) -> None:
+    def report(self, kind, severity, text, **fields) -> None:
         self.texts.append(text)
 
 

@@ -1,21 +1,15 @@
 """What is told to the autopilot, and that an event says what became of its fix: accepted, sent, taken are three
 things."""
 
+import numpy as np
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource
-from flights import Flight, of_kind
-from pictures import textured
+from flights import flight_over, of_kind, pictures
 
+from edgevpr.mavlink.messages import Health
+from edgevpr.mavlink.vehicle import GPS_IN_USE
 from edgevpr.runtime.flight import systemd
-
-
-def flight(folder, tmp_path, link, clock, technique="cohog", **settings):
-    settings = {"source.rate_hz": 1.0} | settings
-    return Flight(folder / f"{technique}.gpkg", tmp_path / "log", clock, link, **settings)
-
-
-def pictures(count, first=0):
-    return [textured(first + number, 240, 320) for number in range(count)]
+from edgevpr.runtime.flight.watching import NOTHING_IN_A_ROW
 
 
 def fixes(lines):
@@ -25,7 +19,7 @@ def fixes(lines):
 def test_a_query_says_whether_its_fix_was_sent_and_what_was_answered_to_the_last(recording, tmp_path):
     clock = FakeClock()
     link = FakeLink(clock)
-    flown = flight(recording, tmp_path, link, clock)
+    flown = flight_over(recording, tmp_path, link, clock)
     lines = flown.fly(FakeSource(pictures(3), clock))
     queries = of_kind(lines, "query")
     assert fixes(lines) == [(True, None)] * 3
@@ -37,10 +31,28 @@ def test_a_query_says_whether_its_fix_was_sent_and_what_was_answered_to_the_last
     assert link.stats().fixes_sent == 3
 
 
-def test_an_answer_that_says_no_is_in_the_next_line(recording, tmp_path):
+def test_every_answer_has_its_own_line_before_the_next_query(recording, tmp_path, monkeypatch):
+    clock, statuses = FakeClock(), []
+    monkeypatch.setattr(systemd, "notify", lambda STATUS="", **_: statuses.append(STATUS) if STATUS else None)
+    lines = flight_over(recording, tmp_path, FakeLink(clock, answer="FAILED"), clock).fly(
+        FakeSource(pictures(4), clock)
+    )
+    assert [line["kind"] for line in lines if line["kind"] in ("query", "answer")] == ["query", "answer"] * 4
+    queries, answers = of_kind(lines, "query"), of_kind(lines, "answer")
+    assert [line["last_fix"]["answer"] for line in queries[1:]] == ["FAILED"] * 3
+    assert [line["query"] for line in answers] == [line["query"] for line in queries]
+    assert {(line["sent"], line["result"], line["why"]) for line in answers} == {(True, "FAILED", GPS_IN_USE.sentence)}
+    assert "3 fixes sent, 0 taken, 3 refused (GPS in use)" in statuses[-1]
+
+
+@pytest.mark.parametrize("settings", [{"mavlink.send_fixes": False}, {}])
+def test_what_was_never_sent_waits_for_no_answer(recording, tmp_path, settings):
     clock = FakeClock()
-    lines = flight(recording, tmp_path, FakeLink(clock, answer="FAILED"), clock).fly(FakeSource(pictures(2), clock))
-    assert of_kind(lines, "query")[1]["last_fix"]["answer"] == "FAILED"
+    lines = flight_over(recording, tmp_path, FakeLink(clock) if settings else None, clock, **settings).fly(
+        FakeSource(pictures(3), clock)
+    )
+    assert len(of_kind(lines, "query")) == 3
+    assert not of_kind(lines, "answer")
 
 
 def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and_the_status(
@@ -49,7 +61,7 @@ def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and
     clock, statuses = FakeClock(), []
     monkeypatch.setattr(systemd, "notify", lambda STATUS="", **_: statuses.append(STATUS) if STATUS else None)
     link = FakeLink(clock)
-    flown = flight(recording, tmp_path, link, clock)
+    flown = flight_over(recording, tmp_path, link, clock)
     encode = flown.recogniser.technique.encode
     flown.recogniser.technique.encode = lambda *seen: (clock.work(6.2), encode(*seen))[1]
     lines = flown.fly(FakeSource(pictures(3), clock))
@@ -61,14 +73,14 @@ def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and
 
 def test_without_a_link_the_line_says_so(recording, tmp_path):
     clock = FakeClock()
-    lines = flight(recording, tmp_path, None, clock).fly(FakeSource(pictures(1), clock))
+    lines = flight_over(recording, tmp_path, None, clock).fly(FakeSource(pictures(1), clock))
     assert fixes(lines) == [(False, "there is no link")]
 
 
 def test_what_is_not_accepted_has_no_fix_to_speak_of(recording, tmp_path):
     clock = FakeClock()
     link = FakeLink(clock)
-    lines = flight(recording, tmp_path, link, clock).fly(FakeSource(pictures(2, first=100), clock))
+    lines = flight_over(recording, tmp_path, link, clock).fly(FakeSource(pictures(2, first=100), clock))
     assert fixes(lines) == [None, None]
     assert link.stats().fixes_sent == 0
 
@@ -76,7 +88,7 @@ def test_what_is_not_accepted_has_no_fix_to_speak_of(recording, tmp_path):
 def test_the_cost_of_every_query_is_told(recording, tmp_path):
     clock = FakeClock()
     link = FakeLink(clock)
-    flown = flight(recording, tmp_path, link, clock, board="rpi-4b")
+    flown = flight_over(recording, tmp_path, link, clock, board="rpi-4b")
     encode = flown.recogniser.technique.encode
     flown.recogniser.technique.encode = lambda *seen: (clock.work(0.1, 2.0), encode(*seen))[1]
     flown.fly(FakeSource(pictures(1, first=100), clock))
@@ -89,7 +101,7 @@ def test_the_cost_of_every_query_is_told(recording, tmp_path):
 def test_how_sure_an_accepted_match_is_is_told_where_it_is_known(recording, tmp_path, technique):
     clock = FakeClock()
     link = FakeLink(clock)
-    flown = flight(recording, tmp_path, link, clock, technique)
+    flown = flight_over(recording, tmp_path, link, clock, technique)
     lines = flown.fly(FakeSource(pictures(2) + pictures(1, first=100), clock))
     queries = of_kind(lines, "query")
     assert [line["accepted"] for line in queries] == [True, True, False]
@@ -104,16 +116,6 @@ def test_how_sure_an_accepted_match_is_is_told_where_it_is_known(recording, tmp_
 
 
 @pytest.mark.slow
-def test_a_camera_that_has_not_been_opened_is_reported_to_the_ground_with_its_state(recording, tmp_path):
-    clock = FakeClock()
-    link = FakeLink(clock)
-    source = FakeSource(pictures(2), clock, work=lambda: setattr(source, "is_lost", False))
-    source.is_lost = True
-    flight(recording, tmp_path, link, clock).fly(source)
-    assert link.texts()[0] == (4, "edgevpr: camera lost: lost, reopening in 0.5 s")
-
-
-@pytest.mark.slow
 def test_a_camera_that_is_lost_is_told_and_is_critical_until_it_is_back(recording, tmp_path):
     clock = FakeClock()
     link, health = FakeLink(clock), []
@@ -122,7 +124,7 @@ def test_a_camera_that_is_lost_is_told_and_is_critical_until_it_is_back(recordin
     def turn():
         source.is_lost = len(health) in (2, 3)
 
-    lines = flight(recording, tmp_path, link, clock).fly(source)
+    lines = flight_over(recording, tmp_path, link, clock).fly(source)
     assert health == ["ACTIVE", "ACTIVE", "CRITICAL", "CRITICAL", "ACTIVE"]
     assert link.texts() == [(4, "edgevpr: camera lost"), (6, "edgevpr: camera is back")]
     assert [line["state"] for line in of_kind(lines, "source")] == ["lost, reopening in 0.5 s", "streaming"]
@@ -132,6 +134,22 @@ def test_a_listener_that_fails_does_not_end_the_flight(recording, tmp_path, capl
     clock = FakeClock()
     link = FakeLink(clock)
     link.send_fix = lambda fix: 1 / 0
-    lines = flight(recording, tmp_path, link, clock).fly(FakeSource(pictures(2), clock))
+    lines = flight_over(recording, tmp_path, link, clock).fly(FakeSource(pictures(2), clock))
     assert len(of_kind(lines, "query")) == 2
-    assert sum("be told" in record.message for record in caplog.records) == 2
+    assert sum("could not be informed" in record.message for record in caplog.records) == 2
+
+
+def test_ten_pictures_of_nothing_are_reported_once_and_so_is_the_ground_after_them(recording, tmp_path, caplog):
+    clock, health = FakeClock(), []
+    link, ground = FakeLink(clock), pictures(1, first=1)
+    source = FakeSource(
+        [*ground, *[np.zeros((240, 320), np.uint8)] * 15, *ground * 3], clock, work=lambda: health.append(link.health)
+    )
+    lines = flight_over(recording, tmp_path, link, clock).fly(source)
+    queries, reported = of_kind(lines, "query"), ["camera shows nothing", "camera shows ground again"]
+    assert [line["accepted"] for line in queries] == [True, *[False] * 15, *[True] * 3]
+    assert queries[1]["fix"] is queries[1]["place"] is None
+    assert link.texts() == [(4, f"edgevpr: {reported[0]}"), (6, f"edgevpr: {reported[1]}")]
+    assert [line["said"] for line in of_kind(lines, "camera")] == reported
+    assert [health[number] for number in (NOTHING_IN_A_ROW, 15, -1)] == [Health.ACTIVE, Health.CRITICAL, Health.ACTIVE]
+    assert len([record for record in caplog.records if "shows nothing" in record.message]) == 1

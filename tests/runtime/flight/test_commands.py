@@ -4,8 +4,7 @@ import shutil
 
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
-from flights import Flight, of_kind
-from pictures import textured
+from flights import Flight, flight_over, of_kind, pictures
 
 from edgevpr.mavlink.ground import Wish
 from edgevpr.runtime.flight import systemd
@@ -14,14 +13,6 @@ from edgevpr.runtime.flight import systemd
 @pytest.fixture
 def clock():
     return FakeClock()
-
-
-def flight(recording, tmp_path, clock, link, technique="cohog", **settings):
-    return Flight(recording / f"{technique}.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0} | settings)
-
-
-def pictures(count, first=0):
-    return [textured(first + number, 240, 320) for number in range(count)]
 
 
 def queries(lines):
@@ -37,7 +28,7 @@ def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_pict
         if wish := wishes.get(len(health)):
             answers.append(link.wish(wish))
 
-    lines = flight(recording, tmp_path, clock, link).fly(FakeSource(pictures(7), clock, work=work))
+    lines = flight_over(recording, tmp_path, link, clock).fly(FakeSource(pictures(7), clock, work=work))
     assert answers == ["ACCEPTED", "ACCEPTED"]
     assert queries(lines) == ["frame 000000", "frame 000001", "frame 000005", "frame 000006"]
     assert health == ["ACTIVE", "ACTIVE", "STANDBY", "STANDBY", "STANDBY", "ACTIVE", "ACTIVE"]
@@ -49,37 +40,9 @@ def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_pict
     assert link.texts() == [(6, "edgevpr: paused by command"), (6, "edgevpr: goes on by command")]
 
 
-def test_while_paused_the_watchdog_is_fed_and_the_status_says_so(recording, tmp_path, clock, monkeypatch):
-    told = []
-    monkeypatch.setenv("WATCHDOG_USEC", "2000000")
-    monkeypatch.delenv("WATCHDOG_PID", raising=False)
-    assert systemd.watchdog_interval_s() == 1.0
-    monkeypatch.setattr(systemd, "notify", lambda **said: told.append(said))
-    link = FakeLink(clock)
-    source = FakeSource(pictures(9), clock, work=lambda: link.wish(Wish.PAUSE))
-    lines = flight(recording, tmp_path, clock, link).fly(source)
-    assert queries(lines) == ["frame 000000"]
-    assert sum("WATCHDOG" in each for each in told) == 9
-    assert "1 queries" in told[-2]["STATUS"]
-    assert "; paused" in told[-2]["STATUS"]
-
-
-def test_a_camera_that_is_lost_while_paused_is_critical(recording, tmp_path, clock):
-    link, health = FakeLink(clock), []
-
-    def work():
-        link.wish(Wish.PAUSE)
-        health.append(link.health.name)
-        source.is_lost = len(health) >= 3
-
-    source = FakeSource(pictures(5), clock, work=work)
-    flight(recording, tmp_path, clock, link).fly(source)
-    assert health == ["ACTIVE", "STANDBY", "STANDBY", "CRITICAL", "CRITICAL"]
-
-
 def test_a_recording_waits_while_paused(recording, tmp_path, clock):
     link = FakeLink(clock)
-    flown = flight(recording, tmp_path, clock, link)
+    flown = flight_over(recording, tmp_path, link, clock)
     source = FakeSource(pictures(3), clock, is_live=False, work=lambda: link.wish(Wish.PAUSE))
     clock.at(30.0, lambda: link.wish(Wish.RESUME))
     clock.at(60.0, flown.stop)
@@ -116,6 +79,21 @@ def test_learning_is_switched_off_and_on(recording, tmp_path, clock):
 def test_a_flight_that_does_not_learn_cannot_be_told_to(recording, tmp_path, clock):
     link, answers = FakeLink(clock), []
     source = FakeSource(pictures(1), clock, work=lambda: answers.extend([link.wish(Wish.LEARN), link.wish(4)]))
-    lines = flight(recording, tmp_path, clock, link).fly(source)
+    lines = flight_over(recording, tmp_path, link, clock).fly(source)
     assert answers == ["TEMPORARILY_REJECTED"] * 2
     assert not of_kind(lines, "command")
+
+
+def test_while_paused_the_watchdog_is_fed_and_the_status_says_so(recording, tmp_path, clock, monkeypatch):
+    told = []
+    monkeypatch.setenv("WATCHDOG_USEC", "2000000")
+    monkeypatch.delenv("WATCHDOG_PID", raising=False)
+    assert systemd.watchdog_interval_s() == 1.0
+    monkeypatch.setattr(systemd, "notify", lambda **said: told.append(said))
+    link = FakeLink(clock)
+    source = FakeSource(pictures(9), clock, work=lambda: link.wish(Wish.PAUSE))
+    lines = flight_over(recording, tmp_path, link, clock).fly(source)
+    assert queries(lines) == ["frame 000000"]
+    assert sum("WATCHDOG" in each for each in told) == 9
+    assert "1 queries" in told[-2]["STATUS"]
+    assert "; paused" in told[-2]["STATUS"]

@@ -12,7 +12,7 @@ from edgevpr.cli.top import lines_of
 from edgevpr.mavlink.messages import TEXT_BYTES, Severity
 from edgevpr.power.thermal import ThermalState, ThermalWatch
 from edgevpr.runtime.flight.companionwatch import CompanionWatch
-from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.notifier import Notifier
 
 FINE = ThermalState(temperature_c=60.0, frequency_mhz=1800.0, throttled=False, why="", under_voltage=False, hot=False)
 LOW = replace(FINE, why="under-voltage now", under_voltage=True)
@@ -36,7 +36,7 @@ class Log:
 def watched(states, every_s=1.0):
     """(severity, text) of all that is sent to the ground station for a reading each second, and when."""
     log, found = Log(), []
-    watch = CompanionWatch(Herald(log, log))
+    watch = CompanionWatch(Notifier(log, log))
     for number, state in enumerate(states):
         watch.take(every_s * number, state)
         found += [(number, *text) for text in log.texts[len(found) :]]
@@ -63,16 +63,6 @@ def test_take_reports_nothing_of_a_value_that_is_unknown():
     assert [severity for _, severity, _ in watched([LOW] * 5 + [UNKNOWN] * 100)] == [Severity.WARNING]
 
 
-def test_each_problem_has_a_text_that_fits():
-    hot = replace(FINE, temperature_c=102.4, throttled=True, hot=True)
-    assert watched([hot] * 5 + [FINE] * 50) == [
-        (0, Severity.WARNING, "companion throttled at 102 C: runs slower"),
-        (0, Severity.WARNING, "companion hot at 102 C: give it cool air"),
-        (34, Severity.INFO, "companion runs at full speed again"),
-        (34, Severity.INFO, "companion is cool again at 60 C"),
-    ]
-
-
 def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(recording, tmp_path, caplog):
     firmware = tmp_path / "sys/devices/platform/soc/soc:firmware/get_throttled"
     firmware.parent.mkdir(parents=True)
@@ -81,7 +71,7 @@ def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(record
     flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, FakeLink(clock), **{"source.rate_hz": 1.0})
 
     class Status:
-        def tell(self, status):
+        def write(self, status):
             statuses.append(status)
             firmware.write_text({1: "0\n", 2: "0\n", 3: "50005\n"}.get(len(statuses), "50000\n"))
 

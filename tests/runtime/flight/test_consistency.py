@@ -1,6 +1,7 @@
 """A fix that contradicts the autopilot's own position is held back until a second, independent one says the same."""
 
 import numpy as np
+import pytest
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import STEP_DEG, Flight, of_kind
 from pictures import textured
@@ -9,8 +10,8 @@ from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Steps
 from edgevpr.frames.level import Levelled, View
-from edgevpr.runtime.flight.autopilot import DRY_RUN
-from edgevpr.runtime.flight.consistency import ComparedFix, Consistency, HeardFrame, PositionedMatch
+from edgevpr.runtime.flight.consistency import ComparedFix, Consistency
+from edgevpr.runtime.flight.measurements import FrameMeasurement, PositionedMatch
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -40,7 +41,7 @@ class Aircraft:
             self.vehicle = vehicle_at(*here, self.t_s, velocity_m_s=velocity, roll_deg=0.0, pitch_deg=0.0, **said)
             self.navigator.hear_vehicle(self.vehicle)
 
-    def told(self, off_m, after_s=0.0, *, places=(1,), fix_sd_m=8.0, heard=True, turned_deg=None):
+    def report(self, off_m, after_s=0.0, *, places=(1,), fix_sd_m=8.0, heard=True, turned_deg=None):
         """The advice on a match `after_s` seconds after the loss of GPS, `off_m` (east, north) off the aircraft."""
         if heard:
             self.go_on(START_S + after_s)
@@ -68,40 +69,59 @@ class Aircraft:
 
     def held(self, *fixes):
         """Tell which fixes (off_m, after_s, places) are held back, in turn."""
-        return [self.told(off_m, after_s, places=places).is_held for off_m, after_s, places in fixes]
+        return [self.report(off_m, after_s, places=places).is_held for off_m, after_s, places in fixes]
 
 
-def test_a_fix_within_what_both_allow_is_believed():
-    assert Aircraft().held(((10, 20), 1, (1,)), ((-15, 0), 2, (2,)), ((0, 0), 3, (3,))) == [False] * 3
+def every_second(offsets_m):
+    """Fixes of different places, one a second."""
+    return [(off_m, t_s, (t_s,)) for t_s, off_m in enumerate(offsets_m, 1)]
+
+
+AT, FAR, ELSEWHERE = (0, 0), (500, 0), (-700, 0)
+
+
+@pytest.mark.parametrize(
+    ("fixes", "held"),
+    [
+        (every_second([(10, 20), (-15, 0), AT]), "..."),
+        (every_second([(500, 0), (-500, 0), (500, 200)]), "hhh"),
+        (every_second([AT, AT, AT, FAR, AT, AT]), "...h.."),
+        (every_second([FAR, FAR, FAR, ELSEWHERE, FAR, FAR]), "h..h.."),
+        (every_second([FAR, AT, FAR]), "h.h"),
+        ([(FAR, 1, (1, 2)), (FAR, 2, (2, 3))], "hh"),  # they share a place
+        ([(FAR, 1, (1, 2)), (FAR, 2, (3, 4))], "h."),
+        ([(FAR, 1, ()), (FAR, 2, ())], "hh"),  # by the best place
+        (
+            [((200 + 20 * t_s, 0), t_s, (t_s, t_s + 1)) for t_s in range(1, 9)],
+            "hhhhhh..",
+        ),  # every second one shares none
+        ([((200 + 20 * t_s, 0), t_s, (1, 2)) for t_s in range(1, 12)], "h" * 11),
+        ([((300, 0), 60.0, (1,))], "."),  # nobody has corrected the path for so long
+    ],
+)
+def test_consistency_holds_back_until_an_independent_fix_agrees(fixes, held):
+    assert Aircraft().held(*fixes) == [each == "h" for each in held]
+
+
+def test_consistency_forgets_what_agreed_long_ago():
+    near, late = Aircraft(speed_m_s=1.0), Aircraft(speed_m_s=1.0)
+    assert near.held(((900, 0), 1, (1,)), ((900, 0), 28, (2,))) == [True, False]
+    assert late.held(((900, 0), 1, (1,)), ((900, 0), 33, (2,))) == [True, True]
 
 
 def test_one_that_contradicts_is_held_back_and_says_by_how_much():
-    advice = Aircraft().told((300, -400), 1.0)
+    advice = Aircraft().report((300, -400), 1.0)
     assert advice.fix is None
+    assert not Aircraft().report((500, 0), 1.0, fix_sd_m=150.0).is_held, "an inexact one has room"
     assert advice.why.startswith("held back: 500 m from where the aircraft is by the autopilot's reckoning")
-
-
-def test_an_inexact_fix_has_room():
-    assert Aircraft().told((500, 0), 1.0).is_held
-    assert not Aircraft().told((500, 0), 1.0, fix_sd_m=150.0).is_held
-
-
-def test_what_nobody_has_corrected_for_long_gives_room():
-    assert Aircraft().told((300, 0), 1.0).is_held
-    assert not Aircraft().told((300, 0), 60.0).is_held
 
 
 def test_a_second_one_of_another_place_that_says_the_same_is_sent_and_so_are_those_after_it():
     aircraft = Aircraft()
-    advices = [aircraft.told((500, 5 * t_s), t_s, places=(t_s,)) for t_s in range(1, 7)]
+    advices = [aircraft.report((500, 5 * t_s), t_s, places=(t_s,)) for t_s in range(1, 7)]
     assert [advice.is_held for advice in advices] == [True] + [False] * 5
     sent = advices[1].fix
     assert distance_m(sent.lat_deg, sent.lon_deg, *moved(*HOME, 500, 10 + 15 * 2)) < 8, "and not between the two"
-
-
-def test_a_second_one_that_says_something_else_is_held_back_too():
-    fixes = ((500, 0), 1, (1,)), ((-500, 0), 2, (2,)), ((500, 200), 3, (3,))
-    assert Aircraft().held(*fixes) == [True] * 3
 
 
 def test_the_same_place_again_is_no_second_one_until_the_aircraft_has_moved_on():
@@ -115,98 +135,61 @@ def test_the_same_place_again_is_no_second_one_until_the_aircraft_has_moved_on()
     assert stuck.held(*[((500, -15 * t_s), t_s, (1,)) for t_s in range(1, 8)]) == [True] * 7, "it says nothing new"
 
 
-def test_places_that_are_partly_the_same_are_not_independent():
-    assert Aircraft().held(((500, 0), 1, (1, 2)), ((500, 0), 2, (2, 3))) == [True, True]
-    assert Aircraft().held(((500, 0), 1, (1, 2)), ((500, 0), 2, (3, 4))) == [True, False]
-    assert Aircraft().held(((500, 0), 1, ()), ((500, 0), 2, ())) == [True, True], "by the best place"
-
-
 def test_a_picture_that_is_suddenly_turned_against_the_compass_is_held_back_until_others_say_the_same():
     aircraft = Aircraft()
-    told = [aircraft.told((0, 0), t_s, places=(t_s,), turned_deg=3.0) for t_s in range(1, 4)]
+    told = [aircraft.report((0, 0), t_s, places=(t_s,), turned_deg=3.0) for t_s in range(1, 4)]
     assert [advice.is_held for advice in told] == [False] * 3
-    alone = aircraft.told((0, 0), 4, places=(4,), turned_deg=180.0)
+    alone = aircraft.report((0, 0), 4, places=(4,), turned_deg=180.0)
     assert "turned by" in alone.why
     assert "against the compass" in alone.why
-    assert not aircraft.told((0, 0), 5, places=(5,), turned_deg=3.0).is_held
-    broken = [aircraft.told((0, 0), t_s, places=(t_s,), turned_deg=100.0).is_held for t_s in range(6, 12)]
+    assert not aircraft.report((0, 0), 5, places=(5,), turned_deg=3.0).is_held
+    broken = [aircraft.report((0, 0), t_s, places=(t_s,), turned_deg=100.0).is_held for t_s in range(6, 12)]
     assert broken == [True, True, True, False, False, False], "a compass that has gone wrong"
 
 
 def test_a_compass_that_was_wrong_from_the_start_is_none_of_its_business():
     aircraft = Aircraft()
-    told = [aircraft.told((0, 0), t_s, places=(t_s,), turned_deg=140.0).is_held for t_s in range(1, 6)]
+    told = [aircraft.report((0, 0), t_s, places=(t_s,), turned_deg=140.0).is_held for t_s in range(1, 6)]
     assert told == [False] * 5
 
 
 def test_matches_win_over_a_path_that_parts_from_them_faster_than_it_drifts():
     aircraft = Aircraft()
-    told = [aircraft.told((200 + 20 * t_s, 0), t_s, places=(t_s,), fix_sd_m=1.0) for t_s in range(1, 5)]
+    told = [aircraft.report((200 + 20 * t_s, 0), t_s, places=(t_s,), fix_sd_m=1.0) for t_s in range(1, 5)]
     assert [advice.is_held for advice in told] == [True, True, True, False]
     aircraft = Aircraft()
-    told = [aircraft.told((200 + 60 * t_s, 0), t_s, places=(t_s,), fix_sd_m=1.0) for t_s in range(1, 9)]
+    told = [aircraft.report((200 + 60 * t_s, 0), t_s, places=(t_s,), fix_sd_m=1.0) for t_s in range(1, 9)]
     assert all(advice.is_held for advice in told), "no aircraft of ours flies through these"
-
-
-def test_matches_of_neighbours_which_share_places_win_too_and_those_of_one_place_do_not():
-    aircraft, over_one = Aircraft(), Aircraft()
-    off_m = [(200 + 20 * t_s, 0) for t_s in range(1, 12)]
-    told = [(off_m[t_s], t_s + 1, (t_s, t_s + 1)) for t_s in range(10)]
-    assert aircraft.held(*told)[:8] == [True] * 6 + [False] * 2, "the first, third, fifth and seventh share none"
-    assert all(over_one.held(*((off_m, t_s, (1, 2)) for off_m, t_s, _ in told)))
-
-
-def test_a_single_wrong_one_among_right_ones_is_all_that_is_held_back():
-    fixes = [((0, 0), t_s, (t_s,)) for t_s in range(1, 7)]
-    fixes[3] = (500, 0), 4, (90,)
-    assert Aircraft().held(*fixes) == [False, False, False, True, False, False]
-
-
-def test_a_wrong_one_among_those_that_agree_against_the_autopilot_is_held_back():
-    fixes = [((500, 0), t_s, (t_s,)) for t_s in range(1, 7)]
-    fixes[3] = (-700, 0), 4, (90,)
-    assert Aircraft().held(*fixes) == [True, False, False, True, False, False]
-
-
-def test_two_that_agree_across_one_that_agrees_with_the_autopilot_do_not_count():
-    fixes = ((500, 0), 1, (1,)), ((0, 0), 2, (2,)), ((500, 0), 3, (3,))
-    assert Aircraft().held(*fixes) == [True, False, True]
-
-
-def test_what_agreed_long_ago_is_forgotten():
-    near, late = Aircraft(speed_m_s=1.0), Aircraft(speed_m_s=1.0)
-    assert near.held(((900, 0), 1, (1,)), ((900, 0), 28, (2,))) == [True, False]
-    assert late.held(((900, 0), 1, (1,)), ((900, 0), 33, (2,))) == [True, True]
 
 
 def test_against_gps_no_fix_is_believed():
     aircraft = Aircraft(has_gps=True)
-    advices = [aircraft.told((500, 0), t_s, places=(t_s,)) for t_s in range(1, 5)]
+    advices = [aircraft.report((500, 0), t_s, places=(t_s,)) for t_s in range(1, 5)]
     assert all(advice.is_held for advice in advices)
     assert advices[0].why.startswith("held back: 500 m from where GPS")
 
 
 def test_where_the_autopilot_says_nothing_of_its_position_a_fix_is_sent_as_it_is():
     aircraft = Aircraft()
-    assert not aircraft.told((500, 0), 2.5, heard=False).is_held, "its last report is too old"
+    assert not aircraft.report((500, 0), 2.5, heard=False).is_held, "its last report is too old"
     knows_nothing = Navigator(1.0, 1.0)
     aircraft.navigator = knows_nothing
-    assert aircraft.told((500, 0), 3.0, heard=False).fix
+    assert aircraft.report((500, 0), 3.0, heard=False).fix
 
 
 def test_an_autopilot_that_has_only_just_appeared_is_sent_nothing_until_it_had_time_to_say_where_it_is():
     aircraft = Aircraft()
     aircraft.navigator.hear_autopilot(START_S + 1.0)
-    too_early = aircraft.told((500, 0), 5.9, heard=False)
+    too_early = aircraft.report((500, 0), 5.9, heard=False)
     assert (too_early.fix, too_early.why) == (None, "not sent yet: nothing is heard of the vehicle")
-    assert aircraft.told((500, 0), 6.1, heard=False).fix, "it has none"
+    assert aircraft.report((500, 0), 6.1, heard=False).fix, "it has none"
 
 
 def test_an_autopilot_whose_reports_fail_for_seconds_is_sent_nothing():
     aircraft = Aircraft(has_gps=True)
-    assert not aircraft.told((0, 0), 2.0, heard=False).fix, "its GPS is still there"
-    assert not aircraft.told((0, 0), 4.9, heard=False).fix
-    assert aircraft.told((0, 0), 5.1, heard=False).fix
+    assert not aircraft.report((0, 0), 2.0, heard=False).fix, "its GPS is still there"
+    assert not aircraft.report((0, 0), 4.9, heard=False).fix
+    assert aircraft.report((0, 0), 5.1, heard=False).fix
 
 
 def fly(recording, tmp_path, pictures, off_deg=0.05, has_gps=False, **settings):
@@ -237,17 +220,10 @@ def test_in_flight_a_fix_held_back_is_in_the_log_and_the_ground_is_told_once(rec
     assert sum(each.name == "vpr_place" for each in link.sent if each.get_type() == "NAMED_VALUE_INT") == 5
 
 
-def test_a_dry_run_says_which_fixes_would_be_held_back(recording, tmp_path):
-    queries, link = fly(recording, tmp_path, (0, 1), **{"mavlink.send_fixes": False})
-    assert queries[0]["fix"]["why"].startswith("held back")
-    assert queries[1]["fix"]["why"] == DRY_RUN
-    assert link.stats().fixes_sent == 0
-
-
 def test_while_match_after_match_contradicts_a_path_that_is_followed_it_is_in_doubt():
     judge, here = Consistency(), np.zeros(2)
     for t_s in range(8):
-        frame = HeardFrame(t_s=float(t_s), sd_m=0.5)
+        frame = FrameMeasurement(t_s=float(t_s), sd_m=0.5)
         how = {"position": Position(*HOME), "accuracy_m": 1.0, "covariance_m2": np.eye(2), "places": (1,)}
         fix = ComparedFix(
             seen=PositionedMatch(frame=frame, **how),
@@ -256,6 +232,6 @@ def test_while_match_after_match_contradicts_a_path_that_is_followed_it_is_in_do
             expected_m=here,
             covariance_m2=np.eye(2),
         )
-        assert judge.weighed(fix, has_gps=False, is_followed=True).why, "of one place they are one"
+        assert judge.judge(fix, has_gps=False, is_followed=True).why, "of one place they are one"
     assert judge.is_contradicted(8.0, is_followed=True)
     assert not judge.is_contradicted(11.0, is_followed=True), "no other has agreed"

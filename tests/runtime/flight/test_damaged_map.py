@@ -84,17 +84,6 @@ def test_a_damaged_fine_part_of_any_place_costs_one_query_and_then_only_where_it
 
 
 @pytest.mark.slow
-def test_each_damaged_place_is_counted_once_however_often_it_is_met(place_map, tmp_path):
-    damages = [lambda n=n: damaged(place_map, "UPDATE places SET fine = x'00' WHERE place_id = ?", n) for n in (4, 9)]
-    queries, lines, flight = fly(place_map, tmp_path / "log", [*damages, *[nothing] * 20])
-    assert [line["place"] for line in of_kind(lines, "left out")] == [4, 9]
-    assert flight.end["left_out"] == 2
-    assert flight.end["unusable"] == 2
-    assert [text for _, text in flight.link.texts()] == ["edgevpr: map damaged, 1 place left out"], "said once"
-    assert sum(line["accepted"] for line in queries) >= 8
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("column", COLUMNS)
 def test_whatever_stands_in_a_column_the_flight_goes_on_and_sends_nothing_that_is_not_in_the_map(
     place_map, tmp_path, column

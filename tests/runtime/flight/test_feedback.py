@@ -12,7 +12,7 @@ from edgevpr.frames.level import View
 from edgevpr.mavlink.channel import Channel
 from edgevpr.runtime.flight import drift, navigator
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.recognise.perspective import Lean
+from edgevpr.runtime.recognise.perspective import AttitudeError
 
 pytestmark = pytest.mark.slow
 
@@ -54,7 +54,7 @@ class Looped(Air):
 
     def match(self, step, vehicle, off_m=(0.0, 0.0), view=None, lean=None):
         wrong = self.errors[2]
-        shown = Lean(tuple(-wrong + self.rng.normal(0, SHOWN_SD, 2)), SHOWN_SD) if self.shows_lean else None
+        shown = AttitudeError(tuple(-wrong + self.rng.normal(0, SHOWN_SD, 2)), SHOWN_SD) if self.shows_lean else None
         return super().match(step, vehicle, HEIGHT_M * wrong, View(aside=(0.0, 0.0)), shown)
 
 
@@ -84,7 +84,7 @@ def test_it_holds_for_every_accuracy_that_is_asked_for(min_accuracy_m, gyro_sd, 
 @pytest.mark.parametrize("min_accuracy_m", [0.1, 1.0])
 def test_a_claim_as_good_as_the_matches_would_not_hold_where_no_picture_shows_the_lean(min_accuracy_m, monkeypatch):
     """And with gyros that are taken to be as good as they are. This is how a PX4 was lost within a minute."""
-    monkeypatch.setattr(navigator, "_ALIKE", 1.0)
+    monkeypatch.setattr(navigator, "_CORRELATION_FACTOR", 1.0)
     trusting = replace(drift.INERTIAL, acceleration_noise=0.02)
     monkeypatch.setattr(navigator, "INERTIAL_PX4", trusting)
     assert flown(min_accuracy_m, GOOD, shows_lean=False)[0].max() > 20.0

@@ -190,7 +190,7 @@ def test_a_flight_refuses_frozen_pictures_and_says_so(recording, tmp_path):
         clock.sleep(1.0)
 
     class Status:
-        def tell(self, status) -> None:
+        def write(self, status) -> None:
             seen.append(status["source"])
 
     link = FakeLink(clock, vehicle=vehicle)

@@ -67,34 +67,3 @@ def test_fewer_candidates_are_compared_before_the_rate_is_lowered(recording, tmp
     assert changes[-1]["from"] == changes[-1]["to"]
     assert changes[-1]["why"].endswith("nothing is left to lower")
     assert "over a limit" in texts[-1][1]
-
-
-def working_flight(recording, tmp_path, rate_hz, seconds, work, **settings):
-    """A flight by a clock on a machine of as many cores as this one, whose frames take the CPU that `work` says."""
-    clock = FakeClock()
-    place_map = recording / "hog.gpkg"
-    flight = Flight(place_map, tmp_path / "log", clock, FakeLink(clock), **{"source.rate_hz": rate_hz} | settings)
-    encode = flight.recogniser.technique.encode
-    flight.recogniser.technique.encode = lambda *seen: (work(clock), encode(*seen))[1]
-    source = FakeSource([textured(0, 240, 320)] * int(rate_hz * seconds), clock)
-    return flight.fly(source), flight
-
-
-def test_a_flight_that_must_share_its_core_asks_less_often_until_it_has_it_back(recording, tmp_path, caplog):
-    """A query needs two thirds of its step; for 20 s another program takes half of the core."""
-    rate_hz, begin_s = 10.0, FakeClock().now_s
-
-    def work(clock):
-        shared = clock.now_s < begin_s + 20
-        wall_s = 0.65 / rate_hz * (2 if shared else 1)
-        clock.work(wall_s, cores=0.5 if shared else 1.0, kept_waiting=0.0)
-
-    caplog.set_level("INFO")
-    lines, flight = working_flight(recording, tmp_path, rate_hz, 90, work)
-    changes = of_kind(lines, "governor")
-    assert "come late" in changes[0]["why"]
-    assert changes[0]["to"]["rate_hz"] == pytest.approx(rate_hz / 2, rel=1e-3)
-    assert "room" in changes[-1]["why"]
-    assert changes[-1]["to"] == changes[0]["from"]
-    said = [record.message for record in caplog.records if record.name.endswith("herald")]
-    assert len(said) == len(changes) == len(flight.link.texts()), "each is said once"

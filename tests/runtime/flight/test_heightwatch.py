@@ -9,14 +9,14 @@ from edgevpr.core.types import Vehicle
 from edgevpr.frames.level import View
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.heightwatch import HeightWatch
-from edgevpr.runtime.flight.herald import Herald
+from edgevpr.runtime.flight.notifier import Notifier
 
 
 class Watch:
     def __init__(self, folder) -> None:
         self.clock, self.log = FakeClock(), folder / "log"
         self.link = FakeLink(self.clock)
-        self.watch = HeightWatch(Herald(FlightLog(self.log, clock=self.clock), self.link))
+        self.watch = HeightWatch(Notifier(FlightLog(self.log, clock=self.clock), self.link))
 
     def see(self, *heights_m, reported_m=100.0, accepted=True, ratio=1.0, every_s=1.0, age_s=0.0):
         """Let matches of these heights be seen; return the texts so far."""
@@ -25,7 +25,7 @@ class Watch:
             now_s = self.clock.now_s
             where = {"lat_deg": 50.0, "lon_deg": 8.0, "alt_m": 600.0, "heading_deg": None}
             vehicle = Vehicle(**where, t_heard_s=now_s - age_s, has_gps=False, height_m=reported_m)
-            self.watch.tell(
+            self.watch.update(
                 SimpleNamespace(
                     frame=SimpleNamespace(t_mono_s=now_s),
                     vehicle=vehicle,

@@ -68,7 +68,9 @@ def fly(place_map, log, turns, **said):
 def test_the_attitude_is_asked_for_the_frames_times(place_map, tmp_path):
     queries, link = fly(place_map, tmp_path / "f.jsonl", 1, roll_deg=0.2, pitch_deg=0.0, height_m=80.0)
     assert list(link.asked_s) == [query["t_frame_s"] for query in queries]
-    assert [query["reference_image"] for query in queries if query["accepted"]] == ["0", "1", "2"]
+    is_refused = said["roll_deg"] == 80.0  # tilted too far to be levelled
+    expected = [] if is_refused else ["0", "1", "2"]
+    assert [query["reference_image"] for query in queries if query["accepted"]] == expected
     assert all(query["rotation_deg"] == 0 for query in queries), "each was turned north-up before it was asked"
     assert all(query["view"]["up_deg"] == 0.0 for query in queries)
     assert queries[0]["view"]["footprint_m"] == pytest.approx(103.9, abs=0.1)
@@ -119,15 +121,9 @@ def surveyed(monkeypatch):
     known, unknown = Measure((9.0,), 0.9, 1.5, 1.0), Measure((0.0,), 9.0, 1.5, 1.0)
     off_m = Measure((3.0, -4.0), 0.5, 1.0, 1.0)
     where = Position(50.0, 8.0)
-    found = Surveyed(matches=99, middle=where, off_m=off_m, scale=unknown, ahead_deg=known, right_deg=unknown)
+    measures = {"off_m": off_m, "scale": unknown, "ahead_deg": known, "right_deg": unknown}
+    found = Surveyed(matches=99, middle=where, measures=measures)
     monkeypatch.setattr(Sightings, "result", lambda self: found)
-
-
-@pytest.mark.usefixtures("surveyed")
-def test_where_the_camera_looks_is_said_before_the_flight_ends(place_map, tmp_path):
-    fly(place_map, tmp_path / "f.jsonl", 0, roll_deg=0.0, pitch_deg=0.0, height_m=80.0)
-    (line,) = of_kind(list(read_log(tmp_path / "f.jsonl")), "survey")
-    assert (line["off_m"], line["off_sd"], line["scale"], line["ahead_deg"]) == ([3.0, -4.0], 0.5, None, 9.0)
 
 
 @pytest.mark.usefixtures("surveyed")
@@ -138,3 +134,10 @@ def test_pictures_are_levelled_by_it_as_soon_as_it_is_known(place_map, tmp_path,
     _, *of_under = zip(*(query["view"]["aside"] for query in queries), strict=True)
     behind = -80.0 * np.tan(np.radians(9.0)) / 103.9
     assert of_under == [pytest.approx((0.0, 0.0, behind), abs=0.002)]
+
+
+@pytest.mark.usefixtures("surveyed")
+def test_where_the_camera_looks_is_said_before_the_flight_ends(place_map, tmp_path):
+    fly(place_map, tmp_path / "f.jsonl", 0, roll_deg=0.0, pitch_deg=0.0, height_m=80.0)
+    (line,) = of_kind(list(read_log(tmp_path / "f.jsonl")), "survey")
+    assert (line["off_m"], line["off_sd"], line["scale"], line["ahead_deg"]) == ([3.0, -4.0], 0.5, None, 9.0)

@@ -8,9 +8,9 @@ from pictures import textured
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import ImageError
 from edgevpr.runtime.flight import systemd
-from edgevpr.runtime.flight.aboard import at_recorded_rate
 from edgevpr.runtime.flight.clock import Pace
-from edgevpr.runtime.flight.world import Stop, StopNow
+from edgevpr.runtime.flight.flightio import Stop, StopNow
+from edgevpr.runtime.flight.startup import apply_recorded_rate
 
 PICTURE = textured(1, 240, 320)
 
@@ -139,9 +139,9 @@ def test_a_flight_over_pictures_with_times_takes_them_at_their_times(recording, 
 
 def test_the_rate_of_a_timed_flight_is_that_at_which_most_pictures_come():
     config = load_config(None, {"source.rate_hz": 1.0})
-    assert at_recorded_rate(config, [0.5, 0.0, 0.5, 60.0]).source.rate_hz == 2.0
-    assert at_recorded_rate(config, [1e-6, 1e-6]).source.rate_hz == 60.0
-    assert at_recorded_rate(config, []) is config
+    assert apply_recorded_rate(config, [0.5, 0.0, 0.5, 60.0]).source.rate_hz == 2.0
+    assert apply_recorded_rate(config, [1e-6, 1e-6]).source.rate_hz == 60.0
+    assert apply_recorded_rate(config, []) is config
 
 
 def test_on_a_terminal_a_flight_says_once_a_minute_how_it_goes(recording, tmp_path, clock, monkeypatch, caplog):
@@ -149,30 +149,11 @@ def test_on_a_terminal_a_flight_says_once_a_minute_how_it_goes(recording, tmp_pa
     with caplog.at_level("INFO"):
         flight(recording, tmp_path, clock).fly(FakeSource([PICTURE] * 62, clock))
     said = [each for each in caplog.messages if " min: " in each]
-    assert [each.partition(" queries")[0] for each in said] == ["1 min: 31", "2 min: 61"]
+    assert [each.partition(" queries")[0] for each in said] == ["1 min: streaming; 31", "2 min: streaming; 61"]
     caplog.clear()
     monkeypatch.setattr("sys.stderr.isatty", lambda: False, raising=False)
     flight(recording, tmp_path, clock).fly(FakeSource([PICTURE] * 62, clock))
     assert not [each for each in caplog.messages if " min: " in each]
-
-
-def test_a_source_without_a_frame_leaves_the_loop_turning(recording, tmp_path, clock):
-    flown = flight(recording, tmp_path, clock)
-
-    class Slow(FakeSource):
-        turns = 0
-
-        def read(self, timeout_s):
-            self.turns += 1
-            clock.now_s += timeout_s
-            return None if self.turns < 20 else super().read(timeout_s)
-
-    source = Slow([PICTURE], clock)
-    lines = flown.fly(source)
-    assert len(of_kind(lines, "query")) == 1
-    assert source.turns == 20
-    beats = [each for each in flown.link.sent if each.get_type() == "ONBOARD_COMPUTER_STATUS"]
-    assert len(beats) == pytest.approx(4, abs=1), "once a second of the four"
 
 
 @pytest.mark.parametrize(

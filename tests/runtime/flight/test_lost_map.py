@@ -151,16 +151,3 @@ def test_while_another_program_writes_nothing_is_learnt_and_afterwards_again(pla
     assert len(of_kind(lines, "learnt")) == 3
     assert flight.learner.totals["left_out"] == {"while another program was writing": 3}
     assert flight.learner.trouble is None
-
-
-def test_a_map_damaged_before_the_flight_is_flown_with_and_learnt_into(place_map, tmp_path):
-    with sqlite3.connect(place_map) as db:
-        db.execute("UPDATE places SET geom = 'text' WHERE place_id = 3")
-        db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 4")
-    db.close()
-    queries, lines, flight = fly(place_map, tmp_path / "log", [nothing] * 6)
-    assert [line["accepted"] for line in queries] == [True, True, False, False, True, True]
-    assert [line["place"] for line in of_kind(lines, "left out")] == [3, 4]
-    assert flight.link.texts() == [(4, "edgevpr: map damaged, 2 places left out")]
-    lines, flight = learning(place_map, tmp_path, [nothing] * 3)
-    assert len(of_kind(lines, "learnt")) == 3

@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource
-from flights import PLACES, Flight, flight_meter, of_kind
+from flights import Flight, flight_meter, of_kind
 from pictures import textured
 
 from edgevpr.power.thermal import ThermalState
@@ -52,17 +52,6 @@ def test_a_flights_charge_is_the_closed_form(recording, tmp_path):
     assert queries[-1]["totals"]["used_mah"] == pytest.approx(totals["used_mah"], rel=1e-6)
 
 
-def test_nearly_all_cpu_time_of_the_loop_is_some_stage_of_a_query(recording, tmp_path):
-    """By a clock that moves where work is done: 1 ms in encoding, as much in reading and logging, nothing between."""
-    clock = FakeClock()
-    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, **{"source.rate_hz": 5.0})
-    encode = flight.recogniser.technique.encode
-    flight.recogniser.technique.encode = lambda *seen: (clock.work(0.001), encode(*seen))[1]
-    flight.fly(FakeSource([PICTURE] * 20, clock, work=lambda: clock.work(0.001)))
-    totals = flight.end
-    assert totals["stages_cpu_s"] == pytest.approx(totals["process_cpu_s"], rel=1e-6)
-
-
 class Watch:
     """A board whose heat is what stands in a script, the last state for ever."""
 
@@ -90,11 +79,3 @@ def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(recor
     assert flight.end["queries_throttled"] == sum(throttled) > 0
     assert told[0] == 61
     assert told[-1] == 84
-
-
-def test_a_flight_of_a_recording_takes_every_picture(recording, tmp_path):
-    clock = FakeClock()
-    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, **{"source.rate_hz": 60.0})
-    lines = flight.fly(FakeSource([PICTURE] * PLACES, clock, is_live=False))
-    assert len(of_kind(lines, "query")) == PLACES
-    assert flight.end["dropped"] is None

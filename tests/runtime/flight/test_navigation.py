@@ -1,30 +1,31 @@
 """Navigation between fixes: with a true flight beside it, how wrong it is, and whether it knows."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from fakes import receiver_at, vehicle_at
 
-from edgevpr.core.geodesy import distance_m, moved, offset_m
+from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight import drift
-from edgevpr.runtime.flight.consistency import BELIEVED, HeardFrame, PositionedMatch, Weighed
 from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, RECKONED
+from edgevpr.runtime.flight.measurements import FrameMeasurement, PositionedMatch
 from edgevpr.runtime.flight.navigation import Navigation
-from edgevpr.runtime.flight.slew import Slew
-from edgevpr.runtime.recognise.perspective import Lean
+from edgevpr.runtime.recognise.perspective import AttitudeError
 from edgevpr.runtime.recognise.stride import Stride
 
 HOME = 47.0, 8.0
 STEP_S = 0.02
 
 
-def match_at(position, t_s, sd_m, lean_s2=0.0):
-    frame, covariance_m2 = HeardFrame(t_s=t_s, sd_m=0.0, lean_s2=lean_s2), sd_m**2 * np.eye(2)
-    return PositionedMatch(frame=frame, position=position, accuracy_m=sd_m, covariance_m2=covariance_m2, places=(1,))
+def match_at(position, t_s, fix_sd_m, lean=None, **frame):
+    frame = FrameMeasurement(t_s=t_s, **{"sd_m": 0.0} | frame)
+    covariance_m2 = fix_sd_m**2 * np.eye(2)
+    return PositionedMatch(
+        frame=frame, position=position, accuracy_m=fix_sd_m, covariance_m2=covariance_m2, places=(1,), lean=lean
+    )
 
 
 class Flown:
@@ -58,44 +59,40 @@ class Flown:
             self.reckoned_m = self.at_m if has_gps else self.reckoned_m + STEP_S * (velocity - self.wind)
             if self.is_inertial:
                 felt = (velocity - before) / STEP_S + self.bias + self.rng.normal(0, 0.2, 2)
-                self.navigation.hear_acceleration(self.t_s, felt)
+                self.navigation.add_acceleration(self.t_s, felt)
             if self.step % 5 == 0:
                 said = {"has_gps": has_gps, "position_sd_m": 0.5 if has_gps else 20.0}
                 speed = tuple(velocity if has_gps else velocity - self.wind)
                 here = moved(*HOME, *self.reckoned_m)
-                self.navigation.hear_vehicle(vehicle_at(*here, self.t_s, velocity_m_s=speed, **said))
+                self.navigation.add_report(vehicle_at(*here, self.t_s, velocity_m_s=speed, **said))
             if self.step % 50 == 0 and self.step > self.late_steps:
                 if fixes:
                     self.fix()
-                here = self.navigation.at(self.t_s)
+                here = self.navigation.state_at(self.t_s)
                 off_m = offset_m(*HOME, here.position.lat_deg, here.position.lon_deg)
                 errors_m.append(np.array(off_m) - self.at_m)
                 said_m.append(here.accuracy_m)
         return np.array(errors_m), np.array(said_m)
 
-    def fix(self, off_m=(0.0, 0.0), verdict=BELIEVED):
-        t_s = (self.step - self.late_steps) * STEP_S
-        seen = self.way[self.step - self.late_steps] + self.map_off + self.rng.normal(0, self.fix_sd_m, 2) + off_m
-        seen_fix = match_at(Position(*moved(*HOME, *seen)), t_s, self.fix_sd_m)
-        self.navigation.hear_fix(self.navigation.compared(seen_fix), verdict)
+    @property
+    def seen_s(self):
+        return (self.step - self.late_steps) * STEP_S
+
+    def see(self, off_m=(0.0, 0.0)):
+        """Where a match puts the aircraft (2,)."""
+        seen_m = self.way[self.step - self.late_steps] + self.map_off + self.rng.normal(0, self.fix_sd_m, 2)
+        return seen_m + off_m
+
+    def take(self, seen_m, fix_sd_m=None, **match):
+        seen = match_at(Position(*moved(*HOME, *seen_m)), self.seen_s, fix_sd_m or self.fix_sd_m, **match)
+        self.navigation.correct_by_fix(self.navigation.compare(seen))
+
+    def fix(self):
+        self.take(self.see())
 
 
 def lengths(errors_m):
     return np.hypot(*errors_m.T)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("drift", "wrong"), [(RECKONED, {}), (RECKONED, {"wind": (6.0, 0.0)}), (INERTIAL, {"bias": (0.08, -0.05)})]
-)
-def test_fixes_hold_the_position_and_what_it_says_of_itself_is_true(drift, wrong):
-    flown = Flown(drift, **wrong)
-    flown.fly(60, has_gps=True)
-    errors_m, said_m = flown.fly(200)
-    assert np.median(lengths(errors_m)) < 2.0
-    assert lengths(errors_m).max() < 8.0
-    assert 0.58 <= (abs(errors_m) < said_m[:, None]).mean() <= 0.85
-    assert (abs(errors_m) < 2 * said_m[:, None]).mean() >= 0.9
 
 
 def test_what_an_error_of_the_attitude_does_to_fix_and_path_is_known_to_be_one():
@@ -106,12 +103,10 @@ def test_what_an_error_of_the_attitude_does_to_fix_and_path_is_known_to_be_one()
 
         def fix(flown=flown, told=told):
             flown.bias = flown.bias + flown.rng.normal(0, 0.05, 2)
-            t_s = (flown.step - flown.late_steps) * STEP_S
-            seen = flown.way[flown.step - flown.late_steps] + lean_s2 * flown.bias + flown.rng.normal(0, 0.5, 2)
-            match = match_at(Position(*moved(*HOME, *seen)), t_s, 0.5, 0.0 if told == "nothing" else lean_s2)
-            shown = Lean(tuple(flown.rng.normal(-flown.bias / GRAVITY_M_S2, 0.02)), 0.02)
-            match = replace(match, lean=shown if "shows" in told else None)
-            flown.navigation.hear_fix(flown.navigation.compared(match))
+            seen_m = flown.see(lean_s2 * flown.bias)
+            shown = AttitudeError(tuple(flown.rng.normal(-flown.bias / GRAVITY_M_S2, 0.02)), 0.02)
+            lean = shown if "shows" in told else None
+            flown.take(seen_m, lean=lean, lean_s2=0.0 if told == "nothing" else lean_s2)
 
         flown.fix = fix
         flown.fly(10, has_gps=True, fixes=False)
@@ -127,11 +122,8 @@ def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopi
     lean_s2, wrong = 100 / GRAVITY_M_S2, np.array([0.06, 0.0])  # of the height: 3.4 degrees
 
     def fix():
-        t_s = (flown.step - flown.late_steps) * STEP_S
-        seen = flown.way[flown.step - flown.late_steps] - 100 * wrong + flown.rng.normal(0, 0.5, 2)
-        shown = Lean(tuple(flown.rng.normal(wrong, 0.02)), 0.02)
-        match = replace(match_at(Position(*moved(*HOME, *seen)), t_s, 0.5, lean_s2), lean=shown)
-        flown.navigation.hear_fix(flown.navigation.compared(match))
+        seen_m = flown.see(-100 * wrong)
+        flown.take(seen_m, lean=AttitudeError(tuple(flown.rng.normal(wrong, 0.02)), 0.02), lean_s2=lean_s2)
 
     flown.fix = fix
     errors_m, said_m = flown.fly(120)
@@ -143,22 +135,18 @@ def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopi
 def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_reckon_is_allowed_for(upset, monkeypatch):
     """4.5 degrees within ten seconds, 100 m high: fixes and strides lead 8 m away, and claim a metre."""
     monkeypatch.setattr(drift, "_UPSET", upset)
-    flown, frames = Flown(RECKONED, wind=(5.0, 0.0), fix_sd_m=1.0), []
+    flown, frames = Flown(RECKONED, wind=(5.0, 0.0), fix_sd_m=0.5), []
     flown.fly(30, has_gps=True, fixes=False)
     loss_s, lean_s2 = flown.t_s, 100 / GRAVITY_M_S2
 
     def fix():
-        t_s = (flown.step - flown.late_steps) * STEP_S
-        led_m = 8.0 * min(1.0, max(0.0, t_s - loss_s) / 10.0)
-        seen = flown.way[flown.step - flown.late_steps] + (led_m, 0.0) + flown.rng.normal(0, 0.5, 2)
-        frames.append((t_s, seen))
+        seen_m = flown.see((8.0 * min(1.0, max(0.0, flown.seen_s - loss_s) / 10.0), 0.0))
+        frames.append((flown.seen_s, seen_m))
         stride = None
         if len(frames) > 1:
             (from_s, before), (to_s, now) = frames[-2:]
             stride = Stride(from_s=from_s, to_s=to_s, moved_m=tuple(now - before), sd_m=0.7, inliers=100)
-        match = match_at(Position(*moved(*HOME, *seen)), t_s, 1.0, lean_s2)
-        frame = replace(match.frame, sd_m=1.5, stride=stride)
-        flown.navigation.hear_fix(flown.navigation.compared(replace(match, frame=frame)))
+        flown.take(seen_m, 1.0, lean_s2=lean_s2, sd_m=1.5, stride=stride)
 
     flown.fix = fix
     errors_m, said_m = flown.fly(15)
@@ -169,14 +157,7 @@ def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_rec
 def test_where_no_picture_shows_an_error_of_the_attitude_a_fix_is_not_taken_for_one():
     flown = Flown(RECKONED, wind=(5.0, 0.0), fix_sd_m=2.0)
     flown.fly(10, has_gps=True, fixes=False)
-
-    def fix():
-        t_s = (flown.step - flown.late_steps) * STEP_S
-        seen = flown.way[flown.step - flown.late_steps] + flown.rng.normal(0, 2.0, 2)
-        match = match_at(Position(*moved(*HOME, *seen)), t_s, 2.0, 18.0)
-        flown.navigation.hear_fix(flown.navigation.compared(match))
-
-    flown.fix = fix
+    flown.fix = lambda: flown.take(flown.see(), lean_s2=18.0)
     flown.fly(60)
     errors_m, said_m = flown.fly(400)
     assert np.median(lengths(errors_m)) < 2.5
@@ -184,83 +165,11 @@ def test_where_no_picture_shows_an_error_of_the_attitude_a_fix_is_not_taken_for_
     assert (abs(errors_m) < 2 * said_m[:, None]).mean() > 0.9
 
 
-def test_without_fixes_it_knows_that_it_knows_less_and_less():
-    flown = Flown(RECKONED, wind=(2.0, 0.0))
-    flown.fly(20, has_gps=True)
-    errors_m, said_m = flown.fly(60, fixes=False)
-    assert all(np.diff(said_m) > 0)
-    assert (abs(errors_m) < 2 * said_m[:, None]).all()
-
-
-def test_a_wind_that_fixes_have_shown_carries_on_without_them():
-    flown = Flown(RECKONED, wind=(6.0, 0.0))
-    flown.fly(20, has_gps=True)
-    flown.fly(60)
-    assert flown.navigation.path_drift_m_s() == pytest.approx((6.0, 0.0), abs=1.0)
-    errors_m, said_m = flown.fly(10, fixes=False)
-    assert lengths(errors_m).max() < 12.0, "where 60 m have been added to the way"
-    assert (abs(errors_m) < 2.5 * said_m[:, None]).all()
-
-
 def test_what_all_fixes_are_off_by_is_learnt_while_there_is_gps():
     flown = Flown(RECKONED, map_off=(4.0, -3.0))
     flown.fly(120, has_gps=True)
     errors_m, _ = flown.fly(60)
     assert np.median(lengths(errors_m)) < 2.5, "and not 5 m"
-
-
-def test_one_that_is_believed_against_all_replaces_what_was_known():
-    flown = Flown(RECKONED)
-    flown.fly(20, has_gps=True)
-    flown.fix((300.0, 0.0), Weighed(is_against=True))
-    here = flown.navigation.at(flown.t_s)
-    east_m, north_m = flown.at_m
-    truth = moved(*HOME, east_m + 300.0, north_m)
-    assert distance_m(here.position.lat_deg, here.position.lon_deg, *truth) < 8
-
-
-def test_a_silence_ends_what_is_known_until_the_vehicle_is_heard_with_a_position_again():
-    flown = Flown(RECKONED)
-    flown.fly(10, has_gps=True)
-    flown.step += 200
-    for _ in range(2):
-        flown.navigation.hear_vehicle(vehicle_at(*HOME, flown.t_s, velocity_m_s=(0.0, 0.0), position_sd_m=None))
-        assert flown.navigation.at(flown.t_s) is None
-        assert flown.navigation.compared(match_at(Position(*HOME), flown.t_s, 1.0)) is None
-    flown.navigation.hear_vehicle(vehicle_at(*HOME, flown.t_s, velocity_m_s=(0.0, 0.0), position_sd_m=30.0))
-    assert flown.navigation.at(flown.t_s).accuracy_m == pytest.approx(30.0)
-
-
-def test_by_accelerations_alone_it_begins_with_a_fix():
-    flown = Flown(INERTIAL)
-    assert flown.navigation.at(0.0) is None
-    flown.navigation.begin(Position(*HOME), 3.0, -1.0, 0.0)
-    assert flown.navigation.at(0.0).accuracy_m > 10, "nobody knows how fast it was"
-    errors_m, _ = flown.fly(60)
-    assert lengths(errors_m)[-20:].max() < 6.0
-
-
-def test_a_slewed_position_follows_at_once_and_catches_up_with_a_jump_slowly():
-    flown = Flown(RECKONED)
-    slew = Slew()
-    flown.fly(10, has_gps=True)
-    behind_m = [slew.follow(flown.navigation.at(flown.t_s))[2] for _ in range(2)]
-    assert behind_m == [0.0, 0.0]
-    flown.fix((30.0, 0.0), Weighed(is_against=True))
-    last, steps_m, behind_m = None, [], []
-    for _ in range(150):
-        flown.fly(0.1, fixes=False)
-        here = flown.navigation.at(flown.t_s)
-        lat_deg, lon_deg, behind = slew.follow(here)
-        behind_m.append(behind)
-        if last:
-            steps_m.append(float(distance_m(*last, lat_deg, lon_deg)))
-        last = lat_deg, lon_deg
-    assert behind_m[0] > 20
-    assert behind_m[-1] == pytest.approx(0.0, abs=0.2)
-    assert max(steps_m) < 0.1 * (12 + 2 + 3), "its own speed, the catching up, and what the filter thinks of the speed"
-    slew.reset()
-    assert slew.follow(flown.navigation.at(flown.t_s))[2] == 0.0
 
 
 class Received:
@@ -273,19 +182,19 @@ class Received:
     def fly(self, seconds, off_m=0.0, has_gps=True, estimate_m=300.0, velocity_m_s=(0.0, 0.0)):
         for _ in range(round(seconds * 10)):
             self.t_s += 0.1
-            self.navigation.hear_acceleration(self.t_s, np.zeros(2))
+            self.navigation.add_acceleration(self.t_s, np.zeros(2))
             steady_for_s = self.t_s - self.steady_since_s
             where = moved(*HOME, off_m - RECEIVER_LAG_S * velocity_m_s[0], 0.0)
             known = {"velocity_m_s": velocity_m_s, "steady_for_s": steady_for_s}
             gps = receiver_at(where, 1.0, self.t_s, **known) if has_gps else None
             estimate = moved(*HOME, estimate_m, 0.0)
             known = {"has_gps": has_gps, "gps": gps, "velocity_m_s": (9.0, 0.0), "position_sd_m": 1.0}
-            self.navigation.hear_vehicle(vehicle_at(*estimate, self.t_s, **known), is_estimate_ours=True)
+            self.navigation.add_report(vehicle_at(*estimate, self.t_s, **known), is_estimate_ours=True)
         return self
 
     @property
     def east_m(self):
-        here = self.navigation.at(self.t_s).position
+        here = self.navigation.state_at(self.t_s).position
         return float(offset_m(*HOME, here.lat_deg, here.lon_deg)[0])
 
 
@@ -293,7 +202,7 @@ def test_navigation_beside_accelerations_takes_the_receiver_and_never_the_estima
     flown = Received().fly(20)
     assert flown.east_m == pytest.approx(0.0, abs=0.5)
     assert flown.navigation.has_gps
-    assert Received().fly(5, has_gps=False).navigation.at(5.0) is None, "its estimate may be ours"
+    assert Received().fly(5, has_gps=False).navigation.state_at(5.0) is None, "its estimate may be ours"
 
 
 def test_navigation_allows_for_the_lag_of_a_receiver():
@@ -320,8 +229,8 @@ def test_receiver_that_contradicts_does_not_overrule_recent_matches():
     flown = Received().fly(20)
     for _ in range(5):
         flown.fly(1, off_m=150.0)
-        fix = flown.navigation.compared(match_at(Position(*HOME), flown.t_s, 1.0))
-        flown.navigation.hear_fix(fix)
+        fix = flown.navigation.compare(match_at(Position(*HOME), flown.t_s, 1.0))
+        flown.navigation.correct_by_fix(fix)
     assert not flown.navigation.has_gps
     assert not flown.navigation.is_in_doubt
     assert flown.east_m == pytest.approx(0.0, abs=1.5)
@@ -338,7 +247,16 @@ def test_strides_claim_what_unknown_ground_can_do(zoom, gap_s, least_m, most_m):
         flown.fly(1, has_gps=False)
         stride = Stride(from_s=flown.t_s - 1, to_s=flown.t_s, moved_m=(10.0, 0.0), sd_m=0.2, inliers=100, zoom=zoom)
         flown.navigation._strides_since_fix.add(
-            np.array([10.0, 0.0]), zoom, HeardFrame(t_s=flown.t_s, sd_m=0.2, stride=stride)
+            np.array([10.0, 0.0]), zoom, FrameMeasurement(t_s=flown.t_s, sd_m=0.2, stride=stride)
         )
-        assert number or flown.navigation.at(flown.t_s)
+        assert number or flown.navigation.state_at(flown.t_s)
     assert least_m <= flown.navigation._strides_since_fix.error_m <= most_m
+
+
+def test_by_accelerations_alone_it_begins_with_a_fix():
+    flown = Flown(INERTIAL)
+    assert flown.navigation.state_at(0.0) is None
+    flown.navigation.begin(Position(*HOME), 3.0, -1.0, 0.0)
+    assert flown.navigation.state_at(0.0).accuracy_m > 10, "nobody knows how fast it was"
+    errors_m, _ = flown.fly(60)
+    assert lengths(errors_m)[-20:].max() < 6.0

@@ -102,7 +102,7 @@ def test_what_is_claimed_is_met(how):
         air = lost(seed=seed, **how).fly(10)
         for _ in range(200):
             air.fly(1)
-            here = air.navigator._navigation.at(air.t_s)
+            here = air.navigator._navigation.state_at(air.t_s)
             known.append((*air.off(here.position.lat_deg, here.position.lon_deg), here.accuracy_m))
     known = np.array(known)
     assert (abs(known[:, :2]) < known[:, 2:]).mean() == pytest.approx(0.68, abs=0.1)
@@ -228,15 +228,6 @@ def test_a_continuous_position_holds_and_says_how_good_it_is():
     assert last.alt_m == 300.0
     assert last.attitude == (0.0, 0.0, 0.0)
     assert last.velocity_m_s[:2] == pytest.approx(tuple(air.velocity(air.t_s)), abs=1.5)
-
-
-def test_looking_whether_the_position_is_known_moves_no_continuous_position():
-    told, asked = (lost(inertial(Navigator(1.0, 1.0))) for _ in range(2))
-    for _ in range(50):
-        for air in (told, asked):
-            air.fly(0.1)
-        assert asked.navigator.knows_position(asked.t_s + 0.2)
-    assert told.states == asked.states
 
 
 def test_continuous_position_by_accelerations_alone_ends_after_ten_seconds():

@@ -7,7 +7,7 @@ import pytest
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import PlaceError
 from edgevpr.core.types import Place, Pose, Position
-from edgevpr.runtime.flight.aboard import find_origin
+from edgevpr.runtime.flight.startup import find_origin
 
 
 def place_map(altitudes_m, footprint_m=100.0, lens=None, is_surveyed=False):

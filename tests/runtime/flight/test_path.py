@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edgevpr.core.types import Position
-from edgevpr.runtime.flight.path import KEPT_S, Path, over_ground
+from edgevpr.runtime.flight.path import KEPT_S, Path, to_ground_acceleration
 
 HOME = Position(47.0, 8.0)
 
@@ -68,4 +68,4 @@ def test_what_accelerometers_feel_without_gravity_is_the_acceleration_over_the_g
     earth_from_body = np.array(about["z"]) @ about["y"] @ about["x"]
     north, east, down = 1.2, -0.7, 0.3
     felt = earth_from_body.T @ (np.array([north, east, down]) - [0, 0, 9.81])
-    assert np.allclose(over_ground(tuple(felt), roll_deg, pitch_deg, yaw_deg), (east, north))
+    assert np.allclose(to_ground_acceleration(tuple(felt), roll_deg, pitch_deg, yaw_deg), (east, north))

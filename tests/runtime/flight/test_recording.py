@@ -1,11 +1,7 @@
 """The recording of a flight: what is kept, and how it ends before it harms."""
 
-import json
 import logging
 import os
-import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -14,7 +10,7 @@ from fakes import FakeClock, FakeSource
 from full_disk import no_file_larger_than
 from pictures import textured
 
-from edgevpr.core.errors import EdgevprError, ImageError
+from edgevpr.core.errors import ImageError
 from edgevpr.frames.images import read_image
 from edgevpr.frames.taped import RecordedSource, ReplayedSource
 from edgevpr.review.tape import Playback, read_tape
@@ -118,46 +114,3 @@ def test_the_last_of_the_disk_is_left_to_logs_and_map(tmp_path, monkeypatch):
         tape.note("x")
         until(lambda: tape.state)
     assert "are left" in tape.state
-
-
-def test_where_none_can_be_made_it_says_what_to_do(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(EdgevprError, match=r"log\.record"):
-        Recording(tmp_path / "file", 100)
-    with pytest.raises(EdgevprError, match=r"log\.record"):
-        Recording(tmp_path / "no" / "such", 100)
-
-
-@pytest.mark.slow
-def test_kill_9_costs_no_more_than_what_came_last(tmp_path):
-    script = (
-        "import sys, time\n"
-        "from edgevpr.runtime.flight.recording import Recording\n"
-        "tape = Recording(sys.argv[1], 100)\n"
-        "for number in range(10_000_000):\n"
-        "    tape.keep(b'x' * 100)\n"
-        "    tape.note('frame', number)\n"
-        "    time.sleep(0.001)\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)])
-    tape = tmp_path / "flight-0001" / TAPE
-    until(lambda: tape.exists() and tape.stat().st_size > 2000)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    kept = notes(tape.parent)
-    assert kept == [["frame", number] for number in range(len(kept))]
-    assert all(frame_path(tape.parent, number + 1).stat().st_size == 100 for number in range(len(kept)))
-
-
-def test_a_note_may_come_from_a_handler_of_signals(tmp_path):
-    with Recording(tmp_path, 100) as tape:
-        before = signal.signal(signal.SIGUSR1, lambda *_: tape.note("signal"))
-        try:
-            for number in range(200):
-                os.kill(os.getpid(), signal.SIGUSR1)
-                tape.note("loop", number)
-        finally:
-            signal.signal(signal.SIGUSR1, before)
-    found = [json.dumps(each) for each in notes(tape.path)]
-    assert found.count('["signal"]') == 200
-    assert [each for each in found if "loop" in each] == [f'["loop", {number}]' for number in range(200)]

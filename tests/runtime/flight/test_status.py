@@ -7,7 +7,7 @@ from statuses import STATUS
 
 from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError
-from edgevpr.runtime.flight.status import StatusFile, read_status, usual_path
+from edgevpr.runtime.flight.status import StatusFile, default_path, read_status
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def test_what_is_told_is_read_again_and_the_file_goes_with_the_flight(path):
     with StatusFile(path) as told:
         assert read_status(path) is None
         for queries in (7, 8):
-            told.tell({**STATUS, "queries": queries})
+            told.write({**STATUS, "queries": queries})
             status, age_s = read_status(path)
             assert status == {**STATUS, "queries": queries}
             assert age_s < 60
@@ -33,7 +33,7 @@ def test_the_mode_is_the_same_under_any_umask_and_what_was_left_is_replaced(path
     before = os.umask(0o077)
     try:
         with StatusFile(path) as told:
-            told.tell(STATUS)
+            told.write(STATUS)
             assert path.stat().st_mode & 0o777 == 0o660
             assert read_status(path)[0] == STATUS
     finally:
@@ -44,13 +44,6 @@ def test_the_mode_is_the_same_under_any_umask_and_what_was_left_is_replaced(path
 def test_a_file_that_cannot_be_made_is_refused_by_name(tmp_path, name):
     with pytest.raises(EdgevprError, match=r"status\.file"):
         StatusFile(tmp_path / name)
-
-
-def test_a_disk_that_is_full_ends_no_flight(path):
-    with StatusFile(path) as told:
-        path.with_name(f"{path.name}.new").mkdir()
-        told.tell(STATUS)
-    assert read_status(path) is None
 
 
 @pytest.mark.parametrize("text", ["", "no JSON", "[]", '{"version": 1}', "[" * 100_000])
@@ -64,7 +57,7 @@ def test_once_takes_no_status_of_a_flight_that_is_gone(path, capsys):
     assert main(["top", "--file", str(path), "--once"]) == 1
     assert "--file" in capsys.readouterr().err
     with StatusFile(path) as told:
-        told.tell(STATUS)
+        told.write(STATUS)
         assert main(["top", "--file", str(path), "--once"]) == 0
         os.utime(path, (0, 0))
         assert main(["top", "--file", str(path), "--once"]) == 1
@@ -76,4 +69,11 @@ def test_once_takes_no_status_of_a_flight_that_is_gone(path, capsys):
 )
 def test_a_service_has_a_folder_for_it(monkeypatch, folder, usual):
     monkeypatch.setenv("RUNTIME_DIRECTORY", folder)
-    assert usual_path() == usual
+    assert default_path() == usual
+
+
+def test_a_disk_that_is_full_ends_no_flight(path):
+    with StatusFile(path) as told:
+        path.with_name(f"{path.name}.new").mkdir()
+        told.write(STATUS)
+    assert read_status(path) is None

@@ -44,11 +44,6 @@ def test_neither_a_password_nor_an_escape_gets_into_the_status(manager):
     assert manager.recv(4096) == b"STATUS=rtsp://pilot:***@cam \\x1b[31m lost"
 
 
-def test_without_systemd_nothing_is_sent(monkeypatch):
-    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    notify(READY=1)
-
-
 @pytest.mark.parametrize("address", ["/nowhere/notify", "vsock:2:1234", "/" + "x" * 200, "@" + "x" * 200])
 def test_an_address_that_cannot_be_reached_is_no_error(monkeypatch, address):
     monkeypatch.setenv("NOTIFY_SOCKET", address)
@@ -65,25 +60,22 @@ def test_a_manager_that_does_not_read_does_not_hang_the_flight(manager):
     notify(WATCHDOG=1)
 
 
-def test_the_watchdog_is_fed_twice_in_its_time(monkeypatch):
-    monkeypatch.setenv("WATCHDOG_USEC", "30000000")
-    monkeypatch.delenv("WATCHDOG_PID", raising=False)
-    assert watchdog_interval_s() == 15.0
-    monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
-    assert watchdog_interval_s() == 15.0
-
-
-def test_a_watchdog_of_another_process_is_not_ours(monkeypatch):
-    monkeypatch.setenv("WATCHDOG_USEC", "30000000")
-    monkeypatch.setenv("WATCHDOG_PID", str(os.getpid() + 1))
-    assert watchdog_interval_s() is None
-
-
-@pytest.mark.parametrize("timeout_us", [None, "", "soon", "0", "-5"])
-def test_no_watchdog_without_a_time(monkeypatch, timeout_us):
-    monkeypatch.delenv("WATCHDOG_PID", raising=False)
-    if timeout_us is None:
-        monkeypatch.delenv("WATCHDOG_USEC", raising=False)
-    else:
-        monkeypatch.setenv("WATCHDOG_USEC", timeout_us)
-    assert watchdog_interval_s() is None
+@pytest.mark.parametrize(
+    ("timeout_us", "pid_ahead", "interval_s"),
+    [
+        ("30000000", None, 15.0),
+        ("30000000", 0, 15.0),
+        ("30000000", 1, None),
+        (None, None, None),
+        ("soon", None, None),
+        ("0", None, None),
+        ("-5", None, None),
+    ],
+)
+def test_watchdog_interval_is_half_of_the_time_of_this_process(monkeypatch, timeout_us, pid_ahead, interval_s):
+    pid = None if pid_ahead is None else os.getpid() + pid_ahead
+    for name, value in (("WATCHDOG_USEC", timeout_us), ("WATCHDOG_PID", pid)):
+        monkeypatch.delenv(name, raising=False)
+        if value is not None:
+            monkeypatch.setenv(name, str(value))
+    assert watchdog_interval_s() == interval_s

@@ -21,7 +21,7 @@ from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.examine import select
 from edgevpr.places.index import bytes_per_place
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.tilemap import TileIndex, TileMap
+from edgevpr.places.tilemap import TileMap
 from edgevpr.power.boards import load_board
 from edgevpr.review.compare import compare
 from edgevpr.review.replay import replay
@@ -179,24 +179,19 @@ def test_no_query_waits_for_a_tile(folder, tmp_path, monkeypatch):
     assert not any(line["accepted"] for line in queries[:5])
 
 
-def test_a_tile_that_cannot_be_read_is_said_once_and_flown_past(folder, tmp_path):
+@pytest.mark.parametrize("how", ["damaged", "of another technique"])
+def test_a_tile_that_cannot_be_used_is_said_once_and_flown_past(folder, tmp_path, how):
     flight = TiledFlight(folder, tmp_path / "log")
-    damaged = folder / f"{flight.map.keys[tile_at(flight.map, 8)]}.gpkg"
-    damaged.write_bytes(b"nothing")
+    tile = folder / f"{flight.map.keys[tile_at(flight.map, 8)]}.gpkg"
+    tile.unlink()
+    if how == "damaged":
+        tile.write_bytes(b"nothing")
+    else:
+        PlaceMap.create(tile, create("cohog", {"camera": "nadir"}).spec).close()
     queries = flight.fly([8, 8, 8, 8, 14, 14, 14, 14])
     (said,) = of_kind(flight.lines, "tile")
-    assert damaged.name in said["problem"]
+    assert (tile.name if how == "damaged" else "w1 is 512, not 256") in said["problem"]
     assert queries[-1]["accepted"]
-
-
-def test_a_tile_of_another_technique_is_not_used(folder, tmp_path):
-    flight = TiledFlight(folder, tmp_path / "log")
-    other = folder / f"{flight.map.keys[tile_at(flight.map, 8)]}.gpkg"
-    other.unlink()
-    with PlaceMap.create(other, create("cohog", {"camera": "nadir"}).spec):
-        pass
-    flight.fly([8, 8, 8, 8])
-    assert "w1 is 512, not 256" in of_kind(flight.lines, "tile")[0]["problem"]
 
 
 def test_a_flight_ends_while_a_tile_is_being_loaded(folder, tmp_path):
@@ -231,21 +226,3 @@ def test_a_folder_is_flown_over_and_nothing_else(folder, tmp_path):
     (tmp_path / "none").mkdir()
     with pytest.raises(MapError, match="no folder of maps"):
         TileMap.open(tmp_path / "none")
-
-
-def test_tiles_lie_one_after_the_other_and_those_searched_together_side_by_side():
-    tiles = TileIndex(TECHNIQUE.spec, 10)
-    for tile, count in enumerate((3, 2, 4)):
-        slots = tiles.beyond()
-        slots.place_ids[:count] = 100 * tile + np.arange(count)
-        slots.rows[:count] = tile
-        tiles.add(tile, count)
-    assert tiles.of([1, 2]).place_ids.tolist() == [100, 101, 200, 201, 202, 203]
-    assert tiles.of([]).place_ids.tolist() == []
-    both = tiles.of([0, 2])
-    assert both.place_ids.tolist() == [0, 1, 2, 200, 201, 202, 203]
-    assert both.rows[:, 0].tolist() == [0] * 3 + [2] * 4
-    tiles.drop(0)
-    assert (tiles.tiles, tiles.free) == ((1, 2), 4)
-    assert tiles.of([2]).place_ids.tolist() == [200, 201, 202, 203]
-    assert tiles.of(tiles.tiles).rows[:, 0].tolist() == [1] * 2 + [2] * 4

@@ -73,15 +73,6 @@ def test_lines_that_a_pulled_battery_cut_are_left_out_of_every_file(path, flown)
     assert flight_of(path).missing is None
 
 
-def test_the_last_of_several_flights_in_a_file_is_taken(path):
-    other = path.with_name("old")
-    for begin in (0, 10):
-        fly(path, range(begin, begin + 1), version=str(begin))
-        with open(other, "ab") as old:
-            old.write(path.read_bytes() + b'{"kind": "que\n')
-    assert numbers(flight_of(other)) == [10]
-
-
 def test_a_file_repeats_its_own_start_line_where_the_medium_came_back_as_another(path):
     start = {"kind": "start", "time": "t", "t_mono_s": 1.0}
     again = {**start, "repeated": True, "part": 2}

@@ -12,7 +12,7 @@ from edgevpr.frames.level import View
 from edgevpr.lab.simulate.camera import CameraPose
 from edgevpr.runtime.recognise.agreement import agreement
 from edgevpr.runtime.recognise.landmarks import OF_QUERY, describe
-from edgevpr.runtime.recognise.perspective import fit_lean
+from edgevpr.runtime.recognise.perspective import fit_attitude_error
 
 FOCAL = 0.77  # shares of the longest side: 66 degrees across
 SEEN = View(aside=(0.0, 0.0), focal=FOCAL, up_deg=0.0)
@@ -39,7 +39,7 @@ def landmarks(count=60, roll_deg=0.0, pitch_deg=0.0, turned_deg=0.0, scale=1.0, 
 def test_a_tilt_moves_the_point_under_the_camera_against_it(roll_deg, pitch_deg, turned_deg, scale):
     """Right wing down, the middle of the picture is to the left: the aircraft is right of it."""
     asked, known = landmarks(roll_deg=roll_deg, pitch_deg=pitch_deg, turned_deg=turned_deg, scale=scale)
-    lean = fit_lean(asked, known, SEEN, up_deg=turned_deg)
+    lean = fit_attitude_error(asked, known, SEEN, up_deg=turned_deg)
     along = np.array([math.tan(math.radians(roll_deg)), -math.tan(math.radians(pitch_deg))])  # right, ahead
     turned = math.radians(turned_deg)
     east = along[0] * math.cos(turned) + along[1] * math.sin(turned)
@@ -49,7 +49,8 @@ def test_a_tilt_moves_the_point_under_the_camera_against_it(roll_deg, pitch_deg,
 
 
 def test_it_is_as_exact_as_it_says():
-    told = [fit_lean(*landmarks(roll_deg=2.0, noise=2 / 640, count=count), SEEN, 0.0) for count in (30, 60, 120, 240)]
+    seen = (landmarks(roll_deg=2.0, noise=2 / 640, count=count) for count in (30, 60, 120, 240))
+    told = [fit_attitude_error(*each, SEEN, 0.0) for each in seen]
     for lean in told:
         assert lean.over_height[0] == pytest.approx(math.tan(math.radians(2.0)), abs=2 * lean.sd)
         assert lean.over_height[1] == pytest.approx(0.0, abs=2 * lean.sd)
@@ -58,7 +59,7 @@ def test_it_is_as_exact_as_it_says():
 
 def test_the_point_under_the_camera_may_be_beside_the_middle():
     aside = (0.2, -0.1)
-    lean = fit_lean(*landmarks(roll_deg=2.0, aside=aside), View(aside=aside, focal=FOCAL), 0.0)
+    lean = fit_attitude_error(*landmarks(roll_deg=2.0, aside=aside), View(aside=aside, focal=FOCAL), 0.0)
     assert lean.over_height == pytest.approx((math.tan(math.radians(2.0)), 0.0), abs=0.005)
 
 
@@ -67,20 +68,20 @@ def test_a_slope_of_the_ground_is_no_tilt():
     asked, known = landmarks(count=60, noise=2 / 640)
     beside = asked.real > -0.1  # the pictures overlap on one side only
     sheared = (known + 0.03 * asked.conj())[beside]
-    lean = fit_lean(asked[beside], sheared, SEEN, 0.0)
+    lean = fit_attitude_error(asked[beside], sheared, SEEN, 0.0)
     assert math.hypot(*lean.over_height) < 2 * lean.sd < 0.1
 
 
 @pytest.mark.parametrize("view", [View(), View(aside=(0.0, 0.0)), View(focal=FOCAL)])
 def test_without_attitude_or_lens_nothing_is_said(view):
-    assert fit_lean(*landmarks(roll_deg=2.0), view, 0.0) is None
+    assert fit_attitude_error(*landmarks(roll_deg=2.0), view, 0.0) is None
 
 
 def test_few_landmarks_or_those_on_a_line_say_nothing():
     asked, known = landmarks(count=11)
-    assert fit_lean(asked, known, SEEN, 0.0) is None
+    assert fit_attitude_error(asked, known, SEEN, 0.0) is None
     line = np.linspace(-0.4, 0.4, 20) + 0j
-    lean = fit_lean(line, line, SEEN, 0.0)
+    lean = fit_attitude_error(line, line, SEEN, 0.0)
     assert lean is None or lean.sd > 1.0
 
 
@@ -99,7 +100,7 @@ def test_pictures_show_by_how_much_the_reported_attitude_is_wrong(ground, roll_d
     )
     query = view_from(ground, pose, replace(pose, roll_deg=told_roll_deg, pitch_deg=0.0))
     found = agreement(describe(query.image, query.mask, OF_QUERY), describe(place.image, place.mask))
-    lean = fit_lean(*found.coinciding, query.view, found.rotation_deg)
+    lean = fit_attitude_error(*found.coinciding, query.view, found.rotation_deg)
     # The left wing is up: the camera looks to the left, and the aircraft is right of where it is taken to be.
     right, ahead = (math.tan(math.radians(each)) for each in (roll_deg - told_roll_deg, -pitch_deg))
     turned = math.radians(40.0)

@@ -55,7 +55,7 @@ def test_run_writes_its_status_and_opens_no_port(fly, tmp_path, capsys):
     shown = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
     for label in ("edgevpr", "frames", "rate", "queries", "CPU", "RAM", "heat", "charge", "match", "newest", "link"):
         assert shown[label]
-    assert re.search(r"place \d+ \(\d\d\.png\), confidence 0\.9\d+", shown["match"])
+    assert re.search(r"place \d+ \(\d\d\.png\), confidence \d", shown["match"])
     run.terminate()
     said = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, said

@@ -1,4 +1,4 @@
-"""Talk of a flight with people. The herald reports to the journal (the log of the process), to
+"""Talk of a flight with people. The notifier reports to the journal (the log of the process), to
 the flight log and to the ground station; all observers report through it. `Commands` does what ground stations ask."""
 
 import logging
@@ -20,24 +20,24 @@ _TEXTS = {
 _log = logging.getLogger(__name__)
 
 
-class Herald:
+class Notifier:
     """Reports what happens in a flight. Without a `link` nothing is sent to the ground station."""
 
     def __init__(self, flight_log: FlightLog, link: Link | None) -> None:
         self._flight_log, self._link = flight_log, link
 
-    def note(self, kind: str, **fields: Any) -> None:
+    def log(self, kind: str, **fields: Any) -> None:
         """Write a line to the flight log only."""
         self._flight_log.write(kind, **fields)
 
-    def say(self, severity: Severity, text: str, *, ground: str | None = None, topic: str | None = None) -> None:
+    def announce(self, severity: Severity, text: str, *, ground: str | None = None, topic: str | None = None) -> None:
         """Write a text to the journal, and queue it for the ground station (the shorter text `ground` instead, if
         given). A text that still waits is replaced by a newer one of the same `topic`."""
         _log.log(logging.WARNING if severity is Severity.WARNING else logging.INFO, "%s", text)
         if self._link:
             self._link.announce(severity, ground or text, topic)
 
-    def tell(
+    def report(
         self,
         kind: str,
         severity: Severity,
@@ -49,34 +49,34 @@ class Herald:
     ) -> None:
         """Report to flight log, journal and ground station: write a line of `kind` with `fields` to the flight log, and
         `say` the text to the other two. Without a `topic`, the kind is the topic of the text."""
-        self.note(kind, **fields)
-        self.say(severity, text, ground=ground, topic=topic or kind)
+        self.log(kind, **fields)
+        self.announce(severity, text, ground=ground, topic=topic or kind)
 
 
 class Trouble:
     """Reports a bad condition once when it begins, with the text `begun`, and once when it ends, with the text `over`.
     `kind` is that of its lines in the flight log. `is_so`: the condition holds."""
 
-    def __init__(self, herald: Herald, kind: str, begun: str, over: str) -> None:
+    def __init__(self, notifier: Notifier, kind: str, begun: str, over: str) -> None:
         self.is_so = False
-        self._herald, self._kind, self._begun, self._over = herald, kind, begun, over
+        self._notifier, self._kind, self._begun, self._over = notifier, kind, begun, over
 
-    def note(self, is_so: bool) -> None:
+    def update(self, is_so: bool) -> None:
         """Set whether the condition holds now, and report if that has changed."""
         if is_so == self.is_so:
             return
         self.is_so = is_so
         text = self._begun if is_so else self._over
-        self._herald.tell(self._kind, Severity.WARNING if is_so else Severity.INFO, text, said=text)
+        self._notifier.report(self._kind, Severity.WARNING if is_so else Severity.INFO, text, said=text)
 
 
 class Commands:
     """Carries out the requests (`Wish`) of ground stations. While the flight `is_paused`, nothing is recognised and no
     fix is sent. Learning can be switched only if there is a learner and it works."""
 
-    def __init__(self, link: Link | None, herald: Herald, learner: Learner | None) -> None:
+    def __init__(self, link: Link | None, notifier: Notifier, learner: Learner | None) -> None:
         self.is_paused = False
-        self._link, self._herald, self._learner = link, herald, learner
+        self._link, self._notifier, self._learner = link, notifier, learner
 
     @property
     def summary(self) -> str | None:
@@ -102,6 +102,6 @@ class Commands:
                 self._learner.is_off = wished.wish is Wish.LEARN_NOTHING
         is_new = before != self.summary
         text, topic = _TEXTS[wished.wish]
-        self._herald.note("command", wish=wished.wish.name, sender=wished.sender, said=text, is_new=is_new)
+        self._notifier.log("command", wish=wished.wish.name, sender=wished.sender, said=text, is_new=is_new)
         if is_new:  # a command repeated because its answer was lost changes nothing
-            self._herald.say(Severity.INFO, f"{text}, as {wished.sender} wishes", ground=text, topic=topic)
+            self._notifier.announce(Severity.INFO, f"{text}, as {wished.sender} wishes", ground=text, topic=topic)

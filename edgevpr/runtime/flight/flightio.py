@@ -1,6 +1,5 @@
-"""The world of a flight: all that it takes in from outside and sends outside. In the air (`in_the_air`) these are real
-cameras, clocks and links, with a recording of all input if one is configured; in a replay they come from the
-recording's tape. The code of the flight is the same."""
+"""All that a flight reads from outside and sends outside. In the air (`open_real_io`) these are real cameras, clocks
+and links, with a recording if one is configured; in a replay they come from the recording."""
 
 import ctypes
 import logging
@@ -28,12 +27,12 @@ from edgevpr.mavlink.wire import Tap, untapped
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.autopilot import ToAutopilot
-from edgevpr.runtime.flight.clock import Clock, taped
+from edgevpr.runtime.flight.clock import Clock, record_clock
 from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.flight.herald import Herald
 from edgevpr.runtime.flight.metering import FlightMeter
+from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.flight.recording import Recording
-from edgevpr.runtime.flight.status import StatusFile, usual_path
+from edgevpr.runtime.flight.status import StatusFile, default_path
 from edgevpr.runtime.flight.tiles import Tiles
 from edgevpr.runtime.recognise.learn import Learner, check_positions
 from edgevpr.runtime.recognise.opening import has_map
@@ -43,13 +42,10 @@ T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
-# Parameters of `mallopt` (glibc's malloc.h) and their values, bytes: how much of what was freed is kept, and from which
-# size on a part of memory is given back to the system as soon as it is freed. Left alone, glibc raises both as larger
-# parts are freed: a flight over many places then holds more than it uses. At half of these it is slower.
+# Parameters of `mallopt` (glibc's malloc.h), bytes: how much freed memory is kept, and from which size on it is given
+# back at once. Left alone, glibc raises both, and a flight over many places holds more than it uses. Half is slower.
 _MALLOC = {-1: 8_000_000, -3: 4_000_000}
-
-
-_TELL_S = 0.3
+_WARN_S = 0.3
 _END_S = 4.0  # from a signal to the end of the process, if it does not end by itself: systemd waits five seconds
 
 
@@ -58,8 +54,8 @@ class StopNow(BaseException):
 
 
 class Stop:
-    """Signal handler that ends a flight: by StopNow while a frame is recognised and before the flight begins, so that
-    long work does not delay the end, otherwise after the present pass of the loop."""
+    """Signal handler that ends a flight: by StopNow before it begins and while a frame is recognised, otherwise after
+    the present pass of the loop."""
 
     def __init__(self, tape: Tape = NO_TAPE) -> None:
         self._tape = tape
@@ -81,8 +77,7 @@ class Stop:
 
     @contextmanager
     def beginning(self) -> Iterator[None]:
-        """Context manager for the start of a flight: a signal, also an earlier one, raises StopNow inside it. This is
-        not recorded, since nothing has been flown that could be replayed."""
+        """Context manager for the start of a flight: a signal, also an earlier one, raises StopNow. Not recorded."""
         self._begins = True
         try:
             if self._asked:
@@ -103,15 +98,11 @@ class Stop:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class World:
-    """External parts of a flight: all that it reads from and writes to. A replay replaces them.
-    - `place_map`: path of the map (None: none is configured); `log`: settings of the flight log
-    - `tape`: records all input of the flight, or plays it back (see `Tape`)
-    - `open_source`: opens the source of frames, given the seconds between two frames
-    - `link`, `ground`: classes of the links to the autopilot and to the ground station
-    - `signing`: of their packets; `tap`: is called with each packet sent or received
-    - `status`: the status file (None: none is written); `recording`: folder of the recording (None: there is none).
-    """
+class FlightIO:
+    """Inputs and outputs of a flight: `place_map`, the path of its map; settings of its `log`; the `tape` that records
+    all input or plays it back; `open_source`, given the seconds between two frames; classes of the `link` to the
+    autopilot and to the `ground` station, `signing` of their packets, and `tap`, called with each packet; the `status`
+    file; and the folder of the `recording`. None: there is none."""
 
     board: Board
     place_map: str | None
@@ -129,9 +120,8 @@ class World:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Crew:
-    """All opened parts of a flight that work together; None: the flight has no such part. `fewer_candidates` are the
-    numbers of candidates that the governor may lower to."""
+class FlightParts:
+    """All opened parts of a flight (None: it has no such part)."""
 
     recogniser: Recogniser
     learner: Learner | None = None
@@ -141,20 +131,16 @@ class Crew:
     ground: Link | None = None
     autopilot: ToAutopilot | None = None
     flight_log: FlightLog
-    herald: Herald
+    notifier: Notifier
     meter: FlightMeter
-    clock: Clock
-    stop: Stop
-    status: StatusFile | None = None
-    fewer_candidates: tuple[int, ...] = ()
+    io: FlightIO
 
 
 @contextmanager
-def in_the_air(config: Config, positions: Path | None = None, steps_s: Sequence[float] = ()) -> Iterator[World]:
-    """Open all inputs and outputs of a real flight, yield them, and close them at the end; meanwhile SIGTERM and SIGINT
-    end the flight. `positions` is a file with the positions of the frames, if the source is a recording (None: there is
-    none), and `steps_s` the seconds between them, if it is flown by its times. Raises an EdgevprError if something
-    cannot be opened."""
+def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequence[float] = ()) -> Iterator[FlightIO]:
+    """Open the inputs and outputs of a real flight, yield and close them; meanwhile SIGTERM and SIGINT end the flight.
+    Of a source that is a recording, `positions` is the file with those of its frames, and `steps_s` the seconds between
+    them (empty: they come at the rate). Raises EdgevprError."""
     uri = config.source.uri
     if uri is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
@@ -166,17 +152,17 @@ def in_the_air(config: Config, positions: Path | None = None, steps_s: Sequence[
         for parameter, value in _MALLOC.items():
             mallopt(parameter, value)
     with ExitStack() as stack:
-        recording = _or_without(lambda: _recording(config, stack))
+        recording = _open_optional(lambda: _open_recording(config, stack))
         folder = str(recording.path.resolve()) if recording else None
         tape: Tape = recording or NO_TAPE
         header = {"version": __version__, "config": asdict(config), "board": asdict(board), "recording": folder}
         tape.note("flight", header)
-        status_path = config.status.file or usual_path()
-        status = _or_without(lambda: stack.enter_context(StatusFile(status_path))) if status_path else None
+        status_path = config.status.file or default_path()
+        status = _open_optional(lambda: stack.enter_context(StatusFile(status_path))) if status_path else None
         tlog_path = config.log.tlog if config.mavlink.link else None
-        tlog = _or_without(lambda: stack.enter_context(Tlog(tlog_path))) if tlog_path else None
+        tlog = _open_optional(lambda: stack.enter_context(Tlog(tlog_path))) if tlog_path else None
 
-        def opened_source(step_s: float) -> Source:
+        def open_recorded(step_s: float) -> Source:
             source = open_source(uri, step_s=step_s, positions=positions, live=True, steps_s=steps_s)
             if steps_s:
                 _log.info("%d pictures come by their own times, in %.0f s", source.total, sum(steps_s))
@@ -184,13 +170,13 @@ def in_the_air(config: Config, positions: Path | None = None, steps_s: Sequence[
                 _log.info("pictures come at %.3g a second: not all have a time, in their order", 1 / step_s)
             return RecordedSource(source, recording, recording.keep) if recording else source
 
-        world = World(
+        io = FlightIO(
             board=board,
             place_map=config.map,
             log=config.log,
             tape=tape,
-            clock=taped(Clock(), tape) if recording else Clock(),
-            open_source=opened_source,
+            clock=record_clock(Clock(), tape) if recording else Clock(),
+            open_source=open_recorded,
             link=Link,
             ground=GroundLink,
             signing=open_signing(config.mavlink.signing_key, config.mavlink.signing_state),
@@ -199,11 +185,11 @@ def in_the_air(config: Config, positions: Path | None = None, steps_s: Sequence[
             status=status,
             recording=folder,
         )
-        with _signals(world.stop):
-            yield world
+        with _signals(io.stop):
+            yield io
 
 
-def _recording(config: Config, stack: ExitStack) -> Recording | None:
+def _open_recording(config: Config, stack: ExitStack) -> Recording | None:
     """Begin the recording, which `stack` closes; return None if none is configured."""
     if config.log.record is None:
         return None
@@ -213,8 +199,8 @@ def _recording(config: Config, stack: ExitStack) -> Recording | None:
     return recording
 
 
-def _or_without(opened: Callable[[], T]) -> T | None:
-    """Return the result of `opened`; None, with a warning, if that fails in a service: it flies on without."""
+def _open_optional(opened: Callable[[], T]) -> T | None:
+    """Return the result of `opened`; None, with a warning, if that fails in a service, which flies on without."""
     try:
         return opened()
     except EdgevprError as error:
@@ -226,15 +212,14 @@ def _or_without(opened: Callable[[], T]) -> T | None:
 
 @contextmanager
 def _signals(stop: Stop) -> Iterator[None]:
-    """Context manager: SIGTERM and SIGINT call `stop` inside it, and end the process if that has not left it after four
-    seconds. SIGHUP is ignored: a closed terminal ends no flight."""
+    """Context manager: SIGTERM and SIGINT call `stop`, and end the process after four seconds. SIGHUP is ignored: a
+    closed terminal ends no flight."""
     handlers: dict[signal.Signals, Stop | signal.Handlers] = {signal.SIGTERM: stop, signal.SIGINT: stop}
     handlers[signal.SIGHUP] = signal.SIG_IGN
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
-    # Python calls `stop` in the main thread only, once that has returned from where it is, which may be a call that
-    # hangs. The number of the signal is written here at once.
+    # Python calls `stop` in the main thread, which may hang. The number of the signal is written here at once.
     before_writer = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     has_ended = threading.Event()
     watch = threading.Thread(target=_end_in_time, args=(reader, has_ended), name="end", daemon=True)
@@ -252,14 +237,13 @@ def _signals(stop: Stop) -> Iterator[None]:
 
 
 def _end_in_time(reader: int, has_ended: threading.Event) -> None:
-    """Wait for a signal from the pipe `reader` that ends the flight, then for `has_ended`. End the process if that does
-    not come in time. The lines of the flight log are in its file by then; memory and locks of a thread that hangs are
-    given back by the kernel alone."""
+    """End the process if a signal comes from the pipe `reader`, and `has_ended` not soon after. The lines of the flight
+    log are in its file by then."""
     while number := os.read(reader, 1):
         if number[0] in (signal.SIGTERM, signal.SIGINT) and not has_ended.wait(_END_S):
             text = "the flight does not end by itself: its process is ended"
             # In a thread, as the one that hangs may be within a message.
-            telling = threading.Thread(target=_log.warning, args=(text,), daemon=True)
-            telling.start()
-            telling.join(_TELL_S)
+            warning = threading.Thread(target=_log.warning, args=(text,), daemon=True)
+            warning.start()
+            warning.join(_WARN_S)
             os._exit(1)

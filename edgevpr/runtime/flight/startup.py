@@ -1,5 +1,4 @@
-"""Opening of the map, the recogniser and the learner, and the first line of the flight log, which records all that a
-flight depends on. `flight` does this before it opens the links and the source of frames."""
+"""The start of a flight: opening of map, recogniser and learner, and the first line of the flight log."""
 
 import logging
 import math
@@ -25,7 +24,7 @@ from edgevpr.places.readmap import ReadMap
 from edgevpr.places.tilemap import TileMap
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import OwnMemory, QueryMeter
-from edgevpr.runtime.flight.world import World
+from edgevpr.runtime.flight.flightio import FlightIO
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import Outlook, outlook, picked_technique
 from edgevpr.runtime.recognise.learn import Learner
@@ -40,21 +39,17 @@ _LIBRARIES = ("numpy", "cv2", "onnxruntime")
 _log = logging.getLogger(__name__)
 
 
-def open_map(config: Config, world: World) -> tuple[Recogniser, Learner | None, str | None]:
+def open_map(config: Config, io: FlightIO) -> tuple[Recogniser, Learner | None, str | None]:
     """Open the recogniser of a flight. Returns it, its learner (None: no places are learnt), and why it cannot learn
-    (None: it can, or is not asked to).
-
-    If the map cannot be written (a memory card that has become read-only, a full disk), only the recogniser is opened:
-    the places of the map can still be recognised. Raises an EdgevprError if the map cannot be opened.
-    """
-    here, meter = replace(config, map=world.place_map), _query_meter(config, world)
-    name = world.tape.read("picked", lambda: _picked(config))
+    (None: it can, or is not asked to), as on a memory card that has become read-only. Raises EdgevprError."""
+    here, meter = replace(config, map=io.place_map), _make_query_meter(config, io)
+    name = io.tape.read("picked", lambda: _pick_technique(config))
 
     @cache
     def learning() -> tuple[Recogniser, Learner]:
-        recogniser, growing = open_learning(here, world.board, name, meter)
+        recogniser, growing = open_learning(here, io.board, name, meter)
         spacing_m, gap_m = config.mapping.spacing_m, config.salience.gap_m
-        return recogniser, Learner(recogniser, growing, spacing_m=spacing_m, gap_m=gap_m, utc_clock=world.clock.utc_s)
+        return recogniser, Learner(recogniser, growing, spacing_m=spacing_m, gap_m=gap_m, utc_clock=io.clock.utc_s)
 
     def problem() -> str | None:
         try:
@@ -64,11 +59,11 @@ def open_map(config: Config, world: World) -> tuple[Recogniser, Learner | None, 
             return str(error)
         return None
 
-    cannot_learn = world.tape.read("cannot_learn", problem)
+    cannot_learn = io.tape.read("cannot_learn", problem)
     if config.mapping.learn and not cannot_learn:
         return *learning(), None
     try:
-        recogniser = open_recogniser(here, world.board, narrowed=True, follows=config.match.follow, meter=meter)
+        recogniser = open_recogniser(here, io.board, narrowed=True, follows=config.match.follow, meter=meter)
     except MapError:
         if cannot_learn:
             raise MapError(cannot_learn) from None
@@ -76,42 +71,41 @@ def open_map(config: Config, world: World) -> tuple[Recogniser, Learner | None, 
     return recogniser, None, cannot_learn
 
 
-def _query_meter(config: Config, world: World) -> QueryMeter:
+def _make_query_meter(config: Config, io: FlightIO) -> QueryMeter:
     """Make the meter of the queries of a flight, by its clock."""
     memory = OwnMemory()
     return QueryMeter(
-        world.board,
+        io.board,
         parse_pack(config.battery.pack),
         config.battery.regulator_efficiency,
-        wall_clock=world.clock.wall_s,
-        cpu_clock=world.clock.process_cpu_s,
-        memory_mb=lambda: world.tape.read("memory_mb", memory.look),
+        wall_clock=io.clock.wall_s,
+        cpu_clock=io.clock.process_cpu_s,
+        memory_mb=lambda: io.tape.read("memory_mb", memory.look),
     )
 
 
-def look_ahead(recogniser: Recogniser, config: Config, world: World) -> Outlook:
-    """Measure how fast the technique is on this board, and set the recogniser to compare as many candidates as there is
-    time for. Returns the expected performance (see `Outlook`)."""
-    found = Outlook(*world.tape.read("outlook", lambda: astuple(outlook(recogniser, config))))
+def measure_speed(recogniser: Recogniser, config: Config, io: FlightIO) -> Outlook:
+    """Measure how fast the technique is on this board, and have as many candidates compared as there is time for."""
+    found = Outlook(*io.tape.read("outlook", lambda: astuple(outlook(recogniser, config))))
     recogniser.change(candidates=found.candidates)
     return found
 
 
-def _picked(config: Config) -> str | None:
+def _pick_technique(config: Config) -> str | None:
     """Return the configured technique (None: that of the map), or for a map yet to be made the best for the board."""
     if config.mapping.learn and config.technique is None and config.map is not None and not has_map(Path(config.map)):
         return picked_technique(config.board, _NEW_MAP_PLACES, config.source.camera)
     return config.technique
 
 
-def rate_hz(config: Config, recogniser: Recogniser) -> float:
+def choose_rate_hz(config: Config, recogniser: Recogniser) -> float:
     """Return the queries per second: the configured rate, or else that of the board's profile."""
     return config.source.rate_hz or recogniser.meter.board.rate_hz
 
 
-def at_recorded_rate(config: Config, steps_s: Sequence[float]) -> Config:
-    """Return the configuration of a flight over pictures that come `steps_s` apart (empty: not by their times): with
-    the rate at which most of them come."""
+def apply_recorded_rate(config: Config, steps_s: Sequence[float]) -> Config:
+    """Return the configuration with the rate at which most pictures of a recording come, `steps_s` apart (empty: as it
+    is configured)."""
     if not steps_s:
         return config
     usual_hz = 1 / median(step_s for step_s in steps_s if step_s > 0)
@@ -120,9 +114,8 @@ def at_recorded_rate(config: Config, steps_s: Sequence[float]) -> Config:
 
 
 def find_origin(place_map: ReadMap, source: SourceConfig) -> Position | None:
-    """Return the first position of a map (None: it has none), with the altitude of the ground: the median, over the
-    first places, of the altitude of the camera less its height. The height follows from the footprint and the lens,
-    which is taken to be that of the map. The altitude is None if altitudes, footprints or the lens are unknown."""
+    """Return the first position of a map (None: it has none), at the altitude of the ground: the median, over the first
+    places, of the camera's altitude less its height by footprint and lens. The altitude is None if one is unknown."""
     first, altitudes_m, lens = None, [], lens_of(source)
     has_lens_of_map = place_map.lens is None or place_map.lens == (source.lens and Path(source.lens).name)
     with suppress(PlaceError):  # a damaged place ends the search
@@ -135,10 +128,10 @@ def find_origin(place_map: ReadMap, source: SourceConfig) -> Position | None:
     return first and Position(first.lat_deg, first.lon_deg, median(altitudes_m) if altitudes_m else None)
 
 
-def say_start(config: Config, world: World, recogniser: Recogniser, found: Outlook) -> dict[str, Any]:
-    """Report the technique that is used; warn if fixes would be too late or the board's power is unverified. Return the
-    fields of the first line of the flight log."""
-    board = world.board
+def log_start(config: Config, io: FlightIO, recogniser: Recogniser, found: Outlook) -> dict[str, Any]:
+    """Log which technique is used, and what its fixes or figures lack; return the fields of the flight log's first
+    line."""
+    board = io.board
     _log.info("version %s on %s", __version__, board.title)
     _log.info("%s", found.reason)
     sends = config.mavlink.link is not None and config.mavlink.send_fixes
@@ -152,19 +145,18 @@ def say_start(config: Config, world: World, recogniser: Recogniser, found: Outlo
         "candidates": recogniser.candidates,
         "sequence": recogniser.sequence,
         "accuracy_m": recogniser.accuracy_m,
-        "rate_hz": rate_hz(config, recogniser),
+        "rate_hz": choose_rate_hz(config, recogniser),
         "idle_w": board.idle_w,
         "full_w": board.full_w,
         "power_verified": board.verified,
         "dry_run": not config.mavlink.send_fixes,
     }
     fields = start_fields(config, board.name, recogniser.technique.spec, recogniser.place_map)
-    return {**fields, "recording": world.recording, "decided": decided}
+    return {**fields, "recording": io.recording, "decided": decided}
 
 
 def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map: ReadMap) -> dict[str, Any]:
-    """Return the fields of the first line of a flight log (kind "start"): all that a flight depends on, except its
-    pictures and its autopilot. Only libraries that are loaded have their version listed."""
+    """Return the fields of a flight log's first line (kind "start"): all that a flight depends on but what comes in."""
     loaded = {name: getattr(sys.modules.get(name), "__version__", None) for name in _LIBRARIES}
     return {
         "version": __version__,
