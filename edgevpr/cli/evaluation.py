@@ -37,26 +37,47 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     """Add the command and its flags."""
-    parser = command(commands, "eval", evaluate, "measure techniques on a data set with ground truth")
-    parser.add_argument("--data", nargs="+", metavar="FOLDER", help="a data set of any known layout; several: --out")
-    parser.add_argument("--sets", metavar="FILE", help="YAML: many sets by many rows, with --out")
-    parser.add_argument("--out", metavar="FOLDER", help="write results.json and a page; an interrupted run goes on")
-    parser.add_argument("--workers", type=count, metavar="N", help="with --out: processes at work (all cores)")
-    video = "a folder of images, or a video with its positions beside it (FLIGHT.mp4 and .csv: time,lat,lon[,...])"
+    parser = command(commands, "eval", evaluate, "evaluate techniques on a data set with ground truth")
+    parser.add_argument("--data", nargs="+", metavar="FOLDER", help="data set in any known layout; several need --out")
+    parser.add_argument("--sets", metavar="FILE", help="YAML file of many data sets and settings; needs --out")
+    parser.add_argument(
+        "--out", metavar="FOLDER", help="folder for results.json and a page; an interrupted run resumes"
+    )
+    parser.add_argument(
+        "--workers", type=count, metavar="N", help="number of processes, with --out (default: all cores)"
+    )
+    video = "folder of query images, or a video with its positions beside it (FLIGHT.mp4 and .csv: time,lat,lon[,...])"
     parser.add_argument("--query", metavar="SOURCE", help=video)
-    parser.add_argument("--ref", metavar="SOURCE", help="the same, of the places to be found")
-    parser.add_argument("--rate-hz", type=positive, metavar="HZ", help="pictures a second of a video (all)")
+    parser.add_argument("--ref", metavar="SOURCE", help="folder of reference images, or a video with its positions")
+    parser.add_argument(
+        "--rate-hz", type=positive, metavar="HZ", help="images per second of a video (default: every frame)"
+    )
     parser.add_argument("--ground-truth", metavar="FILE", help="CSV: query_file,ref_files (else: what is near)")
-    parser.add_argument("--within-m", type=positive, default=25.0, metavar="M", help="near is within so much (25)")
-    parser.add_argument("--within-deg", type=positive, metavar="DEG", help="and with headings that differ by no more")
-    parser.add_argument("--similarity", nargs="+", metavar="FILE", help="measure stored similarities (.npy)")
+    parser.add_argument(
+        "--within-m",
+        type=positive,
+        default=25.0,
+        metavar="M",
+        help="distance in metres that counts as near (default: 25)",
+    )
+    parser.add_argument(
+        "--within-deg",
+        type=positive,
+        metavar="DEG",
+        help="maximum difference of headings that counts as near, in degrees",
+    )
+    parser.add_argument("--similarity", nargs="+", metavar="FILE", help="evaluate stored similarity matrices (.npy)")
     parser.add_argument("--form", default="float", metavar="A,B", help=f"of vectors: {', '.join(FORMS)} (float)")
-    parser.add_argument("--exact", action="store_true", help="compare all places in full, which no flight has time for")
-    parser.add_argument("--follow", action="store_true", help="the queries are those of one flight, in order (cohog)")
+    parser.add_argument("--exact", action="store_true", help="compare all places in full; too slow for a flight")
+    parser.add_argument("--follow", action="store_true", help="treat the queries as one flight, in order (cohog only)")
     add_known(parser)
-    parser.add_argument("--config", metavar="FILE", help="YAML; its sections `salience` and `match` count")
+    parser.add_argument(
+        "--config", metavar="FILE", help="configuration file; its sections `salience` and `match` are used"
+    )
     add_keys(parser, "source.camera", "match.candidates", "match.sequence", "salience.use")
-    parser.add_argument("--techniques", default="hog,cohog", metavar="A,B", help="names, comma-separated")
+    parser.add_argument(
+        "--techniques", default="hog,cohog", metavar="A,B", help="techniques to evaluate, separated by commas"
+    )
     add_parameters(parser, "a parameter of a technique", "TECHNIQUE.KEY=VALUE")
     add_json(parser)
 

@@ -17,14 +17,14 @@ _OF_PASSES = ("merged", "faded", "changed")  # of several flights over the same 
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    fleet = group(commands, "fleet", "make maps that are larger than an aircraft")
-    build = command(fleet, "build", fleet_build, "map ground tile by tile, by many workers")
+    fleet = group(commands, "fleet", "build maps too large for one aircraft")
+    build = command(fleet, "build", fleet_build, "build one map per tile, with several workers")
     build.add_argument("out", metavar="MAPS", help="folder of the maps and of their index; resume if it exists")
     build.add_argument(
         "--images",
         metavar="SOURCE",
         nargs="+",
-        help="folders of photographs, and tables (.csv) of files or addresses (s3://...) with their positions",
+        help="folders of photographs, or tables (.csv) of files or addresses (s3://...) with positions",
     )
     add_orthophoto(build)
     build.add_argument("--config", metavar="FILE", help="configuration of the flights: camera, mask, salience")

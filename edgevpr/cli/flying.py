@@ -43,40 +43,44 @@ _MATCHING_KEYS = (
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    match = command(commands, "match", run_match, "find the places of images in a map, offline")
+    match = command(commands, "match", run_match, "look up images in a map, offline")
     match.add_argument("map", metavar="MAP")
     add_recording(match)
-    match.add_argument("--config", metavar="FILE", help="that of the flight; flags given here override it")
+    match.add_argument("--config", metavar="FILE", help="configuration of the flight; flags override it")
     add_keys(match, *_MATCHING_KEYS)
-    match.add_argument("--follow", action="store_true", help="the images are those of one flight, in order (cohog)")
+    match.add_argument("--follow", action="store_true", help="treat the images as one flight, in order (cohog only)")
     add_known(match)
-    match.add_argument("--page", metavar="FILE", help="write a page for any browser, offline (.html)")
+    match.add_argument("--page", metavar="FILE", help="write an HTML page that opens offline")
     add_map_images(match)
     add_json(match)
 
-    run = command(commands, "run", run_flight, "recognise places in flight and tell the flight controller")
-    run.add_argument("--config", metavar="FILE", help="YAML; flags given here override it")
+    run = command(commands, "run", run_flight, "recognise places in flight and send positions to the autopilot")
+    run.add_argument("--config", metavar="FILE", help="configuration file (YAML); flags override it")
     add_keys(run)
     add_positions(run)
 
-    check = command(commands, "check", run_check, "say whether a configuration would fly")
+    check = command(commands, "check", run_check, "check a configuration before flight")
     check.add_argument("--config", required=True, metavar="FILE")
-    check.add_argument("--offline", action="store_true", help="wait for no frame and no heartbeat: on the bench")
+    check.add_argument("--offline", action="store_true", help="do not wait for a frame or a heartbeat")
     add_json(check)
 
-    services = group(commands, "service", "print the systemd unit for a board, or install it all")
-    unit = command(services, "print", service_print, "print the unit")
-    unit.add_argument("--board", default="this", metavar="NAME", help="that it is for (default: this)")
-    install = command(services, "install", service_install, "install user, folders, program, unit and udev rules")
-    install.add_argument("--config", metavar="FILE", help="to become /etc/edgevpr/config.yaml")
-    uninstall = command(services, "uninstall", service_uninstall, "leaves maps, logs and configuration")
-    for each in (install, uninstall):
-        each.add_argument("--dry-run", action="store_true", help="say each step, and do nothing")
-
-    doctor = command(
-        commands, "doctor", run_doctor, "ask the flight controller, and this board, what to change; nothing is written"
+    services = group(commands, "service", "print or install the systemd service")
+    unit = command(services, "print", service_print, "print the systemd unit")
+    unit.add_argument(
+        "--board", default="this", metavar="NAME", help="board that the unit is for (default: this computer)"
     )
-    doctor.add_argument("--config", metavar="FILE", help="that of the flight; flags given here override it")
+    install = command(
+        services, "install", service_install, "install the service: user, folders, program, unit and udev rules"
+    )
+    install.add_argument("--config", metavar="FILE", help="configuration to copy to /etc/edgevpr/config.yaml")
+    uninstall = command(
+        services, "uninstall", service_uninstall, "remove the service; keep maps, logs and configuration"
+    )
+    for each in (install, uninstall):
+        each.add_argument("--dry-run", action="store_true", help="print each step without doing it")
+
+    doctor = command(commands, "doctor", run_doctor, "check the autopilot's parameters and this computer (read-only)")
+    doctor.add_argument("--config", metavar="FILE", help="configuration of the flight; flags override it")
     add_keys(doctor, "mavlink.link")
     add_json(doctor)
 

@@ -90,11 +90,9 @@ def command_line() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     parser = Parser(prog="edgevpr", description="Visual place recognition for the companion computer of a small drone.")
     parser.add_argument("--version", action="version", version=f"edgevpr {__version__}")
-    text = "show more of what happens, and the traceback of an error"
+    text = "print debug messages, and the traceback of an error"
     parser.add_argument("-v", "--debug", action="store_true", help=text)
-    parser.add_argument(
-        "-q", "--quiet", action="store_true", help="show no progress, and of what happens only warnings"
-    )
+    parser.add_argument("-q", "--quiet", action="store_true", help="print warnings only, and no progress")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for group in _GROUPS:
         group.add(commands)

@@ -47,32 +47,22 @@ def add(commands: Any) -> None:
         parser.add_argument("map", metavar="MAP", help=more)
         return parser
 
-    _add_build(
-        of_map(
-            "build", map_build, "build a map from images or from an orthophoto", "map to write, for example valley.gpkg"
-        )
-    )
+    _add_build(of_map("build", map_build, "build a map from images or from an orthophoto", "map to write (.gpkg)"))
     refine = of_map("refine", map_refine, "refine the positions of the places by matching their images")
-    refine.add_argument(
-        "--images", metavar="DIR", help="images that the map was built from, to find more links between them"
-    )
+    refine.add_argument("--images", metavar="DIR", help="images that the map was built from")
     add_json(refine)
     move = of_map("move", map_move, "shift a map by the offset from GPS that a flight measured")
     move.add_argument("--by", metavar="LOG", required=True, help="log of a flight with this map and with GPS")
     add_json(move)
     calibrate = of_map("calibrate", map_calibrate, "calibrate match confidence from the map's own images")
     _add_pictures(calibrate)
-    calibrate.add_argument(
-        "--config", metavar="FILE", help="configuration of the flight: camera, mask and precision are used"
-    )
+    calibrate.add_argument("--config", metavar="FILE", help="configuration of the flight (camera, mask, precision)")
     add_keys(calibrate, "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
     add_json(calibrate)
     info = of_map("info", map_info, "print what a map contains, or make a page of it")
     info.add_argument("--page", metavar="FILE", help="write an HTML page that opens offline")
     add_map_images(info)
-    info.add_argument(
-        "--config", metavar="FILE", help=("configuration of the mapping flight: its lens is used to draw the images")
-    )
+    info.add_argument("--config", metavar="FILE", help="configuration of the mapping flight (its lens)")
     add_keys(info, "source.lens", "source.fov_deg", "source.up_deg")
     add_json(info)
     add_json(of_map("check", map_check, "read the whole map and report what is damaged"))
@@ -94,22 +84,14 @@ def add(commands: Any) -> None:
 
 def _add_build(build: ArgumentParser) -> None:
     _add_pictures(build)
-    build.add_argument(
-        "--technique", metavar="NAME", help=("technique to use, see `edgevpr profile` (default: chosen for the board)")
-    )
+    build.add_argument("--technique", metavar="NAME", help="technique (default: chosen for the board)")
     add_parameters(build, "set a parameter of the technique")
     build.add_argument("--board", default="this", metavar="NAME", help="board to plan for (default: this computer)")
-    build.add_argument(
-        "--config", metavar="FILE", help="configuration of the flight: camera, mask and salience are used"
-    )
+    build.add_argument("--config", metavar="FILE", help="configuration of the flight (camera, mask, salience)")
     add_keys(build, "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg", "salience.use")
-    build.add_argument(
-        "--rate-hz", type=positive, metavar="HZ", help="places per second of a video (default: every frame)"
-    )
+    build.add_argument("--rate-hz", type=positive, metavar="HZ", help="places per second of a video")
     build.add_argument("--no-refine", dest="refine", action="store_false", help="keep the recorded positions")
-    build.add_argument(
-        "--no-calibrate", dest="calibrate", action="store_false", help="skip the calibration of match confidence"
-    )
+    build.add_argument("--no-calibrate", dest="calibrate", action="store_false", help="skip the confidence calibration")
     build.add_argument("--attribution", metavar="TEXT", help="attribution that the orthophoto's licence requires")
     build.add_argument("--append", action="store_true", help="add to an existing map, or resume an interrupted build")
     add_json(build)

@@ -12,14 +12,16 @@ from edgevpr.core.text import progress
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    models = group(commands, "models", "list, try and add the networks that techniques use")
-    add_json(command(models, "list", models_list, "say which networks there are, whose weights, and what uses them"))
-    verify = command(models, "verify", models_verify, "run networks here: do they work, and what do they take")
-    verify.add_argument("name", metavar="NAME", nargs="?", help="a network (default: all)")
+    models = group(commands, "models", "list, verify and add neural networks")
+    add_json(command(models, "list", models_list, "list the networks, their origin and what uses them"))
+    verify = command(models, "verify", models_verify, "run networks on this computer, and measure them")
+    verify.add_argument("name", metavar="NAME", nargs="?", help="network to verify (default: all)")
     add_json(verify)
-    adding = command(models, "add", models_add, "try a network, and copy it and its card to your models folder")
+    adding = command(models, "add", models_add, "verify a network, and copy it and its card to your models folder")
     adding.add_argument("file", metavar="FILE.onnx")
-    adding.add_argument("--card", required=True, metavar="CARD.yaml", help="its name is that of the network")
+    adding.add_argument(
+        "--card", required=True, metavar="CARD.yaml", help="card of the network (YAML); its name is that of the network"
+    )
     add_json(adding)
 
 

@@ -9,23 +9,29 @@ from edgevpr.cli.shared import add_json, command, show
 
 def add(commands: Any) -> None:
     """Add the command and its flags."""
-    text = "write where pictures were taken, from a log of an autopilot, a track, subtitles or a table"
+    text = "geotag images from an autopilot log, a GPS track, subtitles or a table"
     parser = command(commands, "positions", positions, text)
     parser.add_argument(
         "record",
         metavar="RECORD",
-        help="ArduPilot's .bin, a .tlog, PX4's .ulg, DJI's .SRT, .gpx, GoPro's .mp4, or a table of exiftool, Pix4D, "
-        "Metashape or OpenDroneMap",
+        help=(
+            "ArduPilot .bin, .tlog, PX4 .ulg, DJI .SRT, .gpx, GoPro .mp4, or a table from exiftool, Pix4D, "
+            "Metashape or OpenDroneMap"
+        ),
     )
-    parser.add_argument("--images", required=True, metavar="SOURCE", help="the folder of images, or the video file")
+    parser.add_argument("--images", required=True, metavar="SOURCE", help="folder of images, or video file")
     parser.add_argument(
         "--offset-s",
         type=float,
         metavar="S",
-        help="to add to the camera's clock (default: the time zone that fits); of subtitles, to the time of the video",
+        help=(
+            "seconds to add to the camera's clock (default: the time zone that fits), or to the video time of subtitles"
+        ),
     )
     parser.add_argument(
-        "--out", metavar="CSV", help="default: positions.csv in the folder, or beside a video its name with .csv"
+        "--out",
+        metavar="CSV",
+        help=("file to write (default: positions.csv in the folder, or the video's name with .csv)"),
     )
     add_json(parser)
 

@@ -18,23 +18,29 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     """Add the command and its flags."""
-    parser = command(commands, "profile", profile, "say before take-off what each technique costs in RAM and battery")
+    parser = command(commands, "profile", profile, "estimate memory, rate and battery use before take-off")
     asked = parser.add_mutually_exclusive_group(required=True)
     asked.add_argument("--list", action="store_true", help="list the boards")
-    asked.add_argument("--detect", action="store_true", help="say which board this is, and why; see --out")
-    asked.add_argument("--map", metavar="MAP", help="the map to fly with: what its technique costs")
-    asked.add_argument("--places", type=count, metavar="N", help="places to fly with: what every technique costs")
+    asked.add_argument("--detect", action="store_true", help="identify this board, and say why; see --out")
+    asked.add_argument("--map", metavar="MAP", help="map of the flight: estimate its technique")
+    asked.add_argument("--places", type=count, metavar="N", help="number of places: estimate every technique")
     parser.add_argument(
         "--board",
         default="this",
         metavar="NAME",
-        help="a board, or `this` (default); several beside each other: A,B,C; see --list",
+        help="board, or a list A,B,C to compare; see --list (default: this computer)",
     )
-    parser.add_argument("--flight-min", type=positive, default=20.0, metavar="MIN", help="length of the flight (20)")
-    add_keys(parser, "source.camera", "source.rate_hz", "memory.budget_mb", "battery.pack")
-    parser.add_argument("--hover-w", type=positive, metavar="W", help="what the aircraft draws to hover: minutes lost")
     parser.add_argument(
-        "--out", metavar="FILE.yaml", help="with --detect: measure speed and, with a meter, power; write a profile"
+        "--flight-min", type=positive, default=20.0, metavar="MIN", help="length of the flight in minutes (default: 20)"
+    )
+    add_keys(parser, "source.camera", "source.rate_hz", "memory.budget_mb", "battery.pack")
+    parser.add_argument(
+        "--hover-w", type=positive, metavar="W", help="power to hover in watts, to estimate the flight time lost"
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILE.yaml",
+        help=("with --detect: measure speed and, if there is a meter, power; write a profile"),
     )
     add_json(parser)
 

@@ -77,7 +77,7 @@ def add_recording(parser: ArgumentParser, required: bool = True) -> None:
         dest="source",
         required=required,
         metavar="SOURCE",
-        help="a folder of images or a video file",
+        help="folder of images, or video file",
     )
     add_positions(parser)
 
@@ -99,8 +99,7 @@ def add_map_images(parser: ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="DIR",
-        help="folder with the pictures that the map was made of, repeatable, or its film; if it was cut from an "
-        "orthophoto, that file or address",
+        help="folder of images that the map was built from (repeatable), or its video, or its orthophoto",
     )
 
 
@@ -109,8 +108,10 @@ def add_known(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--known",
         metavar="A,B",
-        help="of each query, as in flight: heading (yaw_deg of positions.csv), height (height_m of queries and places, "
-        "else that of the map), reach (within 300 m of its position)",
+        help=(
+            "what is known of each query, as in flight: heading (yaw_deg of positions.csv), height (height_m "
+            "of queries and places, or that of the map), reach (a position within 300 m)"
+        ),
     )
 
 

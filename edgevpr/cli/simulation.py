@@ -21,52 +21,62 @@ _PARAMETER = "GPS2_TYPE=14"  # an example
 _Numbers = Mapping[str, tuple[float | None, float, float, str]]
 # Number flags of a flight over an orthophoto: (default, least, greatest, help text).
 _NUMBERS: _Numbers = {
-    "height_m": (None, 1.0, 10_000.0, "over the ground (default: that of the track)"),
-    "every_m": (20.0, 1.0, 1e6, "from picture to picture of a mission (20)"),
-    "fov_deg": (66.0, 5.0, 120.0, "angle of view across the picture (66)"),
+    "height_m": (None, 1.0, 10_000.0, "height above ground in metres (default: that of the track)"),
+    "every_m": (20.0, 1.0, 1e6, "distance between images of a mission in metres (default: 20)"),
+    "fov_deg": (66.0, 5.0, 120.0, "field of view across the image in degrees (default: 66)"),
 }
 # A second of the way, which leaves time for a query, and lets one picture show most of the next.
-_REHEARSED: _Numbers = {**_NUMBERS, "every_m": (10.0, 1.0, 1e6, "from picture to picture, flown at 10 m/s (10)")}
+_REHEARSED: _Numbers = {
+    **_NUMBERS,
+    "every_m": (10.0, 1.0, 1e6, "distance between images in metres, flown at 10 m/s (default: 10)"),
+}
 
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    simulations = group(commands, "simulate", "a generated flight, a flight controller to talk to")
-    autopilot = command(simulations, "autopilot", simulate_autopilot, "a flight controller that answers and counts")
-    autopilot.add_argument("--link", default="udpin:127.0.0.1:14550", metavar="URL", help="(udpin:127.0.0.1:14550)")
+    simulations = group(commands, "simulate", "generate flights, simulate an autopilot")
+    autopilot = command(simulations, "autopilot", simulate_autopilot, "simulate an autopilot that answers and counts")
     autopilot.add_argument(
-        "--track", metavar="CSV", help="a positions.csv with times to fly along, from when a flight is first heard"
+        "--link",
+        default="udpin:127.0.0.1:14550",
+        metavar="URL",
+        help="address to listen at (default: udpin:127.0.0.1:14550)",
+    )
+    autopilot.add_argument(
+        "--track", metavar="CSV", help="positions.csv with times, to fly along from the first message of a flight on"
     )
     autopilot.add_argument("--vehicle", choices=_VEHICLES, default=_VEHICLES[0], help=f"({_VEHICLES[0]})")
     autopilot.add_argument(
-        "--no-gps", action="store_true", help="it has lost GPS, as it always has without --track: then it takes fixes"
+        "--no-gps", action="store_true", help="start without GPS, as always without --track; then fixes are accepted"
     )
     autopilot.add_argument(
         "--gps-s",
         type=positive,
         metavar="X",
-        help="GPS is lost X seconds after the start of --track, as a wind of 6 m/s comes up that it does not know",
+        help="lose GPS this many seconds after the start of --track, in an unknown wind of 6 m/s",
     )
     add_parameters(autopilot, f"a parameter of the vehicle, e.g. {_PARAMETER}, as if set before it was started")
     add_json(autopilot)
-    text = "write a flight, generated or over an orthophoto: images and positions.csv"
+    text = "generate the images and positions.csv of a flight"
     flight = command(simulations, "flight", simulate_flight, text)
     flight.add_argument("out", metavar="DIR")
-    flight.add_argument("--which", choices=("map", "query"), help="the mapping flight (default), or a later one")
     flight.add_argument(
-        "--seed", type=_seed, default=1, metavar="N", help="another seed, another landscape and sway (1)"
+        "--which", choices=("map", "query"), help="mapping: the mapping flight (default); query: a later flight"
+    )
+    flight.add_argument(
+        "--seed", type=_seed, default=1, metavar="N", help="random seed of landscape and motion (default: 1)"
     )
     _add_over(flight.add_argument_group("over an orthophoto"), _NUMBERS)
-    text = "fly a mission over another orthophoto than the map's, and say what to expect of it; GPS is lost on the way"
+    text = "rehearse a mission without GPS, over another orthophoto than the map's"
     rehearsal = command(simulations, "rehearsal", simulate_rehearsal, text)
     rehearsal.add_argument("map", metavar="MAP")
-    rehearsal.add_argument("out", metavar="DIR", help="a new folder, for pictures, log and report.html")
-    rehearsal.add_argument("--seed", type=_seed, default=1, metavar="N", help="another seed, another sway (1)")
+    rehearsal.add_argument("out", metavar="DIR", help="new folder for images, log and report.html")
+    rehearsal.add_argument("--seed", type=_seed, default=1, metavar="N", help="random seed of the motion (default: 1)")
     _add_over(rehearsal.add_argument_group("the flight"), _REHEARSED, required=True)
     add_map_images(rehearsal)
     add_json(rehearsal)
-    demo = command(commands, "demo", run_demo, "the whole job on a generated flight, with a picture")
-    demo.add_argument("--out", default="demo_out", metavar="DIR", help="(demo_out)")
+    demo = command(commands, "demo", run_demo, "map and match a generated flight, and draw a picture of it")
+    demo.add_argument("--out", default="demo_out", metavar="DIR", help="folder to write (default: demo_out)")
 
 
 def _seed(text: str) -> int:
@@ -77,12 +87,14 @@ def _seed(text: str) -> int:
 
 def _add_over(over: _ArgumentGroup, numbers: _Numbers, required: bool = False) -> None:
     """Add the flags of a flight over an orthophoto."""
-    over.add_argument("--orthophoto", required=required, metavar="FILE", help="as for `map build`: needs rasterio")
+    over.add_argument(
+        "--orthophoto", required=required, metavar="FILE", help="orthophoto, as for `map build` (needs rasterio)"
+    )
     over.add_argument(
         "--track",
         required=required,
         metavar="FILE",
-        help="a mission, or a positions.csv with height_m[, yaw_deg, roll_deg, pitch_deg]",
+        help="mission, or positions.csv with height_m[, yaw_deg, roll_deg, pitch_deg]",
     )
     for name, (*_, text) in numbers.items():
         over.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)

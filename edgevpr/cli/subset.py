@@ -14,18 +14,24 @@ _MARGIN_M = 500.0
 
 def add(of_map: Callable[..., Any]) -> None:
     """Add the command and its flags. `of_map` adds a command that begins with a map."""
-    parser = of_map("subset", map_subset, "take the part that a mission needs", "a map, or a folder of `fleet build`")
+    parser = of_map(
+        "subset", map_subset, "cut out the part that a mission needs", "map, or folder made by `fleet build`"
+    )
     parser.add_argument(
         "--mission",
         metavar="FILE",
         required=True,
-        help="waypoints of Mission Planner, a .plan of QGroundControl, GeoJSON, KML, or LAT,LON,RADIUS_M",
+        help="Mission Planner waypoints, QGroundControl .plan, GeoJSON, KML, or LAT,LON,RADIUS_M",
     )
-    parser.add_argument("--out", metavar="MAP", required=True, help="the map file to make")
+    parser.add_argument("--out", metavar="MAP", required=True, help="map to write")
     parser.add_argument(
-        "--margin-m", type=positive, metavar="M", default=_MARGIN_M, help="around the mission (default: %(default)g)"
+        "--margin-m",
+        type=positive,
+        metavar="M",
+        default=_MARGIN_M,
+        help="margin around the mission in metres (default: %(default)g)",
     )
-    parser.add_argument("--mb", type=positive, metavar="MB", help="the file is to be no larger (default: all places)")
+    parser.add_argument("--mb", type=positive, metavar="MB", help="maximum file size in MB (default: all places)")
     add_json(parser)
 
 

@@ -23,8 +23,9 @@ FORMS = ("float", "8bit", "1bit")  # number formats of vectors in RAM, from larg
 LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 0.01, 60.0  # of queries
 BUDGET_MB = (1, 65_536)  # of the index in RAM
 SOURCES = (
-    "a folder of images, a video file, a camera (/dev/video0, or rpicam on a Raspberry Pi's ribbon), a stream "
-    "(rtsp://, udp://, rtp://, tcp://, http://, FILE.sdp) or gst: and a pipeline of GStreamer"
+    "folder of images, video file, camera (/dev/video0, or rpicam for the ribbon camera of a "
+    "Raspberry Pi), stream (rtsp://, udp://, rtp://, tcp://, http://, FILE.sdp), or gst: and a "
+    "GStreamer pipeline"
 )
 
 _LARGEST = 2**63
@@ -75,19 +76,21 @@ class SourceConfig:
     uri: str | None = key("--images --source SOURCE", SOURCES)
     camera: str | None = key(
         "--camera",
-        "straight down, or ahead (default: the map's; a new map's is forward)",
+        "nadir: camera looks straight down; forward: ahead (default: as in the map; forward for a new map)",
         choices=("nadir", "forward"),
     )
     rate_hz: float | None = key(
-        "--rate-hz HZ", "queries a second (default: the board's)", within=(LOWEST_RATE_HZ, HIGHEST_RATE_HZ)
+        "--rate-hz HZ", "queries per second (default: the board's)", within=(LOWEST_RATE_HZ, HIGHEST_RATE_HZ)
     )
-    mask: str | None = key("--mask PNG", "black where frames show a display and no ground")
-    lens: str | None = key("--lens FILE", "calibration of the camera, of OpenCV, ROS or Kalibr: takes distortion away")
+    mask: str | None = key("--mask PNG", "mask image, black where frames show an overlay instead of the ground")
+    lens: str | None = key("--lens FILE", "camera calibration (OpenCV, ROS or Kalibr YAML), to undistort images")
     fov_deg: float | None = key(
-        "--fov-deg DEG", "field of view across the longest side of the picture", within=(5, 150)
+        "--fov-deg DEG", "field of view across the longest side of the image, in degrees", within=(5, 150)
     )
     up_deg: float = key(
-        "--up-deg DEG", "where the top of the picture points while the nose points north (0)", within=(0, 360)
+        "--up-deg DEG",
+        "direction of the top of the image when the aircraft heads north, in degrees (default: 0)",
+        within=(0, 360),
     )
     mount_ahead_deg: float = bounded(-45, 45)
     mount_right_deg: float = bounded(-45, 45)
@@ -96,43 +99,57 @@ class SourceConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchConfig:
-    matching: str | None = key("--matching", "how cohog scores (displacement)", choices=("displacement", "thesis"))
+    matching: str | None = key(
+        "--matching", "scoring method of cohog (default: displacement)", choices=("displacement", "thesis")
+    )
     form: str | None = key(
-        "--form", "what a number of a vector takes in RAM: half precision, a byte or a bit (float)", choices=FORMS
+        "--form",
+        "storage of vectors in RAM: half precision, one byte or one bit per number (default: float)",
+        choices=FORMS,
     )
-    candidates: int | None = key("--candidates N", "places compared (the technique's)", within=(1, 1_000_000))
+    candidates: int | None = key(
+        "--candidates N", "number of places compared in full (default: the technique's)", within=(1, 1_000_000)
+    )
     follow: bool
-    sequence: int | None = key("--sequence N", "queries matched together (the technique's)", within=(1, 100))
-    accept_precision: float = key(
-        "--accept-precision P", "share of the accepted matches that is to be right (0.999)", within=(0.5, 0.999999)
+    sequence: int | None = key(
+        "--sequence N", "number of queries matched as a sequence (default: the technique's)", within=(1, 100)
     )
-    min_score: float | None = key("--min-score S", "accept from this score on", within=(0, 1))
-    min_margin: float | None = key("--min-margin M", "accept when this far ahead of a place elsewhere", within=(0, 1))
+    accept_precision: float = key(
+        "--accept-precision P",
+        "required share of right matches among those accepted (default: 0.999)",
+        within=(0.5, 0.999999),
+    )
+    min_score: float | None = key("--min-score S", "minimum score to accept", within=(0, 1))
+    min_margin: float | None = key(
+        "--min-margin M", "minimum lead over the best place elsewhere to accept", within=(0, 1)
+    )
     verify: bool
     neighbour_m: float = bounded(0, 10_000)
     reach_m_s: float | None = key(
-        "--reach-m-s V", "look only where this speed can have led (default: everywhere)", within=(0.1, 100)
+        "--reach-m-s V",
+        "search only the area that can be reached at this speed (default: the whole map)",
+        within=(0.1, 100),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class MemoryConfig:
     budget_mb: float | None = key(
-        "--budget-mb MB", "limit of the index in RAM (default: the board's)", within=BUDGET_MB
+        "--budget-mb MB", "memory limit of the index in MB (default: the board's)", within=BUDGET_MB
     )
 
 
 @dataclass(frozen=True, slots=True)
 class MappingConfig:
     learn: bool = key(
-        "--learn", "add to the map what it does not know, or make a new one, by the flight controller's position"
+        "--learn", "add unknown places to the map, at the autopilot's position; make the map if it does not exist"
     )
     spacing_m: float = bounded(1, 1000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SalienceConfig:
-    use: bool = key("--salience", "keep, and ask for, only what is worth remembering")
+    use: bool = key("--salience", "store and match only memorable images")
     memorability: float = bounded(0, 1)
     staticity: float = bounded(0, 1)
     entropy: float = bounded(0, 1)
@@ -156,7 +173,7 @@ class MavlinkConfig:
     component_id: int = bounded(1, 255)
     system_id: int | None = bounded(1, 255)
     send_fixes: bool = key(
-        "--dry-run", "send no position fix: decide, log and tell all else as in a flight", sets=False
+        "--dry-run", "send no position; decide, log and announce everything else as in a flight", sets=False
     )
     max_fix_age_s: float = bounded(0.1, 5)
     min_accuracy_m: float = bounded(1, 10_000)
@@ -169,10 +186,10 @@ class MavlinkConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogConfig:
-    path: str | None = key("--log FILE", "flight log, JSON lines")
-    tlog: str | None = key("--tlog FILE", "every packet of the link, for mavlogdump and ground stations")
+    path: str | None = key("--log FILE", "flight log to write (JSON lines)")
+    tlog: str | None = key("--tlog FILE", "telemetry log to write, for mavlogdump and ground stations")
     max_mb: float | None = bounded(1, 1_000_000)
-    record: str | None = key("--record FOLDER", "frames and all else that `edgevpr replay` needs")
+    record: str | None = key("--record FOLDER", "folder for a recording, for `edgevpr replay`")
     record_mb: float = bounded(10, 1_000_000)
 
 
@@ -183,7 +200,7 @@ class StatusConfig:
 
 @dataclass(frozen=True, slots=True)
 class BatteryConfig:
-    pack: str = key("--battery PACK", "cells and capacity of the pack, e.g. 4S5200")
+    pack: str = key("--battery PACK", "cells and capacity of the battery, for example 4S5200")
     regulator_efficiency: float = bounded(0.1, 1)
 
 
@@ -191,9 +208,9 @@ class BatteryConfig:
 class Config:
     """The whole configuration; `deploy/config.yaml` documents every key and holds every default."""
 
-    board: str = key("--board NAME", "hardware profile (default: this machine)")
-    map: str | None = key("--map MAP", "the place map, or a folder of tiles")
-    technique: str | None = key("--technique NAME", "insist on this technique")
+    board: str = key("--board NAME", "hardware profile (default: this computer)")
+    map: str | None = key("--map MAP", "map, or folder of tiles")
+    technique: str | None = key("--technique NAME", "use this technique")
     source: SourceConfig
     match: MatchConfig
     memory: MemoryConfig
