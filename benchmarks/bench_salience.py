@@ -30,7 +30,7 @@ from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
-from edgevpr.runtime.recognise.salience_gate import scores_of, worth_of
+from edgevpr.runtime.recognise.salience_gate import compute_memorability, compute_scores
 from edgevpr.techniques.card import load_card
 
 TECHNIQUES = ("hog", "cohog", "calc", "netvlad")
@@ -97,11 +97,11 @@ def speeds(network: str, there: list[str]) -> dict[str, float]:
     memorability = Memorability(load_card(network))
     found = {name: Detector(load_card(name)) for name in there}
     ways = {
-        "entropy": lambda: scores_of(picture),
-        "entropy and memorability": lambda: scores_of(picture, memorability),
+        "entropy": lambda: compute_scores(picture),
+        "entropy and memorability": lambda: compute_scores(picture, memorability),
     }
     for name, each in found.items():
-        ways[f"all three, {name}"] = lambda each=each: scores_of(picture, memorability, each.is_static(picture))
+        ways[f"all three, {name}"] = lambda each=each: compute_scores(picture, memorability, each.is_static(picture))
     times_ms: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(31):  # in turn, so that a busy moment hits all of them; the first round only warms
         for name, way in ways.items():
@@ -142,7 +142,7 @@ def gated(
     `false_discarded` wrongly. `places` is the share of the references that pass the gate."""
     score, found = answers(asked, np.ones(len(asked[0][2]), bool))
     for gate, thresholds in GATES.items():
-        passes = np.array([worth_of(each[gate], thresholds).reason is None for each in seen])
+        passes = np.array([compute_memorability(each[gate], thresholds).reason is None for each in seen])
         precision, recall = metrics.precision_recall(score[passes], found[passes])
         yield {
             "set": name,
@@ -161,17 +161,17 @@ def gated(
 def scores_by_gate(path: Path, memorability: Memorability, detector: Detector | None) -> dict[str, Salience]:
     """Return the scores of a picture under each gate. A criterion alone knows nothing of what moves, but staticity."""
     picture = read_image(path)
-    still = scores_of(picture, memorability)
+    still = compute_scores(picture, memorability)
     if detector is None:
         return dict.fromkeys(GATES, still)
-    moving = scores_of(picture, memorability, detector.is_static(picture))
+    moving = compute_scores(picture, memorability, detector.is_static(picture))
     return {gate: moving if gate in ("all three", "staticity") else still for gate in GATES}
 
 
 def _kept(places: list[Path], seen: dict[Path, dict[str, Salience]]) -> dict[str, np.ndarray]:
     """Return which references pass each gate."""
     return {
-        gate: np.array([worth_of(seen[path][gate], thresholds).reason is None for path in places])
+        gate: np.array([compute_memorability(seen[path][gate], thresholds).reason is None for path in places])
         for gate, thresholds in GATES.items()
     }
 

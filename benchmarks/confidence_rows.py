@@ -15,7 +15,7 @@ from base import DATA
 from edgevpr.frames.images import list_images
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.lab.evaluate.dataset import ScoredQuery
-from edgevpr.mapmaking.calibrate import ask, asked_of
+from edgevpr.mapmaking.calibrate import ask, query_altered_copies
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import elsewhere
 from edgevpr.runtime.recognise.evidence import Evidence
@@ -96,7 +96,7 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
             return  # such a map is not calibrated
         frames = list(walks.frames_of(folder / "ref"))
         order = np.random.default_rng(15).permutation(len(frames))
-        frames = [frames[at] for at in np.resize(order, min(asked_of(technique), 6 * len(frames)))]
+        frames = [frames[at] for at in np.resize(order, min(query_altered_copies(technique), 6 * len(frames)))]
         ids = {place.source_image: place.place_id for place in place_map.places()}
         pictures = ((ids[frame.name], Levelled(frame.image, None, UNKNOWN_VIEW)) for frame in frames)
         for answer in ask(technique, place_map, index, rule, walks.meter(), pictures):

@@ -12,7 +12,7 @@ import base
 import cv2
 import numpy as np
 import rasterio
-from mosaics import Ground, ground_of, laid, mosaic_of, write_tif
+from mosaics import Ground, ground_of, laid, make_mosaic, write_tif
 
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position
@@ -96,7 +96,7 @@ def prepare(name: str, data: Path, work: Path) -> Site:
     on = laid(of)
     ground = _ASSUMED.get(name) or ground_of(of, on)
     for part in ("ref", "query"):
-        write_tif(folder / f"{part}.tif", ground, *mosaic_of(of, on, part))
+        write_tif(folder / f"{part}.tif", ground, *make_mosaic(of, on, part))
     places = [each for each in sorted(on.middle) if (of / "ref" / each).is_file()]
     positions = {each: ground.position(on.middle[each]) for each in places}
     metre_px = abs(ground.affine.determinant) ** 0.5
@@ -108,7 +108,7 @@ def _rows(of: Path, folder: Path) -> Site:
     """Make ground on which one piece repeats itself four times, beside its mirror image, which is alone; and map it by
     a flight over what the pictures ref/ show."""
     on = laid(of)
-    mosaics = {part: mosaic_of(of, on, part) for part in ("ref", "query")}
+    mosaics = {part: make_mosaic(of, on, part) for part in ("ref", "query")}
     top, left, high, wide = _largest_box(mosaics["ref"][1] & mosaics["query"][1])
     metre_px = _ROWS_WIDE_M / wide
     ground = Ground("EPSG:32630", rasterio.Affine(metre_px, 0, 520_000, 0, -metre_px, 6_400_000))

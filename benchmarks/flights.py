@@ -45,9 +45,9 @@ from edgevpr.core.contract import Technique
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.sequence import search_of
+from edgevpr.places.sequence import make_sequence_search
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.evidence import calibration_of
+from edgevpr.runtime.recognise.evidence import read_calibration_for
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import open_recogniser
@@ -80,13 +80,16 @@ def _recogniser(
     technique: Technique, place_map: PlaceMap, index: PlaceIndex, *, length: int = 1, follows: bool = False
 ) -> Recogniser:
     config = walks.config()
-    reach_m_s, rule = config.match.reach_m_s, accept_rule(technique, config.match, length, calibration_of(place_map))
+    reach_m_s, rule = (
+        config.match.reach_m_s,
+        accept_rule(technique, config.match, length, read_calibration_for(place_map)),
+    )
     return walks.walk(
         place_map,
         index,
         technique,
         rule=rule,
-        search=search_of(length),
+        search=make_sequence_search(length),
         prior=Prior(reach_m_s, technique.spec.heading_within_deg, True) if length == 1 else None,
         min_accuracy_m=config.mavlink.min_accuracy_m,
         place_filter=PlaceFilter(place_map, max_speed_m_s=reach_m_s, is_live=True) if follows else None,

@@ -34,7 +34,7 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
 from edgevpr.lab.simulate.camera import Camera, Light
-from edgevpr.lab.simulate.rehearsal import poses_of, seen_from
+from edgevpr.lab.simulate.rehearsal import make_poses, seen_from
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser
@@ -104,7 +104,7 @@ def flown(raster: Path) -> Iterator[Frame]:
         for column in np.linspace(inside_m, wide_m - inside_m, _GRID[0])[:: -1 if len(shots) // _GRID[0] % 2 else 1]:
             at = Position(*moved(south, west, column, row))
             shots.append(GeoTag(position=at, height_m=HEIGHT_M, heading_deg=float(rng.uniform(0, 360))))
-    for number, (shot, pose) in enumerate(zip(shots, poses_of(shots, _SEED), strict=True)):
+    for number, (shot, pose) in enumerate(zip(shots, make_poses(shots, _SEED), strict=True)):
         image = seen_from(photo, shot.position, pose, camera, _LIGHT, rng)
         if image is None:
             raise base.EdgevprError(f"Picture {number} leaves {raster}: choose another grid.")

@@ -29,7 +29,7 @@ from edgevpr.core.text import progress
 from edgevpr.frames.images import cv2, list_images, read_image
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.metrics import roc_auc
-from edgevpr.runtime.recognise.gate_networks import prepared_crops
+from edgevpr.runtime.recognise.gate_networks import prepare_crops
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import InputRule
 
@@ -187,7 +187,7 @@ class TrainingSite:
 def site_of(name: str, labelled: Sequence[Labelled]) -> TrainingSite:
     """Read the labelled pictures of a site, and cut them into crops as in flight."""
     pictures = (label.question.picture() for label in labelled)
-    crops = np.stack([(255 * prepared_crops(picture, INPUT)).round().astype(np.uint8) for picture in pictures])
+    crops = np.stack([(255 * prepare_crops(picture, INPUT)).round().astype(np.uint8) for picture in pictures])
     found = np.array([label.found for label in labelled], np.float32)
     return TrainingSite(name, crops, found, np.array([label.question.change is None for label in labelled]))
 

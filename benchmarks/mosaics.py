@@ -68,7 +68,7 @@ class Ground:
         return lat, lon
 
 
-def mosaic_of(folder: Path, on: Laid, part: str) -> tuple[np.ndarray, np.ndarray]:
+def make_mosaic(folder: Path, on: Laid, part: str) -> tuple[np.ndarray, np.ndarray]:
     """Lay the pictures of a `part` of a set (ref, query) over each other: uint8 (H, W, 3) BGR, and bool (H, W), True
     where there is any."""
     width, height = on.size

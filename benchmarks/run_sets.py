@@ -27,7 +27,7 @@ from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.evaluate import provenance
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
-from edgevpr.lab.evaluate.evaluate import MatchOptions, evaluate, known_of
+from edgevpr.lab.evaluate.evaluate import MatchOptions, evaluate, read_known
 from edgevpr.lab.evaluate.metrics import compare
 from edgevpr.runtime.preflight.choose import ACCURACY_PATH as ACCURACY
 from edgevpr.techniques import create
@@ -199,7 +199,7 @@ def can_be_asked(variant: Variant, folder: Path, dataset: Dataset) -> bool:
         return True
     spec = create(variant.technique, settings(variant, folder)).spec
     try:
-        known_of(variant.options.known, dataset, spec, variant.options.sequence)
+        read_known(variant.options.known, dataset, spec, variant.options.sequence)
     except UsageError:
         return False
     return True

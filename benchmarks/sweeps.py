@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 import walks
 from base import Row, camera_of
-from mosaics import laid, mosaic_of
+from mosaics import laid, make_mosaic
 from sweep_changes import NONE, OF_CAMERA, SWEEPS, spoilt, view
 
 from edgevpr import techniques
@@ -178,7 +178,7 @@ def area(polygon: np.ndarray) -> float:
 def _over_mosaic(folder: Path) -> Iterator[Start]:
     """Start where places of the map were taken, over the mosaic of the queries."""
     on = laid(folder)
-    ground, covered = mosaic_of(folder, on, "query")
+    ground, covered = make_mosaic(folder, on, "query")
     every = sorted(path.name for path in (folder / "ref").iterdir())
     images = {name: read_image(folder / "ref" / name) for name in every if name in on.middle}
     there = {name: np.vstack([on.matrix(name, image), [0, 0, 1]]) for name, image in images.items()}

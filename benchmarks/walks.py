@@ -22,10 +22,10 @@ from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.evidence import calibration_of
+from edgevpr.runtime.recognise.evidence import read_calibration_for
 from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, AcceptRule, accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
-from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.opening import make_meter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create
@@ -41,7 +41,7 @@ def config(**keys: object) -> Config:
 
 
 def meter() -> QueryMeter:
-    return meter_of(config(), load_board("this"))
+    return make_meter(config(), load_board("this"))
 
 
 def frames_of(folder: Path) -> Iterator[Frame]:
@@ -86,7 +86,7 @@ def walk(
 ) -> Recogniser:
     """Return a walk over a map with the technique's own number of candidates, and the rule of the map unless another is
     given; `more` is anything else of a `Recogniser`."""
-    rule = rule or accept_rule(technique, config().match, 1, calibration_of(place_map))
+    rule = rule or accept_rule(technique, config().match, 1, read_calibration_for(place_map))
     settings = WalkSettings(
         candidates=technique.candidates, verify=verify, all_evidence=all_evidence, min_accuracy_m=min_accuracy_m
     )

@@ -18,7 +18,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 from edgevpr.cli.main import EXIT_CODES, command_line
-from edgevpr.core.config import Config, Key, keys_of
+from edgevpr.core.config import Config, Key, list_keys
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.interview import TABLES
 
@@ -104,7 +104,7 @@ def configuration() -> str:
     """Return the page of the configuration: its text is that of `deploy/config.yaml`, its types are the code's."""
     lines = ["# Configuration", "", "Made from `deploy/config.yaml` and `edgevpr/core/config.py`."]
     text, comment, section = (ROOT / "deploy/config.yaml").read_text("utf-8"), [], ""
-    keys = {key.name: key for key in keys_of(Config)}
+    keys = {key.name: key for key in list_keys(Config)}
     for line in text.splitlines():
         if found := re.match(r"( *)# ?(.*)", line):
             comment.append(found[2])

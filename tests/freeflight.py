@@ -13,7 +13,7 @@ from edgevpr.lab.simulate.controller import FlightController
 from edgevpr.lab.simulate.firmware import FAILED, OK
 from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.lab.simulate.motion import Motion, TrueState
-from edgevpr.lab.simulate.reports import yaw_of
+from edgevpr.lab.simulate.reports import compute_yaw
 from edgevpr.lab.simulate.sensors import FIX_3D
 from edgevpr.mavlink.wire import mavlink
 
@@ -154,5 +154,5 @@ def _truth(brain):
     place = truth.lat_deg, truth.lon_deg, truth.alt_m
     speeds = truth.velocity_m_s.imag, truth.velocity_m_s.real, -truth.climb_m_s
     exact = round(truth.lat_deg * 1e7), round(truth.lon_deg * 1e7)
-    angles = math.radians(truth.roll_deg), math.radians(truth.pitch_deg), yaw_of(truth)
+    angles = math.radians(truth.roll_deg), math.radians(truth.pitch_deg), compute_yaw(truth)
     return mavlink.MAVLink_sim_state_message(1, 0, 0, 0, *angles, 0, 0, -9.81, 0, 0, 0, *place, 0, 0, *speeds, *exact)

@@ -16,13 +16,13 @@ from edgevpr.cli.shared import (
     add_known,
     add_parameters,
     command,
-    config_of,
     count,
-    parameters_of,
+    load_command_config,
+    parse_parameters,
+    parse_value,
     positive,
     report,
     show,
-    value_of,
 )
 from edgevpr.core.config import FORMS
 from edgevpr.core.errors import ModelError, UsageError
@@ -95,7 +95,7 @@ def _measure_many(args: Namespace) -> int:
     from edgevpr.lab.evaluate.page import as_json, write_results
     from edgevpr.lab.evaluate.tables import results_text
 
-    if value_of(args, "salience.use"):
+    if parse_value(args, "salience.use"):
         raise UsageError("--salience goes without --out: it takes one set.")
     plan = _plan(args)
     _say_cameras(plan)
@@ -114,12 +114,12 @@ def _measure_techniques(args: Namespace) -> int:
     """Measure techniques on one set, and print the results."""
     from edgevpr.lab.evaluate.evaluate import evaluate
     from edgevpr.lab.evaluate.metrics import compare
-    from edgevpr.runtime.recognise.opening import gate_of
+    from edgevpr.runtime.recognise.opening import open_salience_gate
 
     if args.sets or args.workers or len(args.data or ()) > 1:
         raise UsageError("--sets, --workers and several sets need a folder for the results: name it with --out.")
     plan = _plan(args)
-    gate = gate_of(config_of(args, args.config).salience)
+    gate = open_salience_gate(load_command_config(args, args.config).salience)
     (chosen,) = plan.sets.values()
     measured: list[TechniqueResult] = []
     errors: dict[str, ModelError] = {}  # by technique, whatever the form
@@ -203,13 +203,13 @@ def _rows(args: Namespace) -> "dict[str, RowPlan]":
     forms = [form.strip() for form in args.form.split(",")]
     if unknown := [form for form in forms if form not in FORMS]:
         raise UsageError(f"--form names `{unknown[0]}`: use some of {', '.join(FORMS)}.")
-    settings = {name: camera_setting(name, value_of(args, "source.camera")) for name in wanted}
-    for key, value in parameters_of(args.param).items():
+    settings = {name: camera_setting(name, parse_value(args, "source.camera")) for name in wanted}
+    for key, value in parse_parameters(args.param).items():
         name, _, parameter = key.partition(".")
         if name not in settings or not parameter:
             raise UsageError(f"--param {key}: write TECHNIQUE.KEY=VALUE with a technique of --techniques.")
         settings[name][parameter] = value
-    match = config_of(args, args.config).match
+    match = load_command_config(args, args.config).match
     return {
         offer.label: RowPlan(
             technique=offer.name,

@@ -85,7 +85,7 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
 }
 
 
-def shown_examples(command: str) -> str:
+def format_examples(command: str) -> str:
     """Return the examples of a command, such as `map build`, as text below its help."""
     lines = [f"  # {text}\n  edgevpr {command} {rest}".rstrip() for text, rest in EXAMPLES[command]]
     return "\n".join(["examples:", *lines])

@@ -5,8 +5,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from edgevpr.cli.maps import add_orthophoto, cuttings_of
-from edgevpr.cli.shared import add_json, add_keys, command, config_of, count, group, lines_of, report, show
+from edgevpr.cli.maps import add_orthophoto, parse_cuttings
+from edgevpr.cli.shared import add_json, add_keys, command, count, group, lines_of, load_command_config, report, show
 from edgevpr.core.errors import UsageError
 from edgevpr.core.text import progress
 
@@ -43,22 +43,22 @@ def fleet_build(args: Namespace) -> int:
     try:
         from edgevpr.core.quadkeys import maps_in
         from edgevpr.fleet import building
-        from edgevpr.fleet.photos import photos_of
+        from edgevpr.fleet.photos import list_photos
         from edgevpr.fleet.worker import FleetOrder
     except ModuleNotFoundError as error:
         raise UsageError(f"A fleet's maps need more packages ({error}): `pip install 'edgevpr[fleet]'`.") from error
 
-    config, out = config_of(args, args.config), Path(args.out)
+    config, out = load_command_config(args, args.config), Path(args.out)
     if (args.images is None) == (args.orthophoto is None):
         raise UsageError("Give either --images (photographs of flights) or --orthophoto: maps are made of one of them.")
     zoom, camera = next(map(len, maps_in(out)), None), config.source.camera
     without_position = 0
     if args.orthophoto:
-        tasks, camera = building.tasks_of_orthophoto(cuttings_of(args), args.places_per_tile, zoom), "nadir"
+        tasks, camera = building.tasks_of_orthophoto(parse_cuttings(args), args.places_per_tile, zoom), "nadir"
     elif camera is None:
         raise UsageError("Where did the camera look? Give --camera nadir (straight down) or --camera forward.")
     else:
-        tasks, without_position = building.tasks_of_photos(photos_of(args.images), args.places_per_tile, zoom)
+        tasks, without_position = building.tasks_of_photos(list_photos(args.images), args.places_per_tile, zoom)
     out = out.absolute()
     order = FleetOrder(out=out, config=config, camera=camera, refine=args.refine, calibrate=args.calibrate)
     done = list(building.build(order, tasks, args.scheduler, args.workers, progress))

@@ -15,16 +15,16 @@ from edgevpr.cli.shared import (
     add_positions,
     add_recording,
     command,
-    config_of,
     exit_code,
     group,
     leave_out,
+    load_command_config,
     path_of,
     require_out,
     show,
     write_out,
 )
-from edgevpr.core.config import Config, with_logs_in
+from edgevpr.core.config import Config, place_logs_in
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import progress, shown
 
@@ -87,14 +87,14 @@ def add(commands: Any) -> None:
 
 def run_match(args: Namespace) -> int:
     """Run `match`: find the places of a recording's images in a map, and print a line for each image."""
-    from edgevpr.cli.matched import match_of, of_matches
+    from edgevpr.cli.matched import format_match, format_matches
     from edgevpr.frames.source import open_source, read_to_end
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.recognise.hints import parse_known_fields
     from edgevpr.runtime.recognise.opening import open_recogniser
-    from edgevpr.techniques.card import weights_of
+    from edgevpr.techniques.card import find_weights
 
-    config, known = config_of(args, args.config, map=args.map), parse_known_fields(args.known)
+    config, known = load_command_config(args, args.config, map=args.map), parse_known_fields(args.known)
     recogniser = open_recogniser(config, load_board(config.board), known=known, follows=args.follow)
     page = _MatchPage(args) if args.page else None
     found = []
@@ -108,15 +108,15 @@ def run_match(args: Namespace) -> int:
         if event.failed:
             leave_out(ImageError(f"{frame.name}: {event.reason}"), unusable)
             continue
-        found.append(match_of(event))
+        found.append(format_match(event))
         if page:
             page.take(event)
         if known:
             found[-1]["hints"] = event.hints and event.hints.fields()
-    lines = list(of_matches(found))
+    lines = list(format_matches(found))
     if known:
         lines.append(f"Known of each query: {','.join(known)}.")
-    if weights := weights_of(recogniser.technique.spec):
+    if weights := find_weights(recogniser.technique.spec):
         lines.append(f"Weights of {weights}.")
     show(found, args.json, "\n".join(lines))
     if page:
@@ -162,12 +162,12 @@ class _MatchPage:
 def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recogniser") -> None:
     """Raise UsageError if no query of `match`, or no place of the map, has what is to be known of it."""
     from edgevpr.frames.positions import find_track, read_track
-    from edgevpr.frames.source import tags_of
+    from edgevpr.frames.source import read_tags
     from edgevpr.runtime.recognise.hints import explain_useless
 
     source, positions = Path(args.source), path_of(args.positions)
     if source.is_dir():
-        queries = list(tags_of(source, positions).values())
+        queries = list(read_tags(source, positions).values())
     else:
         table = positions or find_track(source)
         queries = list(read_track(table).tags) if table else []
@@ -179,7 +179,7 @@ def run_flight(args: Namespace) -> int:
     """Run `run`: fly with a configuration, until the flight ends."""
     from edgevpr.runtime.flight.flight import fly
 
-    config = with_logs_in(config_of(args, args.config), os.environ.get("LOGS_DIRECTORY", ""))
+    config = place_logs_in(load_command_config(args, args.config), os.environ.get("LOGS_DIRECTORY", ""))
     return fly(config, path_of(args.positions))
 
 
@@ -195,7 +195,7 @@ def run_doctor(args: Namespace) -> int:
     from edgevpr.mavlink.address import parse_link
     from edgevpr.runtime.service.doctor import doctor
 
-    config = config_of(args, args.config)
+    config = load_command_config(args, args.config)
     if config.mavlink.link is None:
         raise UsageError("There is no link to the flight controller: name one with --link, or in --config.")
     address = parse_link(config.mavlink.link)

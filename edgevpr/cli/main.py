@@ -10,7 +10,7 @@ from functools import cache
 
 from edgevpr import __version__
 from edgevpr.cli import cameras, evaluation, fleet, flying, maps, networks, positions, profile, review, simulation, top
-from edgevpr.cli.screen import LineFormatter, guarded_output
+from edgevpr.cli.screen import LineFormatter, guard_output
 from edgevpr.cli.shared import Parser
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import shown
@@ -44,7 +44,7 @@ def program() -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command `argv` (None: that of `sys.argv`) and return its exit code, one of `EXIT_CODES`."""
-    with guarded_output():
+    with guard_output():
         return _run(sys.argv[1:] if argv is None else argv)
 
 

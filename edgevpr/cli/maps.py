@@ -15,19 +15,19 @@ from edgevpr.cli.shared import (
     add_parameters,
     add_recording,
     command,
-    config_of,
     count,
     exit_code,
     group,
     leave_out,
-    parameters_of,
+    load_command_config,
+    parse_parameters,
     path_of,
     positive,
     require_out,
     show,
     write_out,
 )
-from edgevpr.cli.wording import of_check, of_info, of_made, of_moved, of_refined
+from edgevpr.cli.wording import format_build, format_check, format_info, format_move, format_refinement
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import progress
 
@@ -152,10 +152,10 @@ def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
     if args.source is not None:
         rate_hz = getattr(args, "rate_hz", None)
         return FlownPictures(source=args.source, positions=path_of(args.positions), rate_hz=rate_hz)
-    return cuttings_of(args)
+    return parse_cuttings(args)
 
 
-def cuttings_of(args: Namespace) -> "Cuttings":
+def parse_cuttings(args: Namespace) -> "Cuttings":
     """Return the pictures that the flags of an orthophoto name. Raises UsageError."""
     from edgevpr.mapmaking.making import Cuttings
 
@@ -169,12 +169,12 @@ def map_build(args: Namespace) -> int:
     """Run `map build`: make a map from a recording or an orthophoto, or add to one."""
     from edgevpr.mapmaking.making import MapOrder, make_map
 
-    config = config_of(args, args.config)
+    config = load_command_config(args, args.config)
     order = MapOrder(
         path=args.map,
         pictures=_pictures(args),
         technique=args.technique,
-        parameters=parameters_of(args.param),
+        parameters=parse_parameters(args.param),
         board=args.board,
         append=args.append,
         refine=args.refine,
@@ -186,7 +186,7 @@ def map_build(args: Namespace) -> int:
     more |= {"refined": asdict(made.refined)} if made.refined else {}
     more |= {"calibration": made.calibration.figures()} if made.calibration else {}
     about = {"map": args.map, "technique": made.technique, "places": made.places}
-    show({**about, **asdict(made.result), **more}, args.json, of_made(args.map, made, args.orthophoto is not None))
+    show({**about, **asdict(made.result), **more}, args.json, format_build(args.map, made, args.orthophoto is not None))
     return exit_code(unusable)
 
 
@@ -194,11 +194,11 @@ def map_refine(args: Namespace) -> int:
     """Run `map refine`: correct the positions of a map's pictures by comparing them, and print the result."""
     from edgevpr.mapmaking.making import refine_map
     from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.runtime.recognise.opening import technique_of
+    from edgevpr.runtime.recognise.opening import create_technique
 
     with PlaceMap.open_for_adding(args.map) as place_map:
-        refined = refine_map(place_map, technique_of(place_map), args.images, progress)
-    show({"map": args.map, **asdict(refined)}, args.json, of_refined(args.map, refined))
+        refined = refine_map(place_map, create_technique(place_map), args.images, progress)
+    show({"map": args.map, **asdict(refined)}, args.json, format_refinement(args.map, refined))
     return 0
 
 
@@ -209,7 +209,7 @@ def map_move(args: Namespace) -> int:
 
     with PlaceMap.open_for_adding(args.map) as place_map:
         done = move_map(place_map, args.by)
-    show({"map": args.map, **asdict(done)}, args.json, of_moved(args.map, done))
+    show({"map": args.map, **asdict(done)}, args.json, format_move(args.map, done))
     return 0
 
 
@@ -217,11 +217,11 @@ def map_calibrate(args: Namespace) -> int:
     """Run `map calibrate`: calibrate the confidence of matches in a map, and print what to expect of the map."""
     from edgevpr.mapmaking.making import calibrate_map
     from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.runtime.recognise.opening import technique_of
+    from edgevpr.runtime.recognise.opening import create_technique
 
-    config, pictures = config_of(args, args.config), _pictures(args)
+    config, pictures = load_command_config(args, args.config), _pictures(args)
     with PlaceMap.open_for_adding(args.map) as place_map:
-        found = calibrate_map(place_map, technique_of(place_map), config, pictures, progress)
+        found = calibrate_map(place_map, create_technique(place_map), config, pictures, progress)
     show({"map": args.map, "calibration": found.figures()}, args.json, [f"{args.map}: calibrated: {found.described()}"])
     return 0
 
@@ -230,14 +230,14 @@ def map_info(args: Namespace) -> int:
     """Run `map info`: print what a map holds, and what it takes on disk and in RAM; with --page, make a page of it."""
     from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.places.mapinfo import info_of
-    from edgevpr.runtime.recognise.evidence import calibration_of, not_calibrated
+    from edgevpr.places.mapinfo import describe_map
+    from edgevpr.runtime.recognise.evidence import not_calibrated, read_calibration_for
     from edgevpr.techniques import WITH_CONFIDENCE
 
     if args.page:
         require_out(args.page, args.map)
     with PlaceMap.open(args.map) as place_map:
-        info, calibration = info_of(place_map), calibration_of(place_map)
+        info, calibration = describe_map(place_map), read_calibration_for(place_map)
     each_bytes = bytes_per_place(info.spec)
     if calibration:
         confidence: str | None = f"calibrated {calibration.made}: {calibration.described()}"
@@ -245,7 +245,7 @@ def map_info(args: Namespace) -> int:
         confidence = not_calibrated(info.places) if info.spec.name == WITH_CONFIDENCE else None
     ram_mb = info.places * each_bytes / 1e6
     known = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": each_bytes}
-    said = list(of_info(info, confidence, ram_mb))
+    said = list(format_info(info, confidence, ram_mb))
     show({**asdict(info), **known, "ram_mb": ram_mb}, args.json, said)
     if args.page:
         _write_page(args, said, calibration.recognisable if calibration else {})
@@ -260,7 +260,7 @@ def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, flo
     from edgevpr.review.mappage import MOST_ASKED, make_map_page
     from edgevpr.runtime.recognise.levelling import lens_of
 
-    lens = lens_of(config_of(args, args.config).source)
+    lens = lens_of(load_command_config(args, args.config).source)
     with PlaceMap.open(args.map) as place_map:
         places = list(place_map.places())
         pictures = album_of_map(args.map_images, places)
@@ -280,7 +280,7 @@ def map_check(args: Namespace) -> int:
     from edgevpr.places.examine import check
 
     found = check(args.map, progress)
-    show({**asdict(found), "is_whole": found.is_whole}, args.json, of_check(found))
+    show({**asdict(found), "is_whole": found.is_whole}, args.json, format_check(found))
     return 0 if found.is_whole else 1
 
 
@@ -294,7 +294,7 @@ def map_repair(args: Namespace) -> int:
     done = {"path": args.map, "kept": found.places, "dropped": dropped, "original": original and str(original)}
     last = f"{args.map}: repaired, {found.places} places kept, {dropped} dropped; the original is {original}"
     text = "nothing is damaged: the map is as it was" if original is None else last
-    show(done, args.json, [*of_check(found), text])
+    show(done, args.json, [*format_check(found), text])
     return 0
 
 
@@ -330,12 +330,12 @@ def map_shrink(args: Namespace) -> int:
 def run_salience(args: Namespace) -> int:
     """Run `salience`: print the salience scores of a picture (see the glossary)."""
     from edgevpr.frames.images import read_image
-    from edgevpr.runtime.recognise.opening import gate_of
-    from edgevpr.runtime.recognise.salience_gate import worth_of
+    from edgevpr.runtime.recognise.opening import open_salience_gate
+    from edgevpr.runtime.recognise.salience_gate import compute_memorability
 
-    gate = gate_of(config_of(args, args.config, **{"salience.use": True}).salience)
+    gate = open_salience_gate(load_command_config(args, args.config, **{"salience.use": True}).salience)
     assert gate is not None  # salience.use is set
-    worth = worth_of(gate.scores(read_image(Path(args.image))), gate.config)
+    worth = compute_memorability(gate.scores(read_image(Path(args.image))), gate.config)
     known = {"kept": worth.reason is None, "reason": worth.reason}
     show({"image": args.image, **asdict(worth.salience), **known}, args.json)
     return 0

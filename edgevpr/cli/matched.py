@@ -18,7 +18,7 @@ _NUMBER = re.compile(r"\d+(\.\d+)?%?")
 _UNSURE = re.compile(r"confidence \d|track filter \d")  # such reasons begin with figures that the table has
 
 
-def match_of(event: "Recognition") -> dict[str, Any]:
+def format_match(event: "Recognition") -> dict[str, Any]:
     """Return what `match --json` says of a query: the fields of its event, but `position` is the fix (null: none), and
     the best place is one object (null: none was found). `of_place`: the fix is the place's own position, since nothing
     is known of the way from there. `from_gps_tag_m`: distance of the fix from the query's own tag, null without both.
@@ -46,8 +46,8 @@ def match_of(event: "Recognition") -> dict[str, Any]:
     return first | fields
 
 
-def of_matches(found: Sequence[dict[str, Any]]) -> Iterator[str]:
-    """Yield the table of the queries `found` (see `match_of`), and its summary."""
+def format_matches(found: Sequence[dict[str, Any]]) -> Iterator[str]:
+    """Yield the table of the queries `found` (see `format_match`), and its summary."""
     sure = "confidence" if any("confidence" in each for each in found) else "score"
     rows = aligned([("query", "accepted", sure, "place, picture"), *(_found(each, sure) for each in found)], left=4)
     fixes = [each for each in found if each["position"]]

@@ -41,7 +41,7 @@ def positions(args: Namespace) -> int:
     from edgevpr.core.errors import UsageError
     from edgevpr.core.text import at_work
     from edgevpr.frames.positions import write_positions, write_track
-    from edgevpr.tracks.placing import place_pictures, place_video, rounded_m
+    from edgevpr.tracks.placing import place_pictures, place_video, round_metres
     from edgevpr.tracks.record import read_record
 
     source, is_folder = Path(args.images), Path(args.images).is_dir()
@@ -66,7 +66,7 @@ def positions(args: Namespace) -> int:
         "offset_s": placed.offset_s,
         "placed": len(placed.track.t_s) if placed.track else sum(bool(tag.position) for tag in placed.tags.values()),
         "of": None if placed.track else placed.pictures,
-        "rounded_m": rounded_m(placed),
+        "round_metres": round_metres(placed),
         "out": str(out),
     }
     show(found, args.json)

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import add_json, add_keys, command, config_of, count, positive, report, show
+from edgevpr.cli.shared import add_json, add_keys, command, count, load_command_config, positive, report, show
 from edgevpr.core.errors import UsageError
 from edgevpr.core.text import progress
 
@@ -95,7 +95,7 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ..
     from edgevpr.runtime.preflight.trial import offers
     from edgevpr.runtime.recognise.opening import budget_mb
 
-    config = config_of(args)
+    config = load_command_config(args)
     places, searched, camera = args.places, None, config.source.camera
     if args.map:
         is_folder = Path(args.map).is_dir()

@@ -8,7 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_json, add_map_images, command, path_of, show, write_out
-from edgevpr.cli.wording import of_replay, of_what_if
+from edgevpr.cli.wording import format_comparison, format_replay
 from edgevpr.core.errors import EdgevprError
 
 if TYPE_CHECKING:
@@ -44,15 +44,15 @@ def add(commands: Any) -> None:
 
 def run_report(args: Namespace) -> int:
     """Run `report`: write the HTML page of a flight."""
-    from edgevpr.review.album import album_of, album_of_map
+    from edgevpr.review.album import album_of_map, make_album
     from edgevpr.review.logged import read_flight, text
     from edgevpr.review.overhead import read_ground
     from edgevpr.review.page import make_flight_page
-    from edgevpr.runtime.flight.recording import frames_of, recording_of
+    from edgevpr.runtime.flight.recording import frames_of, open_recording
 
     flight = read_flight(args.log)
-    folder = recording_of(text(flight.start, "recording"), args.log)
-    frames = album_of(args.images, frames_of(folder) if folder else {})
+    folder = open_recording(text(flight.start, "recording"), args.log)
+    frames = make_album(args.images, frames_of(folder) if folder else {})
     ground: list[Place] = []
     no_ground = "The log does not name a map: give it with --map."
     if path := args.map or text(flight.start, "map"):
@@ -71,11 +71,11 @@ def run_report(args: Namespace) -> int:
 
 def run_export(args: Namespace) -> int:
     """Run `export`: write the points of a flight (matches, fixes, positions) as GeoJSON or CSV."""
-    from edgevpr.review.export import WRITERS, features_of
+    from edgevpr.review.export import WRITERS, make_features
     from edgevpr.review.logged import read_flight
 
     form, target = next((name, given) for name in WRITERS if (given := getattr(args, name)) is not None)
-    features = features_of(read_flight(args.log))
+    features = make_features(read_flight(args.log))
     if target == "-":
         WRITERS[form](features, sys.stdout)
     else:
@@ -94,10 +94,10 @@ def run_replay(args: Namespace) -> int:
     end = {"guessed": again.guessed, "why_ended": again.why_ended}
     if args.config:
         found = compare_queries(again.flown, again.lines)
-        show({**found, **end}, args.json, of_what_if(found, again.why_ended))
+        show({**found, **end}, args.json, format_comparison(found, again.why_ended))
         return 0
     lines, packets = compare(again.flown, again.lines), again.packets
     is_same = not (lines.others or packets.others)
     value = {"lines": asdict(lines), "packets": asdict(packets), **end, "is_same": is_same}
-    show(value, args.json, of_replay(again, lines, packets))
+    show(value, args.json, format_replay(again, lines, packets))
     return 0 if is_same else 1

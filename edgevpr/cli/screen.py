@@ -13,7 +13,7 @@ _LAYOUT = "\n\r\t"  # control characters that pass: tables and progress lines ne
 
 
 @contextmanager
-def guarded_output() -> Iterator[None]:
+def guard_output() -> Iterator[None]:
     """Context manager: all that is written to stdout and stderr inside it passes through `core.text.shown`."""
     with redirect_stdout(_Guarded(sys.stdout)), redirect_stderr(_Guarded(sys.stderr)):
         yield

@@ -10,8 +10,8 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any, NoReturn, TextIO, TypeVar
 
-from edgevpr.cli.examples import shown_examples
-from edgevpr.core.config import Config, keys_of, load_config
+from edgevpr.cli.examples import format_examples
+from edgevpr.core.config import Config, list_keys, load_config
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import meant, shown
 
@@ -45,7 +45,7 @@ def command(commands: Any, name: str, run: Callable[[Namespace], int], text: str
     returns the exit code."""
     parser = _parser(commands, name, text)
     parser.set_defaults(run=run, parser=parser)
-    parser.epilog = shown_examples(parser.prog.partition(" ")[2])
+    parser.epilog = format_examples(parser.prog.partition(" ")[2])
     parser.formatter_class = RawDescriptionHelpFormatter
     return parser
 
@@ -122,7 +122,7 @@ def add_parameters(parser: ArgumentParser, text: str, form: str = "KEY=VALUE") -
 
 def add_keys(parser: ArgumentParser, *names: str) -> None:
     """Add the flags of the configuration keys `names`, such as "source.mask"; without names, those of all keys."""
-    for key in keys_of():
+    for key in list_keys():
         if not key.flags or (names and key.name not in names):
             continue
         form: dict[str, Any] = {"type": key.kind, "metavar": key.metavar, "choices": key.choices or None}
@@ -131,19 +131,19 @@ def add_keys(parser: ArgumentParser, *names: str) -> None:
         parser.add_argument(*key.flags, dest=_KEY + key.name, help=key.text, **form)
 
 
-def value_of(args: Namespace, name: str) -> Any:
+def parse_value(args: Namespace, name: str) -> Any:
     """Return the value that the flags give for the configuration key `name`; None if they give none."""
     return getattr(args, _KEY + name)
 
 
-def config_of(args: Namespace, path: str | None = None, **others: Any) -> Config:
+def load_command_config(args: Namespace, path: str | None = None, **others: Any) -> Config:
     """Make the configuration from the file `path` (None: the defaults). Flags override the file, and the values
     `others`, by configuration key, override both."""
     said = {name.removeprefix(_KEY): value for name, value in vars(args).items() if name.startswith(_KEY)}
     return load_config(path, said | others)
 
 
-def parameters_of(pairs: list[str], example: str = "gt=0.4") -> dict[str, str]:
+def parse_parameters(pairs: list[str], example: str = "gt=0.4") -> dict[str, str]:
     """Read ["gt=0.4"] as {"gt": "0.4"}. Raises UsageError for another form."""
     for pair in pairs:
         if "=" not in pair:

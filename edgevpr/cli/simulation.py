@@ -8,8 +8,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import add_json, add_map_images, add_parameters, command, group, parameters_of, positive, show
-from edgevpr.cli.wording import of_rehearsal
+from edgevpr.cli.shared import (
+    add_json,
+    add_map_images,
+    add_parameters,
+    command,
+    group,
+    parse_parameters,
+    positive,
+    show,
+)
+from edgevpr.cli.wording import format_rehearsal
 from edgevpr.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -111,7 +120,7 @@ def simulate_autopilot(args: Namespace) -> int:
     if args.gps_s and not has_gps:
         raise UsageError("--gps-s goes with --track, and without --no-gps: there is no GPS to be lost.")
     flight: dict[str, Any] = {"track": track, "gps": has_gps, "gps_until_s": args.gps_s or math.inf}
-    parameters = parameters_of(args.param, _PARAMETER)
+    parameters = parse_parameters(args.param, _PARAMETER)
     show(run_autopilot(args.link, vehicle=args.vehicle, parameters=parameters, **flight), args.json)
     return 0
 
@@ -167,7 +176,7 @@ def simulate_rehearsal(args: Namespace) -> int:
         map_images=args.map_images,
     )
     report = rehearse(mission, Path(args.out))
-    show(report, args.json, of_rehearsal(report, args.out))
+    show(report, args.json, format_rehearsal(report, args.out))
     return 0
 
 

@@ -31,7 +31,7 @@ _SEAMS = 1 / 8  # share of places with one: straight kerbs look like seams in 2 
 _SHOWN = 20  # differences of a replay at most
 
 
-def of_made(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
+def format_build(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
     """Yield what `map build` has made, and what to expect of the map. `is_cut`: of an orthophoto."""
     result = made.result
     yield f"{path}: {result.added} places added ({result.without_position} without a position), {made.places} in all"
@@ -50,7 +50,7 @@ def of_made(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
     if result.of_low_quality:
         yield f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps"
     if made.refined:
-        yield from of_refined(path, made.refined)
+        yield from format_refinement(path, made.refined)
     if made.calibration:
         yield f"expect: {made.calibration.described()}"
         if is_cut:
@@ -59,7 +59,7 @@ def of_made(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
         yield f"{path}: {WITHOUT_POSITIONS}"
 
 
-def of_refined(path: str, refined: "Refined") -> Iterator[str]:
+def format_refinement(path: str, refined: "Refined") -> Iterator[str]:
     """Yield the result of refining a map: how many pictures were moved to where they really lie, by how much, and which
     were recorded far from there."""
     if refined.without_position == refined.places:
@@ -78,7 +78,7 @@ def of_refined(path: str, refined: "Refined") -> Iterator[str]:
         yield f"  amiss       place {place_id} ({shown(image)}): recorded {off_m:.0f} m from where its picture lies"
 
 
-def of_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[str]:
+def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[str]:
     """Yield what a map holds. `confidence` is a sentence on how sure its matches can be (None: they are judged by fixed
     limits), `ram_mb` the memory that the map takes in a flight."""
     spec = info.spec
@@ -103,21 +103,21 @@ def of_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[
     yield f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM"
 
 
-def of_moved(path: str, done: "MapMove") -> Iterator[str]:
+def format_move(path: str, done: "MapMove") -> Iterator[str]:
     """Yield how `map move` has moved a map."""
     yield f"{path}: {done.places} places moved {beside(done.east_m, done.north_m)}, +-{done.sd_m:.1f} m"
     if done.scale is not None:
         yield f"  scale       divided by {1 + done.scale:.4f}, around {done.middle[0]:.6f}, {done.middle[1]:.6f}"
 
 
-def of_check(found: "MapCheck") -> Iterator[str]:
+def format_check(found: "MapCheck") -> Iterator[str]:
     """Yield the result of `map check`: the places that can be read, and what is damaged."""
     yield f"{found.path}: {found.places} of {found.places + len(found.damaged)} places can be read"
     yield from (f"  damaged     place {place_id}: {problem}" for place_id, problem in found.damaged)
     yield from (f"  SQLite      {fault}" for fault in found.faults or ("the file is sound",))
 
 
-def of_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iterator[str]:
+def format_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iterator[str]:
     """Yield how a replay differs from its flight: in the `lines` of the log, in the `packets` sent, and in its end."""
     yield from _first([*map(_of_line, lines.others), *packets.others])
     yield from (f"The program differs: {name} was {then}, is {now}" for name, (then, now) in lines.program.items())
@@ -130,7 +130,7 @@ def of_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iterator
         yield f"The replay ends before the flight: {again.why_ended}; {lines.after} lines come after it."
 
 
-def of_what_if(found: dict[str, Any], why_ended: str | None) -> Iterator[str]:
+def format_comparison(found: dict[str, Any], why_ended: str | None) -> Iterator[str]:
     """Yield how the queries of a flight end with another configuration. `found` is the result of
     `review.compare.compare_queries`; `why_ended` says why the replay ended before the flight did (None: it did not)."""
     others = found["queries"]
@@ -147,7 +147,7 @@ def of_what_if(found: dict[str, Any], why_ended: str | None) -> Iterator[str]:
         yield f"The replay ends before the flight: {why_ended}."
 
 
-def of_rehearsal(found: "RehearsalReport", folder: str) -> Iterator[str]:
+def format_rehearsal(found: "RehearsalReport", folder: str) -> Iterator[str]:
     """Yield what a rehearsed mission lets expect: the answer, its figures, and where nothing was recognised."""
     yield found.answer
     known_s = f"{found.gps_until_s:.0f} s"

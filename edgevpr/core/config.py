@@ -222,14 +222,14 @@ class Config:
     battery: BatteryConfig
 
 
-def keys_of(cls: type = Config, prefix: str = "") -> Iterator[Key]:
+def list_keys(cls: type = Config, prefix: str = "") -> Iterator[Key]:
     """Yield the keys of the dataclass `cls` and of its sections, in the order of the fields. `prefix` is put before
     each name: the dotted name of the section that `cls` is, such as "source." ("": the whole configuration)."""
     hints = typing.get_type_hints(cls)
     for spec in fields(cls):
         kind = _kind(hints[spec.name])
         if is_dataclass(kind):
-            yield from keys_of(kind, f"{prefix}{spec.name}.")
+            yield from list_keys(kind, f"{prefix}{spec.name}.")
         else:
             yield replace(spec.metadata.get("key", _ANY), name=prefix + spec.name, kind=kind)
 
@@ -252,14 +252,14 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
     return build(Config, merged, str(path or "the command line"))
 
 
-def changed_config(config: Config, path: str | Path) -> Config:
+def change_config(config: Config, path: str | Path) -> Config:
     """Return a copy of `config` with the values of the YAML file `path` in place of its own. Raises ConfigError."""
     from edgevpr.core.yamlfile import read_yaml
 
     return build(Config, _overlaid(asdict(config), read_yaml(path)), str(path))
 
 
-def with_logs_in(config: Config, folder: str) -> Config:
+def place_logs_in(config: Config, folder: str) -> Config:
     """Return a copy of `config` in which the paths of logs and recordings of a flight, where relative, are relative to
     `folder`."""
     given = ((name, getattr(config.log, name)) for name in ("path", "tlog", "record"))

@@ -68,7 +68,7 @@ def read_file(path: str | Path, most_bytes: int) -> bytes:
         return handle.read(size) or b""  # read gives None for a kernel file that has no data yet
 
 
-def sha256_of(path: str | Path, most_bytes: int = sys.maxsize) -> str:
+def compute_sha256(path: str | Path, most_bytes: int = sys.maxsize) -> str:
     """Compute the SHA-256 of a regular file, 64 hexadecimal digits; raises OSError as `open_file` does."""
     digest = hashlib.sha256()
     with open_file(path, most_bytes) as handle:

@@ -54,7 +54,7 @@ def moved(lat_deg: float, lon_deg: float, east_m: float, north_m: float) -> tupl
     return lat_deg + north_deg, shorter_deg(lon_deg + east_deg)
 
 
-def extent_of(points: Iterable[LatLon]) -> tuple[float, float, float, float]:
+def compute_extent(points: Iterable[LatLon]) -> tuple[float, float, float, float]:
     """Return the bounding box of points (lat, lon): south, west, north, east. East is above 180 degrees if the shorter
     way from point to point crosses the antimeridian."""
     lats_deg, lons_deg = zip(*points, strict=True)

@@ -22,7 +22,7 @@ _MORE = 0.01  # of an extent: its edges are curves in other projections
 Extent = tuple[float, float, float, float]
 
 
-def keys_at(lat_deg: Doubles, lon_deg: Doubles, zoom: int) -> NDArray[np.str_]:
+def tile_keys(lat_deg: Doubles, lon_deg: Doubles, zoom: int) -> NDArray[np.str_]:
     """Return the keys, of `zoom` digits, of the tiles in which positions in degrees (N,) lie: str (N,). Raises
     UsageError for a position near a pole."""
     if len(lat_deg) and np.abs(lat_deg).max() > MOST_LAT_DEG:
@@ -42,7 +42,7 @@ def _spelt(column: Ints, row: Ints, zoom: int) -> NDArray[np.str_]:
     return keys
 
 
-def extent_of_key(key: str) -> Extent:
+def tile_extent(key: str) -> Extent:
     """Return the bounding box of a tile: (south, west, north, east) in degrees."""
     column = sum((int(digit) & 1) << level for level, digit in enumerate(reversed(key)))
     row = sum((int(digit) >> 1) << level for level, digit in enumerate(reversed(key)))
@@ -53,9 +53,9 @@ def extent_of_key(key: str) -> Extent:
 
 
 def extent_around(key: str, margin_m: float) -> Extent:
-    """Return the bounding box of a tile and of the ground within `margin_m` metres of it, as `extent_of_key` does; its
+    """Return the bounding box of a tile and of the ground within `margin_m` metres of it, as `tile_extent` does; its
     east may be above 180."""
-    south, west, north, east = extent_of_key(key)
+    south, west, north, east = tile_extent(key)
     (south, west), (north, east) = moved(south, west, -margin_m, -margin_m), moved(north, east, margin_m, margin_m)
     return south, west, north, west + (east - west) % 360
 

@@ -44,7 +44,7 @@ def _escape(char: str) -> str:
     return char.encode("unicode_escape").decode("ascii")
 
 
-def without_passwords(text: str) -> str:
+def redact_passwords(text: str) -> str:
     """Replace passwords and keys in the addresses of a text by ***: rtsp://user:***@host/path?token=***."""
     if ":/" not in text:
         return text
@@ -52,11 +52,11 @@ def without_passwords(text: str) -> str:
 
 
 def shown(text: str, keep: str = "") -> str:
-    """Make a text fit for messages: see `without_passwords` and `printable`, which also explains `keep`."""
-    return printable(without_passwords(text), keep)
+    """Make a text fit for messages: see `redact_passwords` and `printable`, which also explains `keep`."""
+    return printable(redact_passwords(text), keep)
 
 
-def decoded_name(name: str) -> str:
+def decode_name(name: str) -> str:
     """Return a file name as valid UTF-8 text: bytes that are not UTF-8 become \\xNN."""
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
@@ -97,7 +97,7 @@ def json_line(value: Any) -> bytes:
 def _plain(value: Any) -> Any:
     """Convert `value` to JSON types; numbers get seven decimals (a centimetre of latitude) or, if below 1, 7 digits."""
     if isinstance(value, str):
-        return without_passwords(value)
+        return redact_passwords(value)
     if value is None or isinstance(value, (bool, int)):
         return value
     if isinstance(value, float):
@@ -112,7 +112,7 @@ def _plain(value: Any) -> Any:
         return _plain(asdict(value))
     if hasattr(value, "tolist"):  # NumPy's scalars and arrays
         return _plain(value.tolist())
-    return without_passwords(str(value))
+    return redact_passwords(str(value))
 
 
 def is_quiet() -> bool:

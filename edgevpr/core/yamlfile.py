@@ -44,10 +44,10 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
         data = read_file(path, MAX_FILE_BYTES)
     except OSError as error:
         raise ConfigError(f"{path} cannot be read ({error.strerror}): give the path of a YAML file.") from error
-    return parsed_yaml(data, path)
+    return parse_yaml(data, path)
 
 
-def parsed_yaml(data: bytes, path: str | Path) -> dict[str, Any]:
+def parse_yaml(data: bytes, path: str | Path) -> dict[str, Any]:
     """Parse the bytes of the YAML file `path`; raises ConfigError as `read_yaml` does."""
     try:
         content = deepcopy(_load(data.decode("utf-8-sig")))

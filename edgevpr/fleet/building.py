@@ -15,14 +15,14 @@ from edgevpr.core.errors import MapBusyError, MapError, UsageError
 from edgevpr.core.quadkeys import (
     extent_around,
     in_extent,
-    keys_at,
     keys_over,
     maps_in,
+    tile_keys,
     zoom_of_places,
     zoom_of_spacing,
 )
 from edgevpr.fleet import index
-from edgevpr.fleet.index import Tile, tile_of
+from edgevpr.fleet.index import Tile, find_tile
 from edgevpr.fleet.photos import Photos
 from edgevpr.fleet.worker import MARGIN_M, TECHNIQUE, DoneTile, FleetOrder, TileTask, build_tile
 from edgevpr.mapmaking.making import Cuttings
@@ -48,7 +48,7 @@ def tasks_of_photos(photos: Photos, places_per_tile: int, zoom: int | None) -> t
     lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points.values()]).T
     zoom = zoom_of_places(lat_deg, lon_deg, places_per_tile) if zoom is None else zoom
     uris, northwards, tasks = list(points), np.argsort(lat_deg), []
-    keys = keys_at(lat_deg, lon_deg, zoom)
+    keys = tile_keys(lat_deg, lon_deg, zoom)
     for key in np.unique(keys).tolist():
         extent_deg = extent_around(key, MARGIN_M)
         near = northwards[slice(*np.searchsorted(lat_deg, extent_deg[::2], sorter=northwards))]
@@ -99,7 +99,7 @@ def build(
                 yield done
         finally:
             paths = maps_in(order.out)
-            index.write(order.out, (tiles[key] if key in tiles else tile_of(path) for key, path in paths.items()))
+            index.write(order.out, (tiles[key] if key in tiles else find_tile(path) for key, path in paths.items()))
 
 
 @contextmanager

@@ -12,12 +12,12 @@ import pyogrio
 import shapely
 
 from edgevpr.core.contract import TechniqueSpec
-from edgevpr.core.quadkeys import extent_of_key
-from edgevpr.places.history import counts_of
+from edgevpr.core.quadkeys import tile_extent
+from edgevpr.places.history import read_counts
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import info_of
+from edgevpr.places.mapinfo import describe_map
 from edgevpr.places.tilemap import INDEX
-from edgevpr.runtime.recognise.evidence import calibration_of
+from edgevpr.runtime.recognise.evidence import read_calibration_for
 
 _LAYER = "tiles"
 _KINDS: Mapping[str, type] = {str(int): np.int64, str(float | None): np.float64}  # of columns; others are texts
@@ -52,11 +52,11 @@ def path_of(folder: Path, key: str) -> Path:
     return folder / f"{key}.gpkg"
 
 
-def tile_of(path: Path) -> Tile:
+def find_tile(path: Path) -> Tile:
     """Read what the index says of a tile from its map. Raises MapError."""
     with PlaceMap.open(path) as place_map:
-        info, calibration, inputs = info_of(place_map), calibration_of(place_map), place_map.inputs_sha256
-        counts = counts_of(place_map)
+        info, calibration, inputs = describe_map(place_map), read_calibration_for(place_map), place_map.inputs_sha256
+        counts = read_counts(place_map)
     return Tile(
         key=path.stem,
         places=info.places,
@@ -79,7 +79,7 @@ def technique_text(spec: TechniqueSpec) -> str:
 def write(folder: Path, tiles: Iterable[Tile]) -> None:
     """Write the index of a folder. It is replaced as a whole."""
     tiles = list(tiles)
-    extents = [extent_of_key(tile.key) for tile in tiles]
+    extents = [tile_extent(tile.key) for tile in tiles]
     outlines = [shapely.to_wkb(shapely.box(west, south, east, north)) for south, west, north, east in extents]
     columns = list(zip(*map(astuple, tiles), strict=True)) or [() for _ in fields(Tile)]
     kinds = [_KINDS.get(str(field.type), object) for field in fields(Tile)]

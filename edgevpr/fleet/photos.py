@@ -15,10 +15,10 @@ import fsspec
 
 from edgevpr.core.errors import SourceError, UsageError
 from edgevpr.core.geodesy import distance_m
-from edgevpr.core.text import decoded_name
+from edgevpr.core.text import decode_name
 from edgevpr.frames.images import EXTENSIONS, is_image
 from edgevpr.frames.positions import GeoTag, read_positions, write_positions
-from edgevpr.frames.source import tags_of
+from edgevpr.frames.source import read_tags
 
 _CHUNK_BYTES = 1 << 20
 _HASH_DIGITS, _MOST_LETTERS = 12, 40  # of a name: that of a file has 255 bytes
@@ -38,7 +38,7 @@ class Gathered:
     unusable: dict[str, str]
 
 
-def photos_of(sources: Sequence[str]) -> Photos:
+def list_photos(sources: Sequence[str]) -> Photos:
     """Return the photographs of folders and tables. One that is named twice counts once. Raises UsageError for a source
     that cannot be read, and for a photograph that has two positions."""
     found: dict[str, tuple[GeoTag, str]] = {}
@@ -60,7 +60,7 @@ def _agree(tag: GeoTag, other: GeoTag) -> bool:
 def _of_source(source: str) -> Iterator[tuple[str, GeoTag]]:
     path = Path(source)
     if path.is_dir():
-        yield from ((str(image.absolute()), tag) for image, tag in tags_of(path).items())
+        yield from ((str(image.absolute()), tag) for image, tag in read_tags(path).items())
     elif path.suffix.lower() == ".csv":
         folder = path.absolute().parent
         yield from ((file if "://" in file else str(folder / file), tag) for file, tag in read_positions(path).items())
@@ -77,7 +77,7 @@ def _name(uri: str, sha256: str) -> str:
     """Return the name of a photograph in a map: its folder's, its own, so that names sort as the pictures were taken,
     and the hash of its content."""
     path = urlsplit(uri).path if uri.startswith(("http://", "https://")) else uri
-    *folder, file = decoded_name(path).rsplit("/", 2)[-2:]
+    *folder, file = decode_name(path).rsplit("/", 2)[-2:]
     words = [*folder, Path(file).stem]
     return "_".join([*(word[-_MOST_LETTERS:] for word in words), sha256[:_HASH_DIGITS]]) + Path(file).suffix
 

@@ -17,14 +17,14 @@ import cv2
 from edgevpr import __version__
 from edgevpr.core.config import Config
 from edgevpr.core.errors import EdgevprError, ImageError
-from edgevpr.core.quadkeys import keys_at
-from edgevpr.fleet.index import Tile, path_of, tile_of
+from edgevpr.core.quadkeys import tile_keys
+from edgevpr.fleet.index import Tile, find_tile, path_of
 from edgevpr.fleet.photos import Photos, content_in, gather
 from edgevpr.mapmaking.cuttings import NoPlaceError
 from edgevpr.mapmaking.making import Cuttings, FlownPictures, MapOrder, make_map
-from edgevpr.mapmaking.passes import history_of
+from edgevpr.mapmaking.passes import read_history
 from edgevpr.places.examine import Wanted, positions_in, select
-from edgevpr.places.history import History, removed_from, write_history
+from edgevpr.places.history import History, drop_places, write_history
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.preflight.pick import camera_setting
 
@@ -113,7 +113,7 @@ def _of_orthophoto(order: FleetOrder, key: str, cuttings: Cuttings) -> _Inputs:
 
     def inside(place_map: PlaceMap) -> list[int]:
         place_ids, lat_deg, lon_deg = positions_in(place_map)
-        there: list[int] = place_ids[keys_at(lat_deg, lon_deg, len(key)) == key].tolist()
+        there: list[int] = place_ids[tile_keys(lat_deg, lon_deg, len(key)) == key].tolist()
         return there
 
     return _Inputs(
@@ -147,7 +147,7 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
     inputs = _of_orthophoto(order, task.key, task.cuttings) if task.cuttings else _of_photos(order, task, folder)
     unusable = inputs.unusable
     done = DoneTile(key=task.key, unusable=tuple(unusable))
-    if target.exists() and (there := tile_of(target)).inputs_sha256 == inputs.sha256:
+    if target.exists() and (there := find_tile(target)).inputs_sha256 == inputs.sha256:
         return replace(done, tile=there)
     if lost := _lost(target, inputs.is_named):
         return replace(done, problem=lost)
@@ -170,7 +170,7 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
     )
     make_map(ordered, order.config, report_unusable, lambda items, *_: items)
     folders = {name: uri.rpartition("/")[0] for name, uri in inputs.uris.items()}
-    history = history_of(whole, inputs.pictures, order.config, folders, inputs.inside) if folders else History()
+    history = read_history(whole, inputs.pictures, order.config, folders, inputs.inside) if folders else History()
 
     def kept(place_map: PlaceMap) -> list[int]:
         inside = place_map.places(inputs.inside(place_map))
@@ -187,7 +187,7 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
         unfinished.replace(target)
     finally:
         unfinished.unlink(missing_ok=True)
-    return replace(done, tile=tile_of(target), is_new=True, unusable=tuple(unusable))
+    return replace(done, tile=find_tile(target), is_new=True, unusable=tuple(unusable))
 
 
 def _lost(target: Path, is_named: Callable[[str], bool]) -> str | None:
@@ -195,7 +195,7 @@ def _lost(target: Path, is_named: Callable[[str], bool]) -> str | None:
     if not target.exists():
         return None
     with PlaceMap.open(target) as place_map:
-        names = [*(place.source_image for place in place_map.places()), *removed_from(place_map)]
+        names = [*(place.source_image for place in place_map.places()), *drop_places(place_map)]
     lost = sorted(name for name in names if not is_named(name))
     if not lost:
         return None

@@ -13,7 +13,7 @@ from edgevpr.core.arrays import Image, Ints, Singles
 from edgevpr.core.errors import ConfigError, EdgevprError, ImageError
 from edgevpr.core.files import write_whole
 from edgevpr.core.types import Frame
-from edgevpr.frames.lens import CalibratedLens, sight_of
+from edgevpr.frames.lens import CalibratedLens, line_of_sight
 
 MIN_VIEWS = 8
 _ENOUGH_VIEWS = 30
@@ -105,7 +105,7 @@ def calibrate(views: BoardViews, path: str, is_fisheye: bool) -> CalibratedCamer
         )
     empty = views.empty_cells()
     try:
-        sight = sight_of(lens, lens.size_px)
+        sight = line_of_sight(lens, lens.size_px)
     except ConfigError as error:
         raise EdgevprError(f"{error} Hold the board in {', '.join(empty) or 'the corners'} too.") from error
     advice = [f"No corner in {', '.join(empty)}: hold the board there."] if empty else []

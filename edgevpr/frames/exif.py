@@ -48,7 +48,7 @@ def read_exif(path: str | Path) -> GeoTag:
     )
 
 
-def fov_deg_of(path: str | Path) -> float | None:
+def read_fov_deg(path: str | Path) -> float | None:
     """Return about how wide the lens sees along the longest side of a picture, by the focal length in its EXIF data
     that gives the same view on film of 36 x 24 mm. The views are compared along the diagonal (CIPA DCG-001). None: the
     EXIF data do not say it. Never raises."""

@@ -19,7 +19,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, Image, Mask, Singles
 from edgevpr.core.errors import ConfigError, ImageError
 from edgevpr.core.files import read_file
-from edgevpr.core.yamlfile import parsed_yaml
+from edgevpr.core.yamlfile import parse_yaml
 from edgevpr.frames.images import shrunk
 
 _MAX_FILE_BYTES = 300_000  # OpenCV's program writes all corners of the board into its file too
@@ -156,7 +156,7 @@ def _remap(image: Image, pixels: Singles, interpolation: int, border: int) -> Im
 
 
 @lru_cache(maxsize=8)
-def sight_of(lens: CalibratedLens, size_px: tuple[int, int]) -> LensSight:
+def line_of_sight(lens: CalibratedLens, size_px: tuple[int, int]) -> LensSight:
     """Return what a lens shows in pictures of `size_px` (width, height). Raises ImageError for pictures of another
     shape than those that it was calibrated with, and ConfigError for a calibration that can be of no lens."""
     (width, height), (own_width, own_height), (column, row) = size_px, lens.size_px, lens.centre_px
@@ -207,7 +207,7 @@ def read_lens(path: str) -> CalibratedLens:
         data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
         raise ConfigError(f"{path} cannot be read ({error.strerror}): give the calibration of the lens.") from error
-    content = _read_xml(data, path) if data.lstrip().startswith(b"<") else parsed_yaml(_NO_YAML.sub(b"", data), path)
+    content = _read_xml(data, path) if data.lstrip().startswith(b"<") else parse_yaml(_NO_YAML.sub(b"", data), path)
     fields = {str(name).lower(): value for name, value in content.items()}  # old files of OpenCV have capitals
     try:
         lens = _read_kalibr(fields["cam0"], path) if "cam0" in fields else _read_matrix(fields, path)
@@ -216,7 +216,7 @@ def read_lens(path: str) -> CalibratedLens:
         raise ConfigError(
             f"{path} {lacking}: give a calibration of OpenCV, ROS or Kalibr, such as `edgevpr calibrate-camera` writes."
         ) from error
-    sight_of(lens, lens.size_px)
+    line_of_sight(lens, lens.size_px)
     return lens
 
 

@@ -16,7 +16,7 @@ from edgevpr.core.arrays import Doubles, Image, Mask
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.images import shrunk
-from edgevpr.frames.lens import CalibratedLens, Remap, sight_of
+from edgevpr.frames.lens import CalibratedLens, Remap, line_of_sight
 
 MAX_TILT_DEG = 60.0
 # Without a lens an image is not levelled, and beyond this tilt it looks otherwise than straight down. With one, the
@@ -135,11 +135,11 @@ def levelled(
     taking = _Taking(frame, vehicle, lens)
     if taking.is_too_tilted:
         view = View(up_deg=taking.top_deg, reason=f"it is tilted {taking.tilt_deg:.0f} degrees")
-        return straightened(frame.image, overlay, view, lens.calibrated)
+        return undistort_frame(frame.image, overlay, view, lens.calibrated)
     if taking.tilt_deg > MAX_TILT_UNLEVELLED_DEG and taking.heading_deg is None:
         # The ground that it shows lies far from the aircraft, in an unknown direction.
         view = View(reason=f"it is tilted {taking.tilt_deg:.0f} degrees, and its heading is unknown")
-        return straightened(frame.image, overlay, view, lens.calibrated)
+        return undistort_frame(frame.image, overlay, view, lens.calibrated)
     own_m = taking.own_m and scale * taking.own_m
     zoom = own_m / footprint_m if own_m and footprint_m else scale
     if not _ZOOMS[0] <= zoom <= _ZOOMS[1]:
@@ -148,7 +148,7 @@ def levelled(
     if taking.tilt_deg < _LEAST_TILT_DEG and turn_deg < _LEAST_TURN_DEG and abs(zoom - 1) < _LEAST_ZOOM:
         aside, focal = taking.aside(taking.straight, 1.0), taking.focal_px / taking.longest_px
         view = View(up_deg=taking.top_deg, footprint_m=own_m, aside=aside, focal=focal)
-        return straightened(frame.image, overlay, view, lens.calibrated)
+        return undistort_frame(frame.image, overlay, view, lens.calibrated)
 
     below &= taking.tilt_deg <= MAX_TILT_UNLEVELLED_DEG
     side = min(taking.longest_px, _LONGEST_PX)
@@ -163,7 +163,7 @@ def levelled(
     if (filled := warp.shown.mean() / (height * width)) < _LEAST_FILLED:
         reason = f"it shows {filled:.0%} of the ground under it at a tilt of {taking.tilt_deg:.0f} degrees"
         view = View(up_deg=taking.top_deg, reason=reason)
-        return straightened(frame.image, overlay, view, lens.calibrated)
+        return undistort_frame(frame.image, overlay, view, lens.calibrated)
     view = View(
         up_deg=None if taking.heading_deg is None else 0.0,
         footprint_m=own_m and own_m / zoom,
@@ -174,7 +174,7 @@ def levelled(
     return _warped(frame.image, overlay, warp, view)
 
 
-def footprint_of(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> float | None:
+def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> float | None:
     """Return the ground length in metres of a picture's longest side if it were level, by the height of `frame` or,
     where it has none, of `vehicle`. None: unknown."""
     *_, height_m = _attitude(frame, vehicle)
@@ -183,13 +183,13 @@ def footprint_of(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> float | N
     return 2 * height_m * math.tan(math.radians(lens.fov_deg) / 2)
 
 
-def straightened(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> Levelled:
+def undistort_frame(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> Levelled:
     """Take the distortion of `lens` from a picture that is not warped otherwise (None: it has none). `overlay` is as in
     `levelled`. Raises ImageError for a picture of another shape than the lens takes."""
     if lens is None:
         return Levelled(image, overlay, view)
     height, width = image.shape[:2]
-    return _warped(image, overlay, sight_of(lens, (width, height)).straightening(_LONGEST_PX), view)
+    return _warped(image, overlay, line_of_sight(lens, (width, height)).straightening(_LONGEST_PX), view)
 
 
 def _warped(image: Image, overlay: Mask | None, warp: "_Homography | Remap", view: View) -> Levelled:
@@ -246,12 +246,12 @@ class _Taking:
         self._level_from_straight = _level_from_body(*known) @ lens.mount.body_from_straight()
         self._lens = lens
         height, width = frame.image.shape[:2]
-        self._sight = sight_of(lens.calibrated, (width, height)) if lens.calibrated else None
+        self._sight = line_of_sight(lens.calibrated, (width, height)) if lens.calibrated else None
         if self._sight:
             width, height = self._sight.straight_px
         self.size_px, self.longest_px = (width, height), max(height, width)
         self.focal_px = self.longest_px / 2 / math.tan(math.radians(lens.fov_deg) / 2)
-        self.own_m = footprint_of(frame, vehicle, lens)
+        self.own_m = compute_footprint(frame, vehicle, lens)
         focal, middle = self.focal_px, ((width - 1) / 2, (height - 1) / 2)
         self.lens_from_pixel = np.linalg.inv([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
         right, lower = width - 0.5, height - 0.5

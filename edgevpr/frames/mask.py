@@ -29,7 +29,7 @@ class Mask:
         return cv2.resize(self.allowed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-def mask_of(path: str | None) -> Mask | None:
+def load_mask(path: str | None) -> Mask | None:
     """Read the image that the configuration names as a mask (`source.mask`): bright pixels show ground, dark ones are
     ignored. None if it names none. Raises ImageError for a file that is no image, and UsageError for a mask that leaves
     too little of the frame."""

@@ -206,7 +206,7 @@ class Track:
     t_s: tuple[float, ...]
     tags: tuple[GeoTag, ...]
 
-    def tag_at(self, t_s: float) -> GeoTag:
+    def interpolate_tag(self, t_s: float) -> GeoTag:
         """Return position, attitude and height at the video time `t_s`, interpolated linearly between the two table
         rows around it. The tag is empty outside the table, and if these rows are more than `MOST_GAP_S` apart."""
         nearest = int(np.abs(np.subtract(self.t_s, t_s)).argmin())

@@ -14,7 +14,7 @@ from pathlib import Path
 from edgevpr.core.arrays import Image
 from edgevpr.core.config import SOURCES
 from edgevpr.core.errors import EdgevprError, ImageError, SourceError, UsageError
-from edgevpr.core.text import decoded_name
+from edgevpr.core.text import decode_name
 from edgevpr.core.types import Frame
 from edgevpr.frames.depth import DepthRange
 from edgevpr.frames.exif import read_exif
@@ -111,7 +111,7 @@ class FolderSource(RecordingSource):
     ) -> None:
         super().__init__(only)
         self._steps_s = iter(steps_s)
-        paths = {decoded_name(path.name): path for path in list_images(folder)}  # names in maps and tables are UTF-8
+        paths = {decode_name(path.name): path for path in list_images(folder)}  # names in maps and tables are UTF-8
         self._tags = _read_table(folder, positions)
         if positions and not self._tags.keys() & paths:
             raise UsageError(f"{positions} names none of the images in {folder}: its column `file` must.")
@@ -142,20 +142,20 @@ def _read_table(folder: Path, positions: Path | None) -> dict[str, GeoTag]:
     return read_positions(csv_path) if csv_path else {}
 
 
-def tags_of(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]:
+def read_tags(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]:
     """Read the tags that a `FolderSource` gives to the images of a folder, by path; `positions` is the source's. Raises
     UsageError for an unusable table."""
     tags = _read_table(folder, positions)
-    return {path: tags.get(decoded_name(path.name)) or read_exif(path) for path in list_images(folder)}
+    return {path: tags.get(decode_name(path.name)) or read_exif(path) for path in list_images(folder)}
 
 
-def recorded_steps(uri: str | None, positions: Path | None = None) -> list[float]:
+def recorded_intervals(uri: str | None, positions: Path | None = None) -> list[float]:
     """Return the seconds from each image of a folder to the next, by their times in `positions` or EXIF data. Empty:
     `uri` is no folder that can be used, an image has no time, one is older than that before it, or all are equal."""
     times: list[float | None] = []
     if uri is not None and os.path.isdir(uri):
         with suppress(EdgevprError):
-            times = [tag.t_utc_s for tag in tags_of(Path(uri), positions).values()]
+            times = [tag.t_utc_s for tag in read_tags(Path(uri), positions).values()]
     steps_s = [there - here for here, there in pairwise(times) if here is not None and there is not None]
     in_order = len(steps_s) == len(times) - 1 and min(steps_s, default=-1) >= 0
     return steps_s if in_order and any(steps_s) else []
@@ -178,7 +178,7 @@ def open_source(
     of a folder the positions.csv in or beside it, else EXIF data; of a video the .csv of the same name beside it).
     `live`: allow cameras and streams, which never end. One that is not there yet is opened as soon as it is.
     `clock`: the monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`:
-    for a folder that is flown by its recorded times, the `recorded_steps` (empty: it is not).
+    for a folder that is flown by its recorded times, the `recorded_intervals` (empty: it is not).
     Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions.
     """
     path = Path(uri)

@@ -86,7 +86,7 @@ class VideoSource(RecordingSource):
                 self._t_due_s = self._t_s + self._step_s
                 name = f"frame {self._index:06d} t={self._t_s:.3f} s"
                 if self.is_wanted(name):
-                    tag = self._track.tag_at(self._t_s) if self._track else GeoTag()
+                    tag = self._track.interpolate_tag(self._t_s) if self._track else GeoTag()
                     image = self.twins.require_single(self._whole.conversion(picture)())
                     return tagged(image, name, self._clock(), tag)
             if self._clock() >= deadline_s:

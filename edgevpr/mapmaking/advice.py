@@ -24,7 +24,7 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.text import at_work
-from edgevpr.frames.exif import fov_deg_of, read_exif, read_xmp
+from edgevpr.frames.exif import read_exif, read_fov_deg, read_xmp
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.mask import Mask
 from edgevpr.frames.positions import find_positions, find_track, read_positions, read_track
@@ -99,7 +99,11 @@ def suggest_lens(pictures: "FlownPictures", config: SourceConfig, technique: Tec
     """Log the field of view of the lens by the EXIF data of a picture, if it is not configured: without it pictures of
     a camera that looks down are neither untilted nor scaled."""
     is_needed = technique.spec.parameters.get("camera") == "nadir" and config.fov_deg is None and config.lens is None
-    if is_needed and pictures.folder and (fov_deg := fov_deg_of(next(iter(list_images(pictures.folder))))) is not None:
+    if (
+        is_needed
+        and pictures.folder
+        and (fov_deg := read_fov_deg(next(iter(list_images(pictures.folder))))) is not None
+    ):
         text = "EXIF: field of view about %.0f deg: with --fov-deg %.0f, here and in flight, positions are finer"
         _log.info(text, fov_deg, fov_deg)
 

@@ -48,12 +48,12 @@ from edgevpr.runtime.recognise.evidence import (
     FEWEST_PLACES,
     Evidence,
     MapCalibration,
-    calibration_of,
     calibration_text,
-    kinds_of,
+    list_evidence_kinds,
+    read_calibration_for,
 )
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
-from edgevpr.runtime.recognise.opening import meter_of, technique_of
+from edgevpr.runtime.recognise.opening import create_technique, make_meter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -172,12 +172,12 @@ def find_look_alikes(
     places elsewhere, and yield what looks like it (None: nothing does). Yields nothing for a picture that the place was
     not made of, for a place without a position, or for a technique without a confidence. Raises MapError for a map that
     cannot be read."""
-    technique, config = technique_of(place_map), load_config(None, {})
-    if not kinds_of(technique.spec):
+    technique, config = create_technique(place_map), load_config(None, {})
+    if not list_evidence_kinds(technique.spec):
         return
     index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-    rule = accept_rule(technique, config.match, 1, calibration_of(place_map))
-    search = _Search(technique, place_map, index, rule, meter=meter_of(config, load_board("this")))
+    rule = accept_rule(technique, config.match, 1, read_calibration_for(place_map))
+    search = _Search(technique, place_map, index, rule, meter=make_meter(config, load_board("this")))
     for place_id, image, mask in pictures:
         slot = search.slots.get(place_id)
         if slot is None or np.isnan(index.lat_deg[slot]):
@@ -214,7 +214,7 @@ def calibrate(
             )
 
     technique = encoder.technique
-    kinds = kinds_of(technique.spec)
+    kinds = list_evidence_kinds(technique.spec)
     require(kinds, f"matches of {technique.spec.name} are judged by score and margin; only `cohog` has a confidence")
     index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
     require(len(index) >= FEWEST_PLACES, f"it has {len(index)} places, and {FEWEST_PLACES} are needed")
@@ -233,7 +233,7 @@ def calibrate(
     return calibration
 
 
-def asked_of(technique: Technique) -> int:
+def query_altered_copies(technique: Technique) -> int:
     """Return the number of pictures that are used to calibrate a map of this technique."""
     return ASKED_DOWN if technique.spec.looks_down else ASKED_AHEAD
 
@@ -243,10 +243,10 @@ def _as_mapped(
 ) -> Iterator[tuple[int, Levelled]]:
     """Yield (a place's number, its prepared picture) for a random selection of places. A picture that has the name of a
     place's picture, but another content, is left out."""
-    ids_by_image = {name: ids for (name,), ids in place_map.ids_by("source_image").items() if isinstance(name, str)}
+    ids_by_image = {name: ids for (name,), ids in place_map.select_ids("source_image").items() if isinstance(name, str)}
     names = sorted(ids_by_image)
     names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
-    count = asked_of(encoder.technique)
+    count = query_altered_copies(encoder.technique)
     frames = (frame for done in range(0, count, len(names)) for frame in pictures(names[: count - done]))
     for frame in watch(frames, count):
         encoded = encoder.encode(frame)

@@ -15,8 +15,8 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, Image, Ints
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.quadkeys import extent_around, in_extent, keys_at, ring_around
-from edgevpr.core.text import decoded_name
+from edgevpr.core.quadkeys import extent_around, in_extent, ring_around, tile_keys
+from edgevpr.core.text import decode_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
@@ -83,7 +83,7 @@ class OrthophotoSource(RecordingSource):
         super().__init__(only)
         self._orthophoto, self._lattices = orthophoto, lattices
         self.total = sum(map(len, lattices))
-        self.short_name = decoded_name(orthophoto.short_name)
+        self.short_name = decode_name(orthophoto.short_name)
         self.counts = {"without_data": 0, "white": 0, "seams": 0, "tried_for_seams": 0}
         self._read, self._tries_seams = 0, tries_seams
         self._left = ((lattice, at) for lattice in lattices for at in range(len(lattice)))
@@ -177,7 +177,7 @@ def open_cuttings(cuttings: "Cuttings", only: Collection[str] | None) -> Orthoph
     if area is None and key:
         area = Area(((ring_around(extent_around(key, cuttings.margin_m)),),), ())
     orthophoto = _open_orthophoto(cuttings, area)
-    lattices = [lattice_of(orthophoto, footprint_m, cuttings.spacing_m, area) for footprint_m in footprints_m]
+    lattices = [make_lattice(orthophoto, footprint_m, cuttings.spacing_m, area) for footprint_m in footprints_m]
     if (across_px := footprints_m[0] / orthophoto.resolution_m) < _LEAST_PX:
         raise UsageError(
             f"{orthophoto.name} has {across_px:.0f} pixels along a picture of {footprints_m[0]:g} m, and nothing is "
@@ -204,7 +204,7 @@ def _open_orthophoto(cuttings: "Cuttings", area: Area | None) -> Orthophoto:
     return Orthophoto(cuttings.orthophoto, ground_of(area.points, _footprints_m(cuttings)[-1]) if area else None)
 
 
-def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, area: Area | None = None) -> Lattice:
+def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, area: Area | None = None) -> Lattice:
     """Make a grid of places `spacing_m` apart over the orthophoto. A square with sides of `footprint_m` around each
     place is inside its bounding box. With an `area` (None: no limit), keep only the places of this grid that are in
     its polygons or within `footprint_m` of its paths.
@@ -261,7 +261,7 @@ def lattice_of(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, are
 def within(lattice: Lattice, key: str, margin_m: float) -> Lattice:
     """Return the places of a grid that lie in the tile with this quad key, or within `margin_m` of it. Raises
     NoPlaceError if none is in the tile: each place is in one tile of a zoom."""
-    there = keys_at(lattice.lat_deg, lattice.lon_deg, len(key)) == key
+    there = tile_keys(lattice.lat_deg, lattice.lon_deg, len(key)) == key
     if not there.any():
         raise NoPlaceError(f"No place lies in the tile {key}.")
     there |= in_extent(extent_around(key, margin_m), lattice.lat_deg, lattice.lon_deg)

@@ -13,19 +13,25 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.text import at_work
 from edgevpr.core.types import Frame
-from edgevpr.frames.mask import Mask, mask_of
+from edgevpr.frames.mask import Mask, load_mask
 from edgevpr.frames.source import Source, open_source, read_to_end
 from edgevpr.mapmaking import advice
 from edgevpr.mapmaking.mapping import Covered, Gaps, MappingResult, build_map, measure_ground
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove
-from edgevpr.places.mapinfo import info_of
+from edgevpr.places.mapinfo import describe_map
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.preflight.pick import camera_setting, picked_technique
+from edgevpr.runtime.preflight.pick import camera_setting, pick_technique
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.evidence import MapCalibration, kinds_of
-from edgevpr.runtime.recognise.levelling import levelling_of
-from edgevpr.runtime.recognise.opening import gate_of, made_for, meter_of, technique_of, warn_of_other_pictures
+from edgevpr.runtime.recognise.evidence import MapCalibration, list_evidence_kinds
+from edgevpr.runtime.recognise.levelling import make_levelling
+from edgevpr.runtime.recognise.opening import (
+    create_technique,
+    made_for,
+    make_meter,
+    open_salience_gate,
+    warn_of_other_pictures,
+)
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.cuttings import OrthophotoSource
@@ -133,7 +139,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     source: Source
     counts: dict[str, int] = {}
     if isinstance(pictures, FlownPictures):
-        mask, lens = mask_of(config.source.mask), config.source.lens
+        mask, lens = load_mask(config.source.mask), config.source.lens
         source, technique = _open_flown(order, pictures, config, place_map, mask)
     else:
         mask, lens = None, None
@@ -149,7 +155,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     with place_map:
         try:
             if isinstance(pictures, FlownPictures):
-                is_calibrated = order.calibrate and kinds_of(technique.spec)
+                is_calibrated = order.calibrate and list_evidence_kinds(technique.spec)
                 advice.warn_of_gaps(pictures, source.total, len(place_map) if is_calibrated else None)
                 advice.suggest_lens(pictures, config.source, technique)
                 advice.warn_of_display(pictures, mask)
@@ -157,7 +163,9 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 place_map.add_attribution(pictures.attribution)
             result = build_map(
                 (frame for frame in shown(read_to_end(source, unusable), source.total, "mapping") if frame),
-                replace(encoder_of(config, pictures, technique), gate=gate_of(config.salience, here.threads)),
+                replace(
+                    encoder_of(config, pictures, technique), gate=open_salience_gate(config.salience, here.threads)
+                ),
                 place_map,
                 Gaps(config.salience.gap_frames, config.salience.gap_m),
                 unusable,
@@ -172,13 +180,13 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
         if order.refine and technique.spec.looks_down and isinstance(pictures, FlownPictures):
             with _if_possible("refined"):
                 refined = refine_map(place_map, technique, pictures.folder, shown)
-        if order.calibrate and kinds_of(technique.spec):
+        if order.calibrate and list_evidence_kinds(technique.spec):
             with _if_possible("calibrated"):
                 calibration = calibrate_map(place_map, technique, config, pictures, shown)
         return MadeMap(
             technique=technique.spec.name,
             places=len(place_map),
-            with_position=info_of(place_map).with_position,
+            with_position=describe_map(place_map).with_position,
             result=replace(result, **counts),
             covered=covered,
             refined=refined,
@@ -221,7 +229,7 @@ def calibrate_map(
         encoder_of(config, pictures, technique),
         place_map,
         config.match,
-        meter_of(config, load_board("this")),
+        make_meter(config, load_board("this")),
         frames,
         lambda asked, total: shown(asked, total, "calibrating"),
     )
@@ -240,7 +248,7 @@ def _open_flown(
         advice.require_ahead(pictures, mask)
     if name is None:
         with at_work("choosing a technique"):
-            name = picked_technique(order.board, source.total or 1, camera)
+            name = pick_technique(order.board, source.total or 1, camera)
         settings = settings | camera_setting(name, camera)
     elif camera:  # a technique that knows no camera refuses one that was asked for
         settings = settings | {"camera": camera}
@@ -267,7 +275,7 @@ def _open_cuttings(
 def _make_technique(order: MapOrder, place_map: PlaceMap | None, name: str, settings: dict[str, str]) -> Technique:
     here = load_board("this")
     if place_map is not None:  # one without places is false
-        return technique_of(place_map, order.technique, settings, here)
+        return create_technique(place_map, order.technique, settings, here)
     return made_for(here.threads, name, settings)
 
 
@@ -275,8 +283,8 @@ def encoder_of(config: Config, pictures: FlownPictures | Cuttings, technique: Te
     """Return the encoder of places: with mask and levelling, which pictures cut from an orthophoto do not need."""
     if isinstance(pictures, Cuttings):
         return FrameEncoder(technique=technique)
-    levelling = levelling_of(config.source, technique, below=True)
-    return FrameEncoder(technique=technique, mask=mask_of(config.source.mask), levelling=levelling)
+    levelling = make_levelling(config.source, technique, below=True)
+    return FrameEncoder(technique=technique, mask=load_mask(config.source.mask), levelling=levelling)
 
 
 @contextmanager

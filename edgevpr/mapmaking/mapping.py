@@ -20,7 +20,7 @@ from edgevpr.places.rows import readable
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, describe_error
 from edgevpr.runtime.recognise.judge import says_nothing
 from edgevpr.runtime.recognise.levelling import place_at_middle
-from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, best_of
+from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, select_best
 
 _NO_PIXELS = np.empty((0, 0), np.uint8)
 T = TypeVar("T")
@@ -63,7 +63,7 @@ class Gaps:
         """Yield the best of the waiting frames, as places of low quality. Of the others, those before the last one
         yielded are dropped, and those after it continue to wait."""
         waiting = [(encoded, encoded.worth) for encoded in self._waiting if encoded.worth]
-        best = np.flatnonzero(best_of([worth.short_by for _, worth in waiting])).tolist()
+        best = np.flatnonzero(select_best([worth.short_by for _, worth in waiting])).tolist()
         self._waiting = self._waiting[best[-1] + 1 :]
         for encoded, worth in (waiting[at] for at in best):
             yield self._kept(encoded), replace(worth.salience, is_low=True)
@@ -156,7 +156,7 @@ def build_map(
     """
     place_map.require(encoder.technique.spec)
     gaps = gaps or Gaps()
-    ids_by_image = place_map.ids_by("source_image")
+    ids_by_image = place_map.select_ids("source_image")
     result, layers = MappingResult(), layers_of(place_map)
 
     def keep(kept: Iterable[Kept]) -> None:

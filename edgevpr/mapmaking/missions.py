@@ -15,7 +15,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, LatLon
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
-from edgevpr.core.geodesy import extent_of, moved
+from edgevpr.core.geodesy import compute_extent, moved
 
 try:
     import shapely as shapely
@@ -66,8 +66,8 @@ class Area:
 
     @property
     def extent_deg(self) -> tuple[float, float, float, float]:
-        """The bounding box of polygons and paths: (south, west, north, east) in degrees, see `extent_of`."""
-        return extent_of(self.points)
+        """The bounding box of polygons and paths: (south, west, north, east) in degrees, see `compute_extent`."""
+        return compute_extent(self.points)
 
     def on_plane(self, project: Projection, polygon_margin_m: float, path_margin_m: float) -> "shapely.Geometry":
         """Return the ground within these margins of the polygons and of the paths, on a plane."""

@@ -10,8 +10,8 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import identity_of
-from edgevpr.runtime.flight.flightlog import flight_of
+from edgevpr.places.mapinfo import read_identity
+from edgevpr.runtime.flight.flightlog import select_last_flight
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,12 +39,12 @@ def move_map(place_map: PlaceMap, log: str | Path) -> MapMove:
     """Move all places of a map that is open for adding, in one transaction, by the last result in a flight log. Raises
     UsageError if the log has none, or is not of this very map as it is now, and MapError as `PlaceMap` does."""
     found, identity = None, None
-    for line in flight_of(log):
+    for line in select_last_flight(log):
         if line["kind"] == "start":
             identity = line.get("map_identity")
         elif line["kind"] == "survey":
             found = line
-    if identity != asdict(identity_of(place_map)):
+    if identity != asdict(read_identity(place_map)):
         raise UsageError(
             f"{log} is not of {place_map.path} as it is now: it is of another map, or this one was changed or moved "
             "since: give the log of a flight with it."

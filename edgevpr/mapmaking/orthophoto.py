@@ -25,7 +25,7 @@ from edgevpr.mapmaking.georaster import (
     transform,
 )
 from edgevpr.mapmaking.tiles import Ground, TileRaster
-from edgevpr.mapmaking.tilestores import AddressTiles, host_of, is_address, open_tile_file
+from edgevpr.mapmaking.tilestores import AddressTiles, is_address, open_tile_file, parse_host
 
 _EDGE_POINTS = 25  # per edge: a straight edge of the file is a curve in another coordinate system
 _MOST_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
@@ -37,7 +37,7 @@ def _open_raster(source: str | Path, ground: Ground | None) -> GeoRaster | TileR
     """Open a file, a folder of tiles, or an address, see `Orthophoto`."""
     if is_address(source):
         if ground is None:
-            raise UsageError(f"{host_of(str(source))} has tiles of the whole Earth: give --area.")
+            raise UsageError(f"{parse_host(str(source))} has tiles of the whole Earth: give --area.")
         return TileRaster(AddressTiles(str(source)), ground)
     path, kind = Path(source), ""
     if not path.exists() and "#" in path.name:

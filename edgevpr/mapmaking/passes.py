@@ -35,11 +35,11 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.agreement import PROVEN, agreement
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
-from edgevpr.runtime.recognise.evidence import calibration_of
+from edgevpr.runtime.recognise.evidence import read_calibration_for
 from edgevpr.runtime.recognise.hints import RecordedPrior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.landmarks import Landmarks, unpacked
-from edgevpr.runtime.recognise.opening import meter_of, technique_of
+from edgevpr.runtime.recognise.opening import create_technique, make_meter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
 FADES_AFTER = 3  # later passes over the ground of a place, none of which found it
@@ -77,14 +77,14 @@ _Found = tuple[int | None, float]
 _NOTHING: _Found = (None, 0.0)
 
 
-def history_of(
+def read_history(
     path: Path, pictures: FlownPictures | Cuttings, config: Config, folders: Mapping[str, str], inside: Wanted
 ) -> History:
     """Compare the passes of a map made of `pictures`, of which `folders` gives the folder of each by its name. Only
     places that are `inside` are judged. Returns what is to be removed, and what has changed; the map stays as
     it is. Raises MapError."""
     with PlaceMap.open(path) as place_map:
-        technique = technique_of(place_map)
+        technique = create_technique(place_map)
         places = list(place_map.places())
         if not technique.spec.looks_down or not places:
             return History()
@@ -178,11 +178,11 @@ def _find_pictures(
     index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
     at_of = {place.place_id: at for at, place in enumerate(ground.places)}
     flight = ground.flight[[at_of[place_id] for place_id in index.place_ids.tolist()]]
-    rule = accept_rule(technique, config.match, calibration=calibration_of(place_map))
+    rule = accept_rule(technique, config.match, calibration=read_calibration_for(place_map))
     candidates, layers = config.match.candidates or technique.candidates, layers_of(place_map)
     settings = WalkSettings(candidates=candidates, verify=config.match.verify)
     at_its_height = RecordedPrior(("height",), None)  # those of one spot are of one scale: no other needs to be tried
-    meter, encoder = meter_of(config, load_board("this")), encoder_of(config, pictures, technique)
+    meter, encoder = make_meter(config, load_board("this")), encoder_of(config, pictures, technique)
 
     def without(passes: Collection[int]) -> Recogniser:
         matcher = Matcher(index.only(~np.isin(flight, list(passes))), rule, layers=layers)

@@ -26,7 +26,7 @@ from edgevpr.core.arrays import Array, Bools, Complexes, Floats
 from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError, PlaceError
 from edgevpr.core.geodesy import metres, moved
-from edgevpr.core.text import decoded_name
+from edgevpr.core.text import decode_name
 from edgevpr.core.types import Place, Pose, Position
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.mapmaking.graph import Solved, Ties, solve
@@ -267,7 +267,7 @@ def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], imag
     """Return the function that compares two of `places`, given by their indices in this list, and returns their tie
     (None: none is found). `images` is the folder of their pictures (None: they are not at hand, so only landmarks are
     compared)."""
-    paths = {decoded_name(path.name): path for path in list_images(images)} if images else {}
+    paths = {decode_name(path.name): path for path in list_images(images)} if images else {}
     coarse = {place_id: part for place_id, *_, part in place_map.coarse_parts()}
 
     @lru_cache(_KEPT)

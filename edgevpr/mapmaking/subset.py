@@ -13,7 +13,7 @@ from edgevpr.mapmaking.missions import Area, shapely
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import Watch, merge, positions_in, select, shrink
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_of, calibration_text, of_several
+from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_text, of_several, read_calibration_for
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,7 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
         place_ids, lat_deg, lon_deg = positions_in(place_map)
         there: list[int] = place_ids[_is_near(area, margin_m, lat_deg, lon_deg)].tolist()
         if there:
-            calibrations.append(calibration_of(place_map))
+            calibrations.append(read_calibration_for(place_map))
         return there
 
     with mapfiles.whole_or_none(out) as unfinished, tempfile.TemporaryDirectory(dir=out.parent) as scratch:

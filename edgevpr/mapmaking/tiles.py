@@ -12,7 +12,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Bools, Image, Ints, LatLon
 from edgevpr.core.errors import SourceError, UsageError
-from edgevpr.core.geodesy import EARTH_RADIUS_M, extent_of
+from edgevpr.core.geodesy import EARTH_RADIUS_M, compute_extent
 from edgevpr.frames.images import resized
 from edgevpr.mapmaking.georaster import CRS, HALF_WORLD_M, Pixel, rasterio
 
@@ -76,14 +76,14 @@ class TileStore:
 
 def ground_of(points: Sequence[LatLon], footprint_m: float) -> Ground:
     """Return the ground around `points` (lat, lon), with a margin that suits a path and the pictures along it."""
-    footprint_m = min(max(1.0, footprint_m), HALF_WORLD_M)  # what is wrong with another, `lattice_of` says
-    south, west, north, east = extent_of(points)
+    footprint_m = min(max(1.0, footprint_m), HALF_WORLD_M)  # what is wrong with another, `make_lattice` says
+    south, west, north, east = compute_extent(points)
     north_deg = math.degrees(2 * footprint_m / EARTH_RADIUS_M)
     east_deg = north_deg / math.cos(math.radians(min(max(abs(south), abs(north)), _MOST_LAT_DEG)))
     return Ground((south - north_deg, west - east_deg, north + north_deg, east + east_deg), footprint_m)
 
 
-def box_of(ground: Ground | None) -> Box:
+def bounding_box(ground: Ground | None) -> Box:
     """Return the box of `ground` in the projection of tiles; None: the world."""
     if ground is None:
         return 0.0, 0.0, 1.0, 1.0
@@ -105,7 +105,7 @@ def full_level(zoom: int, box: Box) -> Level:
     return Level(count=count, left=left, top=top, right=right, bottom=bottom, some=some)
 
 
-def levels_of(tiles: Ints, box: Box) -> dict[int, Level]:
+def list_zoom_levels(tiles: Ints, box: Box) -> dict[int, Level]:
     """Return the levels of those of `tiles` (N, 3), each (zoom, x, y), that touch `box`."""
     zooms, x, y = tiles.T
     across = 1 << zooms

@@ -24,7 +24,7 @@ import numpy as np
 from edgevpr import __version__
 from edgevpr.core.errors import SourceError, UsageError
 from edgevpr.core.files import write_whole
-from edgevpr.mapmaking.tiles import TILE_PX, Ground, Level, TileStore, box_of, full_level, levels_of
+from edgevpr.mapmaking.tiles import TILE_PX, Ground, Level, TileStore, bounding_box, full_level, list_zoom_levels
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".webp")
 _SQLITE = b"SQLite format 3\x00"
@@ -43,7 +43,7 @@ def is_address(source: object) -> bool:
     return bool(re.match(r"(?i)https?://", str(source)))
 
 
-def host_of(address: str) -> str:
+def parse_host(address: str) -> str:
     """Return the host of an address, which may be shown. Raises UsageError for an address that has none."""
     try:
         host = urlsplit(address).hostname
@@ -84,7 +84,7 @@ class FolderTiles(TileStore):
         }
 
     def levels(self, ground: Ground | None) -> dict[int, Level]:
-        return levels_of(np.array(list(self._tiles), int).reshape(-1, 3), box_of(ground))
+        return list_zoom_levels(np.array(list(self._tiles), int).reshape(-1, 3), bounding_box(ground))
 
     def get(self, zoom: int, x: int, y: int) -> bytes | None:
         path = self._tiles.get((zoom, x, y))
@@ -141,7 +141,7 @@ class CacheTiles(TileStore):
     def levels(self, ground: Ground | None) -> dict[int, Level]:
         with _readable(self._path, self._cache.program):
             rows = np.array(self._db.execute(self._cache.tiles, (self._kind,)).fetchall(), int).reshape(-1, 3)
-        return levels_of(rows[(rows[:, 0] >= 0) & (rows[:, 0] < 32)], box_of(ground))
+        return list_zoom_levels(rows[(rows[:, 0] >= 0) & (rows[:, 0] < 32)], bounding_box(ground))
 
     def get(self, zoom: int, x: int, y: int) -> bytes | None:
         with _readable(self._path, self._cache.program):
@@ -193,7 +193,7 @@ class PmTiles(TileStore):
         south, west, north, east = (
             self._header[f"{side}_e7"] / _E7 for side in ("min_lat", "min_lon", "max_lat", "max_lon")
         )
-        box = box_of(ground or Ground((south, west, north, east), 1.0))
+        box = bounding_box(ground or Ground((south, west, north, east), 1.0))
         return {zoom: full_level(zoom, box) for zoom in range(self._header["min_zoom"], self._header["max_zoom"] + 1)}
 
     def get(self, zoom: int, x: int, y: int) -> bytes | None:
@@ -209,7 +209,7 @@ class AddressTiles(TileStore):
     twice; an empty file stands for one that the server does not have."""
 
     def __init__(self, address: str) -> None:
-        self.name = self.short_name = host_of(address)
+        self.name = self.short_name = parse_host(address)
         if sorted(re.findall(r"\{[^{}]*\}", address)) != sorted(_PLACEHOLDERS):
             raise UsageError(
                 f"The address at {self.name} must have {{z}}, {{x}} and {{y}} where zoom, column and row of a tile "
@@ -222,7 +222,7 @@ class AddressTiles(TileStore):
     def levels(self, ground: Ground | None) -> dict[int, Level]:
         """Return the wanted zoom, or the next coarser that the server has in the middle of the ground."""
         assert ground is not None  # an address needs an area
-        box = box_of(ground)
+        box = bounding_box(ground)
         for zoom in range(ground.zoom, max(ground.zoom - _ZOOMS_TRIED, -1), -1):
             at = full_level(zoom, box).some[0]
             if data := self.get(zoom, *at):

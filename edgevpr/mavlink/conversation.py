@@ -187,7 +187,7 @@ class Conversation:
                 self._hear_stamp(message, now_s)
         return is_ours
 
-    def tell_of_answers(self) -> None:
+    def announce_changes(self) -> None:
         """Announce what has changed with the autopilot and its answers since the last call."""
         now_s = self._clock()
         is_there = self.autopilot.listens(now_s)

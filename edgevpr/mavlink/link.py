@@ -255,7 +255,7 @@ class Link:
         with self.turns.of_link(self.name) as step:
             if line.port.connected:
                 self._transmit(line, step)
-            self.conversation.tell_of_answers()
+            self.conversation.announce_changes()
             step("answers")
         reading: list[Port | socket.socket] = [line.port, self._bell]
         writing = [line.port] if line.unsent else []

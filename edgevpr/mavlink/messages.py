@@ -261,7 +261,7 @@ def origin(target_system: int, lat_deg: float, lon_deg: float, alt_m: float) -> 
     )
 
 
-def named_values(t_mono_s: float, **values: float | None) -> tuple[Message, ...]:
+def make_named_values(t_mono_s: float, **values: float | None) -> tuple[Message, ...]:
     """Make a NAMED_VALUE_INT (252) for each whole number and a NAMED_VALUE_FLOAT (251) for each other number; a value
     of None is unknown and gets no message. docs/reference/ground-station.md lists the names, of 10 letters at most."""
     boot_ms = _boot_ms(t_mono_s)

@@ -13,7 +13,7 @@ from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.places import geopackage, mapfiles, rows
 from edgevpr.places.mapfiles import is_of_one_row, sentences
-from edgevpr.places.mapspec import read_stored, spec_of, write_spec
+from edgevpr.places.mapspec import read_spec, read_stored, write_spec
 from edgevpr.places.rows import Content, Values
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class MapConnection:
 
     def __init__(self, path: Path, db: sqlite3.Connection, lock: int | None = None) -> None:
         self.path, self.stored = path, read_stored(path, db)
-        self.spec = spec_of(path, self.stored)
+        self.spec = read_spec(path, self.stored)
         self._lock = lock  # file descriptor of the lock for adding places; None: open for reading only
         self.left_out: dict[int, str] = {}  # see `mapfile.PlaceMap`
         self._wait_s = mapfiles.WAIT_S

@@ -72,7 +72,7 @@ def examine(place_map: PlaceMap, only: Collection[int] | None = None) -> Iterato
         problem = "SQLite cannot read its row" if row is None else None
         try:
             if content:
-                rows.place_of(place_id, content)
+                rows.parse_place(place_id, content)
                 rows.part_of(content, "coarse", spec.coarse)
                 rows.landmarks_of(content)
                 if spec.fine:
@@ -122,7 +122,7 @@ def _absorb(place_map: PlaceMap, other: PlaceMap, watch: Watch, wanted: Wanted) 
     copied = already_here = 0
     only = wanted(other)
     with place_map.transaction():
-        here = place_map.ids_by("source_image, time")
+        here = place_map.select_ids("source_image, time")
         total = len(other) if only is None else len(only)
         for each in watch(examine(other, only), total, f"copying {other.path.name}"):
             if each.problem:
@@ -192,7 +192,7 @@ def shrink(path: str | Path, out: Path, count: int, watch: Watch = unwatched) ->
     or cannot be written; no part of a file is then left."""
     with mapfiles.whole_or_none(out) as unfinished, PlaceMap.open(path) as place_map:
         whole = (each for each in watch(examine(place_map), len(place_map), "reading") if not each.problem)
-        places = [rows.place_of(each.place_id, each.content) for each in whole]
+        places = [rows.parse_place(each.place_id, each.content) for each in whole]
         points = [place.position or Position(np.nan, np.nan) for place in places]
         lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points], float).reshape(-1, 2).T
         best = best_places(lat_deg, lon_deg, np.array([_worth_of(place) for place in places]), count)

@@ -69,7 +69,7 @@ def _row_of(change: GroundChange) -> tuple[bytes, str | None, str | None, float,
     return point_blob(at.lat_deg, at.lon_deg), *times, change.confidence, change.from_image, change.to_image
 
 
-def counts_of(place_map: PlaceMap) -> dict[str, int]:
+def read_counts(place_map: PlaceMap) -> dict[str, int]:
     """Count the flights compared (`passes`), the places that became part of another (`merged`) or have `faded`, and the
     spots `changed`; empty for a map without a history. Raises MapError."""
     if not _has_history(place_map):
@@ -79,7 +79,7 @@ def counts_of(place_map: PlaceMap) -> dict[str, int]:
     return {"passes": passes, "merged": merged, "faded": removed - merged, "changed": changed}
 
 
-def removed_from(place_map: PlaceMap) -> list[str]:
+def drop_places(place_map: PlaceMap) -> list[str]:
     """Return the names of the pictures that are no places of a map any more. Raises MapError."""
     if not _has_history(place_map):
         return []

@@ -88,7 +88,7 @@ class PlaceMap(MapConnection):
     def insert(self, content: Content, place_id: int | None = None) -> int:
         """Insert a row with its checksums, inside a `transaction`; return its id. `place_id` None: SQLite chooses the
         next id. Raises sqlite3.Error."""
-        row = {"place_id": place_id, **content, **rows.checksums_of(content)}
+        row = {"place_id": place_id, **content, **rows.compute_checksums(content)}
         marks = ", ".join("?" * len(row))
         cursor = self.db.execute(f"INSERT INTO places ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
         if row["geom"] is not None:
@@ -135,7 +135,7 @@ class PlaceMap(MapConnection):
         PlaceError for a place that is missing or damaged."""
         for place_id in [place_id for place_id, _ in self.scan("1")] if place_ids is None else map(int, place_ids):
             with self._named(place_id):
-                place = rows.place_of(place_id, self.row(place_id, rows.OF_PLACE))
+                place = rows.parse_place(place_id, self.row(place_id, rows.OF_PLACE))
             yield place
 
     def coarse_parts(self) -> Iterator[tuple[int, LatLon | None, float | None, Array]]:
@@ -144,7 +144,7 @@ class PlaceMap(MapConnection):
         for place_id, row in self.scan(_OF_COARSE):
             with self._noted(place_id):
                 content = rows.content_of(_OF_COARSE, row)
-                point, heading_deg = rows.where_of(content)
+                point, heading_deg = rows.parse_where(content)
                 part = rows.part_of(content, "coarse", self.spec.coarse)
                 yield place_id, point, heading_deg, part
 
@@ -165,7 +165,7 @@ class PlaceMap(MapConnection):
             if self.spec.fine is None:
                 raise Unreadable("it has no fine part")
             content = self.row(int(place_id), "geom, geom_crc32, fine, fine_crc32")
-            point = rows.point_of(content)
+            point = rows.parse_point(content)
             return rows.part_of(content, "fine", self.spec.fine), point
 
     def landmarks_of(self, place_id: int) -> bytes | None:
@@ -183,7 +183,7 @@ class PlaceMap(MapConnection):
             np.array(ids, np.int64), np.array(length_m, float), np.array([bool(cut) for cut in is_cut], bool)
         )
 
-    def ids_by(self, columns: str) -> dict[Values, list[int]]:
+    def select_ids(self, columns: str) -> dict[Values, list[int]]:
         """Group the readable places by their values in `columns`: return the list of ids for each tuple of values."""
         ids: dict[Values, list[int]] = {}
         for place_id, row in self.scan(columns):
@@ -209,8 +209,8 @@ class PlaceMap(MapConnection):
         for place_id, row in self.scan(columns):
             with self._noted(place_id):
                 content = rows.content_of(columns, row)
-                lat_deg, lon_deg = rows.point_of(content) or (math.nan, math.nan)
-                yield place_id, lat_deg, lon_deg, rows.quality_of(content)
+                lat_deg, lon_deg = rows.parse_point(content) or (math.nan, math.nan)
+                yield place_id, lat_deg, lon_deg, rows.parse_quality(content)
 
     def _grow_extent(self, lat_deg: float, lon_deg: float) -> None:
         self.db.execute(geopackage.GROW_EXTENT, {"table": "places", "lat": lat_deg, "lon": lon_deg})

@@ -56,7 +56,7 @@ class MapIdentity:
     sha256: str
 
 
-def info_of(place_map: PlaceMap) -> MapInfo:
+def describe_map(place_map: PlaceMap) -> MapInfo:
     """Return the summary of a map. Raises MapError if it cannot be read."""
     with sentences(place_map.path):
         summary, extent = (place_map.db.execute(query).fetchone() for query in (_SUMMARY, _EXTENT))
@@ -79,7 +79,7 @@ def info_of(place_map: PlaceMap) -> MapInfo:
     )
 
 
-def identity_of(place_map: PlaceMap) -> MapIdentity:
+def read_identity(place_map: PlaceMap) -> MapIdentity:
     """Return the identity of an open map as it is now. Raises MapError if it cannot be read.
 
     Hashing the whole file at every start would take seconds on a small board. The checksums of the descriptors stand

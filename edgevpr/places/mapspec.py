@@ -69,7 +69,7 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
     return stored
 
 
-def spec_of(path: Path, stored: Stored) -> TechniqueSpec:
+def read_spec(path: Path, stored: Stored) -> TechniqueSpec:
     """Return the specification of the technique that made the map, from `stored`. Raises MapError if it is invalid."""
     try:
         name, parameters, model = stored["technique"], dict(stored["parameters"]), stored["model_sha256"]

@@ -88,7 +88,7 @@ class Ranking:
         """The slots of the places that were compared in full, best first."""
         return [slot for slot in self.slots.tolist() if slot in self.compared]
 
-    def led_by(self, slot: int) -> "Ranking":
+    def promote(self, slot: int) -> "Ranking":
         """Return the ranking with the place `slot` moved to the front; it keeps its own score."""
         order = np.argsort(self.slots != slot, kind="stable")
         return replace(self, slots=self.slots[order], scores=self.scores[order])
@@ -251,7 +251,7 @@ def _read(query: Query, chosen: list[Choice]) -> Iterator[tuple[int, Array, list
     raise first
 
 
-def unmoved_elsewhere(query: Query, best: int, apart_m: float) -> list[FineMatch]:
+def unmoved_outside_neighbourhood(query: Query, best: int, apart_m: float) -> list[FineMatch]:
     """Compare a query, looking down, with a few places elsewhere than the slot `best`, all over the map, as if it had
     been taken from their height and not turned (see `Technique.unmoved`). Raises as `compare` does."""
     index, left_out = query.index, list(query.place_map.left_out)

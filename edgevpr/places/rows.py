@@ -63,7 +63,7 @@ def content_of(columns: str, row: Values | None) -> Content:
     return dict(zip(columns.split(", "), row, strict=True))
 
 
-def point_of(content: Content) -> LatLon | None:
+def parse_point(content: Content) -> LatLon | None:
     """Decode `geom` as (lat_deg, lon_deg); None for a place without a position. Raises Unreadable."""
     if content["geom"] is None:
         if content["geom_crc32"] is not None:
@@ -101,7 +101,7 @@ def landmarks_of(content: Content) -> bytes | None:
     return blob
 
 
-def quality_of(content: Content) -> float:
+def parse_quality(content: Content) -> float:
     """Return the quality of a place, 0 to 1. Raises Unreadable."""
     quality = _number(content, "quality")
     if quality is None:
@@ -109,19 +109,19 @@ def quality_of(content: Content) -> float:
     return quality
 
 
-def where_of(content: Content) -> tuple[LatLon | None, float | None]:
+def parse_where(content: Content) -> tuple[LatLon | None, float | None]:
     """Check the `VALUES` of a row; return its (lat_deg, lon_deg), and its heading in degrees, 0 up to 360. Each is
     None if unknown. Raises Unreadable."""
-    point, heading_deg, _ = point_of(content), _number(content, "heading_deg"), _number(content, "alt_m")
+    point, heading_deg, _ = parse_point(content), _number(content, "heading_deg"), _number(content, "alt_m")
     if not isinstance(content["source_image"], str):
         raise Unreadable("its source_image is no text")
-    quality_of(content)
+    parse_quality(content)
     return point, None if heading_deg is None else heading_deg % 360
 
 
-def place_of(place_id: int, content: Content) -> Place:
+def parse_place(place_id: int, content: Content) -> Place:
     """Make a Place from the columns `OF_PLACE` of its row. Raises Unreadable."""
-    point, _ = where_of(content)
+    point, _ = parse_where(content)
     return Place(
         place_id=place_id,
         source_image=content["source_image"],
@@ -165,7 +165,7 @@ def pose_content(pose: Pose | None) -> Content:
     return dict(zip(_POSE, (*map(float, measured), int(pose.is_surveyed), *recorded), strict=True))
 
 
-def checksums_of(content: Content) -> dict[str, int | None]:
+def compute_checksums(content: Content) -> dict[str, int | None]:
     """Return the columns `CHECKSUMS` of a row. The checksum of a value that is None is None."""
     sums = {f"{name}_crc32": crc32(content[name]) for name in ("geom", "coarse", "fine", "landmarks")}
     return sums | {"pose_crc32": pose_crc32([content[name] for name in _POSE])}

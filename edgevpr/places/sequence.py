@@ -27,12 +27,12 @@ _NEWEST, _NEWEST_ALONE, _BEST_SHARE = 3, 2, 0.1
 _USUAL_INTERVALS = 3  # a pause is no gap if each query takes so long, e.g. 6 s
 
 
-def length_of(spec: TechniqueSpec, asked: int | None) -> int:
+def sequence_length(spec: TechniqueSpec, asked: int | None) -> int:
     """Return how many queries are matched together: `asked`, or the technique's own number if that is None or 0."""
     return asked or spec.sequence
 
 
-def search_of(length: int) -> "SequenceSearch | None":
+def make_sequence_search(length: int) -> "SequenceSearch | None":
     """Make the search over sequences of `length` queries. Returns None for a length of 1: each query is matched
     alone."""
     return SequenceSearch(length) if length > 1 else None

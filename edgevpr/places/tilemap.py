@@ -17,7 +17,7 @@ from edgevpr.core.arrays import Array, Doubles, LatLon
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.geodesy import offset_m, shorter_deg
-from edgevpr.core.quadkeys import extent_of_key, maps_in
+from edgevpr.core.quadkeys import maps_in, tile_extent
 from edgevpr.core.types import Place, Position
 from edgevpr.places import mapfiles
 from edgevpr.places.index import PlaceIndex, bytes_per_place, empty_index, load_index
@@ -115,7 +115,7 @@ class TileMap:
     def __init__(self, folder: Path, keys: tuple[str, ...], places_of: Array, spec: TechniqueSpec) -> None:
         self.path, self.keys, self.places_of, self.spec = folder, keys, places_of, spec
         self.left_out: dict[int, str] = {}
-        self._extents_deg = np.array([extent_of_key(key) for key in keys])
+        self._extents_deg = np.array([tile_extent(key) for key in keys])
         self._held: dict[int, Loaded] = {}
         self._wait_s = mapfiles.WAIT_S
         self.ram = TileIndex(spec, 0)

@@ -103,7 +103,7 @@ def calibrate(board: Board, meter: Meter) -> Board:
     points = []
     for load in (0.0, 1.0):
         print(f"measuring power with the {meter.title}: load {load:.0%}", file=sys.stderr)
-        points.append(measure_at(meter, load))
+        points.append(measure_load(meter, load))
     (low_u, low_w), (high_u, high_w) = points
     if high_u - low_u < _MIN_SPAN:
         raise MeterError(
@@ -121,7 +121,7 @@ def calibrate(board: Board, meter: Meter) -> Board:
     return replace(board, idle_w=idle_w, full_w=idle_w + span_w, verified=True, source=source)
 
 
-def measure_at(meter: Meter, load: float, settle_s: float = 5.0, window_s: float = 20.0) -> tuple[float, float]:
+def measure_load(meter: Meter, load: float, settle_s: float = 5.0, window_s: float = 20.0) -> tuple[float, float]:
     """Hold the `load` (0 or 1), let the meter settle for `settle_s` seconds, and measure for `window_s` seconds: short
     windows are unreliable. Returns the utilisation of the whole machine, 0..1, and the mean power in watts.
 

@@ -109,10 +109,10 @@ def _find_in_folder(folder: Path, name: str) -> AlbumPicture | None:
 
 @cache
 def _tags_in(folder: Path) -> Mapping[Path, GeoTag]:
-    from edgevpr.frames.source import tags_of
+    from edgevpr.frames.source import read_tags
 
     with suppress(EdgevprError):
-        return tags_of(folder)
+        return read_tags(folder)
     return {}
 
 
@@ -141,7 +141,7 @@ class _Film:
         for frame in filter(None, read_to_end(self._source, lambda error: None)):
             self._passed = frame.name
             if frame.name >= name:
-                tag = partial(self._track.tag_at, float(named[1])) if self._track else None
+                tag = partial(self._track.interpolate_tag, float(named[1])) if self._track else None
                 return AlbumPicture(frame.image, tag=tag) if frame.name == name else None
         return None
 
@@ -166,7 +166,7 @@ def _open_orthophoto(source: str | Path, places: Sequence[Place]) -> Finder:
     return find
 
 
-def album_of(sources: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({})) -> Album:
+def make_album(sources: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({})) -> Album:
     """Return the album of the pictures in `sources`: folders, or one film; and first those of a recording, `recorded`,
     by the names of its frames. Raises EdgevprError for a source that cannot be used."""
     finders: list[Finder] = [partial(_find_recorded, recorded)] if recorded else []
@@ -184,7 +184,7 @@ def album_of_map(sources: Sequence[str | Path], places: Sequence[Place]) -> Albu
     orthophoto, the orthophoto. Raises EdgevprError for one that cannot be used."""
     if sources and any(place.position and place.pose and place.pose.is_surveyed for place in places):
         return Album(_open_orthophoto(sources[0], places))
-    return album_of(sources)
+    return make_album(sources)
 
 
 def small_pictures(

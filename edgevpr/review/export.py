@@ -13,7 +13,7 @@ Feature = dict[str, Any]
 _PLACED = ("kind", "lat_deg", "lon_deg")  # what every feature has; the others are its properties
 
 
-def features_of(flight: LoggedFlight) -> list[Feature]:
+def make_features(flight: LoggedFlight) -> list[Feature]:
     """Return the points of a flight: for every query the accepted match, the fix made from it, and the positions by
     autopilot and GPS receiver; and the fixes sent between matches."""
     features = [feature for query in flight.queries for feature in _of_query(query)]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.core.geodesy import distance_m, moved
-from edgevpr.runtime.flight.flightlog import flight_of
+from edgevpr.runtime.flight.flightlog import select_last_flight
 
 _log = logging.getLogger(__name__)
 
@@ -103,8 +103,8 @@ class LoggedFlight:
 
 def read_flight(path: str | Path) -> LoggedFlight:
     """Read the last flight of the log `path`, and warn if files of it are missing. Raises UsageError if there is no
-    such file, and EdgevprError if it has no line of a flight (see `flightlog.flight_of`)."""
-    lines = flight_of(path)
+    such file, and EdgevprError if it has no line of a flight (see `flightlog.select_last_flight`)."""
+    lines = select_last_flight(path)
     flight = read_lines(lines, Path(path))
     if lines.missing:
         _log.warning("%s", lines.missing)

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from edgevpr.core.arrays import Image
-from edgevpr.core.config import Config, build, changed_config
+from edgevpr.core.config import Config, build, change_config
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.text import waiting
 from edgevpr.frames.images import read_image
@@ -24,8 +24,8 @@ from edgevpr.review.tape import Playback, ReplayedGround, ReplayedLink, Replayed
 from edgevpr.runtime.flight.clock import Clock, record_clock
 from edgevpr.runtime.flight.flight import Flight
 from edgevpr.runtime.flight.flightio import FlightIO, Stop
-from edgevpr.runtime.flight.flightlog import flight_of, read_log
-from edgevpr.runtime.flight.recording import MAP, TAPE, frame_path, recording_of
+from edgevpr.runtime.flight.flightlog import read_log, select_last_flight
+from edgevpr.runtime.flight.recording import MAP, TAPE, frame_path, open_recording
 
 _log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ def replay(log: str | Path, place_map: str | None = None, changes: Path | None =
     header = note[1]
     config = build(Config, header["config"], str(folder))
     if changes:
-        config = changed_config(config, changes)
+        config = change_config(config, changes)
     playback = Supposed(notes) if changes else Playback(notes)
     why_ended = None
     with TemporaryDirectory(prefix="edgevpr-replay-") as temporary:
@@ -93,14 +93,14 @@ def replay(log: str | Path, place_map: str | None = None, changes: Path | None =
 
 def _recorded(log: str | Path) -> tuple[list[Line], Path]:
     """Return the lines of the last flight of `log`, and the folder of its recording."""
-    whole = flight_of(log)
+    whole = select_last_flight(log)
     if whole.missing:
         _log.warning("%s", whole.missing)
     lines = list(whole)
     where = lines[0].get("recording") if lines else None
     if not where:
         raise UsageError(f"{log}: its last flight was not recorded: fly with `log: {{record: FOLDER}}`.")
-    folder = recording_of(where, log)
+    folder = open_recording(where, log)
     if folder is None:
         raise UsageError(f"{log}: its recording is neither at {where} nor beside the log: bring it there.")
     return lines, folder

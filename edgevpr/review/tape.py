@@ -76,7 +76,7 @@ class ReplayedLink(Link):
             case ["waits"]:
                 conversation.fixes.drop_stale(now_s)
             case ["answers"]:
-                conversation.tell_of_answers()
+                conversation.announce_changes()
             case ["heard", data, sender, verdicts]:
                 if verdicts:
                     cast(ReplayedSigning, self._settings.signing).verdicts = deque(verdicts)

@@ -94,10 +94,10 @@ class Card:
     def fingerprint(self) -> str:
         """SHA-256 of everything that a feature map or vector depends on: the weights, the preparation of the picture,
         and the names of the outputs."""
-        return digest_of([self.sha256, _used(self.input), _used(self.outputs)])
+        return compute_digest([self.sha256, _used(self.input), _used(self.outputs)])
 
 
-def digest_of(values: list[Any]) -> str:
+def compute_digest(values: list[Any]) -> str:
     """Compute the SHA-256 of values that can be written as JSON: 64 hexadecimal digits."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
@@ -126,7 +126,7 @@ def load_card(name: str) -> Card:
     )
 
 
-def weights_of(spec: TechniqueSpec) -> str | None:
+def find_weights(spec: TechniqueSpec) -> str | None:
     """Return a line for people on the weights that a technique uses: name, title, licence and source of the network's
     card. None: the technique has no network."""
     if spec.model_sha256 is None:

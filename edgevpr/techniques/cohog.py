@@ -20,20 +20,20 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.techniques import layout, overlay, placecode
 from edgevpr.techniques.contrast import stretched
-from edgevpr.techniques.displacement import aligned, most_similar, share, voted
+from edgevpr.techniques.displacement import aligned, find_most_similar, share, voted
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import (
     grey_square,
     in_square,
     levels,
     mask_square,
-    normalised_blocks,
-    oriented_cells,
+    normalise_blocks,
+    orient_cells,
     slow_patterns,
     unit_rows,
 )
 from edgevpr.techniques.layout import ROTATIONS
-from edgevpr.techniques.views import HEIGHT_RATIOS, ViewRegions, Views, hypothesis, scale_of
+from edgevpr.techniques.views import HEIGHT_RATIOS, ViewRegions, Views, compute_scale, hypothesis
 
 # The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
 _DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
@@ -176,7 +176,7 @@ class CoHog:
 
     def _all_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools]:
         """Return the first two results of `_blocks`."""
-        blocks = normalised_blocks(oriented_cells(grey, cell_px, self.bins, signed=True, allowed=allowed))
+        blocks = normalise_blocks(orient_cells(grey, cell_px, self.bins, signed=True, allowed=allowed))
         if allowed is None:
             return blocks, np.ones(blocks.shape[:2], bool)
         return blocks, block_means(allowed.astype(np.float32), cell_px) >= 1.0
@@ -272,7 +272,7 @@ class CoHog:
             matches[each] = match
         best = max(matches, key=lambda each: matches[each].score)
         ratio, turn = hypothesis(best)
-        scale = scale_of(self._side + 1, ratio)
+        scale = compute_scale(self._side + 1, ratio)
         return best, replace(matches[best], rotation_deg=360 * turn / ROTATIONS, height_ratio=scale), nearest[best]
 
     def _agreement(self, query: Descriptor, reference: Singles, match: FineMatch) -> float:
@@ -302,7 +302,7 @@ class CoHog:
             best, match, _ = self._likest(query, reference, hypotheses)
             return match.score, [best]
         view = self._view(query, self._hypotheses[0])
-        nearest = most_similar(view.regions[::_GLANCE], reference)
+        nearest = find_most_similar(view.regions[::_GLANCE], reference)
         return share(view.numbers[::_GLANCE], nearest, (view.side, self._side), _VOTES_COUNT[self.camera]), None
 
     def _reference(self, fine: Bytes) -> Singles:

@@ -73,7 +73,7 @@ def share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float,
     return float(_piled(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
 
 
-def most_similar(regions: Singles, reference: Singles) -> Ints:
+def find_most_similar(regions: Singles, reference: Singles) -> Ints:
     """Return the number of the most similar region of a place, whose regions are `reference` (N, P), for each of
     `regions` (G, P): int (G,)."""
     best = np.empty(len(regions), np.intp)
@@ -89,7 +89,7 @@ def voted(
     """Match a view of the query with a place, whose regions are `reference` float32 (side * side, P), by vote. `counts`
     is that of `displacement`, and `with_support` tells whether the match gets its `support`. Returns the match, and the
     number of the most similar region of the place for each region of the view, int (G,)."""
-    best = most_similar(view.regions, reference)
+    best = find_most_similar(view.regions, reference)
     found = displacement(view.numbers, best, (view.side, math.isqrt(len(reference))), counts)
     asks_all = with_support and len(best)
     backed = support(view.numbers, view.regions, reference, best, found.shift_cells) if asks_all else None

@@ -73,7 +73,7 @@ def in_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
     )
 
 
-def oriented_cells(grey: Array, cell_px: int, bins: int, signed: bool, allowed: Mask | None = None) -> Singles:
+def orient_cells(grey: Array, cell_px: int, bins: int, signed: bool, allowed: Mask | None = None) -> Singles:
     """Compute histograms of gradient orientation, one per cell (Dalal and Triggs 2005; thesis 6.2.2, steps 1 and 2):
     the square root of the image over its maximum, central differences, and the gradient magnitude, shared between the
     two nearest of `bins` orientations over 360 degrees (`signed`) or 180. `grey` is float32 or uint8 (H, W), 0 to 255,
@@ -173,7 +173,7 @@ def _magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[Array, A
     return cv2.sqrt(squares, squares), spare
 
 
-def normalised_blocks(cells: Singles) -> Singles:
+def normalise_blocks(cells: Singles) -> Singles:
     """Return the blocks of 2x2 cells, stride one cell, each of Euclidean length 1 (thesis 6.2.2, step 3): float32
     (rows, cols, L) to (rows-1, cols-1, 4L) in the order top left, top right, bottom left, bottom right. A block without
     any gradient is all zeros."""

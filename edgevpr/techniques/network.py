@@ -12,11 +12,11 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles, Image, Mask, Singles
 from edgevpr.core.errors import ModelError, UsageError
-from edgevpr.techniques.card import Card, digest_of
+from edgevpr.techniques.card import Card, compute_digest
 from edgevpr.techniques.regions import describe, find_regions, region_backbone
 from edgevpr.techniques.session import Backbone, open_backbone
 from edgevpr.techniques.vectors import NEVER, VectorTechnique
-from edgevpr.techniques.words import load_words, local_descriptors, sharpness_of, vlad
+from edgevpr.techniques.words import compute_sharpness, load_words, local_descriptors, vlad
 
 # Minimum margins in the forms `float`, `8bit` and `1bit`. Beside them the largest margin of a wrong match, with the
 # shipped weights: on corridor and aerial_caliterra (the data sets used for tuning), and with the queries of one of them
@@ -99,7 +99,7 @@ def netvlad(
         raise UsageError(f"netvlad has no assignment `{assignment}`: use soft or hard.")
     backbone = open_backbone(model, "features", threads)
     learned, sha256 = load_words(model, "vlad", words)
-    sharpness = sharpness_of(learned) if assignment == "soft" else None
+    sharpness = compute_sharpness(learned) if assignment == "soft" else None
 
     def head(features: Singles) -> Singles:
         return vlad(local_descriptors(features), learned, sharpness)
@@ -130,7 +130,9 @@ def of_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
     """Make the technique of a card: the vector of its network. A map records no parameters, since the hash of the
     network covers them. No match is accepted until the configuration sets a minimum margin."""
     backbone = Backbone(card, "descriptor", threads)
-    sha256 = digest_of([backbone.sha256, None, card.similarity, None])  # None: maps of earlier versions have more here
+    sha256 = compute_digest(
+        [backbone.sha256, None, card.similarity, None]
+    )  # None: maps of earlier versions have more here
     made = NetworkVector(card.name, backbone, None, form=form, similarity=card.similarity, model_sha256=sha256)
     noise = np.random.default_rng(0).integers(0, 256, (card.input.height, card.input.width), np.uint8)
     made.encode(noise)  # raises ModelError for numbers that half precision cannot hold

@@ -12,7 +12,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Image, Mask, Singles
 from edgevpr.core.errors import ModelError, UsageError
-from edgevpr.core.files import read_file, sha256_of
+from edgevpr.core.files import compute_sha256, read_file
 from edgevpr.techniques.card import Card, InputRule, load_card
 
 _FORMS = {"descriptor": (2, "(1, D)"), "features": (4, "(1, C, H, W)")}
@@ -48,7 +48,7 @@ class Backbone:
         """Run the network on uint8 (H, W[, 3]); returns float32 of `shape`. Pixels where bool (H, W) `mask` is False
         get the mean of the others. Raises ModelError for results with NaN, numbers beyond 1e12, or zeros only."""
         card, name = self.card, getattr(self.card.outputs, self.output)
-        prepared = prepare(without_masked(image, mask), card.input)
+        prepared = prepare(drop_masked(image, mask), card.input)
         (result,) = run_outputs(card, self.session, [name], prepared)
         rank, form = _FORMS[self.output]
         if result.ndim != rank or len(result) != 1 or not result.size:
@@ -81,7 +81,7 @@ def open_session(card: Card, threads: int = 1) -> Any:
 def file_sha256(path: Path) -> str:
     """Compute the SHA-256 of a model file, 64 hexadecimal digits. Raises ModelError if it cannot be read."""
     try:
-        return sha256_of(path, MAX_FILE_BYTES)
+        return compute_sha256(path, MAX_FILE_BYTES)
     except OSError as error:
         raise ModelError(
             f"{path} cannot be read ({error.strerror}): put the weights there, or take the card away."
@@ -193,7 +193,7 @@ def shares(image: Array, rule: InputRule) -> tuple[float, float]:
     return max(1, round(width * scale)) / rule.width, max(1, round(height * scale)) / rule.height
 
 
-def without_masked(image: Image, mask: Mask | None) -> Array:
+def drop_masked(image: Image, mask: Mask | None) -> Array:
     """Set every pixel where the bool (H, W) `mask` is False to the mean of the others (128 if there are none): a
     uniform patch adds the least to what a network gives."""
     if mask is None or mask.all():

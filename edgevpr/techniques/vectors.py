@@ -12,7 +12,7 @@ from edgevpr.core.arrays import Array, Bytes, Image, Ints, Mask, Singles
 from edgevpr.core.config import FORMS
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
-from edgevpr.techniques.gradients import grey_square, mask_square, normalised_blocks, oriented_cells
+from edgevpr.techniques.gradients import grey_square, mask_square, normalise_blocks, orient_cells
 
 # A margin that no match can reach. The margins of wrong matches are known for the weights that edgevpr ships. With
 # other weights no match is accepted until the configuration sets a minimum margin.
@@ -182,5 +182,5 @@ class Hog(VectorTechnique):
         """Encode uint8 (H, W[, 3]) to float32 (length,); gradients where `mask` bool (H, W) is False are left out."""
         grey = grey_square(image, self._w1)
         allowed = mask_square(mask, self._w1)
-        cells = oriented_cells(grey, self._cell, self._bins, signed=False, allowed=allowed)
-        return normalised_blocks(cells).ravel()
+        cells = orient_cells(grey, self._cell, self._bins, signed=False, allowed=allowed)
+        return normalise_blocks(cells).ravel()

@@ -52,7 +52,7 @@ def cells_along(cells: int, ratio: float) -> int:
     return cells + 2 * round(cells * (ratio - 1) / 2)
 
 
-def scale_of(cells: int, ratio: float) -> float:
+def compute_scale(cells: int, ratio: float) -> float:
     """Return the exact height ratio of a view: its number of cells along one side, which is whole, over the number
     `cells` of a place."""
     return cells_along(cells, ratio) / cells
@@ -87,7 +87,7 @@ class Views:
         if (ratio, within) not in self._encoded:
             self._encoded[ratio, within] = self._encode(*self._picture_of(ratio, within))
         blocks, good = self._encoded[ratio, within]
-        return turned_blocks(blocks, -quarters), np.rot90(good, -quarters)
+        return rotate_blocks(blocks, -quarters), np.rot90(good, -quarters)
 
     def regions(self, number: int, described: Describe) -> ViewRegions:
         """Return all good regions of the view of the hypothesis `number`. `described` converts blocks float32 (G, 4
@@ -97,7 +97,7 @@ class Views:
             blocks, good = self.blocks(ratio, turn)
             side = max(cells_along(self._side + 1, ratio) - 1, self._side)  # regions along a side, at least a place's
             if ratio > 1:
-                ground = scale_of(self._side + 1, ratio) ** 2  # over that of the place
+                ground = compute_scale(self._side + 1, ratio) ** 2  # over that of the place
                 worth = ground * _LARGER_BY_CHANCE[ratio]  # no more than one in `ground` of the votes can agree
             else:
                 worth = 1.0 if ratio == 1 else min(1.0, (int(good.sum()) / self._good) ** _BY_CHANCE)
@@ -143,7 +143,7 @@ class Views:
         return grey, allowed.astype(bool), cell_px
 
 
-def turned_blocks(blocks: Singles, quarters: int) -> Singles:
+def rotate_blocks(blocks: Singles, quarters: int) -> Singles:
     """Turn the blocks (side, side, 4 L) of a picture counter-clockwise by `quarters` quarter turns; the number L of
     orientations must be a multiple of 4. The result equals the blocks of the turned picture, but for rounding."""
     for _ in range(quarters % QUARTERS):

@@ -80,7 +80,7 @@ def soft_weights(local: Singles, words: Singles, sharpness: float) -> Singles:
     return weights
 
 
-def sharpness_of(words: Singles) -> float:
+def compute_sharpness(words: Singles) -> float:
     """Compute the sharpness for `soft_weights` with which a descriptor equal to a word gives it, on average, 100 times
     the weight of the next word. NetVLAD (section 5, "Training") asks that of the training descriptors."""
     squares = np.einsum("kd,kd->k", words, words)

@@ -81,7 +81,9 @@ def _by_time(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s: fl
         fine_s = clock_offset_s(track, [times[name] + offset_s for name in looked_at], paths)
         offset_s += fine_s or 0.0
         how += ", the camera's clock set by " + ("its time zone" if fine_s is None else "how the pictures move")
-    found = {name: replace(track.tag_at(t_s + offset_s), t_utc_s=t_s + offset_s) for name, t_s in times.items()}
+    found = {
+        name: replace(track.interpolate_tag(t_s + offset_s), t_utc_s=t_s + offset_s) for name, t_s in times.items()
+    }
     tags = {name: _filled(tag, own[name]) for name, tag in found.items() if tag.position}
     if not tags:
         raise UsageError(f"No picture lies within the track with --offset-s {offset_s:g}: {_spans(track, times_s)}")
@@ -141,7 +143,7 @@ def _spans(track: Track, times_s: Doubles) -> str:
     )
 
 
-def rounded_m(placed: Placed) -> float | None:
+def round_metres(placed: Placed) -> float | None:
     """Return to how many metres all positions are rounded, if it is much (None: not)."""
     tags = placed.track.tags if placed.track else placed.tags.values()
     parts = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in tags if tag.position]) / _ROUNDED_DEG

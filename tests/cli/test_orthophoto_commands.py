@@ -133,7 +133,7 @@ def test_map_build_names_rasterio_where_it_is_missing(tmp_path, ground):
 @pytest.mark.slow
 def test_map_calibrate_cuts_the_orthophoto_again(tmp_path, ground, track, capsys, monkeypatch):
     monkeypatch.setattr(calibrate, "FEWEST_PLACES", 6)
-    monkeypatch.setattr(calibrate, "asked_of", lambda technique: 6)
+    monkeypatch.setattr(calibrate, "query_altered_copies", lambda technique: 6)
     path = tmp_path / "m.gpkg"
     cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 80, "--area", track)
     assert run("map", "build", path, *cut, "--no-refine", "--no-calibrate", "--json") == 0

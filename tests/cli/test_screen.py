@@ -10,7 +10,7 @@ from pictures import textured
 
 from edgevpr.cli.main import main
 from edgevpr.cli.screen import LineFormatter
-from edgevpr.core.text import decoded_name, printable, shown, without_passwords
+from edgevpr.core.text import decode_name, printable, redact_passwords, shown
 
 REDDENING = "\x1b[31m.jpg"  # a name that would make all that follows red
 
@@ -40,8 +40,8 @@ def test_printable_escapes_what_a_terminal_acts_on(text, printed):
 
 
 def test_decoded_name_is_utf_8():
-    assert decoded_name(os.fsdecode(b"caf\xe9.jpg")) == "caf\\xe9.jpg"
-    assert decoded_name("café.jpg") == "café.jpg"
+    assert decode_name(os.fsdecode(b"caf\xe9.jpg")) == "caf\\xe9.jpg"
+    assert decode_name("café.jpg") == "café.jpg"
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_decoded_name_is_utf_8():
     ],
 )
 def test_without_passwords_replaces_them(address, without):
-    assert without_passwords(address) == without
+    assert redact_passwords(address) == without
     assert shown(f"{address} is lost, {address} is back") == f"{without} is lost, {without} is back"
 
 

@@ -198,7 +198,7 @@ def test_photographs_of_several_folders_and_a_table_of_addresses_are_mapped_wher
     lines[1:] = [line.replace("DJI_", f"file://{tmp_path}/wednesday/DJI_", 1) for line in lines[1:]]
     table.write_text("\n".join([*lines, lines[-1].replace("_0007", "_0099")]))
     sources = [str(tmp_path / "monday"), str(tmp_path / "tuesday"), str(table)]
-    tasks, without_position = building.tasks_of_photos(photos.photos_of(sources), 10, None)
+    tasks, without_position = building.tasks_of_photos(photos.list_photos(sources), 10, None)
     assert without_position == 1
     done = mapped(cluster, tmp_path / "maps", tasks)
     unusable = " ".join(text for each in done for text in each.unusable)
@@ -215,12 +215,12 @@ def test_a_run_that_does_not_name_what_was_mapped_before_replaces_nothing(cluste
     folders = [str(tmp_path / name) for name in ("monday", "tuesday")]
     for number, folder in enumerate(folders):
         photographs(Path(folder), ["1.png", "2.png"], 2 * number)
-    mapped(cluster, out, building.tasks_of_photos(photos.photos_of(folders[:1]), 10, None)[0])
+    mapped(cluster, out, building.tasks_of_photos(photos.list_photos(folders[:1]), 10, None)[0])
     before = places_of(out)
-    (done,) = mapped(cluster, out, building.tasks_of_photos(photos.photos_of(folders[1:]), 10, None)[0])
+    (done,) = mapped(cluster, out, building.tasks_of_photos(photos.list_photos(folders[1:]), 10, None)[0])
     assert "has 2 pictures that this run does not name, such as monday_" in done.problem
     assert places_of(out) == before
-    mapped(cluster, out, building.tasks_of_photos(photos.photos_of(folders), 10, None)[0])
+    mapped(cluster, out, building.tasks_of_photos(photos.list_photos(folders), 10, None)[0])
     assert sum(map(len, places_of(out).values())) == 4
 
 
@@ -231,7 +231,7 @@ def test_photographs_that_are_moved_or_named_twice_are_neither_mapped_again_nor_
         photographs(card, ["1.png", "2.png"], 2 * number)
 
     def placed(*sources):
-        done = mapped(cluster, out, building.tasks_of_photos(photos.photos_of(list(map(str, sources))), 10, None)[0])
+        done = mapped(cluster, out, building.tasks_of_photos(photos.list_photos(list(map(str, sources))), 10, None)[0])
         assert not [each for each in done if each.problem or each.unusable]
         return sum(map(len, places_of(out).values())), any(each.is_new for each in done)
 
@@ -252,10 +252,10 @@ def test_a_photograph_of_two_positions_is_refused_or_left_out(tmp_path):
     table, elsewhere = tmp_path / "a.csv", GeoTag(position=Position(47.0, 8.001))
     write_positions(table, {"a/1.png": elsewhere})
     with pytest.raises(UsageError, match=r"1\.png has one position in .*a and another in .*a\.csv"):
-        photos.photos_of([str(tmp_path / "a"), str(table)])
+        photos.list_photos([str(tmp_path / "a"), str(table)])
     write_positions(table, {f"file://{tmp_path}/a/1.png": elsewhere})
     (tmp_path / "here").mkdir()
-    found = photos.gather(photos.photos_of([str(tmp_path / "a"), str(table)]), tmp_path / "here")
+    found = photos.gather(photos.list_photos([str(tmp_path / "a"), str(table)]), tmp_path / "here")
     assert len(found.uris) == 1
     assert "and has another position" in found.unusable[f"file://{tmp_path}/a/1.png"]
 

@@ -4,7 +4,7 @@ import photographs
 import pytest
 
 from edgevpr.core.types import Position
-from edgevpr.frames.exif import fov_deg_of, read_exif
+from edgevpr.frames.exif import read_exif, read_fov_deg
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
 
@@ -98,4 +98,4 @@ def test_read_exif_of_rubbish_or_nothing_is_no_tag(content, tmp_path, capfd):
 def test_fov_deg_of_is_that_of_the_equivalent_focal_length(focal_mm, sides, fov_deg, tmp_path):
     size = dict(zip((0xA002, 0xA003), sides, strict=False))
     photographs.write_jpeg(tmp_path / "photo.jpg", camera={0xA405: focal_mm, **size})
-    assert fov_deg_of(tmp_path / "photo.jpg") == (None if fov_deg is None else pytest.approx(fov_deg, abs=0.1))
+    assert read_fov_deg(tmp_path / "photo.jpg") == (None if fov_deg is None else pytest.approx(fov_deg, abs=0.1))

@@ -163,18 +163,18 @@ def test_tag_at_interpolates_and_turns_the_shorter_way(track):
     found = track(
         "time,lat,lon,alt,yaw_deg,roll_deg,pitch_deg,rel_alt\n10,50,179.999,600,350,-4,2,80\n12,51,-179.999,604,20,4,,90\n"
     )
-    half = found.tag_at(11.0)
+    half = found.interpolate_tag(11.0)
     assert half.position.lat_deg == 50.5
     assert abs(half.position.lon_deg) == pytest.approx(180)
     assert half.position.alt_m == 602
     assert (half.heading_deg, half.roll_deg, half.pitch_deg, half.height_m) == (5.0, 0.0, None, 85.0)
-    assert found.tag_at(10.5).heading_deg == 357.5
-    assert found.tag_at(11.5).position.lon_deg == pytest.approx(-179.9995)
+    assert found.interpolate_tag(10.5).heading_deg == 357.5
+    assert found.interpolate_tag(11.5).position.lon_deg == pytest.approx(-179.9995)
 
 
 def test_tag_at_makes_nothing_up_outside_the_table_and_in_wide_gaps(track):
     found = track("time,lat,lon\n1,50,8\n2,,\n6,50.1,8\n11.1,50.2,8\n12,0,0\n13,50.3,8\n")
-    assert [found.tag_at(t_s).position is not None for t_s in (0.9, 1, 3, 6, 8, 11.1, 12, 13, 13.1)] == [
+    assert [found.interpolate_tag(t_s).position is not None for t_s in (0.9, 1, 3, 6, 8, 11.1, 12, 13, 13.1)] == [
         False, True, True, True, False, True, True, True, False
     ]  # fmt: skip
 

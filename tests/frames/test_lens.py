@@ -9,8 +9,8 @@ from distorted_cameras import SIZE_PX, DistortedCamera, fisheye, wide
 
 from edgevpr.core.errors import ConfigError, ImageError
 from edgevpr.core.types import Frame
-from edgevpr.frames.lens import CalibratedLens, read_lens, sight_of
-from edgevpr.frames.level import UNKNOWN_VIEW, Lens, levelled, straightened
+from edgevpr.frames.lens import CalibratedLens, line_of_sight, read_lens
+from edgevpr.frames.level import UNKNOWN_VIEW, Lens, levelled, undistort_frame
 
 PINHOLE = 400.0, 410.0, 322.0, 238.0
 K = ", ".join(map(str, (PINHOLE[0], 0, PINHOLE[2], 0, PINHOLE[1], PINHOLE[3], 0, 0, 1)))
@@ -132,8 +132,8 @@ CAMERAS = pytest.mark.parametrize("camera", [wide(), fisheye()], ids=["wide", "f
 @CAMERAS
 def test_a_straightened_picture_is_that_of_a_camera_without_distortion(camera, ground):
     lens, frame = lens_of(camera), taken(camera, ground)
-    found = straightened(frame.image, None, UNKNOWN_VIEW, lens)
-    sight = sight_of(lens, SIZE_PX)
+    found = undistort_frame(frame.image, None, UNKNOWN_VIEW, lens)
+    sight = line_of_sight(lens, SIZE_PX)
     height, width = found.image.shape[:2]
     assert (width, height) == sight.straight_px
     assert max(width, height) == max(SIZE_PX)
@@ -157,7 +157,11 @@ def test_a_picture_is_levelled_and_straightened_in_one_warp(camera, ground, pose
     lens = lens_of(camera)
     footprint_m = 150.0
     found = levelled(
-        taken(camera, ground, **pose), None, Lens(sight_of(lens, SIZE_PX).fov_deg, 0.0, lens), footprint_m, below=True
+        taken(camera, ground, **pose),
+        None,
+        Lens(line_of_sight(lens, SIZE_PX).fov_deg, 0.0, lens),
+        footprint_m,
+        below=True,
     )
     assert (found.view.aside, found.view.footprint_m) == ((0.0, 0.0), pytest.approx(footprint_m))
     side = found.image.shape[0]
@@ -172,7 +176,7 @@ def test_a_mask_of_the_camera_follows_its_picture(ground):
     overlay = np.ones(SIZE_PX[::-1], bool)
     overlay[:, :160] = False
     grey = np.where(overlay, 255, 0).astype(np.uint8)
-    found = straightened(grey, overlay, UNKNOWN_VIEW, lens_of(camera))
+    found = undistort_frame(grey, overlay, UNKNOWN_VIEW, lens_of(camera))
     assert found.mask is not None
     assert 0.6 < found.mask.mean() < 0.95
     sure = (found.image < 5) | (found.image > 250)
@@ -184,7 +188,7 @@ def test_what_lies_beyond_the_lens_shows_no_ground(ground):
     camera = DistortedCamera(512.0, (-0.3, 0, 0, 0))
     lens = lens_of(camera)
     picture = levelled(
-        taken(camera, ground, pitch_deg=30.0), None, Lens(sight_of(lens, SIZE_PX).fov_deg, 0.0, lens), 250.0
+        taken(camera, ground, pitch_deg=30.0), None, Lens(line_of_sight(lens, SIZE_PX).fov_deg, 0.0, lens), 250.0
     )
     assert picture.mask is not None
     outline = cv2.findContours(picture.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
@@ -195,8 +199,8 @@ def test_frames_of_another_size_are_scaled_and_of_another_shape_refused(ground):
     camera = wide()
     lens, frame = lens_of(camera), taken(camera, ground)
     small = cv2.resize(frame.image, (320, 240), interpolation=cv2.INTER_AREA)
-    half = straightened(small, None, UNKNOWN_VIEW, lens).image
-    full = straightened(frame.image, None, UNKNOWN_VIEW, lens).image
+    half = undistort_frame(small, None, UNKNOWN_VIEW, lens).image
+    full = undistort_frame(frame.image, None, UNKNOWN_VIEW, lens).image
     assert off(half, cv2.resize(full, half.shape[1::-1], interpolation=cv2.INTER_AREA)) < 1
     with pytest.raises(ImageError, match=r"640x360 pixels, and lens\.yaml was calibrated with 640x480"):
-        straightened(frame.image[60:420], None, UNKNOWN_VIEW, lens)
+        undistort_frame(frame.image[60:420], None, UNKNOWN_VIEW, lens)

@@ -6,7 +6,7 @@ import pytest
 from pictures import textured
 
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.frames.mask import mask_of
+from edgevpr.frames.mask import load_mask
 from edgevpr.techniques import create
 
 
@@ -23,33 +23,33 @@ def masked(share, height=120, width=160):
 
 
 def test_mask_is_known_by_its_pixels(tmp_path):
-    one = mask_of(written(tmp_path / "m.png", masked(0.5)))
+    one = load_mask(written(tmp_path / "m.png", masked(0.5)))
     assert np.array_equal(one.allowed, masked(0.5))
     cv2.imwrite(str(tmp_path / "c.bmp"), cv2.cvtColor(masked(0.5).astype(np.uint8) * 200, cv2.COLOR_GRAY2BGR))
-    assert mask_of(tmp_path / "c.bmp").sha256 == one.sha256
-    assert mask_of(written(tmp_path / "o.png", masked(0.5)[:, ::-1])).sha256 != one.sha256
-    assert mask_of(written(tmp_path / "t.png", masked(0.5, 160, 120))).sha256 != one.sha256
-    assert mask_of(None) is None
+    assert load_mask(tmp_path / "c.bmp").sha256 == one.sha256
+    assert load_mask(written(tmp_path / "o.png", masked(0.5)[:, ::-1])).sha256 != one.sha256
+    assert load_mask(written(tmp_path / "t.png", masked(0.5, 160, 120))).sha256 != one.sha256
+    assert load_mask(None) is None
 
 
 @pytest.mark.parametrize("share", [0.61, 1.0])
 def test_mask_that_leaves_too_little_is_refused(tmp_path, share):
     with pytest.raises(UsageError, match=f"masks {share:.0%} of the frame, and 60% is the most"):
-        mask_of(written(tmp_path / "m.png", masked(share, 100, 100)))
-    assert mask_of(written(tmp_path / "m.png", masked(0.6, 100, 100))).allowed.mean() == 0.4
+        load_mask(written(tmp_path / "m.png", masked(share, 100, 100)))
+    assert load_mask(written(tmp_path / "m.png", masked(0.6, 100, 100))).allowed.mean() == 0.4
 
 
 def test_mask_that_is_no_image_is_refused(tmp_path):
     (tmp_path / "m.png").write_bytes(b"\x89PNG\r\n\x1a\ncut")
     for path in (tmp_path / "m.png", tmp_path / "missing.png"):
         with pytest.raises(ImageError, match=rf"source\.mask.*{path.name}"):
-            mask_of(path)
+            load_mask(path)
 
 
 @pytest.mark.parametrize("camera", ["forward", "nadir"])
 def test_what_lies_under_the_mask_changes_nothing(tmp_path, camera):
     technique = create("cohog", {"w1": 208, "camera": camera})
-    mask = mask_of(written(tmp_path / "m.png", masked(0.5)))  # of another size than the picture
+    mask = load_mask(written(tmp_path / "m.png", masked(0.5)))  # of another size than the picture
     picture = textured(1, 240, 320)
     covered = picture.copy()
     covered[:, :150] = np.random.default_rng(1).integers(0, picture.max(), (240, 150))  # ends before the mask

@@ -9,7 +9,7 @@ import pytest
 
 from edgevpr.cli.main import main
 from edgevpr.core.arrays import Image
-from edgevpr.frames.mask import mask_of
+from edgevpr.frames.mask import load_mask
 from edgevpr.mapmaking.advice import measure_still_share
 
 NOISE = cv2.GaussianBlur(np.random.default_rng(3).random((1500, 1500), np.float32), (0, 0), 3)
@@ -115,7 +115,7 @@ def test_a_mask_leaves_it_out(tmp_path):
     painted = np.full((240, 320), 255, np.uint8)
     painted[:45, :150] = painted[95:145, 135:185] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), painted)
-    assert measure_still_share(map(drawn_over, range(20)), mask_of(str(tmp_path / "mask.png"))) == 0
+    assert measure_still_share(map(drawn_over, range(20)), load_mask(str(tmp_path / "mask.png"))) == 0
 
 
 @pytest.mark.parametrize("numbers", [range(11), [3] * 20], ids=["few pictures", "an aircraft that stands"])

@@ -12,7 +12,7 @@ from rasters import HOME, grid, ground_m, marked_raster, textured_raster, write_
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved
-from edgevpr.mapmaking.cuttings import SIDE_PX, OrthophotoSource, lattice_of
+from edgevpr.mapmaking.cuttings import SIDE_PX, OrthophotoSource, make_lattice
 from edgevpr.mapmaking.making import Cuttings
 from edgevpr.mapmaking.missions import Area, Waypoint
 from edgevpr.mapmaking.orthophoto import Orthophoto
@@ -30,7 +30,7 @@ def frames_of(source: OrthophotoSource) -> list:
 
 def source_of(path, footprint_m, spacing_m, area=None, only=None) -> OrthophotoSource:
     orthophoto = Orthophoto(path)
-    lattice = lattice_of(orthophoto, footprint_m, spacing_m, area)
+    lattice = make_lattice(orthophoto, footprint_m, spacing_m, area)
     return OrthophotoSource(orthophoto, [lattice], only=only)
 
 
@@ -50,7 +50,7 @@ def ring(points_m) -> list[tuple[float, float]]:
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4326", "EPSG:3857"])
 def test_places_lie_on_a_grid_of_metres_in_rows_from_the_north(tmp_path, crs):
     path = marked_raster(tmp_path / "o.tif", crs, pixel_m=0.5, side_px=400)
-    lattice = lattice_of(Orthophoto(path), 80.0, 20.0)
+    lattice = make_lattice(Orthophoto(path), 80.0, 20.0)
     points_m = off_m(lattice).reshape(*lattice.shape, 2)
     assert min(lattice.shape) >= 3
     np.testing.assert_allclose(np.diff(points_m[..., 0], axis=1), 20, atol=0.01)
@@ -93,7 +93,7 @@ def test_an_area_keeps_what_lies_in_its_polygons_but_not_in_their_holes(tmp_path
     path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=800)
     outline = ring([(-100, -80), (100, -80), (100, 60), (-100, 60)])
     hole = ring([(-30, -30), (30, -30), (30, 30), (-30, 30)])
-    points_m = off_m(lattice_of(Orthophoto(path), 40.0, 10.0, Area(((outline, hole),), ())))
+    points_m = off_m(make_lattice(Orthophoto(path), 40.0, 10.0, Area(((outline, hole),), ())))
     assert len(points_m) > 150
     assert (points_m.min(axis=0) >= (-100.1, -80.1)).all()
     assert (points_m.max(axis=0) <= (100.1, 60.1)).all()
@@ -104,7 +104,7 @@ def test_an_area_keeps_what_lies_in_its_polygons_but_not_in_their_holes(tmp_path
 def test_an_area_keeps_what_lies_near_its_path(tmp_path):
     path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=800)
     way = Area((), ((waypoint(-100, -50), waypoint(50, 100), waypoint(50, 150)), (waypoint(100, -100),)))
-    points_m = off_m(lattice_of(Orthophoto(path), 25.0, 5.0, way))
+    points_m = off_m(make_lattice(Orthophoto(path), 25.0, 5.0, way))
     ends_m = np.array([(-100, -50), (50, 100), (50, 150)], float)
     away_m = np.hypot(*(points_m - (100, -100)).T)
     for begin, end in pairwise(ends_m):
@@ -130,17 +130,17 @@ def test_an_area_keeps_what_lies_near_its_path(tmp_path):
 def test_a_grid_that_makes_no_sense_is_refused(tmp_path, footprint_m, spacing_m, said):
     orthophoto = Orthophoto(marked_raster(tmp_path / "o.tif"))
     with pytest.raises(UsageError, match=said):
-        lattice_of(orthophoto, footprint_m, spacing_m)
+        make_lattice(orthophoto, footprint_m, spacing_m)
 
 
 def test_an_area_elsewhere_is_refused_with_both_extents(tmp_path):
     orthophoto = Orthophoto(marked_raster(tmp_path / "o.tif"))
     for way in (Waypoint(-35.36, 149.16), waypoint(3000, 0)):
         with pytest.raises(UsageError, match=r"does not touch .* north, .* east, the orthophoto at 49\.99.* east\.$"):
-            lattice_of(orthophoto, 40.0, 10.0, Area((), ((way,),)))
+            make_lattice(orthophoto, 40.0, 10.0, Area((), ((way,),)))
     for off_m in (15.5, 4.0):  # between places, and so near to a row that its box holds one of either
         with pytest.raises(UsageError, match="10 m"):
-            lattice_of(orthophoto, 0.5, 10.0, Area((), ((waypoint(off_m, 15.5),),)))
+            make_lattice(orthophoto, 0.5, 10.0, Area((), ((waypoint(off_m, 15.5),),)))
 
 
 def test_an_area_takes_places_of_the_same_grid_under_the_same_names(tmp_path):

@@ -52,7 +52,7 @@ def at_hand(*frames):
 def few(monkeypatch):
     """A map of few places is enough, and few questions."""
     monkeypatch.setattr(calibrating, "FEWEST_PLACES", PLACES)
-    monkeypatch.setattr(calibrating, "asked_of", lambda technique: 2 * PLACES)
+    monkeypatch.setattr(calibrating, "query_altered_copies", lambda technique: 2 * PLACES)
 
 
 @pytest.fixture
@@ -120,7 +120,7 @@ def test_a_place_that_cannot_be_read_is_not_asked_for(place_map):
 
 
 def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
-    monkeypatch.setattr(calibrating, "asked_of", lambda technique: PLACES)
+    monkeypatch.setattr(calibrating, "query_altered_copies", lambda technique: PLACES)
     down = create("cohog", {"camera": "nadir", "w1": 208})
     tilted = [frame(number, roll_deg=8.0, pitch_deg=-6.0, heading_deg=40.0, height_m=90.0) for number in range(PLACES)]
 

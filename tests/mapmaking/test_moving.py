@@ -13,7 +13,7 @@ from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.mapmaking.moving import move_map
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import identity_of
+from edgevpr.places.mapinfo import read_identity
 from edgevpr.techniques import create
 
 HOME = 47.0, 8.0
@@ -43,7 +43,7 @@ def log_of(path, *lines):
     """The log of a flight with the map, as it is now."""
     log = path.with_name("flight.jsonl")
     with PlaceMap.open(path) as place_map:
-        start = {"kind": "start", "time": "now", "t_mono_s": 0.0, "map_identity": asdict(identity_of(place_map))}
+        start = {"kind": "start", "time": "now", "t_mono_s": 0.0, "map_identity": asdict(read_identity(place_map))}
     log.write_text("".join(json.dumps(line) + "\n" for line in (start, *lines)))
     return log
 

@@ -8,9 +8,9 @@ from overflown import DAY_S, FOOTPRINT_M, FOV_DEG, fly, ground
 from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import distance_m
 from edgevpr.mapmaking.making import FlownPictures, MapOrder, make_map
-from edgevpr.mapmaking.passes import FADES_AFTER, SPOT, history_of
+from edgevpr.mapmaking.passes import FADES_AFTER, SPOT, read_history
 from edgevpr.places.examine import check, select
-from edgevpr.places.history import counts_of, removed_from, write_history
+from edgevpr.places.history import drop_places, read_counts, write_history
 from edgevpr.places.mapfile import PlaceMap
 
 pytestmark = pytest.mark.slow
@@ -46,7 +46,7 @@ def compared(tmp_path, folders, inside=None, camera="nadir"):
         calibrate=False,
     )
     make_map(order, config, print, lambda items, *_: items)
-    history = history_of(path, order.pictures, config, folders, named(folders if inside is None else inside))
+    history = read_history(path, order.pictures, config, folders, named(folders if inside is None else inside))
     out = tmp_path / "m.gpkg"
     select(path, out, named(folders.keys() - history.removed.keys()))
     with PlaceMap.open_for_adding(out) as place_map:
@@ -88,7 +88,7 @@ def test_the_same_ground_becomes_one_place_and_what_is_left_is_as_it_was(tmp_pat
     assert {*history.removed.values()} <= kept_ids
     require_near(tmp_path / "all.gpkg", history)
     pictures = FlownPictures(source=str(tmp_path / "p"))
-    assert history_of(tmp_path / "all.gpkg", pictures, load_config(None, CONFIG), folders, named(folders)) == history
+    assert read_history(tmp_path / "all.gpkg", pictures, load_config(None, CONFIG), folders, named(folders)) == history
 
 
 def test_changed_ground_stays_with_both_its_places_and_is_shown_as_a_layer(tmp_path):
@@ -124,7 +124,7 @@ def test_one_flight_is_not_compared_and_a_pause_of_hours_makes_two(tmp_path, pau
     _, path = compared(tmp_path, {f"{seed}{spot}.png": "/card" for seed in range(2) for spot in range(4)})
     assert len(left(path)) == places
     with PlaceMap.open(path) as place_map:
-        assert (counts_of(place_map).get("passes", 0), len(removed_from(place_map))) == (passes, 8 - places)
+        assert (read_counts(place_map).get("passes", 0), len(drop_places(place_map))) == (passes, 8 - places)
 
 
 def test_only_places_inside_are_judged_and_those_around_are_asked(tmp_path):

@@ -21,8 +21,8 @@ from edgevpr.lab.simulate.generated import mapping_flight, to_position
 from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.mapmaking.refine import refine
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import info_of
-from edgevpr.runtime.recognise.opening import technique_of
+from edgevpr.places.mapinfo import describe_map
+from edgevpr.runtime.recognise.opening import create_technique
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -99,7 +99,7 @@ def test_pictures_say_where_they_lie(flown, map_path, capsys):
     with PlaceMap.open(map_path) as place_map:
         after_m, turned_deg = errors_m(place_map, poses)
         footprints_m = np.array([place.pose.footprint_m for place in place_map.places()])
-        info = info_of(place_map)
+        info = describe_map(place_map)
         recorded = [place.pose.recorded for place in place_map.places()]
     assert np.median(after_m) < np.median(before_m) / 2
     assert after_m.max() < 10
@@ -176,7 +176,7 @@ def test_a_fix_is_finer_than_the_places(flown, map_path, tmp_path, capsys):
 def some_of(built, path, numbers, position=lambda number, place: place.position):
     """A map of some places of another, in this order, at other positions."""
     with PlaceMap.open(built) as there, PlaceMap.create(path, there.spec) as place_map:
-        technique = technique_of(there)
+        technique = create_technique(there)
         for place in there.places(numbers):
             fine, _ = there.fine_part(place.place_id)
             (coarse,) = (part for place_id, *_, part in there.coarse_parts() if place_id == place.place_id)
@@ -194,7 +194,7 @@ def some_of(built, path, numbers, position=lambda number, place: place.position)
 
 def refined_of(path, images=None):
     with PlaceMap.open_for_adding(path) as place_map:
-        technique = technique_of(place_map)
+        technique = create_technique(place_map)
         return refine(place_map, technique, lambda pairs, total: pairs, images), list(place_map.places())
 
 
@@ -247,7 +247,7 @@ def test_places_of_a_surveyed_picture_stay(built, tmp_path):
     with PlaceMap.open(built) as there, PlaceMap.create(tmp_path / "m.gpkg", there.spec) as place_map:
         lies = Pose(up_deg=0.0, footprint_m=80.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
         (first, *_) = there.places([1])
-        descriptor = technique_of(there).encode(np.zeros((64, 64), np.uint8))
+        descriptor = create_technique(there).encode(np.zeros((64, 64), np.uint8))
         frame = Frame(image=np.zeros((8, 8), np.uint8), name="1", t_mono_s=0.0, position=first.position, pose=lies)
         place_map.add(frame, descriptor)
     found, (place,) = refined_of(tmp_path / "m.gpkg")
@@ -271,6 +271,6 @@ def test_a_place_that_cannot_be_read_is_left_alone(map_path):
         db.execute("UPDATE places SET up_deg = 5, pose_crc32 = 1 WHERE place_id = 5")
     db.close()
     with PlaceMap.open_for_adding(map_path) as place_map:
-        found = refine(place_map, technique_of(place_map), lambda pairs, total: pairs)
+        found = refine(place_map, create_technique(place_map), lambda pairs, total: pairs)
     assert found.places == 27
     assert found.refined >= 25

@@ -10,14 +10,14 @@ from walks import map_of
 
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import moved
-from edgevpr.core.quadkeys import keys_at
+from edgevpr.core.quadkeys import tile_keys
 from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.missions import Area, Waypoint, read_area
 from edgevpr.mapmaking.subset import subset
 from edgevpr.places.examine import unwatched
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.confidence import prior
-from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_of, calibration_text
+from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_text, read_calibration_for
 from edgevpr.techniques import create
 
 HOME = 47.0, 8.0
@@ -39,7 +39,7 @@ def tiles(tmp_path_factory):
     folder = tmp_path_factory.mktemp("maps")
     frames = [frame(column, row) for column in range(SIDE) for row in range(SIDE)]
     points = np.array([(each.position.lat_deg, each.position.lon_deg) for each in frames])
-    keys = keys_at(*points.T, 17)
+    keys = tile_keys(*points.T, 17)
     assert len(set(keys)) >= 4
     for key in set(keys):
         map_of(
@@ -101,7 +101,7 @@ def test_the_most_cautious_calibration_of_the_tiles_counts(tiles, tmp_path):
     area = path_over((0, 0), (400, 400))
     assert subset(tmp_path / "tiles", area, 1000.0, tmp_path / "f.gpkg", None, unwatched).is_calibrated
     with PlaceMap.open(tmp_path / "f.gpkg") as place_map:
-        (joined,) = calibration_of(place_map).models.values()
+        (joined,) = read_calibration_for(place_map).models.values()
     assert {each.bias for each in (joined.of_place, *joined.of_other_places)} == {-float(n) for n in range(len(paths))}
 
 

@@ -159,7 +159,7 @@ class Autopilot:
 
     def told(self):
         """The messages that have been sent since the last call."""
-        self.conversation.tell_of_answers()
+        self.conversation.announce_changes()
         self._listen()
         packets, self.packets = self.packets, []
         return list(PacketReader().feed(b"".join(packets)))

@@ -104,7 +104,7 @@ def fly(autopilot, count, every_s=1.0):
     sendings = []
     for _ in range(count):
         autopilot.wait(every_s)
-        autopilot.conversation.tell_of_answers()
+        autopilot.conversation.announce_changes()
         sendings.append(autopilot.put_fix())
     return sendings
 
@@ -134,7 +134,7 @@ def test_a_refused_fix_says_why_by_what_the_autopilot_has_said(autopilot):
     def refused(result=FAILED, after_s=1.0):
         autopilot.wait(after_s)
         autopilot.beat(ARMED)
-        autopilot.conversation.tell_of_answers()
+        autopilot.conversation.announce_changes()
         sending = autopilot.put_fix(base_mode=ARMED)
         autopilot.wait(0.03)
         autopilot.answer(result)

@@ -12,7 +12,7 @@ from edgevpr.mavlink.messages import (
     Health,
     Severity,
     computer_status,
-    named_values,
+    make_named_values,
     position_fix,
     status_text,
 )
@@ -49,7 +49,7 @@ def test_the_ground_hears_what_is_for_people_and_no_fix_and_no_request(two, cloc
     flight.send(text("wake up"))
     autopilot.expect("COMMAND_LONG")
     station.expect_text("wake up")
-    figures = named_values(1.0, vpr_place=5, vpr_score=0.5, vpr_cpu=0.5, vpr_mah=2.0)
+    figures = make_named_values(1.0, vpr_place=5, vpr_score=0.5, vpr_cpu=0.5, vpr_mah=2.0)
     flight.send(*figures, computer_status(1.0, [0.5], 2**20, 2**30, None))
     flight.send(position_fix(Fix(1.0, 2.0, 3.0, clock()), clock(), 7))  # not even where it is queued as a message
     flight.send(text("end"))

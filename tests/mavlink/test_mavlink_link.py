@@ -10,7 +10,7 @@ from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_unt
 
 from edgevpr.mavlink.conversation import MESSAGES_MAX
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.messages import Fix, Health, Severity, named_values, status_text
+from edgevpr.mavlink.messages import Fix, Health, Severity, make_named_values, status_text
 from edgevpr.mavlink.wire import mavlink
 
 pytestmark = pytest.mark.network
@@ -74,7 +74,7 @@ def test_a_fix_from_an_old_frame_or_to_a_silent_autopilot_is_never_sent(link, pe
 
 
 def test_a_value_that_its_field_cannot_hold_costs_that_message_only(link, peer, clock, caplog):
-    link.send(*named_values(clock.now_s, vpr_place=2**40, vpr_score=0.5), text("next"))
+    link.send(*make_named_values(clock.now_s, vpr_place=2**40, vpr_score=0.5), text("next"))
     assert [m.name for m in peer.expect_text("next")] == ["vpr_score"]
     assert "NAMED_VALUE_INT" in caplog.text
 

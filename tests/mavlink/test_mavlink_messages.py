@@ -61,13 +61,13 @@ def test_a_fix_that_says_nothing_is_refused(wrong, says):
 
 
 def test_whole_numbers_and_others_are_named_values_and_what_is_not_known_is_none():
-    named = messages.named_values(12.5, vpr_place=4711, vpr_score=0.625, vpr_conf=None)
+    named = messages.make_named_values(12.5, vpr_place=4711, vpr_score=0.625, vpr_conf=None)
     heard = [(m.get_type(), m.name, m.value, m.time_boot_ms) for m in map(sent_and_received, named)]
     assert heard == [
         ("NAMED_VALUE_INT", "vpr_place", 4711, 12500),
         ("NAMED_VALUE_FLOAT", "vpr_score", 0.625, 12500),
     ]
-    (cpu,) = messages.named_values(2**32 / 1000 + 1.5, vpr_cpu=0.25)
+    (cpu,) = messages.make_named_values(2**32 / 1000 + 1.5, vpr_cpu=0.25)
     assert sent_and_received(cpu).time_boot_ms == 1500, "it wraps as its field does"
 
 

@@ -18,7 +18,7 @@ from map_writer import SPEC, descriptor, frame, make_map
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.places.examine import examine
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import info_of
+from edgevpr.places.mapinfo import describe_map
 from edgevpr.places.rows import readable
 
 PLACES = 40
@@ -114,7 +114,7 @@ def test_a_summary_says_what_it_can(map_path):
         "UPDATE places SET time = 1, footprint_m = 'wide'",
     )
     with PlaceMap.open(map_path) as place_map:
-        info = info_of(place_map)
+        info = describe_map(place_map)
     assert (info.places, info.extent, info.first_time) == (PLACES, None, None)
 
 
@@ -127,7 +127,7 @@ def test_bits_flipped_in_the_header_are_a_sentence(map_path, seed):
     map_path.write_bytes(data)
     # A file that is still a map is read; any other is a MapError, and nothing else.
     with contextlib.suppress(MapError), PlaceMap.open(map_path) as place_map:
-        info_of(place_map)
+        describe_map(place_map)
         for place_id, *_ in list(place_map.coarse_parts()):
             place_map.fine_part(place_id)
 
@@ -167,7 +167,7 @@ def test_a_name_and_a_time_that_cannot_be_written_cost_no_place(map_path):
     with PlaceMap.open_for_adding(map_path) as place_map:
         for number, each in ((41, odd), (42, later)):
             place_map.add(each, descriptor(number))
-            (place_id,) = place_map.ids_by("source_image")[(readable(each.name),)]
+            (place_id,) = place_map.select_ids("source_image")[(readable(each.name),)]
             assert place_map.is_of(place_id, descriptor(number).coarse)
         *_, first, second = place_map.places()
     assert (first.source_image, first.t_utc_s) == ("\\udcff\\udcfe.jpg", None)

@@ -20,7 +20,7 @@ from edgevpr.places.examine import merge, repair, shrink
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import connect
-from edgevpr.places.mapinfo import identity_of, info_of
+from edgevpr.places.mapinfo import describe_map, read_identity
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_what_is_added_comes_back(map_path):
         for number, (_, position, _, coarse) in enumerate(place_map.coarse_parts()):
             np.testing.assert_array_equal(coarse, descriptor(number).coarse)
             assert (position is None) == (frame(number).position is None)
-        info = info_of(place_map)
+        info = describe_map(place_map)
     assert (info.places, info.with_position) == (10, 8)
     np.testing.assert_allclose(info.extent, (50.0001, 8.0, 50.0009, 8.0))
 
@@ -171,7 +171,7 @@ def test_merging_copies_what_is_new_and_refuses_what_differs(map_path, tmp_path)
     assert merge([map_path, other.path], tmp_path / "both.gpkg") == ([(10, 0), (2, 2)], False)
     with PlaceMap.open(tmp_path / "both.gpkg") as both:
         assert len(both) == 12
-        assert info_of(both).extent[2] == pytest.approx(50.0011)
+        assert describe_map(both).extent[2] == pytest.approx(50.0011)
         np.testing.assert_array_equal(both.fine_part(12)[0], descriptor(11).fine)
     with PlaceMap.create(tmp_path / "third.gpkg", dataclasses.replace(SPEC, parameters={"seed": 3})) as third:
         pass
@@ -258,7 +258,7 @@ def test_a_time_of_another_form_is_no_time(map_path):
 def test_a_place_is_known_again_where_the_last_bits_differ_and_not_where_the_picture_does(map_path):
     rng = np.random.default_rng(4)
     with PlaceMap.open(map_path) as place_map:
-        ids = [place_id for found in place_map.ids_by("source_image").values() for place_id in found]
+        ids = [place_id for found in place_map.select_ids("source_image").values() for place_id in found]
         for place_id in ids:
             coarse = next(part for number, _, _, part in place_map.coarse_parts() if number == place_id)
             for off, same in ((0.0, True), (1e-4, True), (0.5, False)):
@@ -296,7 +296,7 @@ def test_one_map_of_several_names_the_owners_of_all(tmp_path):
 
 def identity(map_path):
     with PlaceMap.open(map_path) as place_map:
-        return identity_of(place_map)
+        return read_identity(place_map)
 
 
 def test_a_copy_is_the_same_map(map_path, tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from edgevpr.core.errors import UsageError
 from edgevpr.power import calibrate as calibrating
 from edgevpr.power.boards import MachineSpeed, load_board
-from edgevpr.power.calibrate import MeterError, calibrate, find_meter, measure_at, write_profile
+from edgevpr.power.calibrate import MeterError, calibrate, find_meter, measure_load, write_profile
 
 METER = SimpleNamespace(title="INA3221 (hwmon1), channel VDD_IN", read_w=lambda: 4.0)
 SCORE = MachineSpeed(single=0.2, multi=0.7, products=0.1, passes=0.4, verified=True, source="edgevpr's micro-benchmark")
@@ -17,7 +17,7 @@ SCORE = MachineSpeed(single=0.2, multi=0.7, products=0.1, passes=0.4, verified=T
 def measured(monkeypatch):
     """A machine whose loads are held at once: the points (utilisation, watts) of idle and full load can be set."""
     points = {0.0: (0.0, 2.0), 1.0: (1.0, 6.5)}
-    monkeypatch.setattr(calibrating, "measure_at", lambda meter, load: points[load])
+    monkeypatch.setattr(calibrating, "measure_load", lambda meter, load: points[load])
     monkeypatch.setattr(calibrating, "micro_benchmark", lambda: SCORE)
     monkeypatch.setattr(calibrating, "find_meter", lambda: METER)
     return points
@@ -74,7 +74,7 @@ def test_measure_at_raises_where_the_meter_disappears():
         raise MeterError("it is gone")
 
     with pytest.raises(MeterError, match="it is gone"):
-        measure_at(SimpleNamespace(title="a meter", read_w=read_w), 0.0, settle_s=0.0, window_s=60.0)
+        measure_load(SimpleNamespace(title="a meter", read_w=read_w), 0.0, settle_s=0.0, window_s=60.0)
 
 
 HWMON = "sys/class/hwmon"

@@ -8,7 +8,7 @@ from collections import Counter
 from logs import query, write_log
 
 from edgevpr.cli.main import main
-from edgevpr.review.export import features_of, write_csv, write_geojson
+from edgevpr.review.export import make_features, write_csv, write_geojson
 from edgevpr.review.logged import read_flight
 
 
@@ -19,7 +19,7 @@ def written(write, features):
 
 
 def test_features_of_a_real_flight_are_the_same_in_every_form(flown):
-    features = features_of(read_flight(flown / "flight.jsonl"))
+    features = make_features(read_flight(flown / "flight.jsonl"))
     kinds = Counter(each["kind"] for each in features)
     assert (kinds["match"], kinds["autopilot"], kinds["gps"]) == (8, 10, 10)
     assert kinds["fix"] > 0
@@ -32,17 +32,17 @@ def test_features_of_a_real_flight_are_the_same_in_every_form(flown):
 def test_write_a_match_says_where_it_is_and_what_is_known_of_it(tmp_path):
     located = {"lat_deg": -33.5, "lon_deg": 151.25}
     flight = read_flight(write_log(tmp_path / "log", ("query", query("a", located=located))))
-    match = json.loads(written(write_geojson, features_of(flight)))["features"][0]
+    match = json.loads(written(write_geojson, make_features(flight)))["features"][0]
     assert match["geometry"] == {"type": "Point", "coordinates": [151.25, -33.5]}
     assert match["properties"].items() >= {"kind": "match", "query": "a", "place": 3, "accuracy_m": 2.0}.items()
-    (row,) = [each for each in csv.DictReader(io.StringIO(written(write_csv, features_of(flight)))) if each["score"]]
+    (row,) = [each for each in csv.DictReader(io.StringIO(written(write_csv, make_features(flight)))) if each["score"]]
     assert (row["lat_deg"], row["lon_deg"], row["score"]) == ("-33.50000000", "151.25000000", "0.5")
 
 
 def test_features_of_a_fix_between_matches_is_a_point_too(tmp_path):
     between = {"lat_deg": 50.0, "lon_deg": 8.0, "accuracy_m": 4.5}
     flight = read_flight(write_log(tmp_path / "log", ("query", query("a")), ("between", between), ("between", {})))
-    (found,) = [each for each in features_of(flight) if each["kind"] == "between"]
+    (found,) = [each for each in make_features(flight) if each["kind"] == "between"]
     assert found.items() >= between.items()
     assert not flight.remarks
 

@@ -10,7 +10,7 @@ from rasters import HOME, textured_raster
 
 from edgevpr.core.types import Place, Pose
 from edgevpr.frames.level import Lens
-from edgevpr.review.album import album_of, album_of_map, small_pictures
+from edgevpr.review.album import album_of_map, make_album, small_pictures
 from edgevpr.review.mosaic import lay_mosaic
 
 
@@ -31,16 +31,16 @@ def assert_is_the_ground(found):
 
 
 def test_lay_mosaic_puts_pictures_where_their_poses_say(tmp_path):
-    assert_is_the_ground(lay_mosaic(places_in(tmp_path), album_of([tmp_path]), None, ORIGIN))
+    assert_is_the_ground(lay_mosaic(places_in(tmp_path), make_album([tmp_path]), None, ORIGIN))
 
 
 def test_a_map_of_levelled_pictures_is_laid_with_its_lens(tmp_path):
     places = places_in(tmp_path)
     write_positions(tmp_path / "positions.csv", places)
     north_up = [replace(each, pose=replace(each.pose, up_deg=0.0)) for each in places]
-    assert_is_the_ground(lay_mosaic(north_up, album_of([tmp_path]), Lens(60.0), ORIGIN))
-    assert lay_mosaic(north_up, album_of([tmp_path]), None, ORIGIN)[0] is None
-    assert_is_the_ground(lay_mosaic(places, album_of([tmp_path]), Lens(60.0), ORIGIN))  # it was made without the lens
+    assert_is_the_ground(lay_mosaic(north_up, make_album([tmp_path]), Lens(60.0), ORIGIN))
+    assert lay_mosaic(north_up, make_album([tmp_path]), None, ORIGIN)[0] is None
+    assert_is_the_ground(lay_mosaic(places, make_album([tmp_path]), Lens(60.0), ORIGIN))  # it was made without the lens
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_a_map_of_levelled_pictures_is_laid_with_its_lens(tmp_path):
     ],
 )
 def test_where_there_can_be_no_picture_of_the_ground_it_is_said(tmp_path, places, folder, said):
-    mosaic, lacking = lay_mosaic(places(places_in(tmp_path)), album_of([tmp_path] if folder else []), None, ORIGIN)
+    mosaic, lacking = lay_mosaic(places(places_in(tmp_path)), make_album([tmp_path] if folder else []), None, ORIGIN)
     assert mosaic is None
     assert said in lacking
 
@@ -77,7 +77,7 @@ def test_the_pictures_of_a_map_of_an_orthophoto_are_cut_from_it_again(tmp_path):
 
 def test_pictures_get_smaller_and_then_fewer_until_they_fit(tmp_path):
     keys = [[("seen", place.source_image)] for place in places_in(tmp_path)]
-    albums = {"seen": album_of([tmp_path])}
+    albums = {"seen": make_album([tmp_path])}
     sizes = []
     for room_bytes in (1e6, 3e4, 6e3):
         found, left_out = small_pictures(keys, albums, room_bytes)

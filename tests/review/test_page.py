@@ -10,7 +10,7 @@ import pytest
 from logs import query, write_log
 
 from edgevpr.cli.main import main
-from edgevpr.review.album import Album, album_of
+from edgevpr.review.album import Album, make_album
 from edgevpr.review.logged import read_flight
 from edgevpr.review.page import make_flight_page
 
@@ -74,7 +74,7 @@ def test_only_pictures_of_the_folders_that_are_given_are_shown(tmp_path):
     cv2.imwrite(str(tmp_path / "secret.png"), np.full((20, 20), 90, np.uint8))
     cv2.imwrite(str(folder / "one.png"), np.full((20, 20), 90, np.uint8))
     (folder / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    album = album_of([folder])
+    album = make_album([folder])
     assert album.image("one.png") is not None
     for name in ("../secret.png", str(tmp_path / "secret.png"), "broken.png", "a\0b", "\ud800", "x" * 5000, ""):
         assert album.image(name) is None

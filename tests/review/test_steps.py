@@ -8,7 +8,7 @@ from browser import Opened
 from ground import flown_over, places_in
 from logs import query, write_log
 
-from edgevpr.review.album import album_of
+from edgevpr.review.album import make_album
 from edgevpr.review.logged import read_flight
 from edgevpr.review.page import make_flight_page
 
@@ -18,7 +18,7 @@ COUNT = 30
 
 
 def page_from(log, places=(), folder=None):
-    album = album_of([folder] if folder else [])
+    album = make_album([folder] if folder else [])
     return make_flight_page(read_flight(log), list(places), album, album)
 
 

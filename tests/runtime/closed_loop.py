@@ -129,7 +129,7 @@ class ClosedLoop:
                 break
         if self._steps % round(1 / STEP_S) == 0:
             conversation.set_health(Health.ACTIVE)
-            conversation.tell_of_answers()
+            conversation.announce_changes()
 
     def _pack(self, message):
         packet = message.pack(self._packer)

@@ -103,7 +103,7 @@ class Flight:
                 io=SimpleNamespace(clock=clock, stop=self.stop, status=status),
             )
             patch = opened.enter_context(pytest.MonkeyPatch.context())
-            patch.setattr(flight_module, "trusted_candidates", lambda technique: fewer_candidates)
+            patch.setattr(flight_module, "limit_candidates", lambda technique: fewer_candidates)
             FlightItself(self.config, parts).run()
         *lines, self.end = read_log(self.log)
         return lines

@@ -9,7 +9,7 @@ from edgevpr import techniques
 from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.core.errors import EdgevprError, ModelError, UsageError
 from edgevpr.core.files import model_folders, shipped
-from edgevpr.techniques.card import card_names, load_card, read_card, weights_of
+from edgevpr.techniques.card import card_names, find_weights, load_card, read_card
 from edgevpr.techniques.session import open_backbone
 
 SHA256 = "0" * 64
@@ -91,11 +91,11 @@ def test_a_missing_key_and_a_missing_card_are_said(models):
 def test_the_weights_of_a_result_are_named(models):
     write_network(models)
     part = PartSpec((1,), "<f2")
-    assert weights_of(TechniqueSpec(name="hog", parameters={}, coarse=part)) is None
+    assert find_weights(TechniqueSpec(name="hog", parameters={}, coarse=part)) is None
     said = "tiny: A tiny network (MIT; made by a test)"
-    assert weights_of(TechniqueSpec(name="tiny", parameters={}, coarse=part, model_sha256=SHA256)) == said
+    assert find_weights(TechniqueSpec(name="tiny", parameters={}, coarse=part, model_sha256=SHA256)) == said
     assert (
-        weights_of(TechniqueSpec(name="calc", parameters={"model": "tiny"}, coarse=part, model_sha256=SHA256)) == said
+        find_weights(TechniqueSpec(name="calc", parameters={"model": "tiny"}, coarse=part, model_sha256=SHA256)) == said
     )
 
 

@@ -65,7 +65,7 @@ def test_only_allowed_pixels_vote_in_every_strip(bins, signed):
     grey = textured(11, 192, 64)
     allowed = np.random.default_rng(12).random(grey.shape) < 0.5
     some, others, all_of_them = (
-        gradients.oriented_cells(grey, 16, bins, signed, allowed=mask) for mask in (allowed, ~allowed, None)
+        gradients.orient_cells(grey, 16, bins, signed, allowed=mask) for mask in (allowed, ~allowed, None)
     )
     np.testing.assert_allclose(some + others, all_of_them, atol=1e-4)
     assert (some[..., 0] < all_of_them[..., 0]).any()

@@ -82,7 +82,7 @@ def test_a_word_that_nothing_falls_to_stays_zero():
 
 def test_sharpness_gives_a_word_a_hundred_times_the_weight_of_the_next():
     known = np.float32([[0, 0], [3, 0], [0, 3], [3, 3]])
-    weights = words.soft_weights(known, known, words.sharpness_of(known))
+    weights = words.soft_weights(known, known, words.compute_sharpness(known))
     nearest_two = np.sort(weights, axis=1)[:, :-3:-1]
     np.testing.assert_allclose(nearest_two[:, 0] / nearest_two[:, 1], 100, rtol=1e-4)
 

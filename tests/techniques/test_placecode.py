@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from edgevpr.techniques import placecode
-from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
+from edgevpr.techniques.gradients import normalise_blocks, orient_cells
 
 _CELL_PX = 512 / 12
 ALL = np.ones((31, 31), bool)
@@ -20,7 +20,7 @@ def _picture(seed: int, side_px: int = 1024) -> np.ndarray:
 
 
 def _blocks(image: np.ndarray) -> np.ndarray:
-    return normalised_blocks(oriented_cells(np.ascontiguousarray(image), 16, 8, signed=True))
+    return normalise_blocks(orient_cells(np.ascontiguousarray(image), 16, 8, signed=True))
 
 
 def _view(ground: np.ndarray, right_px: int = 0, down_px: int = 0) -> np.ndarray:

@@ -11,7 +11,7 @@ from tiny_networks import CARD, FEATURES, HEIGHT, WIDTH, write_network
 
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.card import InputRule
-from edgevpr.techniques.session import open_backbone, prepare, without_masked
+from edgevpr.techniques.session import drop_masked, open_backbone, prepare
 
 
 def test_both_outputs_of_a_network_and_their_shapes(models):
@@ -166,9 +166,9 @@ def test_masked_pixels_become_the_mean_of_the_others():
     image = coloured(3)
     mask = np.ones(image.shape[:2], bool)
     mask[:, 100:] = False
-    filled = without_masked(image, mask)
+    filled = drop_masked(image, mask)
     np.testing.assert_array_equal(filled[:, :100], image[:, :100])
     np.testing.assert_allclose(filled[0, 120], image[:, :100].reshape(-1, 3).mean(axis=0), atol=0.51)
     assert (filled[:, 100:] == filled[0, 120]).all()
-    assert without_masked(image, None) is image
-    assert (without_masked(image[..., 0], np.zeros(mask.shape, bool)) == 128).all()
+    assert drop_masked(image, None) is image
+    assert (drop_masked(image[..., 0], np.zeros(mask.shape, bool)) == 128).all()

@@ -6,8 +6,8 @@ import pytest
 
 from edgevpr.core.contract import nearest_height
 from edgevpr.techniques import create
-from edgevpr.techniques.gradients import normalised_blocks, oriented_cells
-from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, hypothesis, turned_blocks
+from edgevpr.techniques.gradients import normalise_blocks, orient_cells
+from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, hypothesis, rotate_blocks
 
 pytestmark = pytest.mark.slow
 
@@ -44,11 +44,11 @@ def test_a_hypothesis_is_a_height_and_a_rotation():
 
 def test_turned_blocks_are_those_of_the_turned_picture():
     image = seen(4)
-    blocks = normalised_blocks(oriented_cells(image, 16, 8, signed=True))
+    blocks = normalise_blocks(orient_cells(image, 16, 8, signed=True))
     for quarters in range(-3, 5):
         turned = np.ascontiguousarray(np.rot90(image, quarters))
-        expected = normalised_blocks(oriented_cells(turned, 16, 8, signed=True))
-        np.testing.assert_allclose(turned_blocks(blocks, quarters), expected, atol=1e-5)
+        expected = normalise_blocks(orient_cells(turned, 16, 8, signed=True))
+        np.testing.assert_allclose(rotate_blocks(blocks, quarters), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("turned_deg", [0, 130])

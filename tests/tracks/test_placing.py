@@ -167,7 +167,7 @@ def test_subtitles_place_their_video_and_the_table_is_found_beside_it(capsys, ca
     map_file.unlink()
     run(capsys, "positions", tmp_path / "DJI_0001.SRT", "--images", film)
     assert find_track(film) == tmp_path / "DJI_0001.csv"
-    assert read_track(tmp_path / "DJI_0001.csv").tag_at(1.5).position.lat_deg == pytest.approx(50.0015)
+    assert read_track(tmp_path / "DJI_0001.csv").interpolate_tag(1.5).position.lat_deg == pytest.approx(50.0015)
     built = json.loads(run(capsys, *build, "--json").out)
     assert (built["places"], built["without_position"]) == (5, 0)
     assert "video" in refused(capsys, "positions", tmp_path / "DJI_0001.SRT", "--images", folder)

@@ -20,10 +20,10 @@ from edgevpr.core.config import bounded
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
 from edgevpr.core.geodesy import offset_m, shorter_deg
-from edgevpr.core.text import decoded_name
+from edgevpr.core.text import decode_name
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import GeoTag
-from edgevpr.frames.source import tags_of
+from edgevpr.frames.source import read_tags
 
 _MAX_FILE_BYTES = 100_000_000  # a million queries
 _LAYOUTS = "query/, ref/ and ground_truth.csv or positions.csv; or database/ and queries/"
@@ -75,7 +75,7 @@ def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str |
 def make_dataset(query_dir: str | Path, ref_dir: str | Path, truth: GroundTruth, origin: str | Path) -> Dataset:
     """Make a data set of two folders of images and the ground truth that was read from `origin`. Raises UsageError for
     a name that is not in its folder, and where no query is scored."""
-    paths = {decoded_name(path.name): path for path in list_images(query_dir)}
+    paths = {decode_name(path.name): path for path in list_images(query_dir)}
     references = list_names(ref_dir)
     for name, (right, ignored) in truth.items():
         if name not in paths:
@@ -90,7 +90,7 @@ def make_dataset(query_dir: str | Path, ref_dir: str | Path, truth: GroundTruth,
 
 def list_names(folder: str | Path) -> tuple[str, ...]:
     """Return the names of all images in a folder, in counting order (2.png before 10.png)."""
-    return tuple(decoded_name(path.name) for path in list_images(folder))
+    return tuple(decode_name(path.name) for path in list_images(folder))
 
 
 def read_truth(path: str | Path) -> GroundTruth:
@@ -149,7 +149,7 @@ def match_positions(query_dir: Path, ref_dir: Path, rule: Nearness) -> Dataset:
     """Make a data set of two folders of images with positions; pictures without one are left out. Raises UsageError
     where there are no positions, or none are near."""
     queries, references = (
-        {path: tag for path, tag in tags_of(d).items() if tag.position} for d in (query_dir, ref_dir)
+        {path: tag for path, tag in read_tags(d).items() if tag.position} for d in (query_dir, ref_dir)
     )
     if not queries or not references:
         raise UsageError(
@@ -191,8 +191,8 @@ def _find_near(queries: Tags, query_m: Doubles, references: Tags, reference_m: D
         if rule.within_deg is not None:
             near &= [_heading_difference_deg(tag, other) <= rule.within_deg for other in references.values()]
         if near.any():
-            names = (decoded_name(other.name) for other, is_near in zip(references, near, strict=True) if is_near)
-            truth[decoded_name(path.name)] = frozenset(names), frozenset()
+            names = (decode_name(other.name) for other, is_near in zip(references, near, strict=True) if is_near)
+            truth[decode_name(path.name)] = frozenset(names), frozenset()
     if not truth:
         raise UsageError(f"No query was taken within {rule.within_m:g} m of a reference: allow more with --within-m.")
     return truth

@@ -20,7 +20,7 @@ from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.core.types import NO_COST, Frame, StageCost
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.positions import GeoTag
-from edgevpr.frames.source import Source, open_source, tags_of
+from edgevpr.frames.source import Source, open_source, read_tags
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
 from edgevpr.mapmaking.making import FlownPictures, calibrate_map, refine_map
@@ -28,23 +28,23 @@ from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import elsewhere
-from edgevpr.places.sequence import length_of, search_of
+from edgevpr.places.sequence import make_sequence_search, sequence_length
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack, queries_ah
 from edgevpr.power.meter import query_cost
 from edgevpr.runtime.preflight.probe import disk_bytes, ram_bytes
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.evidence import calibration_of
+from edgevpr.runtime.recognise.evidence import read_calibration_for
 from edgevpr.runtime.recognise.hints import RecordedPrior, explain_useless, parse_known_fields
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.opening import make_meter
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
 from edgevpr.techniques import create, labelled
-from edgevpr.techniques.card import weights_of
+from edgevpr.techniques.card import find_weights
 
 # Yields the items, of that number, and shows it with a label.
 Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]
@@ -123,19 +123,19 @@ def answer_queries(
     """Map the references of `dataset` in a temporary file, ask every query, and return one judged answer for each that
     is scored. Raises UsageError where no query has what `options.known` asks for, ModelError for a query that fails."""
     spec = technique.spec
-    prior, tags = known_of(options.known, dataset, spec, options.sequence)
-    together = length_of(spec, options.sequence)
-    source, meter = open_source(str(dataset.ref_dir), live=False), meter_of(load_config(None), load_board("this"))
+    prior, tags = read_known(options.known, dataset, spec, options.sequence)
+    together = sequence_length(spec, options.sequence)
+    source, meter = open_source(str(dataset.ref_dir), live=False), make_meter(load_config(None), load_board("this"))
     frames = progress(read_frames(source), source.total, f"{spec.name}: references")
     with mapped(frames, technique, dataset.ref_dir, progress) as (place_map, index):
-        rule = accept_rule(technique, load_config(None).match, together, calibration_of(place_map))
+        rule = accept_rule(technique, load_config(None).match, together, read_calibration_for(place_map))
         follows = options.follow and together == 1 and rule.sure is not None
 
         def open_recogniser(length: int, follows: bool) -> Recogniser:
             return Recogniser(
                 FrameEncoder(technique=technique, gate=gate),
                 place_map,
-                Matcher(index, rule, search_of(length)),
+                Matcher(index, rule, make_sequence_search(length)),
                 meter,
                 settings=WalkSettings(candidates=None if options.exact else options.candidates or technique.candidates),
                 prior=prior,
@@ -191,7 +191,7 @@ def summarise(
     """Return the result of `technique`, without the PCU, from its answers to all queries, which were asked by
     `options`."""
     queries, references = len(answers), len(dataset.references)
-    sequence = length_of(technique.spec, options.sequence)
+    sequence = sequence_length(technique.spec, options.sequence)
     config, board = load_config(None), load_board("this")
     efficiency = config.battery.regulator_efficiency
     encoding, matching = (
@@ -201,7 +201,7 @@ def summarise(
     cost = query_cost(encoding, matching, board, parse_pack(config.battery.pack), efficiency, rss_mb=0.0)
     return metrics.TechniqueResult(
         technique=labelled(technique.spec.name, technique.spec.form),
-        weights=weights_of(technique.spec),
+        weights=find_weights(technique.spec),
         parameters=technique.spec.parameters,
         queries=queries,
         references=references,
@@ -229,7 +229,7 @@ def summarise(
     )
 
 
-def known_of(
+def read_known(
     text: str | None, dataset: Dataset, spec: TechniqueSpec, sequence: int | None
 ) -> tuple[RecordedPrior | None, dict[Path, GeoTag]]:
     """Return what narrows each query of a data set, where `text` says what is known ("heading,height"; None: nothing),
@@ -237,8 +237,8 @@ def known_of(
     that of `MatchOptions`. Raises UsageError if no query has what is asked for, and for a text that cannot be read."""
     if not (parts := parse_known_fields(text)):
         return None, {}
-    queries, places = tags_of(dataset.queries[0].path.parent), tags_of(dataset.ref_dir)
-    if why := explain_useless(parts, queries.values(), places.values(), length_of(spec, sequence)):
+    queries, places = read_tags(dataset.queries[0].path.parent), read_tags(dataset.ref_dir)
+    if why := explain_useless(parts, queries.values(), places.values(), sequence_length(spec, sequence)):
         raise UsageError(why)
     query_heights_m, map_heights_m = (
         [tag.height_m for tag in tags.values() if tag.height_m is not None and tag.height_m > 0]

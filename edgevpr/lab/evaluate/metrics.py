@@ -120,7 +120,7 @@ def precision_at_100_recall(precision: np.ndarray, recall: np.ndarray) -> float:
     return float(precision[np.argmax(recall)])
 
 
-def extended_precision(precision: np.ndarray, recall: np.ndarray) -> float:
+def compute_extended_precision(precision: np.ndarray, recall: np.ndarray) -> float:
     """Compute EP (2.4): the mean of the precision at the smallest recall and the recall at 100 % precision."""
     return float(precision[0] + recall_at_100_precision(precision, recall)) / 2
 
@@ -154,7 +154,7 @@ def figures(scores: np.ndarray, ranks: np.ndarray) -> dict[str, Any]:
         "recall_at_100_precision": recall_at_100_precision(precision, recall),
         "auc": auc(precision, recall),
         "auc_from_zero": auc_from_zero(precision, recall),
-        "ep": extended_precision(precision, recall),
+        "ep": compute_extended_precision(precision, recall),
         "roc_auc": roc_auc(scores, ranks == 0),
         "precision_recall": tuple(zip(precision.round(5).tolist(), recall.round(5).tolist(), strict=True)),
     }

@@ -17,11 +17,11 @@ from edgevpr.lab.simulate.processes import autopilot_process, run_to_end
 from edgevpr.lab.simulate.rehearsal import footprint_m, ground_under, write_rehearsal
 from edgevpr.lab.simulate.rehearsal_report import RehearsalReport, RehearsedFlight, judge_by_tags, report_on
 from edgevpr.mapmaking.orthophoto import Orthophoto
-from edgevpr.review.album import album_of, album_of_map
+from edgevpr.review.album import album_of_map, make_album
 from edgevpr.review.logged import read_lines
 from edgevpr.review.overhead import read_ground
 from edgevpr.review.page import make_flight_page
-from edgevpr.runtime.flight.flightlog import flight_of
+from edgevpr.runtime.flight.flightlog import select_last_flight
 
 _MAX_GPS_S, _GPS_SHARE = 20.0, 0.25  # of the flight with GPS, from which its filter starts
 _MIN_S = 40.0
@@ -59,7 +59,7 @@ def rehearse(mission: Mission, folder: Path) -> RehearsalReport:
     flown = _read(folder)
     report = report_on(flown, ground, footprint_m(mission.shots, mission.fov_deg), gps_until_s)
     flown.flight.notes = (report.answer,)
-    page = make_flight_page(flown.flight, ground, album_of([folder / "images"]), references)
+    page = make_flight_page(flown.flight, ground, make_album([folder / "images"]), references)
     write_whole(folder / "report.html", lambda out: out.write_text(page, "utf-8", errors="backslashreplace"))
     return report
 
@@ -95,7 +95,7 @@ def _fly(mission: Mission, folder: Path, gps_until_s: float) -> None:
 def _read(folder: Path) -> RehearsedFlight:
     """Read a flight, judged by where its pictures were taken. Raises EdgevprError if they came late."""
     log, tags = folder / "flight.jsonl", read_positions(folder / "positions.csv")
-    lines = list(flight_of(log))
+    lines = list(select_last_flight(log))
     flight = read_lines(lines, log)
     if not flight.queries:
         raise EdgevprError(f"No picture became a query: {folder / 'flight.txt'} says why.")

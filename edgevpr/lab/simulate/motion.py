@@ -127,7 +127,7 @@ class AlongTrack(Motion):
         self._start_s = min(self._start_s, now_s)
 
     def step(self, now_s: float, dt_s: float) -> TrueState:
-        return truth_at(self._track, max(0.0, now_s - self._start_s))
+        return interpolate_track(self._track, max(0.0, now_s - self._start_s))
 
 
 def read_track(csv_path: str | Path) -> list[TrueState]:
@@ -160,7 +160,7 @@ def read_track(csv_path: str | Path) -> list[TrueState]:
     return track
 
 
-def truth_at(track: FlownTrack, t_s: float) -> TrueState:
+def interpolate_track(track: FlownTrack, t_s: float) -> TrueState:
     """Return the state on a track at `t_s` seconds from its start. Before and after the track the vehicle stands
     still."""
     leg = bisect_right(track, t_s, key=lambda state: state.t_s)  # it ends at the point of this index

@@ -81,7 +81,7 @@ def ground_under(shots: Sequence[GeoTag], fov_deg: float) -> Ground:
     return ground_of(points, footprint_m(shots, fov_deg))
 
 
-def poses_of(shots: list[GeoTag], seed: int) -> list[CameraPose]:
+def make_poses(shots: list[GeoTag], seed: int) -> list[CameraPose]:
     """Return the pose of the camera for each picture, placed at 0 m east and north. Where the track has neither roll
     nor pitch, both vary slowly by up to 2 degrees, and so does the heading."""
     rng = np.random.default_rng((seed, 4))
@@ -130,7 +130,7 @@ def write_rehearsal(
     rng = np.random.default_rng((seed, 3))
 
     def taken() -> Iterator[tuple[GeoTag, Image | None]]:
-        for shot, pose in zip(shots, poses_of(shots, seed), strict=True):
+        for shot, pose in zip(shots, make_poses(shots, seed), strict=True):
             picture = seen_from(orthophoto, shot.position, pose, camera, _LIGHT, rng) if shot.position else None
             tag = replace(shot, heading_deg=pose.heading_deg, roll_deg=pose.roll_deg, pitch_deg=pose.pitch_deg)
             yield tag, picture

@@ -12,7 +12,7 @@ import numpy as np
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Place
 from edgevpr.frames.positions import GeoTag
-from edgevpr.lab.simulate.motion import FlownTrack, truth_at
+from edgevpr.lab.simulate.motion import FlownTrack, interpolate_track
 from edgevpr.review.logged import LoggedFlight, LoggedQuery, Point, number, point, text
 from edgevpr.review.overhead import at_of
 
@@ -91,7 +91,7 @@ class RehearsedFlight:
 
     def errors_m(self, reported: Iterable[tuple[float, Point]], since_s: float) -> list[float]:
         """Return how far off positions are, of those reported since a time on the clock of the log."""
-        states = [(truth_at(self.track, t_s - self.start_s), at) for t_s, at in reported if t_s >= since_s]
+        states = [(interpolate_track(self.track, t_s - self.start_s), at) for t_s, at in reported if t_s >= since_s]
         return [float(distance_m(*state.point, *at)) for state, at in states]
 
 

@@ -56,7 +56,7 @@ def _attitude(brain: Firmware) -> Message | None:
     if math.isnan(roll_deg + pitch_deg):  # the track does not say
         return None
     roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)
-    return mavlink.MAVLink_attitude_message(_boot_ms(brain), roll, pitch, yaw_of(truth), 0, 0, 0)
+    return mavlink.MAVLink_attitude_message(_boot_ms(brain), roll, pitch, compute_yaw(truth), 0, 0, 0)
 
 
 def _specific_force(brain: Firmware) -> Message:
@@ -144,6 +144,6 @@ def _boot_ms(brain: Firmware) -> int:
     return round(brain.now_s * 1000) % 2**32
 
 
-def yaw_of(truth: TrueState) -> float:
+def compute_yaw(truth: TrueState) -> float:
     """Return the yaw in radians, -pi..pi; 0 where the heading is unknown."""
     return 0.0 if math.isnan(truth.heading_deg) else math.remainder(math.radians(truth.heading_deg), math.tau)

@@ -141,18 +141,20 @@ class ToAutopilot:
         now_s = self._clock.mono_s()
         if event.accepted and (best := event.best):
             place, score = own_number(best.place.place_id), best.match.score
-            found = messages.named_values(now_s, vpr_place=place, vpr_score=score, vpr_conf=combine_confidence(event))
+            found = messages.make_named_values(
+                now_s, vpr_place=place, vpr_score=score, vpr_conf=combine_confidence(event)
+            )
             self._link.send(*found)
         if event.is_query:
             cpu_share = event.cost.whole.utilisation(self._cores)
-            self._link.send(*messages.named_values(now_s, vpr_cpu=float(cpu_share), vpr_mah=float(used_mah)))
+            self._link.send(*messages.make_named_values(now_s, vpr_cpu=float(cpu_share), vpr_mah=float(used_mah)))
 
     def compare_gps(self, off_m: float, is_wrong: bool, have_agreed: bool) -> None:
         """Send the distance `off_m` (metres) from GPS to a match. While GPS `is_wrong`, since it contradicts the map,
         the navigator does not use it. Where they never `have_agreed`, the map is as likely to be wrong: then GPS is
         used, and no position is sent."""
         with self._link.turn("gps"):
-            self._link.send(*messages.named_values(self._clock.mono_s(), vpr_gps_m=float(off_m)))
+            self._link.send(*messages.make_named_values(self._clock.mono_s(), vpr_gps_m=float(off_m)))
             self._navigator.believe_gps(not is_wrong or not have_agreed)
             self._navigator.doubt_map(is_wrong and not have_agreed)
 

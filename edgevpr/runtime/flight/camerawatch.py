@@ -11,7 +11,7 @@ from edgevpr.core.config import Config, SourceConfig
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
-from edgevpr.runtime.recognise.opening import meter_of
+from edgevpr.runtime.recognise.opening import make_meter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -82,7 +82,7 @@ class MirrorWatch:
 
     def __init__(self, notifier: Notifier, recogniser: Recogniser, config: Config) -> None:
         self._notifier, self._recogniser = notifier, recogniser
-        self._meter = meter_of(config, recogniser.meter.board)  # its own: that of the flight may be recorded
+        self._meter = make_meter(config, recogniser.meter.board)  # its own: that of the flight may be recorded
         self._misses = self._tries = self._matches = 0
         self._next_try = _MISSES_TO_TRY
 

@@ -12,7 +12,7 @@ from edgevpr.core.config import Config, MavlinkConfig
 from edgevpr.core.errors import ImageError
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import Mount
-from edgevpr.frames.source import recorded_steps
+from edgevpr.frames.source import recorded_intervals
 from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.link import Link
@@ -40,7 +40,7 @@ from edgevpr.runtime.flight.startup import (
 from edgevpr.runtime.flight.tiles import open_tiles
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Surveyor, Tally
-from edgevpr.runtime.preflight.pick import trusted_candidates
+from edgevpr.runtime.preflight.pick import limit_candidates
 from edgevpr.runtime.recognise.recognition import Recognition, fields_of
 
 _MAX_WAIT_S = 0.2  # a pass of the loop waits no longer than this for a frame
@@ -51,7 +51,7 @@ _log = logging.getLogger(__name__)
 def fly(config: Config, positions: Path | None = None) -> int:
     """Fly, and return the exit code: 1 if any frame failed, else 0. `positions` is a file with the positions of the
     frames of a recording (None: there is none). Raises EdgevprError if the flight cannot start."""
-    steps_s = recorded_steps(config.source.uri, positions)
+    steps_s = recorded_intervals(config.source.uri, positions)
     config = apply_recorded_rate(config, steps_s)
     with open_real_io(config, positions, steps_s) as io:
         try:
@@ -69,7 +69,7 @@ class Flight:
         self._config, self._parts, self._opened = config, parts, ExitStack()
         notifier, self._map_watch, self._tally = parts.notifier, MapWatch(parts.notifier), Tally()
         self._pace = Pace(choose_rate_hz(config, parts.recogniser), parts.io.clock)
-        fewer_candidates = () if config.match.candidates else trusted_candidates(parts.recogniser.technique)
+        fewer_candidates = () if config.match.candidates else limit_candidates(parts.recogniser.technique)
         self._governing = GovernorActuator(parts, self._pace, fewer_candidates)
         self._commands = Commands(parts.link, notifier, parts.learner)
         self._frozen = FrozenWatch(notifier, read_optics(config.source, parts.recogniser), parts.autopilot)

@@ -1,5 +1,5 @@
 """The flight log: one JSON object per line. `flight` writes it; all programs that read a flight after its end use
-`flight_of`. A full disk or a pulled memory card loses lines, but never ends the flight."""
+`select_last_flight`. A full disk or a pulled memory card loses lines, but never ends the flight."""
 
 import errno
 import json
@@ -283,7 +283,7 @@ class FlightLines:
                     yield line
 
 
-def flight_of(path: str | Path) -> FlightLines:
+def select_last_flight(path: str | Path) -> FlightLines:
     """Find the lines of the last flight in a file of a log, from its start in earlier files to the end of this one.
     Raises UsageError if there is no such file, and EdgevprError if it has no line of a flight."""
     path = Path(path)

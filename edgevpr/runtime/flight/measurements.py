@@ -11,7 +11,7 @@ from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.types import FRAME_TIME_SD_S, Position, Vehicle
 from edgevpr.mavlink.receivers import RECEIVER_LAG_SD_S
 from edgevpr.runtime.flight.drift import GRAVITY_M_S2
-from edgevpr.runtime.recognise.locate import matrix_of
+from edgevpr.runtime.recognise.locate import covariance_matrix
 from edgevpr.runtime.recognise.perspective import AttitudeError
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.stride import Stride
@@ -146,7 +146,7 @@ def position_match(event: Recognition, frame: FrameMeasurement) -> PositionedMat
         frame=frame,
         position=event.located.position,
         accuracy_m=event.accuracy_m,
-        covariance_m2=matrix_of(event.located.covariance_m2),
+        covariance_m2=covariance_matrix(event.located.covariance_m2),
         places=event.located.places or (event.best.place.place_id,),
         lean=event.located.lean,
         turn_deg=turn_deg,

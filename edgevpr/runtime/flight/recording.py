@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 from edgevpr.core.appending import append, open_appending, sync
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.text import without_passwords
+from edgevpr.core.text import redact_passwords
 from edgevpr.core.types import Tape
 
 TAPE, FRAMES, MAP = "tape.jsonl", "frames", "map.gpkg"
@@ -80,7 +80,7 @@ class Recording(Tape):
         """Record an event on the tape. May be called from any thread and from a signal handler; never blocks."""
         if self.state is None:
             line = json.dumps([kind, *values], default=lambda data: b64encode(data).decode())
-            self._waiting.append(without_passwords(line).encode() + b"\n")
+            self._waiting.append(redact_passwords(line).encode() + b"\n")
 
     def keep(self, jpeg: bytes) -> int:
         """Record a picture, and return its number in this recording (1, 2, ...), by which `frame_path` finds it."""
@@ -167,7 +167,7 @@ def frame_path(folder: Path, number: int) -> Path:
     return folder / FRAMES / f"{number:06d}.jpg"
 
 
-def recording_of(said: str | None, log: str | Path) -> Path | None:
+def open_recording(said: str | None, log: str | Path) -> Path | None:
     """Find the recording that the file `log` names as `said` (None: none): there, or in a folder of that name beside
     it."""
     if not said:

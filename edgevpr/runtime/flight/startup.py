@@ -19,14 +19,14 @@ from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import FIX_MAX_AGE_S, Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import MapIdentity, identity_of
+from edgevpr.places.mapinfo import MapIdentity, read_identity
 from edgevpr.places.readmap import ReadMap
 from edgevpr.places.tilemap import TileMap
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import OwnMemory, QueryMeter
 from edgevpr.runtime.flight.flightio import FlightIO
 from edgevpr.runtime.preflight.choose import too_late
-from edgevpr.runtime.preflight.pick import Outlook, outlook, picked_technique
+from edgevpr.runtime.preflight.pick import Outlook, outlook, pick_technique
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.levelling import lens_of
 from edgevpr.runtime.recognise.opening import has_map, open_learning, open_recogniser
@@ -94,7 +94,7 @@ def measure_speed(recogniser: Recogniser, config: Config, io: FlightIO) -> Outlo
 def _pick_technique(config: Config) -> str | None:
     """Return the configured technique (None: that of the map), or for a map yet to be made the best for the board."""
     if config.mapping.learn and config.technique is None and config.map is not None and not has_map(Path(config.map)):
-        return picked_technique(config.board, _NEW_MAP_PLACES, config.source.camera)
+        return pick_technique(config.board, _NEW_MAP_PLACES, config.source.camera)
     return config.technique
 
 
@@ -179,7 +179,7 @@ def _identity(place_map: ReadMap) -> MapIdentity | None:
         return place_map.identity()
     assert isinstance(place_map, PlaceMap)
     try:
-        found = identity_of(place_map)
+        found = read_identity(place_map)
         return found if found.places else None
     except MapError as error:  # the flight uses the places that can be read
         _log.warning("the log does not say which map it is: %s", error)

@@ -20,7 +20,7 @@ from edgevpr.places.layers import layers_of
 from edgevpr.places.tilemap import Loaded, TileMap, tile_of_place
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.decide import Matcher
-from edgevpr.runtime.recognise.evidence import calibration_of
+from edgevpr.runtime.recognise.evidence import read_calibration_for
 from edgevpr.runtime.recognise.hints import RECORDED_REACH_M, Reach
 from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -154,7 +154,7 @@ class Tiles:
     def _loaded(self, tile: int) -> tuple[Loaded, AcceptRule]:
         """Read a tile, beside the queries."""
         loaded = self._map.load(tile)
-        calibration = calibration_of(loaded.place_map)
+        calibration = read_calibration_for(loaded.place_map)
         return loaded, accept_rule(self._recogniser.technique, self._match, calibration=calibration)
 
     def _take_loaded(self) -> None:

@@ -19,7 +19,7 @@ from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.measurements import PositionedMatch, measure_for_gps, worst_sd
 from edgevpr.runtime.flight.notifier import Notifier, Trouble
 from edgevpr.runtime.flight.survey import Measure, Sightings, Surveyed
-from edgevpr.runtime.recognise.levelling import mount_of
+from edgevpr.runtime.recognise.levelling import read_mount
 from edgevpr.runtime.recognise.recognition import Recognition
 
 FAILURES_IN_A_ROW = 10  # one may be a bad frame; so many mean a fault of camera, map or technique
@@ -245,7 +245,7 @@ class Surveyor:
     def __init__(
         self, notifier: Notifier, gps: GpsWatch, source: SourceConfig, set_mount: Callable[[Mount], None]
     ) -> None:
-        mount = mount_of(source)
+        mount = read_mount(source)
         self._notifier, self._gps, self._taken, self._set_mount = notifier, gps, 0, set_mount
         self._sightings = Sightings(mount, source.gimbal)
         self._expected = {"off_m": (0.0, 0.0), "scale": (0.0,)}

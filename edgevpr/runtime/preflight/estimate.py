@@ -12,7 +12,7 @@ from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, endurance_min, pack_ah, queries_ah
 from edgevpr.power.meter import query_cost
 from edgevpr.runtime.preflight.choose import Demand, Option, choose_best, explain_no_choice, list_options
-from edgevpr.runtime.preflight.scale import Ratios, counted_work, is_same, on_board, ratios
+from edgevpr.runtime.preflight.scale import Ratios, count_work, is_same, on_board, ratios
 from edgevpr.runtime.preflight.trial import Trial
 
 
@@ -78,7 +78,7 @@ def estimate(board: Board, here: Board, trials: Iterable[Trial], plan: FlightPla
     rows: list[TechniqueEstimate] = []
     for trial in trials:
         if trial.costs:
-            costs = on_board(trial.costs, here, board, counted_work(trial.name, trial.parameters))
+            costs = on_board(trial.costs, here, board, count_work(trial.name, trial.parameters))
             options = list_options(board, trial.label, trial.name, costs, plan)
             rows += [_estimate_option(option, board, plan) for option in options]
     ratio = ratios(here, board)

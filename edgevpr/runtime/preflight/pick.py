@@ -20,10 +20,10 @@ from edgevpr.runtime.preflight.choose import (
     list_preferred,
 )
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe, ram_bytes
-from edgevpr.runtime.preflight.scale import counted_work, on_board
-from edgevpr.runtime.recognise.opening import budget_mb, made_for, places_in_ram, searched_places
+from edgevpr.runtime.preflight.scale import count_work, on_board
+from edgevpr.runtime.recognise.opening import budget_mb, count_searched_places, made_for, places_in_ram
 from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.techniques.card import weights_of
+from edgevpr.techniques.card import find_weights
 
 _log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ class Outlook:
     t_query_s: float | None
 
 
-def picked_technique(board_name: str, places: int, camera: str | None = None) -> str:
+def pick_technique(board_name: str, places: int, camera: str | None = None) -> str:
     """Choose a technique for a new map of `places` places by its accuracy and its cost on the board, and log the reason
     (see `choose`). `camera`: "nadir" or "forward" (None: forward).
 
@@ -80,7 +80,7 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
     except (MapError, ModelError, OSError) as error:  # OSError: the trial map needs a little room for temporary files
         cost = f"what it takes could not be tried ({error})"
     parts = ["the map was built with it" if config.technique is None else "it was named"]
-    if weights := weights_of(technique.spec):
+    if weights := find_weights(technique.spec):
         parts.append(f"weights of {weights}")
     if left_out := len(recogniser.place_map) - places_in_ram(recogniser):
         parts.append(f"{left_out} places are left to the map file")
@@ -104,7 +104,7 @@ def _find_affordable(recogniser: Recogniser, config: Config) -> tuple[Option, st
         rate_hz=config.source.rate_hz or board.rate_hz,
         budget_mb=budget_mb(config, board),
         camera=_camera(spec),
-        searched=searched_places(recogniser),
+        searched=count_searched_places(recogniser),
     )
     option, *fewer = list_options(board, _label(spec), spec.name, costs, demand)
     if option.fit.misfit and config.match.candidates is None and recogniser.sequence == 1:
@@ -112,7 +112,7 @@ def _find_affordable(recogniser: Recogniser, config: Config) -> tuple[Option, st
     return option, describe_option(board, option, demand)
 
 
-def trusted_candidates(technique: Technique) -> tuple[int, ...]:
+def limit_candidates(technique: Technique) -> tuple[int, ...]:
     """Return the numbers of candidates, below the technique's default, with which it accepted no query as a place far
     from the right one on the image sets, largest first."""
     label, camera = _label(technique.spec), _camera(technique.spec)
@@ -146,5 +146,5 @@ def _camera(spec: TechniqueSpec) -> str | None:
 def _measure_costs(technique: Technique, board: Board) -> TechniqueCosts:
     """Measure the costs of a technique here, and convert them to `board`."""
     spec = technique.spec
-    work = counted_work(spec.name, spec.parameters) if _votes(spec) else None
+    work = count_work(spec.name, spec.parameters) if _votes(spec) else None
     return on_board(probe(technique), load_board("this"), board, work)

@@ -19,7 +19,7 @@ from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import times_as_many
 from edgevpr.places.rows import MOST_LANDMARK_BYTES
-from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
+from edgevpr.places.sequence import bytes_beside_place, make_sequence_search, sequence_length
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
@@ -144,7 +144,7 @@ class _Bench:
     `sequence`: number of queries that the technique matches together. `tried_s`: seconds for the repetitions."""
 
     def __init__(self, technique: Technique, meter: QueryMeter, tried_s: float) -> None:
-        self.sequence = length_of(technique.spec, None)
+        self.sequence = sequence_length(technique.spec, None)
         self._technique, self._meter, self._tried_s = technique, meter, tried_s
         rng = Random(0)  # not NumPy's: it takes 2.5 MB, and a flight needs it for nothing else
         pictures = [np.frombuffer(rng.randbytes(480 * 640), np.uint8) for _ in range(_PICTURES)]
@@ -183,7 +183,10 @@ class _Bench:
     def _open_recogniser(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> Recogniser:
         technique = self._technique
         rule = AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0)
-        matcher, settings = Matcher(index, rule, search_of(self.sequence)), WalkSettings(candidates=candidates)
+        matcher, settings = (
+            Matcher(index, rule, make_sequence_search(self.sequence)),
+            WalkSettings(candidates=candidates),
+        )
         return Recogniser(FrameEncoder(technique=technique), place_map, matcher, self._meter, settings=settings)
 
 

@@ -33,7 +33,7 @@ class Ratios:
     passes: float
 
 
-def counted_work(name: str, parameters: Mapping[str, Any]) -> dict[str, float] | None:
+def count_work(name: str, parameters: Mapping[str, Any]) -> dict[str, float] | None:
     """Return the number of instructions that the technique `name` with these parameters takes on an ARM core, by the
     name of the field of `TechniqueCosts` that they are the cost of; None if they were not counted."""
     if name != "cohog" or any(parameters.get(key, value) != value for key, value in _COUNTED_SETTINGS.items()):

@@ -17,7 +17,7 @@ from edgevpr.core.config import FORMS, build
 from edgevpr.core.errors import EdgevprError
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.recognise.opening import made_for
-from edgevpr.techniques.card import weights_of
+from edgevpr.techniques.card import find_weights
 
 _TRIED_S = 0.5  # pictures are tried again for so long; twice as long finds the same. A check has no time for that
 _LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board
@@ -78,7 +78,7 @@ def _try_here(job: dict[str, Any]) -> list[dict[str, Any]]:
         technique = made_for(job["threads"], offer.name, offer.settings)
         costs = probe(technique, tried_s=_TRIED_S)
         spec = technique.spec
-        tried.append(asdict(replace(offer, costs=costs, weights=weights_of(spec), parameters=spec.parameters)))
+        tried.append(asdict(replace(offer, costs=costs, weights=find_weights(spec), parameters=spec.parameters)))
         # What a form has taken is given back, or it would be counted for the next one.
         del technique
         gc.collect()

@@ -124,7 +124,7 @@ class Model:
         return self.scale.confidence(wrong * (_ADAPTED if self.adapted_scale is None else _NOT_ADAPTED))
 
 
-def model_of(stored: Mapping[str, Any]) -> Model:
+def select_model(stored: Mapping[str, Any]) -> Model:
     """Make a model from decoded JSON. Raises KeyError or TypeError for other contents."""
     scales = {name: stored[name] and _scale(**stored[name]) for name in ("scale", "adapted_scale")}
     regressions = {name: _logistic(**stored[name]) for name in ("of_map", "of_place")}
@@ -137,7 +137,7 @@ def prior(kind: str) -> Model:
     """Return the shipped model for a kind of evidence (see `evidence`). Raises ModelError if its file is unusable."""
     path = shipped("models") / f"confidence_{kind}.json"
     try:
-        return model_of(json.loads(read_file(path, _MAX_FILE_BYTES)))
+        return select_model(json.loads(read_file(path, _MAX_FILE_BYTES)))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ModelError(f"{path} cannot be used ({error}): install edgevpr again.") from error
 

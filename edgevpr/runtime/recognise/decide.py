@@ -16,7 +16,15 @@ from edgevpr.frames.level import Levelled
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers
 from edgevpr.places.readmap import ReadMap
-from edgevpr.places.retrieve import NOTHING, Expectation, Query, Ranking, elsewhere, named, unmoved_elsewhere
+from edgevpr.places.retrieve import (
+    NOTHING,
+    Expectation,
+    Query,
+    Ranking,
+    elsewhere,
+    named,
+    unmoved_outside_neighbourhood,
+)
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.agreement import (
@@ -30,11 +38,11 @@ from edgevpr.runtime.recognise.agreement import (
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder
 from edgevpr.runtime.recognise.evidence import (
     Evidence,
+    compute_share,
     gather_evidence,
     log_count,
     log_share,
     log_times_more,
-    share_of,
 )
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.runtime.recognise.judge import (
@@ -212,7 +220,7 @@ class Decider:
             with self.meter.step("locate"):
                 followed = place_filter.update(ranking, index, found.evidence, rule.sure, found.where)
             if followed.slot is not None and followed.leads_from(int(ranking.slots[0])):
-                ranking = ranking.led_by(followed.slot)
+                ranking = ranking.promote(followed.slot)
                 rule, (best, found) = self._find_rule(ranking), self._examine(ranking, query, verifier)
         age_s = query.frame.t_mono_s - self.learnt_s.get(best.place.place_id, -math.inf)
         found = replace(found, is_new=age_s <= NEW_FOR_S, by_flight=followed.confidence if followed else None)
@@ -278,7 +286,7 @@ class Decider:
             return None
         with self.meter.step("compare"):
             fine, _ = self.place_map.fine_part(best.place.place_id)
-            return evidence.agree - log_share(share_of(self.technique.turned(query.descriptor, fine, best.match)))
+            return evidence.agree - log_share(compute_share(self.technique.turned(query.descriptor, fine, best.match)))
 
     def _share_at_rest_elsewhere(self, candidate: Candidate, ranking: Ranking, encoded: EncodedFrame) -> float:
         """Return the share of a few places elsewhere that agree with the query at rest, as the best one (0: it is not
@@ -288,6 +296,6 @@ class Decider:
             return 0.0
         with self.meter.step("compare"):
             query = self.make_query(encoded.descriptor, NOTHING)
-            matches = unmoved_elsewhere(query, int(ranking.slots[0]), self.accuracy_m)
-        least = LIKE_AT_REST * share_of(best)
-        return sum(is_at_rest(match) and share_of(match) >= least for match in matches) / max(len(matches), 1)
+            matches = unmoved_outside_neighbourhood(query, int(ranking.slots[0]), self.accuracy_m)
+        least = LIKE_AT_REST * compute_share(best)
+        return sum(is_at_rest(match) and compute_share(match) >= least for match in matches) / max(len(matches), 1)

@@ -5,7 +5,7 @@ that looks ahead (AHEAD, and AHEAD_PROVEN where landmarks speak for the match). 
 place's neighbourhood. Regions *agree* if they show the same shift between query and place. Larger figures speak for the
 match, but for `rank_gap`.
 
-* agree: logarithm of what `share_of` returns, the share of regions that agree
+* agree: logarithm of what `compute_share` returns, the share of regions that agree
 * lead: `agree` minus the largest `agree` of a place elsewhere
 * coverage: logarithm of the share of the place's regions that agree, each counted once
 * structure: `FineMatch.structure`
@@ -32,7 +32,7 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.readmap import ReadMap
 from edgevpr.places.retrieve import Ranking, elsewhere
 from edgevpr.runtime.recognise.agreement import Agreement
-from edgevpr.runtime.recognise.confidence import Model, model_of, prior
+from edgevpr.runtime.recognise.confidence import Model, prior, select_model
 
 AHEAD, AHEAD_PROVEN, DOWN, DOWN_BARE = "ahead", "ahead_proven", "down", "down_bare"
 _BARE = ("lead", "coverage", "structure")
@@ -163,7 +163,7 @@ class MapCalibration:
         )
 
 
-def kinds_of(spec: TechniqueSpec) -> tuple[str, ...]:
+def list_evidence_kinds(spec: TechniqueSpec) -> tuple[str, ...]:
     """Return the kinds of evidence that a technique gives; an empty tuple if its matches are judged by fixed limits."""
     if spec.looks_down:
         return DOWN, DOWN_BARE
@@ -197,7 +197,7 @@ def gather_evidence(
     slots = np.array(list(matches))
     best = int(slots[0])
     away = frozenset(slots[elsewhere(index, best, slots, neighbour_m, same if down else ())].tolist())
-    agree = {slot: share_of(match) for slot, match in matches.items()}
+    agree = {slot: compute_share(match) for slot, match in matches.items()}
     rivals = (agree[slot] for slot in away)
     evidence = Evidence(
         agree=log_share(agree[best]),
@@ -222,7 +222,7 @@ def log_times_more(inliers: int, rival: int) -> float:
     return max(0.0, math.log(max(inliers, _INLIERS_BY_CHANCE) / max(rival, _INLIERS_BY_CHANCE)))
 
 
-def share_of(match: FineMatch) -> float:
+def compute_share(match: FineMatch) -> float:
     """Return the share of regions that agree on a shift. Ahead it is the geometric mean of the score and of the same
     share of the place; down, `FineMatch.votes`, which counts how well the layouts agree, too."""
     if match.support is not None:
@@ -230,7 +230,7 @@ def share_of(match: FineMatch) -> float:
     return match.score if match.votes is None else match.votes
 
 
-def calibration_of(place_map: ReadMap) -> MapCalibration | None:
+def read_calibration_for(place_map: ReadMap) -> MapCalibration | None:
     """Return the calibration of a map; None if it has none, or, after a warning in the log, if it is unusable."""
     try:
         text = place_map.calibration
@@ -304,7 +304,7 @@ def read_calibration(text: str) -> MapCalibration:
     if text != _checksum(body) + body:
         raise ValueError("its checksum is wrong")
     found = json.loads(body)
-    found["models"] = {kind: model_of(model) for kind, model in found["models"].items()}
+    found["models"] = {kind: select_model(model) for kind, model in found["models"].items()}
     found["recognisable"] = {int(place_id): each for place_id, each in found["recognisable"].items()}
     return MapCalibration(**found)
 

@@ -53,7 +53,7 @@ class Memorability:
 
         Raises ModelError for numbers that are not finite, or are outside 0..1.
         """
-        name, crops = self._output, prepared_crops(image, self.card.input)
+        name, crops = self._output, prepare_crops(image, self.card.input)
         batches = [crops] if self._takes_many else np.split(crops, len(crops))
         said = [run_outputs(self.card, self._session, [name], batch)[0] for batch in batches]
         if any(part.size != len(batch) for part, batch in zip(said, batches, strict=True)):
@@ -64,7 +64,7 @@ class Memorability:
         return values.reshape(CROPS, CROPS)
 
 
-def prepared_crops(image: Image, rule: InputRule) -> Singles:
+def prepare_crops(image: Image, rule: InputRule) -> Singles:
     """Cut uint8 (H, W[, 3]), at least 5 pixels along each side, into crops, row by row, and prepare them for a network:
     float32 (25, C, height, width)."""
     rows, columns = (np.array_split(np.arange(side), CROPS) for side in image.shape[:2])

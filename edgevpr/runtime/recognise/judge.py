@@ -19,7 +19,7 @@ from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Model, prior
-from edgevpr.runtime.recognise.evidence import Evidence, MapCalibration, kinds_of
+from edgevpr.runtime.recognise.evidence import Evidence, MapCalibration, list_evidence_kinds
 from edgevpr.runtime.recognise.locate import Located
 
 NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats the position that the autopilot has just reported
@@ -154,7 +154,7 @@ def accept_rule(
     in the configuration come first. `calibration` is that of the map (None: the shipped models are used). A sequence of
     `length` queries is judged by limits; its margin is that of one query, over the root of its length (10 at most:
     queries that show the same ground are not independent)."""
-    kinds = kinds_of(technique.spec) if length == 1 else ()
+    kinds = list_evidence_kinds(technique.spec) if length == 1 else ()
     # The flight may know better than one match which of two places it is: no lead is needed for its sake.
     own_score, own_margin = (0.0, -math.inf) if kinds else (technique.min_score, technique.min_margin)
     if own_margin < 1:  # a margin of 1 or more accepts nothing, not in sequences either

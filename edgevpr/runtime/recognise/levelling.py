@@ -11,7 +11,7 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import axes_of, moved
 from edgevpr.core.types import Frame, Pose, Position, Vehicle
-from edgevpr.frames.lens import CalibratedLens, read_lens, sight_of
+from edgevpr.frames.lens import CalibratedLens, line_of_sight, read_lens
 from edgevpr.frames.level import (
     STRAIGHT_DOWN,
     UNKNOWN_VIEW,
@@ -19,11 +19,11 @@ from edgevpr.frames.level import (
     Levelled,
     Mount,
     View,
+    compute_footprint,
     enlarged,
-    footprint_of,
     leaning,
     levelled,
-    straightened,
+    undistort_frame,
 )
 from edgevpr.frames.source import is_live
 from edgevpr.places.layers import Layers
@@ -77,7 +77,7 @@ class Levelling:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
         if self.lens is None:
             return enlarged(Levelled(frame.image, overlay, leaning(frame, vehicle, self.mount)), scale)
-        own_m = footprint_of(frame, vehicle, self.lens) if layers else None
+        own_m = compute_footprint(frame, vehicle, self.lens) if layers else None
         footprint_m = layers.fitting(own_m and scale * own_m) if layers else None
         picture = levelled(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self.below, scale=scale)
         if picture.view.reason and not self._has_warned:
@@ -94,19 +94,19 @@ class Straightening:
 
     def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, **_: object) -> Levelled:
         """Straighten the picture of a frame, which has no scale; as `Levelling.prepare`."""
-        return straightened(frame.image, overlay, UNKNOWN_VIEW, self.lens)
+        return undistort_frame(frame.image, overlay, UNKNOWN_VIEW, self.lens)
 
 
-def levelling_of(
+def make_levelling(
     config: SourceConfig, technique: Technique, *, below: bool = False
 ) -> Levelling | Straightening | None:
     """Make what comes before encoding for a configuration. None: nothing, for a camera that looks ahead, or on a gimbal
     with unknown lens. Raises ConfigError for a calibration of the lens that cannot be used, and UsageError for a field
     of view that contradicts it."""
     if technique.spec.parameters.get("camera") != "nadir":
-        calibrated = calibrated_lens(config)
+        calibrated = load_calibrated_lens(config)
         return Straightening(calibrated) if calibrated else None
-    lens, mount = lens_of(config), mount_of(config)
+    lens, mount = lens_of(config), read_mount(config)
     if lens is None:
         _log.info("no correction for tilt, height or heading: set source.fov_deg (--fov-deg)")
         if config.gimbal and mount == STRAIGHT_DOWN:
@@ -115,23 +115,23 @@ def levelling_of(
 
 
 def lens_of(config: SourceConfig) -> Lens | None:
-    """Return the lens of a configuration's camera; None if it is unknown. Raises as `levelling_of`."""
-    calibrated = calibrated_lens(config)
-    fov_deg = sight_of(calibrated, calibrated.size_px).fov_deg if calibrated else config.fov_deg
-    return None if fov_deg is None else Lens(fov_deg, config.up_deg, calibrated, mount_of(config))
+    """Return the lens of a configuration's camera; None if it is unknown. Raises as `make_levelling`."""
+    calibrated = load_calibrated_lens(config)
+    fov_deg = line_of_sight(calibrated, calibrated.size_px).fov_deg if calibrated else config.fov_deg
+    return None if fov_deg is None else Lens(fov_deg, config.up_deg, calibrated, read_mount(config))
 
 
-def mount_of(config: SourceConfig) -> Mount:
+def read_mount(config: SourceConfig) -> Mount:
     """Return where a configuration's camera looks beside straight down."""
     return Mount(config.mount_ahead_deg, config.mount_right_deg)
 
 
-def calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
-    """Read the calibration that the configuration names (None: it names none); raises as `levelling_of`."""
+def load_calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
+    """Read the calibration that the configuration names (None: it names none); raises as `make_levelling`."""
     if config.lens is None:
         return None
     lens = read_lens(config.lens)
-    field_deg = sight_of(lens, lens.size_px).field_deg
+    field_deg = line_of_sight(lens, lens.size_px).field_deg
     if config.fov_deg is not None and abs(config.fov_deg - field_deg) > _FIELDS_AGREE_DEG:
         raise UsageError(
             f"`source.fov_deg` is {config.fov_deg:g}, and {config.lens} says {field_deg:.0f} degrees: leave `fov_deg` "

@@ -140,7 +140,7 @@ def locate(
     )
 
 
-def matrix_of(covariance: Covariance) -> Doubles:
+def covariance_matrix(covariance: Covariance) -> Doubles:
     """Return a covariance (variance, covariance, variance) as a matrix (2, 2)."""
     return np.array([[covariance[0], covariance[1]], [covariance[1], covariance[2]]])
 
@@ -155,7 +155,7 @@ def combine_with_recorded(where: Located, recorded: Position, recorded_sd_m: flo
     along one axis is `recorded_sd_m`, and `where`, computed from the places around it. None if the two contradict each
     other, or `where` has no heading or footprint."""
     off_m = _off_m(recorded, where.position)
-    by_places, by_record = matrix_of(where.covariance_m2), recorded_sd_m**2 * np.eye(2)
+    by_places, by_record = covariance_matrix(where.covariance_m2), recorded_sd_m**2 * np.eye(2)
     both = by_places + by_record
     if in_sd(off_m, both) > _MAX_DIFFERENCE_SD or where.heading_deg is None or where.footprint_m is None:
         return None
@@ -198,11 +198,11 @@ def _estimate(
         return None
     if proof:
         rotation_deg, height_ratio, step = proof.rotation_deg or 0.0, proof.scale, np.array(proof.shift_share)
-        covariance = matrix_of(proof.covariance_share2 or (0.0, 0.0, 0.0)) + _LANDMARK_SD_SHARE**2 * np.eye(2)
+        covariance = covariance_matrix(proof.covariance_share2 or (0.0, 0.0, 0.0)) + _LANDMARK_SD_SHARE**2 * np.eye(2)
     else:
         rotation_deg, height_ratio, step = match.rotation_deg, match.height_ratio, np.array(match.shift_cells) / cells
         # The match's covariance is that of single votes; their mean has a fraction of it.
-        covariance = matrix_of(match.covariance_cells2 or (0.0, 0.0, 0.0)) / cells**2
+        covariance = covariance_matrix(match.covariance_cells2 or (0.0, 0.0, 0.0)) / cells**2
         covariance = covariance * _MEAN_VARIANCE_SHARE + _VOTE_SD_SHARE**2 * np.eye(2)
     # The point below the aircraft, in the place's picture: that of the query's picture, turned, scaled and shifted.
     ratio, turn = height_ratio or 1.0, math.radians(rotation_deg)
@@ -218,7 +218,7 @@ def _estimate(
         score=match.score,
         at_m=off_m + step_m,
         of_step=pose.footprint_m**2 * (axes @ upwards @ axes.T) + by_length,
-        of_pose=matrix_of(pose.covariance_m2),
+        of_pose=covariance_matrix(pose.covariance_m2),
         rotation_deg=rotation_deg,
         height_ratio=height_ratio,
     )
@@ -230,5 +230,5 @@ def _off_m(origin: Position, position: Position) -> Doubles:
 
 
 def to_triple(covariance: Doubles) -> Covariance:
-    """Return a covariance matrix (2, 2) as (variance, covariance, variance), the inverse of `matrix_of`."""
+    """Return a covariance matrix (2, 2) as (variance, covariance, variance), the inverse of `covariance_matrix`."""
     return float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])

@@ -9,23 +9,23 @@ from edgevpr import techniques
 from edgevpr.core.config import Config, SalienceConfig, SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ConfigError, MapError, UsageError
-from edgevpr.frames.mask import Mask, mask_of
+from edgevpr.frames.mask import Mask, load_mask
 from edgevpr.places.index import GrowingIndex, PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove, require_regular
 from edgevpr.places.readmap import ReadMap
-from edgevpr.places.sequence import bytes_beside_place, length_of, search_of
+from edgevpr.places.sequence import bytes_beside_place, make_sequence_search, sequence_length
 from edgevpr.places.tilemap import TileMap
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.evidence import calibration_of, kinds_of
+from edgevpr.runtime.recognise.evidence import list_evidence_kinds, read_calibration_for
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
 from edgevpr.runtime.recognise.hints import Prior, RecordedPrior
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.levelling import Levelling, is_now, levelling_of
+from edgevpr.runtime.recognise.levelling import Levelling, is_now, make_levelling
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate
@@ -67,7 +67,7 @@ def open_recogniser(
     place_map = TileMap.open(config.map) if is_tiled else PlaceMap.open(config.map)
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
-        technique = technique_of(place_map, config.technique, _wanted(config), board)
+        technique = create_technique(place_map, config.technique, _wanted(config), board)
         budget_bytes, beside_bytes = _ram(config, board, technique)
         if isinstance(place_map, TileMap):
             place_map.make_room(technique, budget_bytes)
@@ -78,7 +78,7 @@ def open_recogniser(
         prior = RecordedPrior(known, technique.spec.heading_within_deg)
         if narrowed:
             prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
-        meter = meter or meter_of(config, board)
+        meter = meter or make_meter(config, board)
         recogniser = _recogniser(config, technique, place_map, index, meter, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser
@@ -90,7 +90,7 @@ def places_in_ram(recogniser: Recogniser) -> int:
     return place_map.ram.capacity if isinstance(place_map, TileMap) else len(recogniser.index)
 
 
-def searched_places(recogniser: Recogniser) -> int:
+def count_searched_places(recogniser: Recogniser) -> int:
     """Return the most places that a query is compared with: all in RAM or, of tiles, those of a few."""
     place_map, in_ram = recogniser.place_map, places_in_ram(recogniser)
     return min(place_map.most_searched, in_ram) if isinstance(place_map, TileMap) else in_ram
@@ -111,11 +111,11 @@ def open_learning(
     place_map = PlaceMap.open_for_adding(path)
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
-        technique = technique_of(place_map, config.technique, _wanted(config), board)
+        technique = create_technique(place_map, config.technique, _wanted(config), board)
         budget_bytes, beside_bytes = _ram(config, board, technique)
         growing = GrowingIndex(place_map, technique, budget_bytes=budget_bytes, room=_ROOM, beside_bytes=beside_bytes)
         prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
-        meter, follows = meter or meter_of(config, board), config.match.follow
+        meter, follows = meter or make_meter(config, board), config.match.follow
         recogniser = _recogniser(config, technique, place_map, growing.index, meter, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser, growing
@@ -131,7 +131,7 @@ def budget_mb(config: Config, board: Board) -> float:
     return config.memory.budget_mb or board.budget_mb
 
 
-def gate_of(config: SalienceConfig, threads: int = 1) -> Gate | None:
+def open_salience_gate(config: SalienceConfig, threads: int = 1) -> Gate | None:
     """Make the salience gate, None if the configuration asks for none. A criterion whose network is not named is off,
     with a warning. Raises ConfigError if nothing can pass or all criteria are off, ModelError for an unusable
     network."""
@@ -157,7 +157,7 @@ def gate_of(config: SalienceConfig, threads: int = 1) -> Gate | None:
     return Gate(config, memorability, detector)
 
 
-def meter_of(config: Config, board: Board) -> QueryMeter:
+def make_meter(config: Config, board: Board) -> QueryMeter:
     """Make the meter of time and battery charge of queries, on a board fed by the configured battery pack."""
     return QueryMeter(board, parse_pack(config.battery.pack), config.battery.regulator_efficiency)
 
@@ -168,7 +168,7 @@ def made_for(threads: int | None, name: str, settings: Settings | None = None) -
     return techniques.create(name, {**own, **(settings or {})})
 
 
-def technique_of(
+def create_technique(
     place_map: ReadMap, name: str | None = None, settings: Settings | None = None, board: Board | None = None
 ) -> Technique:
     """Make the technique that a map was built with, for `board`.
@@ -226,19 +226,19 @@ def _recogniser(
     follows: bool,
 ) -> Recogniser:
     match, source, is_flight = config.match, config.source, isinstance(prior, Prior)
-    length, mask = length_of(technique.spec, match.sequence), mask_of(source.mask)
-    rule = accept_rule(technique, match, length, calibration_of(place_map))
+    length, mask = sequence_length(technique.spec, match.sequence), load_mask(source.mask)
+    rule = accept_rule(technique, match, length, read_calibration_for(place_map))
     warn_of_other_pictures(place_map, mask, source.lens)
     place_filter = None
     # Only matches that have a confidence can be followed, and only where no sequence is asked for.
-    if follows and match.sequence is None and kinds_of(technique.spec):
+    if follows and match.sequence is None and list_evidence_kinds(technique.spec):
         place_filter = PlaceFilter(place_map, max_speed_m_s=match.reach_m_s, is_live=is_now(source))
-    levelling, gate = levelling_of(source, technique), gate_of(config.salience, meter.board.threads)
+    levelling, gate = make_levelling(source, technique), open_salience_gate(config.salience, meter.board.threads)
     knows_scale = isinstance(levelling, Levelling) and levelling.lens is not None
     recogniser = Recogniser(
         FrameEncoder(technique=technique, levelling=levelling, mask=mask, gate=gate),
         place_map,
-        Matcher(index, rule, search_of(length)),
+        Matcher(index, rule, make_sequence_search(length)),
         meter,
         settings=WalkSettings(
             candidates=match.candidates or technique.candidates,
@@ -260,7 +260,7 @@ def _make_map(path: Path, technique: Technique, source: SourceConfig) -> None:
     unfinished = path.with_name(path.name + ".new")
     remove(unfinished)
     with PlaceMap.create(unfinished, technique.spec) as place_map:
-        mask = mask_of(source.mask)
+        mask = load_mask(source.mask)
         place_map.record_mask(mask.sha256 if mask else None)
         place_map.record_lens(source.lens)
     unfinished.replace(path)
@@ -274,5 +274,5 @@ def _wanted(config: Config) -> dict[str, str]:
 
 def _ram(config: Config, board: Board, technique: Technique) -> tuple[int, int]:
     """Return the bytes of RAM that an index may take, and that a sequence of queries takes for each place."""
-    beside_bytes = bytes_beside_place(length_of(technique.spec, config.match.sequence))
+    beside_bytes = bytes_beside_place(sequence_length(technique.spec, config.match.sequence))
     return int(budget_mb(config, board) * 1e6), beside_bytes

@@ -24,9 +24,9 @@ from edgevpr.runtime.recognise.belief import (
     Motion,
     Proposals,
 )
-from edgevpr.runtime.recognise.evidence import Evidence, share_of
+from edgevpr.runtime.recognise.evidence import Evidence, compute_share
 from edgevpr.runtime.recognise.judge import Sureness
-from edgevpr.runtime.recognise.locate import Located, matrix_of, to_triple
+from edgevpr.runtime.recognise.locate import Located, covariance_matrix, to_triple
 from edgevpr.runtime.recognise.stride import Stride
 
 _TWIN_SHARE = 0.5  # share of the best place's votes from which on its twins are as likely, as in `Evidence.has_twin`
@@ -215,10 +215,10 @@ def _propose(
         here, there = survey.origin, where.position
         at[0] = offset_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
         if not evidence.has_twin:  # of places that are equally likely none may be known better than the others
-            covariance[0] = matrix_of(where.covariance_m2)
+            covariance[0] = covariance_matrix(where.covariance_m2)
         heading_deg[0] = np.nan if where.heading_deg is None else where.heading_deg
         same = np.isin(index.place_ids[slots], where.places) & (slots != slots[0])
-    votes = np.array([share_of(ranking.compared[slot]) for slot in slots.tolist()])
+    votes = np.array([compute_share(ranking.compared[slot]) for slot in slots.tolist()])
     near = np.hypot(*(at - at[0]).T) <= survey.scale.near
     near[0] = True  # even if its position is unknown
     confidence = sure.confidence(evidence)
@@ -238,7 +238,7 @@ def _propose(
 
 
 def _shares(votes: Doubles) -> Doubles:
-    """Return the share (K,) of each of K places in a probability. `votes` (K,) is what `share_of` says of each."""
+    """Return the share (K,) of each of K places in a probability. `votes` (K,) is what `compute_share` says of each."""
     if not len(votes):
         return votes
     weight: Doubles = (np.maximum(votes, 1e-6) / max(float(votes.max()), 1e-6)) ** _SHARPNESS

@@ -68,7 +68,7 @@ class Gate:
         if len(self._entropies) >= _TO_KNOW:
             middle, high = np.percentile(self._entropies, (75, 90))
             usual = float(middle - _STEPS_BELOW * max(high - middle, _LEAST_STEP))
-        return worth_of(scores, self.config, usual)
+        return compute_memorability(scores, self.config, usual)
 
     def scores(self, image: Image) -> Salience:
         """Return the scores of a frame. Raises ModelError as `judge` does."""
@@ -77,10 +77,10 @@ class Gate:
                 self._static, self._until_detection = None, self.config.detect_every  # None, if the detector fails
                 self._static = self._detector.is_static(image, self.config.footprint_m)
             self._until_detection -= 1
-        return scores_of(image, self._memorability, self._static)
+        return compute_scores(image, self._memorability, self._static)
 
 
-def worth_of(salience: Salience, config: SalienceConfig, usual: float = 1.0) -> Worth:
+def compute_memorability(salience: Salience, config: SalienceConfig, usual: float = 1.0) -> Worth:
     """Compare the scores of a frame (None: not) with their thresholds, entropy with `usual` if that is lower."""
     known = salience.scores
     least = {name: getattr(config, name) for name in known} | {"entropy": min(config.entropy, usual)}
@@ -92,14 +92,14 @@ def worth_of(salience: Salience, config: SalienceConfig, usual: float = 1.0) -> 
     return Worth(salience, short[worst], worst, reason)
 
 
-def best_of(shortfalls: list[float]) -> list[bool]:
+def select_best(shortfalls: list[float]) -> list[bool]:
     """Find the best of some frames: lower all thresholds in steps of 0.03 until at least one frame passes. Returns for
     each frame whether it passes then; `shortfalls` are the frames' `Worth.short_by`."""
     steps = np.ceil(np.round(np.array(shortfalls) / STEP, 6))
     return [bool(step == steps.min()) for step in steps]
 
 
-def scores_of(image: Image, memorability: Memorability | None = None, is_static: Mask | None = None) -> Salience:
+def compute_scores(image: Image, memorability: Memorability | None = None, is_static: Mask | None = None) -> Salience:
     """Return the scores of uint8 (H, W[, 3]): the means over its pixels, of a copy whose longer side has 320 at most.
     Pixels that are not static count as 0 in the other two scores, because a picture with many of them is worth less.
 

@@ -11,10 +11,10 @@ from pathlib import Path
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.core.types import FIX_MAX_AGE_S
-from edgevpr.frames.lens import sight_of
+from edgevpr.frames.lens import line_of_sight
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source, is_by_program, open_source
-from edgevpr.runtime.recognise.levelling import calibrated_lens
+from edgevpr.runtime.recognise.levelling import load_calibrated_lens
 from edgevpr.runtime.service.finding import Finding, check_device, fine, run_check, wrong
 
 FRAME_WAIT_S = 65.0  # longer than any source takes to report that it is lost; a pipeline that starts slowly takes most
@@ -65,13 +65,13 @@ def frame_seen(config: SourceConfig) -> str:
     if it is too old for a flight, ImageError if it does not fit the lens, and ConfigError for a calibration that cannot
     be used."""
     assert config.uri is not None
-    lens = calibrated_lens(config)
+    lens = load_calibrated_lens(config)
     with closing(open_source(config.uri, live=True)) as source:
         (width, height), state = _read_size(source, config.uri), source.state
         facts, age_s = source.facts, source.latency_s
     parts = [config.uri, state, f"{width} x {height} pixels"]
     if lens is not None:
-        parts.append(f"of which {lens.path} shows {sight_of(lens, (width, height)).fov_deg:.0f} degrees")
+        parts.append(f"of which {lens.path} shows {line_of_sight(lens, (width, height)).fov_deg:.0f} degrees")
     if age_s is not None and age_s > FIX_MAX_AGE_S:
         raise SourceError(
             f"{', '.join(parts)}, {age_s:.1f} s old: no fix of a picture older than {FIX_MAX_AGE_S:g} s is sent: "

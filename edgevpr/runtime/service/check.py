@@ -11,7 +11,7 @@ from edgevpr.core.errors import ConfigError, EdgevprError, LinkError, MapError, 
 from edgevpr.core.text import waiting
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.shot import Condition
-from edgevpr.frames.source import is_live, missing_cause, open_source, recorded_steps
+from edgevpr.frames.source import is_live, missing_cause, open_source, recorded_intervals
 from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.signing import open_signing
@@ -23,9 +23,9 @@ from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.flight.startup import apply_recorded_rate
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import outlook
-from edgevpr.runtime.recognise.evidence import calibration_of, not_calibrated
+from edgevpr.runtime.recognise.evidence import not_calibrated, read_calibration_for
 from edgevpr.runtime.recognise.learn import check_positions
-from edgevpr.runtime.recognise.levelling import calibrated_lens
+from edgevpr.runtime.recognise.levelling import load_calibrated_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.service.camera import FRAME_WAIT_S, frame_seen
 from edgevpr.runtime.service.doctor import explain_silence
@@ -39,7 +39,7 @@ def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
         config = load_config(config_path)
     except EdgevprError as error:
         return [wrong("configuration", str(error), exit_code=error.exit_code)]
-    config = apply_recorded_rate(config, recorded_steps(config.source.uri))
+    config = apply_recorded_rate(config, recorded_intervals(config.source.uri))
     findings = [fine("configuration", str(config_path))]
     try:
         board = load_board(config.board)
@@ -77,7 +77,7 @@ def _check_map(config: Config, board: Board) -> str:
         expected = outlook(recogniser, config)
         confidence = ""
         if recogniser.rule.sure:
-            calibration = calibration_of(place_map)
+            calibration = read_calibration_for(place_map)
             confidence = f"; {calibration.described() if calibration else not_calibrated(len(place_map))}"
     t_query_s = expected.t_query_s or 0.0
     if config.mavlink.link and config.mavlink.send_fixes and t_query_s > FIX_MAX_AGE_S:
@@ -96,7 +96,7 @@ def _check_source(config: Config, offline: bool) -> str:
         check_positions(config)
     if not offline:
         return frame_seen(config.source)
-    calibrated_lens(config.source)
+    load_calibrated_lens(config.source)
     if is_live(uri) and (cause := missing_cause(uri)):
         raise SourceError(f"The camera is not there ({cause}): connect it, or correct `source: {{uri: ...}}`.")
     with closing(open_source(uri, live=True)) as source:

@@ -77,7 +77,7 @@ def test_figures_equal_those_of_scikit_learn(queries):
     certain = max(recall[precision == 1], default=0)
     assert metrics.recall_at_100_precision(precision, recall) == certain
     highest = max(precision[recall == min(recall)])
-    assert metrics.extended_precision(precision, recall) == (highest + certain) / 2
+    assert metrics.compute_extended_precision(precision, recall) == (highest + certain) / 2
     if not right.all():
         assert metrics.roc_auc(scores, right) == pytest.approx(sklearn.roc_auc_score(right, scores), abs=1e-12)
 

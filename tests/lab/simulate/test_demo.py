@@ -10,7 +10,7 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.lab.simulate import demo, processes
 from edgevpr.lab.simulate.generated import later_flight, mapping_flight
 from edgevpr.lab.simulate.landscape import make_scene
-from edgevpr.runtime.flight.flightlog import flight_of
+from edgevpr.runtime.flight.flightlog import select_last_flight
 
 pytestmark = [pytest.mark.process, pytest.mark.network, pytest.mark.slow]
 
@@ -28,7 +28,7 @@ def test_run_demo_maps_flies_and_draws(small, tmp_path):
     said = demo.run_demo(tmp_path)
     queries, _ = demo.read_queries(tmp_path / "flight.jsonl", tmp_path / "flight-1", tmp_path / "flight-2")
     assert len(queries) == 6
-    mavlink = list(flight_of(tmp_path / "flight.jsonl"))[-1]["mavlink"]
+    mavlink = list(select_last_flight(tmp_path / "flight.jsonl"))[-1]["mavlink"]
     assert mavlink["received"]["HEARTBEAT"] > 0
     assert set(mavlink["acks"]) <= {"ACCEPTED"}
     picture = cv2.imread(str(tmp_path / "demo.png"))

@@ -11,7 +11,7 @@ from pathlib import Path
 from rasters import HOME, textured_raster
 
 from edgevpr.cli.main import main
-from edgevpr.cli.wording import of_rehearsal
+from edgevpr.cli.wording import format_rehearsal
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Place, Position
 from edgevpr.frames.positions import GeoTag
@@ -89,7 +89,7 @@ def test_report_on_a_flight_has_the_stretches_without_a_match():
         (790, 990, False),
     ]
     assert found.longest_gap_s == 20
-    said = "\n".join(of_rehearsal(found, "out"))
+    said = "\n".join(format_rehearsal(found, "out"))
     assert "0.79 to 0.99 km of the way: 20 s around 50.00000, 11.91" in said
     assert said.count("beyond the map") == 1
 

@@ -14,7 +14,7 @@ from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel
-from edgevpr.lab.simulate.rehearsal import poses_of, read_shots, seen_from, write_rehearsal
+from edgevpr.lab.simulate.rehearsal import make_poses, read_shots, seen_from, write_rehearsal
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 pytestmark = pytest.mark.slow
@@ -88,7 +88,7 @@ def test_read_shots_has_a_picture_for_each_line(tmp_path):
     assert (shots[0].roll_deg, shots[0].pitch_deg, shots[0].position.alt_m) == (3, -4, 600)
     assert [shot.t_utc_s - shots[0].t_utc_s for shot in shots] == pytest.approx([0, 11.12, 11.12 + 14.3], abs=0.05)
     assert [shot.height_m for shot in read_shots(path, 50.0, 20.0)] == [50, 50, 50]
-    told, swaying, _ = poses_of(shots, 1)
+    told, swaying, _ = make_poses(shots, 1)
     assert (told.heading_deg, told.roll_deg, told.pitch_deg) == (270, 3, -4)
     assert 0 < abs(swaying.roll_deg) <= 2
 

@@ -16,7 +16,7 @@ from edgevpr.cli.simulation import _VEHICLES
 from edgevpr.core.errors import LinkError, UsageError
 from edgevpr.lab.simulate.autopilot import run_autopilot
 from edgevpr.lab.simulate.controller import VEHICLES, FlightController
-from edgevpr.lab.simulate.motion import AlongTrack, TrueState, read_track, truth_at
+from edgevpr.lab.simulate.motion import AlongTrack, TrueState, interpolate_track, read_track
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.asking import Inquiry, read_autopilot
@@ -109,7 +109,7 @@ def test_track_starts_with_a_flight_and_not_with_questions(monkeypatch):
         assert there.lat / 1e7 == 50.0
         with link_to(f"udpout:{link}") as flight:
             wait_until(lambda: flight.stats().autopilot_heard)
-            flight.send(*messages.named_values(time.monotonic(), vpr_place=3, vpr_score=0.5))
+            flight.send(*messages.make_named_values(time.monotonic(), vpr_place=3, vpr_score=0.5))
             wait_until(lambda: (vehicle := flight.vehicle()) and vehicle.lat_deg == 50.1, "the end of the track")
     finally:
         autopilot.finish()
@@ -118,17 +118,17 @@ def test_track_starts_with_a_flight_and_not_with_questions(monkeypatch):
 def test_truth_at_has_the_velocity_along_the_track():
     points = (0.0, 50.0, 8.0), (10.0, 50.001, 8.0), (20.0, 50.001, 8.001)
     track = [TrueState(t_s=t_s, lat_deg=lat_deg, lon_deg=lon_deg, alt_m=0.0) for t_s, lat_deg, lon_deg in points]
-    velocities = [truth_at(track, t_s).velocity_m_s for t_s in (0.0, 5.0, 15.0, 30.0)]
+    velocities = [interpolate_track(track, t_s).velocity_m_s for t_s in (0.0, 5.0, 15.0, 30.0)]
     assert velocities == pytest.approx([11.12j, 11.12j, 7.15 + 0j, 0j], abs=0.01), "north first"
 
 
 def test_truth_at_turns_the_shorter_way_and_keeps_what_is_unknown():
     one = TrueState(lat_deg=50, lon_deg=8, alt_m=0, roll_deg=2, heading_deg=350, height_m=80)
     other = TrueState(lat_deg=50, lon_deg=8, alt_m=0, roll_deg=-2, heading_deg=20, height_m=90, t_s=2)
-    here = truth_at([one, other], 1.0)
+    here = interpolate_track([one, other], 1.0)
     assert (here.roll_deg, here.heading_deg % 360, here.height_m) == pytest.approx((0, 5, 85))
     assert math.isnan(here.pitch_deg)
-    assert truth_at([one, TrueState(lat_deg=50, lon_deg=8, alt_m=0, t_s=2)], 1.0).height_m == 80
+    assert interpolate_track([one, TrueState(lat_deg=50, lon_deg=8, alt_m=0, t_s=2)], 1.0).height_m == 80
 
 
 def test_gps_until_s_ends_gps_in_an_unknown_wind():

@@ -19,7 +19,7 @@ from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.types import Position, QueryCost, Steps
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.flight.flightlog import FlightLog, flight_of, read_log
+from edgevpr.runtime.flight.flightlog import FlightLog, read_log, select_last_flight
 from edgevpr.runtime.flight.startup import start_fields
 from edgevpr.runtime.recognise.locate import at_place
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -178,7 +178,7 @@ def test_a_log_that_is_deleted_or_moved_in_flight_goes_on_in_a_new_file(path, ca
         flown(log, clock, "c", "d", "e")
     assert kinds(path) == ["start", "c", "d", "e"]
     assert len(caplog.records) == 1
-    assert flight_of(path).missing
+    assert select_last_flight(path).missing
 
 
 def test_the_password_of_a_camera_stands_in_no_line(path):
@@ -263,7 +263,7 @@ def test_a_log_that_cannot_be_renamed_is_written_on_and_said_once(path, caplog, 
         "log.max_mb: let the flight write to its folder."
     )
     assert caplog.messages == [said, said], "once a flight"
-    assert [line["n"] for line in flight_of(path) if line["kind"] == "query"] == list(range(100, 200))
+    assert [line["n"] for line in select_last_flight(path) if line["kind"] == "query"] == list(range(100, 200))
 
 
 def test_a_log_that_another_flight_writes_is_refused_and_a_service_waits_for_it(path):
@@ -287,7 +287,7 @@ def test_a_start_that_was_lost_is_made_up_for(path):
         log.write("query", n=1)
         log.write("query", n=2)
     assert kinds(path) == ["start", "gap", "query", "query"]
-    assert flight_of(path).missing is None
+    assert select_last_flight(path).missing is None
 
 
 @pytest.mark.slow

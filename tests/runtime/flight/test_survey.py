@@ -17,7 +17,7 @@ from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.flight.survey import Sightings
 from edgevpr.runtime.flight.watching import GpsWatch, Surveyor
-from edgevpr.runtime.recognise.levelling import mount_of
+from edgevpr.runtime.recognise.levelling import read_mount
 
 OFF_M, SCALE, AHEAD_DEG, RIGHT_DEG = np.array([5.0, -3.0]), 0.01, 9.0, -3.0
 HEIGHT_M, SPEED_M_S, FIX_SD_M, GPS_SD_M, GPS_LASTS_S = 100.0, 15.0, 2.0, 1.0, 60.0
@@ -187,7 +187,7 @@ class Flown:
         with FlightLog(folder / "log", clock=clock) as flight_log:
             notifier = Notifier(flight_log, link)
             watch = GpsWatch(map_sd_m, notifier, None)
-            self.mounts, beside = [], mount_of(config.source)
+            self.mounts, beside = [], read_mount(config.source)
             surveyor = Surveyor(notifier, watch, config.source, self.mounts.append)
             for event in flight:
                 clock.now_s = event.frame.t_mono_s

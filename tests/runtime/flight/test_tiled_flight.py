@@ -15,7 +15,7 @@ from pictures import textured
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import MapError, UsageError
-from edgevpr.core.quadkeys import keys_at
+from edgevpr.core.quadkeys import tile_keys
 from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.examine import select
@@ -30,7 +30,7 @@ from edgevpr.runtime.flight.flight import fly
 from edgevpr.runtime.preflight.pick import outlook
 from edgevpr.runtime.recognise import opening
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.opening import open_recogniser, places_in_ram, searched_places
+from edgevpr.runtime.recognise.opening import count_searched_places, open_recogniser, places_in_ram
 from edgevpr.techniques import create
 
 SIDE_PX, PLACES, ZOOM = 256, 24, 17  # a tile has a side of 197 m at this latitude: one or two places, 111 m apart
@@ -49,7 +49,7 @@ def tiles(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tiles")
     with PlaceMap.create(folder / "whole.gpkg", TECHNIQUE.spec) as place_map:
         build_map(map(frame, range(PLACES)), FrameEncoder(technique=TECHNIQUE), place_map)
-    keys = keys_at(50 + np.arange(PLACES) * STEP_DEG, np.full(PLACES, 8.0), ZOOM)
+    keys = tile_keys(50 + np.arange(PLACES) * STEP_DEG, np.full(PLACES, 8.0), ZOOM)
     for key in set(keys.tolist()):
         there = (np.flatnonzero(keys == key) + 1).tolist()
         select(folder / "whole.gpkg", folder / f"{key}.gpkg", lambda place_map, there=there: there)
@@ -111,7 +111,7 @@ class TiledFlight:
 
 
 def tile_at(tile_map, place):
-    (key,) = keys_at(np.array([50 + place * STEP_DEG]), np.array([8.0]), ZOOM)
+    (key,) = tile_keys(np.array([50 + place * STEP_DEG]), np.array([8.0]), ZOOM)
     return tile_map.keys.index(key)
 
 
@@ -132,7 +132,9 @@ def test_the_tiles_around_the_aircraft_are_in_ram_and_no_others(folder, tmp_path
 def test_what_a_query_takes_is_that_of_the_tiles_around_the_aircraft(folder):
     config = load_config(None, {"map": str(folder)})
     recogniser = open_recogniser(config, load_board("this"), narrowed=True)
-    assert (places_in_ram(recogniser), searched_places(recogniser)) == (PLACES, 4 * 2), "two are in the largest tile"
+    assert (places_in_ram(recogniser), count_searched_places(recogniser)) == (PLACES, 4 * 2), (
+        "two are in the largest tile"
+    )
     assert f"{PLACES} places (some 8 of them compared with a query) take" in outlook(recogniser, config).reason
     recogniser.place_map.close()
 

@@ -8,7 +8,7 @@ import pytest
 
 from edgevpr.core.appending import numbered
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.runtime.flight.flightlog import FlightLog, flight_of
+from edgevpr.runtime.flight.flightlog import FlightLog, select_last_flight
 
 PART_MB = 0.01
 
@@ -41,7 +41,7 @@ def flown(path) -> list[Path]:
 
 
 def test_the_newest_file_gives_the_whole_flight_with_one_start_line(path, flown):
-    whole = flight_of(path)
+    whole = select_last_flight(path)
     lines = list(whole)
     assert [line["kind"] for line in lines] == ["start", *["query"] * 4, "end"]
     assert (lines[0]["version"], "repeated" in lines[0]) == ("2", False)
@@ -52,14 +52,14 @@ def test_the_newest_file_gives_the_whole_flight_with_one_start_line(path, flown)
 
 
 def test_a_file_with_a_number_gives_the_flight_up_to_its_end(flown):
-    assert numbers(flight_of(flown[0])) == [0]
-    assert numbers(flight_of(flown[1])) == [0, 1]
-    assert numbers(flight_of(flown[4])) == [100, 101, 102]
+    assert numbers(select_last_flight(flown[0])) == [0]
+    assert numbers(select_last_flight(flown[1])) == [0, 1]
+    assert numbers(select_last_flight(flown[4])) == [100, 101, 102]
 
 
 def test_a_file_that_is_missing_is_said_and_the_rest_is_read(path, flown):
     flown[3].unlink()
-    whole = flight_of(path)
+    whole = select_last_flight(path)
     assert numbers(whole) == [100, 102, 103]
     assert whole.missing == (f"Files of the flight that are missing before {path}: 1. The flight is read without them.")
 
@@ -69,8 +69,8 @@ def test_lines_that_a_pulled_battery_cut_are_left_out_of_every_file(path, flown)
         os.truncate(each, each.stat().st_size - 10)
     with open(path, "ab") as newest:
         newest.write(b'{"kind": "query", "n": 10')
-    assert numbers(flight_of(path)) == [103]
-    assert flight_of(path).missing is None
+    assert numbers(select_last_flight(path)) == [103]
+    assert select_last_flight(path).missing is None
 
 
 def test_a_file_repeats_its_own_start_line_where_the_medium_came_back_as_another(path):
@@ -78,20 +78,20 @@ def test_a_file_repeats_its_own_start_line_where_the_medium_came_back_as_another
     again = {**start, "repeated": True, "part": 2}
     lines = [start, {"kind": "query", "n": 1}, again, {"kind": "query", "n": 2}]
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    whole = flight_of(path)
+    whole = select_last_flight(path)
     assert [line["kind"] for line in whole] == ["start", "query", "query"]
     assert whole.missing is None
     later = path.with_name("flight-0001.jsonl")
     path.rename(later)
     path.write_text(json.dumps({**again, "part": 3}) + '\n{"kind": "query", "n": 3}\n')
-    assert numbers(flight_of(path)) == [1, 2, 3]
-    assert flight_of(path).missing is None
+    assert numbers(select_last_flight(path)) == [1, 2, 3]
+    assert select_last_flight(path).missing is None
 
 
 def test_what_is_no_log_is_refused_in_a_sentence(tmp_path):
     (tmp_path / "empty").touch()
     with pytest.raises(EdgevprError, match="no line"):
-        flight_of(tmp_path / "empty")
+        select_last_flight(tmp_path / "empty")
     for missing in (tmp_path, tmp_path / "nothing", "/dev/zero"):
         with pytest.raises(UsageError, match="no such"):
-            flight_of(missing)
+            select_last_flight(missing)

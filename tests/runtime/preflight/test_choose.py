@@ -190,7 +190,7 @@ def test_picked_technique_passes_over_a_network_that_is_not_there(monkeypatch, c
     monkeypatch.setattr(pick, "made_for", made_for)
     own = board(technique="netvlad", budget_mb=20.0, memory_max_mb=4000.0)
     monkeypatch.setattr(pick, "load_board", lambda name: own)
-    assert pick.picked_technique("this", 10) == "cohog"
+    assert pick.pick_technique("this", 10) == "cohog"
     assert any("netvlad" in message for message in caplog.messages)
 
 
@@ -207,7 +207,7 @@ def test_picked_technique_is_the_best_where_nothing_fits_and_the_log_says_why(mo
     slow = dataclasses.replace(REGIONS, encode=StageCost(30.0, 30.0))
     monkeypatch.setattr(pick, "probe", lambda technique: slow)
     for camera, knows in (("nadir", {"camera": "nadir"}), ("forward", {"camera": "forward"}), (None, {})):
-        assert pick.picked_technique("this", 10, camera) == "cohog"
+        assert pick.pick_technique("this", 10, camera) == "cohog"
         assert pick.camera_setting("cohog", camera) == knows
         assert pick.camera_setting("hog", camera) == {}
     said = [record.message for record in caplog.records if "all the same" in record.message]

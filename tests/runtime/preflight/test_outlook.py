@@ -9,7 +9,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import pick
-from edgevpr.runtime.preflight.pick import outlook, trusted_candidates
+from edgevpr.runtime.preflight.pick import limit_candidates, outlook
 from edgevpr.runtime.recognise.opening import open_recogniser
 
 COSTS = replace(REGIONS, match_per_place=StageCost(0.01, 0.01), candidates=42)
@@ -57,13 +57,13 @@ def test_trusted_candidates_accepted_nothing_wrong(recording, monkeypatch):
     config = load_config(None, {"map": str(recording / "cohog.gpkg")})
     recogniser = open_recogniser(config, load_board("this"))
     with recogniser.place_map:
-        assert trusted_candidates(recogniser.technique) == (20, 10)
+        assert limit_candidates(recogniser.technique) == (20, 10)
         measured = pick.find_accuracy
         with monkeypatch.context() as changed:
             wrong = replace(measured("cohog", "forward", 10), accepted_elsewhere=1)
             changed.setattr(pick, "find_accuracy", lambda *asked: wrong if asked[-1] == 10 else measured(*asked))
-            assert trusted_candidates(recogniser.technique) == (20,)
+            assert limit_candidates(recogniser.technique) == (20,)
     config = load_config(None, {"map": str(recording / "cohog.gpkg"), "match.matching": "thesis"})
     recogniser = open_recogniser(config, load_board("this"))
     with recogniser.place_map:
-        assert trusted_candidates(recogniser.technique) == (), "which was never measured so"
+        assert limit_candidates(recogniser.technique) == (), "which was never measured so"

@@ -12,7 +12,7 @@ from edgevpr.core.types import StageCost
 from edgevpr.power.boards import MachineSpeed, load_board
 from edgevpr.power.speed import REFERENCE_PASSES_HZ
 from edgevpr.runtime.preflight import scale
-from edgevpr.runtime.preflight.scale import Ratios, counted_work, is_same, on_board, ratios, with_comparable_score
+from edgevpr.runtime.preflight.scale import Ratios, count_work, is_same, on_board, ratios, with_comparable_score
 
 REGIONS = replace(example_costs.REGIONS, candidates=40, scan_per_place=StageCost(1e-6, 1e-6))
 HERE, PI = load_board("generic-x86"), load_board("rpi-4b")
@@ -55,7 +55,7 @@ def test_ratios_of_an_arm_board_follow_from_the_counted_instructions():
 
 
 def test_on_board_takes_counted_instructions_whatever_was_measured_here():
-    work = counted_work("cohog", {"camera": "nadir"})
+    work = count_work("cohog", {"camera": "nadir"})
     there = on_board(REGIONS, HERE, PI, work)
     parts, rate_hz = counted_parts(), 1e6 * PI.benchmark_score.arm64_mips
     assert there.encode.wall_s == pytest.approx(parts["down: encode a frame"] / rate_hz, rel=1e-6)
@@ -67,10 +67,10 @@ def test_on_board_takes_counted_instructions_whatever_was_measured_here():
 
 
 def test_counted_work_is_known_only_of_what_was_counted():
-    assert counted_work("cohog", {}) == counted_work("cohog", {"camera": "forward", "w1": 512, "gt": 0.4})
-    assert counted_work("cohog", {"w1": 256}) is None
-    assert counted_work("cohog", {"matching": "thesis"}) is None
-    assert counted_work("hog", {}) is None
+    assert count_work("cohog", {}) == count_work("cohog", {"camera": "forward", "w1": 512, "gt": 0.4})
+    assert count_work("cohog", {"w1": 256}) is None
+    assert count_work("cohog", {"matching": "thesis"}) is None
+    assert count_work("hog", {}) is None
 
 
 def counted_parts():

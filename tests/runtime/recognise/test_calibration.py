@@ -19,17 +19,17 @@ from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.confidence import model_of, prior
+from edgevpr.runtime.recognise.confidence import prior, select_model
 from edgevpr.runtime.recognise.evidence import (
     OF_MAP,
     OF_PLACE,
     Evidence,
     MapCalibration,
-    calibration_of,
     calibration_text,
     not_calibrated,
     of_several,
     read_calibration,
+    read_calibration_for,
     require_usable,
 )
 from edgevpr.runtime.recognise.judge import Sureness
@@ -85,7 +85,7 @@ def test_a_flight_decides_by_the_models_of_its_map(path, caplog):
     keep(path, calibration_text(FOUND))
     assert flown(path) == {**SHIPPED, "ahead": OWN}, "an older edgevpr calibrated one of them"
     with PlaceMap.open(path) as place_map:
-        assert calibration_of(place_map) == FOUND
+        assert read_calibration_for(place_map) == FOUND
     assert not caplog.records
 
 
@@ -142,7 +142,7 @@ def test_what_to_expect_is_said_in_words_and_figures():
 def test_a_shipped_model_makes_a_probability_of_any_evidence(kind):
     model = prior(kind)
     require_usable(kind, model)
-    assert model_of(json.loads(json.dumps(asdict(model)))) == model
+    assert select_model(json.loads(json.dumps(asdict(model)))) == model
     evidence = dict.fromkeys(OF_MAP[kind] + OF_PLACE[kind], 0.0)
     for value in (-3.0, -1.0, 0.0, 1.0, 3.0):
         assert 0 <= model.confidence(dict.fromkeys(evidence, value)) <= 1

@@ -18,7 +18,7 @@ from edgevpr.runtime.recognise.evidence import (
     OF_MAP,
     OF_PLACE,
     gather_evidence,
-    kinds_of,
+    list_evidence_kinds,
     log_times_more,
     require_usable,
 )
@@ -65,9 +65,13 @@ def test_evidence_has_the_names_that_models_ask_for():
 
 
 def test_a_technique_has_the_kinds_of_its_camera():
-    assert kinds_of(create("cohog", {"w1": 208}).spec) == (AHEAD, AHEAD_PROVEN)
-    assert kinds_of(create("cohog", {"camera": "nadir"}).spec) == (DOWN, DOWN_BARE)
-    assert kinds_of(create("hog").spec) == kinds_of(create("cohog", {"matching": "thesis"}).spec) == ()
+    assert list_evidence_kinds(create("cohog", {"w1": 208}).spec) == (AHEAD, AHEAD_PROVEN)
+    assert list_evidence_kinds(create("cohog", {"camera": "nadir"}).spec) == (DOWN, DOWN_BARE)
+    assert (
+        list_evidence_kinds(create("hog").spec)
+        == list_evidence_kinds(create("cohog", {"matching": "thesis"}).spec)
+        == ()
+    )
 
 
 def test_the_lead_is_over_places_elsewhere_and_not_over_neighbours():

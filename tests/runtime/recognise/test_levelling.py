@@ -21,7 +21,7 @@ from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.hints import Prior
-from edgevpr.runtime.recognise.levelling import Levelling, levelling_of, place_at_middle
+from edgevpr.runtime.recognise.levelling import Levelling, make_levelling, place_at_middle
 from edgevpr.techniques import create
 
 CAMERA = Camera(noise_sigma=0)
@@ -200,7 +200,7 @@ def test_without_height_or_heading_a_place_has_no_pose(view):
 def test_only_a_camera_that_looks_down_through_a_known_lens_is_levelled(camera, settings, kind, caplog):
     config = load_config(None, settings)
     with caplog.at_level(logging.INFO):
-        made = levelling_of(config.source, create("cohog", {"camera": camera}))
+        made = make_levelling(config.source, create("cohog", {"camera": camera}))
     assert isinstance(made, kind)
     assert bool(caplog.text) == (camera == "nadir" and not settings.get("source.fov_deg"))
 
@@ -247,7 +247,7 @@ def test_the_mount_of_the_configuration_counts_with_a_lens_and_without_and_on_a_
         config = load_config(None, said | {"source.gimbal": gimbal}).source
         frame = Frame(image=np.zeros((480, 640), np.uint8), name="", t_mono_s=5.0)
         vehicle = vehicle_at(50.0, 8.0, 5.0, heading_deg=90.0, height_m=HEIGHT_M, roll_deg=0.0, pitch_deg=0.0)
-        view = levelling_of(config, technique).prepare(frame, vehicle, None, layers=LAYER).view
+        view = make_levelling(config, technique).prepare(frame, vehicle, None, layers=LAYER).view
         off_m = view.lean_m if fov_deg is None else FOOTPRINT_M * np.array(view.aside)
         assert off_m == pytest.approx((-HEIGHT_M * math.tan(math.radians(9)), 0.0), abs=1e-6)
 

@@ -16,9 +16,9 @@ from edgevpr.runtime.recognise.gate_networks import as_map
 from edgevpr.runtime.recognise.salience_gate import (
     Gate,
     Worth,
-    best_of,
-    scores_of,
-    worth_of,
+    compute_memorability,
+    compute_scores,
+    select_best,
 )
 from edgevpr.techniques.entropy import filled_bins
 
@@ -46,12 +46,12 @@ def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_noth
     picture = texture()
     static = np.ones(picture.shape, bool)
     static[:, 120:] = False
-    scores = scores_of(picture, Half(), static)
+    scores = compute_scores(picture, Half(), static)
     assert scores.staticity == pytest.approx(0.75)
     memorable = as_map(Half().matrix(picture), picture.shape)
     assert scores.memorability == pytest.approx(memorable[:, :120].sum() / picture.size, abs=1e-6)
     assert scores.entropy == pytest.approx(filled_bins(picture)[:, :120].sum() / picture.size, abs=1e-6)
-    alone = scores_of(picture)
+    alone = compute_scores(picture)
     assert (alone.memorability, alone.staticity) == (None, None)
     assert alone.entropy > scores.entropy
 
@@ -68,13 +68,13 @@ def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_noth
     ],
 )
 def test_all_criteria_that_are_on_must_hold(thresholds, lacks):
-    worth = worth_of(Salience(0.5, 0.9, 0.5), thresholds)
+    worth = compute_memorability(Salience(0.5, 0.9, 0.5), thresholds)
     assert worth.lacks == lacks
     assert (worth.reason is None) == (lacks is None) == (worth.short_by == 0)
 
 
 def test_a_score_that_was_not_looked_at_is_not_asked_for():
-    assert worth_of(Salience(None, None, 0.5), asked(0.9, 0.9, 0.4)).reason is None
+    assert compute_memorability(Salience(None, None, 0.5), asked(0.9, 0.9, 0.4)).reason is None
 
 
 def test_in_bad_light_less_entropy_is_asked_for():
@@ -90,7 +90,7 @@ def test_in_bad_light_less_entropy_is_asked_for():
 def test_while_nothing_is_known_of_the_light_half_of_the_threshold_is_enough():
     gate = Gate(asked(entropy=0.4))
     little = texture()
-    while not 0.2 < scores_of(little).entropy < 0.4:
+    while not 0.2 < compute_scores(little).entropy < 0.4:
         little = (little * 0.8).astype(np.uint8)
     assert [gate.judge(little).reason for _ in range(4)] == [None] * 4
     assert all(gate.judge(np.full((120, 160), 3, np.uint8)).lacks == "entropy" for _ in range(3))
@@ -122,9 +122,9 @@ def test_the_detector_looks_at_every_kth_frame_only():
 
 
 def test_lowering_the_thresholds_step_by_step_lets_the_best_pass():
-    assert best_of([0.05, 0.031, 0.2, 0.059]) == [True, True, False, True]  # two steps of 0.03
-    assert best_of([0.03]) == [True]
-    assert best_of([0.5, 0.02, 0.03, 0.031]) == [False, True, True, False]
+    assert select_best([0.05, 0.031, 0.2, 0.059]) == [True, True, False, True]  # two steps of 0.03
+    assert select_best([0.03]) == [True]
+    assert select_best([0.5, 0.02, 0.03, 0.031]) == [False, True, True, False]
 
 
 NORTH_M = 1 / 111_195  # degrees
