@@ -158,10 +158,10 @@ class ToAutopilot:
             self._navigator.believe_gps(not is_wrong or not have_agreed)
             self._navigator.doubt_map(is_wrong and not have_agreed)
 
-    def correct_height(self, ratio: float) -> None:
-        """Set the height above ground by the pictures over that by the autopilot (1.0: they agree)."""
+    def correct_height(self, ratio: float, ratio_sd: float) -> None:
+        """Set the height above ground by the pictures over that by the autopilot (1.0: they agree), and its error."""
         with self._link.turn("height"):
-            self._navigator.correct_height(ratio)
+            self._navigator.correct_height(ratio, ratio_sd)
 
     def begin_anew(self) -> None:
         """Begin to navigate anew, since fixes err otherwise from now on."""

@@ -37,6 +37,13 @@ class HeightWatch:
         return statistics.median(ratios) if is_off else 1.0
 
     @property
+    def ratio_sd(self) -> float:
+        """By how much that ratio may be wrong, a share: by what the newest match contradicts it, as over ground that
+        has begun to fall or rise. 0.0: by no more than matches scatter."""
+        change = self._ratios[-1] / self.ratio if self._heights_m else 1.0
+        return 0.0 if 1 / CORRECTION_RATIO <= change <= CORRECTION_RATIO else abs(change - 1.0)
+
+    @property
     def _ratios(self) -> list[float]:
         return [by_pictures_m / by_autopilot_m for by_pictures_m, by_autopilot_m in self._heights_m]
 
@@ -50,6 +57,8 @@ class HeightWatch:
             return
         self._last_s = frame.t_mono_s
         self._heights_m.append((max(LOWEST_M, where.height_m or 0.0), max(LOWEST_M, vehicle.height_m or 0.0)))
+        if self._autopilot:
+            self._autopilot.correct_height(self.ratio, self.ratio_sd)
         self._judge()
 
     def _judge(self) -> None:
@@ -61,8 +70,6 @@ class HeightWatch:
             self.by_pictures_m = self.by_autopilot_m = None
         elif was_so or _are_beyond(CONTRADICTION_RATIO, ratios):
             self.by_pictures_m, self.by_autopilot_m = map(statistics.median, zip(*self._heights_m, strict=True))
-        if self._autopilot:
-            self._autopilot.correct_height(self.ratio)
         if was_so != (self.by_pictures_m is not None):
             self._report()
 

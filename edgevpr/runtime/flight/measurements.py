@@ -80,10 +80,10 @@ class PositionedMatch:
 
 
 def measure_frame(
-    event: Recognition, vehicle: Vehicle | None, *, is_level: bool, height_ratio: float
+    event: Recognition, vehicle: Vehicle | None, *, is_level: bool, height_ratio: float, height_ratio_sd: float
 ) -> FrameMeasurement | None:
     """Return the frame of an event; None for one that could not be read. `is_level`: the camera hangs in a gimbal;
-    `height_ratio`: height by the pictures over the reported one.
+    `height_ratio`: height by the pictures over the reported one, wrong by the share `height_ratio_sd`.
 
     An error of the attitude does not move the picture of a level camera, nor one that leans by no reported attitude. An
     error of the time moves the point under the camera, as the aircraft flies and as it rolls.
@@ -103,7 +103,7 @@ def measure_frame(
         sd_m=sd_m,
         lean_s2=0.0 if is_unmoved else height_m / GRAVITY_M_S2,
         stride=event.stride.scale(height_ratio) if event.stride and is_correctable else None,
-        scale_sd=abs(height_ratio - 1.0),
+        scale_sd=max(abs(height_ratio - 1.0), height_ratio_sd),
         alike_m=_CORRELATED_SHARE * (event.view.footprint_m or 0.0),
     )
 

@@ -86,7 +86,7 @@ class Navigator(Listener):
         self._channel, self._believes_gps, self._doubts_map = Channel.COMMAND, True, False
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch, self._sent_s = OutputWatch(), -math.inf
-        self._height_ratio = 1.0
+        self._height_ratio, self._height_ratio_sd = 1.0, 0.0
         self._shared_sd_m = map_sd_m  # of the error that the last fixes share
 
     @property
@@ -106,10 +106,11 @@ class Navigator(Listener):
     def believes_gps(self) -> bool:
         return self._believes_gps
 
-    def correct_height(self, ratio: float) -> None:
+    def correct_height(self, ratio: float, ratio_sd: float = 0.0) -> None:
         """Set the height above ground by the pictures over that by the autopilot (1.0: they agree). Where they do not,
-        motion between pictures is corrected by it. The ground may change back at once, so positions claim as much."""
-        self._height_ratio = ratio
+        motion between pictures is corrected by it. The ground may change back at once, so positions claim as much, or
+        `ratio_sd`, the share by which the ratio may be wrong."""
+        self._height_ratio, self._height_ratio_sd = ratio, ratio_sd
 
     def hear_channel(self, channel: Channel) -> None:
         """Note the channel by which positions are sent. With a continuous one, the autopilot's velocity comes from our
@@ -262,7 +263,8 @@ class Navigator(Listener):
 
     def _measure(self, event: Recognition) -> FrameMeasurement | None:
         vehicle = event.vehicle or self._vehicle
-        return measure_frame(event, vehicle, is_level=self._is_level, height_ratio=self._height_ratio)
+        ratio, ratio_sd = self._height_ratio, self._height_ratio_sd
+        return measure_frame(event, vehicle, is_level=self._is_level, height_ratio=ratio, height_ratio_sd=ratio_sd)
 
     def _estimate(self, t_s: float) -> NavState | None:
         estimate = self._navigation.state_at(t_s)
