@@ -23,9 +23,8 @@ FORMS = ("float", "8bit", "1bit")  # number formats of vectors in RAM, from larg
 LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 0.01, 60.0  # of queries
 BUDGET_MB = (1, 65_536)  # of the index in RAM
 SOURCES = (
-    "folder of images, video file, camera (/dev/video0, or rpicam for the ribbon camera of a "
-    "Raspberry Pi), stream (rtsp://, udp://, rtp://, tcp://, http://, FILE.sdp), or gst: and a "
-    "GStreamer pipeline"
+    "a folder of images, a video file, a camera (/dev/video0, or rpicam for the ribbon camera of a Raspberry Pi), a "
+    "stream (rtsp://, udp://, rtp://, tcp://, http://, FILE.sdp), or gst: and a GStreamer pipeline"
 )
 
 _LARGEST = 2**63

@@ -12,7 +12,7 @@ from edgevpr.lab.simulate.motion import GRAVITY_M_S2, Hover, TrueState, tilt_for
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.runtime.flight.path import over_ground
+from edgevpr.runtime.flight.path import to_ground_acceleration
 
 ACCEPTED, DENIED, FAILED = (getattr(mavlink, f"MAV_RESULT_{name}") for name in ("ACCEPTED", "DENIED", "FAILED"))
 NOT_NOW, UNSUPPORTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED, mavlink.MAV_RESULT_UNSUPPORTED
@@ -347,5 +347,5 @@ def test_accelerometers_and_attitude_show_the_acceleration_and_the_tilt(accelera
         imu, attitude = (controller.reports[number](brain) for number in (26, 30))
         force_m_s2 = (imu.xacc * GRAVITY_M_S2 / 1000, imu.yacc * GRAVITY_M_S2 / 1000, imu.zacc * GRAVITY_M_S2 / 1000)
         angles_deg = (math.degrees(each) for each in (attitude.roll, attitude.pitch, attitude.yaw))
-        felt = complex(*over_ground(force_m_s2, *angles_deg))
+        felt = complex(*to_ground_acceleration(force_m_s2, *angles_deg))
         assert felt == pytest.approx(acceleration_m_s2 + GRAVITY_M_S2 * error, abs=0.05)
