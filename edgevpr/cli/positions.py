@@ -66,7 +66,7 @@ def positions(args: Namespace) -> int:
         "offset_s": placed.offset_s,
         "placed": len(placed.track.t_s) if placed.track else sum(bool(tag.position) for tag in placed.tags.values()),
         "of": None if placed.track else placed.pictures,
-        "round_metres": round_metres(placed),
+        "rounded_m": round_metres(placed),
         "out": str(out),
     }
     show(found, args.json)

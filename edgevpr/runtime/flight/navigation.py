@@ -315,7 +315,9 @@ class _StridesSinceFix:
     def error_m(self) -> float:
         """Standard deviation of one axis by which a changed height of the ground can have led us astray, metres."""
         unseen = _UNSEEN_SCALE if self._has_gap else 0.0
-        return float(np.hypot(*self._moved_m)) * max(unseen, self._scale_sd, abs(self._zoom) - _UNTOLD_ZOOM)
+        # What the last match has shown of the height, and what has changed since.
+        scale_sd = self._scale_sd + max(unseen, abs(self._zoom) - _UNTOLD_ZOOM, 0.0)
+        return float(np.hypot(*self._moved_m)) * scale_sd
 
 
 def rests_on_gps(vehicle: Vehicle) -> bool:
