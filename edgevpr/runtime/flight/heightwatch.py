@@ -12,6 +12,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 CONTRADICTION_RATIO = 1.25
 CORRECTION_RATIO = 1.1  # a height that is farther off than this is corrected by; five matches scatter by less
 MATCHES_IN_A_ROW = 5
+_GOES_ON = 0.3  # share of the height by which ground that has begun to change may go on, unseen by matches
 LOWEST_M = 1.0  # a height below this, as on the ground, is compared as this
 
 
@@ -39,9 +40,9 @@ class HeightWatch:
     @property
     def ratio_sd(self) -> float:
         """By how much that ratio may be wrong, a share: by what the newest match contradicts it, as over ground that
-        has begun to fall or rise. 0.0: by no more than matches scatter."""
+        has begun to fall or rise, and by what it may go on to. 0.0: by no more than matches scatter."""
         change = self._ratios[-1] / self.ratio if self._heights_m else 1.0
-        return 0.0 if 1 / CORRECTION_RATIO <= change <= CORRECTION_RATIO else abs(change - 1.0)
+        return 0.0 if 1 / CORRECTION_RATIO <= change <= CORRECTION_RATIO else abs(change - 1.0) + _GOES_ON
 
     @property
     def _ratios(self) -> list[float]:
