@@ -153,7 +153,7 @@ class Lap:
         self.controller = FlightController("arduplane", AlongTrack(track), gps=True, gps_until_s=GPS_S)
         self.truth: list[tuple[float, float, float]] = []
         self.sent: list[tuple[float, float, float, float]] = []
-        self._hear, self.controller.hear = self.controller.hear, self._note
+        self._receive, self.controller.receive = self.controller.receive, self._note
 
     def pose(self) -> CameraPose:
         """Return where the camera is now, and keep it."""
@@ -173,7 +173,7 @@ class Lap:
         if message.get_type() == "COMMAND_INT" and message.command == POSITION_FIX:
             at = time.monotonic() - message.param2, message.x / 1e7, message.y / 1e7, message.param3
             self.sent.append(at)
-        return self._hear(message)
+        return self._receive(message)
 
     @staticmethod
     def _pose(angle: float) -> CameraPose:

@@ -64,6 +64,13 @@ def run_autopilot(
     controller = FlightController(vehicle, motion, gps=gps, gps_until_s=gps_until_s, start_utc_s=time.time())
     for name, text in parameters.items():
         controller.brain.parameters.set_text(name, text)
+    return serve(controller, link_url, stop or threading.Event())
+
+
+def serve(controller: FlightController, link_url: str, stop: threading.Event) -> AutopilotSummary:
+    """Run this controller at `link_url` until `stop` is set, Ctrl-C comes, or the link is lost; return what it
+    received. Raises LinkError if the link cannot be opened.
+    """
     address = parse_link(link_url)
     try:
         port = open_port(address)
@@ -72,7 +79,7 @@ def run_autopilot(
     log.info("%s is up at %s", controller, address)
     conversation = _Conversation(port, controller)
     try:
-        conversation.run(stop or threading.Event())
+        conversation.run(stop)
     except KeyboardInterrupt:
         log.debug("%s is asked to end", address)
     except OSError as error:
