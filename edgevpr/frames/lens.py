@@ -26,13 +26,15 @@ _MAX_FILE_BYTES = 300_000  # OpenCV's program writes all corners of the board in
 # What of OpenCV's files is no YAML. Its own reader is not used: it crashes on damaged files.
 _NO_YAML = re.compile(rb"^%YAML.*|!!opencv-matrix\b", re.MULTILINE)
 _COEFFICIENTS = (4, 5, 8, 12, 14)  # numbers of them that OpenCV knows, k1 k2 p1 p2 first; of a fisheye only 4
-_FISHEYE, _NO_DISTORTION = "equidistant", "none"
+_FISHEYE = "equidistant"
+_NO_DISTORTION = "none"
 # Names of models in files of ROS and Kalibr; "" stands for a file of OpenCV.
 _MODELS = ("", "plumb_bob", "rational_polynomial", "radtan", _FISHEYE, _NO_DISTORTION)
 _WIDEST_DEG = 100.0  # of a straightened picture: beyond, its corners would show little, in many pixels
 _MAX_SKEW = 0.002  # over the focal length: what is left out moves a pixel by less than one
 _NARROWEST_DEG = 5.0  # as of `source.fov_deg`
-_FARTHEST_DEG, _STEP_DEG = 85.0, 0.25  # up to which angle from its axis a lens is sampled, and how finely
+_FARTHEST_DEG = 85.0  # from the axis: up to here a lens is sampled
+_STEP_DEG = 0.25
 _AROUND_DEG = range(0, 360, 15)
 _RIGHT, _DOWN, _LEFT, _UP = (_AROUND_DEG.index(degrees) for degrees in (0, 90, 180, 270))
 # Pixels are computed for every eighth pixel of a picture and interpolated, which is wrong by less than a tenth of one.

@@ -193,7 +193,8 @@ def test_silence_to_five_fixes_says_whether_other_commands_are_answered(autopilo
     assert autopilot.texts() == [(4, f"edgevpr: fixes unanswered: {text}")]
 
 
-CONST, UNINITIALIZED = {"flags": mavlink.EKF_CONST_POS_MODE}, {"flags": mavlink.EKF_UNINITIALIZED}
+CONST = {"flags": mavlink.EKF_CONST_POS_MODE}
+UNINITIALIZED = {"flags": mavlink.EKF_UNINITIALIZED}
 REJECTED = "TEMPORARILY_REJECTED"
 
 

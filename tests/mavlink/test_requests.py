@@ -125,7 +125,8 @@ def test_whatever_a_command_holds_it_has_one_answer_that_can_be_sent():
         assert ack.result == (mavlink.MAV_RESULT_ACCEPTED if wishes else refusal)
 
 
-WARNING, INFO = Severity.WARNING, Severity.INFO
+WARNING = Severity.WARNING
+INFO = Severity.INFO
 
 
 @pytest.fixture

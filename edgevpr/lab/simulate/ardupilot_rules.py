@@ -31,7 +31,8 @@ _OLDEST_FIX_S = 5.0
 _ALIGNED_AFTER_S = 5.0  # of GPS, at the start; a real one needs half a minute
 _REALIGNED_AFTER_S = 0.5
 _ODOMETRY_GOOD_FOR_S = 0.3
-_LEAST_NOISE_M, _MOST_NOISE_M = 0.2, 100.0  # of ODOMETRY: VISO_POS_M_NSE, and the upper limit
+_LEAST_NOISE_M = 0.2  # of ODOMETRY: VISO_POS_M_NSE
+_MOST_NOISE_M = 100.0
 # The share of a wind that comes up without GPS which neither accelerometers nor airspeed reveal to the filter. A plane
 # in ArduPilot's simulator was 767 m off after 150 s in 6 m/s.
 _UNNOTICED_SHARE = 0.85

@@ -23,7 +23,8 @@ from edgevpr.review.overhead import read_ground
 from edgevpr.review.page import make_flight_page
 from edgevpr.runtime.flight.flightlog import select_last_flight
 
-_MAX_GPS_S, _GPS_SHARE = 20.0, 0.25  # of the flight with GPS, from which its filter starts
+_MAX_GPS_S = 20.0  # of the flight with GPS, from which its filter starts
+_GPS_SHARE = 0.25
 _MIN_S = 40.0
 _LATE_S = 0.3
 

@@ -29,10 +29,12 @@ _LEAVES, _JUMPS, _ENTERS = 0.01, 0.01, 0.02
 _MISSED = 0.2  # how likely a query misses the place below it, relative to one over ground that is not in the map
 _ALIKE = 0.1  # how likely ground outside the map, once taken for a place, resembles the next places as well
 _MIN_REST = 1e-4  # least probability that no candidate is right
-_STEADY, _STEADY_SD = 0.75, 0.5  # probability of going on as before; its standard deviation, in spacings of the map
+_STEADY = 0.75  # probability of going on as before
+_STEADY_SD = 0.5  # in spacings of the map
 # Of moving by odometry, which comes first, as an autopilot reports it or as the camera sees it: the probability, and
 # the standard deviation in spacings and as a share of the length.
-_REPORTED, _SEEN = (0.6, 0.25, 0.15), (0.98, 0.05, 0.05)
+_REPORTED = (0.6, 0.25, 0.15)
+_SEEN = (0.98, 0.05, 0.05)
 _REACH_SD = 1.5  # the reach in standard deviations
 _NEWEST_WEIGHT = 0.2  # weight of the newest displacement in the mean velocity
 _SAME_POSITION_SD = 2.0  # standard deviations of a position: a shorter displacement may be none

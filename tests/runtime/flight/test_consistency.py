@@ -77,7 +77,9 @@ def every_second(offsets_m):
     return [(off_m, t_s, (t_s,)) for t_s, off_m in enumerate(offsets_m, 1)]
 
 
-AT, FAR, ELSEWHERE = (0, 0), (500, 0), (-700, 0)
+AT = (0, 0)
+FAR = (500, 0)
+ELSEWHERE = (-700, 0)
 
 
 @pytest.mark.parametrize(
