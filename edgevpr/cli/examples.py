@@ -3,11 +3,6 @@
 from collections.abc import Mapping
 
 EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
-    "calibrate-camera": (
-        ("photographs of a board of 10x7 squares", "board/ --board 9x6 --out lens.yaml"),
-        ("the camera itself, moved before the board", "/dev/video0 --board 9x6 --out lens.yaml"),
-        ("a fisheye on a Raspberry Pi's ribbon", "rpicam --board 9x6 --out lens.yaml --fisheye"),
-    ),
     "positions": (
         ("the subtitles beside a video of DJI", "DJI_0001.SRT --images DJI_0001.MP4"),
         ("photographs by the log of the autopilot", "00000042.BIN --images photos/"),

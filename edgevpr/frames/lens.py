@@ -216,7 +216,7 @@ def read_lens(path: str) -> CalibratedLens:
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         lacking = f"lacks `{error.args[0]}`" if isinstance(error, KeyError) else "is not whole"
         raise ConfigError(
-            f"{path} {lacking}: give a calibration of OpenCV, ROS or Kalibr, such as `edgevpr calibrate-camera` writes."
+            f"{path} {lacking}: give a calibration of OpenCV, ROS or Kalibr (docs/how-to/cameras.md)."
         ) from error
     line_of_sight(lens, lens.size_px)
     return lens

@@ -33,10 +33,6 @@ class TwinCheck:
         self._are_twins = False
         self._twins: list[str] = []  # the halves that were last alike
 
-    def stop(self) -> None:
-        """Compare no more pictures, as where the halves of a chequerboard may be alike."""
-        self._evidence = -_SINGLES_TO_DECIDE
-
     def require_single(self, image: Image) -> Image:
         """Return the picture, uint8 (H, W[, 3]), as it is. Raises ImageError if its halves show the same."""
         if self._evidence == -_SINGLES_TO_DECIDE:

@@ -1,6 +1,8 @@
 """Lenses with distortion: their files, what is refused, and pictures that become those of a camera without it."""
 
 import math
+import re
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -54,6 +56,22 @@ def test_read_lens_of_opencv_in_all_its_forms(tmp_path, name, camera):
     assert lens.is_fisheye is camera.fisheye
 
 
+@pytest.mark.slow
+def test_script_of_the_docs_calibrates_a_lens_that_is_known(tmp_path, monkeypatch):
+    camera, page = wide(), (Path(__file__).parents[2] / "docs/how-to/cameras.md").read_text("utf-8")
+    (tmp_path / "board").mkdir()
+    for number, image in enumerate(camera.photographs_of_board(30)):
+        cv2.imwrite(str(tmp_path / f"board/{number}.png"), image)
+    monkeypatch.chdir(tmp_path)
+    (script,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(script, {})
+    lens = read_lens("lens.yaml")
+    assert lens.focal_px == pytest.approx([camera.matrix[0, 0]] * 2, rel=0.002)
+    rows, columns = np.mgrid[24:456:8, 32:608:8]
+    found_px = lens.projected(camera.rays[rows, columns].reshape(-1, 2))
+    assert np.linalg.norm(found_px - np.column_stack([columns.ravel(), rows.ravel()]), axis=1).max() < 1.0
+
+
 @pytest.mark.parametrize(
     ("text", "model", "coefficients"),
     [
@@ -89,7 +107,7 @@ def test_read_lens_of_ros_and_kalibr(tmp_path, text, model, coefficients):
         ("camera_matrix: [1, 2]\ndistortion_coefficients: [0]", {}, "2 numbers"),
         ("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n", {}, "lacks `data`"),
         ("<?xml version='1.0'?>\n<opencv_storage><a>", {}, "is not valid XML"),
-        ("nothing: here", {}, "calibrate-camera"),
+        ("nothing: here", {}, "OpenCV, ROS or Kalibr"),
     ],
 )
 def test_read_lens_refuses_what_is_no_calibration(tmp_path, text, given, says):
