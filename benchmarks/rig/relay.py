@@ -49,8 +49,11 @@ class Relay:
         self._server.close()
         self._log.close()
 
-    def inject(self, data: bytes) -> None:
+    def inject(self, data: bytes, is_heard: bool = False) -> None:
+        """Send to the autopilot; `is_heard`: to edgevpr as well, as a router does with messages that have no target."""
         self._send(self._far, data)
+        if is_heard:
+            self._send(self._near, data)
 
     def saturate(self, bytes_per_s: float) -> None:
         """Carry no more than that from now on, either way, and lose what is sent beyond it."""

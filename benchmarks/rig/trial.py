@@ -247,7 +247,7 @@ class Trial(Run):
 
         def send(_now_s: float) -> None:
             numbers = (round(time.time() * 1e6), 0, mavlink.MAV_FRAME_BODY_FRD, 0.1, 0.1, 20.0, 0.0, 0.0)
-            self._relay.inject(mavlink.MAVLink_landing_target_message(*numbers).pack(packer))
+            self._relay.inject(mavlink.MAVLink_landing_target_message(*numbers).pack(packer), is_heard=True)
 
         self._each_turn["stamps"] = send
 

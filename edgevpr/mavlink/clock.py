@@ -22,6 +22,8 @@ _BACK_S = 1.0  # a boot time that goes back by more is that of another boot
 _DOUBT_S = 3.0  # after a gap of heartbeats; an autopilot that shows no boot time meanwhile counts as restarted
 _UTC_ROUNDED_S = 5e-3  # its boot time comes in whole milliseconds
 _STAMP_OFF_S = 1.0
+JITTER_LAG_S = 0.5  # `max_lag_ms` of ArduPilot's JitterCorrection
+_JITTER_SAMPLES = 200  # of our stamps, after the last foreign one: twice `convergence_loops`, which start anywhere
 # Only messages whose time is that of sending: others report the time of a measurement, which may be an old one.
 _BOOT_TIMES = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU", "SYSTEM_TIME")
 _WRAP_MS = 2**32
@@ -202,11 +204,19 @@ class ReportDelay:
 
 
 class ForeignStamps:
-    """Finds time stamps of other programs that are not in the autopilot's time: by ArduPilot's one correction for all
-    senders of a link (`JitterCorrection`) they make ours up to 0.5 s too old."""
+    """Finds time stamps of other programs that are not in the autopilot's time. ArduPilot has one correction for all
+    senders of a link (`JitterCorrection`): after a stamp that is ahead, ours counts as sent 0.5 s before it arrives."""
 
     def __init__(self) -> None:
         self._found: set[tuple[str, str]] = set()
+        self._spoilt = 0  # stamps of ours that still count as too old
+
+    def take_lag_s(self) -> float:
+        """Return by how many seconds the stamp that we send now will count as too old."""
+        if self._spoilt == 0:
+            return 0.0
+        self._spoilt -= 1
+        return JITTER_LAG_S
 
     def find(self, message: Message, boot_s: float | None) -> str | None:
         """Return sender and name of a message whose stamp is off by more than a second, the first time (None: it is
@@ -219,10 +229,14 @@ class ForeignStamps:
         else:
             return None
         sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
-        if boot_s is None or abs(stamp_s - boot_s) <= _STAMP_OFF_S or (sender, kind) in self._found:
+        if boot_s is None or abs(stamp_s - boot_s) <= _STAMP_OFF_S:
+            return None
+        if stamp_s > boot_s:
+            self._spoilt = _JITTER_SAMPLES
+        if (sender, kind) in self._found:
             return None
         self._found.add((sender, kind))
-        why = "ArduPilot has one time correction for all senders of a link, so fixes may count as up to 0.5 s older"
+        why = "ArduPilot has one time correction for all senders of a link: ODOMETRY counts as up to 0.5 s older"
         advice = "let it take its time from TIMESYNC, or give it a port of its own"
         text = f"{sender} stamps its {kind} {stamp_s - boot_s:.1f} s off the autopilot's time since boot"
         log.warning("%s: %s; %s", text, why, advice)

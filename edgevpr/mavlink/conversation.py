@@ -13,8 +13,8 @@ from edgevpr.core.types import NO_TAPE, Position, Tape, Vehicle
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.clock import SILENT_AFTER_S, ForeignStamps
-from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending
+from edgevpr.mavlink.clock import SILENT_AFTER_S
+from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending, put_back
 from edgevpr.mavlink.ground import PAUSED, Requests, Texts
 from edgevpr.mavlink.messages import AUTOPILOT, Fix, Health, Severity
 from edgevpr.mavlink.peer import Autopilot, Listener
@@ -70,7 +70,6 @@ class Conversation:
         self._packer = mavlink.MAVLink(None, srcSystem=settings.system_id or 1, srcComponent=settings.component_id)
         self._heartbeat_due_s = self._state_due_s = self._between_due_s = clock()
         self._ask_position_s: float | None = None  # when to request its reports next; None: not wanted
-        self._foreign_stamps = ForeignStamps()
         self._restarts, self._restarted_s = 0, -math.inf
         self._told_channel: Channel | None = self.channel  # the channel that the listener knows
         self._asked_for_state: bool | None = None
@@ -233,7 +232,8 @@ class Conversation:
             elif (stamp_s := self.autopilot.stamp_s(now_s)) is None:
                 self.fixes.drop_stale(now_s, "the autopilot's clock was not known")
             elif sending := self.fixes.next(now_s) or self._between(now_s):
-                return messages.position_fix(sending.fix, now_s, system_id, stamp_s), sending
+                fix = put_back(sending.fix, now_s, self.autopilot.foreign_stamps.take_lag_s(), self.autopilot.vehicle)
+                return messages.position_fix(fix, now_s, system_id, stamp_s), sending
         else:
             self.fixes.drop_stale(now_s)
         if text := self.texts.next(now_s):
@@ -335,7 +335,7 @@ class Conversation:
         sender, autopilot = (message.get_srcSystem(), message.get_srcComponent()), self.autopilot
         if sender in (us, (us[0], AUTOPILOT)) or autopilot.firmware != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
             return
-        if found := self._foreign_stamps.find(message, autopilot.clock.boot_time_s(now_s)):
+        if found := autopilot.foreign_stamps.find(message, autopilot.clock.boot_time_s(now_s)):
             self.announce(Severity.WARNING, f"wrong stamps: {found}", "stamps")
 
     def _hear_request(self, message: Message, now_s: float) -> None:

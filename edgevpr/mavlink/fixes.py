@@ -9,10 +9,11 @@ some tens of milliseconds, there is only one such fix. An answer that matches no
 import logging
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Event
 
-from edgevpr.core.types import FIX_MAX_AGE_S
+from edgevpr.core.geodesy import moved
+from edgevpr.core.types import FIX_MAX_AGE_S, Vehicle
 from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Fix, Severity
 from edgevpr.mavlink.vehicle import GPS_IN_USE, Reason
@@ -209,3 +210,15 @@ class Fixes:
         if sending.sent:
             self.unanswered += 1
             sending.outcome = FixAnswer(None, reason, None)
+
+
+def put_back(fix: Fix, now_s: float, lag_s: float, vehicle: Vehicle | None) -> Fix:
+    """Return a fix for an autopilot that takes what it receives at `now_s` as sent `lag_s` earlier: one that is so much
+    younger or, where it has no such age, the position of the vehicle so long ago."""
+    younger_s = min(lag_s, max(0.0, now_s - fix.t_frame_s))
+    fix = replace(fix, t_frame_s=fix.t_frame_s + younger_s)
+    if younger_s == lag_s or vehicle is None or vehicle.velocity_m_s is None:
+        return fix
+    east_m, north_m = (-(lag_s - younger_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
+    lat_deg, lon_deg = moved(fix.lat_deg, fix.lon_deg, east_m, north_m)
+    return replace(fix, lat_deg=lat_deg, lon_deg=lon_deg)

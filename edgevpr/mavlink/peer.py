@@ -10,7 +10,7 @@ from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.clock import SILENT_AFTER_S, AutopilotClock, ReportDelay
+from edgevpr.mavlink.clock import SILENT_AFTER_S, AutopilotClock, ForeignStamps, ReportDelay
 from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.heights import Altitudes, Heights
 from edgevpr.mavlink.interview import Interview
@@ -151,7 +151,7 @@ class Autopilot:
         self.attitudes, self.heights, self.certainty = Attitudes(), Heights(self._announce), Certainty()
         self.clock, self.force_s = AutopilotClock(), -math.inf  # when its accelerometers were last heard
         self.px4 = Px4Use()
-        self.receivers = Receivers()
+        self.receivers, self.foreign_stamps = Receivers(), ForeignStamps()
         self.report_delay = ReportDelay(self._announce)
 
     @property

@@ -7,7 +7,7 @@ from conversing import Autopilot, Ear
 
 from edgevpr.mavlink.channel import Channel, Choice
 from edgevpr.mavlink.clock import AutopilotClock
-from edgevpr.mavlink.messages import Severity, status_text
+from edgevpr.mavlink.messages import Fix, Severity, status_text
 from edgevpr.mavlink.parameters import Decision
 from edgevpr.mavlink.wire import mavlink
 
@@ -191,3 +191,46 @@ def test_delay_s_keeps_reports_of_a_full_link_from_being_used(is_the_way_back):
     texts = [text for _ in range(12) for text in report_late(autopilot, 0.05)]
     assert autopilot.clock.now_s - autopilot.vehicle.t_heard_s < 0.2
     assert any("in time again" in text for text in texts)
+
+
+class LinkOfArduPilot:
+    """ArduPilot's one time correction for all senders of a link, by the rules of its JitterCorrection: a stamp is never
+    of the future, and never older than 0.5 s."""
+
+    def __init__(self):
+        self.offset_s, self.diffs_s = None, []
+
+    def correct(self, stamp_s, now_s):
+        """Return when a message with this stamp was sent, in the time since boot."""
+        diff_s = now_s - stamp_s
+        self.offset_s = diff_s if self.offset_s is None else min(diff_s, self.offset_s)
+        sent_s = stamp_s + self.offset_s
+        if sent_s + 0.5 < now_s:
+            sent_s = now_s - 0.5
+            self.offset_s = sent_s - stamp_s
+        self.diffs_s.append(diff_s)
+        if len(self.diffs_s) == 100:
+            self.offset_s = min(self.diffs_s)
+            self.diffs_s.clear()
+        return sent_s
+
+
+@pytest.mark.parametrize("age_s", [0.0, 0.3, 1.2])
+@pytest.mark.parametrize("foreign_s", [None, 1.7e9])
+def test_put_back_gives_ardupilot_the_position_of_the_time_by_which_it_counts(age_s, foreign_s):
+    """The vehicle flies north at 20 m/s; what counts is where a fix lies beside the vehicle at the time of the fix."""
+    autopilot, link = streaming(Channel.COMMAND), LinkOfArduPilot()
+    north_deg = 20.0 / 111_195
+    for _ in range(5):
+        autopilot.wait(0.5)
+        autopilot.position(50.0 + north_deg * autopilot.boot_s, vx=2000)
+        if foreign_s:
+            autopilot.say(foreign("LANDING_TARGET", foreign_s), component_id=191)
+            link.correct(foreign_s, autopilot.boot_s)
+        frame_s = autopilot.boot_s - age_s
+        fix = Fix(50.0 + north_deg * frame_s, 8.0, 5.0, autopilot.clock.now_s - age_s)
+        autopilot.conversation.fixes.put(fix, autopilot.clock.now_s)
+        (sent,) = [message for message in autopilot.told() if message.get_type() == "COMMAND_INT"]
+        counts_s = link.correct(sent.param1, autopilot.boot_s) - sent.param2
+        assert (sent.x / 1e7 - 50.0) / north_deg == pytest.approx(counts_s, abs=0.02)
+        autopilot.answer(0)
