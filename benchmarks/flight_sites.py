@@ -17,7 +17,7 @@ from mosaics import Ground, ground_of, laid, make_mosaic, write_tif
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light
-from edgevpr.lab.simulate.rehearsal import seen_from
+from edgevpr.lab.simulate.overflight import seen_from
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 # Sets without positions, or too few of them: metres of a pixel and a place on the Earth are assumed.

@@ -14,7 +14,7 @@ from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Vehicle
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light
 from edgevpr.lab.simulate.generated import wander
-from edgevpr.lab.simulate.rehearsal import seen_from
+from edgevpr.lab.simulate.overflight import seen_from
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 QUERIES = 40

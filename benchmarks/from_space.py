@@ -34,7 +34,7 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
 from edgevpr.lab.simulate.camera import Camera, Light
-from edgevpr.lab.simulate.rehearsal import make_poses, seen_from
+from edgevpr.lab.simulate.overflight import make_poses, seen_from
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser

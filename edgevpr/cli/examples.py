@@ -69,9 +69,7 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "simulate flight": (
         ("a generated mapping flight", "mapping"),
         ("a later one over the same ground", "later --which query"),
-    ),
-    "simulate rehearsal": (
-        ("a mission over this year's ground", "valley.gpkg rehearsed --orthophoto now.tif --track mission.plan"),
+        ("a mission over this year's ground", "later --orthophoto now.tif --track mission.plan --height-m 120"),
     ),
     "demo": (("the whole job in a minute", "--out demo_out"),),
     "models list": (("which networks there are", ""),),

@@ -1,43 +1,23 @@
-"""`edgevpr simulate` and `edgevpr demo`: write the images of a generated flight, run a simulated flight controller,
-rehearse a mission over a map, and demonstrate all steps from map to match."""
+"""`edgevpr simulate` and `edgevpr demo`: write the images of a generated flight, run a simulated flight controller, and
+demonstrate all steps from map to match."""
 
 import math
 import signal
-from argparse import Namespace, _ArgumentGroup
-from collections.abc import Mapping
+from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from edgevpr.cli.shared import (
-    add_json,
-    add_map_images,
-    add_parameters,
-    command,
-    group,
-    parse_parameters,
-    positive,
-    show,
-)
-from edgevpr.cli.wording import format_rehearsal
+from edgevpr.cli.shared import add_json, add_parameters, command, group, parse_parameters, positive, show
 from edgevpr.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from edgevpr.frames.positions import GeoTag
 
 # The vehicles of edgevpr.lab.simulate.controller, which is not imported for a page of help.
 _VEHICLES = ("arduplane", "arducopter", "px4-copter", "px4-plane")
 _PARAMETER = "GPS2_TYPE=14"  # an example
-_Numbers = Mapping[str, tuple[float | None, float, float, str]]
 # Number flags of a flight over an orthophoto: (default, least, greatest, help text).
-_NUMBERS: _Numbers = {
+_NUMBERS: dict[str, tuple[float | None, float, float, str]] = {
     "height_m": (None, 1.0, 10_000.0, "height above ground in metres (default: that of the track)"),
     "every_m": (20.0, 1.0, 1e6, "distance between images of a mission in metres (default: 20)"),
     "fov_deg": (66.0, 5.0, 120.0, "field of view across the image in degrees (default: 66)"),
-}
-# A second of the way, which leaves time for a query, and lets one picture show most of the next.
-_REHEARSED: _Numbers = {
-    **_NUMBERS,
-    "every_m": (10.0, 1.0, 1e6, "distance between images in metres, flown at 10 m/s (default: 10)"),
 }
 
 
@@ -75,15 +55,13 @@ def add(commands: Any) -> None:
     flight.add_argument(
         "--seed", type=_seed, default=1, metavar="N", help="random seed of landscape and motion (default: 1)"
     )
-    _add_over(flight.add_argument_group("over an orthophoto"), _NUMBERS)
-    text = "rehearse a mission without GPS, over another orthophoto than the map's"
-    rehearsal = command(simulations, "rehearsal", simulate_rehearsal, text)
-    rehearsal.add_argument("map", metavar="MAP")
-    rehearsal.add_argument("out", metavar="DIR", help="new folder for images, log and report.html")
-    rehearsal.add_argument("--seed", type=_seed, default=1, metavar="N", help="random seed of the motion (default: 1)")
-    _add_over(rehearsal.add_argument_group("the flight"), _REHEARSED, required=True)
-    add_map_images(rehearsal)
-    add_json(rehearsal)
+    over = flight.add_argument_group("over an orthophoto")
+    over.add_argument("--orthophoto", metavar="FILE", help="orthophoto, as for `map build` (needs rasterio)")
+    over.add_argument(
+        "--track", metavar="FILE", help="mission, or positions.csv with height_m[, yaw_deg, roll_deg, pitch_deg]"
+    )
+    for name, (*_, text) in _NUMBERS.items():
+        over.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
     demo = command(commands, "demo", run_demo, "map and match a generated flight, and draw a picture of it")
     demo.add_argument("--out", default="demo_out", metavar="DIR", help="folder to write (default: demo_out)")
 
@@ -92,21 +70,6 @@ def _seed(text: str) -> int:
     if (value := int(text)) < 0:
         raise ValueError
     return value
-
-
-def _add_over(over: _ArgumentGroup, numbers: _Numbers, required: bool = False) -> None:
-    """Add the flags of a flight over an orthophoto."""
-    over.add_argument(
-        "--orthophoto", required=required, metavar="FILE", help="orthophoto, as for `map build` (needs rasterio)"
-    )
-    over.add_argument(
-        "--track",
-        required=required,
-        metavar="FILE",
-        help="mission, or positions.csv with height_m[, yaw_deg, roll_deg, pitch_deg]",
-    )
-    for name, (*_, text) in numbers.items():
-        over.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
 
 
 def simulate_autopilot(args: Namespace) -> int:
@@ -137,46 +100,21 @@ def simulate_flight(args: Namespace) -> int:
     if args.track is None or args.which is not None:
         raise UsageError("A flight over an orthophoto needs its --track, and has no --which.")
     from edgevpr.core.text import progress
-    from edgevpr.lab.simulate.rehearsal import ground_under, write_rehearsal
+    from edgevpr.lab.simulate.overflight import ground_under, read_shots, write_overflight
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
-    shots, numbers = _shots_of(args, _NUMBERS)
+    numbers: dict[str, Any] = {}
+    for name, (usual, least, most, _) in _NUMBERS.items():
+        numbers[name] = value = usual if getattr(args, name) is None else getattr(args, name)
+        if value is not None and not least <= value <= most:  # false for NaN
+            raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {least:g} to {most:g}.")
+    shots = read_shots(args.track, numbers["height_m"], numbers["every_m"])
     orthophoto = Orthophoto(args.orthophoto, ground_under(shots, numbers["fov_deg"]))
-    taken = write_rehearsal(Path(args.out), orthophoto, shots, numbers["fov_deg"], args.seed)
+    taken = write_overflight(Path(args.out), orthophoto, shots, numbers["fov_deg"], args.seed)
     written = sum(1 for _ in progress(taken, len(shots), "flying"))
     print(f"{args.out}: {written} images in images/, where they were taken in positions.csv")
     if beyond := len(shots) - written:
         print(f"{beyond} left out: they would show ground beyond the orthophoto")
-    return 0
-
-
-def _shots_of(args: Namespace, known: _Numbers) -> "tuple[list[GeoTag], dict[str, Any]]":
-    """Return the pictures to take along the track, and the numbers that the flags give."""
-    from edgevpr.lab.simulate.rehearsal import read_shots
-
-    numbers: dict[str, Any] = {}
-    for name, (usual, least, most, _) in known.items():
-        numbers[name] = value = usual if getattr(args, name) is None else getattr(args, name)
-        if value is not None and not least <= value <= most:  # false for NaN
-            raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {least:g} to {most:g}.")
-    return read_shots(args.track, numbers["height_m"], numbers["every_m"]), numbers
-
-
-def simulate_rehearsal(args: Namespace) -> int:
-    """Run `simulate rehearsal`: rehearse a mission over a map, and print what to expect of it."""
-    from edgevpr.lab.simulate.mission import Mission, rehearse
-
-    shots, numbers = _shots_of(args, _REHEARSED)
-    mission = Mission(
-        place_map=args.map,
-        shots=shots,
-        orthophoto=args.orthophoto,
-        fov_deg=numbers["fov_deg"],
-        seed=args.seed,
-        map_images=args.map_images,
-    )
-    report = rehearse(mission, Path(args.out))
-    show(report, args.json, format_rehearsal(report, args.out))
     return 0
 
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 from edgevpr.core.text import aligned, beside, shown
 
 if TYPE_CHECKING:
-    from edgevpr.lab.simulate.rehearsal_report import RehearsalReport
     from edgevpr.mapmaking.making import MadeMap
     from edgevpr.mapmaking.moving import MapMove
     from edgevpr.mapmaking.refine import Refined
@@ -24,8 +23,8 @@ WITHOUT_POSITIONS = (
 # By benchmarks/results/from_space.md, a raster of half a metre a pixel.
 _OTHER_DAY = (
     "of another day fewer are: of pictures months and an earthquake later 48 % were accepted alone, with heading and "
-    "height known (3 to 8 of twelve in a line), and 23 % without (0 to 6); a rehearsal over another orthophoto says it "
-    "of this ground"
+    "height known (3 to 8 of twelve in a line), and 23 % without (0 to 6); `match` of pictures that `simulate flight` "
+    "takes of another orthophoto says it of this ground"
 )
 _SEAMS = 1 / 8  # share of places with one: straight kerbs look like seams in 2 of 18 pictures of one set
 _SHOWN = 20  # differences of a replay at most
@@ -145,29 +144,6 @@ def format_comparison(found: dict[str, Any], why_ended: str | None) -> Iterator[
         yield f"their positions are at most {apart_m:.1f} m apart"
     if why_ended:
         yield f"The replay ends before the flight: {why_ended}."
-
-
-def format_rehearsal(found: "RehearsalReport", folder: str) -> Iterator[str]:
-    """Yield what a rehearsed mission lets expect: the answer, its figures, and where nothing was recognised."""
-    yield found.answer
-    known_s = f"{found.gps_until_s:.0f} s"
-    yield f"  queries          {found.queries} along {found.way_m / 1e3:.1f} km, with GPS for the first {known_s}"
-    yield f"  accepted         {found.accepted}, {found.wrong} of them wrong ({found.wrong_from_m:.0f} m off or more)"
-    yield f"  longest gap      {found.longest_gap_s:.0f} s without an accepted match"
-    for name, error in (
-        ("matches off by", found.match_error),
-        ("positions sent", found.sent_error),
-        ("autopilot", found.autopilot_error),
-    ):
-        said = "there were none"
-        if error:
-            said = f"median {error.median_m:.1f} m, 90 % within {error.p90_m:.1f} m, largest {error.most_m:.1f} m"
-        yield f"  {name:<16} {said}{'' if name == 'matches off by' else ', without GPS'}"
-    for each in found.unrecognised:
-        where = f"{each.lasts_s:.0f} s around {each.lat_deg:.5f}, {each.lon_deg:.5f}"
-        beyond = "" if each.on_map else ", beyond the map"
-        yield f"  nothing found    {each.from_m / 1e3:.2f} to {each.to_m / 1e3:.2f} km of the way: {where}{beyond}"
-    yield f"  page             {folder}/report.html"
 
 
 def _first(texts: list[str]) -> list[str]:

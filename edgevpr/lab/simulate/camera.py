@@ -1,5 +1,5 @@
 """Pictures of a scene by a camera under a drone: light on the ground, a pinhole camera, and the faults of its sensor.
-`generated` and `rehearsal` take their pictures with it."""
+`generated` and `overflight` take their pictures with it."""
 
 from dataclasses import dataclass
 

@@ -1,6 +1,10 @@
 """The demonstration `edgevpr demo`: two generated flights, and the real commands between them, each as a process."""
 
-from collections.abc import Sequence
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edgevpr.core.arrays import Image, LatLon
+from edgevpr.core.errors import EdgevprError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import progress
 from edgevpr.frames.images import read_image
@@ -24,8 +29,6 @@ from edgevpr.lab.simulate.generated import (
     write_flight,
 )
 from edgevpr.lab.simulate.landscape import make_scene
-from edgevpr.lab.simulate.processes import autopilot_process, run_to_end
-from edgevpr.lab.simulate.rehearsal_report import judge_by_tags
 from edgevpr.review.logged import LoggedQuery, read_flight
 
 _SEED = 1
@@ -64,11 +67,11 @@ def run_demo(folder: str | Path) -> str:
         for _ in progress(write_flight(out, scene, flight), len(flight.poses), label):
             pass
     # The flight controller is started first: it listens long before the map is built.
-    with autopilot_process() as link:
+    with run_autopilot() as link:
         images = ("--images", first / "images", *_CAMERA)
-        run_to_end("map", "build", map_path, *images, "--technique", "cohog", "--no-calibrate")
+        run_command("map", "build", map_path, *images, "--technique", "cohog", "--no-calibrate")
         source = ("--source", second / "images", *_CAMERA)
-        run_to_end("run", "--map", map_path, *source, "--link", link, "--log", log_path)
+        run_command("run", "--map", map_path, *source, "--link", link, "--log", log_path)
     queries, places = read_queries(log_path, first, second)
     _draw(picture_path, lit(scene, mapping.light, mapping.seed), mapping, queries)
     return f"""{summarise(queries, places)}
@@ -76,13 +79,46 @@ picture           {picture_path}
 page              edgevpr report {log_path} --out {folder / "report.html"}"""
 
 
+@contextmanager
+def run_autopilot() -> Iterator[str]:
+    """Run `edgevpr simulate autopilot` at a free port, and yield the address to reach it by."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    command = _command("simulate", "autopilot", "--link", f"udpin:{address}")
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        try:
+            yield f"udpout:{address}"
+        finally:
+            process.terminate()
+
+
+def run_command(*words: object) -> None:
+    """Run a command of edgevpr to its end. Raises EdgevprError if it fails."""
+    done = subprocess.run(_command(*words), stdout=subprocess.DEVNULL)
+    if done.returncode:
+        raise EdgevprError(
+            f"`{' '.join(done.args[2:])}` ended with exit code {done.returncode}: see its message above."
+        )
+
+
+def _command(*words: object) -> list[str]:
+    return [sys.executable, "-m", "edgevpr", *map(str, words)]
+
+
 def read_queries(log_path: Path, mapped: Path, flown: Path) -> tuple[list[LoggedQuery], list[LatLon]]:
     """Read the queries of a flight log, judged by the positions.csv in the folder of its flight, and the positions of
     the places, from that of the mapping flight."""
-    flight = read_flight(log_path)
-    judge_by_tags(flight, read_positions(flown / "positions.csv"))
-    tags = read_positions(mapped / "positions.csv").values()
-    return flight.queries, [(tag.position.lat_deg, tag.position.lon_deg) for tag in tags if tag.position]
+    taken_at, places = (
+        {name: (tag.position.lat_deg, tag.position.lon_deg) for name, tag in tags.items() if tag.position}
+        for tags in (read_positions(folder / "positions.csv") for folder in (flown, mapped))
+    )
+    queries = [
+        replace(query, gps_at=taken_at[query.name], true_at=taken_at[query.name])
+        for query in read_flight(log_path).queries
+        if query.name in taken_at
+    ]
+    return queries, list(places.values())
 
 
 def is_right(query: LoggedQuery) -> bool:

@@ -7,7 +7,7 @@ import cv2
 import pytest
 
 from edgevpr.core.errors import EdgevprError
-from edgevpr.lab.simulate import demo, processes
+from edgevpr.lab.simulate import demo
 from edgevpr.lab.simulate.generated import later_flight, mapping_flight
 from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.runtime.flight.flightlog import select_last_flight
@@ -39,12 +39,10 @@ def test_run_demo_maps_flies_and_draws(small, tmp_path):
 
 def test_run_demo_names_a_command_that_fails_and_leaves_nothing_running(small, tmp_path, monkeypatch):
     started = []
-    popen = processes.subprocess.Popen
-    monkeypatch.setattr(processes.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
-    command = processes._command
-    monkeypatch.setattr(
-        processes, "_command", lambda *words: command(*words, *(["--often"] if words[0] == "run" else []))
-    )
+    popen = demo.subprocess.Popen
+    monkeypatch.setattr(demo.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
+    command = demo._command
+    monkeypatch.setattr(demo, "_command", lambda *words: command(*words, *(["--often"] if words[0] == "run" else [])))
     with pytest.raises(EdgevprError, match=r"`edgevpr run.* 2"):
         demo.run_demo(tmp_path / "out")
     assert len(started) == 3, "flight controller, map, flight"

@@ -1,5 +1,5 @@
-"""A flight over an orthophoto, as a rehearsal before the real one: pictures, and where they were taken. The track is
-read from a positions.csv, or follows the waypoints of a mission. `edgevpr simulate flight` writes it."""
+"""A flight over an orthophoto: pictures, and where they were taken. The track is read from a positions.csv, or follows
+the waypoints of a mission. `edgevpr simulate flight` writes it."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -70,15 +70,11 @@ def _of_mission(path: str | Path, every_m: float) -> list[GeoTag]:
     return [GeoTag(position=Position(*at), height_m=height) for at, height in zip(places, over_m, strict=True)]
 
 
-def footprint_m(shots: Sequence[GeoTag], fov_deg: float) -> float:
-    """Return how much ground the longest side of the highest picture shows."""
-    return 2 * max(shot.height_m or 0.0 for shot in shots) * math.tan(math.radians(fov_deg / 2))
-
-
 def ground_under(shots: Sequence[GeoTag], fov_deg: float) -> Ground:
     """Return the ground that the pictures show, for tiles of it."""
     points = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
-    return ground_of(points, footprint_m(shots, fov_deg))
+    highest_m = max(shot.height_m or 0.0 for shot in shots)
+    return ground_of(points, 2 * highest_m * math.tan(math.radians(fov_deg / 2)))
 
 
 def make_poses(shots: list[GeoTag], seed: int) -> list[CameraPose]:
@@ -120,7 +116,7 @@ def seen_from(
     return photograph(ground, metres_per_pixel, over_patch, camera, light, rng)
 
 
-def write_rehearsal(
+def write_overflight(
     folder: Path, orthophoto: Orthophoto, shots: list[GeoTag], fov_deg: float, seed: int
 ) -> Iterator[str]:
     """Write the pictures with `write_shots`; those that would show ground beyond the orthophoto are left out. Raises

@@ -14,7 +14,7 @@ from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel
-from edgevpr.lab.simulate.rehearsal import make_poses, read_shots, seen_from, write_rehearsal
+from edgevpr.lab.simulate.overflight import make_poses, read_shots, seen_from, write_overflight
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 pytestmark = pytest.mark.slow
@@ -126,12 +126,12 @@ def test_read_shots_refuses_a_track_without_path_or_height(tmp_path):
         read_shots(line, 80.0, 1.0)
 
 
-def test_write_rehearsal_writes_the_truth_and_is_the_same_each_time(tmp_path, orthophoto):
+def test_write_overflight_writes_the_truth_and_is_the_same_each_time(tmp_path, orthophoto):
     north = [moved(HOME.lat_deg, HOME.lon_deg, 0, 15.0 * step) for step in range(-2, 12)]
     shots = [GeoTag(position=Position(*at), height_m=70, t_utc_s=2.0 * n, heading_deg=0) for n, at in enumerate(north)]
     written = {}
     for name, seed in (("one", 1), ("two", 1), ("other", 2)):
-        written[name] = list(write_rehearsal(tmp_path / name, orthophoto, shots, 60, seed))
+        written[name] = list(write_overflight(tmp_path / name, orthophoto, shots, 60, seed))
     names = written["one"]
     assert 5 < len(names) < len(shots), "the end of the track lies beyond the orthophoto"
     assert names == sorted(path.name for path in (tmp_path / "one" / "images").iterdir())
@@ -143,4 +143,4 @@ def test_write_rehearsal_writes_the_truth_and_is_the_same_each_time(tmp_path, or
     one, two, other = ((tmp_path / name / "images" / names[0]).read_bytes() for name in ("one", "two", "other"))
     assert one == two != other
     with pytest.raises(UsageError, match="not taken"):
-        list(write_rehearsal(tmp_path / "none", orthophoto, shots[-2:], 60, 1))
+        list(write_overflight(tmp_path / "none", orthophoto, shots[-2:], 60, 1))
