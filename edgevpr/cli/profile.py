@@ -1,7 +1,6 @@
 """`edgevpr profile`: what each technique costs a board in RAM and battery, estimated before take-off."""
 
 from argparse import Namespace
-from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -86,9 +85,7 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ..
     """Make two things from the flags: the plan of the flight, and the techniques to try in all their forms: that of
     --map, else every one."""
     from edgevpr import techniques
-    from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.places.tilemap import TileMap
     from edgevpr.power.equations import parse_pack
     from edgevpr.runtime.preflight.estimate import FlightPlan
     from edgevpr.runtime.preflight.pick import camera_setting
@@ -96,21 +93,16 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ..
     from edgevpr.runtime.recognise.opening import budget_mb
 
     config = load_command_config(args)
-    places, searched, camera = args.places, None, config.source.camera
+    places, camera = args.places, config.source.camera
     if args.map:
-        is_folder = Path(args.map).is_dir()
-        with closing(TileMap.open(args.map) if is_folder else PlaceMap.open(args.map)) as place_map:
+        with PlaceMap.open(args.map) as place_map:
             places, spec = len(place_map), place_map.spec
-            if isinstance(place_map, TileMap):  # of which as much is in RAM as there is room for
-                places = min(places, int(1e6 * budget_mb(config, board)) // bytes_per_place(spec))
-                searched = place_map.most_searched
         camera = str(spec.parameters["camera"]) if "camera" in spec.parameters else camera
         wanted = offers((spec.name,), settings={spec.name: spec.parameters})
     else:
         wanted = offers(techniques.names(), settings={n: camera_setting(n, camera) for n in techniques.names()})
     plan = FlightPlan(
         places=places,
-        searched=searched,
         rate_hz=config.source.rate_hz or board.rate_hz,
         flight_min=args.flight_min,
         pack=parse_pack(config.battery.pack),

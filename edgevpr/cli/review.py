@@ -57,7 +57,7 @@ def run_report(args: Namespace) -> int:
     no_ground = "The log does not name a map: give it with --map."
     if path := args.map or text(flight.start, "map"):
         try:
-            ground, no_ground = read_ground(path, flight.tiles), ""
+            ground, no_ground = read_ground(path), ""
         except EdgevprError as error:
             if args.map:
                 raise

@@ -208,7 +208,7 @@ class Config:
     """The whole configuration; `deploy/config.yaml` documents every key and holds every default."""
 
     board: str = key("--board NAME", "hardware profile (default: this computer)")
-    map: str | None = key("--map MAP", "map, or folder of tiles")
+    map: str | None = key("--map MAP", "map file")
     technique: str | None = key("--technique NAME", "use this technique")
     source: SourceConfig
     match: MatchConfig

@@ -11,7 +11,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles, Ints
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.readmap import ReadMap
+from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation
 
 # Footprint of the places that a picture is found among best, as a share of its own, by benchmarks/results/from_space.md
@@ -48,7 +48,7 @@ class Layers:
         return replace(expected, in_reach=in_reach) if in_reach.any() else expected
 
 
-def layers_of(place_map: ReadMap) -> Layers:
+def layers_of(place_map: PlaceMap) -> Layers:
     """Read the layers of a map. Raises MapError."""
     place_ids, length_m, is_cut = place_map.footprints()
     footprints_m: list[float] = []

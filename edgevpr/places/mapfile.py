@@ -11,23 +11,32 @@ import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from edgevpr.core.arrays import Array, LatLon, Singles
+from edgevpr.core.arrays import Array, Bools, Doubles, Ints, LatLon, Singles
 from edgevpr.core.contract import Descriptor, TechniqueSpec
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Frame, Place, Pose, Position, Salience
 from edgevpr.places import geopackage, mapspec, rows
 from edgevpr.places.connection import MapConnection
 from edgevpr.places.mapfiles import is_of_one_row, sentences
-from edgevpr.places.readmap import Footprints
 from edgevpr.places.rows import Content, Unreadable, Values
 
 _OF_COARSE = f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"
 _OWNERS = "; "  # between the words of several owners
 _OTHERS = 0.05  # share of the numbers of two coarse parts of one picture that may differ
 _SAME_PICTURE = 0.01  # norm of their difference, relative: far above rounding, far below another picture's
+
+
+class Footprints(NamedTuple):
+    """The places of a map that have a footprint: `place_ids` int64 (M,), `length_m` float64 (M,) of the ground that a
+    picture's longest side shows, and `is_cut` bool (M,): it was cut from an orthophoto."""
+
+    place_ids: Ints
+    length_m: Doubles
+    is_cut: Bools
 
 
 class _StoredText:

@@ -55,6 +55,11 @@ def existing(name: str | Path) -> Path:
 def require_regular(path: Path) -> None:
     """Raise MapError if the map, or a file of SQLite beside it, exists but is not a regular file: a folder, or a pipe,
     from which a program would read for ever."""
+    if path.is_dir():
+        raise MapError(
+            f"{path} is a folder, and a map is one file: cut the map of a mission out of a folder that `fleet build` "
+            f"made with `edgevpr map subset {path} --mission FILE --out flight.gpkg`."
+        )
     for each in (path, *beside(path)):
         if each.exists() and not each.is_file():
             raise MapError(f"{each} is no regular file but a folder, pipe or device: give the path of a map file.")

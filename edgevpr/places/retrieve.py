@@ -22,7 +22,7 @@ from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Candidate
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.readmap import ReadMap
+from edgevpr.places.mapfile import PlaceMap
 
 Choice = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all)
 Glance = tuple[float, Choice]  # approximate score, and the slot with its best hypothesis
@@ -63,7 +63,7 @@ class Query:
 
     technique: Technique
     descriptor: Descriptor
-    place_map: ReadMap
+    place_map: PlaceMap
     index: PlaceIndex
     expected: Expectation = NOTHING
 
@@ -300,7 +300,7 @@ def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Collec
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None
 
 
-def named(ranking: Ranking, index: PlaceIndex, place_map: ReadMap, first: int | None = None) -> list[Candidate]:
+def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int | None = None) -> list[Candidate]:
     """Return the best `first` places of a ranking (None: all) as candidates, best first, with data from the map file.
     Raises PlaceError if one of them cannot be read, was left out before, or has changed its position since the index
     was loaded. The place is left out from then on."""
@@ -343,7 +343,7 @@ def _largest(scores: Singles, count: int) -> Ints:
     return np.argpartition(-scores, count)[:count] if count < len(scores) else np.arange(len(scores))
 
 
-def _require_there(place_map: ReadMap, index: PlaceIndex, slot: int, point: LatLon | None) -> None:
+def _require_there(place_map: PlaceMap, index: PlaceIndex, slot: int, point: LatLon | None) -> None:
     """Raise PlaceError unless `point`, the position in the file, is that in the index (None: no position)."""
     lat_deg = float(index.lat_deg[slot])
     if (None if math.isnan(lat_deg) else (lat_deg, float(index.lon_deg[slot]))) != point:

@@ -83,9 +83,9 @@ class LoggedQuery:
 class LoggedFlight:
     """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `remarks` are the
     lines with a text for people: time, kind and text. `unusable` is the number of frames that never became queries,
-    `learnt` the positions of places learnt in flight, `between` the lines of fixes sent between matches, `tiles` the
-    quad keys of those that were in RAM. Times are seconds after its start; it is `span_s` long. `truth` names the
-    positions by which matches are judged, and `notes` are sentences for the head of its page."""
+    `learnt` the positions of places learnt in flight, `between` the lines of fixes sent between matches. Times are
+    seconds after its start; it is `span_s` long. `truth` names the positions by which matches are judged, and `notes`
+    are sentences for the head of its page."""
 
     path: Path = Path()
     truth: str = "GPS"
@@ -97,7 +97,6 @@ class LoggedFlight:
     unusable: int = 0
     learnt: list[Point] = field(default_factory=list)
     between: list[dict[str, Any]] = field(default_factory=list)
-    tiles: set[str] = field(default_factory=set)
     span_s: float = 0.0
 
 
@@ -140,8 +139,6 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
                 flight.learnt += filter(None, [point(line, "position")])
             case "between":
                 flight.between += [line] if point(line) else []
-            case "tiles":
-                flight.tiles.update(map(str, held) if isinstance(held := line.get("held"), list) else ())
             case _:
                 flight.remarks.append((t_s, str(kind), _text_of(line)))
     return flight

@@ -1,7 +1,7 @@
 """Draws the ground as seen from above: the places of the map with the ground that their pictures show, and what lies
 over them."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,7 +11,6 @@ import numpy as np
 from edgevpr.core.geodesy import axes_of, offset_m
 from edgevpr.core.types import Place
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.tilemap import TileMap
 from edgevpr.review.html import Points, data_url, path
 from edgevpr.review.logged import Point
 from edgevpr.review.mosaic import Mosaic
@@ -41,11 +40,9 @@ class Layer:
     form: Form = "dots"
 
 
-def read_ground(path: str | Path, tiles: Collection[str] = ()) -> list[Place]:
-    """Read the places of the map file `path` that have a position; of a folder of maps, those of `tiles`, by their quad
-    keys. Raises EdgevprError for a map that cannot be read, or is damaged."""
-    if Path(path).is_dir():
-        return [place for place in TileMap.open(path).places_in(tiles) if place.position]
+def read_ground(path: str | Path) -> list[Place]:
+    """Read the places of the map file `path` that have a position. Raises EdgevprError for a map that cannot be
+    read, or is damaged."""
     with PlaceMap.open(path) as place_map:
         return [place for place in place_map.places() if place.position]
 

@@ -230,8 +230,6 @@ class Supposed(Playback):
             return self._frame()
         if kind == "ended":
             return self._has_ended
-        if kind == "tile":
-            return True  # the flight waits until it is loaded
         if kind in _CLOCKS:
             times_s = {"mono_s": self.t_s, "wall_s": self.t_s, "utc_s": self.t_s + self._utc_ahead_s}
             return times_s.get(kind, 0.0)

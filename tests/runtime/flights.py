@@ -10,7 +10,6 @@ from pictures import textured
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.config import Config, load_config
-from edgevpr.core.types import NO_TAPE
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
@@ -22,7 +21,6 @@ from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.notifier import Notifier
-from edgevpr.runtime.flight.tiles import open_tiles
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -81,8 +79,6 @@ class Flight:
             if start:
                 flight_log.write("start", **start)
             notifier, autopilot = Notifier(flight_log, self.link), None
-            if tiles := open_tiles(self.recogniser, self.config.match, notifier, NO_TAPE):
-                opened.callback(tiles.close)
             if self.link:
                 navigator = self.navigator
                 if navigator is None:  # of a real link it is the listener from the start
@@ -93,7 +89,6 @@ class Flight:
             parts = FlightParts(
                 recogniser=self.recogniser,
                 learner=self.learner,
-                tiles=tiles,
                 source=source,
                 link=self.link,
                 autopilot=autopilot,

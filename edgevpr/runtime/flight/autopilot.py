@@ -12,7 +12,6 @@ from edgevpr.mavlink import messages
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix
-from edgevpr.places.tilemap import own_number
 from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.navigator import Navigator
@@ -140,7 +139,7 @@ class ToAutopilot:
     def _tell(self, event: Recognition, used_mah: float) -> None:
         now_s = self._clock.mono_s()
         if event.accepted and (best := event.best):
-            place, score = own_number(best.place.place_id), best.match.score
+            place, score = best.place.place_id, best.match.score
             found = messages.make_named_values(
                 now_s, vpr_place=place, vpr_score=score, vpr_conf=combine_confidence(event)
             )

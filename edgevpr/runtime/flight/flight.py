@@ -37,7 +37,6 @@ from edgevpr.runtime.flight.startup import (
     measure_speed,
     open_map,
 )
-from edgevpr.runtime.flight.tiles import open_tiles
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Surveyor, Tally
 from edgevpr.runtime.preflight.pick import limit_candidates
@@ -91,7 +90,6 @@ class Flight:
             self._surveyor.update,
             self._log_event,
             self._learn,
-            *([parts.tiles.update] if parts.tiles else []),
         )
 
     @classmethod
@@ -116,8 +114,6 @@ class Flight:
                 text = "%s is a recording: its fixes, and what it learns, do not say where you are"
                 _log.warning(text, config.source.uri)
             notifier = Notifier(flight_log, link)
-            if tiles := open_tiles(recogniser, config.match, notifier, io.tape):
-                stack.callback(tiles.close)
             autopilot = None
             if link:
                 cores = io.board.cores
@@ -130,7 +126,6 @@ class Flight:
             parts = FlightParts(
                 recogniser=recogniser,
                 learner=learner,
-                tiles=tiles,
                 source=source,
                 link=link,
                 ground=ground,

@@ -33,7 +33,6 @@ from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.flight.recording import Recording
 from edgevpr.runtime.flight.status import StatusFile, default_path
-from edgevpr.runtime.flight.tiles import Tiles
 from edgevpr.runtime.recognise.learn import Learner, check_positions
 from edgevpr.runtime.recognise.opening import has_map
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -125,7 +124,6 @@ class FlightParts:
 
     recogniser: Recogniser
     learner: Learner | None = None
-    tiles: Tiles | None = None
     source: Source
     link: Link | None = None
     ground: Link | None = None

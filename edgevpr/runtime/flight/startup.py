@@ -20,8 +20,6 @@ from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import FIX_MAX_AGE_S, Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import MapIdentity, read_identity
-from edgevpr.places.readmap import ReadMap
-from edgevpr.places.tilemap import TileMap
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import OwnMemory, QueryMeter
 from edgevpr.runtime.flight.flightio import FlightIO
@@ -113,7 +111,7 @@ def apply_recorded_rate(config: Config, steps_s: Sequence[float]) -> Config:
     return replace(config, source=replace(config.source, rate_hz=usual_hz))
 
 
-def find_origin(place_map: ReadMap, source: SourceConfig) -> Position | None:
+def find_origin(place_map: PlaceMap, source: SourceConfig) -> Position | None:
     """Return the first position of a map (None: it has none), at the altitude of the ground: the median, over the first
     places, of the camera's altitude less its height by footprint and lens. The altitude is None if one is unknown."""
     first, altitudes_m, lens = None, [], lens_of(source)
@@ -155,7 +153,7 @@ def log_start(config: Config, io: FlightIO, recogniser: Recogniser, found: Outlo
     return {**fields, "recording": io.recording, "decided": decided}
 
 
-def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map: ReadMap) -> dict[str, Any]:
+def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map: PlaceMap) -> dict[str, Any]:
     """Return the fields of a flight log's first line (kind "start"): all that a flight depends on but what comes in."""
     loaded = {name: getattr(sys.modules.get(name), "__version__", None) for name in _LIBRARIES}
     return {
@@ -173,11 +171,8 @@ def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map
     }
 
 
-def _identity(place_map: ReadMap) -> MapIdentity | None:
+def _identity(place_map: PlaceMap) -> MapIdentity | None:
     """Return the identity of a map; None if it has no places yet, or cannot be identified."""
-    if isinstance(place_map, TileMap):
-        return place_map.identity()
-    assert isinstance(place_map, PlaceMap)
     try:
         found = read_identity(place_map)
         return found if found.places else None

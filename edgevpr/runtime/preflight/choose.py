@@ -61,22 +61,15 @@ class Accuracy:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demand:
     """Requirements of a flight: places in RAM, queries per second, MB of RAM for the map's index, the direction of the
-    camera ("nadir" or "forward"; None: forward), and the most places that a query is compared with (None: all)."""
+    camera ("nadir" or "forward"; None: forward)."""
 
     places: int
     rate_hz: float
     budget_mb: float
     camera: str | None = None
-    searched: int | None = None
-
-    @property
-    def compared(self) -> int:
-        """The number of places that a query is compared with."""
-        return self.places if self.searched is None else min(self.searched, self.places)
 
     def __str__(self) -> str:
-        few = f" (some {self.compared} of them compared with a query)" if self.compared < self.places else ""
-        return f"{self.places} places{few}"
+        return f"{self.places} places"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,7 +175,7 @@ def check_fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
     """
     map_ram_mb = costs.ram_bytes_per_place * demand.places / 1e6
     process_ram_mb = costs.process_mb + map_ram_mb
-    query = costs.encode + costs.match(demand.compared)
+    query = costs.encode + costs.match(demand.places)
     reachable_hz = min(1 / query.wall_s, board.cores * board.cpu_share / query.cpu_s)
     shortfalls = []
     if map_ram_mb > demand.budget_mb:

@@ -99,7 +99,7 @@ def estimate(board: Board, here: Board, trials: Iterable[Trial], plan: FlightPla
 
 
 def _estimate_option(option: Option, board: Board, plan: FlightPlan) -> TechniqueEstimate:
-    costs, match = option.costs, option.costs.match(plan.compared)
+    costs, match = option.costs, option.costs.match(plan.places)
     query = query_cost(costs.encode, match, board, plan.pack, plan.regulator_efficiency, rss_mb=costs.process_mb)
     flight_s = 60 * plan.flight_min
     marginal_mah = queries_ah(min(plan.rate_hz, option.fit.reachable_hz) * flight_s, query.marginal_mah)

@@ -21,7 +21,7 @@ from edgevpr.runtime.preflight.choose import (
 )
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe, ram_bytes
 from edgevpr.runtime.preflight.scale import count_work, on_board
-from edgevpr.runtime.recognise.opening import budget_mb, count_searched_places, made_for, places_in_ram
+from edgevpr.runtime.recognise.opening import budget_mb, made_for
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import find_weights
 
@@ -82,7 +82,7 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
     parts = ["the map was built with it" if config.technique is None else "it was named"]
     if weights := find_weights(technique.spec):
         parts.append(f"weights of {weights}")
-    if left_out := len(recogniser.place_map) - places_in_ram(recogniser):
+    if left_out := len(recogniser.place_map) - len(recogniser.index):
         parts.append(f"{left_out} places are left to the map file")
     if candidates != usual:
         parts.append(f"{candidates} candidates instead of {usual}")
@@ -100,11 +100,10 @@ def _find_affordable(recogniser: Recogniser, config: Config) -> tuple[Option, st
         candidates=recogniser.candidates if spec.fine else costs.candidates,
     )
     demand = Demand(
-        places=places_in_ram(recogniser),
+        places=len(recogniser.index),
         rate_hz=config.source.rate_hz or board.rate_hz,
         budget_mb=budget_mb(config, board),
         camera=_camera(spec),
-        searched=count_searched_places(recogniser),
     )
     option, *fewer = list_options(board, _label(spec), spec.name, costs, demand)
     if option.fit.misfit and config.match.candidates is None and recogniser.sequence == 1:

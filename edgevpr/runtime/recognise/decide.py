@@ -2,7 +2,7 @@
 locate the aircraft by it, and decide."""
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,7 +15,7 @@ from edgevpr.core.types import Candidate
 from edgevpr.frames.level import Levelled
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers
-from edgevpr.places.readmap import ReadMap
+from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import (
     NOTHING,
     Expectation,
@@ -65,15 +65,13 @@ _MAX_SAME_GROUND = 12  # places that may show the same ground: so many overlap o
 class Matcher:
     """What encoded frames are searched in, and how: an index, the rule for accepting its matches, and the search over
     sequences of queries (None: each query is ranked alone). They belong together: another form of the vectors in RAM
-    gives other scores, and so needs other limits. `layers` are those of the index (None: those of the map). Of an index
-    of several maps, `rule_of` gives the rule for a place by its number (None: `rule`). `follows`: the flight is
-    followed; not where the index is a part of the map in which the aircraft need not be."""
+    gives other scores, and so needs other limits. `layers` are those of the index (None: those of the map).
+    `follows`: the flight is followed; not where the index is a part of the map in which the aircraft need not be."""
 
     index: PlaceIndex = field(kw_only=False)
     rule: AcceptRule = field(kw_only=False)
     search: SequenceSearch | None = field(default=None, kw_only=False)
     layers: Layers | None = None
-    rule_of: Callable[[int], AcceptRule] | None = None
     follows: bool = True
 
 
@@ -93,7 +91,7 @@ class Verifier:
     """Compares the landmarks of one query, which are computed when first needed, with those of places. All methods
     raise PlaceError if the landmarks of a place cannot be read; the place is then left out."""
 
-    def __init__(self, encoder: FrameEncoder, picture: Levelled, index: PlaceIndex, place_map: ReadMap) -> None:
+    def __init__(self, encoder: FrameEncoder, picture: Levelled, index: PlaceIndex, place_map: PlaceMap) -> None:
         self._encoder, self._spec = encoder, encoder.technique.spec
         self._picture, self._index, self._map = picture, index, place_map
 
@@ -191,7 +189,7 @@ class Decider:
     """Decides on rankings of the places of a `matcher`. `accuracy_m` is that of a place's position as a fix, and
     `learnt_s` has the times at which places were learnt in this flight, by their numbers."""
 
-    place_map: ReadMap
+    place_map: PlaceMap
     technique: Technique
     matcher: Matcher
     settings: WalkSettings
@@ -214,14 +212,14 @@ class Decider:
     ) -> Decision:
         """Judge the best place of a ranking by its landmarks, the places around it, and the flight so far. If the
         flight makes another place more likely, judge that one."""
-        index, search, followed = self.matcher.index, self.matcher.search, None
-        rule, (best, found) = self._find_rule(ranking), self._examine(ranking, query, verifier)
+        index, rule, search, followed = self.matcher.index, self.matcher.rule, self.matcher.search, None
+        best, found = self._examine(ranking, query, verifier)
         if place_filter and rule.sure and found.evidence:
             with self.meter.step("locate"):
                 followed = place_filter.update(ranking, index, found.evidence, rule.sure, found.where)
             if followed.slot is not None and followed.leads_from(int(ranking.slots[0])):
                 ranking = ranking.promote(followed.slot)
-                rule, (best, found) = self._find_rule(ranking), self._examine(ranking, query, verifier)
+                best, found = self._examine(ranking, query, verifier)
         age_s = query.frame.t_mono_s - self.learnt_s.get(best.place.place_id, -math.inf)
         found = replace(found, is_new=age_s <= NEW_FOR_S, by_flight=followed.confidence if followed else None)
         verdict = judge(found, index, rule, search)
@@ -239,14 +237,9 @@ class Decider:
             verdict=verdict, hints=hints, best=best, findings=found, confidence=confidence, followed=followed
         )
 
-    def _find_rule(self, ranking: Ranking) -> AcceptRule:
-        """Return the rule for the best place of a ranking."""
-        matcher = self.matcher
-        return matcher.rule_of(int(matcher.index.place_ids[ranking.slots[0]])) if matcher.rule_of else matcher.rule
-
     def _examine(self, ranking: Ranking, query: EncodedFrame, verifier: Verifier) -> tuple[Candidate, Findings]:
         """Verify the best place of a ranking by landmarks, locate the aircraft by it, and gather the evidence."""
-        index, spec, step, rule = self.matcher.index, self.technique.spec, self.meter.step, self._find_rule(ranking)
+        index, spec, step, rule = self.matcher.index, self.technique.spec, self.meter.step, self.matcher.rule
         with step("compare"):
             (best,) = named(ranking, index, self.place_map, first=1)
         where = proof = evidence = None

@@ -29,7 +29,7 @@ import numpy as np
 from edgevpr.core.contract import FineMatch, TechniqueSpec
 from edgevpr.core.errors import MapError
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.readmap import ReadMap
+from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking, elsewhere
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Model, prior, select_model
@@ -230,7 +230,7 @@ def compute_share(match: FineMatch) -> float:
     return match.score if match.votes is None else match.votes
 
 
-def read_calibration_for(place_map: ReadMap) -> MapCalibration | None:
+def read_calibration_for(place_map: PlaceMap) -> MapCalibration | None:
     """Return the calibration of a map; None if it has none, or, after a warning in the log, if it is unusable."""
     try:
         text = place_map.calibration

@@ -89,7 +89,6 @@ class RecordedPrior:
     ) -> None:
         self._known, self._heading_within_deg, self._map_height_m = known, heading_within_deg, map_height_m
         self.footprint_m: float | None = None
-        self.area: Reach | None = None
         self.height_ratio = 1.0
         self.looks_again = True
 
@@ -120,11 +119,10 @@ class Prior(RecordedPrior):
 
     `height_ratio` is the height of the camera over that of the map's pictures, by the last accepted match; where
     pictures are scaled by known heights, it is how far these are wrong. `footprint_m` is that of the layer in which the
-    last match was (None: unknown, or its height tells it); the height ratio is relative to it. `area` is where the
-    aircraft was at the last query, a wider one than narrows the search. `looks_again`: a query that is not accepted
-    there is searched at all other heights. `reach_m_s` is the highest speed, m/s (None: positions give no hint),
-    `heading_within_deg` the largest error of a known heading (None: headings give no hint). `is_live` is False for
-    recorded frames, for which the autopilot's reports do not hold.
+    last match was (None: unknown, or its height tells it); the height ratio is relative to it. `looks_again`: a query
+    that is not accepted there is searched at all other heights. `reach_m_s` is the highest speed, m/s (None: positions
+    give no hint), `heading_within_deg` the largest error of a known heading (None: headings give no hint). `is_live` is
+    False for recorded frames, for which the autopilot's reports do not hold.
     """
 
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
@@ -158,9 +156,6 @@ class Prior(RecordedPrior):
             if (since_s := abs(frame.t_mono_s - t_s)) <= _MAX_FIX_AGE_S:
                 least_m = max(RECORDED_REACH_M, _AREA_PLACES * margin_m)
                 reach = Reach(area.position, least_m + area.radius_m + DEFAULT_MAX_SPEED_M_S * since_s)
-        self.area = reach
-        if known and reach is None:
-            self.area = Reach(known[0], margin_m + DEFAULT_MAX_SPEED_M_S * abs(frame.t_mono_s - known[1]))
         heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
         self._known_hints = _narrowing(reach, None if self._heading_within_deg is None else heading_deg, index)
         return self._known_hints.select(*self._trusted) if self._known_hints and self._uses_hints else None

@@ -13,9 +13,7 @@ from edgevpr.frames.mask import Mask, load_mask
 from edgevpr.places.index import GrowingIndex, PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove, require_regular
-from edgevpr.places.readmap import ReadMap
 from edgevpr.places.sequence import bytes_beside_place, make_sequence_search, sequence_length
-from edgevpr.places.tilemap import TileMap
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
@@ -56,25 +54,12 @@ def open_recogniser(
     """
     if config.map is None:
         raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
-    if is_tiled := Path(config.map).is_dir():
-        if not narrowed:
-            raise UsageError(
-                f"{config.map} is a folder, over whose maps `edgevpr run` flies: elsewhere name one map of them, or "
-                "make one of a part by `edgevpr map subset`."
-            )
-        if config.match.sequence is not None:
-            raise UsageError(f"{config.map} is a folder of maps, in which no sequences are matched: leave them out.")
-    place_map = TileMap.open(config.map) if is_tiled else PlaceMap.open(config.map)
+    place_map = PlaceMap.open(config.map)
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
         technique = create_technique(place_map, config.technique, _wanted(config), board)
         budget_bytes, beside_bytes = _ram(config, board, technique)
-        if isinstance(place_map, TileMap):
-            place_map.make_room(technique, budget_bytes)
-            place_map.take(place_map.load(0))
-            index = place_map.ram.of(place_map.ram.tiles)
-        else:
-            index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
+        index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
         prior = RecordedPrior(known, technique.spec.heading_within_deg)
         if narrowed:
             prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
@@ -82,18 +67,6 @@ def open_recogniser(
         recogniser = _recogniser(config, technique, place_map, index, meter, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser
-
-
-def places_in_ram(recogniser: Recogniser) -> int:
-    """Return the number of places in RAM; of tiles, the most that can be."""
-    place_map = recogniser.place_map
-    return place_map.ram.capacity if isinstance(place_map, TileMap) else len(recogniser.index)
-
-
-def count_searched_places(recogniser: Recogniser) -> int:
-    """Return the most places that a query is compared with: all in RAM or, of tiles, those of a few."""
-    place_map, in_ram = recogniser.place_map, places_in_ram(recogniser)
-    return min(place_map.most_searched, in_ram) if isinstance(place_map, TileMap) else in_ram
 
 
 def open_learning(
@@ -169,7 +142,7 @@ def made_for(threads: int | None, name: str, settings: Settings | None = None) -
 
 
 def create_technique(
-    place_map: ReadMap, name: str | None = None, settings: Settings | None = None, board: Board | None = None
+    place_map: PlaceMap, name: str | None = None, settings: Settings | None = None, board: Board | None = None
 ) -> Technique:
     """Make the technique that a map was built with, for `board`.
 
@@ -198,7 +171,7 @@ def create_technique(
     return technique
 
 
-def warn_of_other_pictures(place_map: ReadMap, mask: Mask | None, lens: str | None) -> None:
+def warn_of_other_pictures(place_map: PlaceMap, mask: Mask | None, lens: str | None) -> None:
     """Warn if the places of a map, which remain usable, were made with another `mask`, or if their pictures were
     straightened by a calibration and those to come are not (`lens` None)."""
     if not len(place_map):
@@ -218,7 +191,7 @@ def warn_of_other_pictures(place_map: ReadMap, mask: Mask | None, lens: str | No
 def _recogniser(
     config: Config,
     technique: Technique,
-    place_map: ReadMap,
+    place_map: PlaceMap,
     index: PlaceIndex,
     meter: QueryMeter,
     *,

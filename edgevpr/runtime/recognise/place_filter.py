@@ -15,7 +15,7 @@ from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import layers_of
-from edgevpr.places.readmap import ReadMap
+from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.belief import (
     DEFAULT_MAX_SPEED_M_S,
@@ -65,7 +65,7 @@ class _Survey:
     """Measures of a map of so many `places`: the `origin` of the belief's plane (None: the map has no positions), the
     `scale`, and `spread`, the standard deviation of the position of a place without a pose."""
 
-    def __init__(self, place_map: ReadMap, index: PlaceIndex) -> None:
+    def __init__(self, place_map: PlaceMap, index: PlaceIndex) -> None:
         known = ~np.isnan(index.lat_deg)
         self.places, self.origin = len(index), None
         self.scale, self.spread = MapScale(spacing=1.0, near=_NEAR_PLACES, is_ordinal=True), 1.0
@@ -102,7 +102,7 @@ class PlaceFilter:
     times are those of the recording.
     """
 
-    def __init__(self, place_map: ReadMap, *, max_speed_m_s: float | None, is_live: bool) -> None:
+    def __init__(self, place_map: PlaceMap, *, max_speed_m_s: float | None, is_live: bool) -> None:
         self._map, self._max_speed_m_s, self._is_live = place_map, max_speed_m_s or DEFAULT_MAX_SPEED_M_S, is_live
         self._survey: _Survey | None = None  # of the map, once it has a place
         self._belief: Belief | None = None

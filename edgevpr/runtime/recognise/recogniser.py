@@ -15,12 +15,12 @@ from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.level import Mount, View
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import layers_of
-from edgevpr.places.readmap import ReadMap
+from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation, Ranking, compare, scan, together
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Decider, Decision, Matcher, Verifier, WalkSettings
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, describe_error
-from edgevpr.runtime.recognise.hints import Reach, RecordedPrior, to_expectation
+from edgevpr.runtime.recognise.hints import RecordedPrior, to_expectation
 from edgevpr.runtime.recognise.judge import NEW_FOR_S, Verdict, says_nothing
 from edgevpr.runtime.recognise.levelling import with_picture_heading
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
@@ -42,7 +42,7 @@ class Recogniser:
     def __init__(
         self,
         encoder: FrameEncoder,
-        place_map: ReadMap,
+        place_map: PlaceMap,
         matcher: Matcher,
         meter: QueryMeter,
         *,
@@ -97,11 +97,6 @@ class Recogniser:
     def sequence(self) -> int:
         """Number of queries that are matched together."""
         return self.matcher.search.length if self.matcher.search else 1
-
-    @property
-    def area(self) -> Reach | None:
-        """The area in which the aircraft was at the last query, as far as it is known by other means than its place."""
-        return self._prior.area
 
     @property
     def measures_strides(self) -> bool:
