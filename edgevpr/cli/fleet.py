@@ -12,14 +12,13 @@ from edgevpr.core.text import progress
 
 _PLACES_PER_TILE = 10_000
 _MAX_SHOWN = 10  # problems: a store that is away causes the same one for each tile
-_OF_PASSES = ("merged", "faded", "changed")  # of several flights over the same ground
 
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
     fleet = group(commands, "fleet", "build maps too large for one aircraft")
     build = command(fleet, "build", fleet_build, "build one map per tile, with several workers")
-    build.add_argument("out", metavar="MAPS", help="folder of the maps and of their index; resume if it exists")
+    build.add_argument("out", metavar="MAPS", help="folder of the maps; resume if it exists")
     build.add_argument(
         "--images",
         metavar="SOURCE",
@@ -41,8 +40,8 @@ def add(commands: Any) -> None:
 def fleet_build(args: Namespace) -> int:
     """Run `fleet build`: make or continue a folder of maps, and print what was done."""
     try:
-        from edgevpr.core.quadkeys import maps_in
         from edgevpr.fleet import building
+        from edgevpr.fleet.grid import parse_zoom
         from edgevpr.fleet.photos import list_photos
         from edgevpr.fleet.worker import FleetOrder
     except ModuleNotFoundError as error:
@@ -51,7 +50,8 @@ def fleet_build(args: Namespace) -> int:
     config, out = load_command_config(args, args.config), Path(args.out)
     if (args.images is None) == (args.orthophoto is None):
         raise UsageError("Give either --images (photographs of flights) or --orthophoto: maps are made of one of them.")
-    zoom, camera = next(map(len, maps_in(out)), None), config.source.camera
+    zoom = next((parse_zoom(path.stem) for path in building.list_maps(out)), None)
+    camera = config.source.camera
     without_position = 0
     if args.orthophoto:
         tasks, camera = building.tasks_of_orthophoto(parse_cuttings(args), args.places_per_tile, zoom), "nadir"
@@ -62,23 +62,21 @@ def fleet_build(args: Namespace) -> int:
     out = out.absolute()
     order = FleetOrder(out=out, config=config, camera=camera, refine=args.refine, calibrate=args.calibrate)
     done = list(building.build(order, tasks, args.scheduler, args.workers, progress))
-    tiles = [each.tile for each in done if each.tile]
+    mapped = [each for each in done if each.places]
     unusable = [text for each in done for text in each.unusable]
-    problems = {each.key: each.problem for each in done if each.problem}
+    problems = {each.name: each.problem for each in done if each.problem}
     result: dict[str, Any] = {
         "maps": str(out),
-        "tiles": len(tiles),
+        "tiles": len(mapped),
         "mapped_now": sum(each.is_new for each in done),
-        "places": sum(tile.places for tile in tiles),
-        "not_calibrated": sum(tile.expected is None for tile in tiles),
-        **{name: sum(getattr(tile, name) for tile in tiles) for name in _OF_PASSES},
+        "places": sum(each.places for each in mapped),
+        "not_calibrated": sum(not each.is_calibrated for each in mapped),
         "without_position": without_position,
         "unusable": unusable,
         "problems": problems,
     }
-    # The keys of new tiles only: the index has the rest, and there may be thousands.
     text = {**result, "unusable": unusable[:_MAX_SHOWN], "problems": dict(list(problems.items())[:_MAX_SHOWN])}
-    show({**result, "new": [each.key for each in done if each.is_new]}, args.json, lines_of(text))
+    show({**result, "new": [each.name for each in done if each.is_new]}, args.json, lines_of(text))
     if more := max(len(unusable), len(problems), _MAX_SHOWN) - _MAX_SHOWN:
         report(f"{more} more problems are not shown: --json has all")
     return 1 if problems or unusable else 0

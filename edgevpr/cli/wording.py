@@ -26,7 +26,6 @@ _OTHER_DAY = (
     "height known (3 to 8 of twelve in a line), and 23 % without (0 to 6); `match` of pictures that `simulate flight` "
     "takes of another orthophoto says it of this ground"
 )
-_SEAMS = 1 / 8  # share of places with one: straight kerbs look like seams in 2 of 18 pictures of one set
 _SHOWN = 20  # differences of a replay at most
 
 
@@ -44,8 +43,6 @@ def format_build(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
         yield f"  left out: {result.without_data} without data, {result.says_nothing} with too little texture"
     if result.white:
         yield f"  {result.white} of the places are white over a third or more: clouds and snow do not stay"
-    if result.seams > _SEAMS * result.tried_for_seams:
-        yield f"  {result.seams} of {result.tried_for_seams} places have straight seams: fewer of them are found"
     if result.of_low_quality:
         yield f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps"
     if made.refined:

@@ -6,8 +6,9 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from edgevpr.core.arrays import Array, Degrees, Doubles, Floats, LatLon
+from edgevpr.core.arrays import Array, Bools, Degrees, Doubles, Floats, LatLon
 
+Extent = tuple[float, float, float, float]  # south, west, north, east in degrees
 D = TypeVar("D", float, Doubles, Floats)
 EARTH_RADIUS_M = 6_371_009.0  # mean radius: over a few kilometres a sphere is within 0.5 % of the ellipsoid
 
@@ -54,13 +55,29 @@ def moved(lat_deg: float, lon_deg: float, east_m: float, north_m: float) -> tupl
     return lat_deg + north_deg, shorter_deg(lon_deg + east_deg)
 
 
-def compute_extent(points: Iterable[LatLon]) -> tuple[float, float, float, float]:
+def compute_extent(points: Iterable[LatLon]) -> Extent:
     """Return the bounding box of points (lat, lon): south, west, north, east. East is above 180 degrees if the shorter
     way from point to point crosses the antimeridian."""
     lats_deg, lons_deg = zip(*points, strict=True)
     if max(lons_deg) - min(lons_deg) > 180:
         lons_deg = tuple(lon_deg % 360 for lon_deg in lons_deg)
     return min(lats_deg), min(lons_deg), max(lats_deg), max(lons_deg)
+
+
+def widen_extent(extent_deg: Extent, margin_m: float) -> Extent:
+    """Return the bounding box of what lies in `extent_deg` or within `margin_m` metres of it; east is above 180 degrees
+    if it crosses the antimeridian."""
+    south, west, north, east = extent_deg
+    (south, west), (north, east) = moved(south, west, -margin_m, -margin_m), moved(north, east, margin_m, margin_m)
+    return south, west, north, west + (east - west) % 360
+
+
+def is_in_extent(extent_deg: Extent, lat_deg: Doubles, lon_deg: Doubles) -> Bools:
+    """Return bool (N,), True for the positions in degrees, (N,) each, that lie in a bounding box: not for those on its
+    northern and eastern edge, which are its neighbours'."""
+    south, west, north, east = extent_deg
+    is_between = [(lon_deg + turn_deg >= west) & (lon_deg + turn_deg < east) for turn_deg in (-360, 0, 360)]
+    return np.asarray((lat_deg >= south) & (lat_deg < north) & np.any(is_between, axis=0))
 
 
 def axes_of(up_deg: float) -> Doubles:

@@ -11,18 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from edgevpr.core.errors import MapBusyError, MapError, UsageError
-from edgevpr.core.quadkeys import (
-    extent_around,
-    in_extent,
-    keys_over,
-    maps_in,
-    tile_keys,
-    zoom_of_places,
-    zoom_of_spacing,
-)
-from edgevpr.fleet import index
-from edgevpr.fleet.index import Tile, find_tile
+from edgevpr.core.errors import MapBusyError, UsageError
+from edgevpr.core.geodesy import is_in_extent, widen_extent
+from edgevpr.fleet.grid import Tile, list_tiles, locate, parse_zoom, zoom_of_places, zoom_of_spacing
 from edgevpr.fleet.photos import Photos
 from edgevpr.fleet.worker import MARGIN_M, TECHNIQUE, DoneTile, FleetOrder, TileTask, build_tile
 from edgevpr.mapmaking.making import Cuttings
@@ -48,13 +39,14 @@ def tasks_of_photos(photos: Photos, places_per_tile: int, zoom: int | None) -> t
     lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points.values()]).T
     zoom = zoom_of_places(lat_deg, lon_deg, places_per_tile) if zoom is None else zoom
     uris, northwards, tasks = list(points), np.argsort(lat_deg), []
-    keys = tile_keys(lat_deg, lon_deg, zoom)
-    for key in np.unique(keys).tolist():
-        extent_deg = extent_around(key, MARGIN_M)
+    squares = locate(lat_deg, lon_deg, zoom)
+    for square in np.unique(squares, axis=0):
+        tile = Tile(zoom, *square.tolist())
+        extent_deg = widen_extent(tile.extent_deg, MARGIN_M)
         near = northwards[slice(*np.searchsorted(lat_deg, extent_deg[::2], sorter=northwards))]
-        near = np.sort(near[in_extent(extent_deg, lat_deg[near], lon_deg[near])])
-        inside = frozenset(uris[at] for at in near[keys[near] == key])
-        tasks.append(TileTask(key=key, photos={uris[at]: photos[uris[at]] for at in near}, inside=inside))
+        near = np.sort(near[is_in_extent(extent_deg, lat_deg[near], lon_deg[near])])
+        inside = frozenset(uris[at] for at in near[(squares[near] == square).all(axis=1)])
+        tasks.append(TileTask(tile=tile, photos={uris[at]: photos[uris[at]] for at in near}, inside=inside))
     return tasks, len(photos) - len(points)
 
 
@@ -64,10 +56,16 @@ def tasks_of_orthophoto(cuttings: Cuttings, places_per_tile: int, zoom: int | No
     if zoom is None:
         if not cuttings.spacing_m > 0:  # false for NaN
             raise UsageError(f"--spacing-m is {cuttings.spacing_m:g}: give more than 0.")
-        zoom = zoom_of_spacing(
-            (extent_deg[0] + extent_deg[2]) / 2, cuttings.spacing_m, places_per_tile / np.size(cuttings.footprint_m)
-        )
-    return [TileTask(key=key, cuttings=replace(cuttings, tile=key)) for key in keys_over(extent_deg, zoom)]
+        zoom = zoom_of_spacing(cuttings.spacing_m, places_per_tile / np.size(cuttings.footprint_m))
+    return [
+        TileTask(tile=tile, cuttings=replace(cuttings, tile_deg=tile.extent_deg))
+        for tile in list_tiles(extent_deg, zoom)
+    ]
+
+
+def list_maps(folder: Path) -> list[Path]:
+    """Return the maps of tiles in a folder."""
+    return sorted(path for path in folder.glob("*.gpkg") if parse_zoom(path.stem) is not None)
 
 
 def build(
@@ -78,28 +76,21 @@ def build(
     shown: Callable[[Iterable[Any], int, str], Iterable[Any]],
 ) -> Iterator[DoneTile]:
     """Map the tiles of `tasks` by the workers of the Dask `scheduler` (None: by `workers` of this computer; None: one a
-    core), and write the index. Yields what became of each. `shown` shows progress. Raises EdgevprError."""
+    core). Yields what became of each. `shown` shows progress. Raises EdgevprError."""
     from dask.distributed import as_completed
 
     order.out.mkdir(parents=True, exist_ok=True)
     with _alone(order.out), _client(scheduler, workers) as client:
         _require_alike(order)
-        tiles: dict[str, Tile] = {}
-        futures = {client.submit(build_tile, task, order, pure=False): task.key for task in tasks}
-        try:
-            for future in shown(as_completed(futures), len(futures), "tiles"):
-                key = futures.pop(future)  # what nobody holds is not done again where the worker that has it dies
-                try:
-                    done = future.result()
-                except Exception as error:  # a task returns what edgevpr can say: this is a worker's or Dask's
-                    done = DoneTile(key=key, problem=_sentence(error))
-                del future
-                if done.tile:
-                    tiles[done.tile.key] = done.tile
-                yield done
-        finally:
-            paths = maps_in(order.out)
-            index.write(order.out, (tiles[key] if key in tiles else find_tile(path) for key, path in paths.items()))
+        futures = {client.submit(build_tile, task, order, pure=False): task.tile.name for task in tasks}
+        for future in shown(as_completed(futures), len(futures), "tiles"):
+            name = futures.pop(future)  # what nobody holds is not done again where the worker that has it dies
+            try:
+                done = future.result()
+            except Exception as error:  # a task returns what edgevpr can say: this is a worker's or Dask's
+                done = DoneTile(name=name, problem=_sentence(error))
+            del future
+            yield done
 
 
 @contextmanager
@@ -124,8 +115,7 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator["Client"]:
     """Connect to a scheduler, or start workers here. Raises UsageError if there is none, or none that can be used."""
     from dask.distributed import Client
 
-    for name in ("distributed", "pyogrio"):  # they log each connection, and lost ones with a traceback
-        logging.getLogger(name).setLevel(logging.CRITICAL)
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it logs lost connections with a traceback
     own = {"n_workers": workers, "threads_per_worker": 1, "silence_logs": logging.CRITICAL, "dashboard_address": ":0"}
     try:
         connected = Client(scheduler, timeout=_CONNECT_S, **({} if scheduler else own))
@@ -142,12 +132,10 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator["Client"]:
 
 def _require_alike(order: FleetOrder) -> None:
     """Raise MapError if a tile in the folder was mapped by another technique than the new ones will be."""
-    wanted = index.technique_text(create(TECHNIQUE, camera_setting(TECHNIQUE, order.camera)).spec)
-    for path in maps_in(order.out).values():
+    wanted = create(TECHNIQUE, camera_setting(TECHNIQUE, order.camera)).spec
+    for path in list_maps(order.out):
         with PlaceMap.open(path) as place_map:
-            found = index.technique_text(place_map.spec)
-        if found != wanted:
-            raise MapError(f"{path} is of {found}, and new tiles would be of {wanted}: map into another folder.")
+            place_map.require(wanted)
 
 
 def _sentence(error: BaseException) -> str:

@@ -17,16 +17,15 @@ import cv2
 from edgevpr import __version__
 from edgevpr.core.config import Config
 from edgevpr.core.errors import EdgevprError, ImageError
-from edgevpr.core.quadkeys import tile_keys
-from edgevpr.fleet.index import Tile, find_tile, path_of
+from edgevpr.core.geodesy import Extent, is_in_extent
+from edgevpr.fleet.grid import Tile
 from edgevpr.fleet.photos import Photos, content_in, gather
 from edgevpr.mapmaking.cuttings import NoPlaceError
 from edgevpr.mapmaking.making import Cuttings, FlownPictures, MapOrder, make_map
-from edgevpr.mapmaking.passes import read_history
 from edgevpr.places.examine import Wanted, positions_in, select
-from edgevpr.places.history import History, drop_places, write_history
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.preflight.pick import camera_setting
+from edgevpr.runtime.recognise.evidence import read_calibration_for
 
 TECHNIQUE = "cohog"
 MARGIN_M = 150.0  # around a tile: pictures from which its own are refined, and told from
@@ -47,10 +46,10 @@ class FleetOrder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TileTask:
-    """A tile to be mapped: its quad key, and what of: `cuttings` of an orthophoto, or `photos`, in the tile and around
-    it, those `inside` by their addresses."""
+    """A `tile` to be mapped, and what of: `cuttings` of an orthophoto, or `photos`, in the tile and around it, those
+    `inside` by their addresses."""
 
-    key: str
+    tile: Tile
     cuttings: Cuttings | None = None
     photos: Photos = field(default_factory=dict)
     inside: frozenset[str] = frozenset()
@@ -58,12 +57,13 @@ class TileTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoneTile:
-    """The end of the task for the tile with the quad key `key`. `tile`: what the index says of it (None: it has no
-    place). `is_new`: its map was made now. `unusable`: sentences about pictures that could not be used. `problem`: why
-    it could not be mapped."""
+    """The end of the task for the tile `name`. `places`: their number in its map (0: it has none). `is_calibrated`: its
+    map is. `is_new`: its map was made now. `unusable`: sentences about pictures that could not be used. `problem`:
+    why it could not be mapped."""
 
-    key: str
-    tile: Tile | None = None
+    name: str
+    places: int = 0
+    is_calibrated: bool = False
     is_new: bool = False
     unusable: tuple[str, ...] = ()
     problem: str | None = None
@@ -73,18 +73,18 @@ def build_tile(task: TileTask, order: FleetOrder) -> DoneTile:
     """Map one tile; a worker runs this."""
     if order.version != __version__:  # a worker that has come later
         problem = f"a worker has edgevpr {__version__}, and {order.version} asks: install the same on all machines"
-        return DoneTile(key=task.key, problem=problem)
+        return DoneTile(name=task.tile.name, problem=problem)
     log = logging.getLogger("edgevpr")
     level_before = log.level
-    log.setLevel(logging.ERROR)  # the index says what a tile lacks
+    log.setLevel(logging.ERROR)  # the command says what the tiles lack
     cv2.setNumThreads(1)  # there is a worker for every core
     try:
         with tempfile.TemporaryDirectory(prefix="edgevpr-tile-") as scratch:
             return _built(task, order, Path(scratch))
     except NoPlaceError:
-        return DoneTile(key=task.key)
+        return DoneTile(name=task.tile.name)
     except EdgevprError as error:  # as text: not every error can travel
-        return DoneTile(key=task.key, problem=str(error))
+        return DoneTile(name=task.tile.name, problem=str(error))
     finally:
         log.setLevel(level_before)
 
@@ -103,7 +103,7 @@ class _Inputs:
     unusable: list[str] = field(default_factory=list)
 
 
-def _of_orthophoto(order: FleetOrder, key: str, cuttings: Cuttings) -> _Inputs:
+def _of_orthophoto(order: FleetOrder, tile_deg: Extent, cuttings: Cuttings) -> _Inputs:
     """Open the ground of a tile. Raises NoPlaceError if it has none."""
     cuttings = replace(cuttings, margin_m=MARGIN_M if order.calibrate else 0.0)
     said = repr(replace(cuttings, orthophoto="", area=None))
@@ -113,7 +113,7 @@ def _of_orthophoto(order: FleetOrder, key: str, cuttings: Cuttings) -> _Inputs:
 
     def inside(place_map: PlaceMap) -> list[int]:
         place_ids, lat_deg, lon_deg = positions_in(place_map)
-        there: list[int] = place_ids[tile_keys(lat_deg, lon_deg, len(key)) == key].tolist()
+        there: list[int] = place_ids[is_in_extent(tile_deg, lat_deg, lon_deg)].tolist()
         return there
 
     return _Inputs(
@@ -143,12 +143,18 @@ def _of_photos(order: FleetOrder, task: TileTask, folder: Path) -> _Inputs:
 
 
 def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
-    target, folder = path_of(order.out, task.key), scratch / "pictures"
-    inputs = _of_orthophoto(order, task.key, task.cuttings) if task.cuttings else _of_photos(order, task, folder)
+    name, folder = task.tile.name, scratch / "pictures"
+    target = order.out / f"{name}.gpkg"
+    if task.cuttings:
+        inputs = _of_orthophoto(order, task.tile.extent_deg, task.cuttings)
+    else:
+        inputs = _of_photos(order, task, folder)
     unusable = inputs.unusable
-    done = DoneTile(key=task.key, unusable=tuple(unusable))
-    if target.exists() and (there := find_tile(target)).inputs_sha256 == inputs.sha256:
-        return replace(done, tile=there)
+    done = DoneTile(name=name, unusable=tuple(unusable))
+    if target.exists():
+        with PlaceMap.open(target) as there:
+            if there.inputs_sha256 == inputs.sha256:
+                return _describe(done, there)
     if lost := _lost(target, inputs.is_named):
         return replace(done, problem=lost)
     if task.photos and not task.inside.intersection(inputs.uris.values()):
@@ -169,25 +175,24 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
         calibrate=order.calibrate,
     )
     make_map(ordered, order.config, report_unusable, lambda items, *_: items)
-    folders = {name: uri.rpartition("/")[0] for name, uri in inputs.uris.items()}
-    history = read_history(whole, inputs.pictures, order.config, folders, inputs.inside) if folders else History()
-
-    def kept(place_map: PlaceMap) -> list[int]:
-        inside = place_map.places(inputs.inside(place_map))
-        return [place.place_id for place in inside if place.source_image not in history.removed]
-
-    if not select(whole, path, kept):
-        return replace(done, unusable=tuple(unusable))
+    done = replace(done, unusable=tuple(unusable))
+    if not select(whole, path, inputs.inside):
+        return done
     with PlaceMap.open_for_adding(path) as place_map:
         place_map.record_inputs(inputs.sha256)
-        write_history(place_map, history)
+        done = _describe(replace(done, is_new=True), place_map)
     unfinished = target.with_name(f".{target.name}.{scratch.name}")
     try:
         shutil.copyfile(path, unfinished)
         unfinished.replace(target)
     finally:
         unfinished.unlink(missing_ok=True)
-    return replace(done, tile=find_tile(target), is_new=True, unusable=tuple(unusable))
+    return done
+
+
+def _describe(done: DoneTile, place_map: PlaceMap) -> DoneTile:
+    """Return the result of a task with what its map holds."""
+    return replace(done, places=len(place_map), is_calibrated=read_calibration_for(place_map) is not None)
 
 
 def _lost(target: Path, is_named: Callable[[str], bool]) -> str | None:
@@ -195,7 +200,7 @@ def _lost(target: Path, is_named: Callable[[str], bool]) -> str | None:
     if not target.exists():
         return None
     with PlaceMap.open(target) as place_map:
-        names = [*(place.source_image for place in place_map.places()), *drop_places(place_map)]
+        names = [place.source_image for place in place_map.places()]
     lost = sorted(name for name in names if not is_named(name))
     if not lost:
         return None

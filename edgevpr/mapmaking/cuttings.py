@@ -15,15 +15,14 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, Image, Ints
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.quadkeys import extent_around, in_extent, ring_around, tile_keys
+from edgevpr.core.geodesy import Extent, is_in_extent, widen_extent
 from edgevpr.core.text import decode_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
-from edgevpr.mapmaking.georaster import WGS84, Extent, local_crs, transform
+from edgevpr.mapmaking.georaster import WGS84, local_crs, transform
 from edgevpr.mapmaking.missions import Area, read_area, shapely
 from edgevpr.mapmaking.orthophoto import Orthophoto
-from edgevpr.mapmaking.seams import WINDOW_PX, has_seam
 from edgevpr.mapmaking.tiles import ground_of
 
 if TYPE_CHECKING:
@@ -40,9 +39,9 @@ _LEAST_PX = 32
 _WHITE = 200  # grey values: the least, and the largest difference of colours
 _COLOURLESS = 30
 _CLOUDY = 1 / 3  # share of a picture that is white: in seven sets without clouds it is at most a sixth
-_TRIED_FOR_SEAMS = 64  # places: it takes a tenth of a second each
 _BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
 _MOST_PLACES = 1_000_000
+_EDGE_MARGIN = 0.01  # of the sides of a box
 _MOST_POINTS = 20 * _MOST_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
 
 
@@ -69,23 +68,18 @@ class Lattice:
 
 class OrthophotoSource(RecordingSource):
     """Gives a frame for each place of the grids `lattices`, one for each footprint: a square of ground. `counts` are
-    those of `MappingResult`: places `without_data` are left out, since more than a tenth of them has none, and if it
-    `tries_seams`, some are tried for seams. `only` are the names of the frames to read (None: all)."""
+    those of `MappingResult`: places `without_data` are left out, since more than a tenth of them has none. `only` are
+    the names of the frames to read (None: all)."""
 
     def __init__(
-        self,
-        orthophoto: Orthophoto,
-        lattices: Sequence[Lattice],
-        *,
-        only: Collection[str] | None = None,
-        tries_seams: bool = True,
+        self, orthophoto: Orthophoto, lattices: Sequence[Lattice], *, only: Collection[str] | None = None
     ) -> None:
         super().__init__(only)
         self._orthophoto, self._lattices = orthophoto, lattices
         self.total = sum(map(len, lattices))
         self.short_name = decode_name(orthophoto.short_name)
-        self.counts = {"without_data": 0, "white": 0, "seams": 0, "tried_for_seams": 0}
-        self._read, self._tries_seams = 0, tries_seams
+        self.counts = {"without_data": 0, "white": 0}
+        self._read = 0
         self._left = ((lattice, at) for lattice in lattices for at in range(len(lattice)))
         variance_m2 = _GEO_REFERENCE_M**2 + (orthophoto.resolution_m / 2) ** 2
         self._covariance_m2 = variance_m2, 0.0, variance_m2
@@ -116,9 +110,6 @@ class OrthophotoSource(RecordingSource):
             self.counts["without_data"] += 1
             return None
         self.counts["white"] += _white(image) > _CLOUDY
-        if self._tries_seams and self._read % max(1, self.total // _TRIED_FOR_SEAMS) == 0:
-            self.counts["tried_for_seams"] += 1
-            self.counts["seams"] += has_seam(*self._orthophoto.as_it_is(position, WINDOW_PX))
         pose = Pose(up_deg=0.0, footprint_m=lattice.footprint_m, covariance_m2=self._covariance_m2, is_surveyed=True)
         return Frame(image=image, name=name, t_mono_s=time.monotonic(), position=position, heading_deg=0.0, pose=pose)
 
@@ -172,10 +163,10 @@ def _white(image: Image) -> float:
 
 def open_cuttings(cuttings: "Cuttings", only: Collection[str] | None) -> OrthophotoSource:
     """Open an orthophoto and choose the places, see `Cuttings.open`."""
-    key, footprints_m = cuttings.tile, _footprints_m(cuttings)
+    tile_deg, footprints_m = cuttings.tile_deg, _footprints_m(cuttings)
     area = read_area(cuttings.area) if cuttings.area else None
-    if area is None and key:
-        area = Area(((ring_around(extent_around(key, cuttings.margin_m)),),), ())
+    if area is None and tile_deg:
+        area = _make_area_around(widen_extent(tile_deg, cuttings.margin_m))
     orthophoto = _open_orthophoto(cuttings, area)
     lattices = [make_lattice(orthophoto, footprint_m, cuttings.spacing_m, area) for footprint_m in footprints_m]
     if (across_px := footprints_m[0] / orthophoto.resolution_m) < _LEAST_PX:
@@ -183,10 +174,17 @@ def open_cuttings(cuttings: "Cuttings", only: Collection[str] | None) -> Orthoph
             f"{orthophoto.name} has {across_px:.0f} pixels along a picture of {footprints_m[0]:g} m, and nothing is "
             f"found with fewer than {_LEAST_PX}: give a sharper one."
         )
-    if key:
-        lattices = [within(lattice, key, cuttings.margin_m) for lattice in lattices]
-    # Seams are those of the whole raster, and to try a place takes longer than to map it.
-    return OrthophotoSource(orthophoto, lattices, only=only, tries_seams=key is None)
+    if tile_deg:
+        lattices = [select_of_tile(lattice, tile_deg, cuttings.margin_m) for lattice in lattices]
+    return OrthophotoSource(orthophoto, lattices, only=only)
+
+
+def _make_area_around(extent_deg: Extent) -> Area:
+    """Return an area a little larger than a bounding box, whose edges are curves in other projections."""
+    south, west, north, east = extent_deg
+    lat_deg, lon_deg = _EDGE_MARGIN * (north - south), _EDGE_MARGIN * (east - west)
+    south, west, north, east = south - lat_deg, west - lon_deg, north + lat_deg, east + lon_deg
+    return Area((([(south, west), (south, east), (north, east), (north, west), (south, west)],),), ())
 
 
 def extent_of_cuttings(cuttings: "Cuttings") -> Extent:
@@ -258,13 +256,13 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
     return Lattice(footprint_m=footprint_m, rows=rows, columns=columns, lat_deg=lat_deg, lon_deg=lon_deg, shape=shape)
 
 
-def within(lattice: Lattice, key: str, margin_m: float) -> Lattice:
-    """Return the places of a grid that lie in the tile with this quad key, or within `margin_m` of it. Raises
+def select_of_tile(lattice: Lattice, tile_deg: Extent, margin_m: float) -> Lattice:
+    """Return the places of a grid that lie in the tile with this bounding box, or within `margin_m` of it. Raises
     NoPlaceError if none is in the tile: each place is in one tile of a zoom."""
-    there = tile_keys(lattice.lat_deg, lattice.lon_deg, len(key)) == key
+    there = is_in_extent(tile_deg, lattice.lat_deg, lattice.lon_deg)
     if not there.any():
-        raise NoPlaceError(f"No place lies in the tile {key}.")
-    there |= in_extent(extent_around(key, margin_m), lattice.lat_deg, lattice.lon_deg)
+        raise NoPlaceError(f"No place lies in the tile {extent_words(tile_deg)}.")
+    there |= is_in_extent(widen_extent(tile_deg, margin_m), lattice.lat_deg, lattice.lon_deg)
     arrays = {name: getattr(lattice, name)[there] for name in ("rows", "columns", "lat_deg", "lon_deg")}
     return replace(lattice, **arrays)
 
@@ -278,7 +276,7 @@ def _require_bounded(count: int, most: int, spacing_m: float) -> None:
         )
 
 
-def extent_words(extent_deg: tuple[float, float, float, float]) -> str:
+def extent_words(extent_deg: Extent) -> str:
     """Format a bounding box (south, west, north, east) for messages."""
     south, west, north, east = extent_deg
     return f"{south:.4f}..{north:.4f} north, {west:.4f}..{east:.4f} east"

@@ -40,7 +40,6 @@ WGS84 = CRS.from_epsg(4326)
 HALF_WORLD_M = math.pi * 6_378_137.0  # of Web Mercator
 
 Pixel = tuple[int, int]  # column and row
-Extent = tuple[float, float, float, float]
 
 
 class GeoRaster:

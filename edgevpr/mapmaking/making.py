@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from edgevpr.core.config import Config
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
+from edgevpr.core.geodesy import Extent
 from edgevpr.core.text import at_work
 from edgevpr.core.types import Frame
 from edgevpr.frames.mask import Mask, load_mask
@@ -71,15 +72,15 @@ class Cuttings:
     `orthophoto`: see `Orthophoto`. `footprint_m`: ground length of a picture's side, or several, each of which gives a
     picture of every place. `spacing_m`: distance between neighbouring places. `area`: file or circle that limits the
     places, see `missions.read_area` (None: the whole orthophoto). `attribution`: the owner's words, which a map keeps
-    (None: none are asked for). `tile`: the quad key of the tile that the places are in, or not more than `margin_m`
-    metres beside (None: all)."""
+    (None: none are asked for). `tile_deg`: the bounding box of the tile that the places are in, or not more than
+    `margin_m` metres beside (None: all)."""
 
     orthophoto: str
     footprint_m: float | Sequence[float]
     spacing_m: float
     area: str | None = None
     attribution: str | None = None
-    tile: str | None = None
+    tile_deg: Extent | None = None
     margin_m: float = 0.0
 
     def open(self, only: Collection[str] | None = None) -> "OrthophotoSource":
@@ -89,7 +90,7 @@ class Cuttings:
 
         return open_cuttings(self, only)
 
-    def extent_deg(self) -> tuple[float, float, float, float]:
+    def extent_deg(self) -> Extent:
         """Return the bounding box of the ground that is cut: (south, west, north, east) in degrees, longitudes perhaps
         beyond the date line. Raises as `open` does."""
         from edgevpr.mapmaking.cuttings import extent_of_cuttings

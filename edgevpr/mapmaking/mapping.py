@@ -124,8 +124,7 @@ class MappingResult:
     closed a gap. `already_here`: frames in the map before. `says_nothing`: frames with too little information.
     `tilted`: frames that are tilted too far to be levelled. `not_memorable`: frames left out because they failed a
     salience criterion. `without_data`: places left out because the orthophoto has no data there. `white`: places cut
-    from it that are white over a third or more. `seams`: places through which a straight seam runs, of the
-    `tried_for_seams`, some of all."""
+    from it that are white over a third or more."""
 
     added: int = 0
     without_position: int = 0
@@ -136,8 +135,6 @@ class MappingResult:
     not_memorable: int = 0
     without_data: int = 0
     white: int = 0
-    seams: int = 0
-    tried_for_seams: int = 0
 
 
 def build_map(

@@ -1,18 +1,18 @@
-"""The part of a map, or of a folder of a fleet's maps, that one flight needs: what lies near its mission."""
+"""The part of a map, or of a folder of maps, that one flight needs: what lies near its mission."""
 
 import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from edgevpr.core.arrays import Bools, Doubles
+from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import MapError, UsageError
-from edgevpr.core.geodesy import offset_m
-from edgevpr.core.quadkeys import extent_around, maps_in
+from edgevpr.core.geodesy import Extent, offset_m, widen_extent
 from edgevpr.mapmaking.missions import Area, shapely
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import Watch, merge, positions_in, select, shrink
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapinfo import read_extent
 from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_text, of_several, read_calibration_for
 
 
@@ -33,11 +33,20 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
     """Make the map `out` of the places of `source`, a map or a folder of tiles, that are within `margin_m` metres of an
     area: as many as fit into `most_bytes` (None: all), the best, spread over the ground. Raises UsageError if there are
     none or none fits, and MapError for a map that cannot be read."""
-    paths, calibrations = _maps_near(source, area, margin_m), list[MapCalibration | None]()
+    south, west, north, east = area.extent_deg
+
+    def project(lat_deg: Doubles, lon_deg: Doubles) -> tuple[Doubles, Doubles]:
+        return offset_m((south + north) / 2, (west + east) / 2, lat_deg, lon_deg)
+
+    ground = area.on_plane(project, margin_m, margin_m)
+    paths, calibrations = (
+        _list_maps_near(source, widen_extent(area.extent_deg, margin_m)),
+        list[MapCalibration | None](),
+    )
 
     def wanted(place_map: PlaceMap) -> list[int]:
         place_ids, lat_deg, lon_deg = positions_in(place_map)
-        there: list[int] = place_ids[_is_near(area, margin_m, lat_deg, lon_deg)].tolist()
+        there: list[int] = place_ids[shapely.contains_xy(ground, *project(lat_deg, lon_deg))].tolist()
         if there:
             calibrations.append(read_calibration_for(place_map))
         return there
@@ -68,30 +77,21 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
     return Subset(maps=len(paths), near=near, places=count, file_bytes=size, is_calibrated=is_calibrated)
 
 
-def _maps_near(source: Path, area: Area, margin_m: float) -> list[Path]:
-    """Return the maps to look into: one map, or of a folder the tiles that may have places near an area."""
+def _list_maps_near(source: Path, near_deg: Extent) -> list[Path]:
+    """Return the maps to look into: one map, or of a folder those whose bounding box touches another."""
     if not source.is_dir():
         return [mapfiles.existing(source)]
-    tiles = maps_in(source)
-    if not tiles:
-        raise MapError(f"{source} is no folder of maps: give one that `edgevpr fleet build` has made.")
-    south, west, north, east = area.extent_deg
-
-    def touches(key: str) -> bool:
-        low, left, high, right = extent_around(key, margin_m)
-        overlaps = (west - left) % 360 <= right - left or (left - west) % 360 <= east - west
-        return overlaps and low <= north and high >= south
-
-    return [path for key, path in tiles.items() if touches(key)]
-
-
-def _is_near(area: Area, margin_m: float, lat_deg: Doubles, lon_deg: Doubles) -> Bools:
-    """Return bool (N,), True for the positions in degrees, (N,) each, in an area or within `margin_m` metres of it: in
-    a hole of it, too. False for NaN."""
-    south, west, north, east = area.extent_deg
-
-    def project(lat_deg: Doubles, lon_deg: Doubles) -> tuple[Doubles, Doubles]:
-        return offset_m((south + north) / 2, (west + east) / 2, lat_deg, lon_deg)
-
-    near: Bools = shapely.contains_xy(area.on_plane(project, margin_m, margin_m), *project(lat_deg, lon_deg))
+    paths = sorted(source.glob("*.gpkg"))
+    if not paths:
+        raise MapError(f"{source} holds no map (*.gpkg): give one that `edgevpr fleet build` has made.")
+    south, west, north, east = near_deg
+    near = []
+    for path in paths:
+        with PlaceMap.open(path) as place_map:
+            extent_deg = read_extent(place_map)
+        if extent_deg:
+            low, left, high, right = extent_deg
+            overlaps = (west - left) % 360 <= right - left or (left - west) % 360 <= east - west
+            if overlaps and low <= north and high >= south:
+                near.append(path)
     return near

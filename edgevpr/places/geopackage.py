@@ -57,21 +57,6 @@ INSERT INTO gpkg_contents (table_name, data_type, identifier, description, srs_i
 INSERT INTO gpkg_geometry_columns VALUES ('places', 'geom', 'POINT', {WGS84}, 0, 0);
 """
 
-# What several flights have said of the same ground (see `history`): tables that a map may lack.
-CHANGES = "geom, from_time, to_time, confidence, from_image, to_image"
-_FID = "fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL"
-HISTORY = (
-    f"CREATE TABLE passes ({_FID}, name TEXT NOT NULL, first_time DATETIME, last_time DATETIME)",
-    f"CREATE TABLE removed ({_FID}, source_image TEXT NOT NULL, place_id INTEGER)",
-    f"""CREATE TABLE changes ({_FID}, geom POINT NOT NULL, from_time DATETIME, to_time DATETIME,
-    confidence DOUBLE NOT NULL, from_image TEXT NOT NULL, to_image TEXT NOT NULL)""",
-    f"""INSERT INTO gpkg_contents (table_name, data_type, identifier, description, srs_id) VALUES
-    ('passes', 'attributes', 'passes', 'flights that were compared', NULL),
-    ('removed', 'attributes', 'removed', 'pictures that are part of another place, or have faded', NULL),
-    ('changes', 'features', 'changes', 'spots where a later flight did not find earlier ground', {WGS84})""",
-    f"INSERT INTO gpkg_geometry_columns VALUES ('changes', 'geom', 'POINT', {WGS84}, 0, 0)",
-)
-
 # A layer's extent grows with every point, in the same transaction.
 GROW_EXTENT = """
 UPDATE gpkg_contents SET last_change = strftime('%Y-%m-%dT%H:%M:%fZ','now'),

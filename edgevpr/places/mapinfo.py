@@ -5,12 +5,11 @@ import math
 from dataclasses import dataclass
 
 from edgevpr.core.contract import TechniqueSpec
+from edgevpr.core.geodesy import Extent
 from edgevpr.places import rows
 from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import sentences
-
-Extent = tuple[float, float, float, float]
 
 _SUMMARY = """
 SELECT count(*), count(geom), total(is_low_quality = 1), count(up_deg),
@@ -59,15 +58,14 @@ class MapIdentity:
 def describe_map(place_map: PlaceMap) -> MapInfo:
     """Return the summary of a map. Raises MapError if it cannot be read."""
     with sentences(place_map.path):
-        summary, extent = (place_map.db.execute(query).fetchone() for query in (_SUMMARY, _EXTENT))
+        summary = place_map.db.execute(_SUMMARY).fetchone()
     places, with_position, of_low_quality, with_pose, var_m2, first, last = summary
-    is_extent = extent and all(isinstance(side, (int, float)) and math.isfinite(side) for side in extent)
     return MapInfo(
         path=str(place_map.path),
         spec=place_map.spec,
         places=places,
         with_position=with_position,
-        extent=extent if with_position and is_extent else None,
+        extent=read_extent(place_map) if with_position else None,
         first_time=first,
         last_time=last,
         of_low_quality=int(of_low_quality),
@@ -77,6 +75,14 @@ def describe_map(place_map: PlaceMap) -> MapInfo:
         attribution=place_map.attribution,
         file_bytes=place_map.path.stat().st_size,
     )
+
+
+def read_extent(place_map: PlaceMap) -> Extent | None:
+    """Return the bounding box that the file states for its places (None: it states none). Raises MapError."""
+    with sentences(place_map.path):
+        extent = place_map.db.execute(_EXTENT).fetchone()
+    is_extent = extent and all(isinstance(side, (int, float)) and math.isfinite(side) for side in extent)
+    return extent if is_extent else None
 
 
 def read_identity(place_map: PlaceMap) -> MapIdentity:

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import overflown
 import pytest
 import rasterio
 from pictures import textured
@@ -29,10 +28,8 @@ from edgevpr.mapmaking.making import Cuttings
 from edgevpr.places.mapfile import PlaceMap
 
 building = pytest.importorskip("edgevpr.fleet.building", reason="needs the extra `fleet`")
-index = pytest.importorskip("edgevpr.fleet.index")
 photos = pytest.importorskip("edgevpr.fleet.photos")
 worker = pytest.importorskip("edgevpr.fleet.worker")
-pyogrio = pytest.importorskip("pyogrio")
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.slow
 PER_TILE = 10
@@ -72,7 +69,7 @@ def mapped(cluster, out, tasks, **more):
 def places_of(folder):
     """The names of the places of all tiles, by the tile."""
     found = {}
-    for path in sorted(folder.glob("[0-3]*.gpkg")):
+    for path in building.list_maps(folder):
         with PlaceMap.open(path) as place_map:
             found[path.stem] = sorted(place.source_image for place in place_map.places())
     return found
@@ -101,36 +98,16 @@ def test_every_place_of_an_orthophoto_is_in_one_tile(tiled, orthophoto):
     assert len(found) > 4
 
 
-def index_column(folder, name):
-    """A column of the index of a folder, by the keys of its tiles."""
-    meta, _, _, columns = pyogrio.raw.read(folder / index.INDEX, layer="tiles", read_geometry=False)
-    rows = dict(zip(meta["fields"].tolist(), columns, strict=True))
-    return [value for _, value in sorted(zip(rows["key"], rows[name].tolist(), strict=True))]
-
-
-def test_the_index_shows_the_tiles_in_any_program(tiled):
-    out, _, _ = tiled
-    info = pyogrio.read_info(out / index.INDEX)
-    assert (info["layer_name"], info["geometry_type"], info["crs"]) == ("tiles", "Polygon", "EPSG:4326")
-    assert index_column(out, "places") == [len(each) for each in places_of(out).values()]
-    with rasterio.open(out.parents[1] / "raster0" / "o.tif") as raster:
-        west, south, east, north = rasterio.warp.transform_bounds(raster.crs, "EPSG:4326", *raster.bounds)
-    bounds = info["total_bounds"]
-    assert bounds[0] < west + 0.001
-    assert bounds[3] > north - 0.001
-    assert (bounds[2] > east - 0.001, bounds[1] < south + 0.001) == (True, True)
-
-
 def test_a_second_run_maps_nothing_and_one_over_changed_ground_what_has_changed(cluster, orthophoto, tmp_path):
     path, out = tmp_path / "o.tif", tmp_path / "maps"
     path.write_bytes(orthophoto.read_bytes())
     tasks = building.tasks_of_orthophoto(cuttings(path), PER_TILE, None)
-    assert all(each.is_new for each in mapped(cluster, out, tasks) if each.tile)
+    assert all(each.is_new for each in mapped(cluster, out, tasks) if each.places)
     assert not any(each.is_new for each in mapped(cluster, out, tasks))
     with rasterio.open(path, "r+") as raster:  # a house more, in the north-west
         raster.write(np.full((1, 20, 20), 255, np.uint8), window=rasterio.windows.Window(30, 30, 20, 20))
     again = mapped(cluster, out, tasks)
-    assert 1 <= sum(each.is_new for each in again) < sum(each.tile is not None for each in again)
+    assert 1 <= sum(each.is_new for each in again) < sum(each.places > 0 for each in again)
 
 
 def test_a_tile_is_calibrated_with_the_ground_around_it_which_it_does_not_keep(orthophoto, tmp_path, monkeypatch):
@@ -141,8 +118,8 @@ def test_a_tile_is_calibrated_with_the_ground_around_it_which_it_does_not_keep(o
     task = next(task for task in tasks if 0 < len(cut_of(task)) < 6)
     done = worker.build_tile(task, order(tmp_path / "maps", calibrate=True))
     assert done.problem is None
-    assert places_of(tmp_path / "maps")[task.key] == cut_of(task)
-    assert done.tile.expected is not None
+    assert places_of(tmp_path / "maps")[task.tile.name] == cut_of(task)
+    assert done.is_calibrated
 
 
 def cut_of(task):
@@ -162,16 +139,14 @@ def test_a_worker_that_dies_costs_its_tile_some_time(orthophoto, tmp_path):
         first = cluster.workers[0].process
         for each in building.build(order(out), tasks, cluster.scheduler_address, None, unshown):
             done.append(each)
-            if sum(each.tile is not None for each in done) == 3 and not made:
+            if sum(each.places > 0 for each in done) == 3 and not made:
                 made = {
-                    index.path_of(out, each.key): index.path_of(out, each.key).stat().st_ino
-                    for each in done
-                    if each.tile
+                    path: path.stat().st_ino for path in (out / f"{each.name}.gpkg" for each in done if each.places)
                 }
                 os.kill(first.pid, signal.SIGKILL)
     assert not [each.problem for each in done if each.problem]
     names = [name for each in places_of(out).values() for name in each]
-    assert len(names) == len(set(names)) == sum(each.tile.places for each in done if each.tile)
+    assert len(names) == len(set(names)) == sum(each.places for each in done)
     assert len(names) == cuttings(orthophoto).open().total
     assert {path: path.stat().st_ino for path in made} == made, "what was done is not done again"
     assert not list(out.glob(".*.gpkg.*"))
@@ -260,30 +235,6 @@ def test_a_photograph_of_two_positions_is_refused_or_left_out(tmp_path):
     assert "and has another position" in found.unusable[f"file://{tmp_path}/a/1.png"]
 
 
-def test_flights_over_the_same_ground_become_one_map_which_the_index_tells_of(cluster, tmp_path, capsys):
-    days = [str(tmp_path / day) for day in ("monday", "tuesday", "wednesday")]
-    same, other = overflown.ground(1), overflown.ground(2)
-    for number, (day, last) in enumerate(zip(days, (same, same, other), strict=True)):
-        overflown.fly(Path(day), [same, same, same, last], number, 1.7e9 + number * overflown.DAY_S)
-    words = ["--camera", "nadir", "--fov-deg", str(overflown.FOV_DEG), "--no-refine", "--no-calibrate"]
-    build = ["fleet", "build", str(tmp_path / "maps"), *words, "--scheduler", cluster, "--images"]
-    assert main([*build, *days]) == 0
-    counts = dict(line.rsplit(maxsplit=1) for line in capsys.readouterr().out.splitlines())
-    assert (counts["merged"], counts["faded"], counts["changed"]) == ("7", "0", "1")
-    maps = tmp_path / "maps"
-    assert [sum(index_column(maps, name)) for name in ("places", "merged", "changed")] == [5, 7, 1]
-    assert set(index_column(maps, "passes")) == {3}
-    before = pyogrio.raw.read(maps / "index.gpkg")[3]
-    (maps / "index.gpkg").unlink()
-    assert main([*build, *days, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["mapped_now"] == 0
-    assert str(pyogrio.raw.read(maps / "index.gpkg")[3]) == str(before)
-    # A flight all of whose pictures are part of others' places is missed, too.
-    kept = {name.split("_")[0] for names in places_of(tmp_path / "maps").values() for name in names}
-    assert main([*build, *(day for day in days if Path(day).name in kept)]) == 1
-    assert "that this run does not name" in capsys.readouterr().out
-
-
 def test_two_runs_into_one_folder_are_refused(tmp_path, cluster, tiled):
     out, tasks, _ = tiled
     first = building.build(order(out), tasks, cluster, None, unshown)
@@ -296,14 +247,14 @@ def test_two_runs_into_one_folder_are_refused(tmp_path, cluster, tiled):
 def test_a_tile_of_another_technique_is_refused(tiled, cluster):
     out, tasks, _ = tiled
     ahead = replace(order(out), camera="forward")
-    with pytest.raises(MapError, match=r"camera=nadir.*new tiles would be of.*camera=forward.*another folder"):
+    with pytest.raises(MapError, match="camera is nadir, not forward"):
         list(building.build(ahead, tasks, cluster, None, unshown))
 
 
 def test_a_worker_of_another_version_maps_nothing(tiled, cluster, tmp_path):
     _, tasks, _ = tiled
     done = mapped(cluster, tmp_path / "maps", tasks[:2], version="99.0")
-    assert [each.tile for each in done] == [None, None]
+    assert [each.places for each in done] == [0, 0]
     assert "99.0 asks: install the same on all machines" in done[0].problem
 
 

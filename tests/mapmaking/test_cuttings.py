@@ -188,21 +188,6 @@ def test_places_under_cloud_are_counted(tmp_path):
     assert (len(frames), source.counts["white"]) == (16, 4)
 
 
-def test_places_with_a_seam_are_counted(tmp_path):
-    source = source_of(textured_raster(tmp_path / "o.tif", pixel_m=0.5), 100.0, 60.0)
-    assert len(frames_of(source)) == 16
-    assert (source.counts["seams"], source.counts["tried_for_seams"]) == (0, 16)
-    with rasterio.open(tmp_path / "o.tif", "r+") as raster:
-        window = rasterio.windows.Window(0, 0, 200, 640)
-        raster.write(255 - raster.read(window=window), window=window)
-    source = source_of(tmp_path / "o.tif", 100.0, 60.0)
-    assert len(frames_of(source)) == 16
-    assert (source.counts["seams"], source.counts["tried_for_seams"]) == (
-        12,
-        16,
-    )  # the pixels around the easternmost begin beyond it
-
-
 def test_one_order_cuts_every_place_at_several_footprints(tmp_path):
     path = textured_raster(tmp_path / "o.tif", pixel_m=0.5)
     source = Cuttings(orthophoto=str(path), footprint_m=(150.0, 100.0), spacing_m=50.0).open()

@@ -3,18 +3,16 @@
 import shutil
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from pictures import textured
 from walks import map_of
 
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import moved
-from edgevpr.core.quadkeys import tile_keys
 from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.missions import Area, Waypoint, read_area
 from edgevpr.mapmaking.subset import subset
-from edgevpr.places.examine import unwatched
+from edgevpr.places.examine import merge, unwatched
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.confidence import prior
 from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_text, read_calibration_for
@@ -35,18 +33,20 @@ def frame(column, row):
 
 @pytest.fixture(scope="module")
 def tiles(tmp_path_factory):
-    """A folder of maps, of places 100 m apart, and one map of them all."""
+    """A folder of maps, of places 100 m apart: columns of them, and two in the last."""
     folder = tmp_path_factory.mktemp("maps")
     frames = [frame(column, row) for column in range(SIDE) for row in range(SIDE)]
-    points = np.array([(each.position.lat_deg, each.position.lon_deg) for each in frames])
-    keys = tile_keys(*points.T, 17)
-    assert len(set(keys)) >= 4
-    for key in set(keys):
-        map_of(
-            folder / f"{key}.gpkg", create("hog"), [each for each, own in zip(frames, keys, strict=True) if own == key]
-        )
-    map_of(folder / "whole.gpkg", create("hog"), frames)
+    for tile in range(4):
+        map_of(folder / f"{tile}.gpkg", create("hog"), frames[tile * SIDE : (tile + 1 + (tile == 3)) * SIDE])
     return folder
+
+
+@pytest.fixture(scope="module")
+def whole(tiles, tmp_path_factory):
+    """One map of them all."""
+    path = tmp_path_factory.mktemp("whole") / "whole.gpkg"
+    merge(sorted(map(str, tiles.iterdir())), path)
+    return path
 
 
 def names_in(path):
@@ -59,12 +59,18 @@ def path_over(*points):
 
 
 @pytest.mark.parametrize("of_one", [True, False])
-def test_places_along_a_path_are_taken_from_the_tiles_that_they_are_in(tiles, tmp_path, of_one):
-    source = tiles / "whole.gpkg" if of_one else tiles
-    found = subset(source, path_over((0, 200), (400, 200)), 110.0, tmp_path / "f.gpkg", None, unwatched)
+def test_places_along_a_path_are_taken_from_the_maps_that_they_are_in(tiles, whole, tmp_path, of_one):
+    found = subset(
+        whole if of_one else tiles, path_over((0, 200), (400, 200)), 110.0, tmp_path / "f.gpkg", None, unwatched
+    )
     assert names_in(tmp_path / "f.gpkg") == sorted(f"{column}{row}" for column in range(5) for row in (1, 2, 3))
-    assert (found.near, found.places, found.is_calibrated) == (15, 15, False)
+    assert (found.maps, found.near, found.places, found.is_calibrated) == (1 if of_one else 4, 15, 15, False)
     assert found.file_bytes == (tmp_path / "f.gpkg").stat().st_size
+
+
+def test_subset_reads_only_the_maps_near_the_mission(tiles, tmp_path):
+    found = subset(tiles, path_over((0, 0), (0, 400)), 20.0, tmp_path / "f.gpkg", None, unwatched)
+    assert (found.maps, names_in(tmp_path / "f.gpkg")) == (1, [f"0{row}" for row in range(SIDE)])
 
 
 def test_places_in_a_polygon_are_taken_and_those_deep_in_its_hole_are_not(tiles, tmp_path):
@@ -89,7 +95,7 @@ def test_a_budget_keeps_the_places_that_leave_the_smallest_gaps(tiles, tmp_path)
 
 def test_the_most_cautious_calibration_of_the_tiles_counts(tiles, tmp_path):
     shutil.copytree(tiles, tmp_path / "tiles")
-    paths, model = sorted((tmp_path / "tiles").glob("[0-3]*.gpkg")), prior("ahead")
+    paths, model = sorted((tmp_path / "tiles").iterdir()), prior("ahead")
     model = replace(model, scale=model.adapted_scale, adapted_scale=None)
     for number, path in enumerate(paths):
         biased = replace(model, of_place=replace(model.of_place, bias=float(-number)))
@@ -108,7 +114,7 @@ def test_the_most_cautious_calibration_of_the_tiles_counts(tiles, tmp_path):
 def test_what_cannot_be_taken_is_said_and_leaves_nothing(tiles, tmp_path):
     with pytest.raises(UsageError, match=r"No place of .* is within 50 m of the mission"):
         subset(tiles, path_over((5000, 0)), 50.0, tmp_path / "f.gpkg", None, unwatched)
-    with pytest.raises(MapError, match="no folder of maps"):
+    with pytest.raises(MapError, match="holds no map"):
         subset(tmp_path, path_over((0, 0)), 50.0, tmp_path / "f.gpkg", None, unwatched)
     assert not list(tmp_path.iterdir())
 
