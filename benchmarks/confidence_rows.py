@@ -12,6 +12,7 @@ import run_sets
 import walks
 from base import DATA
 
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.frames.images import list_images
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.lab.evaluate.dataset import ScoredQuery
@@ -40,7 +41,7 @@ class Row:
     near: bool
     score: float
     evidence: Evidence
-    veto: str | None = None
+    veto: ReasonCode | None = None
 
 
 def site_of(name: str) -> str:
@@ -90,7 +91,7 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
                     near=kind == "beside",
                     score=event.best.match.score,
                     evidence=event.evidence,
-                    veto=event.reason if refused else None,
+                    veto=event.reason.code if refused else None,
                 )
         if technique.spec.looks_down and np.isnan(index.lat_deg).any():
             return  # such a map is not calibrated

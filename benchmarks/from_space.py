@@ -147,7 +147,7 @@ def matched(path: Path, frames: Iterable[Frame], known: str) -> Row:
         told = frame if is_told else replace(frame, heading_deg=None, height_m=None, roll_deg=None, pitch_deg=None)
         event = recogniser.step(replace(told, position=None))
         if event.failed:
-            raise base.EdgevprError(event.reason)
+            raise base.EdgevprError(str(event.reason))
         errors_m.append(np.inf if event.accepted else np.nan)
         if frame.position is None:
             continue

@@ -17,6 +17,7 @@ from base import Row
 from edgevpr.cli.main import main
 from edgevpr.core.config import Config, load_config
 from edgevpr.core.errors import EdgevprError
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.geopackage import point_blob
@@ -145,8 +146,8 @@ def _asked(recogniser: Recogniser) -> int:
         event = recogniser.step(_frame(number))
         here = event.position  # set for an accepted match only; a fix carries no altitude
         wrong += here is not None and (here.lat_deg, here.lon_deg) != _where(number)
-        if event.reason.startswith("an unforeseen"):
-            raise AssertionError(event.reason)
+        if event.reason.code is ReasonCode.UNFORESEEN:
+            raise AssertionError(str(event.reason))
     return wrong
 
 

@@ -98,7 +98,7 @@ def ranked(event: Recognition, names: list[str] | tuple[str, ...]) -> list[str]:
     """Return the names of the places that a query found, best first, by the names of the slots. Raises EdgevprError
     where it failed."""
     if event.failed:
-        raise base.EdgevprError(event.reason)
+        raise base.EdgevprError(str(event.reason))
     return [names[slot] for slot in event.ranking.slots] if event.ranking else []
 
 

@@ -20,6 +20,7 @@ from typing import Any
 from edgevpr.core.arrays import Covariance, Image
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import ImageError, UsageError
+from edgevpr.core.reasons import Reason
 from edgevpr.core.text import progress
 from edgevpr.core.types import Frame, Place, Position
 from edgevpr.mapmaking.making import Cuttings, FlownPictures, MadeMap, MapOrder, make_map
@@ -34,15 +35,16 @@ _log = logging.getLogger(__name__)
 class Match:
     """Answer to one picture. None: unknown, or nothing was found.
 
-    `accepted`: the picture shows `place`, and `reason` says why, or why not. `confidence`: probability that it does.
-    `position`: where the aircraft was, if it is accepted. `accuracy_m`: its standard deviation, metres.
-    `covariance_m2`: (variance east, covariance, variance north). `of_place`: `position` is that of the place, since
-    nothing is known of the way from there. `heading_deg`: compass direction of the top of the picture. `turned_deg`:
-    rotation of the picture against that of the place, clockwise. `t_query_s`: seconds that it took.
+    `accepted`: the picture shows `place`, and `reason` says why, or why not: by a code with parameters, and as text,
+    `str(reason)`, in a sentence. `confidence`: probability that it does. `position`: where the aircraft was, if it is
+    accepted. `accuracy_m`: its standard deviation, metres. `covariance_m2`: (variance east, covariance, variance
+    north). `of_place`: `position` is that of the place, since nothing is known of the way from there. `heading_deg`:
+    compass direction of the top of the picture. `turned_deg`: rotation of the picture against that of the place,
+    clockwise. `t_query_s`: seconds that it took.
     """
 
     accepted: bool
-    reason: str
+    reason: Reason
     place: Place | None
     score: float | None
     confidence: float | None
@@ -59,7 +61,7 @@ class Match:
         at = self.position
         about = {
             "accepted": self.accepted,
-            "reason": self.reason,
+            "reason": self.reason.fields(),
             "confidence": self.confidence,
             "accuracy_m": self.accuracy_m,
             "place": self.place and self.place.place_id,
@@ -144,7 +146,7 @@ class Map:
         )
         event = self._recogniser.step(frame)
         if event.failed:
-            raise ImageError(event.reason)
+            raise ImageError(str(event.reason))
         return _match_of(event)
 
 

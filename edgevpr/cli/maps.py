@@ -336,6 +336,6 @@ def run_salience(args: Namespace) -> int:
     gate = open_salience_gate(load_command_config(args, args.config, **{"salience.use": True}).salience)
     assert gate is not None  # salience.use is set
     worth = compute_memorability(gate.scores(read_image(Path(args.image))), gate.config)
-    known = {"kept": worth.reason is None, "reason": worth.reason}
+    known = {"kept": worth.reason is None, "reason": worth.reason and worth.reason.fields()}
     show({"image": args.image, **asdict(worth.salience), **known}, args.json)
     return 0

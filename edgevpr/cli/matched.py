@@ -1,12 +1,12 @@
 """Result of `edgevpr match`: the value of a query, for JSON, and the table with its summary, for people."""
 
-import re
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.text import aligned, format_probability, shown
 
 if TYPE_CHECKING:
@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
 _NAME_COLUMNS, _REASON_COLUMNS = 17, 48  # with them a row has about 120 columns
 _FIX_HEADINGS = ("lat", "lon", "± m", "m from its GPS tag")
-_NUMBER = re.compile(r"\d+(\.\d+)?%?")
-_UNSURE = re.compile(r"confidence \d|track filter \d")  # such reasons begin with figures that the table has
 
 
 def format_match(event: "Recognition") -> dict[str, Any]:
@@ -77,13 +75,8 @@ def _fix(match: dict[str, Any]) -> tuple[str, ...]:
 
 def _why(match: dict[str, Any]) -> str:
     """Return the right part of a row without a fix: the reason in a few words."""
-    words = "its place has no position" if match["accepted"] else shown(_few(match["reason"]))
+    words = "its place has no position" if match["accepted"] else ReasonCode[match["reason"]["code"]].summary
     return textwrap.shorten(words, _REASON_COLUMNS, placeholder=" ...")
-
-
-def _few(reason: str) -> str:
-    """Return the first few words of a reason; "not sure enough" for one that says only how sure it is."""
-    return "not sure enough" if _UNSURE.match(reason) else re.split(r"[:;,] ", reason)[0]
 
 
 def _short(name: str) -> str:
@@ -93,8 +86,9 @@ def _short(name: str) -> str:
 
 
 def _summary(found: Sequence[dict[str, Any]], fixes: Sequence[dict[str, Any]]) -> Iterator[str]:
-    refused = Counter(_NUMBER.sub("..", shown(_few(each["reason"]))) for each in found if not each["accepted"])
-    why = "; refused: " + ", ".join(f"{count} {reason}" for reason, count in refused.most_common()) if refused else ""
+    refused = Counter(ReasonCode[each["reason"]["code"]] for each in found if not each["accepted"])
+    counts = ", ".join(f"{count} {code.summary}" for code, count in refused.most_common())
+    why = f"; refused: {counts}" if refused else ""
     yield f"{len(found)} queries, {len(found) - refused.total()} accepted{why}"
     if not fixes:
         return

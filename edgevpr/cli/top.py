@@ -9,6 +9,7 @@ from typing import Any
 
 from edgevpr.cli.shared import add_json, command, show
 from edgevpr.core.errors import EdgevprError
+from edgevpr.core.reasons import read_reason
 from edgevpr.core.text import format_probability, printable
 
 _FILE = "/run/edgevpr/status.json"
@@ -95,7 +96,7 @@ def _seen(query: dict[str, Any] | None, now_s: float) -> str:
         return "none yet"
     ago = f"{now_s - query['t_frame_s']:.0f} s ago"
     if not query["accepted"]:
-        return f"{ago}, refused: {query['reason']}"
+        return f"{ago}, refused: {read_reason(query['reason']) or 'unknown'}"
     sure = "" if query["confidence"] is None else f", confidence {format_probability(query['confidence'])}"
     sure += _known(", score {:.3f}", query["score"])
     good = _known(", good to {:.0f} m", query["accuracy_m"])

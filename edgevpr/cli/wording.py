@@ -158,4 +158,4 @@ def _of_line(difference: dict[str, Any]) -> str:
 def _outcome(query: dict[str, Any] | None) -> str:
     if query is None:
         return "no query"
-    return f"place {query['place']} accepted" if query["accepted"] else f"refused ({query['reason']})"
+    return f"place {query['place']} accepted" if query["accepted"] else f"refused ({query['reason'] or 'unknown'})"

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from difflib import get_close_matches
+from enum import Enum
 from itertools import zip_longest
 from threading import Event, Thread
 from typing import Any, TextIO, TypeVar
@@ -88,7 +89,8 @@ def wrapped(text: str) -> list[str]:
 
 
 def json_line(value: Any) -> bytes:
-    """Write a value as one line of JSON, without passwords. Dataclasses become objects, NaN and infinities null."""
+    """Write a value as one line of JSON, without passwords. Dataclasses become objects, members of
+    an Enum their names, NaN and infinities null."""
     text = json.dumps(_plain(value), ensure_ascii=False, allow_nan=False)
     # Text that is not UTF-8 (a foreign file name) becomes a \u escape, which JSON reads back unchanged.
     return text.encode("utf-8", "backslashreplace") + b"\n"
@@ -100,6 +102,8 @@ def _plain(value: Any) -> Any:
         return redact_passwords(value)
     if value is None or isinstance(value, (bool, int)):
         return value
+    if isinstance(value, Enum):
+        return value.name
     if isinstance(value, float):
         if not math.isfinite(value):
             return None

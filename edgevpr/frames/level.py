@@ -14,6 +14,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles, Image, Mask
 from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.images import shrunk
 from edgevpr.frames.lens import CalibratedLens, Remap, line_of_sight
@@ -77,7 +78,7 @@ class View:
     zoom: float = 1.0
     lean_m: tuple[float, float] | None = None
     focal: float | None = None
-    reason: str | None = None
+    reason: Reason | None = None
 
     @property
     def is_laid(self) -> bool:
@@ -91,7 +92,7 @@ class View:
             "footprint_m": self.footprint_m and round(self.footprint_m, 2),
             "aside": self.aside and [round(share, 4) for share in self.aside],
             "lean_m": self.lean_m and [round(each, 2) for each in self.lean_m],
-            "reason": self.reason,
+            "reason": self.reason and self.reason.fields(),
         }
 
 
@@ -134,11 +135,11 @@ def levelled(
         return Levelled(frame.image, overlay, known)
     taking = _Taking(frame, vehicle, lens)
     if taking.is_too_tilted:
-        view = View(up_deg=taking.top_deg, reason=f"it is tilted {taking.tilt_deg:.0f} degrees")
+        view = View(up_deg=taking.top_deg, reason=Reason(ReasonCode.TILTED, {"tilt_deg": taking.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     if taking.tilt_deg > MAX_TILT_UNLEVELLED_DEG and taking.heading_deg is None:
         # The ground that it shows lies far from the aircraft, in an unknown direction.
-        view = View(reason=f"it is tilted {taking.tilt_deg:.0f} degrees, and its heading is unknown")
+        view = View(reason=Reason(ReasonCode.TILTED_WITHOUT_HEADING, {"tilt_deg": taking.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     own_m = taking.own_m and scale * taking.own_m
     zoom = own_m / footprint_m if own_m and footprint_m else scale
@@ -161,7 +162,7 @@ def levelled(
 
     width, height = (min(1.0, zoom * px / taking.longest_px) for px in taking.size_px)
     if (filled := warp.shown.mean() / (height * width)) < _LEAST_FILLED:
-        reason = f"it shows {filled:.0%} of the ground under it at a tilt of {taking.tilt_deg:.0f} degrees"
+        reason = Reason(ReasonCode.TILTED_OFF_GROUND, {"shown": float(filled), "tilt_deg": taking.tilt_deg})
         view = View(up_deg=taking.top_deg, reason=reason)
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     view = View(
@@ -221,7 +222,7 @@ def leaning(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN)
     ahead, right, down = (_level_from_body(roll_deg, pitch_deg) @ mount.body_from_straight())[:, 2]
     tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, down))))
     if tilt_deg > MAX_TILT_UNLEVELLED_DEG:
-        return View(reason=f"it is tilted {tilt_deg:.0f} degrees")
+        return View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": tilt_deg}))
     if heading_deg is None or height_m is None or not 0 <= height_m <= _HIGHEST_M:
         return UNKNOWN_VIEW
     heading = math.radians(heading_deg)

@@ -17,7 +17,7 @@ from edgevpr.core.types import Frame, Position, Salience
 from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import readable
-from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, describe_error
+from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, explain_failure
 from edgevpr.runtime.recognise.judge import says_nothing
 from edgevpr.runtime.recognise.levelling import place_at_middle
 from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, select_best
@@ -172,8 +172,8 @@ def build_map(
             encoded = encoder.encode(frame, layers=layers)
         except Exception as error:
             if unusable is None:
-                raise ModelError(describe_error(error)) from error
-            unusable(ImageError(f"{frame.name}: {describe_error(error)}"))
+                raise ModelError(str(explain_failure(error))) from error
+            unusable(ImageError(f"{frame.name}: {explain_failure(error)}"))
             continue
         if encoded.view.reason:
             result.tilted += 1

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.reasons import Reason, read_reason
 from edgevpr.runtime.flight.flightlog import select_last_flight
 
 _log = logging.getLogger(__name__)
@@ -60,7 +61,7 @@ class LoggedQuery:
     name: str
     t_s: float
     accepted: bool
-    reason: str
+    reason: Reason | None
     confidence: float | None
     place: int | None
     reference_image: str | None
@@ -167,7 +168,7 @@ def read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
         name=text(line, "query") or "",
         t_s=t_s,
         accepted=accepted,
-        reason=text(line, "reason") or "no reason is given",
+        reason=read_reason(line.get("reason")),
         confidence=max((known for known in confidences if known is not None), default=None),
         place=None if place is None else int(place),
         reference_image=text(line, "reference_image"),

@@ -5,7 +5,6 @@ Functions that return a str return HTML.
 """
 
 import json
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -146,8 +145,8 @@ def _step(query: LoggedQuery, place: Place | None, flight: LoggedFlight, has_lin
         "gps": query.gps_at,
         "autopilot": query.autopilot_at,
     }
-    reason = without_numbers(re.split(r"[:;,] ", query.reason)[0])  # its first words
-    groups = {"match accepted": "accepted"} if query.accepted else {f"match refused: {reason}": "refused"}
+    refused = f"match refused: {query.reason.code.summary}" if query.reason else "match refused"
+    groups = {"match accepted": "accepted"} if query.accepted else {refused: "refused"}
     fixed = f"{fix.outcome.value}{f': {fix.why}' if fix.why else ''}" if fix else ""
     if fix:
         groups[without_numbers(fixed)] = _FIX_COLOURS[fix.outcome]
@@ -161,7 +160,7 @@ def _step(query: LoggedQuery, place: Place | None, flight: LoggedFlight, has_lin
     pictures.append(("place", query.reference_image or "", f"place found: {query.reference_image}"))
     return Step(
         title=f"{f'{clock(query.t_s)} – ' if flight.span_s else ''}{query.name}: {verdict}",
-        said=[_place_found(query), _position(query, flight.truth), query.reason, fixed],
+        said=[_place_found(query), _position(query, flight.truth), str(query.reason or ""), fixed],
         groups=groups,
         at={name: at for name, at in {**points, "accepted": query.at}.items() if at},  # the last has the circle
         circle_m=query.accuracy_m if query.at else None,

@@ -95,7 +95,7 @@ def test_match_skips_a_query_that_is_not_memorable(recording, tmp_path, capsys):
     said = ["match", place_map, "--images", str(recording), "--salience", "--json"]
     assert main([*said, "--config", config(tmp_path, entropy=0.5)]) == 0
     answers = json.loads(capsys.readouterr().out)
-    refused = [each for each in answers if each["reason"].startswith("not memorable: entropy")]
+    refused = [each for each in answers if each["reason"]["code"] == "NOT_MEMORABLE"]
     assert [int(each["query"][:2]) for each in refused] == [*range(15, 45)]
     assert all(each["place"] is None and not each["accepted"] for each in refused)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Pose, Vehicle
 from edgevpr.frames.level import MAX_TILT_UNLEVELLED_DEG, Lens, Mount, View, leaning, levelled
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph
@@ -100,7 +101,7 @@ def test_levelled_with_a_camera_that_is_mounted_turned(ground, up_deg):
 
 def test_levelled_without_a_heading_turns_nothing(ground):
     steep, tilted = (replace(taken(ground, heading_deg=0, pitch_deg=deg), heading_deg=None) for deg in (25, 18))
-    assert "its heading is unknown" in levelled(steep, None, LENS).view.reason
+    assert levelled(steep, None, LENS).view.reason.code is ReasonCode.TILTED_WITHOUT_HEADING
     found = levelled(tilted, None, LENS)
     assert found.view.up_deg is None
     assert off(found.image, from_above(ground, found.view), found.mask) < 0.5
@@ -161,21 +162,21 @@ TILTED = {"heading_deg": 90.0, "roll_deg": 0.0, "pitch_deg": 40.0}
 
 
 @pytest.mark.parametrize(
-    ("pose", "lens", "below", "reason"),
+    ("pose", "lens", "below", "code"),
     [
         *(
-            (TILTED | pose, LENS, False, "tilted")
+            (TILTED | pose, LENS, False, ReasonCode.TILTED)
             for pose in ({"pitch_deg": 61.0}, {"roll_deg": -62.0}, {"roll_deg": 180.0}, {"pitch_deg": 90.0})
         ),
-        (TILTED | {"roll_deg": 1e9}, LENS, False, "tilted"),
-        (TILTED, Lens(110.0), False, "tilted 40 degrees"),  # the horizon is in view
+        (TILTED | {"roll_deg": 1e9}, LENS, False, ReasonCode.TILTED),
+        (TILTED, Lens(110.0), False, ReasonCode.TILTED),  # the horizon is in view
     ],
 )
-def test_levelled_leaves_a_picture_that_bears_no_warp_with_a_reason(pose, lens, below, reason):
+def test_levelled_leaves_a_picture_that_bears_no_warp_with_a_reason(pose, lens, below, code):
     image = np.zeros((48, 64), np.uint8)
     found = levelled(frame_of(image, **pose), None, lens, below=below)
     assert found.image is image
-    assert reason in found.view.reason
+    assert found.view.reason.code is code
     assert (found.view.footprint_m, found.view.aside) == (None, None)
     assert levelled(frame_of(image, **TILTED), None, Lens(40.0)).view.reason is None
 

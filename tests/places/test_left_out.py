@@ -8,6 +8,7 @@ import pytest
 from ranking import Ruler, rank
 
 from edgevpr.core.errors import MapError, PlaceError
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.index import load_index
@@ -103,7 +104,7 @@ def test_without_the_right_place_no_other_is_accepted(ruler):
     bare = dataclasses.replace(ranking, unread=np.empty(0, np.intp))
     assert judge(Findings(bare), index, rule).accepted, "but for the rule"
     verdict = judge(Findings(ranking), index, rule)
-    assert (verdict.accepted, verdict.reason) == (False, "a place that cannot be read may be the right one")
+    assert (verdict.accepted, verdict.reason.code) == (False, ReasonCode.PLACE_UNREAD)
 
 
 @pytest.mark.parametrize(("number", "may_be_right"), [(90, True), (110, True), (80, False), (120, False)])

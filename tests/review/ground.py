@@ -14,7 +14,8 @@ ORIGIN = 50.0, 8.0
 SIDE_M, METRE_PX = 40.0, 4  # of a picture's longest side; pixels of the large picture
 ROWS, COLUMNS, STEP_M = 3, 4, 20.0
 
-LOW_REASON = "not similar enough to any place: score 0.004, 0.010 needed"
+LOW_REASON = {"code": "LOW_SCORE", "parameters": {"score": 0.004, "needed": 0.01}}
+UNSURE = {"code": "LOW_CONFIDENCE", "parameters": {"confidence": 0.99, "needed": 0.999, "landmarks": 30}}
 
 
 def landscape() -> np.ndarray:
@@ -66,7 +67,7 @@ def flown_over(places: list[Place], count: int) -> list[tuple[str, dict]]:
             "position": at,
             "located": None if refused else at,
             "accepted": not refused,
-            "reason": LOW_REASON if is_low else "confidence 99.0 %, 1 in 1,000 wrong needed: 30 landmarks agree",
+            "reason": LOW_REASON if is_low else UNSURE,
             "vehicle": {**at, "t_heard_s": t_s, "gps": {"lat_deg": at["lat_deg"] + 3e-5, "lon_deg": 8.0, "t_s": t_s}},
             "t_frame_s": t_s,
         }

@@ -10,7 +10,14 @@ def query(name: str, **fields) -> dict:
     at = {"lat_deg": 50.0, "lon_deg": 8.0}
     fix = {"query": name, "sent": True, "why": None, "answer": None, **at, "accuracy_m": 2.0}
     found = {"place": 3, "reference_image": "3.jpg", "score": 0.5, "position": at, "located": at, "accuracy_m": 2.0}
-    return {"query": name, "accepted": True, "reason": "sure", "confidence": 1.0, **found, "fix": fix} | fields
+    return {
+        "query": name,
+        "accepted": True,
+        "reason": {"code": "ACCEPTED_BY_CONFIDENCE", "parameters": {"confidence": 1.0}},
+        "confidence": 1.0,
+        **found,
+        "fix": fix,
+    } | fields
 
 
 def write_log(path: Path, *lines: tuple[str, dict], end: bool = True, first_s: int = 1000) -> Path:

@@ -45,7 +45,7 @@ def test_a_flight_of_several_files_is_read_whole_and_what_is_missing_is_a_remark
     with FlightLog(path, max_mb=0.02) as log:
         log.write("start", map="m.gpkg", t_mono_s=1000.0)
         for second in range(1, 5):
-            fields = query(str(second), reason="x" * 3000) | {"t_mono_s": 1000.0 + second}
+            fields = query(str(second), note="x" * 3000) | {"t_mono_s": 1000.0 + second}
             log.write("query", **fields)
             log.write("camera", t_mono_s=1000.5 + second, said="camera shows nothing")
     flight = read_flight(path)

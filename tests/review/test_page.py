@@ -81,7 +81,9 @@ def test_only_pictures_of_the_folders_that_are_given_are_shown(tmp_path):
 
 
 def test_names_in_the_log_are_text_and_nothing_else(tmp_path):
-    nasty = query(NASTY, reason=NASTY, reference_image=NASTY, accepted=False)
+    nasty = query(
+        NASTY, reason={"code": "UNUSABLE", "parameters": {"problem": NASTY}}, reference_image=NASTY, accepted=False
+    )
     log = write_log(tmp_path / "log", ("query", nasty), ("query", query("b")), ("camera", {"said": NASTY}))
     content = page(log)
     assert content.count("<script") == 2, "the data and the script of the page"
@@ -94,7 +96,11 @@ def test_names_in_the_log_are_text_and_nothing_else(tmp_path):
     ("lines", "end", "said"),
     [
         ([], True, "No picture became a query"),
-        ([("unusable", {"problem": "cut short"})], True, "No picture became a query"),
+        (
+            [("unusable", {"reason": {"code": "UNUSABLE", "parameters": {"problem": "cut short"}}})],
+            True,
+            "No picture became a query",
+        ),
         ([("query", query("a", located=None, position=None, fix=None))], True, "No place has a position"),
         ([("query", query("a"))], False, "has no last line: it was cut off"),
         ([("query", query("a"))], True, "no report of the autopilot"),

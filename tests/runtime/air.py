@@ -44,7 +44,6 @@ def match_at(
         picture=view and Levelled(_PICTURE, None, view),
         best=Candidate(Place(place_id=places[0], source_image="", position=position), FineMatch(0.5)),
         accepted=True,
-        reason="",
         located=Located(position=position, covariance_m2=(sd_m**2, 0.0, sd_m**2), places=tuple(places), lean=lean),
         accuracy_m=sd_m,
         steps=Steps(),

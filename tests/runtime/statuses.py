@@ -6,7 +6,7 @@ MATCH = {
     "t_frame_s": 996.8,
     "query": "0007.jpg",
     "accepted": True,
-    "reason": "confidence 0.9991",
+    "reason": {"code": "ACCEPTED_BY_CONFIDENCE", "parameters": {"confidence": 0.9991}},
     "place": 812,
     "reference_image": "0812.jpg",
     "score": 0.87,
@@ -20,6 +20,7 @@ LINK = {
     "fixes": "3 fixes sent, 2 taken",
     "accuracy_m": 7.25,
 }
+LOW_SCORE = {"code": "LOW_SCORE", "parameters": {"score": 0.4, "needed": 0.5}}
 STATUS = {
     "version": __version__,
     "time": "2026-11-22T10:00:00Z",
@@ -42,7 +43,7 @@ STATUS = {
     "hot": False,
     "throttled": False,
     "under_voltage": None,
-    "newest": {**MATCH, "accepted": False, "reason": "score 0.4 is too low", "t_frame_s": 999.6},
+    "newest": {**MATCH, "accepted": False, "reason": LOW_SCORE, "t_frame_s": 999.6},
     "match": MATCH,
     "link": LINK,
     "remarks": ["held to 1 Hz"],

@@ -262,7 +262,7 @@ def _recognise(recogniser: Recogniser, path: Path, tag: GeoTag) -> Recognition:
         )
     )
     if event.failed:
-        raise ModelError(event.reason)
+        raise ModelError(str(event.reason))
     return event
 
 

@@ -246,7 +246,7 @@ class Flight:
 
     def _log_event(self, event: Recognition) -> None:
         if event.frame is None or not event.is_query:
-            self._parts.flight_log.write("unusable", problem=event.reason)
+            self._parts.flight_log.write("unusable", reason=event.reason)
             return
         self._parts.flight_log.write(
             "query",

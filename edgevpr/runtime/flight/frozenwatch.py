@@ -16,6 +16,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.sameness import BLOCKS, CoarsePicture, make_coarse
 from edgevpr.mavlink.messages import Severity
@@ -57,8 +58,6 @@ _CANDIDATES = 3  # earlier pictures that are compared block by block
 _NEW_IN_A_ROW = 3  # pictures after which the camera is taken as back
 _NEW_AFTER_REPEATS = 10  # the same, after a clip
 
-FROZEN_TEXT = "camera frozen: pictures stay the same"
-REPEATING_TEXT = "camera frozen: pictures repeat"
 BACK_TEXT = "camera is back: pictures move again"
 
 
@@ -130,11 +129,14 @@ class FrozenWatch:
         self._repeats_in_a_row = self._new_in_a_row = self._new_needed = 0
 
     @property
-    def state(self) -> str | None:
-        """What is reported of the pictures while they are frozen, else None."""
-        return (REPEATING_TEXT if self._new_needed == _NEW_AFTER_REPEATS else FROZEN_TEXT) if self.is_frozen else None
+    def reason(self) -> Reason | None:
+        """Why pictures are refused while they are frozen, else None."""
+        if not self.is_frozen:
+            return None
+        is_repeating = self._new_needed == _NEW_AFTER_REPEATS
+        return Reason(ReasonCode.PICTURES_REPEAT if is_repeating else ReasonCode.PICTURES_STAY)
 
-    def judge(self, frame: Frame, vehicle: Vehicle | None) -> str | None:
+    def judge(self, frame: Frame, vehicle: Vehicle | None) -> Reason | None:
         """Judge the next picture, with the autopilot's report at its time. Return why it is refused, or None."""
         if vehicle and not vehicle.is_fresh_at(frame.t_mono_s):
             vehicle = None
@@ -150,7 +152,7 @@ class FrozenWatch:
             self._begin_row(now)
         self._newest = now
         self._decide(now.t_s)
-        return None if self.state is None else f"not used: {self.state}"
+        return self.reason
 
     def _locate_picture(self, picture: CoarsePicture, t_s: float, vehicle: Vehicle | None) -> TimedPicture:
         before, path_m = self._newest, np.zeros(2)
@@ -237,11 +239,12 @@ class FrozenWatch:
     def _report(self, new_needed: int) -> None:
         was_frozen, self.is_frozen = self.is_frozen, True
         self._new_needed = max(new_needed, self._new_needed if was_frozen else 0)
-        if was_frozen or self.state is None:
+        if was_frozen:
             return
         if self._autopilot:
             self._autopilot.begin_anew()
-        self._notifier.report("source", Severity.WARNING, self.state, topic="frozen", state=self.state)
+        state = str(self.reason)
+        self._notifier.report("source", Severity.WARNING, state, topic="frozen", state=state)
 
 
 def _velocity(vehicle: Vehicle | None) -> tuple[float, float] | None:

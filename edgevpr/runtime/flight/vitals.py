@@ -163,7 +163,7 @@ class Vitals:
             "elapsed_s": totals["elapsed_s"],
             "health": health.name,
             "paused": self._commands.is_paused,
-            "source": self._frozen.state or parts.source.state,
+            "source": str(self._frozen.reason or parts.source.state),
             "latency_s": parts.source.latency_s,
             "queries": tally.queries,
             "accepted": tally.accepted,

@@ -11,6 +11,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.geodesy import offset_m
+from edgevpr.core.reasons import Reason
 from edgevpr.core.text import beside
 from edgevpr.frames.level import Mount
 from edgevpr.mavlink.messages import Severity
@@ -56,7 +57,7 @@ class Tally:
     queries; events that failed in a row; and pictures in a row that hold too little."""
 
     def __init__(self) -> None:
-        self._trouble: str | None = None
+        self._trouble: Reason | None = None
         self.queries = self.accepted = self.unusable = self.failed = 0
         self.failed_in_a_row = self.nothing_in_a_row = 0
 

@@ -25,7 +25,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
-from edgevpr.runtime.recognise.encoder import FrameEncoder, describe_error
+from edgevpr.runtime.recognise.encoder import FrameEncoder, explain_failure
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -157,7 +157,7 @@ class _Bench:
         try:
             first = encoder.encode(frame)
         except Exception as error:
-            raise ModelError(describe_error(error)) from error
+            raise ModelError(str(explain_failure(error))) from error
         for _ in range(_PLACES):
             trial_map.add(frame, first.descriptor, landmarks=encoder.pack_landmarks(first.picture))
 
@@ -193,7 +193,7 @@ class _Bench:
 def _recognise(recogniser: Recogniser, image: Image, t_mono_s: float) -> Recognition:
     event = recogniser.step(Frame(image=image, name=f"trial {t_mono_s:.1f}", t_mono_s=t_mono_s))
     if event.failed:
-        raise ModelError(event.reason)
+        raise ModelError(str(event.reason))
     return event
 
 

@@ -5,7 +5,8 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
 from edgevpr.core.contract import Descriptor, Technique
-from edgevpr.core.errors import EdgevprError
+from edgevpr.core.errors import EdgevprError, MapError, PlaceError
+from edgevpr.core.reasons import NOT_SEARCHED, Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, Mount, View, enlarged
 from edgevpr.frames.mask import Mask
@@ -86,8 +87,16 @@ class FrameEncoder:
         return replace(self, levelling=self.levelling.with_mount(mount))
 
 
-def describe_error(error: Exception) -> str:
-    """Return an error as a sentence. An error that is not edgevpr's own is a fault of a technique or of a library."""
-    if isinstance(error, EdgevprError):
-        return str(error)
-    return f"an unforeseen {type(error).__name__} ({error}): report it, with the output of --debug"
+def explain_failure(error: Exception | None) -> Reason:
+    """Return why a frame failed (None: it did not, and was not searched for). An error that is not edgevpr's own is a
+    fault of a technique or of a library."""
+    match error:
+        case None:
+            return NOT_SEARCHED
+        case PlaceError():
+            return Reason(ReasonCode.PLACE_UNREADABLE, {"problem": str(error)})
+        case MapError():
+            return Reason(ReasonCode.MAP_UNREADABLE, {"problem": str(error)})
+        case EdgevprError():
+            return Reason(ReasonCode.UNUSABLE, {"problem": str(error)})
+    return Reason(ReasonCode.UNFORESEEN, {"error": type(error).__name__, "problem": str(error)})

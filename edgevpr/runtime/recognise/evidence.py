@@ -98,17 +98,17 @@ class Evidence:
         """True if a place elsewhere agrees nearly as well, so that its landmarks must be compared too."""
         return self.lead < _SMALL_LEAD
 
-    def describe(self) -> str:
-        """Describe the evidence in words, for the log."""
-        ahead = (
-            f"{math.exp(self.lead):.1f} times as many regions agree as for the runner-up ({math.exp(self.agree):.0%})"
-        )
-        if self.landmarks is not None:
-            rival = "" if self.rival is None else f", and {_to_count(self.rival)} with a place elsewhere"
-            return f"{ahead}, {_to_count(self.landmarks)} landmarks agree{rival}"
-        if self.proof:
-            return f"{ahead}, and {math.exp(self.proof):.2f} times as many landmarks"
-        return f"{ahead}, {math.exp(self.coverage):.1%} of the place agrees"
+    def describe(self) -> dict[str, float | None]:
+        """Return this evidence as parameters of a `Reason` of the judge, without logarithms."""
+        is_down = self.landmarks is not None
+        return {
+            "regions_ratio": math.exp(self.lead),
+            "regions_share": math.exp(self.agree),
+            "landmarks": None if self.landmarks is None else _to_count(self.landmarks),
+            "rival_landmarks": None if self.rival is None else _to_count(self.rival),
+            "landmarks_ratio": math.exp(self.proof) if self.proof and not is_down else None,
+            "coverage_share": None if is_down or self.proof else math.exp(self.coverage),
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,7 @@ import numpy as np
 from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Descriptor, FineMatch, Technique
 from edgevpr.core.geodesy import shorter_deg
-from edgevpr.core.text import format_probability
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import SequenceSearch
@@ -141,10 +141,10 @@ class Findings:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Decision on the best place: whether it is accepted, and the reason in a few words for the log."""
+    """Decision on the best place: whether it is accepted, and why or why not."""
 
     accepted: bool
-    reason: str
+    reason: Reason
 
 
 def accept_rule(
@@ -171,19 +171,19 @@ def accept_rule(
     )
 
 
-def says_nothing(query: Descriptor, min_quality: float) -> str | None:
+def says_nothing(query: Descriptor, min_quality: float) -> Reason | None:
     """Return the reason if a picture shows too little to be recognised, as a covered lens or bare sky does, None if its
     quality is at least `min_quality`. The few regions that hold information can agree on a place by chance."""
     if query.quality >= min_quality:  # False for NaN
         return None
-    return f"too little texture in the image: {query.quality:.0%} usable, {min_quality:.0%} needed"
+    return Reason(ReasonCode.LOW_TEXTURE, {"usable": query.quality, "needed": min_quality})
 
 
 def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch | None = None) -> Verdict:
     """Decide whether the best place of a ranking is accepted. `search` is the search over sequences that made the
     ranking (None: the query was ranked alone)."""
     if search and search.frames < search.length:
-        return Verdict(False, f"the sequence has {search.frames} queries of {search.length} yet")
+        return _refuse(ReasonCode.SEQUENCE_INCOMPLETE, queries=search.frames, needed=search.length)
     ranking, proof, where = findings.ranking, findings.proof, findings.where
     score = float(ranking.scores[0])
     ahead = margin(ranking, index, rule.neighbour_m, where.places if where else ())
@@ -192,36 +192,40 @@ def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: Seque
     if search and (objection := _lost_track(ranking, index, rule, search)):
         return Verdict(False, objection)
     if len(ranking.unread):
-        return Verdict(False, "a place that cannot be read may be the right one")
+        return _refuse(ReasonCode.PLACE_UNREAD)
     if rule.sure:
         verdict = _by_confidence(rule.sure, findings)
     elif ahead is None:
-        verdict = Verdict(True, f"score {score:.3f}; there is no place elsewhere to compare with")
+        verdict = Verdict(True, Reason(ReasonCode.ACCEPTED_WITHOUT_RIVAL, {"score": score}))
     else:
-        verdict = Verdict(True, f"score {score:.3f}, {ahead:.3f} ahead of any place elsewhere")
+        verdict = Verdict(True, Reason(ReasonCode.ACCEPTED_BY_SCORE, {"score": score, "lead": ahead}))
     if not verdict.accepted:
         return verdict
     if findings.at_rest_elsewhere > _DISPLAY_SHARE:
-        return Verdict(False, "places elsewhere have not moved either, as behind a display: mask it (`source.mask`)")
+        return _refuse(ReasonCode.ELSEWHERE_AT_REST)
     if proof is not None and (objection := _disproves(proof, score)):
         return Verdict(False, objection)
     if where and where.objection:
         return Verdict(False, where.objection)
     if findings.is_new:  # a fix would only repeat the autopilot's position, and make its errors look confirmed
-        return Verdict(False, f"place was learnt within the last {NEW_FOR_S:g} s: it repeats the autopilot's position")
+        return _refuse(ReasonCode.JUST_LEARNT, limit_s=NEW_FOR_S)
     return verdict
 
 
-def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> str | None:
+def _refuse(code: ReasonCode, **parameters: float) -> Verdict:
+    return Verdict(False, Reason(code, parameters))
+
+
+def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> Reason | None:
     """Return the reason if a match fails the least score or the least lead of `rule`, else None. `ahead` is its lead
     (None: there is no place elsewhere)."""
     least = max(rule.min_score, rule.worth_a_look if rule.sure else 0.0)
     if not score >= least:  # `not >=` refuses NaN as well
-        return f"not similar enough to any place: score {score:.3f}, {least:.3f} needed"
+        return Reason(ReasonCode.LOW_SCORE, {"score": score, "needed": least})
     if ahead is None and rule.min_score == 0 and rule.sure is None:
-        return "no place elsewhere to compare with: the score alone does not decide"
+        return Reason(ReasonCode.NO_RIVAL)
     if ahead is not None and not ahead >= rule.min_margin:
-        return f"too little ahead of a place elsewhere: {ahead:.3f}, {rule.min_margin:.3f} needed"
+        return Reason(ReasonCode.LOW_LEAD, {"lead": ahead, "needed": rule.min_margin})
     return None
 
 
@@ -229,21 +233,20 @@ def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
     """Decide by the confidence of the match or, if it is known, by the place's probability by the flight so far."""
     evidence, followed = findings.evidence, findings.by_flight
     if evidence is None:
-        return Verdict(False, "map is not calibrated: no confidence available")
+        return _refuse(ReasonCode.NOT_CALIBRATED)
     confidence, needed = sure.confidence(evidence), sure.threshold(evidence)
-    figures = f"confidence {format_probability(confidence)}, {format_probability(needed)} needed: {evidence.describe()}"
-    if followed is not None:
-        figures = f"track filter {format_probability(followed)}; {figures}"
+    figures = {"track": followed, "confidence": confidence, "needed": needed, **evidence.describe()}
     by_itself = confidence >= needed
+    code = ReasonCode.ACCEPTED_BY_CONFIDENCE
     if not (by_itself or (followed is not None and _is_sure_by_flight(followed, confidence, needed, sure.precision))):
-        return Verdict(False, figures)
-    if evidence.lead < 0 and not by_itself:
-        return Verdict(False, f"a place elsewhere agrees better: {figures}")
-    if followed is not None and followed < _MIN_FOLLOWED:
-        return Verdict(False, f"the track filter contradicts it: {figures}")
-    if findings.ahead_of_turned is not None and findings.ahead_of_turned < _MIN_LEAD_OVER_TURNED:
-        return Verdict(False, f"the same place agrees nearly as well if the picture is turned otherwise; {figures}")
-    return Verdict(True, figures)
+        code = ReasonCode.LOW_CONFIDENCE
+    elif evidence.lead < 0 and not by_itself:
+        code = ReasonCode.ELSEWHERE_AGREES_BETTER
+    elif followed is not None and followed < _MIN_FOLLOWED:
+        code = ReasonCode.TRACK_CONTRADICTS
+    elif findings.ahead_of_turned is not None and findings.ahead_of_turned < _MIN_LEAD_OVER_TURNED:
+        code = ReasonCode.TURNED_AGREES
+    return Verdict(code is ReasonCode.ACCEPTED_BY_CONFIDENCE, Reason(code, figures))
 
 
 def _is_sure_by_flight(followed: float, confidence: float, needed: float, precision: float) -> bool:
@@ -253,12 +256,12 @@ def _is_sure_by_flight(followed: float, confidence: float, needed: float, precis
     return followed >= max(_MIN_BY_FLIGHT, min(needed, precision) if is_raised else needed)
 
 
-def _disproves(proof: Agreement, score: float) -> str | None:
+def _disproves(proof: Agreement, score: float) -> Reason | None:
     """Return the reason if the landmarks show that the query is not at the best place, None if they do not."""
     if not proof.is_expected:
-        return f"landmarks and regions disagree on the offset: {proof.inliers} landmarks support another one"
+        return Reason(ReasonCode.LANDMARKS_DISAGREE, {"landmarks": proof.inliers})
     if score >= _CLEAR_SCORE and proof.inliers < _MIN_INLIERS and proof.possible >= _ENOUGH_LANDMARKS:
-        return f"too few landmarks agree: {proof.inliers}, {_MIN_INLIERS} needed at such a score"
+        return Reason(ReasonCode.FEW_LANDMARKS, {"landmarks": proof.inliers, "needed": _MIN_INLIERS})
     return None
 
 
@@ -272,16 +275,17 @@ def is_at_rest(match: FineMatch) -> bool:
     return max(map(abs, match.shift_cells)) <= _AT_REST_CELLS
 
 
-def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch) -> str | None:
+def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch) -> Reason | None:
     """Return the reason if the mean score of a sequence is not to be trusted, else None: the newest query shows other
     places, the newest queries no longer fit, or a place elsewhere fits about as well if it is passed at another speed.
     """
     if ranking.compared and int(ranking.slots[0]) not in ranking.compared:
-        return "other places resemble the newest query more than this one does"
+        return Reason(ReasonCode.NEWEST_DISAGREES)
     away = elsewhere(index, int(ranking.slots[0]), np.arange(len(index)), rule.neighbour_m)
     if not search.goes_on(~away, rule.min_score):
-        return "the newest queries no longer see what those before them saw"
+        return Reason(ReasonCode.NEWEST_LEFT)
     ahead_of_rivals = float(ranking.scores[0]) - float(search.rivals[away].max(initial=0))
-    if not ahead_of_rivals >= _MARGIN_SHARE_AT_OTHER_SPEEDS * rule.min_margin:
-        return f"only {ahead_of_rivals:.3f} ahead of a place elsewhere that is passed at another speed"
+    needed = _MARGIN_SHARE_AT_OTHER_SPEEDS * rule.min_margin
+    if not ahead_of_rivals >= needed:
+        return Reason(ReasonCode.LOW_LEAD_AT_OTHER_SPEED, {"lead": ahead_of_rivals, "needed": needed})
     return None

@@ -13,6 +13,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Covariance, Doubles
 from edgevpr.core.geodesy import axes_of, moved, offset_m
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
@@ -49,7 +50,7 @@ class Located:
     footprint_m: float | None = None
     height_m: float | None = None
     places: tuple[int, ...] = ()
-    objection: str | None = None
+    objection: Reason | None = None
     lean: AttitudeError | None = None
 
     @property
@@ -124,7 +125,7 @@ def locate(
     apart = [(each.score, float(np.hypot(*(each.at_m - first.at_m)))) for each in estimates if each.score >= least]
     against = [(score, off_m) for score, off_m in apart if off_m > far_m]
     if sum(score for score, _ in against) > _OUTWEIGHS * sum(each.score for each in agreeing):
-        objection = f"places of the same ground say positions that are {max(against)[1]:.0f} m apart"
+        objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"apart_m": max(against)[1]})
     footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
     here = moved(best.position.lat_deg, best.position.lon_deg, *at_m.tolist())
     return Located(

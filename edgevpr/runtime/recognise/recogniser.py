@@ -11,6 +11,7 @@ from itertools import islice
 
 from edgevpr.core.contract import Descriptor, nearest_height
 from edgevpr.core.errors import MapError, PlaceError
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.level import Mount, View
 from edgevpr.places.index import PlaceIndex
@@ -19,7 +20,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation, Ranking, compare, scan, together
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Decider, Decision, Matcher, Verifier, WalkSettings
-from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, describe_error
+from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, explain_failure
 from edgevpr.runtime.recognise.hints import RecordedPrior, to_expectation
 from edgevpr.runtime.recognise.judge import NEW_FOR_S, Verdict, says_nothing
 from edgevpr.runtime.recognise.levelling import with_picture_heading
@@ -149,7 +150,7 @@ class Recogniser:
         failure: Exception | None = None,
     ) -> Recognition:
         """Return the event of a frame; `failure` is the error that ended it (None: none did)."""
-        decision = decision or Decision(verdict=Verdict(False, describe_error(failure) if failure else ""))
+        decision = decision or Decision(verdict=Verdict(False, explain_failure(failure)))
         found, accepted = decision.findings, decision.verdict.accepted
         where = found.where if found and accepted else None
         left_out = tuple(islice(self.place_map.left_out.items(), self._left_out_reported, None))
@@ -196,14 +197,11 @@ class Recogniser:
         """Search the map for an encoded frame, and learn from the decision what the next query needs."""
         place_filter = self._place_filter if self.matcher.follows else None
         objection = says_nothing(query.descriptor, self.rule.min_quality)
-        if not objection and query.view.reason:
-            objection = f"the image is not levelled: {query.view.reason}"
-        if not objection and query.worth:
-            objection = query.worth.reason
+        objection = objection or query.view.reason or (query.worth.reason if query.worth else None)
         if place_filter:
             place_filter.predict(query.frame, query.vehicle, stride)
         if not len(self.index):
-            return Decision(verdict=Verdict(False, "the map has no place yet"))
+            return Decision(verdict=Verdict(False, Reason(ReasonCode.EMPTY_MAP)))
         if objection and self.matcher.search is None:  # a sequence needs every query
             if place_filter:
                 place_filter.update_without_match(self.index)

@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from edgevpr.core.contract import Descriptor
+from edgevpr.core.reasons import NOT_SEARCHED, Reason
 from edgevpr.core.types import Candidate, FixReport, Frame, Position, QueryCost, Steps, Vehicle
 from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
 from edgevpr.places.retrieve import Ranking
@@ -40,7 +41,7 @@ class Recognition:
     confidence: float | None = None  # probability, by the evidence, that the match is right (None: judged by limits)
     followed: Followed | None = None  # the result together with the flight so far
     accepted: bool = False  # `best` is taken for the place
-    reason: str = ""  # why or why not, in a few words
+    reason: Reason = NOT_SEARCHED  # why or why not
     says_nothing: bool = False  # too little to be recognised; a search was only made to continue a sequence
     failed: bool = False  # the frame, a place or the technique was unusable
     map_lost: bool = False  # the whole map cannot be read
@@ -97,7 +98,7 @@ def fields_of(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
         **_best(event.best),
         **{key: value for key, value in known.items() if value is not None and value != {}},
         "accepted": event.accepted,
-        "reason": event.reason,
+        "reason": event.reason.fields(),
         "accuracy_m": event.accuracy_m,
         "located": event.located and _located(event.located),
         "costs": {key: value and float(f"{value:.6g}") for key, value in asdict(event.cost).items()},

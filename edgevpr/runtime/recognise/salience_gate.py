@@ -16,6 +16,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Image, Mask
 from edgevpr.core.config import SalienceConfig
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Salience
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability, as_map
 from edgevpr.techniques.entropy import filled_bins
@@ -32,12 +33,12 @@ _LONGEST_PX = 320  # of the copy on which entropy is computed: a larger one cost
 @dataclass(frozen=True, slots=True)
 class Worth:
     """Judgement of a frame by its scores, `salience`. `short_by` is how far the worst one is below its threshold,
-    `lacks` its name, and `reason` a sentence about it (0 and None: the frame passes)."""
+    `lacks` its name, and `reason` says so (0 and None: the frame passes)."""
 
     salience: Salience
     short_by: float = 0.0
     lacks: str | None = None
-    reason: str | None = None
+    reason: Reason | None = None
 
 
 class Gate:
@@ -88,8 +89,8 @@ def compute_memorability(salience: Salience, config: SalienceConfig, usual: floa
     worst = max(short, key=lambda name: short[name], default=None)
     if worst is None or short[worst] <= 0:
         return Worth(salience)
-    reason = f"not memorable: {worst} {known[worst]:.2f}, {least[worst]:.2f} needed"
-    return Worth(salience, short[worst], worst, reason)
+    figures = {"measure": worst, "score": known[worst], "needed": least[worst]}
+    return Worth(salience, short[worst], worst, Reason(ReasonCode.NOT_MEMORABLE, figures))
 
 
 def select_best(shortfalls: list[float]) -> list[bool]:

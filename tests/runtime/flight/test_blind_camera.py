@@ -24,7 +24,7 @@ def test_ten_pictures_of_nothing_are_said_once_and_so_is_the_ground_after_them(r
     lines, texts, health = flown(recording, tmp_path, [GROUND, *[NOTHING] * 15, *[GROUND] * 3])
     queries = of_kind(lines, "query")
     assert [line["accepted"] for line in queries] == [True, *[False] * 15, *[True] * 3]
-    assert all(line["reason"].startswith("too little texture") for line in queries[1:16])
+    assert all(line["reason"]["code"] == "LOW_TEXTURE" for line in queries[1:16])
     assert queries[1]["fix"] is queries[1]["place"] is None
     assert texts == [(4, "edgevpr: camera shows nothing"), (6, "edgevpr: camera shows ground again")]
     assert [line["said"] for line in of_kind(lines, "camera")] == ["camera shows nothing", "camera shows ground again"]

@@ -54,7 +54,6 @@ class Aircraft:
             vehicle=self.vehicle,
             best=Candidate(place, FineMatch(0.5)),
             accepted=True,
-            reason="",
             located=Located(
                 position=Position(*here),
                 covariance_m2=(fix_sd_m**2, 0.0, fix_sd_m**2),

@@ -17,6 +17,7 @@ from edgevpr.core.appending import numbered
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.core.errors import EdgevprError
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Position, QueryCost, Steps
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log, select_last_flight
@@ -59,7 +60,7 @@ def test_a_match_is_written_as_it_is_with_nan_as_null(path):
     match = Recognition(
         frame=None,
         accepted=True,
-        reason="score 0.9",
+        reason=Reason(ReasonCode.ACCEPTED_WITHOUT_RIVAL, {"score": 0.9}),
         located=at_place(Position(50.12345678901, -1.5, None), 20.0),
         accuracy_m=20.0,
         steps=Steps(),

@@ -8,12 +8,14 @@ from flights import Flight, of_kind
 from frozen_cameras import DOWN, Flown, at_constant_bitrate, compressed, make_ground, with_clock
 from pictures import textured
 
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Health
-from edgevpr.runtime.flight.frozenwatch import BACK_TEXT, FROZEN_TEXT, REPEATING_TEXT, Optics
+from edgevpr.runtime.flight.frozenwatch import BACK_TEXT, Optics
 
 pytestmark = pytest.mark.slow
 
 AHEAD = Optics(focal_share=0.77, looks_down=False, is_level=False)
+STAY = Reason(ReasonCode.PICTURES_STAY)
 GIMBAL = Optics(focal_share=0.77, looks_down=True, is_level=True)
 
 
@@ -41,11 +43,11 @@ def test_pictures_that_stay_while_the_aircraft_flies_on_are_refused_until_they_m
     last = flown.fly_on(6, speed_m_s)[-1]
     for picture in harm(last, flown.rng, 16):
         flown.see(picture, velocity_m_s=(speed_m_s, 0.0))
-    assert flown.refused == [None] * (5 + within_s) + [f"not used: {FROZEN_TEXT}"] * (17 - within_s)
+    assert flown.refused == [None] * (5 + within_s) + [STAY] * (17 - within_s)
     assert flown.autopilot.begun_anew == 1
     flown.fly_on(6, speed_m_s, start_m=180.0)
     assert flown.refused[-4:] == [None] * 4
-    assert flown.notes.texts == [FROZEN_TEXT, BACK_TEXT]
+    assert flown.notes.texts == [str(STAY), BACK_TEXT]
 
 
 @pytest.mark.parametrize(
@@ -66,7 +68,7 @@ def test_pictures_that_stay_while_the_aircraft_turns_are_refused(ground, optics,
         flown.see(compressed(still, flown.rng), **turn(number))
     assert flown.refused[:5] == [None] * 5
     assert all(flown.refused[11:])
-    assert flown.notes.texts == [FROZEN_TEXT]
+    assert flown.notes.texts == [str(STAY)]
 
 
 @pytest.mark.parametrize("is_in_order", [True, False])
@@ -78,7 +80,7 @@ def test_a_clip_that_is_played_again_in_flight_is_refused(ground, is_in_order):
         flown.see(compressed(shown, flown.rng), velocity_m_s=(5.0, 0.0))
     assert flown.refused[:20] == [None] * 20
     assert all(flown.refused[30:])
-    assert flown.notes.texts == [REPEATING_TEXT]
+    assert flown.notes.texts == [str(Reason(ReasonCode.PICTURES_REPEAT))]
 
 
 def test_a_clip_whose_turns_the_aircraft_does_not_fly_is_refused(ground):
@@ -202,11 +204,11 @@ def test_a_flight_refuses_frozen_pictures_and_says_so(recording, tmp_path):
     accepted = [line["accepted"] for line in of_kind(lines, "query")]
     refused = of_kind(lines, "unusable")
     assert 7 <= len(refused) <= 11
-    assert {line["problem"] for line in refused} == {f"not used: {FROZEN_TEXT}"}
+    assert {line["reason"]["code"] for line in refused} == {"PICTURES_STAY"}
     assert accepted == [True] * (len(shown) - len(refused))
     assert flight.end["unusable"] == 0, "the camera has failed, and no picture"
-    assert [line["state"] for line in of_kind(lines, "source")] == [FROZEN_TEXT, BACK_TEXT]
-    assert link.texts() == [(4, f"edgevpr: {FROZEN_TEXT}"), (6, f"edgevpr: {BACK_TEXT}")]
-    assert FROZEN_TEXT in seen
+    assert [line["state"] for line in of_kind(lines, "source")] == [str(STAY), BACK_TEXT]
+    assert link.texts() == [(4, f"edgevpr: {STAY}"), (6, f"edgevpr: {BACK_TEXT}")]
+    assert str(STAY) in seen
     assert Health.CRITICAL in health
     assert health[-1] is Health.ACTIVE

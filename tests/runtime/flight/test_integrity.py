@@ -10,6 +10,7 @@ from air import GPS_SD_M, HOME, Air, lengths, match_at
 from fakes import FakeClock, FakeLink, receiver_at, to_autopilot, vehicle_at
 
 from edgevpr.core.geodesy import moved
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import FRAME_TIME_SD_S, Position
 from edgevpr.frames.level import View
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
@@ -316,7 +317,7 @@ def test_without_a_receiver_or_with_an_old_report_nothing_is_compared(watched):
 def test_a_picture_that_does_not_show_the_ground_below_is_not_compared(watched):
     air = watched().fly(3)
     before = len(air.distances())
-    air.match_now(view=View(reason="it tilts by 40 degrees"))
+    air.match_now(view=View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 40.0})))
     assert len(air.distances()) == before
 
 

@@ -79,7 +79,9 @@ def test_a_frame_that_cannot_be_read_is_logged_and_the_next_is_recognised(record
     flown = flight(recording, tmp_path, clock)
     pictures = [PICTURE, ImageError("1.png is cut short: copy it again."), PICTURE]
     lines = flown.fly(FakeSource(pictures, clock, is_live=False))
-    assert [line["problem"] for line in of_kind(lines, "unusable")] == ["1.png is cut short: copy it again."]
+    assert [line["reason"]["parameters"]["problem"] for line in of_kind(lines, "unusable")] == [
+        "1.png is cut short: copy it again."
+    ]
     assert len(of_kind(lines, "query")) == 2
     assert (flown.end["queries"], flown.end["unusable"]) == (2, 1)
 

@@ -8,6 +8,7 @@ import pytest
 from air import Air, lengths
 
 from edgevpr.core.geodesy import distance_m
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import FRAME_TIME_SD_S
 from edgevpr.frames.level import View
 from edgevpr.mavlink.channel import Channel
@@ -128,7 +129,7 @@ def test_a_px4_is_sent_positions_while_it_has_no_gps_and_none_while_it_has(chann
 def test_a_picture_that_cannot_be_levelled_is_withheld_and_says_why():
     air = lost(wind=WIND).fly(10)
     before = air.navigator.knows_position(air.t_s)
-    advice = air.match_now(view=View(reason="it tilts by 40 degrees"))
+    advice = air.match_now(view=View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 40.0})))
     assert before
     assert advice.fix is None
     assert not advice.is_held

@@ -9,6 +9,7 @@ from flights import Flight, of_kind
 from pictures import textured
 
 from edgevpr.core.config import load_config
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.frames.level import View
 from edgevpr.runtime.flight.camerawatch import ScaleWatch, TurnWatch
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
@@ -36,7 +37,7 @@ class Seen:
                     failed=outcome == "x",
                     says_nothing=outcome == "0",
                     worth=SimpleNamespace(reason="grass" if outcome == "n" else None),
-                    view=View(reason="it is tilted 50 degrees" if outcome == "t" else None),
+                    view=View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 50.0}) if outcome == "t" else None),
                     followed=SimpleNamespace(lost=0.95 if outcome == "L" else 0.2),
                     frame=SimpleNamespace(t_mono_s=self.clock.now_s),
                 )

@@ -8,6 +8,7 @@ import pytest
 from sureness import agreed, bare_index
 
 from edgevpr.core.contract import FineMatch, Support
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.confidence import prior
 from edgevpr.runtime.recognise.evidence import (
@@ -61,7 +62,7 @@ def test_evidence_has_the_names_that_models_ask_for():
     ):
         assert evidence.kind == kind
         assert set(evidence.figures()) >= {*OF_MAP[kind], *OF_PLACE[kind]}
-        assert evidence.describe()
+        assert evidence.describe().keys() <= ReasonCode.LOW_CONFIDENCE.parameters
 
 
 def test_a_technique_has_the_kinds_of_its_camera():
@@ -87,7 +88,9 @@ def test_ahead_landmarks_speak_for_a_match_as_far_as_more_agree_than_elsewhere_a
     proof = log_times_more(inliers, rival)
     assert proof == pytest.approx(math.log(times))
     known = replace(looked_ahead({5: ahead(0.2)}), proof=proof)
-    assert known.describe().endswith(f"and {times}.00 times as many landmarks" if proof else "of the place agrees")
+    described = known.describe()
+    assert described["landmarks_ratio"] == (pytest.approx(times) if proof else None)
+    assert (described["coverage_share"] is None) == bool(proof)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from sureness import NEEDED, agreed, bare_index, sure_rule, told
 
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import FineMatch
-from edgevpr.core.text import format_probability
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, OF_MAP, OF_PLACE, Evidence
@@ -31,8 +31,8 @@ def judged(scores=(0.2, 0.1), rule=RULE, matches=None, **more):
 
 def test_a_technique_without_a_confidence_is_judged_by_its_limits():
     assert judged().accepted
-    assert "not similar enough" in judged((0.05, 0.0)).reason
-    assert "elsewhere" in judged((0.2, 0.19)).reason
+    assert judged((0.05, 0.0)).reason.code is ReasonCode.LOW_SCORE
+    assert judged((0.2, 0.19)).reason.code is ReasonCode.LOW_LEAD
 
 
 CLEAR = Evidence(agree=-1.6, lead=0.7, coverage=-0.5)
@@ -43,9 +43,9 @@ def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted)
     rule = sure_rule(lambda evidence: confidence)
     verdict = judged(rule=rule, evidence=CLEAR)
     assert verdict.accepted is accepted
-    assert verdict.reason.startswith(
-        f"confidence {format_probability(confidence)}, 90.0 % needed: 2.0 times as many regions agree"
-    )
+    assert verdict.reason.code is (ReasonCode.ACCEPTED_BY_CONFIDENCE if accepted else ReasonCode.LOW_CONFIDENCE)
+    figures = {"confidence": confidence, "needed": 0.9, "regions_ratio": math.exp(CLEAR.lead)}
+    assert {name: verdict.reason.parameters[name] for name in figures} == pytest.approx(figures, nan_ok=True)
     assert judged((0.2,), sure_rule(lambda evidence: confidence), evidence=CLEAR).accepted is accepted, (
         "no place elsewhere"
     )
@@ -83,7 +83,7 @@ def test_no_flight_makes_sure_what_a_place_elsewhere_beats_in_the_same_picture(l
     rule = sure_rule(lambda evidence: 0.5)
     verdict = judged(rule=rule, evidence=replace(CLEAR, lead=lead), by_flight=0.9999)
     assert verdict.accepted is accepted
-    assert verdict.reason.startswith("a place elsewhere agrees better: ") is not accepted
+    assert (verdict.reason.code is ReasonCode.ELSEWHERE_AGREES_BETTER) is not accepted
 
 
 def test_a_match_that_offers_no_evidence_is_never_sure():
@@ -121,14 +121,15 @@ def test_a_sequence_and_a_technique_without_evidence_are_judged_by_limits():
 def test_a_sequence_is_not_at_a_place_that_its_newest_query_was_not_compared_with():
     search = SimpleNamespace(frames=2, length=2)
     ranking = Ranking(slots=np.array([0, 10]), scores=np.array([0.2, 0.1], np.float32), compared={10: FineMatch(0.1)})
-    assert "newest query" in judge(Findings(ranking), bare_index(30), RULE, search).reason
+    verdict = judge(Findings(ranking), bare_index(30), RULE, search)
+    assert verdict.reason.code is ReasonCode.NEWEST_DISAGREES
 
 
 @pytest.mark.parametrize(("share", "accepted"), [(0.0, True), (3 / 9, True), (4 / 9, False), (1.0, False)])
 def test_where_places_elsewhere_have_not_moved_either_all_share_a_display(share, accepted):
     verdict = judged(at_rest_elsewhere=share)
     assert verdict.accepted is accepted
-    assert ("display" in verdict.reason) is not accepted
+    assert (verdict.reason.code is ReasonCode.ELSEWHERE_AT_REST) is not accepted
 
 
 @pytest.mark.parametrize(
@@ -156,9 +157,10 @@ def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, i
     evidence = Evidence(agree=-2.0, lead=lead, coverage=-0.5, **counted)
     verdict = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), proof=agreed(inliers), evidence=evidence)
     assert verdict.accepted is accepted
-    assert f"{inliers} landmarks agree, and {rival} with a place elsewhere" in verdict.reason
+    parameters = verdict.reason.parameters
+    assert (parameters["landmarks"], parameters["rival_landmarks"]) == (inliers, rival)
     if not accepted:
-        assert verdict.reason.startswith("confidence 50.0 %, ")
+        assert parameters["confidence"] == 0.5
         by_flight = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), evidence=evidence, by_flight=0.999)
         assert by_flight.accepted, "the flight knows which of the two it is"
 
@@ -189,7 +191,7 @@ RULE_OF_SEQUENCE = AcceptRule(min_score=0.1, min_margin=0.05, neighbour_m=50.0)
 
 
 def flown(velocity, start, leaves=18, seed=3):
-    """(accepted, why, slot) of each query of a flight along places that look a little like the two around them; from
+    """(accepted, code, slot) of each query of a flight along places that look a little like the two around them; from
     query `leaves` on it shows nothing of the map."""
     index = bare_index(PLACES)
     index.place_ids[:] = np.arange(PLACES)
@@ -203,7 +205,7 @@ def flown(velocity, start, leaves=18, seed=3):
         ranking = Ranking(slots=slots, scores=scores[slots], compared={})
         ranking = sequence.follow(ranking, index, float(query))
         verdict = judge(Findings(ranking), index, RULE_OF_SEQUENCE, sequence)
-        found.append((verdict.accepted, verdict.reason, int(ranking.slots[0])))
+        found.append((verdict.accepted, verdict.reason.code, int(ranking.slots[0])))
     return found
 
 
@@ -212,7 +214,7 @@ def test_a_flight_like_the_mapping_flight_is_accepted_from_the_first_full_sequen
     found = flown(velocity, 5)
     assert [yes for yes, _, _ in found] == [False] * (LENGTH - 1) + [True] * (18 - LENGTH + 1)
     assert all(abs(slot - (5 + velocity * query)) <= 1 for query, (yes, _, slot) in enumerate(found) if yes)
-    assert "4 queries of 6" in found[3][1]
+    assert found[3][1] is ReasonCode.SEQUENCE_INCOMPLETE
 
 
 @pytest.mark.parametrize(("velocity", "start"), [(2.0, 5), (3.0, 5), (0.0, 30), (0.3, 30), (-1.0, 60), (-2.0, 60)])
@@ -227,7 +229,7 @@ def test_an_aircraft_that_leaves_the_mapped_way_is_not_followed_beyond_it(seed):
     assert found[10][0]
     # The mean would bear it for some queries yet: it is far ahead of all other places.
     assert not any(yes for yes, _, _ in found[13:])
-    assert any("no longer" in why for _, why, _ in found[11:14])
+    assert any(code is ReasonCode.NEWEST_LEFT for _, code, _ in found[11:14])
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from walks import map_of, walk_over
 
 from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import offset_m
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import STRAIGHT_DOWN, UNKNOWN_VIEW, Lens, Levelled, Mount, View, enlarged
 from edgevpr.frames.mask import Mask
@@ -139,7 +140,8 @@ def test_a_steep_picture_of_known_angles_gives_the_position_of_the_aircraft(walk
 @pytest.mark.slow
 def test_a_picture_that_is_not_levelled_is_refused(walk, ground):
     event = walk(scaling()).step(frame(ground, 2, told=STRAIGHT | {"roll_deg": 170.0}))
-    assert (event.accepted, event.reason) == (False, "the image is not levelled: it is tilted 170 degrees")
+    assert (event.accepted, event.reason.code) == (False, ReasonCode.TILTED)
+    assert event.reason.parameters["tilt_deg"] == pytest.approx(170.0)
 
 
 @pytest.mark.slow
@@ -161,9 +163,9 @@ def test_a_tilt_that_a_picture_does_not_bear_is_said_once(walk, ground, caplog):
     steep = frame(ground, 1, told=STRAIGHT | {"roll_deg": 65.0})
     with caplog.at_level(logging.WARNING):
         reasons = [asked.step(steep).view.reason for _ in range(3)]
-    assert reasons == ["it is tilted 65 degrees"] * 3
+    assert [reason.code for reason in reasons] == [ReasonCode.TILTED] * 3
     assert [record.message for record in caplog.records] == [
-        "1 is taken as it is, as others like it will be: it is tilted 65 degrees"
+        f"1 is taken as it is, as others like it will be: {reasons[0]}"
     ]
 
 
@@ -225,7 +227,7 @@ def test_a_picture_of_an_unknown_lens_says_how_far_it_looks_aside(roll_deg, pitc
 
 def test_one_that_leans_too_far_says_so_and_of_one_whose_heading_is_unknown_nothing_is_known():
     frame = Frame(image=np.zeros((48, 64), np.uint8), name="", t_mono_s=5.0, roll_deg=50.0, pitch_deg=0.0)
-    assert Levelling(None, is_live=False).prepare(frame, None, None).view.reason.split()[-2:] == ["50", "degrees"]
+    assert Levelling(None, is_live=False).prepare(frame, None, None).view.reason.code is ReasonCode.TILTED
     assert Levelling(None, is_live=False).prepare(replace(frame, roll_deg=20.0), None, None).view == UNKNOWN_VIEW
 
 

@@ -8,6 +8,7 @@ from sureness import agreed
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import metres, moved
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import View
 from edgevpr.runtime.recognise.locate import at_place, combine_with_recorded, locate
@@ -98,7 +99,7 @@ def test_places_of_the_same_ground_are_heard_together():
 
 def test_places_that_contradict_each_other_are_refused():
     found = locate([candidate(1, shift=(4, 0)), candidate(2, east_m=22)], CELLS, View(aside=(0.0, 0.0)))
-    assert "positions" in found.objection
+    assert found.objection.code is ReasonCode.POSITIONS_DISAGREE
 
 
 def test_a_place_a_little_amiss_is_not_heard_and_no_objection():

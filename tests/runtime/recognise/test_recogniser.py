@@ -11,6 +11,7 @@ from walks import map_of, walk_over
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import MapError, ModelError
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
@@ -49,7 +50,7 @@ def test_the_event_of_a_place_that_is_recognised_says_everything(walk):
     event = walk.step(frame(3, 12.5))
     assert event.accepted
     assert not event.failed
-    assert event.reason.startswith("score 0.9")
+    assert event.reason.code is ReasonCode.ACCEPTED_BY_SCORE
     assert (event.best.place.place_id, event.best.place.source_image) == (4, "3.png")
     assert event.position == Position(50.003, 8.0)
     assert event.accuracy_m == pytest.approx(111.2, abs=0.5), "half of the way to the next place nobody knows better"
@@ -95,8 +96,9 @@ def test_whatever_a_technique_raises_is_a_refusal_with_its_reason(walk, error, w
     event = walk.step(frame(1))
     assert (event.failed, event.accepted, event.position) == (True, False, None)
     assert event.is_query == (where != "encode")
-    expected = str(error) if isinstance(error, (ModelError, MapError)) else type(error).__name__
-    assert expected in event.reason
+    expected = {ModelError: ReasonCode.UNUSABLE, MapError: ReasonCode.MAP_UNREADABLE}
+    assert event.reason.code is expected.get(type(error), ReasonCode.UNFORESEEN)
+    assert event.reason.parameters["problem"] == str(error)
     setattr(walk.technique, where, whole)
     assert walk.step(frame(1)).accepted, "the next frame is recognised"
 
@@ -118,10 +120,10 @@ def test_a_place_learnt_a_moment_ago_moves_nothing(walk):
     walk.add_place(walk.index, 4, 100.0)
     event = walk.step(frame(3, 129.9))
     assert (event.accepted, event.position, event.accuracy_m) == (False, None, None)
-    assert "learnt" in event.reason
+    assert event.reason.code is ReasonCode.JUST_LEARNT
     assert walk.step(frame(2, 129.9)).accepted, "another place"
     far = walk.step(Frame(image=textured(99), name="elsewhere", t_mono_s=129.9))
-    assert "learnt" not in far.reason, "what is not like it has its own reason"
+    assert far.reason.code is not ReasonCode.JUST_LEARNT, "what is not like it has its own reason"
     assert walk.step(frame(3, 130.1)).accepted
 
 
@@ -129,13 +131,14 @@ def test_a_map_without_a_place_refuses_and_does_not_fail(walk):
     nothing = type(walk.index)(**{name: array[:0] for name, array in walk.index.arrays.items()}, mean=walk.index.mean)
     walk.change(matcher=Matcher(nothing, walk.rule))
     event = walk.step(frame(3))
-    assert (event.failed, event.accepted, event.reason, event.best) == (False, False, "the map has no place yet", None)
+    assert (event.failed, event.accepted, event.best) == (False, False, None)
+    assert event.reason.code is ReasonCode.EMPTY_MAP
 
 
 def test_a_frame_that_could_not_be_read_is_an_event_too(walk):
     event = walk.report_unread(ValueError("cut"))
     assert (event.frame, event.failed, event.is_query) == (None, True, False)
-    assert "cut" in event.reason
+    assert event.reason == Reason(ReasonCode.UNFORESEEN, {"error": "ValueError", "problem": "cut"})
 
 
 def test_the_accuracy_of_a_map_is_never_below_what_is_claimed_at_least(walk):

@@ -5,6 +5,7 @@ import pytest
 from pictures import textured
 from walks import map_of, walk_over
 
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.hints import RecordedPrior
@@ -32,7 +33,7 @@ def walk(tmp_path_factory):
 def test_a_place_that_looks_the_same_from_the_other_side_is_accepted_with_a_heading_only(walk):
     unknown, known = (walk.step(frame(LIKE_A_BRIDGE, 40, heading_deg)) for heading_deg in (None, 0.0))
     assert not unknown.accepted
-    assert "agrees nearly as well if the picture is turned otherwise" in unknown.reason
+    assert unknown.reason.code is ReasonCode.TURNED_AGREES
     assert known.accepted, known.reason
 
 

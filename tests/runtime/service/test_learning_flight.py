@@ -53,7 +53,7 @@ def test_learning_flight_makes_a_map_for_a_second_flight(generated, tmp_path):
     assert of_kind(lines, "end")[0]["accepted"] == 0, "nothing new is recognised in what was just learnt"
     assert [line["place"] for line in of_kind(lines, "learnt")] == list(range(1, 9))
     assert "8 places learnt" in said
-    assert "no place" in lines[1]["reason"]
+    assert lines[1]["reason"]["code"] == "EMPTY_MAP"
 
     lines, _ = flown(place_map, generated / "second" / "images", tmp_path / "2.jsonl")
     truth = read_positions(generated / "second" / "positions.csv")
