@@ -19,6 +19,7 @@ from mkdocs.structure.pages import Page
 
 from edgevpr.cli.main import EXIT_CODES, command_line
 from edgevpr.core.config import Config, Key, list_keys
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.interview import TABLES
 
@@ -59,6 +60,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     files.append(File.generated(config, "reference/parameters.md", content=parameters()))
     files.append(File.generated(config, "reference/command-line.md", content=commands()))
     files.append(File.generated(config, "reference/json-output.md", content=json_output()))
+    files.append(File.generated(config, "reference/reasons.md", content=reasons()))
     return files
 
 
@@ -177,6 +179,18 @@ def json_output() -> str:
     for name, part in schema["$defs"].items():
         lines += ["", f"## {name}", "", part.get("description", ""), "", "| field | type | meaning |", "|---|---|---|"]
         lines += [f"| {field} | {kind} | {text} |" for field, kind, text in fields_of(part, "")]
+    return "\n".join(lines) + "\n"
+
+
+def reasons() -> str:
+    """Return the page of the reasons, made from their table."""
+    lines = ["# Reasons", ""]
+    lines += ["Why a match is accepted or refused, and a fix not sent or not taken. Flight log and `--json` carry the"]
+    lines += ["code and the parameters, here in braces; sentences may change. Made from `edgevpr/core/reasons.py`.", ""]
+    lines += ["| code | in short | sentence |", "|---|---|---|"]
+    for code in ReasonCode:
+        sentence = re.sub(r"{(\w+):?[^}]*}", r"{\1}", "".join(code.parts)).replace("{summary}", code.summary)
+        lines.append(f"| `{code.name}` | {code.summary} | {sentence} |")
     return "\n".join(lines) + "\n"
 
 

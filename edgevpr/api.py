@@ -61,7 +61,7 @@ class Match:
         at = self.position
         about = {
             "accepted": self.accepted,
-            "reason": self.reason.fields(),
+            "reason": self.reason.code.name,
             "confidence": self.confidence,
             "accuracy_m": self.accuracy_m,
             "place": self.place and self.place.place_id,
