@@ -290,7 +290,7 @@ def map_repair(args: Namespace) -> int:
 
     found = check(args.map, progress)
     original = None if found.is_whole else repair(args.map, progress)
-    dropped = len(found.damaged)
+    dropped = found.total - found.places
     done = {"path": args.map, "kept": found.places, "dropped": dropped, "original": original and str(original)}
     last = f"{args.map}: repaired, {found.places} places kept, {dropped} dropped; the original is {original}"
     text = "nothing is damaged: the map is as it was" if original is None else last

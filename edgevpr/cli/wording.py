@@ -108,7 +108,7 @@ def format_move(path: str, done: "MapMove") -> Iterator[str]:
 
 def format_check(found: "MapCheck") -> Iterator[str]:
     """Yield the result of `map check`: the places that can be read, and what is damaged."""
-    yield f"{found.path}: {found.places} of {found.places + len(found.damaged)} places can be read"
+    yield f"{found.path}: {found.places} of {found.total} places can be read"
     yield from (f"  damaged     place {place_id}: {problem}" for place_id, problem in found.damaged)
     yield from (f"  SQLite      {fault}" for fault in found.faults or ("the file is sound",))
 

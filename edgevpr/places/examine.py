@@ -3,7 +3,7 @@
 import os
 import sqlite3
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -19,16 +19,19 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import Content, Unreadable, Values
 
 _MOST_FAULTS = 20  # most faults of a file that SQLite lists
+_NO_LANDMARKS: Content = {"landmarks": None, "landmarks_crc32": None}
 _LOW = 0.5  # factor on the value of a place that was added only because there would have been too wide a gap
 
 
 class Examined(NamedTuple):
     """The result of checking one place. `problem` says in a few words what is damaged (None: nothing). `content` has
-    the values of its row by column name; it is empty if they cannot be read."""
+    the values of its row by column name, without landmarks that are damaged; it is empty if they cannot be read.
+    `is_usable`: nothing else than its landmarks is damaged."""
 
     place_id: int
     problem: str | None
     content: Content
+    is_usable: bool
 
 
 Wanted = Callable[[PlaceMap], Collection[int] | None]  # the ids of the places of a map that are wanted; None: all
@@ -50,11 +53,13 @@ def unwatched(places: Iterable[Examined], total: int, label: str) -> Iterable[Ex
 
 @dataclass(frozen=True, slots=True)
 class MapCheck:
-    """The result of checking a map. `places` is the number of readable places. `damaged` has (place id, problem in few
-    words) of each other place. `faults` are SQLite's messages about the file as a whole."""
+    """The result of checking a map. `places` is the number of readable places, of `total`. `damaged` has (place id,
+    problem in few words) of each place with damage; one of which only the landmarks are damaged can still be read.
+    `faults` are SQLite's messages about the file as a whole."""
 
     path: str
     places: int
+    total: int
     damaged: tuple[tuple[int, str], ...]
     faults: tuple[str, ...]
 
@@ -68,18 +73,31 @@ def examine(place_map: PlaceMap, only: Collection[int] | None = None) -> Iterato
     places were added."""
     spec = place_map.spec
     for place_id, row in place_map.scan(rows.ALL) if only is None else _rows_of(place_map, only):
-        content: Content = {} if row is None else rows.content_of(rows.ALL, row)
-        problem = "SQLite cannot read its row" if row is None else None
+        if row is not None:
+            problem, content = None, rows.content_of(rows.ALL, row)
+        else:
+            content = _read_but_landmarks(place_map, place_id)
+            problem = "SQLite cannot read its landmarks" if content else "SQLite cannot read its row"
+        is_usable = False
         try:
             if content:
                 rows.parse_place(place_id, content)
                 rows.part_of(content, "coarse", spec.coarse)
-                rows.landmarks_of(content)
                 if spec.fine:
                     rows.part_of(content, "fine", spec.fine)
+                is_usable = True
+                rows.landmarks_of(content)
         except Unreadable as error:
             problem = str(error)
-        yield Examined(place_id, problem, content)
+            content = {**content, **_NO_LANDMARKS}
+        yield Examined(place_id, problem, content, is_usable)
+
+
+def _read_but_landmarks(place_map: PlaceMap, place_id: int) -> Content:
+    """Return what is left of a row whose end, the landmarks, cannot be read; empty if it cannot be read either."""
+    with suppress(PlaceError):
+        return {**place_map.row(place_id, rows.BUT_LANDMARKS), **_NO_LANDMARKS}
+    return {}
 
 
 def _rows_of(place_map: PlaceMap, place_ids: Collection[int]) -> Iterator[tuple[int, Values | None]]:
@@ -140,17 +158,18 @@ def _absorb(place_map: PlaceMap, other: PlaceMap, watch: Watch, wanted: Wanted) 
 def check(path: str | Path, watch: Watch = unwatched) -> MapCheck:
     """Read and check everything in the map file `path`. Raises MapError for a file that cannot be opened as a map."""
     with PlaceMap.open(path) as place_map:
-        problems = [(each.place_id, each.problem) for each in watch(examine(place_map), len(place_map), "checking")]
+        examined = [each._replace(content={}) for each in watch(examine(place_map), len(place_map), "checking")]
         try:
             found = [str(text) for (text,) in place_map.db.execute(f"PRAGMA integrity_check({_MOST_FAULTS})")]
         except (sqlite3.Error, UnicodeDecodeError) as error:
             found = [str(error)]
-    damaged = tuple((place_id, problem) for place_id, problem in problems if problem)
-    return MapCheck(str(path), len(problems) - len(damaged), damaged, () if found == ["ok"] else tuple(found))
+    damaged = tuple((each.place_id, each.problem) for each in examined if each.problem)
+    usable = sum(each.is_usable for each in examined)
+    return MapCheck(str(path), usable, len(examined), damaged, () if found == ["ok"] else tuple(found))
 
 
 def repair(path: str | Path, watch: Watch = unwatched) -> Path:
-    """Replace the map by a copy of its undamaged places, which keep their ids and get checksums; keep the original as
+    """Replace the map by a copy of its usable places, which keep their ids and get checksums; keep the original as
     `*.damaged` and return its path. Mask hash and calibration are copied if they can be read. Raises MapError, and
     leaves the map as it is, if no place can be read, if the original of an earlier repair exists, or if the copy cannot
     be written."""
@@ -191,8 +210,8 @@ def shrink(path: str | Path, out: Path, count: int, watch: Watch = unwatched) ->
     (number of places copied, number of readable places). Raises MapError if the map cannot be read, or if `out` exists
     or cannot be written; no part of a file is then left."""
     with mapfiles.whole_or_none(out) as unfinished, PlaceMap.open(path) as place_map:
-        whole = (each for each in watch(examine(place_map), len(place_map), "reading") if not each.problem)
-        places = [rows.parse_place(each.place_id, each.content) for each in whole]
+        usable = (each for each in watch(examine(place_map), len(place_map), "reading") if each.is_usable)
+        places = [rows.parse_place(each.place_id, each.content) for each in usable]
         points = [place.position or Position(np.nan, np.nan) for place in places]
         lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points], float).reshape(-1, 2).T
         best = best_places(lat_deg, lon_deg, np.array([_worth_of(place) for place in places]), count)
@@ -210,7 +229,7 @@ def _worth_of(place: Place) -> float:
 
 
 def _copy(place_map: PlaceMap, out: Path, places: Iterable[Examined]) -> int:
-    """Make the map `out` from the undamaged ones of `places`, with the same ids and the same texts beside them;
+    """Make the map `out` from the usable ones of `places`, with the same ids and the same texts beside them;
     return how many places it has."""
     copied = 0
     with PlaceMap.create(out, place_map.spec) as copy:
@@ -220,7 +239,7 @@ def _copy(place_map: PlaceMap, out: Path, places: Iterable[Examined]) -> int:
         copy.record_calibration(place_map.calibration)
         with copy.transaction():
             for each in places:
-                if not each.problem:
+                if each.is_usable:
                     copy.insert(each.content, each.place_id)
                     copied += 1
     return copied

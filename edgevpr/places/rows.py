@@ -31,6 +31,7 @@ BLOBS = "coarse, fine, landmarks"
 CHECKSUMS = "geom_crc32, coarse_crc32, fine_crc32, pose_crc32, landmarks_crc32"
 OF_PLACE = f"{VALUES}, {SALIENCE}, {POSE}, geom_crc32, pose_crc32"
 ALL = f"{VALUES}, {SALIENCE}, {POSE}, {BLOBS}, {CHECKSUMS}"
+BUT_LANDMARKS = f"{VALUES}, {SALIENCE}, {POSE}, coarse, fine, geom_crc32, coarse_crc32, fine_crc32, pose_crc32"
 MOST_LANDMARK_BYTES = 10_000  # per place
 
 _POSE = tuple(POSE.split(", "))

@@ -8,7 +8,7 @@ from test_mapfile import SPEC, descriptor, frame
 
 from edgevpr.core.errors import PlaceError
 from edgevpr.core.types import Pose, Position
-from edgevpr.places.examine import examine, merge
+from edgevpr.places.examine import check, examine, merge, repair
 from edgevpr.places.mapfile import PlaceMap
 
 POSE = Pose(up_deg=271.5, footprint_m=66.0, covariance_m2=(4.0, -1.0, 2.25), recorded=Position(50.1, 8.2))
@@ -63,6 +63,19 @@ def test_a_pose_that_cannot_be_true_is_not_believed(posed, change, says):
         assert broken.place_id == 1
         with pytest.raises(PlaceError, match=says):
             [*place_map.places([1]), place_map.landmarks_of(1)]
+
+
+def test_repair_keeps_a_place_whose_landmarks_alone_are_damaged_without_them(posed):
+    with sqlite3.connect(posed) as db:
+        db.execute("UPDATE places SET landmarks = x'00' WHERE place_id = 1")
+    db.close()
+    found = check(posed)
+    assert (found.places, found.total, len(found.damaged)) == (2, 2, 1)
+    repair(posed)
+    assert check(posed).is_whole
+    with PlaceMap.open(posed) as place_map:
+        assert [place.place_id for place in place_map.places()] == [1, 2]
+        assert place_map.landmarks_of(1) is None
 
 
 def test_a_place_moved_by_another_program_keeps_its_pose_and_forgets_where_it_was_recorded(posed):
