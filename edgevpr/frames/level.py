@@ -16,14 +16,18 @@ from edgevpr.core.arrays import Doubles, Image, Mask
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
-from edgevpr.frames.images import shrunk
+from edgevpr.frames.homography import Homography, cut_polygon
 from edgevpr.frames.lens import CalibratedLens, Remap, line_of_sight
 
-MAX_TILT_DEG = 60.0
+MAX_TILT_DEG = 63.0  # a camera that looks 60 degrees ahead, and sways
 # Without a lens an image is not levelled, and beyond this tilt it looks otherwise than straight down. With one, the
 # ground under the aircraft lies at the edge of the image or outside, and the middle of the image takes its place.
 MAX_TILT_UNLEVELLED_DEG = 20.0
-_MOST_OFF_DOWN_DEG = 85.0  # between a corner's ray and straight down: beyond are the horizon and far too distant ground
+# Rays, (right, down, 1) in focal lengths, that go down by less are left out: beyond are far too distant ground, the
+# horizon and the sky.
+_LEAST_DOWN = 0.1
+# Standard deviations of a tilt, as tangents: of one that is reported, and of one that only the camera's mount tells.
+_REPORTED_TILT_SD, _MOUNT_TILT_SD = math.tan(math.radians(1.0)), math.tan(math.radians(3.0))
 _LEAST_TILT_DEG, _LEAST_TURN_DEG, _LEAST_ZOOM = 1.0, 1.0, 0.03  # smaller corrections do not affect matches
 # Limits of a picture's footprint over the wanted footprint. Beyond them too few of its pixels are left, or too little
 # of the output is filled, and the height is more likely wrong than so far from the map's.
@@ -31,7 +35,6 @@ _ZOOMS = (0.3, 4.0)
 _LEAST_FILLED = 1 / 3  # of the output area that the same picture would fill if it were taken straight down
 _HIGHEST_M = 10_000.0
 _LONGEST_PX = 1024  # largest side of a warped picture: no technique uses more pixels
-_SUBPIXEL_BITS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +71,15 @@ class View:
 
     `up_deg`: compass direction (0..360) of the picture's top. `footprint_m`: ground length of its longest side.
     `aside`: offset from the picture's middle to the point straight under the camera, (right, up) in shares of the
-    longest side. `zoom`: factor by which the picture was enlarged; its longest side shows that many times less ground.
+    longest side. `aside_sd`: standard deviation of each, by what is not known of a large tilt. `zoom`: factor by which
+    the picture was enlarged; its longest side shows that many times less ground.
     `lean_m`: that offset on the ground (east, north), of a picture that was not warped because its lens is unknown.
     `focal`: focal length in shares of the longest side. `reason`: why a tilted picture was not warped."""
 
     up_deg: float | None = None
     footprint_m: float | None = None
     aside: tuple[float, float] | None = None
+    aside_sd: float = 0.0
     zoom: float = 1.0
     lean_m: tuple[float, float] | None = None
     focal: float | None = None
@@ -137,8 +142,8 @@ def levelled(
     if taking.is_too_tilted:
         view = View(up_deg=taking.top_deg, reason=Reason(ReasonCode.TILTED, {"tilt_deg": taking.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
-    if taking.tilt_deg > MAX_TILT_UNLEVELLED_DEG and taking.heading_deg is None:
-        # The ground that it shows lies far from the aircraft, in an unknown direction.
+    if below and taking.tilt_deg > MAX_TILT_UNLEVELLED_DEG and taking.heading_deg is None:
+        # The ground that it shows lies far from the aircraft, in an unknown direction. Of a query, the match tells it.
         view = View(reason=Reason(ReasonCode.TILTED_WITHOUT_HEADING, {"tilt_deg": taking.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     own_m = taking.own_m and scale * taking.own_m
@@ -148,7 +153,7 @@ def levelled(
     turn_deg = abs(shorter_deg(taking.top_deg or 0.0))
     if taking.tilt_deg < _LEAST_TILT_DEG and turn_deg < _LEAST_TURN_DEG and abs(zoom - 1) < _LEAST_ZOOM:
         aside, focal = taking.aside(taking.straight, 1.0), taking.focal_px / taking.longest_px
-        view = View(up_deg=taking.top_deg, footprint_m=own_m, aside=aside, focal=focal)
+        view = View(up_deg=taking.top_deg, footprint_m=own_m, aside=aside, aside_sd=taking.aside_sd(1.0), focal=focal)
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
 
     below &= taking.tilt_deg <= MAX_TILT_UNLEVELLED_DEG
@@ -170,7 +175,8 @@ def levelled(
         footprint_m=own_m and own_m / zoom,
         zoom=zoom,
         focal=out_px / side,
-        aside=(0.0, 0.0) if below and taking.is_attitude_known else taking.aside(turned, zoom),
+        aside=(0.0, 0.0) if below and taking.is_tilt_known else taking.aside(turned, zoom),
+        aside_sd=taking.aside_sd(zoom),
     )
     return _warped(frame.image, overlay, warp, view)
 
@@ -193,7 +199,7 @@ def undistort_frame(image: Image, overlay: Mask | None, view: View, lens: Calibr
     return _warped(image, overlay, line_of_sight(lens, (width, height)).straightening(_LONGEST_PX), view)
 
 
-def _warped(image: Image, overlay: Mask | None, warp: "_Homography | Remap", view: View) -> Levelled:
+def _warped(image: Image, overlay: Mask | None, warp: Homography | Remap, view: View) -> Levelled:
     mask = warp.shown if overlay is None else warp.shown & warp.overlay(overlay)
     return Levelled(warp.picture(image), None if mask.all() else mask, view)
 
@@ -238,12 +244,15 @@ class _Taking:
     looks), of the airframe (nose, right, down), and of the level picture (right, down in the picture, to the ground).
     `straight`: rotation from lens to level picture without a turn. `tilt_deg`: angle between the viewing direction and
     straight down; `is_too_tilted` for a warp. `top_deg`: compass direction of the picture's top. `own_m`: ground length
-    of the longest side if the picture were level. `corners` (3, 4): those of the picture, homogeneous pixels."""
+    of the longest side if the picture were level. `corners` (3, n): those of the part of the picture that goes down
+    enough, homogeneous pixels. `is_tilt_known`: by a reported attitude or, within some degrees, by the mount alone."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
         roll_deg, pitch_deg, self.heading_deg, _ = _attitude(frame, vehicle)
-        self.is_attitude_known = roll_deg is not None and pitch_deg is not None
-        known = (roll_deg or 0.0, pitch_deg or 0.0) if self.is_attitude_known else (0.0, 0.0)
+        is_attitude_known = roll_deg is not None and pitch_deg is not None
+        self.is_tilt_known = is_attitude_known or lens.mount != STRAIGHT_DOWN
+        self._is_attitude_known = is_attitude_known
+        known = (roll_deg or 0.0, pitch_deg or 0.0) if is_attitude_known else (0.0, 0.0)
         self._level_from_straight = _level_from_body(*known) @ lens.mount.body_from_straight()
         self._lens = lens
         height, width = frame.image.shape[:2]
@@ -259,26 +268,35 @@ class _Taking:
         self.corners = np.array([[-0.5, right, right, -0.5], [-0.5, -0.5, lower, lower], [1] * 4])
         self.straight = self.level_from_lens(lens.up_deg)
         self.tilt_deg = math.degrees(math.acos(np.clip(self.straight[2, 2], -1, 1)))
-        rays = self.straight @ self.lens_from_pixel @ self.corners
-        lowest = (rays[2] / np.linalg.norm(rays, axis=0)).min()
-        self.is_too_tilted = self.tilt_deg > MAX_TILT_DEG or lowest < math.cos(math.radians(_MOST_OFF_DOWN_DEG))
+        self.is_too_tilted = self.tilt_deg > MAX_TILT_DEG
+        if not self.is_too_tilted:
+            depth = (self.straight @ self.lens_from_pixel @ self.corners)[2]
+            self.corners = cut_polygon(self.corners, depth - _LEAST_DOWN)
         self.top_deg = None if self.heading_deg is None else (self.heading_deg + lens.up_deg) % 360
 
-    def warp(self, out_from_ray: Doubles, out_px: float, side: int) -> "_Homography | Remap":
+    def warp(self, out_from_ray: Doubles, out_px: float, side: int) -> Homography | Remap:
         """Return the warp to (side, side) pixels by the homography (3, 3) from rays to pixels of an output of the focal
         length `out_px`."""
         if self._sight:
             return self._sight.remap(out_from_ray, out_px, (side, side))
-        return _Homography(out_from_ray @ self.lens_from_pixel, self.corners, side, self.focal_px / out_px)
+        return Homography(out_from_ray @ self.lens_from_pixel, self.corners, side, self.focal_px / out_px)
 
     def level_from_lens(self, up_deg: float) -> Doubles:
         """Return the rotation from the lens to a level picture whose top is `up_deg` clockwise from the nose."""
         return np.asarray(_body_from_lens(up_deg).T @ self._level_from_straight @ _body_from_lens(self._lens.up_deg))
 
     def aside(self, turned: Doubles, zoom: float) -> tuple[float, float] | None:
-        """Return `View.aside` after the rotation `turned` and scaling by `zoom`; None if the attitude is unknown."""
+        """Return `View.aside` after the rotation `turned` and scaling by `zoom`; None if the tilt is unknown."""
         right, back = turned[:2, 2] / turned[2, 2] * zoom * self.focal_px / self.longest_px
-        return (float(-right), float(back)) if self.is_attitude_known else None
+        return (float(-right), float(back)) if self.is_tilt_known else None
+
+    def aside_sd(self, zoom: float) -> float:
+        """Return `View.aside_sd` after scaling by `zoom`. An error of a tilt t moves the point by 1 + tan(t)^2 times
+        the height. Of a reported one, the 1 is part of the errors of all positions."""
+        if not self.is_tilt_known:
+            return 0.0
+        steep, focal = math.tan(math.radians(self.tilt_deg)) ** 2, zoom * self.focal_px / self.longest_px
+        return float(focal * (_REPORTED_TILT_SD * steep if self._is_attitude_known else _MOUNT_TILT_SD * (1 + steep)))
 
 
 def _attitude(frame: Frame, vehicle: Vehicle | None) -> Iterator[float | None]:
@@ -300,31 +318,3 @@ def _body_from_lens(up_deg: float) -> Doubles:
     """Return the rotation (3, 3) of the axes of a camera that looks straight down to those of the airframe."""
     up = math.radians(up_deg)
     return np.array([[-math.sin(up), -math.cos(up), 0], [math.cos(up), -math.sin(up), 0], [0, 0, 1]])
-
-
-class _Homography:
-    """The warp of a picture without distortion to (side, side) pixels by a homography (3, 3), like `frames.lens.Remap`.
-    `corners` are those of the picture, homogeneous pixels (3, 4)."""
-
-    def __init__(self, out_from_pixel: Doubles, corners: Doubles, side: int, shrink: float) -> None:
-        self._out_from_pixel, self._side, self._shrink = out_from_pixel, side, shrink
-        ends = out_from_pixel @ corners
-        points = np.round((ends[:2] / ends[2]).T * 2**_SUBPIXEL_BITS).astype(np.int32)
-        shown = cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, (1,), shift=_SUBPIXEL_BITS)
-        self.shown: Mask = shown.view(np.bool_)
-
-    def overlay(self, overlay: Mask) -> Mask:
-        size = (self._side, self._side)
-        return cv2.warpPerspective(overlay.view(np.uint8), self._out_from_pixel, size, flags=cv2.INTER_NEAREST).view(
-            bool
-        )
-
-    def picture(self, image: Image) -> Image:
-        small, out_from_pixel = shrunk(image, self._shrink), self._out_from_pixel
-        if small is not image:
-            along, across = (before / after for before, after in zip(image.shape[:2], small.shape[:2], strict=True))
-            out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]
-        # Outside the picture, where the mask is False, its edge is repeated, so that no gradient arises inside.
-        return cv2.warpPerspective(  # type: ignore[return-value]  # of the same dtype
-            small, out_from_pixel, (self._side, self._side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )

@@ -3,6 +3,7 @@ aircraft flew level. A wrong height scales a picture wrongly; a technique with `
 """
 
 import logging
+import math
 from dataclasses import dataclass, field, replace
 
 from edgevpr.core.arrays import Mask
@@ -32,6 +33,7 @@ GPS_SD_M = 5.0  # standard deviation along one axis of a recorded position, unle
 # Distance, as a share of the footprint, from the picture's middle to the point below an aircraft tilted by 3 degrees.
 # Chosen on generated flights and aerial_swindale.
 TILT_SD_WITHOUT_ATTITUDE = 0.04
+_MAX_ASIDE_WITHOUT_HEADING = 0.25  # of the longest side: farther from the aircraft, the picture shows other ground
 _FIELDS_AGREE_DEG = 5.0  # that of a data sheet is rounded
 
 _log = logging.getLogger(__name__)
@@ -155,6 +157,8 @@ def place_at_middle(frame: Frame, view: View) -> Frame:
     this becomes the position of the picture's middle instead of the aircraft's, as far as that can be computed, and
     with a known height and heading it gets a pose."""
     frame = with_picture_heading(frame, view)
+    if view.aside and view.up_deg is None and math.hypot(*view.aside) > _MAX_ASIDE_WITHOUT_HEADING:
+        return replace(frame, position=None)
     if frame.position and view.lean_m:
         east_m, north_m = view.lean_m
         middle = moved(frame.position.lat_deg, frame.position.lon_deg, -east_m, -north_m)
@@ -166,6 +170,7 @@ def place_at_middle(frame: Frame, view: View) -> Frame:
         variance_m2 += (TILT_SD_WITHOUT_ATTITUDE * view.footprint_m) ** 2
     else:
         # The point `aside` is below the aircraft: the picture's middle is as far from it, in the opposite direction.
+        variance_m2 += (view.aside_sd * view.footprint_m) ** 2
         off_m = -view.footprint_m * axes_of(view.up_deg) @ view.aside
         position = Position(*moved(position.lat_deg, position.lon_deg, *off_m.tolist()), position.alt_m)
     pose = Pose(up_deg=view.up_deg, footprint_m=view.footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2))

@@ -119,8 +119,9 @@ def locate(
     at_m, covariance = _average([each for each in agreeing if each.score >= least][:_MAX_PLACES_AVERAGED])
     if view.lean_m is not None:
         at_m = at_m + view.lean_m
-    elif view.aside is None:
-        covariance += (TILT_SD_WITHOUT_ATTITUDE * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
+    else:
+        tilt_sd = TILT_SD_WITHOUT_ATTITUDE if view.aside is None else view.aside_sd
+        covariance += (tilt_sd * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
     objection, far_m = None, _CONTRADICTION_SHARE * pose.footprint_m
     apart = [(each.score, float(np.hypot(*(each.at_m - first.at_m)))) for each in estimates if each.score >= least]
     against = [(score, off_m) for score, off_m in apart if off_m > far_m]

@@ -1,0 +1,49 @@
+"""The warp of a picture by a homography, and the part of a picture that a homography can warp."""
+
+import cv2
+import numpy as np
+
+from edgevpr.core.arrays import Doubles, Image, Mask
+from edgevpr.frames.images import shrunk
+
+_SUBPIXEL_BITS = 4
+
+
+class Homography:
+    """The warp of a picture without distortion to (side, side) pixels by a homography (3, 3), like `lens.Remap`.
+    `corners` are those of the part of the picture that is used, homogeneous pixels (3, n)."""
+
+    def __init__(self, out_from_pixel: Doubles, corners: Doubles, side: int, shrink: float) -> None:
+        self._out_from_pixel, self._side, self._shrink = out_from_pixel, side, shrink
+        ends = out_from_pixel @ corners
+        points = np.round((ends[:2] / ends[2]).T * 2**_SUBPIXEL_BITS).astype(np.int32)
+        shown = cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, (1,), shift=_SUBPIXEL_BITS)
+        self.shown: Mask = shown.view(np.bool_)
+
+    def overlay(self, overlay: Mask) -> Mask:
+        size = (self._side, self._side)
+        return cv2.warpPerspective(overlay.view(np.uint8), self._out_from_pixel, size, flags=cv2.INTER_NEAREST).view(
+            bool
+        )
+
+    def picture(self, image: Image) -> Image:
+        small, out_from_pixel = shrunk(image, self._shrink), self._out_from_pixel
+        if small is not image:
+            along, across = (before / after for before, after in zip(image.shape[:2], small.shape[:2], strict=True))
+            out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]
+        # Outside the picture, where the mask is False, its edge is repeated, so that no gradient arises inside.
+        return cv2.warpPerspective(  # type: ignore[return-value]  # of the same dtype
+            small, out_from_pixel, (self._side, self._side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+
+
+def cut_polygon(corners: Doubles, depth: Doubles) -> Doubles:
+    """Cut from a convex polygon, homogeneous (3, n), what is not deep: at its corners it has the `depth` (n,)."""
+    kept = []
+    for one, other in zip(range(-1, len(depth) - 1), range(len(depth)), strict=True):
+        if (depth[one] > 0) != (depth[other] > 0):
+            share = depth[one] / (depth[one] - depth[other])
+            kept.append(corners[:, one] + share * (corners[:, other] - corners[:, one]))
+        if depth[other] > 0:
+            kept.append(corners[:, other])
+    return np.column_stack(kept)
