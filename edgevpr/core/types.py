@@ -1,9 +1,7 @@
-"""The values that packages pass to each other: frozen dataclasses, and the interface of recordings (`Tape`)."""
+"""The values that packages pass to each other: frozen dataclasses."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
 
 import numpy as np
 
@@ -247,21 +245,3 @@ class FixReport:
     lat_deg: float | None = None
     lon_deg: float | None = None
     accuracy_m: float | None = None
-
-
-T = TypeVar("T")
-
-
-class Tape:
-    """Records all values that enter a flight from outside, or plays a recording back; this base class does neither.
-    Values are JSON types or bytes. `kind` is the name of the input, such as "frame"."""
-
-    def read(self, kind: str, look: Callable[[], T]) -> T:
-        """Get a value of the input `kind` by `look`, and record it; in a replay return the recorded value instead."""
-        return look()
-
-    def note(self, kind: str, *values: Any) -> None:
-        """Record values that were not obtained by `read`; may be called from any thread."""
-
-
-NO_TAPE = Tape()

@@ -9,13 +9,13 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field, replace
 
-from edgevpr.core.types import NO_TAPE, Position, Tape, Vehicle
+from edgevpr.core.types import Position, Vehicle
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.clock import SILENT_AFTER_S
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending, put_back
-from edgevpr.mavlink.ground import PAUSED, Requests, Texts
+from edgevpr.mavlink.ground import FOR_PEOPLE, PAUSED, Requests, Texts
 from edgevpr.mavlink.messages import AUTOPILOT, Fix, Health, Severity
 from edgevpr.mavlink.peer import Autopilot, Listener
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
@@ -28,7 +28,6 @@ HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the l
 BETWEEN_S = 0.5  # from a single fix to the next one that no match asks for
 ASK_AGAIN_S = 5.0
 ORIGIN_WITHIN_S = 5.0  # an autopilot that has an origin sends it once a second when asked to
-FOR_PEOPLE = ("STATUSTEXT", "NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "ONBOARD_COMPUTER_STATUS")
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +46,6 @@ class LinkSettings:
     tap: Tap = untapped
     signing: Signing = NOT_SIGNING
     origin: Position | None = None
-    tape: Tape = NO_TAPE
 
 
 class Conversation:
@@ -136,9 +134,8 @@ class Conversation:
 
     def wait_s(self, longest_s: float) -> float:
         """Return for how many seconds, `longest_s` at most, the link may sleep before something is due to be sent."""
-        if not self.channel.is_continuous:
-            return longest_s
-        return min(longest_s, max(0.0, self._state_due_s - self._clock()))
+        due_in_s = self._state_due_s - self._clock() if self.channel.is_continuous else longest_s
+        return min(longest_s, max(0.0, due_in_s))
 
     def next_packet(self) -> tuple[bytes, Sending | None] | None:
         """Choose and pack the next message. Returns its packet and the fix in it, if any; None: nothing is due."""
@@ -198,15 +195,18 @@ class Conversation:
         if is_there or self._is_there is not None:
             self._is_there = is_there
         self.fixes.report_silence(self.autopilot.readiness(now_s).why_silent, now_s)
-        for report in self._reports:
-            self.announce(*report)
-        self._reports.clear()
+        while self._reports:
+            self.announce(*self._reports.pop(0))
 
     def break_off(self, lost_fixes: int) -> None:
         """Reset what ends when the port is lost. `lost_fixes` is the number of fixes thrown away with the port."""
         self.fixes.note_lost(lost_fixes)
         self.autopilot.heard_s = -math.inf  # another one may be at the port when it is open again
         self.reader.parsers.clear()  # with incomplete messages
+
+    def drop_stale(self) -> None:
+        """Give up the fixes that have waited too long for a port."""
+        self.fixes.drop_stale(self._clock())
 
     def end(self) -> None:
         """Give up all fixes, whether they wait for an answer or wait to be sent."""

@@ -6,6 +6,7 @@ No message is forwarded: that would let a stranger on the ground speak to the fl
 
 from edgevpr.mavlink.address import LinkAddress, Sender
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
+from edgevpr.mavlink.driver import DriverMaker, PortDriver
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import mavlink
 
@@ -28,14 +29,13 @@ class GroundLink(Link):
 
     name = "ground"
 
-    def __init__(self, address: LinkAddress, flight: Link) -> None:
+    def __init__(self, address: LinkAddress, flight: Link, drive: DriverMaker = PortDriver) -> None:
         of_flight = flight.conversation.settings
         settings = LinkSettings(
             component_id=of_flight.component_id,
             clock=of_flight.clock,
             signing=of_flight.signing.of_ground(),
-            tape=of_flight.tape,
         )
-        super().__init__(address, settings, flight.turns, GroundConversation)
+        super().__init__(address, settings, flight.turns, converse=GroundConversation, drive=drive)
         with self.turn("ground link"):
             flight.conversation.copy_to(self.conversation)

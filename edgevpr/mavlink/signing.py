@@ -124,22 +124,17 @@ class TimeStamps:
 
 class Signing:
     """Signs the messages that one link sends, and admits those received that are signed with the same key and not older
-    than earlier ones. `refused` counts the others by reason. Without a key (no `stamps`) nothing is signed, and every
-    message is admitted."""
+    than earlier ones. `refused` counts the others by reason; `verdicts` has the reason for each message received last
+    (None: admitted). Without a key (no `stamps`) nothing is signed, and every message is admitted."""
 
     def __init__(self, key: bytes = b"", stamps: TimeStamps | None = None, link_id: int = TO_AUTOPILOT) -> None:
         self.refused: Counter[str] = Counter()
         self._key, self._stamps, self._link_id = key, stamps, link_id
-        self._verdicts: list[str | None] = []
+        self.verdicts: list[str | None] = []
 
     def of_ground(self) -> "Signing":
         """Return the signing of the link to the ground: the same key and time stamps, but another link id."""
         return Signing(self._key, self._stamps, TO_GROUND)
-
-    def take_verdicts(self) -> list[str | None]:
-        """Return, for each message since the last call, why it was refused (None: admitted)."""
-        verdicts, self._verdicts = self._verdicts, []
-        return verdicts
 
     def stamp(self, packer: Message) -> None:
         """Make a pymavlink packer sign its next message."""
@@ -153,7 +148,7 @@ class Signing:
         if not self._stamps:
             return True
         reason = self._refusal(self._stamps, message.get_msgbuf(), message.get_header())
-        self._verdicts.append(reason)
+        self.verdicts.append(reason)
         if reason is None:
             return True
         if reason not in self.refused:

@@ -15,15 +15,23 @@ from edgevpr.core.config import Config, build, change_config
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.text import waiting
 from edgevpr.frames.images import read_image
-from edgevpr.frames.taped import ReplayedSource
 from edgevpr.mavlink.signing import NOT_SIGNING
 from edgevpr.mavlink.wire import untapped
 from edgevpr.power.boards import Board
 from edgevpr.review.compare import Line, Packets
-from edgevpr.review.tape import Playback, ReplayedGround, ReplayedLink, ReplayedSigning, Supposed, TapeEnded, read_tape
-from edgevpr.runtime.flight.clock import Clock, record_clock
+from edgevpr.review.tape import (
+    Playback,
+    ReplayedDriver,
+    ReplayedSigning,
+    ReplayedSource,
+    Supposed,
+    TapeEnded,
+    read_tape,
+)
+from edgevpr.runtime.flight.boundary import TapedMachine, TapedStop, TapedTurns, tape_clock
+from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flight import Flight
-from edgevpr.runtime.flight.flightio import FlightIO, Stop
+from edgevpr.runtime.flight.flightio import FlightIO
 from edgevpr.runtime.flight.flightlog import read_log, select_last_flight
 from edgevpr.runtime.flight.recording import MAP, TAPE, frame_path, open_recording
 
@@ -58,21 +66,22 @@ def replay(log: str | Path, place_map: str | None = None, changes: Path | None =
     if changes:
         config = change_config(config, changes)
     playback = Supposed(notes) if changes else Playback(notes)
+    board = build(Board, header["board"], "the board of the flight")
     why_ended = None
     with TemporaryDirectory(prefix="edgevpr-replay-") as temporary:
         again_log = f"{temporary}/flight.jsonl" if config.log.path else None
         io = FlightIO(
-            board=build(Board, header["board"], "the board of the flight"),
+            board=board,
             place_map=_map_of(folder, Path(temporary), config, place_map or config.map),
             log=replace(config.log, path=again_log, max_mb=None),
-            tape=playback,
-            clock=record_clock(Clock(sleep=playback.sleep), playback),
+            clock=tape_clock(Clock(sleep=playback.sleep), playback),
+            machine=TapedMachine(board, playback),
             open_source=lambda step_s: ReplayedSource(playback, partial(_picture, folder)),
-            link=ReplayedLink,
-            ground=ReplayedGround,
+            turns=TapedTurns(Clock().mono_s, playback),
+            drive=partial(ReplayedDriver, playback),
             signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
             tap=untapped,
-            stop=Stop(playback),
+            stop=TapedStop(playback),
             status=None,
             recording=header["recording"],
         )

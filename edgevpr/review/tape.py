@@ -1,9 +1,7 @@
 """Plays back the tape of a recorded flight: the code's questions to the outside world (clock, frame, temperature) get
 the answers that they got in the flight, and its links receive what they received then. `replay` uses it.
 
-A line of the tape is a note: the answer to a question of some kind, or a turn of a link. In a turn (see
-`mavlink.conversation`) a link works alone and its time stands still; the note has this time and the steps, such as
-bytes received or a packet sent."""
+`runtime.flight.boundary` says what is on the tape."""
 
 import json
 import logging
@@ -14,16 +12,22 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, cast
 
-from edgevpr.core.errors import EdgevprError
-from edgevpr.core.types import Tape
+from edgevpr.core.arrays import Image
+from edgevpr.core.errors import EdgevprError, ImageError
+from edgevpr.core.types import Frame, Position
+from edgevpr.frames.shot import Condition
+from edgevpr.frames.source import Source
+from edgevpr.mavlink.address import LinkAddress
+from edgevpr.mavlink.conversation import Conversation
+from edgevpr.mavlink.driver import PortState
 from edgevpr.mavlink.fixes import Sending
-from edgevpr.mavlink.groundlink import GroundLink
-from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.ports import LOST
 from edgevpr.mavlink.signing import Signing
+from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Message
 from edgevpr.review.compare import Packets
-from edgevpr.runtime.flight.flightio import StopNow
+from edgevpr.runtime.flight.boundary import SOURCE_STATE, Tape
+from edgevpr.runtime.flight.stop import StopNow
 
 Note = list[Any]  # a line of the tape: a kind, and its values
 _CLOCKS = ("mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s")
@@ -38,48 +42,56 @@ class TapeEnded(BaseException):
     """Raised where the tape has no more notes: the flight was killed, or its recording ended before it did."""
 
 
-class ReplayedLink(Link):
-    """A link without a port and a thread, whose turns come from the tape, a `Playback`. In a "what if" it receives what
-    the autopilot sent in the flight, and a packet to the autopilot counts as sent at once."""
+class ReplayedDriver:
+    """A driver without a port and a thread: the turns of its link come from the tape, a `Playback`. In a "what if" it
+    receives what the autopilot sent in the flight, and a packet to the autopilot counts as sent at once."""
+
+    def __init__(
+        self, playback: "Playback", name: str, address: LinkAddress, conversation: Conversation, turns: Turns
+    ) -> None:
+        self._playback, self._name, self._conversation, self._turns = playback, name, conversation, turns
+        self._leaving: deque[Sending] = deque()
 
     def start(self) -> None:
         """Let the playback perform the link's turns from now on."""
-        self._leaving: deque[Sending] = deque()
-        self._playback = cast(Playback, self._tape)  # the type of `_tape` is more general
-        self._playback.links[self.name] = self._perform
+        self._playback.links[self._name] = self._perform
 
-    def close(self) -> None:
-        """Send waiting texts without delay; all else that closing does is on the tape."""
-        with self.turn("close"):
-            self.conversation.texts.hurry()
+    def state(self) -> PortState:
+        """Return the state that the port had in the flight."""
+        connected, trouble, reopened = self._playback.read("port", lambda: (False, None, 0))
+        return connected, trouble, reopened
 
-    def _ring(self) -> None:
+    def ring(self) -> None:
+        """Send what waits, in a "what if"."""
         if not self._playback.is_exact:
-            with self.turn("ring"):
+            with self._turns.taken("ring"):
                 self._send_all()
 
+    def close(self) -> None:
+        """Do nothing: all that closing does is on the tape."""
+
     def _send_all(self) -> None:
-        while chosen := self.conversation.next_packet():
+        while chosen := self._conversation.next_packet():
             if sending := chosen[1]:
                 sending.settle(True)
-                self.conversation.note_departed([sending])
+                self._conversation.note_departed([sending])
 
     def _perform(self, t_s: float, steps: list[Note]) -> None:
-        """Repeat the `steps` of a turn at the time `t_s`, as `Link` wrote them on the tape."""
-        with self.turns.again(t_s):
+        """Repeat the `steps` of a turn at the time `t_s`."""
+        with self._turns.again(t_s):
             for step in steps:
                 self._repeat(step, t_s)
 
     def _repeat(self, step: Note, now_s: float) -> None:
-        conversation = self.conversation
+        conversation = self._conversation
         match step:
             case ["waits"]:
-                conversation.fixes.drop_stale(now_s)
+                conversation.drop_stale()
             case ["answers"]:
                 conversation.announce_changes()
             case ["heard", data, sender, verdicts]:
                 if verdicts:
-                    cast(ReplayedSigning, self._settings.signing).verdicts = deque(verdicts)
+                    conversation.settings.signing.verdicts = verdicts
                 try:
                     conversation.hear(b64decode(data), now_s, tuple(sender) if sender else None)
                 except Exception:  # as in the flight, which then lost the link
@@ -89,32 +101,24 @@ class ReplayedLink(Link):
             case ["said", then]:
                 packet, sending = conversation.next_packet() or (None, None)
                 self._leaving += [sending] if sending else []
-                self._playback.packets.compare(now_s, self.name, b64decode(then) if then else None, packet)
+                self._playback.packets.compare(now_s, self._name, b64decode(then) if then else None, packet)
             case ["departed", count]:
                 departed = [self._leaving.popleft() for _ in range(min(count, len(self._leaving)))]
                 for sending in departed:
                     sending.settle(True)
                 conversation.note_departed(departed)
-            case ["lost" | "closed" as what, count]:
+            case ["lost" | "closed" as what, *count]:
                 for sending in self._leaving:
                     sending.settle(False, LOST)
                 self._leaving.clear()
-                conversation.break_off(count) if what == "lost" else conversation.end()
+                conversation.break_off(*count) if what == "lost" else conversation.end()
             case _:
                 raise EdgevprError(f"The tape has a step of the link that this edgevpr does not know: {step}")
-
-
-class ReplayedGround(GroundLink, ReplayedLink):
-    """The link to the ground station, replayed as `ReplayedLink` is."""
 
 
 class ReplayedSigning(Signing):
     """Signing without the key: signs nothing, and admits the messages that the flight admitted. `verdicts` has, for
     each of the next messages, why the flight refused it (None: it did not)."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.verdicts: deque[str | None] = deque()
 
     def of_ground(self) -> "ReplayedSigning":
         """Return the signing of the link to the ground station."""
@@ -122,10 +126,35 @@ class ReplayedSigning(Signing):
 
     def admits(self, message: Message) -> bool:
         """Return True if the flight accepted this message's signature."""
-        reason = self.verdicts.popleft() if self.verdicts else None
+        reason = self.verdicts.pop(0) if self.verdicts else None
         if reason:
             self.refused[reason] += 1
         return reason is None
+
+
+class ReplayedSource(Source):
+    """The source of a recorded flight: frames and attributes (see `Source`) come from its tape. `picture` returns the
+    picture stored under a number, uint8 (H, W, 3) BGR or (H, W) grey."""
+
+    def __init__(self, tape: Tape, picture: Callable[[int], Image]) -> None:
+        self.is_live, self.total = tape.read("is_live", lambda: False), 0
+        self._tape, self._picture = tape, picture
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in SOURCE_STATE:
+            raise AttributeError(name)
+        value: Any = self._tape.read(name, lambda: SOURCE_STATE[name])
+        return Condition[value] if name == "condition" else value
+
+    def read(self, timeout_s: float) -> Frame | None:
+        known: Any = self._tape.read("frame", lambda: None)
+        if known is None:
+            return None
+        self.step_s = known.pop("step_s", None)
+        if problem := known.get("problem"):
+            raise ImageError(problem)
+        number, position = known.pop("number"), known.pop("position")
+        return Frame(image=self._picture(number), position=position and Position(**position), **known)
 
 
 class Playback(Tape):

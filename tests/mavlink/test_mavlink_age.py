@@ -120,7 +120,7 @@ BEAT = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
 
 
 def losses_told(caplog) -> int:
-    told = [record.getMessage() for record in caplog.records if record.name == "edgevpr.mavlink.link"]
+    told = [record.getMessage() for record in caplog.records if record.name == "edgevpr.mavlink.driver"]
     return sum("the device is gone" in message for message in told)
 
 

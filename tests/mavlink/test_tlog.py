@@ -82,7 +82,7 @@ def test_both_directions_of_a_link_are_read_by_mavlogdump(path):
             port.send(b"no packet\xfd\x05" + bytes(300))
             peer.heartbeat()
             peer.synchronise(link)
-            sending = link.send_fix(Fix(50.0, 8.0, 20.0, link._settings.clock()))
+            sending = link.send_fix(Fix(50.0, 8.0, 20.0, link.turns.now_s()))
             assert peer.expect("COMMAND_INT").x == 500_000_000
             wait_until(lambda: sending.sent)
             peer.answer_fix(mavlink.MAV_RESULT_ACCEPTED)

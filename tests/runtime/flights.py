@@ -16,11 +16,13 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.flight import flight as flight_module
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flight import Flight as FlightItself
-from edgevpr.runtime.flight.flightio import FlightParts, Stop
+from edgevpr.runtime.flight.flightio import FlightParts
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.machine import Machine
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.notifier import Notifier
+from edgevpr.runtime.flight.stop import Stop
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -95,7 +97,7 @@ class Flight:
                 flight_log=flight_log,
                 notifier=notifier,
                 meter=meter or FlightMeter(self.config.battery, self.board, clock),
-                io=SimpleNamespace(clock=clock, stop=self.stop, status=status),
+                io=SimpleNamespace(clock=clock, machine=Machine(self.board), stop=self.stop, status=status),
             )
             patch = opened.enter_context(pytest.MonkeyPatch.context())
             patch.setattr(flight_module, "limit_candidates", lambda technique: fewer_candidates)

@@ -2,10 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from functools import partial
-
-from edgevpr.core.types import Tape
+from dataclasses import dataclass
 
 # Pictures of queries further apart share too little ground to show the motion of an aeroplane. Between those so far
 # apart others show it: 100 m high, at 20 m/s, they share more than half.
@@ -23,12 +20,6 @@ class Clock:
     process_cpu_s: Callable[[], float] = time.process_time
     thread_cpu_s: Callable[[], float] = time.thread_time
     sleep: Callable[[float], None] = time.sleep
-
-
-def record_clock(clock: Clock, tape: Tape) -> Clock:
-    """Return the same clocks with each reading recorded on the `tape`, or played back from it."""
-    names = [each.name for each in fields(clock) if each.name != "sleep"]
-    return replace(clock, **{name: partial(tape.read, name, getattr(clock, name)) for name in names})
 
 
 class Pace:

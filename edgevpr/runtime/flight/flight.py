@@ -15,13 +15,14 @@ from edgevpr.frames.level import Mount
 from edgevpr.frames.source import recorded_intervals
 from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.conversation import LinkSettings
+from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, report_unsent
 from edgevpr.runtime.flight.camerawatch import MirrorWatch, ScaleWatch, TurnWatch
 from edgevpr.runtime.flight.clock import Pace
-from edgevpr.runtime.flight.flightio import FlightIO, FlightParts, StopNow, open_real_io
+from edgevpr.runtime.flight.flightio import FlightIO, FlightParts, open_real_io
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.frozenwatch import FrozenWatch, read_optics
 from edgevpr.runtime.flight.governor import GovernorActuator
@@ -37,6 +38,7 @@ from edgevpr.runtime.flight.startup import (
     measure_speed,
     open_map,
 )
+from edgevpr.runtime.flight.stop import StopNow
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Surveyor, Tally
 from edgevpr.runtime.preflight.pick import limit_candidates
@@ -132,7 +134,7 @@ class Flight:
                 autopilot=autopilot,
                 flight_log=flight_log,
                 notifier=notifier,
-                meter=FlightMeter(config.battery, io.board, io.clock, tape=io.tape),
+                meter=FlightMeter(config.battery, io.board, io.clock, machine=io.machine),
                 io=io,
             )
             flight = cls(config, parts)
@@ -311,7 +313,7 @@ class Flight:
 
 def _open_log(io: FlightIO) -> FlightLog:
     log, clock, is_service = io.log, io.clock, systemd.is_there()
-    return FlightLog(log.path, clock.mono_s, clock.utc_s, wait=is_service, max_mb=log.max_mb, tape=io.tape)
+    return FlightLog(log.path, clock.mono_s, clock.utc_s, wait=is_service, max_mb=log.max_mb)
 
 
 def open_links(
@@ -329,11 +331,10 @@ def open_links(
         tap=io.tap,
         origin=origin,
         signing=io.signing,
-        tape=io.tape,
     )
-    link = stack.enter_context(io.link(address, link_settings))
+    link = stack.enter_context(Link(address, link_settings, io.turns, drive=io.drive))
     link.want_position()
-    return link, stack.enter_context(io.ground(ground_address, link)) if ground_address else None
+    return link, stack.enter_context(GroundLink(ground_address, link, io.drive)) if ground_address else None
 
 
 def _report_learning_stopped(notifier: Notifier, problem: str) -> None:

@@ -8,31 +8,41 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from edgevpr import __version__
 from edgevpr.core.config import Config, LogConfig
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.types import NO_TAPE, Tape
 from edgevpr.frames.source import Source, open_source
-from edgevpr.frames.taped import RecordedSource
 from edgevpr.mavlink.address import parse_links
-from edgevpr.mavlink.groundlink import GroundLink
+from edgevpr.mavlink.driver import DriverMaker, PortDriver
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.signing import Signing, open_signing
 from edgevpr.mavlink.tlog import Tlog
+from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Tap, untapped
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.autopilot import ToAutopilot
-from edgevpr.runtime.flight.clock import Clock, record_clock
+from edgevpr.runtime.flight.boundary import (
+    RecordedDriver,
+    RecordedSource,
+    TapedMachine,
+    TapedStop,
+    TapedTurns,
+    tape_clock,
+)
+from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.machine import Machine
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.flight.recording import Recording
 from edgevpr.runtime.flight.status import StatusFile, default_path
+from edgevpr.runtime.flight.stop import Stop
 from edgevpr.runtime.recognise.learn import Learner, check_positions
 from edgevpr.runtime.recognise.opening import has_map
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -48,69 +58,21 @@ _WARN_S = 0.3
 _END_S = 4.0  # from a signal to the end of the process, if it does not end by itself: systemd waits five seconds
 
 
-class StopNow(BaseException):
-    """Raised by a signal to end a flight at once; a BaseException, so that no handler of errors catches it."""
-
-
-class Stop:
-    """Signal handler that ends a flight: by StopNow before it begins and while a frame is recognised, otherwise after
-    the present pass of the loop."""
-
-    def __init__(self, tape: Tape = NO_TAPE) -> None:
-        self._tape = tape
-        self._asked = self._breakable = self._begins = False
-
-    @property
-    def asked(self) -> bool:
-        """True if a signal has asked for the end of the flight."""
-        return self._tape.read("stop", lambda: self._asked)
-
-    def __call__(self, *_: object) -> None:
-        self._asked = True
-        if self._begins:
-            raise StopNow
-        if self._breakable:
-            self._breakable = False  # a second signal must not raise again
-            self._tape.note("stopped")
-            raise StopNow
-
-    @contextmanager
-    def beginning(self) -> Iterator[None]:
-        """Context manager for the start of a flight: a signal, also an earlier one, raises StopNow. Not recorded."""
-        self._begins = True
-        try:
-            if self._asked:
-                raise StopNow
-            yield
-        finally:
-            self._begins = False
-
-    @contextmanager
-    def breaks_off(self) -> Iterator[None]:
-        """Context manager: a signal interrupts the work inside it by StopNow."""
-        self._breakable = True
-        try:
-            yield
-        finally:
-            self._breakable = False
-        self._tape.read("went on", lambda: True)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightIO:
-    """Inputs and outputs of a flight: `place_map`, the path of its map; settings of its `log`; the `tape` that records
-    all input or plays it back; `open_source`, given the seconds between two frames; classes of the `link` to the
-    autopilot and to the `ground` station, `signing` of their packets, and `tap`, called with each packet; the `status`
-    file; and the folder of the `recording`. None: there is none."""
+    """Inputs and outputs of a flight: `place_map`, the path of its map; settings of its `log`; `open_source`, given the
+    seconds between two frames; the `turns` of the links, what makes their drivers (`drive`), `signing` of their
+    packets, and `tap`, called with each packet; the `status` file; and the folder of the `recording`. None: there is
+    none. All that comes in passes here; where it is recorded or played back, `boundary` does so."""
 
     board: Board
     place_map: str | None
     log: LogConfig
-    tape: Tape
     clock: Clock
+    machine: Machine
     open_source: Callable[[float], Source]
-    link: type[Link]
-    ground: type[GroundLink]
+    turns: Turns
+    drive: DriverMaker
     signing: Signing
     tap: Tap
     stop: Stop
@@ -152,39 +114,54 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
     with ExitStack() as stack:
         recording = _open_optional(lambda: _open_recording(config, stack))
         folder = str(recording.path.resolve()) if recording else None
-        tape: Tape = recording or NO_TAPE
-        header = {"version": __version__, "config": asdict(config), "board": asdict(board), "recording": folder}
-        tape.note("flight", header)
         status_path = config.status.file or default_path()
         status = _open_optional(lambda: stack.enter_context(StatusFile(status_path))) if status_path else None
         tlog_path = config.log.tlog if config.mavlink.link else None
         tlog = _open_optional(lambda: stack.enter_context(Tlog(tlog_path))) if tlog_path else None
 
-        def open_recorded(step_s: float) -> Source:
+        def open_own(step_s: float) -> Source:
             source = open_source(uri, step_s=step_s, positions=positions, live=True, steps_s=steps_s)
             if steps_s:
                 _log.info("%d pictures come by their own times, in %.0f s", source.total, sum(steps_s))
             elif Path(uri).is_dir():
                 _log.info("pictures come at %.3g a second: not all have a time, in their order", 1 / step_s)
-            return RecordedSource(source, recording, recording.keep) if recording else source
+            return source
 
         io = FlightIO(
             board=board,
             place_map=config.map,
             log=config.log,
-            tape=tape,
-            clock=record_clock(Clock(), tape) if recording else Clock(),
-            open_source=open_recorded,
-            link=Link,
-            ground=GroundLink,
+            clock=Clock(),
+            machine=Machine(board),
+            open_source=open_own,
+            turns=Turns(Clock().mono_s),
+            drive=PortDriver,
             signing=open_signing(config.mavlink.signing_key, config.mavlink.signing_state),
             tap=tlog.record if tlog else untapped,
-            stop=Stop(tape),
+            stop=Stop(),
             status=status,
             recording=folder,
         )
+        if recording:
+            header = {"version": __version__, "config": asdict(config), "board": asdict(board), "recording": folder}
+            recording.note("flight", header)
+            io = record_io(io, recording)
         with _signals(io.stop):
             yield io
+
+
+def record_io(io: FlightIO, recording: Recording) -> FlightIO:
+    """Return the same inputs and outputs, with all that comes in recorded."""
+    turns = TapedTurns(io.clock.mono_s, recording)
+    return replace(
+        io,
+        clock=tape_clock(io.clock, recording),
+        machine=TapedMachine(io.board, recording),
+        open_source=lambda step_s: RecordedSource(io.open_source(step_s), recording, recording.keep),
+        turns=turns,
+        drive=partial(RecordedDriver, turns),
+        stop=TapedStop(recording),
+    )
 
 
 def _open_recording(config: Config, stack: ExitStack) -> Recording | None:

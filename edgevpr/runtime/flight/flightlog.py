@@ -29,7 +29,6 @@ from edgevpr.core.appending import (
 )
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.text import json_line
-from edgevpr.core.types import NO_TAPE, Tape
 
 Line = dict[str, Any]
 
@@ -62,14 +61,13 @@ class FlightLog:
         *,
         wait: bool = False,
         max_mb: float | None = None,
-        tape: Tape = NO_TAPE,
     ) -> None:
         """Open the file. Raises EdgevprError if that fails; with `wait`, for a service that may be restarted in the
         air, every line tries again. `clock` gives monotonic seconds."""
         self.path = path
         self.state: str | None = None
         self.lost_lines = 0
-        self._clock, self._utc_s, self._tape = clock, utc_s, tape
+        self._clock, self._utc_s = clock, utc_s
         self._at = Path(path or "")
         self._part_bytes = math.inf if max_mb is None else 1e6 * max_mb / _PARTS
         self._file: FileIO | None = None
@@ -88,11 +86,6 @@ class FlightLog:
                         "own, in a folder that is there and may be written to."
                     ) from error
                 self._note_trouble(error)
-
-    @property
-    def is_written(self) -> bool:
-        """True if the last line could be written; the answer is recorded on the tape."""
-        return self._tape.read("log is written", lambda: self.state is None)
 
     def __enter__(self) -> "FlightLog":
         return self

@@ -1,16 +1,14 @@
 """What a flight takes from its board: charge, CPU time, memory, heat."""
 
 from contextlib import AbstractContextManager
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 
 from edgevpr.core.config import BatteryConfig
-from edgevpr.core.types import NO_TAPE, Tape
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import marginal_energy_j, pack_ah, parse_pack
-from edgevpr.power.machine import rss_mb
-from edgevpr.power.meter import MachineLoad, OwnLoad, RunningEnergy, Stage, machine_load, stage
-from edgevpr.power.thermal import ThermalState, ThermalWatch, limit_c
+from edgevpr.power.meter import MachineLoad, OwnLoad, RunningEnergy, Stage, stage
 from edgevpr.runtime.flight.clock import Clock
+from edgevpr.runtime.flight.machine import Machine
 from edgevpr.runtime.recognise.recognition import Recognition
 
 
@@ -30,7 +28,7 @@ class LoadReading:
 class FlightMeter:
     """Meter of a flight, from when it is made. `energy` sums up the costs of queries, `load` the time for which the
     loop is busy. `thermal` is the newest measurement of heat and supply, `limit_c` the temperature at which the board
-    slows itself down. All measurements are recorded on the `tape`."""
+    slows itself down. `machine` measures (None: this one)."""
 
     def __init__(
         self,
@@ -38,16 +36,14 @@ class FlightMeter:
         board: Board,
         clock: Clock,
         *,
-        watch: ThermalWatch | None = None,
-        tape: Tape = NO_TAPE,
+        machine: Machine | None = None,
     ) -> None:
-        self._board, self._clock, self._tape = board, clock, tape
+        self._board, self._clock, self._machine = board, clock, machine or Machine(board)
         self._pack, self._regulator_efficiency = parse_pack(battery.pack), battery.regulator_efficiency
         self.energy = RunningEnergy(board, clock.mono_s, clock.process_cpu_s)
         self.load = OwnLoad(board.cores, clock.mono_s, clock.process_cpu_s)
-        self._watch = watch or ThermalWatch(hot_c=board.thermal_limit_c)
         self.measure_heat()
-        self.limit_c = self._tape.read("limit_c", limit_c) if board.thermal_limit_c is None else board.thermal_limit_c
+        self.limit_c = self._machine.limit_c() if board.thermal_limit_c is None else board.thermal_limit_c
         self.queries_throttled = 0
 
     def timed(self, thread_only: bool = False) -> AbstractContextManager[Stage]:
@@ -79,18 +75,15 @@ class FlightMeter:
 
     def measure_heat(self) -> None:
         """Measure the heat of the board. Call it about once a second."""
-        names = [field.name for field in fields(ThermalState)]
-        values = self._tape.read("heat", lambda: astuple(self._watch.look()))
-        self.thermal = ThermalState(**dict(zip(names, values, strict=False)))  # an older tape has fewer values
+        self.thermal = self._machine.measure_heat()
 
     def machine_load(self) -> MachineLoad:
         """Return the load of the whole machine since the last call. Call it once a second."""
-        core_shares, *ram_bytes = self._tape.read("load", lambda: astuple(machine_load()))
-        return MachineLoad(tuple(core_shares), *ram_bytes)
+        return self._machine.measure_load()
 
     def rss_mb(self) -> float:
         """Return the memory that this process takes, MB."""
-        return self._tape.read("rss_mb", rss_mb)
+        return self._machine.rss_mb()
 
     def reading(self) -> LoadReading:
         """Return a measurement for the governor: the load since the last one, and the present memory and heat."""

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 from edgevpr.core.appending import append, open_appending, sync
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import redact_passwords
-from edgevpr.core.types import Tape
+from edgevpr.runtime.flight.boundary import Tape
 
 TAPE, FRAMES, MAP = "tape.jsonl", "frames", "map.gpkg"
 SPARED_BYTES = 100_000_000  # free bytes of the disk that are left to logs and map

@@ -6,7 +6,7 @@ import platform
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, astuple, replace
+from dataclasses import asdict, replace
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -21,16 +21,15 @@ from edgevpr.core.types import FIX_MAX_AGE_S, Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import MapIdentity, read_identity
 from edgevpr.power.equations import parse_pack
-from edgevpr.power.meter import OwnMemory, QueryMeter
+from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.flight.flightio import FlightIO
 from edgevpr.runtime.preflight.choose import too_late
-from edgevpr.runtime.preflight.pick import Outlook, outlook, pick_technique
+from edgevpr.runtime.preflight.pick import Outlook
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.levelling import lens_of
-from edgevpr.runtime.recognise.opening import has_map, open_learning, open_recogniser
+from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-_NEW_MAP_PLACES = 1000  # places that a technique chosen for an empty map must be fast enough for
 _ORIGIN_PLACES = 15  # the first places of the map, by which the altitude of the ground is found
 _LIBRARIES = ("numpy", "cv2", "onnxruntime")
 
@@ -41,7 +40,7 @@ def open_map(config: Config, io: FlightIO) -> tuple[Recogniser, Learner | None, 
     """Open the recogniser of a flight. Returns it, its learner (None: no places are learnt), and why it cannot learn
     (None: it can, or is not asked to), as on a memory card that has become read-only. Raises EdgevprError."""
     here, meter = replace(config, map=io.place_map), _make_query_meter(config, io)
-    name = io.tape.read("picked", lambda: _pick_technique(config))
+    name = io.machine.pick_technique(config)
 
     @cache
     def learning() -> tuple[Recogniser, Learner]:
@@ -49,15 +48,7 @@ def open_map(config: Config, io: FlightIO) -> tuple[Recogniser, Learner | None, 
         spacing_m, gap_m = config.mapping.spacing_m, config.salience.gap_m
         return recogniser, Learner(recogniser, growing, spacing_m=spacing_m, gap_m=gap_m, utc_clock=io.clock.utc_s)
 
-    def problem() -> str | None:
-        try:
-            if config.mapping.learn:
-                learning()
-        except MapError as error:
-            return str(error)
-        return None
-
-    cannot_learn = io.tape.read("cannot_learn", problem)
+    cannot_learn = io.machine.try_map(learning) if config.mapping.learn else None
     if config.mapping.learn and not cannot_learn:
         return *learning(), None
     try:
@@ -71,29 +62,21 @@ def open_map(config: Config, io: FlightIO) -> tuple[Recogniser, Learner | None, 
 
 def _make_query_meter(config: Config, io: FlightIO) -> QueryMeter:
     """Make the meter of the queries of a flight, by its clock."""
-    memory = OwnMemory()
     return QueryMeter(
         io.board,
         parse_pack(config.battery.pack),
         config.battery.regulator_efficiency,
         wall_clock=io.clock.wall_s,
         cpu_clock=io.clock.process_cpu_s,
-        memory_mb=lambda: io.tape.read("memory_mb", memory.look),
+        memory_mb=io.machine.memory_mb,
     )
 
 
 def measure_speed(recogniser: Recogniser, config: Config, io: FlightIO) -> Outlook:
     """Measure how fast the technique is on this board, and have as many candidates compared as there is time for."""
-    found = Outlook(*io.tape.read("outlook", lambda: astuple(outlook(recogniser, config))))
+    found = io.machine.measure_speed(recogniser, config)
     recogniser.change(candidates=found.candidates)
     return found
-
-
-def _pick_technique(config: Config) -> str | None:
-    """Return the configured technique (None: that of the map), or for a map yet to be made the best for the board."""
-    if config.mapping.learn and config.technique is None and config.map is not None and not has_map(Path(config.map)):
-        return pick_technique(config.board, _NEW_MAP_PLACES, config.source.camera)
-    return config.technique
 
 
 def choose_rate_hz(config: Config, recogniser: Recogniser) -> float:

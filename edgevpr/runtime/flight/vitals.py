@@ -131,7 +131,7 @@ class Vitals:
 
     def _check_log(self) -> None:
         """Report to the ground station if the log cannot be written, and when it can; the journal has the reason."""
-        has_log = self._parts.flight_log.is_written
+        has_log = self._parts.io.machine.is_written(self._parts.flight_log)
         if has_log != self._has_log:
             self._has_log = has_log
             text = f"flight log {'is written again' if has_log else 'cannot be written'}"

@@ -12,6 +12,7 @@ from edgevpr.cli.top import lines_of
 from edgevpr.mavlink.messages import TEXT_BYTES, Severity
 from edgevpr.power.thermal import ThermalState, ThermalWatch
 from edgevpr.runtime.flight.companionwatch import CompanionWatch
+from edgevpr.runtime.flight.machine import Machine
 from edgevpr.runtime.flight.notifier import Notifier
 
 FINE = ThermalState(temperature_c=60.0, frequency_mhz=1800.0, throttled=False, why="", under_voltage=False, hot=False)
@@ -75,7 +76,7 @@ def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(record
             statuses.append(status)
             firmware.write_text({1: "0\n", 2: "0\n", 3: "50005\n"}.get(len(statuses), "50000\n"))
 
-    meter = flight_meter(flight, watch=ThermalWatch(tmp_path))
+    meter = flight_meter(flight, machine=Machine(flight.board, ThermalWatch(tmp_path)))
     lines = flight.fly(FakeSource([textured(1, 240, 320)] * 45, clock), meter, status=Status())
     said = [(line["problem"], line["holds"], line["why"], line["said"]) for line in of_kind(lines, "companion")]
     begun, slow = "companion under-voltage: check 5 V supply", "companion throttled: runs slower"

@@ -9,8 +9,8 @@ from edgevpr.core.config import load_config
 from edgevpr.core.errors import ImageError
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.clock import Pace
-from edgevpr.runtime.flight.flightio import Stop, StopNow
 from edgevpr.runtime.flight.startup import apply_recorded_rate
+from edgevpr.runtime.flight.stop import Stop, StopNow
 
 PICTURE = textured(1, 240, 320)
 

@@ -9,6 +9,7 @@ from flights import Flight, flight_meter, of_kind
 from pictures import textured
 
 from edgevpr.power.thermal import ThermalState
+from edgevpr.runtime.flight.machine import Machine
 
 pytestmark = pytest.mark.slow
 
@@ -70,7 +71,7 @@ def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(recor
     hot = ThermalState(temperature_c=84.0, frequency_mhz=600.0, throttled=True, why="throttled now", under_voltage=True)
     clock = FakeClock()
     flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, FakeLink(clock), **{"source.rate_hz": 1.0})
-    meter = flight_meter(flight, watch=Watch([cool] * 3 + [hot]))
+    meter = flight_meter(flight, machine=Machine(flight.board, Watch([cool] * 3 + [hot])))
     lines = flight.fly(FakeSource([PICTURE] * 6, clock), meter)
     boards = [line["board"] for line in of_kind(lines, "query")]
     assert (boards[0], boards[-1]) == (asdict(cool), asdict(hot))

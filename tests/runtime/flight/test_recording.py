@@ -12,9 +12,9 @@ from pictures import textured
 
 from edgevpr.core.errors import ImageError
 from edgevpr.frames.images import read_image
-from edgevpr.frames.taped import RecordedSource, ReplayedSource
-from edgevpr.review.tape import Playback, read_tape
+from edgevpr.review.tape import Playback, ReplayedSource, read_tape
 from edgevpr.runtime.flight import recording as module
+from edgevpr.runtime.flight.boundary import RecordedSource
 from edgevpr.runtime.flight.recording import FRAMES, TAPE, Recording, frame_path, recordings
 
 

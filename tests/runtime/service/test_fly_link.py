@@ -1,5 +1,6 @@
 """The link of a flight is opened as the configuration says."""
 
+import time
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from types import SimpleNamespace
@@ -9,10 +10,10 @@ from mavlink_peers import Peer, UdpPort, wait_until
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import ConfigError
-from edgevpr.core.types import NO_TAPE
-from edgevpr.mavlink.link import Link
+from edgevpr.mavlink.driver import PortDriver
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.signing import NOT_SIGNING, open_signing
+from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import untapped
 from edgevpr.runtime.flight.flight import open_links
 from edgevpr.runtime.flight.navigator import Navigator
@@ -20,7 +21,7 @@ from edgevpr.runtime.flight.navigator import Navigator
 
 def opened(config, port, signing, stack):
     settings = replace(config.mavlink, link=f"udpout:127.0.0.1:{port.number}")
-    world = SimpleNamespace(link=Link, ground=None, signing=signing, tap=untapped, tape=NO_TAPE)
+    world = SimpleNamespace(turns=Turns(time.monotonic), drive=PortDriver, signing=signing, tap=untapped)
     return open_links(settings, world, Navigator(5.0, 1.0), None, stack)[0]
 
 

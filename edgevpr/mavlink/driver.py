@@ -1,0 +1,222 @@
+"""Drives a conversation: moves packets between it and a port, in a thread of its own, which alone touches the socket or
+serial port."""
+
+import logging
+import select
+import socket
+import threading
+import time
+from contextlib import suppress
+from typing import Protocol
+
+from edgevpr.core.errors import LinkError
+from edgevpr.mavlink.address import LinkAddress, Sender
+from edgevpr.mavlink.conversation import LinkSettings
+from edgevpr.mavlink.fixes import Sending
+from edgevpr.mavlink.peer import Autopilot
+from edgevpr.mavlink.ports import Line, Port, open_port
+from edgevpr.mavlink.signing import OLD
+from edgevpr.mavlink.turns import Turns
+
+SLEEP_S = 0.25  # of the thread, when nothing wakes it
+RETRY_FIRST_S = 0.2
+RETRY_MAX_S = 2.0
+WATCH_S = 0.01  # between two checks whether a fix has left the operating system
+FLUSH_S = 0.5
+
+PortState = tuple[bool, str | None, int]  # is it connected; why not, or None; how often it was opened again
+
+log = logging.getLogger(__name__)
+
+
+class Wire(Protocol):
+    """A `Conversation` as its driver uses it, within turns of the link."""
+
+    @property
+    def settings(self) -> LinkSettings: ...
+    @property
+    def autopilot(self) -> Autopilot: ...
+    @property
+    def waits(self) -> bool: ...
+    def wait_s(self, longest_s: float) -> float: ...
+    def drop_stale(self) -> None: ...
+    def announce_changes(self) -> None: ...
+    def next_packet(self) -> tuple[bytes, Sending | None] | None: ...
+    def note_departed(self, fixes: list[Sending]) -> None: ...
+    def hear(self, data: bytes, now_s: float, sender: Sender | None) -> bool: ...
+    def break_off(self, lost_fixes: int) -> None: ...
+    def end(self) -> None: ...
+
+
+class Driver(Protocol):
+    """What a link needs of its driver. None of the methods waits for the other end."""
+
+    def start(self) -> None:
+        """Begin to send and receive. Raises LinkError for a fault that only the user can correct."""
+
+    def ring(self) -> None:
+        """Send soon: there is something to be sent."""
+
+    def state(self) -> PortState:
+        """Return the state of the port."""
+
+    def close(self) -> None:
+        """Send what is queued, wait for the answers to fixes, both for half a second at most, and close the port."""
+
+
+class DriverMaker(Protocol):
+    """Makes the driver of the link `name`."""
+
+    def __call__(self, name: str, address: LinkAddress, conversation: Wire, turns: Turns, /) -> Driver: ...
+
+
+class PortDriver:
+    """The driver of a real port, which it reopens whenever the connection is lost. A missing device or server is no
+    error: the thread tries to open it again and again, and `state` gives the reason."""
+
+    def __init__(self, name: str, address: LinkAddress, conversation: Wire, turns: Turns) -> None:
+        self._name, self._address, self._conversation, self._turns = name, address, conversation, turns
+        self._settings = conversation.settings
+        self._line: Line | None = None
+        self._reopened = 0
+        self._retry_s = RETRY_FIRST_S
+        self._trouble: str | None = None
+        self._closing = threading.Event()
+        self._bell, self._bell_button = socket.socketpair()  # wakes the thread when there is something to send
+        self._bell_button.setblocking(False)
+        self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
+
+    def start(self) -> None:
+        try:
+            self._line = self._opened()
+        except OSError as error:
+            self._note_trouble(error)
+        except LinkError:
+            self.close()
+            raise
+        self._thread.start()
+
+    def ring(self) -> None:
+        with suppress(OSError):  # it rings already, or the link is closed
+            self._bell_button.send(b"!")
+
+    def state(self) -> PortState:
+        line = self._line
+        return line is not None and line.port.connected, self._trouble, self._reopened
+
+    def close(self) -> None:
+        self._closing.set()
+        self.ring()
+        if self._thread.ident is None:  # never started
+            self._close_all()
+        else:
+            self._thread.join(2 * FLUSH_S)
+
+    def _opened(self) -> Line:
+        return Line(open_port(self._address), self._settings.clock, self._settings.tap)
+
+    # The methods below run in the driver's own thread.
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                if self._line is None:
+                    self._reopen()
+                else:
+                    self._work(self._line, timeout_s=SLEEP_S)
+            except (OSError, LinkError) as error:
+                self._lose(error)
+            except Exception as error:  # a flight without a link is worse than one with a link opened anew
+                log.exception("the link failed")
+                self._lose(error)
+        self._flush()
+        self._close_all()
+
+    def _reopen(self) -> None:
+        if self._closing.wait(self._retry_s):
+            return
+        self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
+        with self._turns.of_link(self._name):
+            self._conversation.drop_stale()
+        self._line = self._opened()
+        self._reopened += 1
+
+    def _work(self, line: Line, timeout_s: float) -> None:
+        """Write as much as the port accepts, wait until there is something to do or `timeout_s` is over, and read."""
+        with self._turns.of_link(self._name):
+            if line.port.connected:
+                self._transmit(line)
+            self._conversation.announce_changes()
+        reading: list[Port | socket.socket] = [line.port, self._bell]
+        writing = [line.port] if line.unsent else []
+        timeout_s = min(timeout_s, WATCH_S) if line.leaving else self._conversation.wait_s(timeout_s)
+        readable, _, _ = select.select(reading, writing, [], timeout_s)
+        if self._bell in readable:
+            self._bell.recv(4096)
+        if line.port in readable:
+            self._receive(line)
+
+    def _receive(self, line: Line) -> None:
+        data = line.port.read()
+        if data:
+            self._retry_s = RETRY_FIRST_S
+            if self._trouble is not None:
+                log.info("%s is back", self._address)
+                self._trouble = None
+        with self._turns.of_link(self._name):
+            self._note_departed(line)  # before its answer is read
+            self._settings.signing.verdicts.clear()
+            beats = self._conversation.hear(data, self._turns.now_s(), line.port.sender)
+            # An autopilot whose clock is old, which has the key, learns the time from what we send it.
+            has_old_clock = OLD in self._settings.signing.verdicts
+            is_behind = has_old_clock and not self._conversation.autopilot.listens(self._turns.now_s())
+        if beats or is_behind:
+            line.port.answer_sender()
+
+    def _transmit(self, line: Line) -> None:
+        while True:
+            # Before writing: what has waited too long must not be written on.
+            self._note_departed(line)
+            if not line.unsent:
+                next_one = self._conversation.next_packet()
+                if next_one is None:
+                    return
+                line.put(*next_one)
+            line.write()
+            if line.unsent:
+                return
+
+    def _note_departed(self, line: Line) -> None:
+        if departed := line.departed():
+            self._conversation.note_departed(departed)
+
+    def _lose(self, error: Exception) -> None:
+        with self._turns.of_link(self._name):
+            self._conversation.break_off(self._close_line())
+        self._note_trouble(error)
+
+    def _close_line(self) -> int:
+        """Close the port, and return the number of fixes thrown away with it."""
+        line, self._line = self._line, None
+        return line.close() if line else 0
+
+    def _note_trouble(self, error: Exception) -> None:
+        reason = getattr(error, "strerror", None) or str(error)
+        if reason != self._trouble:
+            self._trouble = reason
+            log.warning("%s is not there (%s); trying again", self._address, reason)
+
+    def _flush(self) -> None:
+        give_up_s = time.monotonic() + FLUSH_S
+        with suppress(OSError):
+            while self._line and self._line.port.connected and time.monotonic() < give_up_s:
+                self._work(self._line, timeout_s=0.01)
+                if not self._conversation.waits and self._line.is_idle:
+                    break
+
+    def _close_all(self) -> None:
+        with self._turns.of_link(self._name):
+            self._close_line()
+            self._conversation.end()
+        self._bell.close()
+        self._bell_button.close()
