@@ -227,7 +227,7 @@ class FakeLink:
             commands={},
             ignored_requests=0,
             unanswered_fixes=self._waiting.unanswered,
-            refused_why=self._waiting.refusal and self._waiting.refusal.brief,
+            refused_why=self._waiting.refusal and self._waiting.refusal.code.summary,
             foreign_messages=0,
             refused_signatures={},
             dropped_queue_full=0,

@@ -76,6 +76,76 @@ class ReasonCode(Enum):
         "{summary}: {lead:.3f}, {needed:.3f} needed",
     )
 
+    # Of a fix that was not sent
+    DRY_RUN = "dry run: no fix is sent"
+    NO_LINK = "there is no link"
+    PLACE_WITHOUT_POSITION = "the place has no position"
+    INVALID_POSITION = "its position is invalid", "{problem}"
+    NOT_BELOW_AIRCRAFT = "not sent: the image is not levelled, so it does not show what is under the aircraft"
+    NO_TELEMETRY = "not sent: no telemetry from the autopilot yet"
+    CONTINUOUS = "taken into the continuous position"
+    HAS_GPS = "not needed: the autopilot has GPS"
+    HAS_WRONG_GPS = "not sent: the autopilot has GPS, which the map contradicts, and takes no fix"
+    MAP_CONTRADICTS_GPS = "not sent: the map has contradicted GPS from the first match on"
+    NOT_BETTER = (
+        "not needed: the autopilot's position is as good",
+        "not needed: the autopilot is {off_m:.1f} m from where we are, good to {accuracy_m:.1f} m",
+    )
+    HELD_TURNED = (
+        "held back: turned against the compass",
+        "held back: its picture is turned by {turn_deg:.0f} degrees against the compass",
+    )
+    HELD_OFF_GPS = (
+        "held back: far from GPS",
+        "held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is",
+    )
+    HELD_OFF_PATH = (
+        "held back: far from where the aircraft should be",
+        "held back: {off_m:.0f} m from where the aircraft is by the autopilot's reckoning and the fixes before, ",
+        "good to {accuracy_m:.0f} m: another fix has to agree",
+    )
+    PAUSED = "not sent: paused by the ground station"
+    PARAMETERS_UNFIT = "not sent: parameters of the autopilot", "{problem}"
+    FIXES_UNANSWERED = "not sent: five fixes in a row had no answer"
+    ANSWERS_BEGIN_AGAIN = "not sent: the autopilot has only just begun to answer again"
+    FRAME_TOO_OLD = "its frame is too old", "its frame is {age_s:.1f} s old, and {limit_s:g} s are the limit"
+    SUPERSEDED = "newer ones came before its turn"
+    NO_AUTOPILOT = "no autopilot was there to take it", "{summary} within {limit_s:g} s"
+    CLOCK_UNKNOWN = "the autopilot's clock was not known", "{summary} within {limit_s:g} s"
+    NOT_ENCODABLE = "it does not fit its message", "{summary} ({problem})"
+    LINK_LOST = "the link was lost before it had left"
+
+    # Of a fix without an answer
+    NO_ANSWER = "it had no answer", "{summary} within {limit_s:g} s"
+    LINK_LOST_BEFORE_ANSWER = "the link was lost before its answer came"
+    ENDED_BEFORE_ANSWER = "the flight ended before its answer came"
+    AUTOPILOT_REPLACED = "another autopilot has taken its place"
+    AUTOPILOT_RESTARTED = "the autopilot has restarted"
+
+    # Of an autopilot's answer to fixes, or of its silence: "it" is the autopilot, and a summary has 26 bytes at most
+    TAKEN = "taken", "it takes them"
+    GPS_IN_USE = "GPS in use", "a GPS receiver of its has a fix, and while it has GPS it takes no other position"
+    NOT_STARTED = "filter not started", "its position filter has not started: a plane starts it with GPS only"
+    NO_ORIGIN = "no origin", "it gives no origin when asked: it must have had GPS once, or be sent one"
+    NOT_ARMED = "not armed", "it is not armed: on the ground it reckons no position that a fix could correct"
+    NOT_RECKONING = "nothing to reckon by", "it reckons no position, with neither GPS, airspeed, flow nor vision"
+    OTHER_AID = "not dead reckoning", "it takes a fix only while it reckons its position without any aid"
+    NOT_PLAUSIBLE = "fix not plausible", "it reckons its position, and the fix does not fit, or it has no origin"
+    NOT_SAID = "see its log", "it does not say: GPS just in use, no origin, or nothing to reckon by"
+    OTHER_ANSWER = "see its log", "it answers {result}"
+    WRONG_FORM = "wrong form", "it does not like their form"
+    NO_COMMAND = "43003 not known", "its firmware has no command 43003, or was built without, as for boards of 1 MB"
+    NO_COMMAND_ANSWERED = (
+        "signing? system id?",
+        "it answers no command of ours: does its port take signed messages only, does another vehicle have its ",
+        "system id, or does the line carry nothing towards it?",
+    )
+    FIXES_NOT_ANSWERED = (
+        "no command 43003?",
+        "it answers other commands: is its firmware built without 43003, or does another program have our component ",
+        "id?",
+    )
+
     def __init__(self, summary: str, *parts: str) -> None:
         self.summary, self.parts = summary, parts or (summary,)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.core.contract import FineMatch
+from edgevpr.core.reasons import Reason
 
 # ArduPilot treats an older frame as 5 s old, and would then correct the position by too little: no such fix is sent.
 FIX_MAX_AGE_S = 5.0
@@ -240,7 +241,7 @@ class FixReport:
 
     query: str
     sent: bool | None
-    why: str | None = None
+    why: Reason | None = None
     answer: str | None = None
     lat_deg: float | None = None
     lon_deg: float | None = None

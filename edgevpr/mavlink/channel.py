@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import TypeAlias
 
+from edgevpr.core.reasons import Reason, ReasonCode
+
 Parameters: TypeAlias = Mapping[str, float]
 
 # ArduPilot's names of before 4.6, by those since (AP_GPS.cpp, convert_parameters).
@@ -66,9 +68,11 @@ class Choice:
     lag_s: float = 0.0
 
     @property
-    def why_nothing(self) -> str | None:
+    def why_nothing(self) -> Reason | None:
         """The reason why nothing is sent; None if something is."""
-        return self.reason if self.channel is Channel.NONE else None
+        if self.channel is not Channel.NONE:
+            return None
+        return Reason(ReasonCode.PARAMETERS_UNFIT, {"problem": self.reason})
 
 
 def kind_of(mav_type: int) -> Kind:

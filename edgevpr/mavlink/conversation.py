@@ -9,13 +9,14 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field, replace
 
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Position, Vehicle
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.clock import SILENT_AFTER_S
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending, put_back
-from edgevpr.mavlink.ground import FOR_PEOPLE, PAUSED, Requests, Texts
+from edgevpr.mavlink.ground import FOR_PEOPLE, Requests, Texts
 from edgevpr.mavlink.messages import AUTOPILOT, Fix, Health, Severity
 from edgevpr.mavlink.peer import Autopilot, Listener
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
@@ -147,7 +148,7 @@ class Conversation:
             except (struct.error, OverflowError) as error:  # a value that its field cannot hold must not end the link
                 log.error("%s is not sent: %s", message, error)
                 if sending:
-                    sending.settle(False, f"it does not fit its message ({error})")
+                    sending.settle(False, Reason(ReasonCode.NOT_ENCODABLE, {"problem": str(error)}))
                 continue
             self._packer.seq = (self._packer.seq + 1) % 256
             if sending:
@@ -171,10 +172,10 @@ class Conversation:
                 if self._ground:
                     self._ground._packer.srcSystem = self.autopilot.system_id
                 if self.autopilot.identity.has_moved:
-                    self._begin_anew("another autopilot has taken its place")
+                    self._begin_anew(ReasonCode.AUTOPILOT_REPLACED)
                     self.announce(Severity.WARNING, "autopilot has another address", "autopilot")
             if self.autopilot.has_restarted:
-                self._begin_anew("the autopilot has restarted")
+                self._begin_anew(ReasonCode.AUTOPILOT_RESTARTED)
                 self._announce_restart(now_s)
             if self.autopilot.answer:
                 self._hear_answer(self.autopilot.answer, now_s)
@@ -210,7 +211,7 @@ class Conversation:
 
     def end(self) -> None:
         """Give up all fixes, whether they wait for an answer or wait to be sent."""
-        self.fixes.break_off("the flight ended before its answer came")
+        self.fixes.break_off(Reason(ReasonCode.ENDED_BEFORE_ANSWER))
         self.fixes.drop_stale(math.inf)
 
     def _next_message(self, now_s: float) -> tuple[Message, Sending | None] | None:
@@ -226,11 +227,11 @@ class Conversation:
             self._ask_for_position(system_id, now_s)
             if self.channel.is_continuous and (state := self._state(system_id, now_s)):
                 return state, None
-            pause = PAUSED if self.requests.is_paused else self.autopilot.interview.choice.why_nothing
-            if why := pause or self.fixes.why_not(now_s):
+            pause = Reason(ReasonCode.PAUSED) if self.requests.is_paused else None
+            if why := pause or self.autopilot.interview.choice.why_nothing or self.fixes.why_not(now_s):
                 self.fixes.withhold(why)
             elif (stamp_s := self.autopilot.stamp_s(now_s)) is None:
-                self.fixes.drop_stale(now_s, "the autopilot's clock was not known")
+                self.fixes.drop_stale(now_s, ReasonCode.CLOCK_UNKNOWN)
             elif sending := self.fixes.next(now_s) or self._between(now_s):
                 fix = put_back(sending.fix, now_s, self.autopilot.foreign_stamps.take_lag_s(), self.autopilot.vehicle)
                 return messages.position_fix(fix, now_s, system_id, stamp_s), sending
@@ -313,9 +314,9 @@ class Conversation:
     def _report(self, severity: Severity, text: str, topic: str) -> None:
         self._reports.append((severity, text, topic))
 
-    def _begin_anew(self, why: str) -> None:
+    def _begin_anew(self, why: ReasonCode) -> None:
         """Begin again with an autopilot that has forgotten all. `why` goes to the fixes without an answer."""
-        self.fixes.break_off(why)
+        self.fixes.break_off(Reason(why))
         self._asked_for_state = self._told_channel = None
         self._no_origin_since_s, self._has_set_origin = math.inf, False
         if self._ask_position_s is not None:

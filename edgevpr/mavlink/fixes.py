@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from threading import Event
 
 from edgevpr.core.geodesy import moved
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import FIX_MAX_AGE_S, Vehicle
 from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Fix, Severity
-from edgevpr.mavlink.vehicle import GPS_IN_USE, Reason
 
 FIXES_MAX = 8
 # The longest that a fix may wait, from `put` on and in all buffers together. types.FIX_MAX_AGE_S limits the age of its
@@ -32,10 +32,10 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True)
 class FixAnswer:
     """The autopilot's answer to a fix: `result` is the name of a MAV_RESULT (None: none came in time), `why` the reason
-    in words (None: accepted), `latency_s` the time from sending to answer."""
+    (None: accepted), `latency_s` the time from sending to answer."""
 
     result: str | None
-    why: str | None
+    why: Reason | None
     latency_s: float | None
 
 
@@ -46,7 +46,7 @@ class Sending:
     def __init__(self, fix: Fix, due_s: float) -> None:
         self.fix, self.due_s = fix, due_s
         self.sent: bool | None = None
-        self.why: str | None = None
+        self.why: Reason | None = None
         self.t_sent_s: float | None = None
         self.outcome: FixAnswer | None = None
         self._settled = Event()
@@ -56,7 +56,7 @@ class Sending:
         """The name of a MAV_RESULT; None if there is no answer (yet)."""
         return self.outcome.result if self.outcome else None
 
-    def settle(self, sent: bool, why: str | None = None) -> None:
+    def settle(self, sent: bool, why: Reason | None = None) -> None:
         """Set the outcome: sent, or not sent and `why`. This wakes the threads in `wait`."""
         self.sent, self.why = sent, why
         self._settled.set()
@@ -101,10 +101,10 @@ class Fixes:
         sending = Sending(fix, min(now_s + self._max_wait_s, fix.t_frame_s + FIX_MAX_AGE_S))
         age_s = now_s - fix.t_frame_s
         if age_s > FIX_MAX_AGE_S:
-            self._drop(sending, f"its frame is {age_s:.1f} s old, and {FIX_MAX_AGE_S:g} s are the limit")
+            self._drop(sending, Reason(ReasonCode.FRAME_TOO_OLD, {"age_s": age_s, "limit_s": FIX_MAX_AGE_S}))
             return sending
         if len(self._waiting) == FIXES_MAX:
-            self._drop(self._waiting.popleft(), "newer ones came before its turn")
+            self._drop(self._waiting.popleft(), Reason(ReasonCode.SUPERSEDED))
         self._waiting.append(sending)
         return sending
 
@@ -113,26 +113,26 @@ class Fixes:
         self.drop_stale(now_s)
         return self._waiting.popleft() if self._waiting else None
 
-    def drop_stale(self, now_s: float, lack: str = "no autopilot was there to take it") -> None:
+    def drop_stale(self, now_s: float, lack: ReasonCode = ReasonCode.NO_AUTOPILOT) -> None:
         """Give up the fixes that have waited too long, for a `lack`."""
         for sending in self._waiting:
             if now_s > sending.due_s:
-                self._drop(sending, f"{lack} within {self._max_wait_s:g} s")
+                self._drop(sending, Reason(lack, {"limit_s": self._max_wait_s}))
         self._waiting = deque(sending for sending in self._waiting if sending.sent is None)
 
-    def withhold(self, why: str) -> None:
+    def withhold(self, why: Reason) -> None:
         """Give up all fixes that wait to be sent, for the reason `why`."""
         self.withheld += len(self._waiting)
         for sending in self._waiting:
             sending.settle(False, why)
         self._waiting.clear()
 
-    def why_not(self, now_s: float) -> str | None:
+    def why_not(self, now_s: float) -> Reason | None:
         """Return the reason why no fix may be sent now (None: it may)."""
         if self._row >= UNANSWERED_MAX and now_s - self._sent_s < TRIED_AGAIN_AFTER_S:
-            return "not sent: five fixes in a row had no answer"
+            return Reason(ReasonCode.FIXES_UNANSWERED)
         if now_s < self._resumes_s:
-            return "not sent: the autopilot has only just begun to answer again"
+            return Reason(ReasonCode.ANSWERS_BEGIN_AGAIN)
         return None
 
     def note_sent(self, sending: Sending, now_s: float) -> None:
@@ -146,7 +146,7 @@ class Fixes:
         sending is stopped already, which only an answer ends."""
         if not self._is_stopped:
             self._row -= count
-        self.break_off("the link was lost before its answer came")
+        self.break_off(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))
 
     def hear(self, result: str, reason: Reason, now_s: float) -> Sending | None:
         """Process an answer: `result` is the name of a MAV_RESULT, `reason` explains it. Returns its fix, if any."""
@@ -158,9 +158,9 @@ class Fixes:
         is_taken = result == "ACCEPTED"
         if (result, reason) != self._last_answer:
             level = logging.INFO if is_taken else logging.WARNING
-            log.log(level, "the autopilot's answer to position fixes: %s (%s)", result, reason.sentence)
-            severity = Severity.INFO if is_taken or reason is GPS_IN_USE else Severity.WARNING
-            text = "fixes are taken again" if is_taken else f"fixes refused: {reason.brief}"
+            log.log(level, "the autopilot's answer to position fixes: %s (%s)", result, reason)
+            severity = Severity.INFO if is_taken or reason.code is ReasonCode.GPS_IN_USE else Severity.WARNING
+            text = "fixes are taken again" if is_taken else f"fixes refused: {reason.code.summary}"
             if self._last_answer or not is_taken:
                 self._announce(severity, text, "fixes")
         self._last_answer = result, reason
@@ -171,15 +171,15 @@ class Fixes:
         if not self._under_way:
             return None
         sent_s, sending = self._under_way.popleft()
-        sending.outcome = FixAnswer(result, None if is_taken else reason.sentence, now_s - sent_s)
+        sending.outcome = FixAnswer(result, None if is_taken else reason, now_s - sent_s)
         return sending
 
     def time_out(self, now_s: float) -> None:
         """Count the fixes sent more than a second ago as unanswered."""
         while self._under_way and self._under_way[0][1].sent and now_s - self._under_way[0][0] > ANSWERED_WITHIN_S:
-            self._give_up(f"it had no answer within {ANSWERED_WITHIN_S:g} s")
+            self._give_up(Reason(ReasonCode.NO_ANSWER, {"limit_s": ANSWERED_WITHIN_S}))
 
-    def break_off(self, reason: str) -> None:
+    def break_off(self, reason: Reason) -> None:
         """Stop waiting for the answers to all fixes sent, for `reason`."""
         while self._under_way:
             self._give_up(reason)
@@ -193,17 +193,17 @@ class Fixes:
         self._is_stopped = is_stopped
         if is_stopped:
             often = f"one every {TRIED_AGAIN_AFTER_S:g} s is sent until one is answered"
-            log.warning("five fixes in a row had no answer, so %s: %s", often, why_silent.sentence)
-            self._announce(Severity.WARNING, f"fixes unanswered: {why_silent.brief}", "answers")
+            log.warning("five fixes in a row had no answer, so %s: %s", often, why_silent)
+            self._announce(Severity.WARNING, f"fixes unanswered: {why_silent.code.summary}", "answers")
         else:
             log.warning("position fixes are answered again: they are sent again")
             self._announce(Severity.INFO, "fixes are answered again", "answers")
 
-    def _drop(self, sending: Sending, why: str) -> None:
+    def _drop(self, sending: Sending, why: Reason) -> None:
         self.dropped += 1
         sending.settle(False, why)
 
-    def _give_up(self, reason: str) -> None:
+    def _give_up(self, reason: Reason) -> None:
         """Give up the oldest fix sent; the autopilot may use it all the same."""
         sent_s, sending = self._under_way.popleft()
         self._taken_s = max(self._taken_s, sent_s)

@@ -12,7 +12,6 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 ANSWERED_MAX = 50  # requests a second; the answers to a flood of them must not displace our own messages
 FOR_PEOPLE = ("STATUSTEXT", "NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "ONBOARD_COMPUTER_STATUS")  # copied to all links
-PAUSED = "not sent: paused by the ground"
 SPACING_S = 5.0
 
 Announce = Callable[[Severity, str, str], None]  # reports to the ground station: severity, text and topic

@@ -157,7 +157,7 @@ class Link:
                 commands=dict(said.requests.results),
                 ignored_requests=said.requests.ignored,
                 unanswered_fixes=fixes.unanswered,
-                refused_why=fixes.refusal.brief if fixes.refusal else None,
+                refused_why=fixes.refusal.code.summary if fixes.refusal else None,
                 foreign_messages=autopilot.identity.foreign_messages,
                 refused_signatures=dict(said.settings.signing.refused),
                 dropped_queue_full=said.dropped_queue_full,

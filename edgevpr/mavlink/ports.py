@@ -14,6 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from edgevpr.core.errors import LinkAddressError, LinkError
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.address import LinkAddress, Sender
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.wire import Tap, untapped
@@ -22,7 +23,7 @@ CONNECT_TIMEOUT_S = 1.0
 TCP_GIVE_UP_MS = 1000  # if the other end has not confirmed bytes by then, the connection is closed and they are lost
 TCP_SEND_BYTES = 8192  # doubled by the system: some 30 messages; left to itself it takes megabytes
 READ_BYTES = 65_536
-LOST = "the link was lost before it had left"
+LOST = Reason(ReasonCode.LINK_LOST)
 STUCK_S = 0.5  # a port that has accepted no byte for this time is reopened: bytes that wait in it would leave late
 
 

@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.wire import Message, mavlink
 
 _KEPT_S = 3.0  # of attitudes: a frame is hardly ever older when it is recognised
@@ -112,57 +113,36 @@ class Readiness(NamedTuple):
     answers_others: bool = False  # our commands that are no fixes
 
     @property
-    def why_silent(self) -> "Reason":
+    def why_silent(self) -> Reason:
         """The likely reason why it does not answer fixes."""
-        return FIXES_NOT_ANSWERED if self.answers_others else NO_COMMAND_ANSWERED
+        return Reason(ReasonCode.FIXES_NOT_ANSWERED if self.answers_others else ReasonCode.NO_COMMAND_ANSWERED)
 
-    def why(self, result: str) -> "Reason":
+    def why(self, result: str) -> Reason:
         """Return the likely reason for an answer to a fix; `result` is the name of a MAV_RESULT."""
-        if result == "FAILED":
-            return self._why_failed()
-        if result == "TEMPORARILY_REJECTED":
-            return GPS_IN_USE if self.has_gps else OTHER_AID if self.is_px4 else UNKNOWN
-        reasons = {"ACCEPTED": TAKEN, "DENIED": WRONG_FORM, "UNSUPPORTED": NO_COMMAND}
-        return reasons.get(result) or Reason("see its log", f"it answers {result}")
+        match result:
+            case "FAILED":
+                return Reason(self._why_failed())
+            case "TEMPORARILY_REJECTED" if self.has_gps:
+                return Reason(ReasonCode.GPS_IN_USE)
+            case "TEMPORARILY_REJECTED":
+                return Reason(ReasonCode.OTHER_AID if self.is_px4 else ReasonCode.NOT_SAID)
+        codes = {
+            "ACCEPTED": ReasonCode.TAKEN,
+            "DENIED": ReasonCode.WRONG_FORM,
+            "UNSUPPORTED": ReasonCode.NO_COMMAND,
+        }
+        return Reason(codes[result]) if result in codes else Reason(ReasonCode.OTHER_ANSWER, {"result": result})
 
-    def _why_failed(self) -> "Reason":
+    def _why_failed(self) -> ReasonCode:
         """Return the likely reason for the answer FAILED: the first one in order that is known to apply."""
         # PX4 answers with TEMPORARILY_REJECTED while it has GPS, and uses this flag for glitches of it.
         if self.is_px4:
-            return NO_ORIGIN if self.lacks_origin else NOT_PLAUSIBLE
+            return ReasonCode.NO_ORIGIN if self.lacks_origin else ReasonCode.NOT_PLAUSIBLE
         causes = {
-            NO_ORIGIN: self.lacks_origin and not self.has_gps,
-            NOT_STARTED: self.flags & mavlink.EKF_UNINITIALIZED,
-            GPS_IN_USE: self.has_gps,
-            NOT_ARMED: self.is_armed is False,
-            NOT_RECKONING: self.flags & mavlink.EKF_CONST_POS_MODE,
+            ReasonCode.NO_ORIGIN: self.lacks_origin and not self.has_gps,
+            ReasonCode.NOT_STARTED: self.flags & mavlink.EKF_UNINITIALIZED,
+            ReasonCode.GPS_IN_USE: self.has_gps,
+            ReasonCode.NOT_ARMED: self.is_armed is False,
+            ReasonCode.NOT_RECKONING: self.flags & mavlink.EKF_CONST_POS_MODE,
         }
-        return next((reason for reason, is_there in causes.items() if is_there), UNKNOWN)
-
-
-class Reason(NamedTuple):
-    """The reason for an autopilot's answer, or for its silence, in two forms: `brief` has at most 26 bytes, to fit a
-    status text; `sentence` is a part of a sentence in which "it" is the autopilot."""
-
-    brief: str
-    sentence: str
-
-
-# fmt: off
-TAKEN = Reason("", "it takes them")
-GPS_IN_USE = Reason("GPS in use", "a GPS receiver of its has a fix, and while it has GPS it takes no other position")
-NOT_STARTED = Reason("filter not started", "its position filter has not started: a plane starts it with GPS only")
-NO_ORIGIN = Reason("no origin", "it gives no origin when asked: it must have had GPS once, or be sent one")
-NOT_ARMED = Reason("not armed", "it is not armed: on the ground it reckons no position that a fix could correct")
-NOT_RECKONING = Reason("nothing to reckon by", "it reckons no position, with neither GPS, airspeed, flow nor vision")
-OTHER_AID = Reason("not dead reckoning", "it takes a fix only while it reckons its position without any aid")
-NOT_PLAUSIBLE = Reason("fix not plausible", "it reckons its position, and the fix does not fit, or it has no origin")
-UNKNOWN = Reason("see its log", "it does not say: GPS just in use, no origin, or nothing to reckon by")
-WRONG_FORM = Reason("wrong form", "it does not like their form")
-NO_COMMAND = Reason("43003 not known", "its firmware has no command 43003, or was built without, as for boards of 1 MB")
-NO_COMMAND_ANSWERED = Reason("signing? system id?",
-    "it answers no command of ours: does its port take signed messages only, does another vehicle have its system id, "
-    "or does the line carry nothing towards it?")
-FIXES_NOT_ANSWERED = Reason("no command 43003?",
-    "it answers other commands: is its firmware built without 43003, or does another program have our component id?")
-# fmt: on
+        return next((code for code, is_there in causes.items() if is_there), ReasonCode.NOT_SAID)

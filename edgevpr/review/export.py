@@ -35,7 +35,7 @@ def _of_query(query: LoggedQuery) -> list[Feature]:
     }
     features = _feature("match", query.at, named | match)
     if fix := query.fix:
-        outcome = {"outcome": fix.outcome.value, "why": fix.why, "accuracy_m": fix.accuracy_m}
+        outcome = {"outcome": fix.outcome.value, "why": fix.why and fix.why.code.name, "accuracy_m": fix.accuracy_m}
         features += _feature("fix", fix.at, named | outcome)
     return [*features, *_feature("autopilot", query.autopilot_at, named), *_feature("gps", query.gps_at, named)]
 

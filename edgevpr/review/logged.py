@@ -2,7 +2,6 @@
 or of another type, becomes None."""
 
 import logging
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -10,17 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.core.geodesy import distance_m, moved
-from edgevpr.core.reasons import Reason, read_reason
+from edgevpr.core.reasons import Reason, ReasonCode, read_reason
 from edgevpr.runtime.flight.flightlog import select_last_flight
 
 _log = logging.getLogger(__name__)
 
 Point = tuple[float, float]  # latitude and longitude, degrees
 _FRESH_S = 1.0  # a report of the autopilot that is further in time from a frame is not used for it
-_CONTINUOUS = "taken into the continuous position"  # `why` of a fix in the stream of positions, which is not answered
 _TEXTS = ("said", "state", "problem", "why")  # fields with a text for people: the first that a line has is shown
 _LARGEST = 1e15  # larger numbers are damage; the comparison also excludes NaN, and integers that no float can hold
-_NUMBER = re.compile(r"\d+(\.\d+)?%?")
 
 
 class FixOutcome(Enum):
@@ -39,11 +36,11 @@ SENT = (FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.UNANSWERED)
 
 @dataclass(slots=True, kw_only=True)
 class LoggedFix:
-    """The fix of a query: its outcome, `why` it was not sent or not taken (None: no reason is given), and its position
+    """The fix of a query: its outcome, `why` it was not sent or not taken (None: unknown), and its position
     `at` (None: there was nothing to send)."""
 
     outcome: FixOutcome
-    why: str | None
+    why: Reason | None
     at: Point | None
     accuracy_m: float | None
 
@@ -148,9 +145,7 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
 def _apply_answer(fix: LoggedFix, line: dict[str, Any]) -> None:
     """Set outcome and reason of a fix from a log line of kind "answer"."""
     fix.outcome = _outcome(line, line.get("result"))
-    fix.why = text(line, "why") or fix.why
-    if fix.outcome is FixOutcome.REFUSED:
-        fix.why = fix.why or "no reason given"
+    fix.why = read_reason(line.get("why")) or fix.why
 
 
 def read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
@@ -185,13 +180,14 @@ def read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
 
 
 def _read_fix(fix: dict[str, Any]) -> LoggedFix:
-    outcome = _outcome(fix, fix.get("answer"))
-    return LoggedFix(outcome=outcome, why=text(fix, "why"), at=point(fix), accuracy_m=number(fix, "accuracy_m"))
+    outcome, why = _outcome(fix, fix.get("answer")), read_reason(fix.get("why"))
+    return LoggedFix(outcome=outcome, why=why, at=point(fix), accuracy_m=number(fix, "accuracy_m"))
 
 
 def _outcome(fix: dict[str, Any], answer: object) -> FixOutcome:
     if fix.get("sent") is False:
-        return FixOutcome.CONTINUOUS if fix.get("why") == _CONTINUOUS else FixOutcome.KEPT
+        why = read_reason(fix.get("why"))
+        return FixOutcome.CONTINUOUS if why and why.code is ReasonCode.CONTINUOUS else FixOutcome.KEPT
     if answer is None:
         return FixOutcome.UNANSWERED
     return FixOutcome.TAKEN if answer == "ACCEPTED" else FixOutcome.REFUSED
@@ -221,11 +217,6 @@ def _text_of(line: dict[str, Any]) -> str:
             return f"{', '.join(changed)}: {words}"
     others = {"kind", "time", "t_mono_s"}
     return words or ", ".join(f"{key} {known}" for key, known in line.items() if key not in others)
-
-
-def without_numbers(sentence: str) -> str:
-    """Return a sentence with "…" for each number, so that equal ones can be counted."""
-    return _NUMBER.sub("…", sentence)
 
 
 def value(record: Any, *keys: str) -> Any:

@@ -40,7 +40,6 @@ from edgevpr.review.logged import (
     point,
     text,
     value,
-    without_numbers,
 )
 from edgevpr.review.overhead import Layer, at_of
 from edgevpr.review.steps import Explored, Step, layer_of, make_page
@@ -149,7 +148,8 @@ def _step(query: LoggedQuery, place: Place | None, flight: LoggedFlight, has_lin
     groups = {"match accepted": "accepted"} if query.accepted else {refused: "refused"}
     fixed = f"{fix.outcome.value}{f': {fix.why}' if fix.why else ''}" if fix else ""
     if fix:
-        groups[without_numbers(fixed)] = _FIX_COLOURS[fix.outcome]
+        in_short = f": {fix.why.code.summary}" if fix.why else ""
+        groups[f"{fix.outcome.value}{in_short}"] = _FIX_COLOURS[fix.outcome]
         if fix.outcome in SENT:
             points[_FIX_COLOURS[fix.outcome]] = fix.at
     if (query.off_m or 0.0) > _FAR_M:

@@ -6,15 +6,17 @@ import math
 import pytest
 from conversing import FIX_3D
 
-from edgevpr.mavlink import vehicle as reasons
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.fixes import FixAnswer, Fixes, Sending
 from edgevpr.mavlink.messages import TEXT_BYTES, Fix
-from edgevpr.mavlink.vehicle import GPS_IN_USE, Readiness, Reason
+from edgevpr.mavlink.vehicle import Readiness
 from edgevpr.mavlink.wire import mavlink
 
 ACCEPTED, FAILED, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED, mavlink.MAV_RESULT_DENIED
-LATE = FixAnswer(None, "it had no answer within 1 s", None)
-UNANSWERED = "not sent: five fixes in a row had no answer"
+LATE = FixAnswer(None, Reason(ReasonCode.NO_ANSWER, {"limit_s": 1.0}), None)
+UNANSWERED = Reason(ReasonCode.FIXES_UNANSWERED)
+GPS_IN_USE = Reason(ReasonCode.GPS_IN_USE)
+SILENT = Reason(ReasonCode.NO_COMMAND_ANSWERED)
 ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
 
@@ -80,7 +82,7 @@ def test_a_fix_may_be_in_the_position_unless_it_was_refused(fixes):
     fixes.time_out(14.1)
     assert fixes.t_fix_s == 13.0, "only the answer may have been lost"
     sent(fixes, 15.0)
-    fixes.break_off("the link was lost")
+    fixes.break_off(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))
     assert fixes.t_fix_s == 15.0
 
 
@@ -91,10 +93,10 @@ def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_sto
     fixes.note_lost(3)
     assert fixes.why_not(5.0) is None
     sent(fixes, 5, 6, 7)
-    fixes.report_silence(reasons.NO_COMMAND_ANSWERED, 8.5)
+    fixes.report_silence(SILENT, 8.5)
     sent(fixes, 17.5)
     fixes.note_lost(2)
-    fixes.report_silence(reasons.NO_COMMAND_ANSWERED, 20.0)
+    fixes.report_silence(SILENT, 20.0)
     assert fixes.why_not(20.0) == UNANSWERED
     assert [text for _, text, _ in reports] == ["fixes unanswered: signing? system id?"]
 
@@ -112,7 +114,7 @@ def fly(autopilot, count, every_s=1.0):
 def test_five_unanswered_fixes_stop_the_sending_and_one_in_ten_seconds_asks_again(autopilot):
     sendings = fly(autopilot, 40)
     assert [number for number, sending in enumerate(sendings) if sending.sent] == [0, 1, 2, 3, 4, 14, 24, 34]
-    assert {sending.why for sending in sendings if not sending.sent} == {UNANSWERED}
+    assert all(sending.why == UNANSWERED for sending in sendings if not sending.sent)
     assert (autopilot.conversation.sent["COMMAND_INT"], autopilot.conversation.fixes.withheld) == (8, 32)
 
 
@@ -121,7 +123,7 @@ def test_late_answers_to_the_fixes_of_before_do_not_pass_for_one_to_a_new_fix(au
     autopilot.wait(0.1)
     autopilot.answer(ACCEPTED)
     (held,) = fly(autopilot, 1, every_s=0.4)
-    assert (held.sent, held.why) == (False, "not sent: the autopilot has only just begun to answer again")
+    assert (held.sent, held.why.code) == (False, ReasonCode.ANSWERS_BEGIN_AGAIN)
     for _ in range(4):
         autopilot.answer(DENIED)
     (new,) = fly(autopilot, 1, every_s=0.6)
@@ -141,21 +143,21 @@ def test_a_refused_fix_says_why_by_what_the_autopilot_has_said(autopilot):
         return sending.outcome
 
     autopilot.gps()
-    assert refused() == FixAnswer("FAILED", GPS_IN_USE.sentence, pytest.approx(0.03))
+    assert refused() == FixAnswer("FAILED", GPS_IN_USE, pytest.approx(0.03))
     autopilot.wait(2)
     autopilot.gps(fix_type=1)
-    assert refused().why == reasons.UNKNOWN.sentence
+    assert refused().why.code is ReasonCode.NOT_SAID
     (request,) = autopilot.questions()
     assert (request.command, request.param1) == (512, 49), "it is asked for its origin"
-    why = [refused(after_s=3.0).why] + [refused().why for _ in range(20)]
-    assert set(why) == {reasons.NO_ORIGIN.sentence}, "while it is asked again, too"
+    codes = [refused(after_s=3.0).why.code] + [refused().why.code for _ in range(20)]
+    assert set(codes) == {ReasonCode.NO_ORIGIN}, "while it is asked again, too"
     assert len(autopilot.questions()) == 2
     autopilot.say(mavlink.MAVLink_gps_global_origin_message(1, 1, 1))
     autopilot.filter(mavlink.EKF_CONST_POS_MODE)
-    assert refused().why == reasons.NOT_RECKONING.sentence
+    assert refused().why.code is ReasonCode.NOT_RECKONING
     assert refused(ACCEPTED).why is None
     assert autopilot.conversation.autopilot.acks == {"FAILED": 24, "ACCEPTED": 1}
-    assert autopilot.conversation.fixes.refusal is reasons.NOT_RECKONING
+    assert autopilot.conversation.fixes.refusal.code is ReasonCode.NOT_RECKONING
 
 
 def test_the_ground_station_hears_each_reason_once_and_that_fixes_are_taken_again(autopilot, caplog):
@@ -199,32 +201,33 @@ REJECTED = "TEMPORARILY_REJECTED"
 
 
 @pytest.mark.parametrize(
-    ("result", "state", "reason"),
+    ("result", "state", "code"),
     [
-        ("FAILED", {}, reasons.UNKNOWN),
-        ("FAILED", {"has_gps": True, "is_armed": False}, reasons.GPS_IN_USE),
-        ("FAILED", {"lacks_origin": True, "is_armed": False}, reasons.NO_ORIGIN),
-        ("FAILED", {"is_armed": False, **CONST}, reasons.NOT_ARMED),
-        ("FAILED", {"is_armed": True, **CONST}, reasons.NOT_RECKONING),
-        ("FAILED", {"has_gps": True, **UNINITIALIZED}, reasons.NOT_STARTED),
-        ("FAILED", {"lacks_origin": True, **UNINITIALIZED}, reasons.NO_ORIGIN),
-        ("FAILED", {"lacks_origin": True, "has_gps": True}, reasons.GPS_IN_USE),
-        ("FAILED", {"is_px4": True, **UNINITIALIZED}, reasons.NOT_PLAUSIBLE),
-        ("FAILED", {"is_px4": True, "lacks_origin": True}, reasons.NO_ORIGIN),
-        ("ACCEPTED", {}, reasons.TAKEN),
-        ("DENIED", {"has_gps": True}, reasons.WRONG_FORM),
-        ("UNSUPPORTED", {}, reasons.NO_COMMAND),
-        (REJECTED, {"is_px4": True, "has_gps": True}, reasons.GPS_IN_USE),
-        (REJECTED, {"is_px4": True}, reasons.OTHER_AID),
-        (REJECTED, {}, reasons.UNKNOWN),
-        ("99", {}, Reason("see its log", "it answers 99")),
+        ("FAILED", {}, ReasonCode.NOT_SAID),
+        ("FAILED", {"has_gps": True, "is_armed": False}, ReasonCode.GPS_IN_USE),
+        ("FAILED", {"lacks_origin": True, "is_armed": False}, ReasonCode.NO_ORIGIN),
+        ("FAILED", {"is_armed": False, **CONST}, ReasonCode.NOT_ARMED),
+        ("FAILED", {"is_armed": True, **CONST}, ReasonCode.NOT_RECKONING),
+        ("FAILED", {"has_gps": True, **UNINITIALIZED}, ReasonCode.NOT_STARTED),
+        ("FAILED", {"lacks_origin": True, **UNINITIALIZED}, ReasonCode.NO_ORIGIN),
+        ("FAILED", {"lacks_origin": True, "has_gps": True}, ReasonCode.GPS_IN_USE),
+        ("FAILED", {"is_px4": True, **UNINITIALIZED}, ReasonCode.NOT_PLAUSIBLE),
+        ("FAILED", {"is_px4": True, "lacks_origin": True}, ReasonCode.NO_ORIGIN),
+        ("ACCEPTED", {}, ReasonCode.TAKEN),
+        ("DENIED", {"has_gps": True}, ReasonCode.WRONG_FORM),
+        ("UNSUPPORTED", {}, ReasonCode.NO_COMMAND),
+        (REJECTED, {"is_px4": True, "has_gps": True}, ReasonCode.GPS_IN_USE),
+        (REJECTED, {"is_px4": True}, ReasonCode.OTHER_AID),
+        (REJECTED, {}, ReasonCode.NOT_SAID),
+        ("99", {}, ReasonCode.OTHER_ANSWER),
     ],
 )
-def test_why_returns_the_first_reason_that_applies(result, state, reason):
-    assert Readiness(**state).why(result) == reason
+def test_why_returns_the_first_reason_that_applies(result, state, code):
+    assert Readiness(**state).why(result).code is code
 
 
-def test_every_reason_fits_a_status_text():
-    known = [each for each in vars(reasons).values() if isinstance(each, Reason)]
-    assert len(known) > 10
-    assert all(len(f"edgevpr: fixes unanswered: {each.brief}".encode()) <= TEXT_BYTES for each in known)
+def test_every_answer_of_an_autopilot_fits_a_status_text():
+    codes = list(ReasonCode)
+    answers = codes[codes.index(ReasonCode.TAKEN) : codes.index(ReasonCode.FIXES_NOT_ANSWERED) + 1]
+    assert len(answers) > 10
+    assert all(len(f"edgevpr: fixes unanswered: {code.summary}".encode()) <= TEXT_BYTES for code in answers)

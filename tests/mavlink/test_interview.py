@@ -6,6 +6,7 @@ from itertools import pairwise
 import pytest
 from conversing import Autopilot
 
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.lab.simulate.firmware import ARDUPILOT, PX4
 from edgevpr.mavlink.channel import OLD_NAMES, Channel
 from edgevpr.mavlink.messages import Fix, Severity
@@ -128,8 +129,8 @@ def test_missing_answers_are_reported_once_and_withhold_fixes():
     assert [text for _, text in autopilot.sentences()] == ["edgevpr: no answer for GPS2_TYPE and 1 more"]
     sending = autopilot.conversation.send_fix(Fix(50.0, 8.0, 9.0, autopilot.clock.now_s))
     autopilot.answer_for(1)
-    assert (sending.sent, sending.why) == (False, autopilot.interview.choice.reason)
-    assert "GPS2_TYPE, VISO_TYPE" in sending.why
+    assert (sending.sent, sending.why.code) == (False, ReasonCode.PARAMETERS_UNFIT)
+    assert "GPS2_TYPE, VISO_TYPE" in sending.why.parameters["problem"]
     autopilot.link = {}
     autopilot.answer_for(60, Channel.GPS_INPUT)
     autopilot.answer_for(10)

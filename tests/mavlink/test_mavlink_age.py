@@ -12,6 +12,7 @@ import pytest
 import serial
 from mavlink_peers import AutopilotThread, Peer, SerialCable, TcpServer, free_port, link_to, wait_until
 
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.messages import Fix, Severity, status_text
@@ -20,7 +21,7 @@ from edgevpr.mavlink.wire import mavlink
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-THROWN_AWAY = "the link was lost before it had left"
+THROWN_AWAY = Reason(ReasonCode.LINK_LOST)
 
 
 @pytest.fixture

@@ -80,7 +80,7 @@ DANGEROUS = [
 def test_decide_stops_the_channel_for_what_is_dangerous(parameters, wrong, advice):
     decision = decide(parameters | wrong)
     assert decision.choice.channel is Channel.NONE
-    assert f"set {advice}." in decision.choice.why_nothing
+    assert f"set {advice}." in decision.choice.why_nothing.parameters["problem"]
 
 
 WEAK = [

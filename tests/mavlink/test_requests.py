@@ -5,7 +5,8 @@ import math
 
 import pytest
 
-from edgevpr.mavlink.ground import ANSWERED_MAX, PAUSED, Requests, Texts, Wish
+from edgevpr.core.reasons import ReasonCode
+from edgevpr.mavlink.ground import ANSWERED_MAX, Requests, Texts, Wish
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.wire import mavlink
 
@@ -78,7 +79,7 @@ def test_of_wishes_that_contradict_each_other_the_newest_is_left_and_others_stay
 def test_no_fix_leaves_once_a_pause_is_acknowledged(autopilot, requests):
     assert answered(autopilot, command_long(31010, 1)) == "ACCEPTED"
     held = autopilot.put_fix()
-    assert (held.sent, held.why) == (False, PAUSED)
+    assert (held.sent, held.why.code) == (False, ReasonCode.PAUSED)
     assert answered(autopilot, command_long(31010, 2)) == "ACCEPTED"
     assert autopilot.put_fix().sent
 

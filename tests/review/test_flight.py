@@ -6,6 +6,7 @@ import pytest
 from logs import query, write_log
 
 from edgevpr.core.appending import numbered
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.review.logged import FixOutcome, read_flight
 from edgevpr.runtime.flight.flightlog import FlightLog
 
@@ -30,14 +31,33 @@ def test_a_real_flight_is_read(flown):
 
 def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):
     lines = [("query", query(name)) for name in ("a", "b", "c", "d")]
+    refused, superseded = ({"code": code, "parameters": {}} for code in ("WRONG_FORM", "SUPERSEDED"))
     answers = [
         ("answer", {"query": "a", "sent": True, "result": "ACCEPTED", "why": None, "latency_ms": 12.5}),
-        ("answer", {"query": "b", "sent": True, "result": "DENIED", "why": "denied", "latency_ms": 3.0}),
-        ("answer", {"query": "c", "sent": False, "result": None, "why": "too late", "latency_ms": None}),
+        (
+            "answer",
+            {
+                "query": "b",
+                "sent": True,
+                "result": "DENIED",
+                "why": refused,
+                "latency_ms": 3.0,
+            },
+        ),
+        (
+            "answer",
+            {
+                "query": "c",
+                "sent": False,
+                "result": None,
+                "why": superseded,
+                "latency_ms": None,
+            },
+        ),
     ]
     flight = read_flight(write_log(tmp_path / "log", *lines, *answers))
     assert outcomes(flight) == [FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.KEPT, FixOutcome.UNANSWERED]
-    assert flight.queries[1].fix.why == "denied"
+    assert flight.queries[1].fix.why.code is ReasonCode.WRONG_FORM
 
 
 def test_a_flight_of_several_files_is_read_whole_and_what_is_missing_is_a_remark(tmp_path):

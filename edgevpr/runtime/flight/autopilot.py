@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from edgevpr.core.config import MavlinkConfig, SourceSetsConfig
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import FixReport
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.fixes import Sending
@@ -23,7 +24,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 # long, so that the log line of the query can say whether the fix was sent.
 _SETTLED_WITHIN_S = 0.02
 
-DRY_RUN = "dry run: no fix is sent"
+DRY_RUN = Reason(ReasonCode.DRY_RUN)
 
 _ASKED_AGAIN_S = 2.0  # for a source set, while that is not answered
 _GPS_GOOD_FOR_S = 10.0  # so long GPS must be good before the source set with GPS is asked for again
@@ -56,7 +57,7 @@ class ToAutopilot:
             if stats.used_share is not None:
                 told = f"used them by {stats.used_share:.0%} of its reports"
             taken = f"{stats.positions_sent} positions sent, the autopilot {told}"
-        sent = taken if self._send_fixes else DRY_RUN
+        sent = taken if self._send_fixes else str(DRY_RUN)
         counts = (
             (sum(stats.acks.values()) - stats.acks.get("ACCEPTED", 0), f"refused ({stats.refused_why})"),
             (stats.unanswered_fixes, "unanswered"),
@@ -203,13 +204,13 @@ class ToAutopilot:
             advice = self._navigator.advise(event, self._clock.mono_s())
         except ValueError as error:  # another program wrote an invalid position
             _log.warning("%s: %s; no fix is sent", event.name, error)
-            return report_unsent(event, str(error)), None
+            return report_unsent(event, Reason(ReasonCode.INVALID_POSITION, {"problem": str(error)})), None
         self._report_held(advice.why if advice.is_held else None)
         if advice.fix is None or not self._send_fixes:
             return report_unsent(event, advice.why or DRY_RUN), None
         return None, self._link.send_fix(advice.fix)
 
-    def _report_held(self, objection: str | None) -> None:
+    def _report_held(self, objection: Reason | None) -> None:
         """Count a fix that is held back because of `objection`, and report when a row of them begins and ends."""
         before, self._is_holding = self._is_holding, objection is not None
         self._held += self._is_holding
@@ -268,7 +269,7 @@ def _place_of(fix: Fix) -> dict[str, float]:
     return {**at, "accuracy_m": round(fix.accuracy_m, 2)}
 
 
-def report_unsent(event: Recognition, why: str) -> FixReport:
+def report_unsent(event: Recognition, why: Reason) -> FixReport:
     """Return the report of a fix that was not sent, and why."""
     return FixReport(query=event.name, sent=False, why=why)
 

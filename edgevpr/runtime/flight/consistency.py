@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.runtime.flight.measurements import PositionedMatch
 from edgevpr.runtime.recognise.locate import in_sd
 
@@ -41,7 +42,7 @@ class GateResult(NamedTuple):
     """Verdict on a fix: `why` it is not believed (None: it is). `is_against`: it contradicts the expected position,
     and other fixes agree with it; `is_lost`: the path's velocity is wrong too."""
 
-    why: str | None = None
+    why: Reason | None = None
     is_against: bool = False
     is_lost: bool = False
 
@@ -78,11 +79,10 @@ class Consistency:
         if in_sd(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS and not is_turned:
             return self._believed(fix, BELIEVED)
         off_m, good_to_m = math.hypot(*step_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
-        turned = f"held back: its picture is turned by {fix.seen.turn_deg or 0:.0f} degrees against the compass"
+        turned = Reason(ReasonCode.HELD_TURNED, {"turn_deg": fix.seen.turn_deg or 0.0})
         if has_gps:
             self._held, self._row = None, []
-            there = f"held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is"
-            return GateResult(turned if is_turned else there)
+            return GateResult(turned if is_turned else Reason(ReasonCode.HELD_OFF_GPS, {"off_m": off_m}))
         self._row = [each for each in self._row if _could_follow(each, fix)]
         if all(fix.seen.is_of_other_places(each.seen) for each in self._row):  # neighbours share places
             self._row.append(fix)
@@ -98,8 +98,7 @@ class Consistency:
             self._joined += 1
             if _is_independent(self._held, fix, drift_m_s) and self._joined >= (_IN_A_ROW if is_followed else 2):
                 return self._believed(fix, GateResult(is_against=True))
-        there = "where the aircraft is by the autopilot's reckoning and the fixes before"
-        return GateResult(f"held back: {off_m:.0f} m from {there}, good to {good_to_m:.0f} m: another fix has to agree")
+        return GateResult(Reason(ReasonCode.HELD_OFF_PATH, {"off_m": off_m, "accuracy_m": good_to_m}))
 
     def _believed(self, fix: ComparedFix, verdict: GateResult) -> GateResult:
         self._held, self._row = None, []

@@ -10,6 +10,7 @@ from typing import Any
 
 from edgevpr.core.config import Config, MavlinkConfig
 from edgevpr.core.errors import ImageError
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import Mount
 from edgevpr.frames.source import recorded_intervals
@@ -121,7 +122,7 @@ class Flight:
                 cores = io.board.cores
                 autopilot = ToAutopilot(link, navigator, notifier, settings=settings, cores=cores, clock=io.clock)
             if not settings.send_fixes:
-                notifier.announce(Severity.WARNING, DRY_RUN)
+                notifier.announce(Severity.WARNING, str(DRY_RUN))
             if cannot_learn:
                 _report_learning_stopped(notifier, cannot_learn)
             notifier.announce(Severity.INFO, f"started, {len(recogniser.place_map)} places", topic="start")
@@ -236,7 +237,7 @@ class Flight:
                 if self._parts.autopilot:
                     event = self._parts.autopilot.report_match(event, meter.totals()["used_mah"])
                 elif event.accepted:
-                    event = replace(event, fix=report_unsent(event, "there is no link"))
+                    event = replace(event, fix=report_unsent(event, Reason(ReasonCode.NO_LINK)))
             except Exception:
                 _log.exception("the autopilot could not be informed")
             for update in self._observers:

@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import BETWEEN_S
@@ -50,13 +51,7 @@ _OURS_FOR_S = 10.0  # so long after our last position an autopilot that has GPS 
 # sent as GPS_INPUT, by which ArduPilot returns to its receiver at once (AP_GPS::update_primary).
 _BACK_S = 1.0
 _TAKEN_BACK_S = 3.0
-_UNHEARD = "nothing is heard of the vehicle"
 _UNHEARD_S = 5.0
-_CONTINUOUS = "taken into the continuous position"
-# With GPS, ArduPilot refuses a fix, and PX4 takes it with a gain that makes its velocity jump.
-_DOUBTED = "not sent: the map has contradicted GPS from the first match on"
-_HAS_GPS = "not needed: the autopilot has GPS"
-_HAS_WRONG_GPS = "not sent: the autopilot has GPS, which the map contradicts, and takes no fix"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +60,12 @@ class Advice:
     back, since it contradicts the expected position."""
 
     fix: Fix | None
-    why: str | None = None
+    why: Reason | None = None
     is_held: bool = False
+
+
+def _withhold(code: ReasonCode) -> Advice:
+    return Advice(None, Reason(code))
 
 
 class Navigator(Listener):
@@ -154,20 +153,20 @@ class Navigator(Listener):
         frame = self._measure(event)
         seen = position_match(event, frame) if frame else None
         if seen is None:
-            return Advice(None, "the place has no position")
+            return _withhold(ReasonCode.PLACE_WITHOUT_POSITION)
         if event.view.reason:
-            return Advice(None, f"not sent: {event.view.reason}, so it does not show what is under the aircraft")
+            return _withhold(ReasonCode.NOT_BELOW_AIRCRAFT)
         vehicle, late_m = self._vehicle, shared_time_error_m(event, event.vehicle or self._vehicle)
         accuracy_m = math.hypot(seen.accuracy_m, late_m)
         fix = Fix(seen.position.lat_deg, seen.position.lon_deg, accuracy_m, seen.t_s)
         if vehicle is None or not vehicle.is_fresh_at(now_s):
             return self._advise_unheard(fix, now_s)
         if vehicle.velocity_m_s is None:
-            return Advice(None, _UNHEARD) if self._channel.is_continuous else Advice(fix)
+            return _withhold(ReasonCode.NO_TELEMETRY) if self._channel.is_continuous else Advice(fix)
         compared = self._navigation.compare(seen)
         if compared is None:
             self._navigation.begin(seen.position, worst_sd(seen.scatter_m2), seen.t_s, vehicle.t_heard_s)
-            return Advice(None, _CONTINUOUS) if self._channel.is_continuous else Advice(fix)
+            return _withhold(ReasonCode.CONTINUOUS) if self._channel.is_continuous else Advice(fix)
         is_followed = self._navigation.is_followed_at(seen.t_s)
         verdict = self._consistency.judge(compared, self.has_gps, is_followed)
         if verdict.why:
@@ -257,9 +256,9 @@ class Navigator(Listener):
     def _advise_unheard(self, fix: Fix, now_s: float) -> Advice:
         """Advise on a fix without a recent report: the autopilot has no position, or its report is still to come."""
         if self._channel.is_continuous:
-            return Advice(None, _UNHEARD)
+            return _withhold(ReasonCode.NO_TELEMETRY)
         since_s = max(self._appeared_s, self._vehicle.t_heard_s if self._vehicle else -math.inf)
-        return Advice(fix) if now_s - since_s > _UNHEARD_S else Advice(None, f"not sent yet: {_UNHEARD}")
+        return Advice(fix) if now_s - since_s > _UNHEARD_S else _withhold(ReasonCode.NO_TELEMETRY)
 
     def _measure(self, event: Recognition) -> FrameMeasurement | None:
         vehicle = event.vehicle or self._vehicle
@@ -283,14 +282,14 @@ class Navigator(Listener):
     def _advise_improvement(self, vehicle: Vehicle, velocity_m_s: tuple[float, float], now_s: float) -> Advice:
         """Advise what to send to an autopilot that reports a position of its own: a fix only if ours is better."""
         if self._channel.is_continuous:
-            return Advice(None, _CONTINUOUS)
-        if rests_on_gps(vehicle):
-            return Advice(None, _HAS_GPS if self._believes_gps else _HAS_WRONG_GPS)
+            return _withhold(ReasonCode.CONTINUOUS)
+        if rests_on_gps(vehicle):  # ArduPilot refuses a fix then, and PX4's velocity jumps by the gain that it has
+            return _withhold(ReasonCode.HAS_GPS if self._believes_gps else ReasonCode.HAS_WRONG_GPS)
         if self._doubts_map:
-            return Advice(None, _DOUBTED)
+            return _withhold(ReasonCode.MAP_CONTRADICTS_GPS)
         estimate = self._navigation.state_at(now_s)
         if estimate is None:
-            return Advice(None, _UNHEARD)
+            return _withhold(ReasonCode.NO_TELEMETRY)
         here, claimed_m = estimate.position, self._claimed_m(estimate)
         east_m_s, north_m_s = velocity_m_s
         since_s = now_s - vehicle.t_heard_s
@@ -298,10 +297,8 @@ class Navigator(Listener):
         off_m = float(distance_m(*there, here.lat_deg, here.lon_deg))
         # Mean square errors: of our estimate 2 * accuracy_m**2 (two axes), of the autopilot's position off_m**2 more.
         if off_m**2 <= 2 * estimate.accuracy_m**2:
-            return Advice(
-                None,
-                f"not needed: the autopilot is {off_m:.1f} m from where we are, good to {estimate.accuracy_m:.1f} m",
-            )
+            figures = {"off_m": off_m, "accuracy_m": estimate.accuracy_m}
+            return Advice(None, Reason(ReasonCode.NOT_BETTER, figures))
         # Lead by the drift of half the time to the next fix, so that the autopilot is right in the middle of it. Now it
         # is off by this lead, in one direction: half of its square is added to the variance of each axis.
         ahead_m = [self._next_s / 2 * each for each in self._navigation.path_drift_m_s()]

@@ -122,4 +122,4 @@ def _check_link(settings: MavlinkConfig, offline: bool) -> str:
             parts.append(f"ground station at {ground}")
     if settings.signing_key is not None:
         parts.append("signed")
-    return ", ".join(parts if settings.send_fixes else [*parts, DRY_RUN])
+    return ", ".join(parts if settings.send_fixes else [*parts, str(DRY_RUN)])

@@ -7,13 +7,13 @@ from fakes import FakeClock, FakeLink, FakeSource
 from flights import flight_over, of_kind, pictures
 
 from edgevpr.mavlink.messages import Health
-from edgevpr.mavlink.vehicle import GPS_IN_USE
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.watching import NOTHING_IN_A_ROW
 
 
 def fixes(lines):
-    return [line["fix"] and (line["fix"]["sent"], line["fix"]["why"]) for line in of_kind(lines, "query")]
+    """Of each query, whether its fix was sent, and why not."""
+    return [fix and (fix["sent"], fix["why"]) for fix in (line["fix"] for line in of_kind(lines, "query"))]
 
 
 def test_a_query_says_whether_its_fix_was_sent_and_what_was_answered_to_the_last(recording, tmp_path):
@@ -41,7 +41,7 @@ def test_every_answer_has_its_own_line_before_the_next_query(recording, tmp_path
     queries, answers = of_kind(lines, "query"), of_kind(lines, "answer")
     assert [line["last_fix"]["answer"] for line in queries[1:]] == ["FAILED"] * 3
     assert [line["query"] for line in answers] == [line["query"] for line in queries]
-    assert {(line["sent"], line["result"], line["why"]) for line in answers} == {(True, "FAILED", GPS_IN_USE.sentence)}
+    assert {(line["sent"], line["result"], line["why"]["code"]) for line in answers} == {(True, "FAILED", "GPS_IN_USE")}
     assert "3 fixes sent, 0 taken, 3 refused (GPS in use)" in statuses[-1]
 
 
@@ -66,7 +66,7 @@ def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and
     flown.recogniser.technique.encode = lambda *seen: (clock.work(6.2), encode(*seen))[1]
     lines = flown.fly(FakeSource(pictures(3), clock))
     assert all(line["accepted"] for line in of_kind(lines, "query")), "accepted never means sent"
-    assert fixes(lines) == [(False, "its frame is 6.2 s old, and 5 s are the limit")] * 3
+    assert fixes(lines) == [(False, {"code": "FRAME_TOO_OLD", "parameters": {"age_s": 6.2, "limit_s": 5.0}})] * 3
     assert link.stats().fixes_sent == 0
     assert "2 too late" in statuses[-1]
 
@@ -74,7 +74,7 @@ def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and
 def test_without_a_link_the_line_says_so(recording, tmp_path):
     clock = FakeClock()
     lines = flight_over(recording, tmp_path, None, clock).fly(FakeSource(pictures(1), clock))
-    assert fixes(lines) == [(False, "there is no link")]
+    assert fixes(lines) == [(False, {"code": "NO_LINK", "parameters": {}})]
 
 
 def test_what_is_not_accepted_has_no_fix_to_speak_of(recording, tmp_path):

@@ -8,6 +8,7 @@ from pictures import textured
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Steps
 from edgevpr.frames.level import Levelled, View
 from edgevpr.runtime.flight.consistency import ComparedFix, Consistency
@@ -114,7 +115,8 @@ def test_one_that_contradicts_is_held_back_and_says_by_how_much():
     advice = Aircraft().report((300, -400), 1.0)
     assert advice.fix is None
     assert not Aircraft().report((500, 0), 1.0, fix_sd_m=150.0).is_held, "an inexact one has room"
-    assert advice.why.startswith("held back: 500 m from where the aircraft is by the autopilot's reckoning")
+    assert advice.why.code is ReasonCode.HELD_OFF_PATH
+    assert advice.why.parameters["off_m"] == pytest.approx(500.0, abs=0.5)
 
 
 def test_a_second_one_of_another_place_that_says_the_same_is_sent_and_so_are_those_after_it():
@@ -141,8 +143,7 @@ def test_a_picture_that_is_suddenly_turned_against_the_compass_is_held_back_unti
     told = [aircraft.report((0, 0), t_s, places=(t_s,), turned_deg=3.0) for t_s in range(1, 4)]
     assert [advice.is_held for advice in told] == [False] * 3
     alone = aircraft.report((0, 0), 4, places=(4,), turned_deg=180.0)
-    assert "turned by" in alone.why
-    assert "against the compass" in alone.why
+    assert alone.why.code is ReasonCode.HELD_TURNED
     assert not aircraft.report((0, 0), 5, places=(5,), turned_deg=3.0).is_held
     broken = [aircraft.report((0, 0), t_s, places=(t_s,), turned_deg=100.0).is_held for t_s in range(6, 12)]
     assert broken == [True, True, True, False, False, False], "a compass that has gone wrong"
@@ -167,7 +168,8 @@ def test_against_gps_no_fix_is_believed():
     aircraft = Aircraft(has_gps=True)
     advices = [aircraft.report((500, 0), t_s, places=(t_s,)) for t_s in range(1, 5)]
     assert all(advice.is_held for advice in advices)
-    assert advices[0].why.startswith("held back: 500 m from where GPS")
+    assert advices[0].why.code is ReasonCode.HELD_OFF_GPS
+    assert advices[0].why.parameters["off_m"] == pytest.approx(500.0, abs=0.5)
 
 
 def test_where_the_autopilot_says_nothing_of_its_position_a_fix_is_sent_as_it_is():
@@ -182,7 +184,7 @@ def test_an_autopilot_that_has_only_just_appeared_is_sent_nothing_until_it_had_t
     aircraft = Aircraft()
     aircraft.navigator.hear_autopilot(START_S + 1.0)
     too_early = aircraft.report((500, 0), 5.9, heard=False)
-    assert (too_early.fix, too_early.why) == (None, "not sent yet: nothing is heard of the vehicle")
+    assert (too_early.fix, too_early.why.code) == (None, ReasonCode.NO_TELEMETRY)
     assert aircraft.report((500, 0), 6.1, heard=False).fix, "it has none"
 
 
@@ -212,7 +214,8 @@ def test_in_flight_a_fix_held_back_is_in_the_log_and_the_ground_is_told_once(rec
     queries, link = fly(recording, tmp_path, (0, 20, 2, 3, 4))
     assert all(line["accepted"] for line in queries), "held back or not, the match stays accepted"
     assert [line["fix"]["sent"] for line in queries] == [False, False, False, True, True]
-    assert queries[0]["fix"]["why"].startswith("held back: 3574 m from where the aircraft is")
+    assert queries[0]["fix"]["why"]["code"] == "HELD_OFF_PATH"
+    assert queries[0]["fix"]["why"]["parameters"]["off_m"] == pytest.approx(3574.0, abs=0.5)
     assert link.stats().fixes_sent == 2
     assert link.texts() == [
         (4, "edgevpr: fix held back, contradicts autopilot"),

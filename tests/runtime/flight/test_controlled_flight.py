@@ -3,6 +3,7 @@
 import pytest
 from controlled import Controlled
 
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.mavlink.wire import mavlink
 
 pytestmark = pytest.mark.slow
@@ -49,7 +50,7 @@ def test_a_plane_gets_single_fixes_after_the_loss_only_and_takes_them():
         flown.sees = True
         flown.fly(30)
         assert not flown.commands(FIX)
-        assert "has GPS" in flown.reports[-1].why
+        assert flown.reports[-1].why.code is ReasonCode.HAS_GPS
         flown.controller.set("SIM_GPS1_ENABLE", 0)
         flown.controller.set("SIM_WIND_SPD", 6)
         lost_s = flown.now_s

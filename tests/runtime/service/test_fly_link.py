@@ -35,7 +35,7 @@ def test_open_links_uses_the_keys_of_the_configuration():
         assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (5, 191)
         sending = link.send_fix(Fix(50.0, 8.0, 20.0, link.turns.now_s()))
         wait_until(lambda: sending.sent is not None)
-        assert "0.2 s" in sending.why
+        assert sending.why.parameters["limit_s"] == 0.2
 
 
 def test_open_links_signs_and_keeps_the_time(tmp_path):
