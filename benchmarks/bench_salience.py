@@ -149,7 +149,7 @@ def gated(
             "technique": technique,
             "gate": gate,
             "recall": float(found[passes].mean()) if passes.any() else 0.0,
-            "auc": float(metrics.auc(precision, recall)) if passes.any() else 0.0,
+            "auc": float(metrics.auc_2_3(precision, recall)) if passes.any() else 0.0,
             "recall_strict": float((found & passes).mean()),
             "queries": len(passes),
             "true_discarded": int((found & ~passes).sum()),

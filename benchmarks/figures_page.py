@@ -33,9 +33,12 @@ def recall(contents: list[dict[str, Any]]) -> str:
     for content in contents:
         name = "cohog" if "cohog" in content["techniques"] else "hog"
         said = "* {set}: `{name}`, {accepted} of {queries}, {accepted_wrong} wrong"
+        if content["techniques"][name]["queries_off_map"]:
+            said += "; {accepted_off_map} of the {queries_off_map} off the map"
         by_flight.append(said.format(set=content["set"], name=name, **content["techniques"][name]))
     return (
-        "Recall@1, made by `make results` (bytes: of a place in RAM; number of queries after the use of a set):\n\n"
+        "Recall@1, made by `make results` (bytes: of a place in RAM; number of queries whose place is in the map after "
+        "the use of a set):\n\n"
         f"{sets_page.overview(contents, lambda label: not label.endswith(sets_page.FORMS))}\n\n"
         "The same vectors less the map's mean, a byte or a bit a number:\n\n"
         f"{sets_page.overview(contents, lambda label: label.endswith(sets_page.FORMS))}\n\n"

@@ -27,7 +27,6 @@ from write_onnx import ModelFile, write_model
 from edgevpr.core.arrays import Bools, Bytes, Image, Singles
 from edgevpr.core.text import progress
 from edgevpr.frames.images import cv2, list_images, read_image
-from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.metrics import roc_auc
 from edgevpr.runtime.recognise.gate_networks import prepare_crops
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -107,7 +106,7 @@ def _questions(folder: Path, places: list[Path], seed: int) -> list[Question]:
         asked += [Question(path, (seed, slot, change), frozenset({slot}), near) for change in range(CHANGES)]
     truth = folder / "ground_truth.csv"
     numbers = {path.name: slot for slot, path in enumerate(places)}
-    for query in load_dataset(folder / "query", folder / "ref", truth).queries if truth.is_file() else ():
+    for query in walks.dataset_of(folder).queries if truth.is_file() else ():
         right, ignored = (frozenset(numbers[name] for name in names) for names in (query.right, query.ignored))
         asked.append(Question(query.path, None, right, ignored))
     return asked

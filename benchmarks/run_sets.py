@@ -226,10 +226,11 @@ def write_accuracy(contents: list[dict[str, Any]]) -> None:
             if not any(word in label for word in NOT_OFFERED):
                 rows = [(each["use"], each["techniques"][label]) for each in of_camera if label in each["techniques"]]
                 reported, results = [row for use, row in rows if use == "report"], [row for _, row in rows]
+                recalls = [sets_page.of_matches(row) for row in reported]
                 table[label] = {
-                    "recall_at_1": round(sum(row["recall_at_1"] for row in reported) / len(reported), 4),
-                    "sets": len(reported),
-                    "queries": sum(row["queries"] for row in reported),
+                    "recall_at_1": round(sum(row["recall_at_1"] for row in recalls) / len(recalls), 4),
+                    "sets": len(recalls),
+                    "queries": sum(row["queries"] for row in recalls),
                     "asked": sum(row["queries"] for row in results),
                     **{key: sum(row[key] for row in results) for key in ("accepted", "accepted_wrong")},
                     "accepted_elsewhere": sum(sets_page.result(row).accepted_elsewhere for row in results),

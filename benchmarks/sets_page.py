@@ -12,6 +12,7 @@ from edgevpr.lab.evaluate.metrics import Quality, TechniqueResult, from_json
 
 CURVES = "curves.png"
 _PANELS_A_ROW = 3
+_REACHED = (*tables.RECALLS, *tables.CURVE, *tables.DECIDED)
 _PAID = ("grief_stromovka_seasons", "aerial_swindale")  # whose costs are shown: ahead, and down
 # More than ten colours cannot be told apart: after ten curves the line style changes.
 _LINES = ("-", "--", ":", "-.")
@@ -62,6 +63,11 @@ def by_name(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return {row["technique"]: {"ah_assumes": content["ah_assumes"], **row} for row in content.get("rows", ())}
 
 
+def of_matches(row: dict[str, Any]) -> dict[str, Any]:
+    """Return the figures of a row of a file of the queries whose place is in the map."""
+    return row["with_match"] or row
+
+
 def is_drawn(label: str) -> bool:
     """Return whether a row has a curve."""
     return not label.endswith(_NOT_DRAWN)
@@ -79,6 +85,7 @@ def write(folder: Path, left_out: dict[str, str]) -> None:
 
 def plot(results: Mapping[str, Sequence[Quality]], path: Path) -> None:
     """Draw one panel per data set with one curve per technique, best AUC first in the legend, and write it to `path`.
+    A curve is that of all queries.
     A curve of one point, where all scores are the same, is drawn as a mark."""
     columns = min(len(results), _PANELS_A_ROW)
     rows = -(-len(results) // columns)
@@ -87,17 +94,22 @@ def plot(results: Mapping[str, Sequence[Quality]], path: Path) -> None:
     names = list(dict.fromkeys(result.technique for compared in results.values() for result in compared))
     for at, (title, compared) in enumerate(results.items(), start=1):
         axes = drawn.add_subplot(rows, columns, at)
-        for result in sorted(compared, key=lambda result: -result.auc):
+        for result in sorted(compared, key=lambda result: -result.auc_from_zero):
             number = names.index(result.technique)
             precision, recall = zip(*result.precision_recall, strict=True)
-            label, mark = f"{result.technique} {result.auc:.2f}", "o" if len(recall) == 1 else None
+            label, mark = f"{result.technique} {result.auc_from_zero:.2f}", "o" if len(recall) == 1 else None
             line, colour = _LINES[number // 10 % len(_LINES)], f"C{number % 10}"
             axes.plot(recall, precision, line, color=colour, marker=mark, label=label)
         axes.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision", title=title)
         axes.grid(alpha=0.3)
         # Below the panel, where it hides no curve.
         axes.legend(
-            title="AUC (2.3)", fontsize=7, title_fontsize=7, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.13)
+            title="AUC from recall 0",
+            fontsize=7,
+            title_fontsize=7,
+            ncols=3,
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.13),
         )
     drawn.savefig(path, dpi=60)
 
@@ -114,8 +126,10 @@ def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResul
         for label, row in content["techniques"].items()
         if not label.endswith(FORMS)
     ]
-    reached = [[name, row["technique"], *tables.quality(result(row))] for name, row in shown]
-    paid = [[name, row["technique"], *tables.costs(result(row)), row["cpu"]] for name, row in shown if name in _PAID]
+    reached = [[name, *cells] for name, row in shown for cells in tables.make_rows(result(row), _REACHED)]
+    costs = [(name, row, *tables.make_rows(result(row), tables.COSTS, both=False)) for name, row in shown]
+    paid = [[name, *cells, row["cpu"]] for name, row, cells in costs if name in _PAID]
+    old = [content["set"] for content in contents if any("unscored" not in row for row in _rows(content))]
     weights = sorted({each.weights for rows in results.values() for each in rows if each.weights})
     page = f"""# Every technique on real images
 
@@ -131,24 +145,30 @@ Weights in use:
 
 ## Recall@1
 
+Of the queries whose place is in the map:
+
 {overview(contents)}
 
 ![Precision-recall curves]({CURVES})
 
 ## Recognition
 
-{markdown(("set", "technique", *tables.QUALITY), reached)}
+{markdown(("set", *tables.list_headings(_REACHED)), reached)}
 
+Rows are of all queries; where some have no place in the map, those called *in map* are of the others alone. Measured
+before these were counted, so that they were not asked: {", ".join(old) or "none"}.
+
+{chr(10).join(f"* {each}" for each in tables.ABOUT_FIGURES)}
 * P@100%R: precision with the threshold at the lowest-scoring right match. R@100%P: recall with the threshold above the
-  highest-scoring wrong one. AUC, EP: equations 2.3 and 2.4 of the thesis.
+  highest-scoring wrong one. EP: equation 2.4 of the thesis, as in VPR-Bench.
 * ROC: the chance that a right match scores higher than a wrong one; 0.5 means that the score by itself tells nothing.
 * PCU: P@100%R x log10(t_e,max / t_e + 9), where t_e,max is the slowest encoder on the same set.
 * accepted: queries that would have moved the aircraft by the technique's own rule; in brackets, how many of them would
-  have moved it to a wrong place.
+  have moved it to a wrong place. off the map: how many of the queries without a place in the map were accepted.
 
 ## Costs
 
-{markdown(("set", "technique", *tables.COSTS, "machine"), paid)}
+{markdown(("set", *tables.list_headings(tables.COSTS), "machine"), paid)}
 
 * Means over the queries; t_m is for all references. U: share of all cores. Of the other sets the JSON files have them.
 * mAh: {contents[0]["ah_assumes"]}.
@@ -161,14 +181,16 @@ Weights in use:
 
 
 def overview(contents: list[dict[str, Any]], wanted: Callable[[str], bool] = lambda label: True) -> str:
-    """Recall@1 of every `wanted` technique (down) on every set (across), as a Markdown table."""
+    """Recall@1 of every `wanted` technique (down) on every set (across), of the queries whose place is in the map, as a
+    Markdown table."""
     rows = []
     for label in filter(wanted, dict.fromkeys(label for content in contents for label in content["techniques"])):
         found = [content["techniques"].get(label) for content in contents]
         sizes = sorted({row["descriptor_bytes"] for row in found if row})  # those of cohog differ by camera
-        recalls = ("-" if row is None else f"{row['recall_at_1']:.2f}" for row in found)
+        recalls = ("-" if row is None else f"{of_matches(row)['recall_at_1']:.2f}" for row in found)
         rows.append([label, " or ".join(map(str, sizes)), *recalls])
-    heads = [f"{content['set']} ({content['use']}, {_rows(content)[0]['queries']})" for content in contents]
+    queries = [of_matches(_rows(content)[0])["queries"] for content in contents]
+    heads = [f"{each['set']} ({each['use']}, {count})" for each, count in zip(contents, queries, strict=True)]
     return markdown(("technique", "RAM B/place", *heads), rows)
 
 

@@ -51,10 +51,10 @@ def curves(results: Results, path: Path) -> None:
     colours = {name: f"C{number}" for number, name in enumerate(ours)}
     drawn, axes = base.panels(11, 5.2, 2, sharey=True)
     for axis, title, rows in zip(axes, ("the author's matrices", "here"), (theirs, ours), strict=True):
-        for name, row in sorted(rows.items(), key=lambda each: -each[1]["auc"]):
+        for name, row in sorted(rows.items(), key=lambda each: -each[1]["auc_2_3"]):
             precision, recall = zip(*row["precision_recall"], strict=True)
             style = {"color": "k", "lw": 2} if name not in theirs and "cohog" in name else {"color": colours[name]}
-            axis.plot(recall, precision, label=f"{name} {row['auc']:.2f}", **style)
+            axis.plot(recall, precision, label=f"{name} {row['auc_2_3']:.2f}", **style)
         axis.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", title=f"corridor: {title}")
         axis.legend(title="AUC (2.3)", fontsize=7, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.13))
     axes[0].set_ylabel("precision")

@@ -14,7 +14,7 @@ def answers(results: Results) -> list[list[str]]:
     matrices, here = results.thesis["matrices"], results.sets["corridor"]["techniques"]
     power = THESIS["table_5_2"]["techniques"]
     worst = max(abs(total_ah(*map(float, inputs)) / float(ah) - 1) for *inputs, ah in power.values())
-    calc = here[ROWS["CALC"]]["auc"] - matrices["CALC"]["auc"]
+    calc = here[ROWS["CALC"]]["auc_2_3"] - matrices["CALC"]["auc_2_3"]
     cohog = here[ROWS["CoHOG"]]["recall_at_1"] - matrices["CoHOG"]["recall_at_1"]
     leads = f"CoHOG first on {costs.sets_where_cohog_leads()} of {len(THESIS['table_6_1']['sets'])} sets, as it says"
     corridor = f"CALC's AUC {calc:+.3f}, CoHOG's recall@1 {cohog:+.3f}; networks less, being small ones"

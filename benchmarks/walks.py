@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,9 @@ from edgevpr.techniques import create
 
 
 def dataset_of(folder: Path) -> Dataset:
-    return load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
+    """Read a set; of its queries those whose place is in the map: how foreign ones fare has benchmarks of its own."""
+    dataset = load_dataset(folder / "query", folder / "ref", folder / "ground_truth.csv")
+    return replace(dataset, queries=tuple(query for query in dataset.queries if query.right))
 
 
 def config(**keys: object) -> Config:
@@ -67,7 +70,7 @@ def map_of(
     """Map the references of a set, by `cohog` unless another technique is named. The map is refined and calibrated as
     `map build` does where `images` names their folder, from which pictures are read again."""
     technique = technique or cohog(base.camera_of(folder.name))
-    with mapped(frames_of(folder / "ref"), technique, images) as (place_map, index):
+    with mapped(frames_of(folder / "ref"), technique, images) as (place_map, index, _):
         yield place_map, index, technique
 
 
@@ -112,5 +115,5 @@ def names_of(place_map: PlaceMap, index: PlaceIndex) -> list[str]:
 def walk_over(places: Iterable[Path], name: str, looks_down: bool) -> Iterator[Recogniser]:
     """Map images with a technique, and give what recognises in that map, as it flies, and accepts nothing."""
     technique = create(name, {"camera": "nadir"} if looks_down and name == "cohog" else {})
-    with mapped(map(frame, places), technique) as (place_map, index):
+    with mapped(map(frame, places), technique) as (place_map, index, _):
         yield walk(place_map, index, technique, rule=ACCEPT_NOTHING)

@@ -90,6 +90,7 @@ def run_match(args: Namespace) -> int:
     from edgevpr.cli.matched import format_match, format_matches
     from edgevpr.frames.source import open_source, read_to_end
     from edgevpr.power.boards import load_board
+    from edgevpr.runtime.recognise.evidence import list_evidence_kinds, not_calibrated
     from edgevpr.runtime.recognise.hints import parse_known_fields
     from edgevpr.runtime.recognise.opening import open_recogniser
     from edgevpr.techniques.card import find_weights
@@ -103,17 +104,21 @@ def run_match(args: Namespace) -> int:
     if known:
         _require_known(args, known, recogniser)
     frames = read_to_end(source, lambda error: leave_out(error, unusable))
+    place_map = recogniser.place_map
+    is_calibrated = place_map.calibration is not None
     for frame in filter(None, progress(frames, source.total, "matching")):
         event = recogniser.step(frame)
         if event.failed:
             leave_out(ImageError(f"{frame.name}: {event.reason}"), unusable)
             continue
-        found.append(format_match(event))
+        found.append(format_match(event) | {"calibrated": is_calibrated})
         if page:
             page.take(event)
         if known:
             found[-1]["hints"] = event.hints and event.hints.fields()
     lines = list(format_matches(found))
+    if not is_calibrated and list_evidence_kinds(place_map.spec):
+        lines.append(f"The map is {not_calibrated(len(place_map))}.")
     if known:
         lines.append(f"Known of each query: {','.join(known)}.")
     if weights := find_weights(recogniser.technique.spec):

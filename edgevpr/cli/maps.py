@@ -185,6 +185,7 @@ def map_build(args: Namespace) -> int:
     more: dict[str, Any] = {"covered": asdict(made.covered)} if made.covered else {}
     more |= {"refined": asdict(made.refined)} if made.refined else {}
     more |= {"calibration": made.calibration.figures()} if made.calibration else {}
+    more |= {"not_done": made.not_done} if made.not_done else {}
     about = {"map": args.map, "technique": made.technique, "places": made.places}
     show({**about, **asdict(made.result), **more}, args.json, format_build(args.map, made, args.orthophoto is not None))
     return exit_code(unusable)

@@ -51,6 +51,7 @@ def format_build(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
         yield f"expect: {made.calibration.described()}"
         if is_cut:
             yield f"  {_OTHER_DAY}"
+    yield from (f"  {sentence}" for sentence in made.not_done)
     if made.places and not made.with_position:
         yield f"{path}: {WITHOUT_POSITIONS}"
 

@@ -120,7 +120,8 @@ class MapOrder:
 class MadeMap:
     """Result of `make_map`. `technique`: its name. `places`, `with_position`: number of places in the map, and of
     those that have a position. `result`: counts of the frames read. `covered`: the ground of all places, as recorded
-    (None: too few positions). `refined`, `calibration`: results of refining and calibrating (None: not done)."""
+    (None: too few positions). `refined`, `calibration`: results of refining and calibrating (None: not done).
+    `not_done`: sentences on which of them was to be done and could not be, and why."""
 
     technique: str
     places: int
@@ -129,6 +130,16 @@ class MadeMap:
     covered: Covered | None
     refined: "Refined | None"
     calibration: MapCalibration | None
+    not_done: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class FinishedMap:
+    """Result of `finish_map`: the fields of the same names of a `MadeMap`."""
+
+    refined: "Refined | None"
+    calibration: MapCalibration | None
+    not_done: tuple[str, ...]
 
 
 def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], None], shown: Shown) -> MadeMap:
@@ -177,22 +188,46 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             raise
         if covered := measure_ground(place_map):
             _log.info("%s", covered.described(is_flown=isinstance(pictures, FlownPictures)))
-        refined, calibration = None, None
-        if order.refine and technique.spec.looks_down and isinstance(pictures, FlownPictures):
-            with _if_possible("refined"):
-                refined = refine_map(place_map, technique, pictures.folder, shown)
-        if order.calibrate and list_evidence_kinds(technique.spec):
-            with _if_possible("calibrated"):
-                calibration = calibrate_map(place_map, technique, config, pictures, shown)
+        finished = finish_map(
+            place_map, technique, config, pictures, shown, refine=order.refine, calibrate=order.calibrate
+        )
         return MadeMap(
             technique=technique.spec.name,
             places=len(place_map),
             with_position=describe_map(place_map).with_position,
             result=replace(result, **counts),
             covered=covered,
-            refined=refined,
-            calibration=calibration,
+            refined=finished.refined,
+            calibration=finished.calibration,
+            not_done=finished.not_done,
         )
+
+
+def finish_map(
+    place_map: PlaceMap,
+    technique: Technique,
+    config: Config,
+    pictures: FlownPictures | Cuttings | None,
+    shown: Shown,
+    refine: bool = True,
+    calibrate: bool = True,
+) -> FinishedMap:
+    """Refine and calibrate an open map as far as its technique and its `pictures` (None: not at hand, so that it is not
+    calibrated) allow it. What fails is logged and said in the result: a map is of use without."""
+    refined, calibration, not_done = None, None, []
+    if refine and technique.spec.looks_down and not isinstance(pictures, Cuttings):
+        try:
+            refined = refine_map(place_map, technique, pictures.folder if pictures else None, shown)
+        except EdgevprError as error:
+            not_done.append(f"the map is not refined: {error}")
+    if calibrate and pictures and list_evidence_kinds(technique.spec):
+        try:
+            calibration = calibrate_map(place_map, technique, config, pictures, shown)
+        except EdgevprError as error:
+            not_done.append(f"the map is not calibrated: {error}")
+    for sentence in not_done:
+        _log.warning("%s", sentence)
+    return FinishedMap(refined, calibration, tuple(not_done))
 
 
 def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | None, shown: Shown) -> "Refined":
@@ -286,16 +321,6 @@ def encoder_of(config: Config, pictures: FlownPictures | Cuttings, technique: Te
         return FrameEncoder(technique=technique)
     levelling = make_levelling(config.source, technique, below=True)
     return FrameEncoder(technique=technique, mask=load_mask(config.source.mask), levelling=levelling)
-
-
-@contextmanager
-def _if_possible(what: str) -> Iterator[None]:
-    """Run the body of `with` as an optional step: if it raises EdgevprError, only log a warning that the map is not
-    `what` (such as "refined")."""
-    try:
-        yield
-    except EdgevprError as error:
-        _log.warning("the map is not %s: %s", what, error)
 
 
 @contextmanager

@@ -1,5 +1,5 @@
 """Parts of HTML pages that need no network, in the light or dark colours that the reader has chosen: for the pages of
-flights, matches and maps (`review.page`) and of evaluations (`lab.evaluate.page`).
+flights, matches and maps (`review.page`).
 
 Charts follow the width of the page, while their lines and dots keep their thickness. Their text is HTML beside the SVG,
 so that it is readable on a phone. A `colour` is a CSS class that sets the colour. Functions that return a str return

@@ -1,5 +1,6 @@
 """A data set: a folder of queries, a folder of references (the images to map), and a ground truth, which names the
-right references of each query. `open_folder` recognises the layouts in which data sets are published by their files:
+right references of each query; a query without any is off the map. `open_folder` recognises the layouts in which data
+sets are published by their files:
 
 * query/, ref/ and ground_truth.csv: edgevpr's own.
 * database/ and queries/, or images/test/ with both: file names like @EASTING@NORTHING@...jpg, metres of UTM (Pitts30k,
@@ -27,18 +28,17 @@ from edgevpr.frames.source import read_tags
 
 _MAX_FILE_BYTES = 100_000_000  # a million queries
 _LAYOUTS = "query/, ref/ and ground_truth.csv or positions.csv; or database/ and queries/"
+_SCORED = ("ok", "novel")  # statuses of a query; novel: its place is not in the map
 # By the file name of each query, in the order of the file: the file names of the references that are right (none: the
-# query is not scored), and of those ignored, where a match counts as neither right nor wrong.
-Judged = tuple[frozenset[str], frozenset[str]]
-GroundTruth = dict[str, Judged]
-NOT_SCORED: Judged = (frozenset(), frozenset())
+# query is off the map), and of those ignored, where a match counts as neither right nor wrong. None: it is not scored.
+GroundTruth = dict[str, tuple[frozenset[str], frozenset[str]] | None]
 Tags = dict[Path, GeoTag]  # of the pictures of a folder
 
 
 @dataclass(frozen=True, slots=True)
 class ScoredQuery:
-    """A query that is scored: the `path` of its image, and the file names of the references that are `right` and of
-    those `ignored`, where a match counts as neither right nor wrong."""
+    """A query that is scored: the `path` of its image, and the file names of the references that are `right` (none: its
+    place is not in the map) and of those `ignored`, where a match counts as neither right nor wrong."""
 
     path: Path
     right: frozenset[str]
@@ -48,11 +48,12 @@ class ScoredQuery:
 @dataclass(frozen=True, slots=True)
 class Dataset:
     """A data set: its scored `queries`, and the folder `ref_dir` of its references. `references` are the file names of
-    all images there, in the order of mapping."""
+    all images there, in the order of mapping. `unscored`: how many images of queries have no truth to score them by."""
 
     queries: tuple[ScoredQuery, ...]
     ref_dir: Path
     references: tuple[str, ...]
+    unscored: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,7 +66,7 @@ class Nearness:
 
 
 def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str | Path) -> Dataset:
-    """Read a data set and check it against its folders. Images of queries that `ground_truth` lacks are left out.
+    """Read a data set and check it against its folders. Images of queries that `ground_truth` lacks are not scored.
 
     Raises UsageError with file, name and what to do, and SourceError for a folder without images.
     """
@@ -77,15 +78,15 @@ def make_dataset(query_dir: str | Path, ref_dir: str | Path, truth: GroundTruth,
     a name that is not in its folder, and where no query is scored."""
     paths = {decode_name(path.name): path for path in list_images(query_dir)}
     references = list_names(ref_dir)
-    for name, (right, ignored) in truth.items():
+    for name, judged in truth.items():
         if name not in paths:
             raise UsageError(f"{origin}: the query `{name}` is not in {query_dir}: correct its name, or drop the row.")
-        if right and (unknown := sorted((right | ignored).difference(references))):
+        if judged and (unknown := sorted(frozenset.union(*judged).difference(references))):
             raise UsageError(f"{origin}: the reference `{unknown[0]}` is not in {ref_dir}: correct its name.")
-    queries = tuple(ScoredQuery(paths[name], *judged) for name, judged in truth.items() if judged[0])
+    queries = tuple(ScoredQuery(paths[name], *judged) for name, judged in truth.items() if judged)
     if not queries:
-        raise UsageError(f"{origin} scores no query: it needs a row with ref_files (and status `ok`).")
-    return Dataset(queries, Path(ref_dir), references)
+        raise UsageError(f"{origin} scores no query: it needs a row with the status `ok` or `novel`.")
+    return Dataset(queries, Path(ref_dir), references, len(paths) - len(queries))
 
 
 def list_names(folder: str | Path) -> tuple[str, ...]:
@@ -94,19 +95,20 @@ def list_names(folder: str | Path) -> tuple[str, ...]:
 
 
 def read_truth(path: str | Path) -> GroundTruth:
-    """Read a CSV with the columns query_file and ref_files (file names separated by spaces). Optional columns are
-    ref_files_loose (references to ignore, unless they are in ref_files too) and status (only `ok` is scored). Raises
-    UsageError with file, line, value and what to do."""
+    """Read a CSV with the columns query_file and ref_files (file names separated by spaces; none: the query is off the
+    map). Optional columns are ref_files_loose (references to ignore, unless they are in ref_files too) and status
+    (`ok`, or `novel` for a query off the map; with any other it is not scored). Raises UsageError with file, line,
+    value and what to do."""
     truth: GroundTruth = {}
     for where, row in _rows(Path(path)):
         name = row["query_file"]
         if name in truth:
             raise UsageError(f"{where}: the query `{name}` has a row already: keep one, with all its ref_files.")
         right, loose = (frozenset(row.get(key, "").split()) for key in ("ref_files", "ref_files_loose"))
-        is_scored = row.get("status", "ok") == "ok"
-        if is_scored and not right:
-            raise UsageError(f"{where}: the query `{name}` has no ref_files: name one, or give it another status.")
-        truth[name] = (right, loose - right) if is_scored else NOT_SCORED
+        status = row.get("status", "ok")
+        if right and status == "novel":
+            raise UsageError(f"{where}: the query `{name}` is `novel` and has ref_files: drop them, or write `ok`.")
+        truth[name] = (right, loose - right) if status in _SCORED else None
     return truth
 
 
@@ -146,7 +148,7 @@ def open_folder(folder: str | Path, rule: Nearness) -> Dataset:
 
 
 def match_positions(query_dir: Path, ref_dir: Path, rule: Nearness) -> Dataset:
-    """Make a data set of two folders of images with positions; pictures without one are left out. Raises UsageError
+    """Make a data set of two folders of images with positions; queries without one are not scored. Raises UsageError
     where there are no positions, or none are near."""
     queries, references = (
         {path: tag for path, tag in read_tags(d).items() if tag.position} for d in (query_dir, ref_dir)
@@ -183,17 +185,16 @@ def _utm_m(path: Path) -> tuple[float, float]:
 
 
 def _find_near(queries: Tags, query_m: Doubles, references: Tags, reference_m: Doubles, rule: Nearness) -> GroundTruth:
-    """Return the ground truth of the queries that have a right reference by `rule`. `query_m` and `reference_m`, (N,
-    2), are metres east and north of a common origin. Raises UsageError if no query has a right reference."""
+    """Return the ground truth of queries by `rule`. `query_m` and `reference_m`, (N, 2), are metres east and north of a
+    common origin. Raises UsageError if no query has a right reference."""
     truth: GroundTruth = {}
     for (path, tag), position_m in zip(queries.items(), query_m, strict=True):
         near = np.hypot(*(reference_m - position_m).T) <= rule.within_m
         if rule.within_deg is not None:
             near &= [_heading_difference_deg(tag, other) <= rule.within_deg for other in references.values()]
-        if near.any():
-            names = (decode_name(other.name) for other, is_near in zip(references, near, strict=True) if is_near)
-            truth[decode_name(path.name)] = frozenset(names), frozenset()
-    if not truth:
+        names = (decode_name(other.name) for other, is_near in zip(references, near, strict=True) if is_near)
+        truth[decode_name(path.name)] = frozenset(names), frozenset()
+    if not any(judged and judged[0] for judged in truth.values()):
         raise UsageError(f"No query was taken within {rule.within_m:g} m of a reference: allow more with --within-m.")
     return truth
 

@@ -1,13 +1,14 @@
 """Measurement of one technique on a data set: map the references, ask every query as in a flight, judge each answer by
 ground truth, and sum up quality and costs.
 
-`edgevpr eval` and `many` use this module. Numbers in parentheses are sections and equations of the thesis (Mubariz
+Numbers in parentheses are sections and equations of the thesis (Mubariz
 Zaffar, *Visual Place Recognition for Autonomous Robots*).
 """
 
+import math
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from edgevpr.frames.positions import GeoTag
 from edgevpr.frames.source import Source, open_source, read_tags
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
-from edgevpr.mapmaking.making import FlownPictures, calibrate_map, refine_map
+from edgevpr.mapmaking.making import FlownPictures, finish_map
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -68,29 +69,28 @@ class MatchOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryAnswer:
-    """The judged answer to one query. `found` is the name of the best reference that is not ignored (None: there is
-    none) and `score` its score; `first_right` is the rank of the first right reference, from 0 (infinite: none).
+    """The judged answer to one query. `has_match`: its place is in the map. `found` is the name of the best reference
+    that is not ignored (None: there is none) and `score` its score (-inf); `first_right` is the rank of the first right
+    reference, from 0 (infinite: none).
 
-    `accepted`: a flight would have accepted the match; `accepted_wrong`: and it is wrong; `accepted_elsewhere`: and it
-    is no neighbour of a right or ignored reference (`places.retrieve.elsewhere`). `discarded`: the salience gate
-    dropped the query as not memorable. `encoding` and `matching` are the costs of the two stages.
+    `accepted`: a flight would have accepted the match; `accepted_wrong`: and it is wrong; `accepted_off_map`: and the
+    query has no place in the map; `accepted_elsewhere`: it is wrong, and no neighbour of a right or ignored reference
+    (`places.retrieve.elsewhere`). `discarded`: the salience gate dropped the query as not memorable. `encoding` and
+    `matching` are the costs of the two stages.
     """
 
     query: str
+    has_match: bool
     found: str | None
     score: float
     first_right: float
     accepted: bool
     accepted_wrong: bool
+    accepted_off_map: bool
     accepted_elsewhere: bool
     discarded: bool
     encoding: StageCost
     matching: StageCost
-
-    @property
-    def is_right(self) -> bool:
-        """True where the best match is right."""
-        return self.first_right == 0
 
 
 def iterate_silently(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
@@ -114,20 +114,22 @@ def evaluate(
     the temporary map cannot be written, and ModelError for a network that cannot be used or a query that fails.
     """
     technique = create(technique_name, parameters)
-    return summarise(technique, dataset, answer_queries(technique, dataset, options, progress, gate), options)
+    answers, not_done = answer_queries(technique, dataset, options, progress, gate)
+    return summarise(technique, dataset, answers, options, not_done)
 
 
 def answer_queries(
     technique: Technique, dataset: Dataset, options: MatchOptions, progress: Progress, gate: Gate | None = None
-) -> list[QueryAnswer]:
-    """Map the references of `dataset` in a temporary file, ask every query, and return one judged answer for each that
-    is scored. Raises UsageError where no query has what `options.known` asks for, ModelError for a query that fails."""
+) -> tuple[list[QueryAnswer], tuple[str, ...]]:
+    """Map the references of `dataset` in a temporary file, and ask every query. Return one judged answer for each that
+    is scored, and what could not be done to the map (see `mapped`). Raises UsageError where no query has what
+    `options.known` asks for, ModelError for a query that fails."""
     spec = technique.spec
     prior, tags = read_known(options.known, dataset, spec, options.sequence)
     together = sequence_length(spec, options.sequence)
     source, meter = open_source(str(dataset.ref_dir), live=False), make_meter(load_config(None), load_board("this"))
     frames = progress(read_frames(source), source.total, f"{spec.name}: references")
-    with mapped(frames, technique, dataset.ref_dir, progress) as (place_map, index):
+    with mapped(frames, technique, dataset.ref_dir, progress) as (place_map, index, not_done):
         rule = accept_rule(technique, load_config(None).match, together, read_calibration_for(place_map))
         follows = options.follow and together == 1 and rule.sure is not None
 
@@ -155,7 +157,7 @@ def answer_queries(
             event = _recognise(recogniser, path, tags.get(path, _NO_TAG))
             if query := scored.get(path.name):
                 answers.append(_judge(event, query, dataset.references, index))
-    return answers
+    return answers, not_done
 
 
 @contextmanager
@@ -164,10 +166,10 @@ def mapped(
     technique: Technique,
     images: Path | None = None,
     progress: Progress = iterate_silently,
-) -> Iterator[tuple[PlaceMap, PlaceIndex]]:
+) -> Iterator[tuple[PlaceMap, PlaceIndex, tuple[str, ...]]]:
     """Context manager: map `frames` in a temporary file, then refine and calibrate the map as `map build` does; gives
-    the map, open to read, and an index with all its places. `images` is the folder that the frames come from (None: the
-    map is not calibrated)."""
+    the map, open to read, an index with all its places, and sentences on what could not be done to it. `images` is the
+    folder that the frames come from (None: the map is not calibrated)."""
 
     def show(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
         return progress(items, total, f"{technique.spec.name}: {label}")
@@ -176,20 +178,23 @@ def mapped(
         path = Path(folder) / "references.gpkg"
         with PlaceMap.create(path, technique.spec) as place_map:
             build_map(frames, FrameEncoder(technique=technique), place_map)
-            with suppress(UsageError):  # nothing to refine, or no SciPy: positions stay as they were recorded
-                refine_map(place_map, technique, images, show)
-            if images:
-                with suppress(UsageError):  # too few pictures to calibrate by: the shipped model of confidence applies
-                    calibrate_map(place_map, technique, load_config(None), FlownPictures(source=str(images)), show)
+            pictures = FlownPictures(source=str(images)) if images else None
+            finished = finish_map(place_map, technique, load_config(None), pictures, show)
         with PlaceMap.open(path) as place_map:
-            yield place_map, load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
+            index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
+            # The folder is gone when the sentences are read, and another one in the next run.
+            yield place_map, index, tuple(why.replace(f"{folder}/", "") for why in finished.not_done)
 
 
 def summarise(
-    technique: Technique, dataset: Dataset, answers: Sequence[QueryAnswer], options: MatchOptions
+    technique: Technique,
+    dataset: Dataset,
+    answers: Sequence[QueryAnswer],
+    options: MatchOptions,
+    not_done: tuple[str, ...] = (),
 ) -> metrics.TechniqueResult:
     """Return the result of `technique`, without the PCU, from its answers to all queries, which were asked by
-    `options`."""
+    `options` on a map to which something could not be done."""
     queries, references = len(answers), len(dataset.references)
     sequence = sequence_length(technique.spec, options.sequence)
     config, board = load_config(None), load_board("this")
@@ -203,14 +208,15 @@ def summarise(
         technique=labelled(technique.spec.name, technique.spec.form),
         weights=find_weights(technique.spec),
         parameters=technique.spec.parameters,
-        queries=queries,
         references=references,
-        **metrics.figures(
-            np.array([answer.score for answer in answers]), np.array([answer.first_right for answer in answers])
+        unscored=dataset.unscored,
+        not_done=not_done,
+        **metrics.compute_both(
+            *(np.array([getattr(answer, name) for answer in answers]) for name in ("score", "first_right", "has_match"))
         ),
         **{
             name: sum(getattr(answer, name) for answer in answers)
-            for name in ("accepted", "accepted_wrong", "accepted_elsewhere", "discarded")
+            for name in ("accepted", "accepted_wrong", "accepted_off_map", "accepted_elsewhere", "discarded")
         },
         t_encode_s=cost.t_encode_s,
         t_match_s=cost.t_match_s,
@@ -278,11 +284,13 @@ def _judge(event: Recognition, query: ScoredQuery, references: Sequence[str], in
     away = wrong and elsewhere(index, slots[0], np.flatnonzero(right | ignored), 0.0).all()
     return QueryAnswer(
         query=query.path.name,
+        has_match=bool(query.right),
         found=references[slots[counted[0]]] if len(counted) else None,
-        score=float(ranking.scores[counted[0]]) if ranking and len(counted) else 0.0,
+        score=float(ranking.scores[counted[0]]) if ranking and len(counted) else -math.inf,
         first_right=metrics.first_right(slots[counted], right),
         accepted=event.accepted,
         accepted_wrong=bool(wrong),
+        accepted_off_map=bool(wrong and not query.right),
         accepted_elsewhere=bool(away),
         discarded=discarded,
         encoding=event.steps.encoding,
@@ -291,7 +299,7 @@ def _judge(event: Recognition, query: ScoredQuery, references: Sequence[str], in
 
 
 def read_frames(source: Source) -> Iterator[Frame]:
-    """Yield all frames of a folder or video. Raises ImageError for the first that cannot be used: figures without some
+    """Yield all frames of a source. Raises ImageError for the first that cannot be used: figures without some
     images would mislead."""
     while not source.ended:
         if frame := source.read(timeout_s=1.0):

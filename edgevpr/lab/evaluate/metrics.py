@@ -1,9 +1,11 @@
 """Results of an evaluation, and their quality figures (thesis 2.7 and 6.3.1), as pure functions of the best match of
 every query.
 
-`scores` is float (N,): the score of each query's best match. `correct` is bool (N,): whether that match is right. A
-match is accepted when its score is at least the threshold; false negatives are right matches below the threshold. So
-each threshold gives a precision and a recall, and these are the curve. Numbers like (2.1) are equations of the thesis.
+`scores` is float (N,): the score of each query's best match, -inf for a query that found none. `ranks` is float (N,):
+the rank, from 0, of its first right reference, infinite if there is none. `has_match` is bool (N,): whether its place
+is in the map. A match is accepted when its score is at least the threshold. So each threshold gives a precision, the
+share of right ones among the accepted matches, and a recall, the share of accepted ones among the right matches, and
+these are the curve. Numbers like (2.1) are equations of the thesis.
 """
 
 import math
@@ -14,50 +16,73 @@ from typing import Any
 import numpy as np
 
 Interval = tuple[float, float]  # lower end, upper end
-SEED, RESAMPLES = 0, 2000  # of the bootstrap that gives the intervals
+_SIGMAS_95 = 1.959964  # of a normal distribution, within which 95 % lie
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Quality:
-    """Quality of a technique on a data set; all shares are 0..1. Each recall has its 95 % confidence interval (None: no
-    SciPy, see `interval`). `auc` is by equation 2.3, `auc_from_zero` as scikit-learn computes it, `ep` the extended
-    precision. `precision_recall` are the points (precision, recall) of the curve, from the highest threshold down.
-    `roc_auc` is None if all best matches are right, or none is."""
+class Figures:
+    """Figures of quality of `queries`; all shares are 0..1, and each recall has its 95 % confidence interval.
 
-    technique: str
+    `auc_from_zero` is the area under the curve with a first point at recall 0, as scikit-learn and VPR-Bench compute
+    it, `auc_2_3` that by equation 2.3, `ep` the extended precision (2.4). R@100P is the recall at 100 % precision: of
+    the right best matches (VPR-Bench), and of the queries whose place is in the map (VPR_Tutorial). `roc_auc` is None
+    if all best matches are right, or none is. `precision_recall` are the points (precision, recall) of the curve, from
+    the highest threshold down."""
+
     queries: int
-    references: int
     recall_at_1: float
     recall_at_5: float
     recall_at_10: float
-    recall_at_1_interval: Interval | None = None
-    recall_at_5_interval: Interval | None = None
-    recall_at_10_interval: Interval | None = None
+    recall_at_1_interval: Interval
+    recall_at_5_interval: Interval
+    recall_at_10_interval: Interval
     precision_at_100_recall: float
-    recall_at_100_precision: float
-    auc: float
-    auc_from_zero: float | None = None
+    recall_at_100_precision_vpr_bench: float
+    recall_at_100_precision_vpr_tutorial: float
+    auc_from_zero: float
+    auc_2_3: float
     ep: float
     roc_auc: float | None
     precision_recall: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Quality(Figures):
+    """Quality of a technique on a data set: the figures of all queries that are scored.
+
+    `queries_off_map` of them have no place in the map, where every match is wrong. `with_match` are the figures of the
+    others alone (None: they are all queries, or there are none). `unscored` queries have no truth to score them by."""
+
+    technique: str
+    references: int
+    queries_off_map: int = 0
+    unscored: int = 0
+    with_match: Figures | None = None
+
+    @property
+    def of_matches(self) -> Figures:
+        """The figures of the queries whose place is in the map."""
+        return self.with_match or self
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueResult(Quality):
     """Result of a technique (in one form) on a data set: its quality, its weights and its cost.
 
-    `accepted`, `accepted_wrong`, `accepted_elsewhere` and `discarded` count queries by the fields of
-    `evaluate.QueryAnswer`; a discarded query counts as missed. Times are means over the queries: `t_match_s` is for all
-    references, `t_match_per_ref_s` for one. `u_encode` and `u_match` are the shares of all cores that were busy, 0..1
-    (5.1). `descriptor_bytes` and `fine_bytes` are the RAM and the disk of a place, as in `profile`. Charges are for all
-    queries, in Ah (5.7), from the battery pack; `ah_assumes` names board, pack and efficiency. `sequence`: how many
-    queries were matched together. `known`: that of `evaluate.MatchOptions`. `weights`: origin of the network's weights
-    (None: no network). `pcu`: filled in by `compare`, since it depends on all techniques compared.
+    `accepted`, `accepted_wrong`, `accepted_off_map`, `accepted_elsewhere` and `discarded` count queries by the fields
+    of `evaluate.QueryAnswer`; a discarded query counts as missed. Times are means over the queries: `t_match_s` is for
+    all references, `t_match_per_ref_s` for one. `u_encode` and `u_match` are the shares of all cores that were busy,
+    0..1 (5.1). `descriptor_bytes` and `fine_bytes` are the RAM and the disk of a place, as in `profile`. Charges are
+    for all queries, in Ah (5.7), from the battery pack; `ah_assumes` names board, pack and efficiency. `sequence`: how
+    many queries were matched together. `known`: that of `evaluate.MatchOptions`. `weights`: origin of the network's
+    weights (None: no network). `not_done`: sentences on what `map build` does to a map and could not be done to this
+    one. `pcu`: filled in by `compare`, since it depends on all techniques compared.
     """
 
     parameters: dict[str, int | float | str]
     accepted: int
     accepted_wrong: int
+    accepted_off_map: int = 0
     accepted_elsewhere: int
     t_encode_s: float
     t_match_s: float
@@ -72,6 +97,7 @@ class TechniqueResult(Quality):
     known: str | None = None
     discarded: int = 0
     weights: str | None = None
+    not_done: tuple[str, ...] = ()
     pcu: float | None = None
 
 
@@ -82,32 +108,31 @@ def first_right(ranked: np.ndarray, right: np.ndarray) -> float:
     return float(hits[0]) if len(hits) else math.inf
 
 
-def recall_at(k: int, ranks: np.ndarray) -> float:
-    """Return the share of queries with a right reference among their first `k`. `ranks` (N,) are by `first_right`."""
-    return float(np.mean(np.asarray(ranks) < k))
-
-
 def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute the curve with the threshold at every distinct score, from the highest down: precision (2.1) and recall
-    (2.2), float (points,). If no match at all is right, recall is taken to be 0."""
-    scores, correct = np.asarray(scores), np.asarray(correct, bool)
-    order = np.argsort(-scores, kind="stable")
-    last_of_its_score = np.append(np.flatnonzero(np.diff(scores[order])), len(scores) - 1)
+    (2.2), float (points,). `correct`, bool (N,), tells right matches. If none is right, recall is taken to be 0."""
+    scores, correct = np.asarray(scores, float), np.asarray(correct, bool)
+    order = np.argsort(-scores, kind="stable")[: np.count_nonzero(scores > -math.inf)]
+    if not len(order):
+        return np.zeros(1), np.zeros(1)
+    falling = scores[order]
+    last_of_its_score = np.append(np.flatnonzero(falling[1:] != falling[:-1]), len(order) - 1)
     true_positives = np.cumsum(correct[order])[last_of_its_score]
     accepted = last_of_its_score + 1
     return true_positives / accepted, true_positives / max(int(correct.sum()), 1)
 
 
-def auc(precision: np.ndarray, recall: np.ndarray) -> float:
-    """Compute the area under the precision-recall curve (2.3): only the points that occur, no extra one at recall 0. So
-    it is at most (N-1)/N, and 0 if all scores are the same."""
+def auc_2_3(precision: np.ndarray, recall: np.ndarray) -> float:
+    """Compute the area under the precision-recall curve by equation 2.3: only the points that occur, no extra one at
+    recall 0. So it is at most (N-1)/N, and 0 if all scores are the same, even of a faultless technique."""
     return float(np.trapezoid(precision, recall))
 
 
 def auc_from_zero(precision: np.ndarray, recall: np.ndarray) -> float:
     """Compute the area under the precision-recall curve with an extra first point at recall 0 and precision 1, as
-    scikit-learn and most papers do."""
-    return float((1 + precision[0]) / 2 * recall[0]) + auc(precision, recall)
+    scikit-learn's `auc(*precision_recall_curve(...))` and most papers do. It is 1 for a faultless technique, whatever
+    the ties."""
+    return float((1 + precision[0]) / 2 * recall[0]) + auc_2_3(precision, recall)
 
 
 def recall_at_100_precision(precision: np.ndarray, recall: np.ndarray) -> float:
@@ -118,11 +143,6 @@ def recall_at_100_precision(precision: np.ndarray, recall: np.ndarray) -> float:
 def precision_at_100_recall(precision: np.ndarray, recall: np.ndarray) -> float:
     """Return the precision with the threshold at the lowest-scoring right match: never below recall@1."""
     return float(precision[np.argmax(recall)])
-
-
-def compute_extended_precision(precision: np.ndarray, recall: np.ndarray) -> float:
-    """Compute EP (2.4): the mean of the precision at the smallest recall and the recall at 100 % precision."""
-    return float(precision[0] + recall_at_100_precision(precision, recall)) / 2
 
 
 def roc_auc(scores: np.ndarray, correct: np.ndarray) -> float | None:
@@ -143,38 +163,44 @@ def pcu(precision: float, t_encode_s: float, t_encode_max_s: float) -> float:
     return precision * math.log10(t_encode_max_s / t_encode_s + 9)
 
 
-def figures(scores: np.ndarray, ranks: np.ndarray) -> dict[str, Any]:
-    """Return the fields of a `Quality`, by name, except `technique` and the counts. `ranks`, float (N,), are the ranks
-    of the first right references (see `first_right`)."""
-    precision, recall = precision_recall(scores, ranks == 0)
-    return {
-        **{f"recall_at_{k}": recall_at(k, ranks) for k in (1, 5, 10)},
-        **{f"recall_at_{k}_interval": interval(ranks < k) for k in (1, 5, 10)},
-        "precision_at_100_recall": precision_at_100_recall(precision, recall),
-        "recall_at_100_precision": recall_at_100_precision(precision, recall),
-        "auc": auc(precision, recall),
-        "auc_from_zero": auc_from_zero(precision, recall),
-        "ep": compute_extended_precision(precision, recall),
-        "roc_auc": roc_auc(scores, ranks == 0),
-        "precision_recall": tuple(zip(precision.round(5).tolist(), recall.round(5).tolist(), strict=True)),
-    }
+def interval(hits: np.ndarray) -> Interval:
+    """Return the 95 % confidence interval of the share of `hits`, bool (N,), by Wilson's score (1927)."""
+    share, spread = float(np.mean(hits)), _SIGMAS_95**2 / len(hits)
+    half = math.sqrt(spread * (share * (1 - share) + spread / 4))
+    return max(0.0, (share + spread / 2 - half) / (1 + spread)), min(1.0, (share + spread / 2 + half) / (1 + spread))
 
 
-def interval(hits: np.ndarray) -> Interval | None:
-    """Return the 95 % confidence interval of the share of `hits`, bool (N,), by resampling the queries (bootstrap). If
-    all or none hit, every resample gives the same share; then it is the exact interval of Clopper and Pearson. None if
-    SciPy is not installed."""
-    try:
-        from scipy import stats
-    except ModuleNotFoundError:
-        return None
-    if hits.all() or not hits.any():
-        exact = stats.binomtest(int(hits.sum()), len(hits)).proportion_ci()
-        return float(exact.low), float(exact.high)
-    found = stats.bootstrap(
-        (hits.astype(float),), np.mean, n_resamples=RESAMPLES, method="percentile", random_state=SEED
+def compute_figures(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray) -> Figures:
+    """Compute the figures of one query or more."""
+    correct = ranks == 0
+    precision, recall = precision_recall(scores, correct)
+    certain = recall_at_100_precision(precision, recall)
+    recalls: dict[str, Any] = {f"recall_at_{k}": float(np.mean(ranks < k)) for k in (1, 5, 10)}
+    recalls |= {f"recall_at_{k}_interval": interval(ranks < k) for k in (1, 5, 10)}
+    return Figures(
+        queries=len(scores),
+        **recalls,
+        precision_at_100_recall=precision_at_100_recall(precision, recall),
+        recall_at_100_precision_vpr_bench=certain,
+        recall_at_100_precision_vpr_tutorial=certain * int(correct.sum()) / max(int(has_match.sum()), 1),
+        auc_from_zero=auc_from_zero(precision, recall),
+        auc_2_3=auc_2_3(precision, recall),
+        ep=(float(precision[0]) + certain) / 2,
+        roc_auc=roc_auc(scores, correct),
+        precision_recall=tuple(zip(precision.round(5).tolist(), recall.round(5).tolist(), strict=True)),
     )
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+def compute_both(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray) -> dict[str, Any]:
+    """Return the fields of a `Quality`, by name, that follow from the answers: the figures of all queries, and of those
+    whose place is in the map."""
+    every = compute_figures(scores, ranks, has_match)
+    is_mixed = has_match.any() and not has_match.all()
+    return {
+        **{field.name: getattr(every, field.name) for field in fields(Figures)},
+        "queries_off_map": int((~has_match).sum()),
+        "with_match": compute_figures(*(each[has_match] for each in (scores, ranks, has_match))) if is_mixed else None,
+    }
 
 
 def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
@@ -188,4 +214,5 @@ def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
 
 def from_json(row: dict[str, Any]) -> TechniqueResult:
     """Return the result whose fields are in `row`, as read from JSON. Other keys of `row` are left out."""
-    return TechniqueResult(**{field.name: row[field.name] for field in fields(TechniqueResult) if field.name in row})
+    known = {field.name: row[field.name] for field in fields(TechniqueResult) if field.name in row}
+    return TechniqueResult(**{**known, "with_match": known.get("with_match") and Figures(**known["with_match"])})

@@ -48,6 +48,11 @@ def cpu_model() -> str:
     return platform.machine()
 
 
+def describe_origin() -> dict[str, Any]:
+    """Return the date, the machine and the versions, which are stored with a result."""
+    return {"date": today(), "machine": machine(), "versions": versions()}
+
+
 def hash_parts(*parts: Any) -> str:
     """Return the SHA-256 in hex of `parts`, any values that JSON or `str` can write."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()

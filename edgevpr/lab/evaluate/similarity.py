@@ -3,6 +3,7 @@
 `edgevpr eval --similarity` uses it. A file is a .npy, float (queries, references); higher is more alike.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,8 +12,8 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.images import counting_order
-from edgevpr.lab.evaluate.dataset import NOT_SCORED, GroundTruth
-from edgevpr.lab.evaluate.metrics import Quality, figures, first_right
+from edgevpr.lab.evaluate.dataset import GroundTruth
+from edgevpr.lab.evaluate.metrics import Quality, compute_both, first_right
 
 
 def read_similarities(path: str | Path) -> Doubles:
@@ -23,7 +24,7 @@ def read_similarities(path: str | Path) -> Doubles:
         raise UsageError(f"{path} cannot be read ({error.strerror or error}): give a .npy file.") from error
     except (ValueError, EOFError) as error:
         raise UsageError(f"{path} holds no similarities ({error}): give a .npy file of them.") from error
-    is_matrix = isinstance(scores, np.ndarray) and scores.ndim == 2 and scores.size and scores.dtype.kind in "biuf"
+    is_matrix = isinstance(scores, np.ndarray) and scores.ndim == 2 and scores.dtype.kind in "biuf"
     if not is_matrix or np.isnan(scores).any():
         raise UsageError(f"{path} needs a row of numbers for each query, with one for each reference, and no NaN.")
     return np.asarray(scores, np.float64)
@@ -34,14 +35,14 @@ def add_unscored(truth: GroundTruth, queries: Sequence[str]) -> GroundTruth:
     it names others."""
     if missing := sorted(truth.keys() - set(queries)):
         raise UsageError(f"The ground truth names the query `{missing[0]}`, which is not in --query.")
-    return {name: truth.get(name, NOT_SCORED) for name in queries}
+    return {name: truth.get(name) for name in queries}
 
 
 def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequence[str] | None = None) -> Quality:
     """Compute the quality of `scores`, float (queries, references), which `label` names in messages. Rows are the
     queries of `truth`, in its order, and columns `references` (None: all that `truth` names, in counting order). Raises
     UsageError where the counts do not fit."""
-    named = frozenset().union(*(right | ignored for right, ignored in truth.values()))
+    named = frozenset[str]().union(*(names for judged in truth.values() for names in judged or ()))
     names = list(references or sorted(named, key=counting_order))
     if scores.shape != (len(truth), len(names)) or not named <= set(names):
         raise UsageError(
@@ -49,16 +50,15 @@ def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequenc
             f"is of {len(truth)} and {len(names)}: give the one that belongs to it, or the folders of all images with "
             "--query and --ref."
         )
-    best, ranks = [], []
+    answers = []
     for row, judged in zip(scores, truth.values(), strict=True):
-        right, ignored = (np.array([name in group for name in names]) for group in judged)
-        if right.any():
+        if judged:
+            right, ignored = (np.array([name in group for name in names], bool) for group in judged)
             ranked = np.argsort(-row, kind="stable")
             ranked = ranked[~ignored[ranked]]
-            best.append(row[ranked[0]])
-            ranks.append(first_right(ranked, right))
-    if not best:
+            best = row[ranked[0]] if len(ranked) else -math.inf
+            answers.append((best, first_right(ranked, right), bool(right.any())))
+    if not answers:
         raise UsageError(f"{label}: the ground truth scores none of its queries: give the one that belongs to it.")
-    return Quality(
-        technique=label, queries=len(best), references=len(names), **figures(np.array(best), np.array(ranks))
-    )
+    columns = map(np.array, zip(*answers, strict=True))
+    return Quality(technique=label, references=len(names), unscored=len(truth) - len(answers), **compute_both(*columns))

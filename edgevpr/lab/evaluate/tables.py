@@ -1,12 +1,21 @@
-"""Formats results of evaluations: as text tables for a terminal, and as cells for the tables of `page`."""
+"""Formats results of evaluations as text tables for a terminal, and as rows for tables of pages."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from edgevpr.core.text import aligned
-from edgevpr.lab.evaluate.metrics import Interval, Quality, TechniqueResult
+from edgevpr.lab.evaluate.metrics import Figures, Interval, Quality, TechniqueResult
+from edgevpr.lab.evaluate.provenance import versions
 
 Column = tuple[str, Callable[[Any], str]]  # a heading, and the text of a result's cell
+
+ABOUT_FIGURES = (
+    "95 %: interval by Wilson's score.",
+    "AUC: area under the precision-recall curve from recall 0 (scikit-learn, VPR-Bench); AUC 2.3: that of equation 2.3 "
+    "of the thesis, from the first point on.",
+    "R@100%P, right: share of the right best matches (VPR-Bench); in map: of the queries whose place is in the map "
+    "(VPR_Tutorial).",
+)
 
 
 def share_text(share: float | Interval | None) -> str:
@@ -17,10 +26,21 @@ def share_text(share: float | Interval | None) -> str:
 
 
 def _share(heading: str, field: str) -> Column:
-    return heading, lambda result: share_text(getattr(result, field))
+    return heading, lambda result: share_text(getattr(result, field, None))
 
 
-_RECALLS: tuple[Column, ...] = (
+def _off_map(result: Figures) -> str:
+    if not isinstance(result, TechniqueResult) or not result.queries_off_map:
+        return "-"
+    return f"{result.accepted_off_map} of {result.queries_off_map}"
+
+
+def _accepted(result: Figures) -> str:
+    return f"{result.accepted} ({result.accepted_wrong})" if isinstance(result, TechniqueResult) else "-"
+
+
+RECALLS: tuple[Column, ...] = (
+    ("queries", lambda figures: str(figures.queries)),
     _share("recall@1", "recall_at_1"),
     _share("95 %", "recall_at_1_interval"),
     _share("@5", "recall_at_5"),
@@ -28,19 +48,21 @@ _RECALLS: tuple[Column, ...] = (
     _share("@10", "recall_at_10"),
     _share("95 %", "recall_at_10_interval"),
 )
-_CURVE: tuple[Column, ...] = (
+CURVE: tuple[Column, ...] = (
+    _share("AUC", "auc_from_zero"),
+    _share("AUC 2.3", "auc_2_3"),
     _share("P@100%R", "precision_at_100_recall"),
-    _share("R@100%P", "recall_at_100_precision"),
-    _share("AUC", "auc"),
-    _share("AUC from 0", "auc_from_zero"),
+    _share("R@100%P, right", "recall_at_100_precision_vpr_bench"),
+    _share("in map", "recall_at_100_precision_vpr_tutorial"),
     _share("EP", "ep"),
     _share("ROC", "roc_auc"),
 )
-_DECIDED: tuple[Column, ...] = (
+DECIDED: tuple[Column, ...] = (
     _share("PCU", "pcu"),
-    ("accepted (wrong)", lambda result: f"{result.accepted} ({result.accepted_wrong})"),
+    ("accepted (wrong)", _accepted),
+    ("off the map", _off_map),
 )
-_COSTS: tuple[Column, ...] = (
+COSTS: tuple[Column, ...] = (
     ("t_e ms", lambda result: f"{result.t_encode_s * 1000:.1f}"),
     ("t_m ms", lambda result: f"{result.t_match_s * 1000:.1f}"),
     ("t_m/ref ms", lambda result: f"{result.t_match_per_ref_s * 1000:.3f}"),
@@ -50,55 +72,58 @@ _COSTS: tuple[Column, ...] = (
     ("U_m", lambda result: f"{result.u_match:.2f}"),
     ("mAh/query", lambda result: f"{result.ah_total * 1000 / result.queries:.2g}"),
 )
-_QUALITY = (*_RECALLS, *_CURVE, *_DECIDED)
-QUALITY = tuple(heading for heading, _ in _QUALITY)
-COSTS = tuple(heading for heading, _ in _COSTS)
 
 
-def quality(result: TechniqueResult) -> list[str]:
-    """Return the quality figures of a technique as texts, in the order of `QUALITY`."""
-    return [text_of(result) for _, text_of in _QUALITY]
+def make_rows(result: Quality, columns: Sequence[Column], both: bool = True) -> Iterator[list[str]]:
+    """Yield the row of a result, and with `both` a second one of the queries whose place is in the map, if these are
+    not all."""
+    yield [result.technique, *(text_of(result) for _, text_of in columns)]
+    if both and result.with_match:
+        yield [f"{result.technique}, in map", *(text_of(result.with_match) for _, text_of in columns)]
 
 
-def costs(result: TechniqueResult) -> list[str]:
-    """Return the costs of a technique as texts, in the order of `COSTS`."""
-    return [text_of(result) for _, text_of in _COSTS]
+def list_headings(columns: Sequence[Column]) -> list[str]:
+    """Return the headings of a table of `make_rows`."""
+    return ["technique", *(heading for heading, _ in columns)]
 
 
 def results_text(results: Sequence[Quality]) -> str:
     """Return the text that `edgevpr eval` prints for a data set: tables, then the notes on them. Results of techniques
     come from `metrics.compare`; those of stored similarities have no costs."""
     has_costs = isinstance(results[0], TechniqueResult)
-    tables = [_RECALLS, (*_CURVE, *_DECIDED), _COSTS] if has_costs else [_RECALLS, _CURVE]
     texts = []
-    for columns in tables:
-        rows = [[result.technique, *(text_of(result) for _, text_of in columns)] for result in results]
-        texts.append("\n".join(aligned([["technique", *(heading for heading, _ in columns)], *rows])) + "\n")
+    for columns in (RECALLS, (*CURVE, *DECIDED), COSTS) if has_costs else (RECALLS, CURVE):
+        rows = [row for result in results for row in make_rows(result, columns, both=columns is not COSTS)]
+        texts.append("\n".join(aligned([list_headings(columns), *rows])) + "\n")
     return "\n".join([*texts, *list_notes(results)])
 
 
 def list_notes(results: Sequence[Quality]) -> Iterator[str]:
     """Yield the sentences below the tables of a data set."""
-    known = "the queries resampled" if results[0].recall_at_1_interval else "not computed: it needs SciPy"
-    yield f"{results[0].queries} queries scored against {results[0].references} references."
-    yield f"95 %: what other queries of the same kind would give, {known}. AUC: equation 2.3; from 0: scikit-learn's."
+    first = results[0]
+    yield f"{first.queries} queries scored against {first.references} references."
+    yield f"{first.queries_off_map} of them have no place in the map: every match of theirs is wrong (off the map)."
+    if first.unscored:
+        yield f"{first.unscored} more queries have no truth, and are not scored."
+    yield from ABOUT_FIGURES
     techniques = [result for result in results if isinstance(result, TechniqueResult)]
-    if not techniques:
-        return
-    for result in techniques:
+    if techniques:
+        yield from _list_notes_on_techniques(techniques)
+    yield "By " + ", ".join(f"{name} {version or '(not installed)'}" for name, version in versions().items()) + "."
+
+
+def _list_notes_on_techniques(results: Sequence[TechniqueResult]) -> Iterator[str]:
+    for result in results:
         if result.sequence > 1:
             yield f"{result.technique} matched sequences of {result.sequence} queries."
         if result.known:
             yield f"Known of each query of {result.technique}: {result.known}."
         if result.discarded:
-            remaining = result.recall_at_1 * result.queries / max(result.queries - result.discarded, 1)
-            yield (
-                f"{result.technique}: {result.discarded} queries were not memorable, and count as missed; recall@1 of "
-                f"the others is {remaining:.3f}."
-            )
+            yield f"{result.technique}: {result.discarded} queries were not memorable, and count as missed."
+        yield from (f"{result.technique}: {sentence}" for sentence in result.not_done)
     yield "Times: means over the queries. accepted: would have moved the aircraft, by the technique's own rule."
-    slowest_ms = 1000 * max(result.t_encode_s for result in techniques)
+    slowest_ms = 1000 * max(result.t_encode_s for result in results)
     yield f"PCU: P@100%R x log10(t_e,max / t_e + 9) with t_e,max = {slowest_ms:.1f} ms."
-    yield f"mAh: {techniques[0].ah_assumes}."
-    for weights in dict.fromkeys(result.weights for result in techniques if result.weights):
+    yield f"mAh: {results[0].ah_assumes}."
+    for weights in dict.fromkeys(result.weights for result in results if result.weights):
         yield f"Weights of {weights}."

@@ -35,9 +35,16 @@ def test_load_dataset_reads_right_and_ignored_references_of_scored_queries(folde
         "c.png,0.1,,a.png,loose_only\n",
     )
     assert dataset.references == ("a.png", "b.png", "c.png")
-    first, second = dataset.queries
-    assert (first.path, first.right, first.ignored) == (folder / "query" / "b.png", {"a.png", "b.png"}, {"c.png"})
-    assert (second.path.name, second.right, second.ignored) == ("a.png", {"c.png"}, set())
+    assert dataset.queries[0].path == folder / "query" / "b.png"
+    assert right_of(dataset) == {"b.png": ({"a.png", "b.png"}, {"c.png"}), "a.png": ({"c.png"}, set())}
+    assert dataset.unscored == 1
+
+
+@pytest.mark.parametrize("row", ["b.png,,,ok", "b.png,,,novel"])
+def test_load_dataset_reads_a_query_off_the_map(folder, row):
+    dataset = load(folder, f"query_file,ref_files,ref_files_loose,status\n{row}\na.png,a.png,,ok\n")
+    assert right_of(dataset) == {"b.png": (set(), set()), "a.png": ({"a.png"}, set())}
+    assert dataset.unscored == 1
 
 
 def test_load_dataset_reads_a_file_of_a_spreadsheet_that_leaves_queries_out(folder):
@@ -55,10 +62,10 @@ HEAD = "query_file,ref_files,status\n"
         ("", ["truth.csv", "`query_file` is missing"]),
         (HEAD + "a.png,a.png,ok\nz.png,a.png,ok\n", ["truth.csv", "`z.png`", "correct its name"]),
         (HEAD + "a.png,a.png y.png,ok\n", ["truth.csv", "`y.png`", "correct its name"]),
-        (HEAD + "a.png,,ok\n", ["truth.csv, line 2", "`a.png`", "no ref_files"]),
+        (HEAD + "a.png,a.png,novel\n", ["truth.csv, line 2", "`a.png`", "`novel` and has ref_files"]),
         (HEAD + "a.png,a.png,ok\na.png,b.png,ok\n", ["truth.csv, line 3", "`a.png`", "keep one"]),
         (HEAD + "a.png,a.png\n", ["truth.csv, line 2", "fields"]),
-        (HEAD + "a.png,a.png,novel\n", ["truth.csv", "scores no query"]),
+        (HEAD + "a.png,a.png,uncertain\n", ["truth.csv", "scores no query"]),
         (b"\xff\xd8\xff\xe0 a JPEG", ["truth.csv", "not a CSV file"]),
     ],
 )
@@ -91,7 +98,10 @@ def test_open_folder_reads_names_with_utm(tmp_path, inside):
     write_pictures(tmp_path / inside / "database", places)
     queries = tmp_path / inside / "queries"
     write_pictures(queries, ["@500005@4100000@q.jpg", "@510000@4100000@far.jpg"])
-    assert right_of(open_folder(tmp_path, Nearness())) == {"@500005@4100000@q.jpg": (places, set())}
+    assert right_of(open_folder(tmp_path, Nearness())) == {
+        "@500005@4100000@q.jpg": (places, set()),
+        "@510000@4100000@far.jpg": (set(), set()),
+    }
     (queries / "@500005@4100000@q.jpg").rename(queries / "@5@q.jpg")
     with pytest.raises(UsageError, match="EASTING"):
         open_folder(tmp_path, Nearness())

@@ -1,24 +1,79 @@
-"""The figures of quality, by scikit-learn and for any scores at all: with ties, one query, none right, all right."""
+"""The figures of quality: small cases worked out by hand, and any scores at all by scikit-learn."""
 
 import math
 
 import numpy as np
 import pytest
+import sklearn.metrics
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from edgevpr.lab.evaluate import metrics
-from edgevpr.lab.evaluate.metrics import figures, interval
+from edgevpr.lab.evaluate.metrics import compute_both, compute_figures, interval
+
+NEVER = math.inf
 
 
-def test_recall_at_counts_queries_with_a_right_reference_among_the_first_k():
+def figures_of(*queries):
+    """The figures of queries (score, rank of the first right reference), whose place is in the map unless they have a
+    third value, False."""
+    scores, ranks, has_match = zip(*((*query, True)[:3] for query in queries), strict=True)
+    both = compute_both(np.array(scores), np.array(ranks), np.array(has_match))
+    return metrics.Quality(technique="", references=10, **both)
+
+
+def test_compute_both_of_a_faultless_run_with_ties():
+    found = figures_of((0.9, 0), (0.9, 0), (0.5, 0), (0.5, 0))
+    assert (found.auc_from_zero, found.auc_2_3) == (1, 0.5), "2.3 takes half of it for the ties"
+    assert (found.ep, found.precision_at_100_recall, found.roc_auc) == (1, 1, None)
+    assert found.recall_at_100_precision_vpr_bench == found.recall_at_100_precision_vpr_tutorial == 1
+    assert (found.queries_off_map, found.with_match) == (0, None)
+
+
+def test_compute_both_counts_queries_off_the_map():
+    # By falling score: right, off the map, right, wrong (third), right.
+    found = figures_of((0.9, 0), (0.8, NEVER, False), (0.7, 0), (0.6, 2), (0.5, 0))
+    assert (found.queries, found.queries_off_map) == (5, 1)
+    assert (found.recall_at_1, found.recall_at_5) == (3 / 5, 4 / 5)
+    # Points (recall, precision): (1/3, 1), (1/3, 1/2), (2/3, 2/3), (2/3, 1/2), (1, 3/5).
+    assert found.auc_2_3 == pytest.approx((1 / 2 + 2 / 3) / 6 + (1 / 2 + 3 / 5) / 6)
+    assert found.auc_from_zero == pytest.approx(found.auc_2_3 + 1 / 3)
+    assert found.recall_at_100_precision_vpr_bench == pytest.approx(1 / 3), "of three right best matches"
+    assert found.recall_at_100_precision_vpr_tutorial == pytest.approx(1 / 4), "of four queries with a match"
+    assert found.ep == pytest.approx((1 + 1 / 3) / 2)
+    assert found.roc_auc == pytest.approx((2 + 1 + 0) / 6)
+    without = found.with_match
+    assert (without.queries, without.recall_at_1) == (4, 3 / 4)
+    # (1/3, 1), (2/3, 1), (2/3, 2/3), (1, 3/4)
+    assert without.auc_2_3 == pytest.approx(1 / 3 + (2 / 3 + 3 / 4) / 6)
+    assert without.recall_at_100_precision_vpr_tutorial == pytest.approx(2 / 4)
+    assert without.ep == pytest.approx((1 + 2 / 3) / 2)
+
+
+def test_compute_both_of_a_query_off_the_map_that_scores_best():
+    found = figures_of((0.9, NEVER, False), (0.8, 0), (0.7, 0))
+    assert (found.ep, found.recall_at_100_precision_vpr_bench, found.roc_auc) == (0, 0, 0)
+    assert (found.with_match.ep, found.with_match.roc_auc) == (1, None)
+
+
+@pytest.mark.parametrize("score", [0.3, -math.inf])
+def test_compute_both_where_no_query_has_a_match(score):
+    found = figures_of((score, NEVER, False), (score, NEVER, False))
+    assert (found.queries_off_map, found.with_match) == (2, None)
+    shares = (found.recall_at_10, found.auc_from_zero, found.auc_2_3, found.ep, found.precision_at_100_recall)
+    assert shares == (0, 0, 0, 0, 0)
+    assert (found.recall_at_100_precision_vpr_tutorial, found.roc_auc) == (0, None)
+
+
+def test_precision_recall_accepts_no_query_that_found_nothing():
+    precision, recall = metrics.precision_recall([-math.inf, 0.5, -math.inf], [False, True, False])
+    assert (precision.tolist(), recall.tolist()) == ([1], [1])
+
+
+def test_first_right_is_the_rank_of_the_first_right_reference():
     right = np.array([False, True, False, True])
-    ranks = [metrics.first_right(np.array(order), right) for order in ([1, 0, 2, 3], [0, 2, 3, 1], [2, 0])]
-    assert ranks == [0, 2, math.inf]
-    assert metrics.recall_at(1, ranks) == 1 / 3
-    assert metrics.recall_at(2, ranks) == 1 / 3
-    assert metrics.recall_at(3, ranks) == 2 / 3
-    assert metrics.recall_at(10, ranks) == 2 / 3
+    assert [metrics.first_right(np.array(order), right) for order in ([1, 0], [0, 2, 3, 1], [2, 0])] == [0, 2, NEVER]
 
 
 def test_pcu_of_the_slowest_technique_is_its_precision():
@@ -27,66 +82,36 @@ def test_pcu_of_the_slowest_technique_is_its_precision():
     assert metrics.pcu(0.90, 0.02, 0.83) == pytest.approx(0.9 * math.log10(50.5))
 
 
+@pytest.mark.parametrize(("right", "of"), [(0, 1), (0, 20), (13, 20), (20, 20)])
+def test_interval_is_that_of_wilson(right, of):
+    expected = stats.binomtest(right, of).proportion_ci(method="wilson")
+    assert interval(np.arange(of) < right) == pytest.approx((expected.low, expected.high), abs=1e-6)
+
+
 # Few distinct scores, so that ties are usual; and the rank of the first right one, infinite where there is none.
-QUERIES = st.lists(
-    st.tuples(st.integers(-3, 3), st.sampled_from([0.0, 1.0, 4.0, 7.0, 30.0, float("inf")])), min_size=1, max_size=60
-)
+QUERIES = st.lists(st.tuples(st.integers(-3, 3), st.sampled_from([0.0, 1.0, 7.0, NEVER])), min_size=1, max_size=60)
 
 
-def arrays(queries):
+@pytest.mark.slow
+@settings(deadline=None)
+@given(QUERIES)
+def test_compute_figures_equal_those_of_scikit_learn(queries):
     scores, ranks = (np.array(column, float) for column in zip(*queries, strict=True))
-    return scores, ranks
-
-
-@pytest.mark.slow
-@settings(deadline=None)
-@given(QUERIES)
-def test_figures_are_shares_that_fit_each_other(queries):
-    scores, ranks = arrays(queries)
-    found, right = figures(scores, ranks), ranks == 0
-    shares = [value for key, value in found.items() if isinstance(value, float)]
-    assert all(0 <= share <= 1 for share in shares)
-    assert found["recall_at_1"] <= found["recall_at_5"] <= found["recall_at_10"]
-    assert found["recall_at_1"] == right.mean()
-    assert found["auc"] <= found["auc_from_zero"] + 1e-12
-    if right.any():
-        assert found["precision_at_100_recall"] >= found["recall_at_1"] - 1e-12
-    else:
-        assert found["auc"] == found["recall_at_100_precision"] == 0
-    if right.all():
-        assert found["precision_at_100_recall"] == found["recall_at_100_precision"] == found["auc_from_zero"] == 1
-    assert (found["roc_auc"] is None) == (right.all() or not right.any())
-
-
-@pytest.mark.slow
-@settings(deadline=None)
-@given(QUERIES)
-def test_figures_equal_those_of_scikit_learn(queries):
-    sklearn = pytest.importorskip("sklearn.metrics")
-    scores, ranks = arrays(queries)
     right = ranks == 0
+    found = compute_figures(scores, ranks, np.isfinite(ranks))
+    assert found.recall_at_1 == right.mean()
     if not right.any():
         return
-    precision, recall = metrics.precision_recall(scores, right)
-    theirs = sklearn.precision_recall_curve(right, scores)
-    ours = np.column_stack([precision, recall])
-    assert np.allclose(ours, np.column_stack([theirs[0][-2::-1], theirs[1][-2::-1]])[: len(ours)])
-    assert metrics.auc_from_zero(precision, recall) == pytest.approx(sklearn.auc(theirs[1], theirs[0]), abs=1e-12)
-    assert metrics.auc(precision, recall) == pytest.approx(np.trapezoid(precision, recall), abs=1e-12)
-    assert metrics.precision_at_100_recall(precision, recall) == max(precision[recall == 1])
-    certain = max(recall[precision == 1], default=0)
-    assert metrics.recall_at_100_precision(precision, recall) == certain
-    highest = max(precision[recall == min(recall)])
-    assert metrics.compute_extended_precision(precision, recall) == (highest + certain) / 2
+    # As VPR-Bench does, of all queries: performance_comparison.py.
+    precision, recall, _ = sklearn.metrics.precision_recall_curve(right, scores)
+    assert found.auc_from_zero == pytest.approx(sklearn.metrics.auc(recall, precision), abs=1e-12)
+    certain = max(recall[:-1][precision[:-1] == 1], default=0)
+    assert found.recall_at_100_precision_vpr_bench == certain
+    assert found.ep == pytest.approx((precision[-2] + certain) / 2)
+    assert found.precision_at_100_recall == max(precision[recall == 1])
+    # As VPR_Tutorial does: evaluation/metrics.py, with a threshold at every score.
+    accepted = [right[scores >= threshold] for threshold in np.unique(scores)]
+    certain = max((each.sum() for each in accepted if each.all()), default=0) / np.isfinite(ranks).sum()
+    assert found.recall_at_100_precision_vpr_tutorial == pytest.approx(certain)
     if not right.all():
-        assert metrics.roc_auc(scores, right) == pytest.approx(sklearn.roc_auc_score(right, scores), abs=1e-12)
-
-
-@pytest.mark.slow
-def test_interval_covers_the_share_that_the_queries_were_drawn_with():
-    random = np.random.default_rng(5)
-    covered = 0
-    for _ in range(200):
-        low, high = interval(random.random(100) < 0.8)
-        covered += low <= 0.8 <= high
-    assert covered > 0.88 * 200
+        assert found.roc_auc == pytest.approx(sklearn.metrics.roc_auc_score(right, scores), abs=1e-12)

@@ -32,14 +32,15 @@ def test_measure_gives_the_published_figures_of_eight_matrices(capsys):
     truth = str(_DATA / "corridor" / "ground_truth.csv")
     assert main(["eval", "--similarity", *files, "--ground-truth", truth, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["similarities"]
-    ours = {"auc_eq_2_3": "auc", "auc_scikit_learn": "auc_from_zero"}
+    ours = {"auc_eq_2_3": "auc_2_3", "auc_scikit_learn": "auc_from_zero"}
     assert len(found) == 8
     for name, row in published.items():
         for figure, value in row.items():
             if not figure.startswith("t_"):
                 assert found[f"corridor_{name}"][ours.get(figure, figure)] == pytest.approx(float(value), abs=5e-4)
-        low, high = found[f"corridor_{name}"]["recall_at_1_interval"]
-        assert low < found[f"corridor_{name}"]["recall_at_1"] < high
+    calc = found["corridor_CALC"]
+    assert calc["recall_at_100_precision_vpr_bench"] == pytest.approx(8 / 36)
+    assert calc["recall_at_100_precision_vpr_tutorial"] == pytest.approx(8 / 111)
 
 
 @pytest.mark.parametrize(
@@ -64,6 +65,25 @@ def test_measure_refuses_what_does_not_fit_in_one_sentence(tmp_path, truth, caps
     assert error.count("\n") == 1
 
 
+def test_measure_counts_queries_off_the_map_and_takes_the_first_of_equal_scores(tmp_path, truth, capsys):
+    truth.write_text("query_file,ref_files,ref_files_loose\nq1,r1,\nq2,r2,\nq3,,\nq4,,r1 r2\n")
+    np.save(tmp_path / "a.npy", [[0.9, 0.1], [0.5, 0.5], [0.7, 0.2], [0.1, 0.8]])
+    assert main(["eval", "--similarity", str(tmp_path / "a.npy"), "--ground-truth", str(truth), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["similarities"]["a"]
+    assert (found["queries"], found["queries_off_map"], found["recall_at_1"]) == (4, 2, 0.25)
+    assert (found["auc_from_zero"], found["roc_auc"]) == (1, 1), "q1 is right and scores best, q4 finds nothing"
+    assert (found["with_match"]["queries"], found["with_match"]["recall_at_1"]) == (2, 0.5)
+
+
+def test_measure_of_an_empty_map_finds_nothing(tmp_path, truth, capsys):
+    truth.write_text("query_file,ref_files\nq1,\nq2,\n")
+    np.save(tmp_path / "a.npy", np.empty((2, 0)))
+    assert main(["eval", "--similarity", str(tmp_path / "a.npy"), "--ground-truth", str(truth), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["similarities"]["a"]
+    assert (found["queries"], found["queries_off_map"], found["references"]) == (2, 2, 0)
+    assert (found["recall_at_1"], found["auc_from_zero"], found["with_match"]) == (0, 0, None)
+
+
 def test_measure_takes_all_images_of_the_folders(tmp_path, truth, capsys):
     for folder, names in (("query", ["q1", "q2", "q3", "q4"]), ("ref", ["r1", "r2", "r10", "r11"])):
         (tmp_path / folder).mkdir()
@@ -75,7 +95,7 @@ def test_measure_takes_all_images_of_the_folders(tmp_path, truth, capsys):
     flags = ["--query", str(tmp_path / "query"), "--ref", str(tmp_path / "ref"), "--ground-truth", str(truth)]
     assert main(["eval", "--similarity", str(tmp_path / "a.npy"), *flags, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["similarities"]["a"]
-    assert (found["queries"], found["references"], found["recall_at_1"]) == (2, 4, 1.0)
+    assert (found["queries"], found["references"], found["recall_at_1"], found["unscored"]) == (2, 4, 1.0, 2)
     truth.write_text(rows + "q9.png,r1.png\n")
     assert main(["eval", "--similarity", str(tmp_path / "a.npy"), *flags]) == 2
     assert "`q9.png`, which is not in --query" in capsys.readouterr().err
