@@ -78,7 +78,7 @@ def evaluate(args: Namespace) -> int:
     from edgevpr.lab.evaluate.runs import Plan, measure, write_results
     from edgevpr.lab.evaluate.tables import results_text
 
-    config, sets, rows = load_command_config(args, args.config), _open_sets(args), _list_rows(args)
+    config, rows, sets = load_command_config(args, args.config), _list_rows(args), _open_sets(args)
     options = MatchOptions(
         candidates=config.match.candidates,
         sequence=config.match.sequence,

@@ -70,9 +70,10 @@ def test_map_build_makes_a_map_that_it_cannot_calibrate(flight, tmp_path, capsys
     assert f"it has {PLACES} places" in caplog.text
     assert "expect:" not in capsys.readouterr().out
     monkeypatch.setitem(sys.modules, "edgevpr.mapmaking.calibrate", None)  # as where SciPy is missing
-    assert built(tmp_path / "bare.gpkg", flight / "ref") == 0
-    assert "SciPy" in caplog.text
-    assert f" {PLACES} places added" in capsys.readouterr().out
+    assert built(tmp_path / "bare.gpkg", flight / "ref", "--json") == 0
+    made = json.loads(capsys.readouterr().out)
+    assert (made["places"], len(made["not_done"])) == (PLACES, 1)
+    assert "SciPy" in made["not_done"][0]
 
 
 @pytest.mark.slow
