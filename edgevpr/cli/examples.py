@@ -62,7 +62,7 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "replay": (("fly it again, and compare each line", "flight.jsonl --map valley.gpkg"),),
     "profile": (
         ("a map on a board", "--map valley.gpkg --board rpi-4b --battery 4S5200 --flight-min 20"),
-        ("which board?", "--places 2000 --board rpi-zero-2w,rpi-4b,rpi-5"),
+        ("every technique on a small board", "--places 10000 --board rpi-zero-2w --camera nadir"),
     ),
     "eval": (("techniques on a data set", "--data my_set/ --techniques cohog,hog --camera nadir"),),
     "simulate autopilot": (("a plane that loses GPS", "--track later/positions.csv --gps-s 30"),),

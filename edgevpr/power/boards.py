@@ -4,10 +4,8 @@ module also detects the machine that it runs on. The flight, `edgevpr profile` a
 `root` is the root of the file system with /proc and /sys: another tree can stand in.
 """
 
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from edgevpr.core.config import BUDGET_MB, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, bounded, build
 from edgevpr.core.errors import ConfigError
@@ -23,16 +21,13 @@ _ANY_MACHINE = "generic-x86"
 class MachineSpeed:
     """Speed of a machine relative to one core of the reference machine of `profiles/generic-x86.yaml` (None: unknown).
 
-    `single`: one thread at integer and byte operations. `multi`: all cores together at such operations.
-    `products`: one thread at matrix products. `passes`: one thread at passes over bytes.
+    `single`: one thread at integer and byte operations. `products`: one thread at matrix products.
     `arm64_mips`: million instructions per second of one thread of an aarch64 board (not relative).
     `verified`: True if `source` measured the figures on this very board.
     """
 
-    single: float | None = bounded(0.0001, 100)
-    multi: float | None = bounded(0.0001, 10_000)
-    products: float | None = bounded(0.0001, 100)
-    passes: float | None = bounded(0.0001, 100)
+    single: float | None = bounded(0.0001, 100, default=None)
+    products: float | None = bounded(0.0001, 100, default=None)
     arm64_mips: float | None = bounded(1, 1_000_000, default=None)
     verified: bool
     source: str
@@ -49,8 +44,8 @@ class Board:
     `thermal_limit_c`: degrees Celsius at which the board begins to slow down (None: read from its kernel).
     `technique`: used if the user names none, provided that it fits (None: the best that fits).
     `threads`: number of threads that a network may use.
-    `recognised_by`, `machine`: a machine is this board if the model in its device tree contains the first text; the
-    profile was written on the machine whose `machine.title` is the second (None: neither is known).
+    `recognised_by`: a machine is this board if its model, by device tree or firmware, contains this text (None: no
+    machine is).
     """
 
     name: str
@@ -70,7 +65,10 @@ class Board:
     benchmark_score: MachineSpeed
     technique: str | None = None
     threads: int = bounded(1, 64, default=1)
-    machine: str | None = None
+
+    def is_this_machine(self, root: Path = Path("/")) -> bool:
+        """Return True if the profile is that of the machine this runs on."""
+        return self.name == _this_machine(root).name or _matches(self, root)
 
 
 def board_names() -> tuple[str, ...]:
@@ -92,45 +90,10 @@ def load_board(name: str, root: Path = Path("/")) -> Board:
     raise ConfigError(f"There is no board `{name}`: {hint}")
 
 
-def detect(root: Path = Path("/")) -> dict[str, Any]:
-    """Describe this machine: its `title`, `cpu`, `cores`, `ram_mb`, and `thermal_limit_c`, the degrees Celsius at which
-    it begins to slow down; `usable_cores` and `ram_limit_mb`, what CPU affinity and control groups leave of them to
-    this process; `board`, the name of its profile, and `model`, its name by its maker (None: unknown)."""
-    cores, recognised = machine.cores_online(root), _recognised(root)
-    return {
-        "board": recognised.name if recognised else None,
-        "model": machine.model(root) or machine.dmi_model(root),
-        "cpu": machine.cpu(root),
-        "cores": cores,
-        "usable_cores": min(float(cores), machine.cores(root)),
-        "ram_mb": machine.ram_mb(root),
-        "ram_limit_mb": machine.ram_limit_mb(root),
-        "thermal_limit_c": thermal.limit_c(root),
-        "title": machine.title(root),
-    }
-
-
-def own_profile(speed: MachineSpeed, root: Path = Path("/")) -> Board:
-    """Return a profile of this machine with the score `speed`. Its power is that of the shipped profile of its board,
-    else relative (idle 0 W, full load 1 W). Memory and shares are those of `load_board("this")`."""
-    board, model = _this_machine(root), machine.model(root)
-    source = board.source if _recognised(root) else "relative figures (idle 0, full load 1 W): nobody has measured it"
-    return replace(board, title=machine.title(root), recognised_by=model, source=source, benchmark_score=speed)
-
-
-def profile_text(board: Board) -> str:
-    """Return a profile as YAML text, which `load_board` can read."""
-    # The name is that of the file. JSON values are valid YAML, whatever characters they contain.
-    lines = [f"{key}: {json.dumps(value)}\n" for key, value in asdict(board).items() if key != "name"]
-    about = f"# Written by edgevpr for the machine it ran on; profiles/{_ANY_MACHINE}.yaml explains it.\n\n"
-    return about + "".join(lines)
-
-
-def _recognised(root: Path) -> Board | None:
-    """Return the shipped profile of the board whose device tree is below `root`; None if there is none."""
-    model = (machine.model(root) or "").lower()
-    known = map(_shipped, board_names() if model else ())
-    return next((board for board in known if board.recognised_by and board.recognised_by.lower() in model), None)
+def _matches(board: Board, root: Path) -> bool:
+    """Return True if the model of the machine below `root` contains the text that `board` is recognised by."""
+    model = machine.model(root)
+    return bool(model and board.recognised_by and board.recognised_by.lower() in model.lower())
 
 
 def _shipped(name: str) -> Board:
@@ -153,13 +116,12 @@ def _read(path: Path) -> Board:
 
 def _this_machine(root: Path) -> Board:
     """Return the profile of this machine's board, else generic-x86, with the cores and memory that are really there."""
-    model, recognised = machine.model(root), _recognised(root)
+    model = machine.model(root)
+    recognised = next((board for board in map(_shipped, board_names() if model else ()) if _matches(board, root)), None)
     profile = recognised or _shipped(_ANY_MACHINE)
-    title, speed = profile.title, profile.benchmark_score
+    title = profile.title
     if model and not recognised:
         title = f"{model}, which has no profile: the figures of {_ANY_MACHINE}"
-        unknown = f"nobody has measured a {model}"
-        speed = MachineSpeed(single=None, multi=None, products=None, passes=None, verified=False, source=unknown)
     ram_mb = machine.ram_mb(root)
     # Keep the profile's shares, but of the memory that the machine really has; a control group may allow less.
     memory_max_mb = min(profile.memory_max_mb / profile.ram_mb * ram_mb, machine.ram_limit_mb(root))
@@ -169,12 +131,10 @@ def _this_machine(root: Path) -> Board:
     return replace(
         profile,
         title=f"this machine ({title})",
-        benchmark_score=speed,
         ram_mb=ram_mb,
         cores=cores,
         cpu_share=cpu_share,
         thermal_limit_c=profile.thermal_limit_c or thermal.limit_c(root),
-        machine=machine.title(root),
         threads=max(1, min(profile.threads, round(cpu_share * cores))),
         budget_mb=memory_max_mb * profile.budget_mb / profile.memory_max_mb,
         memory_max_mb=memory_max_mb,

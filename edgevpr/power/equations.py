@@ -64,11 +64,6 @@ def pack_ah(energy_j: float, pack: Pack, regulator_efficiency: float) -> float:
     return energy_j / (pack.nominal_v * regulator_efficiency * _S_PER_H)
 
 
-def endurance_min(pack: Pack, load_w: float) -> float:
-    """Return the minutes that a full pack lasts at `load_w` watts drawn from it."""
-    return 60 * pack.nominal_v * pack.capacity_mah / 1000 / load_w
-
-
 def queries_ah(queries: float, query_ah: float) -> float:
     """Return the ampere-hours of `queries` queries of `query_ah` each: Ah_t = N Ah_q (5.7)."""
     return queries * query_ah

@@ -1,54 +1,24 @@
 """Hardware of this machine and memory of this process, as the kernel reports them in /proc and /sys.
 
-Board profiles, power meters and trials of techniques use it. `root` is the root of the file system: another tree can
-stand in. A megabyte (MB) is 10^6 bytes.
+Board profiles, meters of queries and trials of techniques use it. `root` is the root of the file system: another tree
+can stand in. A megabyte (MB) is 10^6 bytes.
 """
 
 import os
-import platform
 import re
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 
 _ROOT = Path("/")
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
-# Arm's part numbers in /proc/cpuinfo (implementer 0x41), of processors that companion computers have.
-_ARM_PARTS = {
-    "0xc07": "Cortex-A7", "0xc0f": "Cortex-A15", "0xd03": "Cortex-A53", "0xd04": "Cortex-A35", "0xd05": "Cortex-A55",
-    "0xd07": "Cortex-A57", "0xd08": "Cortex-A72", "0xd09": "Cortex-A73", "0xd0a": "Cortex-A75", "0xd0b": "Cortex-A76",
-    "0xd0d": "Cortex-A77", "0xd41": "Cortex-A78", "0xd42": "Cortex-A78AE", "0xd46": "Cortex-A510",
-}  # fmt: skip
 
 
 def model(root: Path = _ROOT) -> str | None:
-    """Return the board's name in the device tree, e.g. "Raspberry Pi 4 Model B Rev 1.4"; None without one (x86)."""
-    return text(root / "proc/device-tree/model")
-
-
-def dmi_model(root: Path = _ROOT) -> str | None:
-    """Return maker and product from the firmware (DMI) of an x86 machine; None if it says neither."""
+    """Return the machine's name by its maker, from the device tree ("Raspberry Pi 4 Model B Rev 1.4") or, of an x86
+    machine, the firmware (DMI); None if neither says one."""
     names = (text(root / "sys/class/dmi/id" / name) for name in ("sys_vendor", "product_name"))
-    return " ".join(filter(None, names)) or None
-
-
-def cpu(root: Path = _ROOT) -> str:
-    """Return the processor's name from /proc/cpuinfo: the model (x86, 32-bit ARM), or the number and name of each kind
-    of Arm core, e.g. "4 x Cortex-A72"."""
-    info = text(root / "proc/cpuinfo") or ""
-    if name := re.search(r"^model name\s*:\s*(.+)$", info, re.MULTILINE):
-        return " ".join(name[1].split())
-    parts = Counter(re.findall(r"^CPU part\s*:\s*(\w+)$", info, re.MULTILINE))
-    kinds = [f"{count} x {_ARM_PARTS.get(part, f'CPU part {part}')}" for part, count in parts.items()]
-    return " + ".join(kinds) or f"unknown {platform.machine()} processor"
-
-
-def title(root: Path = _ROOT) -> str:
-    """Return the machine's name and processor as one text, the same at every start, so that it identifies the
-    machine."""
-    words = f"{model(root) or dmi_model(root) or 'a machine without a name'} ({cpu(root)})"
-    return "".join(c if c.isprintable() else " " for c in words)
+    return text(root / "proc/device-tree/model") or " ".join(filter(None, names)) or None
 
 
 def cores_online(root: Path = _ROOT) -> int:

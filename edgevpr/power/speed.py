@@ -4,38 +4,38 @@ Two figures are measured, because machines differ in them: matrix products (coho
 units, passes over bytes (encoding an image, scanning a map) do not. Small ARM cores fall behind more at products.
 """
 
-import math
-import os
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from threading import Barrier
+from dataclasses import dataclass
 
 import numpy as np
-
-from edgevpr.power.boards import MachineSpeed
 
 # Rounds per second of one core of the reference machine, an AMD EPYC (Zen 4) in a virtual machine. Measured by
 # `_round_times_s` with OPENBLAS_NUM_THREADS=1, Python 3.11 and NumPy 2.4 (OpenBLAS 0.3.31).
 REFERENCE_PRODUCTS_HZ = 1585.0
 REFERENCE_PASSES_HZ = 1960.0
 
-_MIN_TIME_S = 0.4  # of each of the four measurements
+_MIN_TIME_S = 0.4  # of each of the two measurements
 _MIN_ROUNDS = 5
 
 
-def micro_benchmark() -> MachineSpeed:
-    """Measure the speed of this machine, in about two seconds (longer on a slow board). Nothing else should run.
-    `single` (one thread) and `multi` (one a core) are the geometric means of the speeds at products and at passes.
-    NumPy's library must have one thread (OPENBLAS_NUM_THREADS=1, which edgevpr's command line sets before NumPy is
-    imported)."""
-    cores = len(os.sched_getaffinity(0))
-    products, all_products = (hz / REFERENCE_PRODUCTS_HZ for hz in _rates_hz(product_round, cores))
-    passes, all_passes = (hz / REFERENCE_PASSES_HZ for hz in _rates_hz(pass_round, cores))
-    figures = (math.sqrt(products * passes), math.sqrt(all_products * all_passes), products, passes)
-    single, multi, products, passes = (float(f"{value:.3g}") for value in figures)
-    source = "edgevpr's micro-benchmark, run on it; single and multi are means of both kinds"
-    return MachineSpeed(single=single, multi=multi, products=products, passes=passes, verified=True, source=source)
+@dataclass(frozen=True, slots=True)
+class Speed:
+    """Speed of one thread of a machine divided by that of another machine. `products`: at matrix products (networks,
+    and full comparisons of candidates). `passes`: at passes over bytes (everything else)."""
+
+    products: float
+    passes: float
+
+
+def micro_benchmark() -> Speed:
+    """Measure the speed of this machine relative to the reference, in about a second (longer on a slow board). Nothing
+    else should run. NumPy's library must have one thread (OPENBLAS_NUM_THREADS=1, which edgevpr's command line sets
+    before NumPy is imported)."""
+    return Speed(
+        products=1 / min(_round_times_s(product_round())) / REFERENCE_PRODUCTS_HZ,
+        passes=1 / min(_round_times_s(pass_round())) / REFERENCE_PASSES_HZ,
+    )
 
 
 def product_round() -> Callable[[], object]:
@@ -66,21 +66,10 @@ def pass_round() -> Callable[[], object]:
     return work
 
 
-def _rates_hz(make: Callable[[], Callable[[], object]], threads: int) -> tuple[float, float]:
-    """Return the calls of the work per second by one thread alone, and in total by `threads` threads at once, each with
-    its own work from `make`."""
-    alone_hz = 1 / min(_round_times_s(make(), Barrier(1)))  # a slower round was disturbed by something else
-    start = Barrier(threads)
-    with ThreadPoolExecutor(threads) as pool:
-        together = list(pool.map(lambda work: _round_times_s(work, start), [make() for _ in range(threads)]))
-    return alone_hz, sum(len(times_s) / sum(times_s) for times_s in together)
-
-
-def _round_times_s(work: Callable[[], object], start: Barrier) -> list[float]:
-    """Call `work` again and again, and return the seconds of each call. A first call is not counted; after it, this
-    thread waits at the barrier `start` until all threads are ready."""
+def _round_times_s(work: Callable[[], object]) -> list[float]:
+    """Call `work` again and again, and return the seconds of each call. A first call is not counted. Of them the least
+    counts: a slower round was disturbed by something else."""
     work()
-    start.wait()
     times_s: list[float] = []
     while len(times_s) < _MIN_ROUNDS or sum(times_s) < _MIN_TIME_S:
         before_s = time.perf_counter()

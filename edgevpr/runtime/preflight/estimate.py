@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 from edgevpr.core.types import QueryCost
 from edgevpr.power.boards import Board
-from edgevpr.power.equations import Pack, endurance_min, pack_ah, queries_ah
+from edgevpr.power.equations import Pack, pack_ah, queries_ah
 from edgevpr.power.meter import query_cost
+from edgevpr.power.speed import Speed
 from edgevpr.runtime.preflight.choose import Demand, Option, choose_best, explain_no_choice, list_options
-from edgevpr.runtime.preflight.scale import Ratios, count_work, is_same, on_board, ratios
+from edgevpr.runtime.preflight.scale import SAME_MACHINE, count_work, on_board
 from edgevpr.runtime.preflight.trial import Trial
 
 
@@ -21,13 +22,12 @@ class FlightPlan(Demand):
     """Plan of a flight: its demands of a technique (`Demand`), and what its energy is computed from.
 
     `flight_min`: minutes in the air. `pack`: the aircraft's battery. `regulator_efficiency`: share of the pack's energy
-    that reaches the board, 0..1. `hover_w`: watts that the aircraft draws to hover (None: not given).
+    that reaches the board, 0..1.
     """
 
     flight_min: float
     pack: Pack
     regulator_efficiency: float
-    hover_w: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,9 +36,8 @@ class TechniqueEstimate:
 
     `query`: time, utilisation and charge of a query (symbols and equations: see `power.equations`).
     `flight_mah`: charge that the board draws in the flight. `flight_marginal_mah`: the part of it that the queries add
-    (equation 5.7). All charges are drawn from the pack; `flight_pack_frac` is `flight_mah` as a share of its capacity.
-    `lost_min`: minutes of hovering on a full pack that the board costs. `lost_marginal_min`: the part of them that the
-    queries cost (both None: hover power unknown).
+    (equation 5.7). All charges are drawn from the pack; `flight_pack_frac` is `flight_mah` as a share of its capacity,
+    and so the share of its endurance that the aircraft loses.
     """
 
     option: Option
@@ -46,16 +45,14 @@ class TechniqueEstimate:
     flight_mah: float
     flight_marginal_mah: float
     flight_pack_frac: float
-    lost_min: float | None
-    lost_marginal_min: float | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightEstimate:
     """Estimates of all techniques on one board.
 
-    `times`: "measured" (on this machine, for this machine), "scaled" (from this machine to the board, by `ratios`) or
-    "unscaled" (this machine's, since the speed score of one of them is missing). `recommended`: label of the option
+    `times`: "measured" (on this machine, for this machine), "scaled" (from this machine to the board, by `ratio`) or
+    "unscaled" (this machine's, since the speed of the board is unknown). `recommended`: label of the option
     to use (None: there is none). `reason`: why it is recommended, or why none is, in a sentence. `notes`: remarks on
     the estimate. `unusable`: techniques that cannot be used here, each with the reason.
     """
@@ -63,7 +60,7 @@ class FlightEstimate:
     board: str
     title: str
     times: str
-    ratios: Ratios | None
+    ratio: Speed | None
     plan: FlightPlan
     techniques: tuple[TechniqueEstimate, ...]
     recommended: str | None
@@ -72,28 +69,28 @@ class FlightEstimate:
     unusable: dict[str, str]
 
 
-def estimate(board: Board, here: Board, trials: Iterable[Trial], plan: FlightPlan) -> FlightEstimate:
-    """Estimate every technique of `trials`, which were made on the machine `here`, for a flight of `board`."""
+def estimate(board: Board, ratio: Speed | None, trials: Iterable[Trial], plan: FlightPlan) -> FlightEstimate:
+    """Estimate every technique of `trials`, which were made on this machine, for a flight of `board`, whose speed is
+    `ratio` of this machine's (see `compare_speed`)."""
     trials = list(trials)
     rows: list[TechniqueEstimate] = []
     for trial in trials:
         if trial.costs:
-            costs = on_board(trial.costs, here, board, count_work(trial.name, trial.parameters))
+            costs = on_board(trial.costs, board, ratio, count_work(trial.name, trial.parameters))
             options = list_options(board, trial.label, trial.name, costs, plan)
             rows += [_estimate_option(option, board, plan) for option in options]
-    ratio = ratios(here, board)
     recommended, reason = _recommend(rows, board, plan)
     weights = dict.fromkeys(f"Weights of {trial.weights}." for trial in trials if trial.weights)
     return FlightEstimate(
         board=board.name,
         title=board.title,
-        times="unscaled" if ratio is None else "measured" if is_same(here, board) else "scaled",
-        ratios=ratio,
+        times="unscaled" if ratio is None else "measured" if ratio == SAME_MACHINE else "scaled",
+        ratio=ratio,
         plan=plan,
         techniques=tuple(rows),
         recommended=recommended,
         reason=reason,
-        notes=(*weights, *_list_notes(board, here, ratio, plan)),
+        notes=(*weights, *_list_notes(board, ratio)),
         unusable={trial.label: trial.problem for trial in trials if trial.problem},
     )
 
@@ -105,21 +102,12 @@ def _estimate_option(option: Option, board: Board, plan: FlightPlan) -> Techniqu
     marginal_mah = queries_ah(min(plan.rate_hz, option.fit.reachable_hz) * flight_s, query.marginal_mah)
     # Equation 5.7 leaves out the idle power between two queries, which the pack supplies too.
     idle_mah = 1000 * pack_ah(board.idle_w * flight_s, plan.pack, plan.regulator_efficiency)
-    lost_min = lost_marginal_min = None
-    if plan.hover_w is not None:
-        w_per_mah = plan.pack.nominal_v / 1000 * 60 / plan.flight_min
-        without, idling, recognising = (
-            endurance_min(plan.pack, plan.hover_w + mah * w_per_mah) for mah in (0.0, idle_mah, idle_mah + marginal_mah)
-        )
-        lost_min, lost_marginal_min = without - recognising, idling - recognising
     return TechniqueEstimate(
         option=option,
         query=query,
         flight_mah=idle_mah + marginal_mah,
         flight_marginal_mah=marginal_mah,
         flight_pack_frac=(idle_mah + marginal_mah) / plan.pack.capacity_mah,
-        lost_min=lost_min,
-        lost_marginal_min=lost_marginal_min,
     )
 
 
@@ -143,20 +131,19 @@ def _recommend(rows: list[TechniqueEstimate], board: Board, plan: FlightPlan) ->
     )
 
 
-def _list_notes(board: Board, here: Board, ratio: Ratios | None, plan: FlightPlan) -> Iterator[str]:
-    score, own_score = board.benchmark_score, here.benchmark_score
+def _list_notes(board: Board, ratio: Speed | None) -> Iterator[str]:
+    score = board.benchmark_score
     if ratio is None:
-        unknown = board if score.single is None else here
         yield (
-            f"The times are this machine's, unscaled, not measured on this board: the speed of {unknown.title} is not "
-            f"known ({unknown.benchmark_score.source})."
+            f"The times are this machine's, unscaled, not measured on this board: its speed is not known "
+            f"({score.source})."
         )
-    elif not is_same(here, board):
-        doubt = "" if score.verified and own_score.verified else "unverified; "
+    elif ratio != SAME_MACHINE:
+        doubt = "" if score.verified else "unverified; "
         yield (
             f"The times are scaled from this machine, not measured on this board: networks and full comparisons to "
             f"{ratio.products:.2g} of its speed, everything else to {ratio.passes:.2g} ({doubt}the board by "
-            f"{score.source}; this machine by {own_score.source})."
+            f"{score.source}; this machine by edgevpr's micro-benchmark)."
         )
         if score.arm64_mips:
             yield (
@@ -165,5 +152,3 @@ def _list_notes(board: Board, here: Board, ratio: Ratios | None, plan: FlightPla
             )
     if not board.verified:
         yield f"The power of {board.title} is unverified: {board.source}."
-    if plan.hover_w is None:
-        yield "Give the hover power of the aircraft (--hover-w W) to see how many minutes of flight this costs."

@@ -20,7 +20,7 @@ from edgevpr.runtime.preflight.choose import (
     list_preferred,
 )
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe, ram_bytes
-from edgevpr.runtime.preflight.scale import count_work, on_board
+from edgevpr.runtime.preflight.scale import compare_speed, count_work, on_board
 from edgevpr.runtime.recognise.opening import budget_mb, made_for
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import find_weights
@@ -146,4 +146,4 @@ def _measure_costs(technique: Technique, board: Board) -> TechniqueCosts:
     """Measure the costs of a technique here, and convert them to `board`."""
     spec = technique.spec
     work = count_work(spec.name, spec.parameters) if _votes(spec) else None
-    return on_board(probe(technique), load_board("this"), board, work)
+    return on_board(probe(technique), board, compare_speed(board), work)
