@@ -73,7 +73,6 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     ),
     "demo": (("the whole job in a minute", "--out demo_out"),),
     "models list": (("which networks there are", ""),),
-    "models verify": (("try them all", ""),),
     "models add": (("a network of yours", "net.onnx --card net.yaml"),),
 }
 

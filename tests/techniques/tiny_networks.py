@@ -71,30 +71,8 @@ def _network(fault: str | None):
         helper.make_node("AveragePool", ["features"], ["pooled"], kernel_shape=[5, 7], strides=[5, 7]),
         helper.make_node("Flatten", ["pooled"], ["descriptor"]),
     ]
-    if fault == "endless":
-        nodes.insert(1, helper.make_node("Loop", ["many", "true", "conv"], ["turned"], body=_turn()))
-        nodes[2].input[0] = "turned"
     inputs = [helper.make_tensor_value_info("picture", TensorProto.FLOAT, size)]
     outputs = [helper.make_tensor_value_info(each, TensorProto.FLOAT, None) for each in ("descriptor", "features")]
     initial = [numpy_helper.from_array(weights, "weights"), numpy_helper.from_array(bias, "bias")]
-    if fault == "endless":
-        initial += [numpy_helper.from_array(np.array(2**62), "many"), numpy_helper.from_array(np.array(True), "true")]
     graph = helper.make_graph(nodes, "tiny", inputs, outputs, initial)
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-
-
-def _turn():
-    """One turn of a loop that always asks for the next."""
-    return helper.make_graph(
-        [helper.make_node("Identity", ["go"], ["go_on"]), helper.make_node("Relu", ["x"], ["y"])],
-        "turn",
-        [
-            helper.make_tensor_value_info("turn", TensorProto.INT64, []),
-            helper.make_tensor_value_info("go", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("x", TensorProto.FLOAT, None),
-        ],
-        [
-            helper.make_tensor_value_info("go_on", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("y", TensorProto.FLOAT, None),
-        ],
-    )
