@@ -1,5 +1,5 @@
 """Recordings that say where an aircraft was: logs of autopilots, subtitles of drones' videos, tracks of receivers,
-films of action cameras, and tables of other programs. `read_record` finds out which a file is."""
+and tables of other programs. `read_record` finds out which a file is."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -32,9 +32,9 @@ class Record:
 
 
 def read_record(path: Path) -> Record:
-    """Read a recording; its name says which it is: .bin and .log, .tlog, .ulg, .srt, .gpx, .mp4 and .mov, and any other
-    is a table. Raises UsageError for a file that cannot be read, or that has no position."""
-    from edgevpr.tracks import gps, logs, srt, tables
+    """Read a recording; its name says which it is: .bin and .log, .tlog, .ulg, .srt and .gpx, and any other is a
+    table. Raises UsageError for a file that cannot be read, or that has no position."""
+    from edgevpr.tracks import gpx, logs, srt, tables
 
     if not path.is_file():
         raise UsageError(f"There is no file {path}: name a log, a track, subtitles or a table.")
@@ -44,9 +44,7 @@ def read_record(path: Path) -> Record:
         ".tlog": logs.read_telemetry,
         ".ulg": logs.read_px4,
         ".srt": srt.read_subtitles,
-        ".gpx": gps.read_gpx,
-        ".mp4": gps.read_film,
-        ".mov": gps.read_film,
+        ".gpx": gpx.read_gpx,
     }
     record = readers.get(path.suffix.lower(), tables.read_table)(path)
     if not (record.track or record.shots or record.named):

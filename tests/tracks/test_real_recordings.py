@@ -1,4 +1,4 @@
-"""Recordings of real aircraft and cameras, from public projects. They are fetched once, into EDGEVPR_RECORDINGS or the
+"""Recordings of real aircraft, from public projects. They are fetched once, into EDGEVPR_RECORDINGS or the
 cache of this user; without a network the tests are skipped."""
 
 import os
@@ -19,7 +19,6 @@ PX4 = "PX4/pyulog/3cf17793f14709713ab297d3743314c658874068/test"
 PYMAVLINK = "ArduPilot/pymavlink/b4c7ca298cfac46aa841994d5d3288143e2fa7e5/tests"
 VIEWER = "ArduPilot/UAVLogViewer/c048ae207a105540d762a72ef8701565540d8d4a/src/assets"
 GPXPY = "tkrajina/gpxpy/017d9961ee9aa86ccdbf5bb50a4e2341d5c42f4b/test_files"
-GOPRO = "gopro/gpmf-parser/9a7150632892c7356c91145c889016f07b0ed48d/samples"
 AGUNG = "spwoodcock/drone-testdata-agung-2/40b1e3d2a1950b97260c129b120db63d3245e464"
 # Project, commit and file; what it is, how many positions it has, and about where and for how many seconds.
 RECORDINGS = {
@@ -30,7 +29,6 @@ RECORDINGS = {
     f"{PYMAVLINK}/test.BIN": ("ArduPilot", 12, (-35.36, 149.17), 1),
     f"{VIEWER}/vtol.tlog": ("telemetry", 744, (-35.36, 149.16), 208),
     f"{GPXPY}/cerknicko-jezero.gpx": ("GPX", 296, (45.77, 14.36), 7190),
-    f"{GOPRO}/max-heromode.mp4": ("GoPro", 191, (33.13, -117.33), 11),
     f"{AGUNG}/image_metadata.csv": ("GPSLatitude", 1817, (-8.29, 115.46), None),
 }
 
@@ -50,8 +48,6 @@ def fetched(name):
 
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_a_real_recording_is_read(name):
-    if name.endswith(".mp4"):
-        pytest.importorskip("telemetry_parser", reason="it has no wheel for this Python")
     kind, count, where, lasts_s = RECORDINGS[name]
     record = read_record(fetched(name))
     assert kind in record.kind

@@ -1,7 +1,6 @@
 """Reading what recordings say: each format, whole and damaged, and what a reader makes of it."""
 
 import struct
-from importlib.util import find_spec
 
 import pytest
 from recordings import START_S, write_dataflash, write_gpx, write_tlog, write_ulog
@@ -9,7 +8,6 @@ from recordings import START_S, write_dataflash, write_gpx, write_tlog, write_ul
 from edgevpr.core.errors import UsageError
 from edgevpr.tracks.record import read_record
 
-HAS_FILMS, NO_FILMS = find_spec("telemetry_parser") is not None, "telemetry-parser has no wheel for this Python"
 # seconds, lat, lon, alt, height, roll, pitch, yaw
 POINTS = [(t, -35.36 + 1e-4 * t, 149.16 + 2e-4 * t, 600.0 + t, 20.0 + t, 5.0, -3.0, 280.0) for t in range(6)]
 SHOTS = [(t + 0.5, -35.5 + 1e-4 * t, 149.5, 610.0, 30.0, 1.0, 2.0, 90.0) for t in range(3)]
@@ -160,7 +158,6 @@ def test_tables_of_other_programs_are_understood_and_said(tmp_path, text, expect
         ("t.srt", b"", "no position"),
         ("t.srt", b"1\n00:00:01,000 --> 00:00:02,000\n[latitude: 0.0] [longitude: 0.0]\n", "no position"),
         ("t.gpx", b"<gpx", "GPX"),
-        pytest.param("t.mp4", b"nothing", "telemetry", marks=pytest.mark.skipif(not HAS_FILMS, reason=NO_FILMS)),
     ],
 )
 def test_what_is_no_recording_gets_a_sentence(tmp_path, name, content, said):
