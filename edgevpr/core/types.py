@@ -212,9 +212,9 @@ class Steps:
 class QueryCost:
     """Cost of one query by equations 5.1-5.7 of the thesis, for the stages of encoding and matching.
 
-    `t_*_s`: elapsed seconds. `u_*`: utilisation of all cores, 0..1. `cpu_s`: CPU-seconds of both. `rss_mb`: memory of
-    the process now. `pss_mb`: memory with shared pages in proportion, some seconds old (None: unknown). `used_mah`:
-    charge drawn from the battery; `marginal_mah`: the part that would not be drawn without the query.
+    `t_*_s`: elapsed seconds. `u_*`: utilisation of all cores, 0..1. `cpu_s`: CPU-seconds of both. `rss_mb`: resident
+    memory of the process now. `used_mah`: charge drawn from the battery; `marginal_mah`: the part that would not be
+    drawn without the query.
     """
 
     t_encode_s: float = 0.0
@@ -225,7 +225,6 @@ class QueryCost:
     rss_mb: float = 0.0
     used_mah: float = 0.0
     marginal_mah: float = 0.0
-    pss_mb: float | None = None
 
     @property
     def whole(self) -> StageCost:

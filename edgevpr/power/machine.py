@@ -64,13 +64,6 @@ def peak_mb(root: Path = _ROOT) -> float:
     return _kib_line(root / "proc/self/status", "VmHWM:")
 
 
-def pss_mb(root: Path = _ROOT) -> float | None:
-    """Return the memory of this process in MB, with shared pages in proportion (PSS); None if the kernel gives none."""
-    with suppress(OSError):
-        return _kib_line(root / "proc/self/smaps_rollup", "Pss:")
-    return None
-
-
 def text(path: Path) -> str | None:
     """Read a small file and strip zero bytes, line ends and blanks from both ends; None if it cannot be read."""
     try:

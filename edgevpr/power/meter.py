@@ -5,7 +5,6 @@ Energies add up, powers do not (see `equations`, which explains a, s and U). The
 seconds, plus s U t of every stage, is exactly the integral of 5.1 over the flight, in whatever order the stages run.
 """
 
-import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,7 +18,6 @@ from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, stage_energy_j
 
 Clock = Callable[[], float]
-_PSS_EVERY_S = 20.0
 _KEPT_WAITING = 0.15  # of busy time; a thread off the CPU for more was kept waiting by other programs
 
 
@@ -42,26 +40,9 @@ def stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process
         metered.cost = StageCost(wall_clock() - wall_s, cpu_clock() - cpu_s)
 
 
-class OwnMemory:
-    """Reads the memory of this process: RSS, and PSS (with shared pages in proportion). PSS is read at most once in
-    twenty seconds: the kernel walks through all pages for it, which takes some hundredths of the time of a query."""
-
-    def __init__(self, clock: Clock = time.monotonic, read: Callable[[], float | None] = machine.pss_mb) -> None:
-        self._clock, self._read = clock, read
-        self._read_s = -math.inf
-        self._pss_mb: float | None = None
-
-    def look(self) -> tuple[float, float | None]:
-        """Return the RSS now, and the PSS that was read last (None: the kernel does not report it), MB."""
-        now_s = self._clock()
-        if now_s - self._read_s >= _PSS_EVERY_S:
-            self._read_s, self._pss_mb = now_s, self._read()
-        return machine.rss_mb(), self._pss_mb
-
-
 class QueryMeter:
     """Measures the steps of one query after another, and the charge that each query draws from the pack of a board.
-    `wall_clock` and `cpu_clock` (all threads) return seconds, `memory_mb` what `OwnMemory.look` does (None: that)."""
+    `wall_clock` and `cpu_clock` (all threads) return seconds, `memory_mb` the resident memory of this process."""
 
     def __init__(
         self,
@@ -71,12 +52,12 @@ class QueryMeter:
         *,
         wall_clock: Clock = time.perf_counter,
         cpu_clock: Clock = time.process_time,
-        memory_mb: Callable[[], tuple[float, float | None]] | None = None,
+        memory_mb: Callable[[], float] = machine.rss_mb,
     ) -> None:
         self.board = board
         self._pack, self._regulator_efficiency = pack, regulator_efficiency
         self._wall_clock, self._cpu_clock = wall_clock, cpu_clock
-        self._memory_mb = memory_mb or OwnMemory().look
+        self._memory_mb = memory_mb
         self._taken: dict[str, StageCost] = {}
 
     def begin(self) -> None:
@@ -99,9 +80,8 @@ class QueryMeter:
 
     def cost(self) -> QueryCost:
         """Return the cost of the query so far."""
-        steps, (rss_mb, pss_mb) = self.steps(), self._memory_mb()
-        stages, efficiency = (steps.encoding, steps.match), self._regulator_efficiency
-        return query_cost(*stages, self.board, self._pack, efficiency, rss_mb=rss_mb, pss_mb=pss_mb)
+        steps, efficiency = self.steps(), self._regulator_efficiency
+        return query_cost(steps.encoding, steps.match, self.board, self._pack, efficiency, rss_mb=self._memory_mb())
 
 
 def query_cost(
@@ -112,7 +92,6 @@ def query_cost(
     regulator_efficiency: float,
     *,
     rss_mb: float,
-    pss_mb: float | None = None,
 ) -> QueryCost:
     """Compute the cost of one query by equations 5.1-5.6; the energies of both stages are added. Charges are drawn from
     the pack: `used_mah` is (a + s U) t, and `marginal_mah` is s U t, what is added to an idle board."""
@@ -128,7 +107,6 @@ def query_cost(
         rss_mb=rss_mb,
         used_mah=1000 * pack_ah(used_j, pack, regulator_efficiency),
         marginal_mah=1000 * pack_ah(marginal_j, pack, regulator_efficiency),
-        pss_mb=pss_mb,
     )
 
 

@@ -33,7 +33,7 @@ Note = list[Any]  # a line of the tape: a kind, and its values
 _CLOCKS = ("mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s")
 
 # Questions about the machine: in a "what if", the newest answer on the tape is given.
-_MACHINE = ("is_live", "limit_c", "heat", "load", "rss_mb", "memory_mb", "port", "picked", "cannot_learn")
+_MACHINE = ("is_live", "limit_c", "heat", "load", "rss_mb", "port", "picked", "cannot_learn")
 
 _log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from fakes import FakeClock
 from edgevpr.core.types import NO_COST, StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import Pack, parse_pack
-from edgevpr.power.meter import OwnLoad, OwnMemory, QueryMeter, query_cost, stage
+from edgevpr.power.meter import OwnLoad, QueryMeter, query_cost, stage
 
 
 def clock(*readings):
@@ -47,15 +47,6 @@ def test_query_cost_follows_the_closed_form():
     assert cost.used_mah == pytest.approx(1000 * total_j / volt_hours, abs=1e-9)
     assert cost.marginal_mah == pytest.approx(1000 * marginal_j / volt_hours, abs=1e-9)
     assert cost.rss_mb == 80.0
-
-
-def test_own_memory_reads_pss_every_twenty_seconds():
-    now_s, answers = [0.0], iter([80.0, 81.0, None])
-    memory = OwnMemory(lambda: now_s[0], lambda: next(answers))
-    seen = []
-    for now_s[0] in (0.0, 0.1, 19.9, 20.0, 39.9, 40.0, 59.9):
-        seen.append(memory.look()[1])
-    assert seen == [80.0, 80.0, 80.0, 81.0, 81.0, None, None]
 
 
 def test_step_does_not_mask_an_exception_before_its_cost_is_set():

@@ -87,9 +87,6 @@ class TapedMachine(Machine):
     def rss_mb(self) -> float:
         return self._tape.read("rss_mb", super().rss_mb)
 
-    def memory_mb(self) -> tuple[float, float | None]:
-        return self._tape.read("memory_mb", super().memory_mb)
-
     def pick_technique(self, config: Config) -> str | None:
         return self._tape.read("picked", partial(super().pick_technique, config))
 

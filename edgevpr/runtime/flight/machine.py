@@ -7,7 +7,7 @@ from edgevpr.core.config import Config
 from edgevpr.core.errors import MapError
 from edgevpr.power.boards import Board
 from edgevpr.power.machine import rss_mb
-from edgevpr.power.meter import MachineLoad, OwnMemory, machine_load
+from edgevpr.power.meter import MachineLoad, machine_load
 from edgevpr.power.thermal import ThermalState, ThermalWatch, limit_c
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.preflight.pick import Outlook, outlook, pick_technique
@@ -23,7 +23,6 @@ class Machine:
 
     def __init__(self, board: Board, watch: ThermalWatch | None = None) -> None:
         self._watch = watch or ThermalWatch(hot_c=board.thermal_limit_c)
-        self._memory = OwnMemory()
 
     def limit_c(self) -> float:
         """Return the temperature at which this computer slows itself down, degrees Celsius."""
@@ -40,10 +39,6 @@ class Machine:
     def rss_mb(self) -> float:
         """Return the memory that this process takes, MB."""
         return rss_mb()
-
-    def memory_mb(self) -> tuple[float, float | None]:
-        """Return what `OwnMemory.look` does."""
-        return self._memory.look()
 
     def pick_technique(self, config: Config) -> str | None:
         """Return the configured technique (None: that of the map), or for a map yet to be made the best for the

@@ -68,7 +68,7 @@ def _make_query_meter(config: Config, io: FlightIO) -> QueryMeter:
         config.battery.regulator_efficiency,
         wall_clock=io.clock.wall_s,
         cpu_clock=io.clock.process_cpu_s,
-        memory_mb=io.machine.memory_mb,
+        memory_mb=io.machine.rss_mb,
     )
 
 
