@@ -36,7 +36,6 @@ from edgevpr.runtime.flight.startup import (
     choose_rate_hz,
     find_origin,
     log_start,
-    measure_speed,
     open_map,
 )
 from edgevpr.runtime.flight.stop import StopNow
@@ -105,7 +104,7 @@ class Flight:
                 recogniser, learner, cannot_learn = open_map(config, io)
                 stack.callback(recogniser.place_map.close)
                 flight_log = stack.enter_context(_open_log(io))
-                found = measure_speed(recogniser, config, io)
+                found = io.machine.measure_speed(recogniser, config)
             flight_log.write("start", **log_start(config, io, recogniser, found))
             step_s, settings = 1 / choose_rate_hz(config, recogniser), config.mavlink
             navigator = Navigator(settings.min_accuracy_m, step_s, not settings.send_fixes, config.source.gimbal)

@@ -72,13 +72,6 @@ def _make_query_meter(config: Config, io: FlightIO) -> QueryMeter:
     )
 
 
-def measure_speed(recogniser: Recogniser, config: Config, io: FlightIO) -> Outlook:
-    """Measure how fast the technique is on this board, and have as many candidates compared as there is time for."""
-    found = io.machine.measure_speed(recogniser, config)
-    recogniser.change(candidates=found.candidates)
-    return found
-
-
 def choose_rate_hz(config: Config, recogniser: Recogniser) -> float:
     """Return the queries per second: the configured rate, or else that of the board's profile."""
     return config.source.rate_hz or recogniser.meter.board.rate_hz

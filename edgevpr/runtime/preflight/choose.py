@@ -3,16 +3,15 @@
 The accuracy of each technique, for a camera that looks down or forward, is that which `make results` measured on image
 sets. Its figures (accuracy.json) are installed with the program, so that no cost is ever shown without accuracy.
 
-An option is a technique in one form with one number of candidates. Of those that fit the board, the most accurate is
-chosen. A technique that accepted a wrong place on the image sets is never chosen automatically: its fixes would be
-sent.
+An option is a technique in one form. Of those that fit the board, the most accurate is chosen. A technique that accepted
+a wrong place on the image sets is never chosen automatically: its fixes would be sent.
 """
 
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -91,12 +90,10 @@ class Fit:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option:
     """An option to choose (see the module), with its costs on the board and its `fit`. `label` is its unique name,
-    `name` that of the technique. `candidates` is set if they are fewer than the technique's default (None: the
-    default). `accuracy` is None if it was not measured."""
+    `name` that of the technique. `accuracy` is None if it was not measured."""
 
     label: str
     name: str
-    candidates: int | None
     costs: TechniqueCosts
     fit: Fit
     accuracy: Accuracy | None
@@ -115,20 +112,15 @@ class Option:
         return None
 
 
-def list_options(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Iterator[Option]:
-    """Yield the options of the technique `name`: with its default number of candidates, then with each smaller number
-    whose accuracy was measured. `label` is technique and form; `costs` are those on `board`."""
-    smaller = (count for count in list_fewer_candidates(label, demand.camera) if count < (costs.candidates or 0))
-    for candidates in (None, *smaller):
-        option_costs = replace(costs, candidates=candidates or costs.candidates)
-        yield Option(
-            label=_label(label, candidates),
-            name=name,
-            candidates=candidates,
-            costs=option_costs,
-            fit=check_fit(board, option_costs, demand),
-            accuracy=find_accuracy(label, demand.camera, candidates),
-        )
+def make_option(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Option:
+    """Make the option of the technique `name`. `label` is technique and form; `costs` are those on `board`."""
+    return Option(
+        label=label,
+        name=name,
+        costs=costs,
+        fit=check_fit(board, costs, demand),
+        accuracy=find_accuracy(label, demand.camera),
+    )
 
 
 def find_accuracy(label: str, camera: str | None, candidates: int | None = None) -> Accuracy | None:

@@ -12,7 +12,7 @@ from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, pack_ah, queries_ah
 from edgevpr.power.meter import query_cost
 from edgevpr.power.speed import Speed
-from edgevpr.runtime.preflight.choose import Demand, Option, choose_best, explain_no_choice, list_options
+from edgevpr.runtime.preflight.choose import Demand, Option, choose_best, explain_no_choice, make_option
 from edgevpr.runtime.preflight.scale import SAME_MACHINE, count_work, on_board
 from edgevpr.runtime.preflight.trial import Trial
 
@@ -77,8 +77,7 @@ def estimate(board: Board, ratio: Speed | None, trials: Iterable[Trial], plan: F
     for trial in trials:
         if trial.costs:
             costs = on_board(trial.costs, board, ratio, count_work(trial.name, trial.parameters))
-            options = list_options(board, trial.label, trial.name, costs, plan)
-            rows += [_estimate_option(option, board, plan) for option in options]
+            rows.append(_estimate_option(make_option(board, trial.label, trial.name, costs, plan), board, plan))
     recommended, reason = _recommend(rows, board, plan)
     weights = dict.fromkeys(f"Weights of {trial.weights}." for trial in trials if trial.weights)
     return FlightEstimate(

@@ -16,8 +16,8 @@ from edgevpr.runtime.preflight.choose import (
     explain_no_choice,
     find_accuracy,
     list_fewer_candidates,
-    list_options,
     list_preferred,
+    make_option,
 )
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe, ram_bytes
 from edgevpr.runtime.preflight.scale import compare_speed, count_work, on_board
@@ -31,11 +31,9 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True)
 class Outlook:
     """Expectation of a flight, made before it. `reason`: the technique that is used and why, in one line for the log.
-    `candidates`: number of places to compare a query with. `t_query_s`: seconds that a query will take (None: the
-    technique could not be tried)."""
+    `t_query_s`: seconds that a query will take (None: the technique could not be tried)."""
 
     reason: str
-    candidates: int
     t_query_s: float | None
 
 
@@ -55,7 +53,7 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
         except ModelError as error:
             _log.warning("technique %s is passed over: %s", name, error)
             continue
-        options += list_options(board, _label(technique.spec), name, _measure_costs(technique, board), demand)
+        options.append(make_option(board, _label(technique.spec), name, _measure_costs(technique, board), demand))
     if not options:
         raise ModelError("No technique can be used here (see above): correct what it names, or name another one.")
     chosen = choose_best(options, board)
@@ -68,15 +66,12 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
 
 
 def outlook(recogniser: Recogniser, config: Config) -> Outlook:
-    """Report the technique that the flight uses and why, and measure now whether the board can afford it. If it cannot,
-    the number of candidates is reduced to the largest trusted one that fits, unless the configuration sets the number
-    (see `choose`). A failed measurement is only reported: it must not prevent a flight."""
-    technique = recogniser.technique
-    usual = candidates = recogniser.candidates or technique.candidates
-    t_query_s = None
+    """Report the technique that the flight uses and why, and measure now whether the board can afford it. A failed
+    measurement is only reported: it must not prevent a flight."""
+    technique, t_query_s = recogniser.technique, None
     try:
-        option, cost = _find_affordable(recogniser, config)
-        t_query_s, candidates = option.fit.t_query_s, option.candidates or candidates
+        option, cost = _measure_option(recogniser, config)
+        t_query_s = option.fit.t_query_s
     except (MapError, ModelError, OSError) as error:  # OSError: the trial map needs a little room for temporary files
         cost = f"what it takes could not be tried ({error})"
     parts = ["the map was built with it" if config.technique is None else "it was named"]
@@ -84,14 +79,11 @@ def outlook(recogniser: Recogniser, config: Config) -> Outlook:
         parts.append(f"weights of {weights}")
     if left_out := len(recogniser.place_map) - len(recogniser.index):
         parts.append(f"{left_out} places are left to the map file")
-    if candidates != usual:
-        parts.append(f"{candidates} candidates instead of {usual}")
-    return Outlook(f"technique {_label(technique.spec)}: {'; '.join([*parts, cost])}", candidates, t_query_s)
+    return Outlook(f"technique {_label(technique.spec)}: {'; '.join([*parts, cost])}", t_query_s)
 
 
-def _find_affordable(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
-    """Return two things: the technique with the number of candidates that the flight will compare, as an option; and
-    its accuracy and cost as text."""
+def _measure_option(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
+    """Return two things: the technique of a flight as an option; and its accuracy and cost as text."""
     board, spec = recogniser.meter.board, recogniser.technique.spec
     costs = _measure_costs(recogniser.technique, board)
     costs = replace(
@@ -105,9 +97,7 @@ def _find_affordable(recogniser: Recogniser, config: Config) -> tuple[Option, st
         budget_mb=budget_mb(config, board),
         camera=_camera(spec),
     )
-    option, *fewer = list_options(board, _label(spec), spec.name, costs, demand)
-    if option.fit.misfit and config.match.candidates is None and recogniser.sequence == 1:
-        option = next((smaller for smaller in fewer if not smaller.objection), option)
+    option = make_option(board, _label(spec), spec.name, costs, demand)
     return option, describe_option(board, option, demand)
 
 

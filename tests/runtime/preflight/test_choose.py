@@ -25,8 +25,8 @@ from edgevpr.runtime.preflight.choose import (
     explain_no_choice,
     find_accuracy,
     list_fewer_candidates,
-    list_options,
     list_preferred,
+    make_option,
 )
 from edgevpr.runtime.preflight.probe import probe
 
@@ -36,14 +36,14 @@ COSTS = {"regions": REGIONS, "vector": VECTOR}
 @pytest.fixture
 def accuracies(monkeypatch):
     """Regions find more than vectors; a test may change it."""
-    table = {"regions": found(0.9), "regions, 10 candidates": found(0.8), "vector": found(0.5)}
+    table = {"regions": found(0.9), "vector": found(0.5)}
     monkeypatch.setattr(choosing, "_accuracies", lambda: {"forward": table, "nadir": {}})
     return table
 
 
 def options_of(board, costs, places):
     demand = Demand(places=places, rate_hz=1.0, budget_mb=100)
-    return [option for name, cost in costs.items() for option in list_options(board, name, name, cost, demand)]
+    return [make_option(board, name, name, cost, demand) for name, cost in costs.items()]
 
 
 def fit(board, costs, places, rate_hz=1.0):
@@ -121,15 +121,6 @@ def test_choose_best_takes_the_most_accurate_that_fits(accuracies):
     del accuracies["regions"]
     assert chosen(board(), COSTS, 100) == "vector", "what was never measured"
     assert chosen(board(technique="regions"), COSTS, 100) == "regions", "but the board names it"
-
-
-def test_choose_best_takes_fewer_candidates_before_another_technique(accuracies):
-    two_stages = {**COSTS, "regions": dataclasses.replace(REGIONS, candidates=400)}
-    assert chosen(board(), two_stages, places=200) == "regions"
-    assert chosen(board(), two_stages, places=300) == "regions, 10 candidates"
-    assert [option.label for option in options_of(board(), COSTS, 300)] == ["regions", "vector"], "of one stage"
-    few = {"regions": dataclasses.replace(REGIONS, candidates=10)}
-    assert [option.label for option in options_of(board(), few, 300)] == ["regions"], "ten are no fewer"
 
 
 def test_choose_best_never_takes_what_has_accepted_wrong_places(accuracies):
