@@ -1,7 +1,7 @@
 """`edgevpr profile` as a user meets it: before the flight, and on which board."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,7 +10,6 @@ from example_costs import REGIONS, VECTOR
 
 from edgevpr import techniques
 from edgevpr.cli.main import main
-from edgevpr.core.errors import EdgevprError
 from edgevpr.core.types import StageCost
 from edgevpr.power import speed
 from edgevpr.power.boards import board_names
@@ -32,13 +31,15 @@ def tried(monkeypatch):
     """What was tried, by trials that take no time."""
     asked = []
 
-    def answer(module, job, limit_s, what):
-        asked.extend(each["label"] for each in job["trials"])
-        if job["trials"][0]["name"] == "calc":
-            raise EdgevprError("There is no model `calc`.")
-        return [{**each, "costs": asdict(HOG if each["name"] == "hog" else COSTS)} for each in job["trials"]]
+    def answer(wanted, threads):
+        for offer in wanted:
+            asked.append(offer.label)
+            if offer.label == "calc":
+                yield replace(offer, problem="There is no model `calc`.")
+            elif offer.name != "calc":
+                yield replace(offer, costs=HOG if offer.name == "hog" else COSTS)
 
-    monkeypatch.setattr(trial, "ask_child", answer)
+    monkeypatch.setattr(trial, "try_each", answer)
     monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog", "seqslam", "calc"))
     counts = {"sets": 2, "queries": 90, "asked": 90, "accepted": 9, "accepted_wrong": 0, "accepted_elsewhere": 0}
     recalls = {"cohog": 0.9, "hog": 0.4, "hog 8bit": 0.4, "hog 1bit": 0.3, "seqslam": 0.5}

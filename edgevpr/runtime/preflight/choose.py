@@ -3,8 +3,8 @@
 The accuracy of each technique, for a camera that looks down or forward, is that which `make results` measured on image
 sets. Its figures (accuracy.json) are installed with the program, so that no cost is ever shown without accuracy.
 
-An option is a technique in one form. Of those that fit the board, the most accurate is chosen. A technique that accepted
-a wrong place on the image sets is never chosen automatically: its fixes would be sent.
+An option is a technique in one form. Of those that fit the board, the most accurate is chosen. A technique that
+accepted a wrong place on the image sets is never chosen automatically: its fixes would be sent.
 """
 
 import json

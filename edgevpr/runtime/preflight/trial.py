@@ -1,26 +1,27 @@
 """Trials of techniques, each in a child process with all its forms: the memory that one has loaded is not counted for
-another, and a library that crashes on this processor fails only its own trials.
-
-`python -m edgevpr.runtime.preflight.trial` is that child process: it reads a job as JSON and prints Trials as JSON.
-"""
+another, and a library that crashes on this processor fails only its own trials."""
 
 import ctypes
 import gc
+import os
+import signal
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field, replace
 from itertools import groupby
+from multiprocessing import get_context
 from typing import Any
 
 from edgevpr import techniques
-from edgevpr.core.child import ask_child, serve_parent
-from edgevpr.core.config import FORMS, build
+from edgevpr.core.child import end_with_parent
+from edgevpr.core.config import FORMS
 from edgevpr.core.errors import EdgevprError
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.recognise.opening import made_for
 from edgevpr.techniques.card import find_weights
 
 _TRIED_S = 0.5  # pictures are tried again for so long; twice as long finds the same. A check has no time for that
-_LIMIT_S = 900.0  # ten times what the slowest technique takes on the slowest board
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,30 +63,32 @@ def try_each(wanted: Sequence[Trial], threads: int) -> Iterator[Trial]:
     that cannot be used has one result, labelled with its name. `threads`: number of threads for networks."""
     for name, forms in groupby(wanted, lambda trial: trial.name):
         trials = list(forms)
-        job = {"threads": threads, "trials": [asdict(trial) for trial in trials]}
-        try:
-            answer = ask_child("edgevpr.runtime.preflight.trial", job, _LIMIT_S, f"Trying {name}")
-        except EdgevprError as error:
-            yield replace(trials[0], label=name, problem=str(error))
-        else:
-            yield from (build(Trial, tried, "a trial") for tried in answer)
+        with ProcessPoolExecutor(1, get_context("spawn"), _begin_child, (os.getpid(),)) as pool:
+            try:
+                yield from pool.submit(_try_here, trials, threads).result()
+            except EdgevprError as error:
+                yield replace(trials[0], label=name, problem=str(error))
+            except BrokenProcessPool:
+                why = f"Trying {name} ended its process: memory ran out, or a library does not suit this processor."
+                yield replace(trials[0], label=name, problem=why)
 
 
-def _try_here(job: dict[str, Any]) -> list[dict[str, Any]]:
+def _begin_child(parent_pid: int) -> None:
+    end_with_parent(parent_pid)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it without a traceback of its own
+    os.dup2(2, 1)  # what a library prints does not go into the answer of the program
+
+
+def _try_here(trials: list[Trial], threads: int) -> list[Trial]:
     tried = []
-    for content in job["trials"]:
-        offer = build(Trial, content, "a trial")
-        technique = made_for(job["threads"], offer.name, offer.settings)
+    for offer in trials:
+        technique = made_for(threads, offer.name, offer.settings)
         costs = probe(technique, tried_s=_TRIED_S)
         spec = technique.spec
-        tried.append(asdict(replace(offer, costs=costs, weights=find_weights(spec), parameters=spec.parameters)))
+        tried.append(replace(offer, costs=costs, weights=find_weights(spec), parameters=spec.parameters))
         # What a form has taken is given back, or it would be counted for the next one.
         del technique
         gc.collect()
         if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # musl has none
             trim(0)
     return tried
-
-
-if __name__ == "__main__":
-    serve_parent(_try_here)

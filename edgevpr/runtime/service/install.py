@@ -27,7 +27,15 @@ NAME = "edgevpr"  # of the package, its command, the service, its user and the u
 _VENV = "opt/edgevpr"  # below the root; not below /home, which the service cannot see
 _UNFINISHED = "unfinished"  # the file that is in the environment while packages are installed
 _SHIPPED = ("profiles", "models", "deploy")
-_SCRIPT = "#!{python}\nimport sys\n\nfrom edgevpr.cli.main import program\n\nsys.exit(program())\n"
+_SCRIPT = """\
+#!{python}
+import sys
+
+from edgevpr.cli.main import program
+
+if __name__ == "__main__":
+    sys.exit(program())
+"""
 _AGAIN = "correct that and run it again: what is done stays"
 _CONFIG = "etc/edgevpr/config.yaml"
 _UNIT, _RULES = "etc/systemd/system/edgevpr.service", "etc/udev/rules.d/99-edgevpr.rules"
