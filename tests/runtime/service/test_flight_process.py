@@ -15,7 +15,7 @@ from flights import PLACES, STEP_DEG, of_kind
 from mavlink_peers import free_port
 
 from edgevpr.cli.main import main
-from edgevpr.runtime.flight import startup
+from edgevpr.runtime.flight import machine
 from edgevpr.runtime.flight.flightlog import read_log
 
 pytestmark = pytest.mark.process
@@ -136,7 +136,7 @@ def test_run_ends_by_a_signal_before_the_flight(recording, tmp_path, monkeypatch
         time.sleep(60)
         pytest.fail("it went on computing")
 
-    monkeypatch.setattr(startup, "outlook", computing)
+    monkeypatch.setattr(machine, "outlook", computing)
     place_map, images, log = recording / "cohog.gpkg", recording / "seen" / "images", tmp_path / "f.jsonl"
     with caplog.at_level("INFO"):
         assert main(["run", "--map", str(place_map), "--source", str(images), "--log", str(log)]) == 0
