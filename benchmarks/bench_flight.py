@@ -27,6 +27,12 @@ IDLE_S = 10.0
 SETTLE_S = 2.0
 NOBODY = "rtsp://127.0.0.1:9/nobody"
 FLAGS = ["--link", "udpout:127.0.0.1:9"]
+MATCH_BY = {
+    "edgevpr.Map": "import cv2, edgevpr, sys; m = edgevpr.Map(sys.argv[1]); "
+    "[m.match(cv2.imread(f'{sys.argv[2]}/{name}')) for name in sorted(__import__('os').listdir(sys.argv[2]))]",
+    "edgevpr match": "from edgevpr.cli.main import main; import sys; "
+    "main(['match', sys.argv[1], '--images', sys.argv[2]])",
+}
 NEVER_IMPORTED = ["onnxruntime", "matplotlib"]
 
 
@@ -47,6 +53,7 @@ def rows() -> list[Row]:
             *memory_rows(place_map, frames, folder),
             *start_rows(place_map, frames, folder),
             *idle_rows(place_map, frames, folder),
+            library_row(place_map, frames),
         ]
 
 
@@ -84,6 +91,19 @@ def idle_rows(place_map: Path, frames: Path, folder: Path) -> list[Row]:
         row_of("idle CPU, stream not there", 100 * absent, "% of a core", 2.0),
         row_of("idle CPU, between two frames", 100 * waiting, "% of a core", 2.0),
     ]
+
+
+def library_row(place_map: Path, frames: Path) -> Row:
+    """Processor time of the Python interface over that of the command line, each a process of its own."""
+    environment = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
+    used_s = []
+    for code in MATCH_BY.values():
+        before = os.times()
+        words = [sys.executable, "-c", code, str(place_map), str(frames)]
+        subprocess.run(words, check=True, capture_output=True, env=environment)
+        after = os.times()
+        used_s.append(after.children_user + after.children_system - before.children_user - before.children_system)
+    return row_of("processor time, edgevpr.Map over edgevpr match", used_s[0] / used_s[1], "times", 1.2)
 
 
 def start_s(place_map: Path, frames: Path, folder: Path) -> float:

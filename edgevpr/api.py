@@ -10,23 +10,31 @@ may change from version to version; this may not.
 """
 
 import logging
+import math
+import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
+from threadpoolctl import ThreadpoolController
+
+from edgevpr.core import text
 from edgevpr.core.arrays import Covariance, Image
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.reasons import Reason
-from edgevpr.core.text import progress
 from edgevpr.core.types import Frame, Place, Position
 from edgevpr.mapmaking.making import Cuttings, FlownPictures, MadeMap, MapOrder, make_map
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
+
+Progress = Callable[[int, int, str], None]  # called with the number done, of how many, and of which work
+T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
@@ -88,13 +96,14 @@ class Map:
         accept_precision: float | None = None,
         follow: bool = False,
     ) -> None:
-        wanted = {"map": str(path), "source.fov_deg": fov_deg, "match.accept_precision": accept_precision}
+        wanted = {"map": _path_of(path), "source.fov_deg": fov_deg, "match.accept_precision": accept_precision}
         settings = load_config(config, wanted)
         source = settings.source
         known = ("heading", "height", "reach") if source.fov_deg or source.lens else ("heading", "reach")
         self._recogniser = open_recogniser(settings, load_board(settings.board), known=known, follows=follow)
         is_nadir = self._recogniser.technique.spec.looks_down
         self._needs_height = source.fov_deg is not None or (source.lens is not None and is_nadir)
+        self._is_open, self._threads = True, ThreadpoolController()
 
     def __enter__(self) -> "Map":
         return self
@@ -107,6 +116,7 @@ class Map:
 
     def close(self) -> None:
         """Close the file."""
+        self._is_open = False
         self._recogniser.place_map.close()
 
     def places(self) -> Iterator[Place]:
@@ -130,8 +140,17 @@ class Map:
         `fov_deg` or a `lens` in the configuration. `roll_deg`, `pitch_deg`: as in `Frame`. `near`: places within 300 m
         of it are searched, and a few others in case that is wrong. `t_s`: when it was taken, seconds of any clock
         (None: now); it counts with `follow`. Raises ImageError for a picture that cannot be used, UsageError for a
-        missing height.
+        missing height or a value that is none.
         """
+        if not self._is_open:
+            raise UsageError("The map is closed: match within its `with` block, or before close().")
+        _check_image(image)
+        numbers = {"heading_deg": heading_deg, "height_m": height_m, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
+        for name, value in {**numbers, "t_s": t_s}.items():
+            if value is not None and not (isinstance(value, int | float | np.number) and math.isfinite(value)):
+                raise UsageError(f"{name} is {value!r}: give a finite number, or None if it is unknown.")
+        if near is not None and not isinstance(near, Position):
+            raise UsageError(f"near is {near!r}: give edgevpr.core.types.Position(lat_deg, lon_deg).")
         if self._needs_height and height_m is None:
             raise UsageError("The map was opened with a field of view: give the height_m of each picture too.")
         frame = Frame(
@@ -144,7 +163,9 @@ class Map:
             pitch_deg=pitch_deg,
             height_m=height_m,
         )
-        event = self._recogniser.step(frame)
+        # Products of small matrices gain nothing from more threads, which spin: they took eight times the processor.
+        with self._threads.limit(limits=1, user_api="blas"):
+            event = self._recogniser.step(frame)
         if event.failed:
             raise ImageError(str(event.reason))
         return _match_of(event)
@@ -177,19 +198,47 @@ def build(
     config: str | Path | None = None,
     refine: bool = True,
     calibrate: bool = True,
+    progress: Progress | None = None,
 ) -> MadeMap:
-    """Make a map as `edgevpr map build` does, and show the progress on stderr.
+    """Make a map as `edgevpr map build` does. `progress` is called after each picture (None: it is shown on stderr).
 
     `images`: a folder of pictures or a video; `FlownPictures` say more of them, and `Cuttings` take an orthophoto.
     `camera`: "nadir" or "forward". `technique`: None chooses it. `config`: a configuration of the flight (None: the
     shipped one). Pictures that cannot be used are left out with a warning. Raises EdgevprError.
     """
-    pictures = images if isinstance(images, FlownPictures | Cuttings) else FlownPictures(source=str(images))
+    pictures = images if isinstance(images, FlownPictures | Cuttings) else FlownPictures(source=_path_of(images))
     order = MapOrder(
-        path=str(path), pictures=pictures, technique=technique, parameters={}, refine=refine, calibrate=calibrate
+        path=_path_of(path), pictures=pictures, technique=technique, parameters={}, refine=refine, calibrate=calibrate
     )
     settings = load_config(config, {"source.camera": camera})
-    return make_map(order, settings, lambda error: _log.warning("%s", error), progress)
+    shown = text.progress if progress is None else _reported_to(progress)
+    with ThreadpoolController().limit(limits=1, user_api="blas"):
+        return make_map(order, settings, lambda error: _log.warning("%s", error), shown)
+
+
+def _reported_to(progress: Progress) -> Any:
+    def shown(items: Iterable[T], total: int, label: str) -> Iterator[T]:
+        for done, item in enumerate(items, 1):
+            yield item
+            progress(done, total, label)
+
+    return shown
+
+
+def _path_of(path: object) -> str:
+    if not isinstance(path, str | os.PathLike):
+        raise UsageError(f"A path is {path!r}: give text or a pathlib.Path.")
+    return os.fspath(path)
+
+
+def _check_image(image: object) -> None:
+    """Raise ImageError for anything but a picture."""
+    wanted = "give a NumPy array of uint8, (H, W) grey or (H, W, 3) blue, green, red, as cv2.imread returns"
+    if not isinstance(image, np.ndarray):
+        hint = " (None: the file could not be read)" if image is None else ""
+        raise ImageError(f"The picture is of type {type(image).__name__}: {wanted}{hint}.")
+    if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.ndim < 2 or 0 in image.shape:
+        raise ImageError(f"The picture is {image.dtype} of shape {image.shape}: {wanted}.")
 
 
 __all__ = ("Cuttings", "FlownPictures", "Map", "Match", "build")

@@ -47,7 +47,11 @@ def flight(tmp_path_factory):
 @pytest.fixture(scope="module")
 def valley(flight):
     path = flight / "valley.gpkg"
-    made = edgevpr.build(path, flight / "mapped", camera="nadir", calibrate=False)
+    done = []
+    made = edgevpr.build(
+        path, flight / "mapped", camera="nadir", calibrate=False, progress=lambda *step: done.append(step)
+    )
+    assert done[:PLACES] == [(number, PLACES, "mapping") for number in range(1, PLACES + 1)]
     assert (made.technique, made.places, made.with_position) == ("cohog", PLACES, PLACES)
     return path
 
@@ -85,8 +89,23 @@ def test_map_match_uses_what_is_known(flight, valley):
 def test_interface_raises_errors_of_edgevpr(flight, valley, tmp_path):
     with pytest.raises(MapError, match="nowhere"):
         edgevpr.Map(tmp_path / "nowhere.gpkg")
-    with edgevpr.Map(valley) as ground, pytest.raises(ImageError):
-        ground.match(None)
+    with edgevpr.Map(valley) as ground:
+        for image in (None, "x.jpg", [[1, 2]], *(np.zeros(shape, np.uint8) for shape in ((9,), (3, 9, 9), (0, 9)))):
+            with pytest.raises(ImageError, match="of uint8"):
+                ground.match(image)
+        for kind in (np.float64, np.uint16):
+            with pytest.raises(ImageError, match="of uint8"):
+                ground.match(seen(1).astype(kind))
+        for known in ({"heading_deg": "north"}, {"height_m": float("nan")}, {"near": (50.0, 8.0)}, {"t_s": "now"}):
+            with pytest.raises(UsageError, match=next(iter(known))):
+                ground.match(seen(1), **known)
+    with pytest.raises(UsageError, match="closed"):
+        ground.match(seen(1))
+    for wrong in (None, 3):
+        with pytest.raises(UsageError, match="path"):
+            edgevpr.Map(wrong)
+        with pytest.raises(UsageError, match="path"):
+            edgevpr.build(tmp_path / "m.gpkg", wrong)
     with edgevpr.Map(valley, fov_deg=60) as ground, pytest.raises(UsageError, match="height_m"):
         ground.match(seen(1))
     with pytest.raises(SourceError, match="nothing"):
