@@ -1,8 +1,8 @@
-"""`edgevpr service`: prints the unit of the service; makes its user, folders, program, configuration, unit and udev
-rules, and removes them again. Maps, flight logs and the configuration stay.
+"""`edgevpr service`: prints the unit of the service; makes its user, folders, configuration, unit and udev rules, and
+removes them again. Maps, flight logs and the configuration stay.
 
-The program is a virtual environment (`venv`) with a copy of the running edgevpr and the packages that it needs. Each
-step may be repeated, so that a run after an interrupted one completes the work."""
+The program is the running edgevpr, which pip has installed in a virtual environment (deploy/README.md). Each step may
+be repeated, so that a run after an interrupted one completes the work."""
 
 import os
 import platform
@@ -12,11 +12,8 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from functools import partial
-from importlib import util
 from pathlib import Path
 
-import edgevpr
-from edgevpr import __version__
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.files import shipped, write_whole
@@ -25,17 +22,6 @@ from edgevpr.power.boards import Board, load_board
 
 NAME = "edgevpr"  # of the package, its command, the service, its user and the user's group
 _VENV = "opt/edgevpr"  # below the root; not below /home, which the service cannot see
-_UNFINISHED = "unfinished"  # the file that is in the environment while packages are installed
-_SHIPPED = ("profiles", "models", "deploy")
-_SCRIPT = """\
-#!{python}
-import sys
-
-from edgevpr.cli.main import program
-
-if __name__ == "__main__":
-    sys.exit(program())
-"""
 _AGAIN = "correct that and run it again: what is done stays"
 _CONFIG = "etc/edgevpr/config.yaml"
 _UNIT, _RULES = "etc/systemd/system/edgevpr.service", "etc/udev/rules.d/99-edgevpr.rules"
@@ -84,7 +70,7 @@ def install(config: Path | None, dry_run: bool, say: Callable[[str], None], root
     written = config or (there if there.exists() else None)
     content = written.read_bytes() if written else _FIRST_CONFIG.encode()
     unit = render_unit(load_board(load_config(written).board if written else "this"))
-    rules, venv = (shipped("deploy") / "99-edgevpr.rules").read_bytes(), root / _VENV
+    rules = (shipped("deploy") / "99-edgevpr.rules").read_bytes()
     steps: tuple[Step, ...] = (
         (f"system user {NAME}, without a login, in the groups {_GROUPS}", _make_user),
         *(
@@ -92,9 +78,6 @@ def install(config: Path | None, dry_run: bool, say: Callable[[str], None], root
             for name in (_MAPS, _LOGS)
         ),
         (f"configuration in /{_CONFIG}", lambda: _put(root / _CONFIG, content)),
-        (f"virtual environment in /{_VENV}", lambda: _make_environment(venv)),
-        ("packages of requirements.lock, by their hashes", lambda: _install_packages(venv)),
-        (f"edgevpr {__version__}", lambda: _copy_edgevpr(venv)),
         (f"unit, with the limits of the board, in /{_UNIT}", lambda: _put(root / _UNIT, unit.encode())),
         (f"udev rules in /{_RULES}", lambda: _put(root / _RULES, rules)),
         ("systemd has read the unit", lambda: _reload_units(root)),
@@ -140,11 +123,16 @@ def _take_steps(steps: Iterable[Step], dry_run: bool, say: Callable[[str], None]
 
 def _require_right_to_change(root: Path) -> None:
     _require_root(root)
+    if Path(sys.prefix).resolve() != (root / _VENV).resolve():
+        raise UsageError(
+            f"The service runs the edgevpr in /{_VENV}, and this one is in {sys.prefix}: install it there by pip "
+            f"(deploy/README.md), and run /{_VENV}/bin/edgevpr service install."
+        )
     for folder in _HIDDEN_FROM_THE_SERVICE if root == Path("/") else ():
         if Path(sys.base_prefix).resolve().is_relative_to(folder):
             raise EdgevprError(
-                f"The service cannot see {sys.base_prefix}, where this Python is: install edgevpr with the system's "
-                "(/usr/bin/python3 -m venv) and run it from there."
+                f"The service cannot see {sys.base_prefix}, where this Python is: make /{_VENV} with the system's "
+                "(/usr/bin/python3 -m venv)."
             )
     if _succeeds("systemctl", "is-active", "--quiet", NAME):
         raise EdgevprError(f"The service runs: `systemctl stop {NAME}` on the ground, then run it again.")
@@ -182,11 +170,11 @@ def _reload_rules() -> None:
     _run("udevadm", "trigger", *(f"--subsystem-match={name}" for name in subsystems))
 
 
-def _run(*words: str | Path, **environment: str) -> None:
-    """Run a program, `words` being its name and arguments, with `environment` added to our variables. If it fails,
-    raise EdgevprError with the last line of its output."""
+def _run(*words: str | Path) -> None:
+    """Run a program, `words` being its name and arguments. If it fails, raise EdgevprError with the last line of its
+    output."""
     path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"  # `su` leaves those two out
-    name, variables = Path(words[0]).name, {**os.environ, "PATH": path, **environment}
+    name, variables = Path(words[0]).name, {**os.environ, "PATH": path}
     try:
         done = subprocess.run(
             words, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", env=variables
@@ -195,9 +183,8 @@ def _run(*words: str | Path, **environment: str) -> None:
         raise EdgevprError(f"{name} is not on this machine; {_AGAIN}.") from error
     if done.returncode:
         lines = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip()]
-        errors = [line for line in lines if line.startswith("ERROR: ")]  # pip's: its last line may advise an upgrade
-        problem = (errors or lines or [f"exit code {done.returncode}"])[-1]
-        raise EdgevprError(f"{name}: {problem.removeprefix('ERROR: ').rstrip('.')}; {_AGAIN}.")
+        problem = (lines or [f"exit code {done.returncode}"])[-1]
+        raise EdgevprError(f"{name}: {problem.rstrip('.')}; {_AGAIN}.")
 
 
 def _succeeds(*words: str | Path) -> bool:
@@ -206,50 +193,6 @@ def _succeeds(*words: str | Path) -> bool:
         return subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True).returncode == 0
     except OSError:
         return False
-
-
-def _make_environment(venv: Path) -> None:
-    """Make the virtual environment; if an interrupted run has left it unfinished, or an upgrade of the system has taken
-    its Python, make it anew."""
-    if util.find_spec("ensurepip") is None:
-        raise EdgevprError("Python's venv module is missing: `apt install python3-venv`, then run it again.")
-    is_own = (venv / "pyvenv.cfg").is_file()
-    if not is_own and venv.exists() and any(venv.iterdir()):
-        raise EdgevprError(f"{venv} is not a virtual environment: move it away.")
-    if Path(sys.prefix).resolve() == venv.resolve():  # it is this very program
-        return
-    if (venv / _UNFINISHED).exists() or not _succeeds(venv / "bin" / "python", "-I", "-m", "pip", "--version"):
-        _run(sys.executable, "-I", "-m", "venv", *(("--clear",) if is_own else ()), venv)
-
-
-def _install_packages(venv: Path) -> None:
-    """Install the packages that edgevpr needs, and check them by their hashes. Without a network this succeeds if all
-    are installed already."""
-    pip = (venv / "bin" / "python", "-I", "-m", "pip", "--disable-pip-version-check", "--no-input", "install")
-    lock = shipped("deploy") / "requirements.lock"
-    (venv / _UNFINISHED).touch()
-    try:  # /tmp may be memory, of which a small board has too little
-        _run(*pip, "--require-hashes", "--only-binary", ":all:", "--requirement", lock, TMPDIR=str(venv))
-    finally:
-        (venv / _UNFINISHED).unlink()
-
-
-def _copy_edgevpr(venv: Path) -> None:
-    """Copy the running edgevpr, a checkout or an installed one, into the environment, and compile it for a quick start.
-    This needs no network and no tool to build it."""
-    (site,) = venv.glob("lib/python3*/site-packages")
-    room = venv / "new"
-    shutil.rmtree(room, ignore_errors=True)
-    without_bytecode = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(Path(edgevpr.__file__).parent, room, ignore=without_bytecode)
-    for kind in _SHIPPED:  # in a checkout they lie beside the package
-        shutil.copytree(shipped(kind), room / "shipped" / kind, ignore=without_bytecode, dirs_exist_ok=True)
-    shutil.rmtree(site / NAME, ignore_errors=True)
-    room.rename(site / NAME)
-    script = venv / "bin" / NAME
-    script.write_text(_SCRIPT.format(python=venv / "bin" / "python"), "utf-8")
-    script.chmod(0o755)
-    _run(venv / "bin" / "python", "-I", "-m", "compileall", "-q", site / NAME)
 
 
 def _remove_environment(venv: Path) -> None:
