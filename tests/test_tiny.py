@@ -21,4 +21,4 @@ def test_flight_from_pictures_to_a_fix(tmp_path):
     assert [flight.end[each] for each in ("queries", "accepted", "unusable")] == [2, 1, 0]
     assert (known["place"], known["accepted"], known["fix"]["sent"]) == (4, True, True)
     assert (answer["kind"], answer["query"], answer["result"]) == ("answer", known["query"], "ACCEPTED")
-    assert (unknown["accepted"], unknown["fix"], unknown["last_fix"]["answer"]) == (False, None, "ACCEPTED")
+    assert (unknown["accepted"], unknown["fix"]) == (False, None)

@@ -39,10 +39,7 @@ class ReasonCode(Enum):
     LOW_TEXTURE = "too little texture in the image", "{summary}: {usable:.0%} usable, {needed:.0%} needed"
     TILTED = "the image is not levelled", "{summary}: it is tilted {tilt_deg:.0f} degrees"
     TILTED_WITHOUT_HEADING = "the image is not levelled", "{summary}: tilted {tilt_deg:.0f} degrees, heading unknown"
-    TILTED_OFF_GROUND = (
-        "the image is not levelled",
-        "{summary}: it shows {shown:.0%} of the ground under it at a tilt of {tilt_deg:.0f} degrees",
-    )
+    TILTED_OFF_GROUND = "the image is not levelled", "{summary}: {shown:.0%} of the ground at {tilt_deg:.0f} degrees"
     NOT_MEMORABLE = "not memorable", "{summary}: {measure} {score:.2f}, {needed:.2f} needed"
     EMPTY_MAP = "the map has no place yet"
     UNUSABLE = "unusable", "{problem}"
@@ -61,18 +58,15 @@ class ReasonCode(Enum):
     TRACK_CONTRADICTS = "the track filter contradicts it", "{summary}: ", *_FIGURES
     TURNED_AGREES = "the same place agrees nearly as well if the picture is turned otherwise", "{summary}: ", *_FIGURES
     ELSEWHERE_AT_REST = "places elsewhere have not moved either", "{summary}: is it a display? mask it (`source.mask`)"
-    LANDMARKS_DISAGREE = (
-        "landmarks and regions disagree on the offset",
-        "{summary}: {landmarks:.0f} landmarks support another one",
-    )
+    LANDMARKS_DISAGREE = "landmarks and regions disagree on the offset", "{summary}: {landmarks:.0f} are for another"
     FEW_LANDMARKS = "too few landmarks agree", "{summary}: {landmarks:.0f}, {needed:.0f} needed at such a score"
     POSITIONS_DISAGREE = "places of the same ground disagree on the position", "{summary} by {apart_m:.0f} m"
     JUST_LEARNT = "place was learnt just now", "{summary}, within {limit_s:g} s: it repeats the autopilot's position"
     SEQUENCE_INCOMPLETE = "the sequence is not complete yet", "{summary}: {queries:.0f} queries of {needed:.0f}"
     NEWEST_DISAGREES = "other places resemble the newest query more than this one does"
     NEWEST_LEFT = "the newest queries no longer see what those before them saw"
-    LOW_LEAD_AT_OTHER_SPEED = (
-        "too little ahead of a place elsewhere that is passed at another speed",
+    LOW_LEAD_SPEED = (
+        "too little ahead of a place passed at another speed",
         "{summary}: {lead:.3f}, {needed:.3f} needed",
     )
 
@@ -87,18 +81,9 @@ class ReasonCode(Enum):
     HAS_GPS = "not needed: the autopilot has GPS"
     HAS_WRONG_GPS = "not sent: the autopilot has GPS, which the map contradicts, and takes no fix"
     MAP_CONTRADICTS_GPS = "not sent: the map has contradicted GPS from the first match on"
-    NOT_BETTER = (
-        "not needed: the autopilot's position is as good",
-        "not needed: the autopilot is {off_m:.1f} m from where we are, good to {accuracy_m:.1f} m",
-    )
-    HELD_TURNED = (
-        "held back: turned against the compass",
-        "held back: its picture is turned by {turn_deg:.0f} degrees against the compass",
-    )
-    HELD_OFF_GPS = (
-        "held back: far from GPS",
-        "held back: {off_m:.0f} m from where GPS and the fixes before say that the aircraft is",
-    )
+    NOT_BETTER = "not needed: as good as ours", "not needed: it is {off_m:.1f} m from ours, good to {accuracy_m:.1f} m"
+    HELD_TURNED = "held back: turned against compass", "held back: turned {turn_deg:.0f} degrees against the compass"
+    HELD_OFF_GPS = "held back: far from GPS", "held back: {off_m:.0f} m from the position by GPS and the fixes before"
     HELD_OFF_PATH = (
         "held back: far from where the aircraft should be",
         "held back: {off_m:.0f} m from where the aircraft is by the autopilot's reckoning and the fixes before, ",
@@ -135,16 +120,52 @@ class ReasonCode(Enum):
     OTHER_ANSWER = "see its log", "it answers {result}"
     WRONG_FORM = "wrong form", "it does not like their form"
     NO_COMMAND = "43003 not known", "its firmware has no command 43003, or was built without, as for boards of 1 MB"
-    NO_COMMAND_ANSWERED = (
-        "signing? system id?",
-        "it answers no command of ours: does its port take signed messages only, does another vehicle have its ",
-        "system id, or does the line carry nothing towards it?",
+    NO_COMMAND_ANSWERED = "signing? system id?", "it answers no command: signed only, another system id, a dead line?"
+    FIXES_NOT_ANSWERED = "no command 43003?", "it answers other commands: is 43003 missing, or our component id taken?"
+
+    # Notes of a flight. The ground station is sent the summary where the sentence is too long for a STATUSTEXT.
+    FAILING = "frames fail in a row", "{count:.0f} frames in a row have failed"
+    NOT_FAILING = "frames are recognised again"
+    NOTHING_SHOWN = "camera shows nothing"
+    GROUND_SHOWN = "camera shows ground again"
+    MAP_LEFT = "map left"
+    MAP_FOUND = "map found again"
+    TILT_TOO_LARGE = "tilt too large"
+    TILT_FINE = "tilt is fine again"
+    MAP_LOST = "its map cannot be read, see its log"
+    MAP_BACK = "its map is read again"
+    PICTURES_MOVE = "camera is back: pictures move again"
+    SCALE_DIFFERS = "footprint is not the map's", "footprint {flown_m:.0f} m, map's {cut_m:.0f} m: set --footprint-m"
+    PICTURES_TURNED = (
+        "pictures are turned",
+        "pictures are turned {turn_deg:.0f} degrees against the heading: if the compass is right, ",
+        "set source.up_deg: {up_deg:.0f}",
     )
-    FIXES_NOT_ANSWERED = (
-        "no command 43003?",
-        "it answers other commands: is its firmware built without 43003, or does another program have our component ",
-        "id?",
-    )
+    PICTURES_MIRRORED = "pictures are mirrored", "{summary}, so none can match: switch off mirror or flip in the camera"
+    HEIGHT_DIFFERS = "height differs", "height: autopilot {by_autopilot_m:.0f} m, pictures {by_pictures_m:.0f} m"
+    HEIGHT_AGREES = "height agrees with pictures again"
+    GPS_DIFFERS = "GPS is far from the map", "GPS is {off_m:.0f} m from the map's position"
+    GPS_AGREES = "GPS agrees with the map again"
+    SURVEY_WITHDRAWN = "the map's place is unknown again", "{summary}: GPS contradicts what was reported"
+    LEARNING_STOPPED = "nothing more is learnt, see its log", "nothing more is learnt: {problem}"
+    PAUSED_BY_COMMAND = "paused by command"
+    RESUMED_BY_COMMAND = "goes on by command"
+    LEARNING_ON = "learning on by command"
+    LEARNING_OFF = "learning off by command"
+    UNDER_VOLTAGE = "companion under-voltage: check 5 V supply"
+    SUPPLY_FINE = "companion supply is fine again"
+    THROTTLED = "companion throttled", "{summary}", " at {temperature_c:.0f} degrees C", ": runs slower"
+    FULL_SPEED = "companion runs at full speed again"
+    HOT = "companion hot", "{summary}", " at {temperature_c:.0f} degrees C", ": give it cool air"
+    COOL = "companion is cool again", "{summary}", " at {temperature_c:.0f} degrees C"
+
+    # Of a change of the governor
+    BOARD_HOT = "the board is too hot", "{temperature_c:.0f} degrees, and {limit_c:.0f} are the limit"
+    BOARD_SLOW = "the board slows itself down"
+    CORES_TAKEN = "too much of all cores taken", "{taken:.0%} of all cores taken, and {allowed:.0%} allowed"
+    QUERIES_LATE = "queries come late, kept waiting by other programs or the disk"
+    MEMORY_TAKEN = "too much memory taken", "{taken_mb:.0f} MB of memory taken, and {allowed_mb:.0f} allowed"
+    ROOM_AGAIN = "there is room again"
 
     def __init__(self, summary: str, *parts: str) -> None:
         self.summary, self.parts = summary, parts or (summary,)

@@ -16,7 +16,8 @@ _log = logging.getLogger(__name__)
 
 Point = tuple[float, float]  # latitude and longitude, degrees
 _FRESH_S = 1.0  # a report of the autopilot that is further in time from a frame is not used for it
-_TEXTS = ("said", "state", "problem", "why")  # fields with a text for people: the first that a line has is shown
+_REASONS = ("note", "why")  # fields with a reason: the first that a line has is shown
+_TEXTS = ("said", "state", "problem")  # fields with a text for people, else
 _LARGEST = 1e15  # larger numbers are damage; the comparison also excludes NaN, and integers that no float can hold
 
 
@@ -210,7 +211,8 @@ def _gps_at(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
 
 
 def _text_of(line: dict[str, Any]) -> str:
-    words = next((known for key in _TEXTS if (known := text(line, key))), None)
+    reasons = [str(reason) for key in _REASONS if (reason := read_reason(line.get(key)))]
+    words = next(iter([*reasons, *(known for key in _TEXTS if (known := text(line, key)))]), None)
     match line:
         case {"from": dict() as before, "to": dict() as after}:  # of the governor
             changed = [f"{key} {before.get(key)} to {now}" for key, now in after.items() if before.get(key) != now]

@@ -63,7 +63,9 @@ def test_reasons_are_given_the_parameters_of_their_sentences():
     for path, tree in parse_package():
         for node in ast.walk(tree):
             match node:
-                case ast.Call(func=ast.Name(id="Reason"), args=[ast.Attribute(attr=code), *given]):
+                case ast.Call(
+                    func=ast.Name(id="Reason"), args=[ast.Attribute(value=ast.Name(id="ReasonCode"), attr=code), *given]
+                ):
                     keys = given[0].keys if given and isinstance(given[0], ast.Dict) else []
                 case ast.Call(func=ast.Name(id="_refuse"), args=[ast.Attribute(attr=code)], keywords=keywords):
                     given, keys = [], [ast.Constant(keyword.arg) for keyword in keywords]

@@ -42,7 +42,6 @@ class ToAutopilot:
     ) -> None:
         self._link, self._navigator, self._notifier, self._cores, self._clock = link, navigator, notifier, cores, clock
         self._send_fixes, self._source_sets = settings.send_fixes, SourceSets(settings.source_sets)
-        self._last: tuple[str, Sending] | None = None
         self._unanswered: list[tuple[str, Sending]] = []
         self._held, self._is_holding = 0, False
         self._output = Output.STARTING  # as it was last reported
@@ -105,27 +104,24 @@ class ToAutopilot:
                 )
 
     def report_match(self, event: Recognition, used_mah: float) -> Recognition:
-        """Send the fix of an event, if there is one to send, and its figures. Return the event with the reports of this
-        fix and of the fix before it (`fix`, `last_fix`). `used_mah` is the charge that the board has drawn so far."""
+        """Send the fix of an event, if there is one to send, and its figures. Return the event with the report of this
+        fix. `used_mah` is the charge that the board has drawn so far."""
         with self._link.turn("told"):
-            last = _reported(*self._last) if self._last else None
             fix, sending = None, None
             if event.accepted:
                 fix, sending = self._fixed(event)
             else:
                 self._navigator.hear_frame(event)
             is_heard = self._link.listens()
-        if sending:
-            if is_heard:
-                sending.wait(_SETTLED_WITHIN_S)
-            self._last = event.name, sending
+        if sending and is_heard:
+            sending.wait(_SETTLED_WITHIN_S)
         with self._link.turn("told of its fix"):
             if sending:
                 if sending.sent is not False:  # a fix that was not sent gets no answer; the line of its query says why
                     self._unanswered.append((event.name, sending))
                 fix = _reported(event.name, sending)
             self._tell(event, used_mah)
-        return replace(event, fix=fix, last_fix=last)
+        return replace(event, fix=fix)
 
     def add_motion(self, event: Recognition) -> None:
         """Report to the navigator the motion that a picture shows which is no query."""
@@ -196,7 +192,8 @@ class ToAutopilot:
         output = self._navigator.output
         if self._link.channel.is_continuous and output is not self._output:
             self._output = output
-            self._notifier.report("output", output.severity, output.text, state=output.name)
+            self._notifier.log("output", state=output.name)
+            self._notifier.announce(output.severity, output.text, topic="output")
 
     def _fixed(self, event: Recognition) -> tuple[FixReport | None, Sending | None]:
         """Send the fix of an accepted match. Return (None, the sending), or (a report of why it is not sent, None)."""

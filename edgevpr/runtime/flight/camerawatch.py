@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from edgevpr.core.config import Config, SourceConfig
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
@@ -45,10 +46,9 @@ class ScaleWatch:
             return
         flown_m, cut_m = np.median(self._seen, axis=0).tolist()
         if not _SCALES[0] <= flown_m / cut_m <= _SCALES[1]:
-            text = f"a picture shows {flown_m:.0f} m of ground, the map was cut for {cut_m:.0f} m"
+            note = Reason(ReasonCode.SCALE_DIFFERS, {"flown_m": flown_m, "cut_m": cut_m})
             ground = f"footprint {flown_m:.0f} m, map's {cut_m:.0f} m"
-            said = f"{text}: --footprint-m {flown_m:.0f} finds more"
-            self._notifier.report("camera", Severity.WARNING, said, ground=ground, said=said)
+            self._notifier.report("camera", Severity.WARNING, note, ground=ground)
 
 
 class TurnWatch:
@@ -71,9 +71,9 @@ class TurnWatch:
         if len(self._turned) < _TURNED_BY or abs(mean) < _AGREE or abs(turn_deg) < _TURNED_DEG:
             return
         self._is_said, up_deg = True, (self._up_deg + turn_deg) % 360
-        turned = f"turned {turn_deg:.0f} degrees"
-        said = f"pictures are {turned} against the heading: if the compass is right, set source.up_deg: {up_deg:.0f}"
-        self._notifier.report("camera", Severity.WARNING, said, ground=f"pictures {turned}", topic="turn", said=said)
+        note = Reason(ReasonCode.PICTURES_TURNED, {"turn_deg": turn_deg, "up_deg": up_deg})
+        ground = f"pictures turned {turn_deg:.0f} degrees"
+        self._notifier.report("camera", Severity.WARNING, note, ground=ground, topic="turn")
 
 
 class MirrorWatch:
@@ -102,10 +102,8 @@ class MirrorWatch:
         self._next_try = self._misses + (1 if is_mirrored else _MISSES_TO_TRY_AGAIN)
         if self._matches == _MIRRORED_TO_REPORT:
             self._tries = _MAX_TRIES
-            said = "pictures are mirrored, so none can match: switch mirror or flip off in the camera's settings"
-            self._notifier.report(
-                "camera", Severity.WARNING, said, ground="pictures are mirrored", topic="mirror", said=said
-            )
+            note = Reason(ReasonCode.PICTURES_MIRRORED)
+            self._notifier.report("camera", Severity.WARNING, note, topic="mirror")
 
     def _matches_mirrored(self, event: Recognition, axis: int) -> bool:
         """Search the whole map for the flipped picture, by nothing that the flight knows."""

@@ -2,17 +2,18 @@
 
 import math
 
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
 from edgevpr.power.thermal import ThermalState
 from edgevpr.runtime.flight.notifier import Notifier
 
 # Seconds between two reports of a problem at least, and without it until it counts as over: an under-voltage blinks.
 _REPORT_EVERY_S = 30.0
-# Fields of the state that are problems, each with the texts that it has begun and that it is over.
-_TEXTS = {
-    "under_voltage": ("companion under-voltage: check 5 V supply", "companion supply is fine again"),
-    "throttled": ("companion throttled{at}: runs slower", "companion runs at full speed again"),
-    "hot": ("companion hot{at}: give it cool air", "companion is cool again{at}"),
+# Fields of the state that are problems, each with the notes that it has begun and that it is over.
+_NOTES = {
+    "under_voltage": (ReasonCode.UNDER_VOLTAGE, ReasonCode.SUPPLY_FINE),
+    "throttled": (ReasonCode.THROTTLED, ReasonCode.FULL_SPEED),
+    "hot": (ReasonCode.HOT, ReasonCode.COOL),
 }
 
 
@@ -32,7 +33,7 @@ class CompanionWatch:
 
     def take(self, now_s: float, state: ThermalState) -> None:
         """Take a reading once a second, and report what has changed. An unknown value (None) changes nothing."""
-        for problem in _TEXTS:
+        for problem in _NOTES:
             value: bool | None = getattr(state, problem)
             if value:
                 self._seen_s[problem] = now_s
@@ -42,23 +43,22 @@ class CompanionWatch:
                 self._report(now_s, problem, holds, state)
 
     def _report(self, now_s: float, problem: str, holds: bool, state: ThermalState) -> None:
-        at = "" if state.temperature_c is None else f" at {state.temperature_c:.0f} degrees C"
-        begun, over = (text.format(at=at) for text in _TEXTS[problem])
+        begun, over = _NOTES[problem]
+        code = begun if holds else over
+        parameters = {"temperature_c": state.temperature_c} if code.parameters else {}
+        note = Reason(code, parameters)
         self._reported_s[problem] = now_s
         if holds:
-            self._holding[problem] = begun
+            self._holding[problem] = str(note)
         else:
             del self._holding[problem]
-        text = begun if holds else over
         self._notifier.report(
             "companion",
             Severity.WARNING if holds else Severity.INFO,
-            text,
-            ground=text.replace(" degrees", ""),  # so that it fits a STATUSTEXT
+            note,
             topic=f"companion {problem}",
             problem=problem,
             holds=holds,
             temperature_c=state.temperature_c,
             why=state.why,
-            said=text,
         )

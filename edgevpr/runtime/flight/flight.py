@@ -255,7 +255,6 @@ class Flight:
             t_frame_s=event.frame.t_mono_s,
             **fields_of(event),
             fix=event.fix,
-            last_fix=event.last_fix,
             reading=event.steps.read,
             vehicle=event.vehicle,
             board=self._parts.meter.thermal,
@@ -338,5 +337,5 @@ def open_links(
 
 
 def _report_learning_stopped(notifier: Notifier, problem: str) -> None:
-    text, ground = f"nothing more is learnt: {problem}", "nothing more is learnt, see its log"
-    notifier.report("learning stopped", Severity.WARNING, text, ground=ground, topic="learning", problem=problem)
+    note = Reason(ReasonCode.LEARNING_STOPPED, {"problem": problem})
+    notifier.report("learning stopped", Severity.WARNING, note, topic="learning")

@@ -58,8 +58,6 @@ _CANDIDATES = 3  # earlier pictures that are compared block by block
 _NEW_IN_A_ROW = 3  # pictures after which the camera is taken as back
 _NEW_AFTER_REPEATS = 10  # the same, after a clip
 
-BACK_TEXT = "camera is back: pictures move again"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Optics:
@@ -234,7 +232,7 @@ class FrozenWatch:
             self._report(_NEW_AFTER_REPEATS)
         elif self.is_frozen and self._new_in_a_row >= self._new_needed:
             self.is_frozen = False
-            self._notifier.report("source", Severity.INFO, BACK_TEXT, topic="frozen", state=BACK_TEXT)
+            self._notifier.report("source", Severity.INFO, Reason(ReasonCode.PICTURES_MOVE), topic="frozen")
 
     def _report(self, new_needed: int) -> None:
         was_frozen, self.is_frozen = self.is_frozen, True
@@ -243,8 +241,8 @@ class FrozenWatch:
             return
         if self._autopilot:
             self._autopilot.begin_anew()
-        state = str(self.reason)
-        self._notifier.report("source", Severity.WARNING, state, topic="frozen", state=state)
+        if reason := self.reason:
+            self._notifier.report("source", Severity.WARNING, reason, topic="frozen")
 
 
 def _velocity(vehicle: Vehicle | None) -> tuple[float, float] | None:

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
 from edgevpr.power.boards import Board
 from edgevpr.runtime.flight.clock import Pace
@@ -45,7 +46,7 @@ class Change:
 
     before: Setting
     after: Setting
-    why: str
+    why: Reason
     back: bool = False
 
 
@@ -99,7 +100,9 @@ class Governor:
         if reading.rss_mb <= _MEMORY_ROOM * most_mb:
             self._reported.discard("memory")
         if full_s >= _PATIENCE_S and "memory" not in self._reported:
-            return self._nothing_left("memory", f"{reading.rss_mb:.0f} MB of memory taken, and {most_mb:.0f} allowed")
+            return self._nothing_left(
+                "memory", Reason(ReasonCode.MEMORY_TAKEN, {"taken_mb": reading.rss_mb, "allowed_mb": most_mb})
+            )
         if over is not None and over_s >= _PATIENCE_S and not (hot and now_s - self._changed_s < _HEAT_PATIENCE_S):
             if hot:
                 self._wait_s = max(self._wait_s, _HEAT_PATIENCE_S)
@@ -109,7 +112,7 @@ class Governor:
             return None if "load" in self._reported else self._nothing_left("load", over)
         if self._at > 0 and room_s >= self._wait_s:
             self._raised_s = now_s
-            return self._changed(now_s, self._at - 1, "there is room again", back=True)
+            return self._changed(now_s, self._at - 1, Reason(ReasonCode.ROOM_AGAIN), back=True)
         return None
 
     def _held_s(self, what: str, now_s: float, holds: bool) -> float:
@@ -125,17 +128,17 @@ class Governor:
         slower = [at for at in below if self._settings[at].rate_hz < self.setting.rate_hz]
         return next(iter(slower if hot and slower else below), None)
 
-    def _load(self, reading: LoadReading) -> tuple[bool, str | None]:
-        """Return True if the board is too hot, and a few words about the limit that is exceeded (None: none is)."""
+    def _load(self, reading: LoadReading) -> tuple[bool, Reason | None]:
+        """Return True if the board is too hot, and the limit that is exceeded (None: none is)."""
         allowed, temperature_c = self._board.cpu_share, reading.temperature_c
         if temperature_c is not None and temperature_c >= self._limit_c:
-            return True, f"{temperature_c:.0f} degrees, and {self._limit_c:.0f} are the limit"
+            return True, Reason(ReasonCode.BOARD_HOT, {"temperature_c": temperature_c, "limit_c": self._limit_c})
         if reading.throttled:
-            return True, "the board slows itself down"
+            return True, Reason(ReasonCode.BOARD_SLOW)
         if reading.cpu_share > allowed:
-            return False, f"{reading.cpu_share:.0%} of all cores taken, and {allowed:.0%} allowed"
+            return False, Reason(ReasonCode.CORES_TAKEN, {"taken": reading.cpu_share, "allowed": allowed})
         if reading.late_share > _LATE:
-            return False, "queries come late, kept waiting by other programs or the disk"
+            return False, Reason(ReasonCode.QUERIES_LATE)
         return False, None
 
     def _has_room(self, reading: LoadReading, then: Setting) -> bool:
@@ -151,12 +154,12 @@ class Governor:
             and reading.rss_mb <= _MEMORY_ROOM * board.memory_max_mb
         )
 
-    def _nothing_left(self, what: str, why: str) -> Change:
+    def _nothing_left(self, what: str, why: Reason) -> Change:
         """Return a change between equal settings: a limit ("memory" or "load") is exceeded, and nothing is lowered."""
         self._reported.add(what)
-        return Change(self.setting, self.setting, f"{why}, and nothing is left to lower")
+        return Change(self.setting, self.setting, why)
 
-    def _down(self, now_s: float, at: int, why: str) -> Change:
+    def _down(self, now_s: float, at: int, why: Reason) -> Change:
         if now_s - self._raised_s < _TRIAL_S:
             self._wait_s = min(2 * self._wait_s, _LONGEST_WAIT_S)
             self._raised_s = -math.inf  # further steps down for the same reason are no new failure
@@ -164,7 +167,7 @@ class Governor:
             self._wait_s = _FIRST_WAIT_S
         return self._changed(now_s, at, why, back=False)
 
-    def _changed(self, now_s: float, at: int, why: str, back: bool) -> Change:
+    def _changed(self, now_s: float, at: int, why: Reason, back: bool) -> Change:
         before = self.setting
         self._at, self._changed_s = at, now_s
         self._since_s.clear()  # readings before a change say nothing of the time after it
@@ -193,9 +196,11 @@ class GovernorActuator:
             return
         text = ground = self.governor.held or "back to what was asked"
         if change.before == change.after:
-            text, ground = "over a limit of the board", "over a limit of its board, see its log"
+            text = "over a limit of the board, and nothing is left to lower"
+            ground = "over a limit of its board, see its log"
         severity = Severity.INFO if change.back else Severity.WARNING
         fields = {"from": asdict(change.before), "to": asdict(change.after), "why": change.why}
-        parts.notifier.report("governor", severity, f"{text}: {change.why}", ground=ground, topic="limits", **fields)
+        parts.notifier.log("governor", **fields)
+        parts.notifier.announce(severity, f"{text}: {change.why}", ground=ground, topic="limits")
         self._pace.rate_hz = change.after.rate_hz
         parts.recogniser.change(candidates=change.after.candidates)

@@ -4,6 +4,7 @@ picture's footprint, the motion between two pictures and the correction of tilt 
 import statistics
 from collections import deque
 
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.notifier import Notifier
@@ -76,12 +77,11 @@ class HeightWatch:
 
     def _report(self) -> None:
         if self.by_pictures_m is None or self.by_autopilot_m is None:
-            said = "height by the autopilot agrees with the pictures again"
-            self._notifier.report("height", Severity.INFO, said, ground="height agrees with pictures again", said=said)
+            self._notifier.report("height", Severity.INFO, Reason(ReasonCode.HEIGHT_AGREES))
             return
-        said = f"height: {self.by_autopilot_m:.0f} m by the autopilot, {self.by_pictures_m:.0f} m by the pictures"
-        ground = f"height {self.by_autopilot_m:.0f} m, by pictures {self.by_pictures_m:.0f} m"
-        self._notifier.report("height", Severity.WARNING, said, ground=ground, said=said, ratio=round(self.ratio, 2))
+        heights_m = {"by_autopilot_m": self.by_autopilot_m, "by_pictures_m": self.by_pictures_m}
+        note = Reason(ReasonCode.HEIGHT_DIFFERS, heights_m)
+        self._notifier.report("height", Severity.WARNING, note, ratio=round(self.ratio, 2))
 
 
 def _are_beyond(limit: float, ratios: list[float]) -> bool:

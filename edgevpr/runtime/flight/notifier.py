@@ -4,18 +4,20 @@ the flight log and to the ground station; all observers report through it. `Comm
 import logging
 from typing import Any
 
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.ground import Wish, Wished
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.messages import Severity
+from edgevpr.mavlink.messages import TEXT_BYTES, Severity
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.recognise.learn import Learner
 
-_TEXTS = {
-    Wish.PAUSE: ("paused by command", "pause"),
-    Wish.RESUME: ("goes on by command", "pause"),
-    Wish.LEARN: ("learning on by command", "learning"),
-    Wish.LEARN_NOTHING: ("learning off by command", "learning"),
+_NOTES = {
+    Wish.PAUSE: (ReasonCode.PAUSED_BY_COMMAND, "pause"),
+    Wish.RESUME: (ReasonCode.RESUMED_BY_COMMAND, "pause"),
+    Wish.LEARN: (ReasonCode.LEARNING_ON, "learning"),
+    Wish.LEARN_NOTHING: (ReasonCode.LEARNING_OFF, "learning"),
 }
+_SHORT_BYTES = TEXT_BYTES - len("edgevpr: ")  # of a text for the ground station
 
 _log = logging.getLogger(__name__)
 
@@ -41,23 +43,26 @@ class Notifier:
         self,
         kind: str,
         severity: Severity,
-        text: str,
+        note: Reason,
         *,
         ground: str | None = None,
         topic: str | None = None,
         **fields: Any,
     ) -> None:
-        """Report to flight log, journal and ground station: write a line of `kind` with `fields` to the flight log, and
-        `say` the text to the other two. Without a `topic`, the kind is the topic of the text."""
-        self.log(kind, **fields)
+        """Report to flight log, journal and ground station: write a line of `kind` with the `note` and `fields` to the
+        flight log, and announce the note to the other two; to the ground station its summary if its sentence is too
+        long, or the text `ground`. Without a `topic`, the kind is the topic of the text."""
+        self.log(kind, note=note, **fields)
+        text = str(note)
+        ground = ground or (note.code.summary if len(text.encode()) > _SHORT_BYTES else None)
         self.announce(severity, text, ground=ground, topic=topic or kind)
 
 
 class Trouble:
-    """Reports a bad condition once when it begins, with the text `begun`, and once when it ends, with the text `over`.
+    """Reports a bad condition once when it begins, with the note `begun`, and once when it ends, with the note `over`.
     `kind` is that of its lines in the flight log. `is_so`: the condition holds."""
 
-    def __init__(self, notifier: Notifier, kind: str, begun: str, over: str) -> None:
+    def __init__(self, notifier: Notifier, kind: str, begun: Reason, over: ReasonCode) -> None:
         self.is_so = False
         self._notifier, self._kind, self._begun, self._over = notifier, kind, begun, over
 
@@ -66,8 +71,8 @@ class Trouble:
         if is_so == self.is_so:
             return
         self.is_so = is_so
-        text = self._begun if is_so else self._over
-        self._notifier.report(self._kind, Severity.WARNING if is_so else Severity.INFO, text, said=text)
+        note = self._begun if is_so else Reason(self._over)
+        self._notifier.report(self._kind, Severity.WARNING if is_so else Severity.INFO, note)
 
 
 class Commands:
@@ -101,7 +106,8 @@ class Commands:
             case Wish.LEARN | Wish.LEARN_NOTHING if self._learner:
                 self._learner.is_off = wished.wish is Wish.LEARN_NOTHING
         is_new = before != self.summary
-        text, topic = _TEXTS[wished.wish]
-        self._notifier.log("command", wish=wished.wish.name, sender=wished.sender, said=text, is_new=is_new)
+        code, topic = _NOTES[wished.wish]
+        self._notifier.log("command", wish=wished.wish.name, sender=wished.sender, note=Reason(code), is_new=is_new)
         if is_new:  # a command repeated because its answer was lost changes nothing
+            text = code.summary
             self._notifier.announce(Severity.INFO, f"{text}, as {wished.sender} wishes", ground=text, topic=topic)

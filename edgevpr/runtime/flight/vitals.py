@@ -8,6 +8,7 @@ from datetime import datetime, timezone
 from typing import Any
 
 from edgevpr import __version__
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.frames.shot import Condition
 from edgevpr.mavlink.messages import Health, Severity
 from edgevpr.power.meter import MachineLoad
@@ -56,9 +57,9 @@ class Vitals:
         self._source_trouble: str | None = None
         self._start_s = self._explained_s = self._health_due_s
         self._has_log = True
-        failing = f"{FAILURES_IN_A_ROW} frames in a row have failed"
-        self._failing = Trouble(parts.notifier, "failing", failing, "frames are recognised again")
-        self._blind = Trouble(parts.notifier, "camera", "camera shows nothing", "camera shows ground again")
+        failing, nothing = Reason(ReasonCode.FAILING, {"count": FAILURES_IN_A_ROW}), Reason(ReasonCode.NOTHING_SHOWN)
+        self._failing = Trouble(parts.notifier, "failing", failing, ReasonCode.NOT_FAILING)
+        self._blind = Trouble(parts.notifier, "camera", nothing, ReasonCode.GROUND_SHOWN)
         self._companion = CompanionWatch(parts.notifier)
         self._has_event = False
         self._newest: dict[str, Any] | None = None
@@ -120,14 +121,10 @@ class Vitals:
             return
         self._source_trouble = trouble
         is_unopened = source.condition is Condition.LOST and not self._tally.queries  # then its state has the cause
-        self._parts.notifier.report(
-            "source",
-            Severity.WARNING if trouble else Severity.INFO,
-            f"source: {source.state}",
-            ground=f"camera {trouble or 'is back'}{f': {source.state}' if is_unopened else ''}",
-            state=source.state,
-            refused=source.refused,
-        )
+        self._parts.notifier.log("source", condition=condition.name, state=source.state, refused=source.refused)
+        severity = Severity.WARNING if trouble else Severity.INFO
+        ground = f"camera {trouble or 'is back'}{f': {source.state}' if is_unopened else ''}"
+        self._parts.notifier.announce(severity, f"source: {source.state}", ground=ground, topic="source")
 
     def _check_log(self) -> None:
         """Report to the ground station if the log cannot be written, and when it can; the journal has the reason."""

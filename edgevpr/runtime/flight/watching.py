@@ -11,7 +11,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.geodesy import offset_m
-from edgevpr.core.reasons import Reason
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.text import beside
 from edgevpr.frames.level import Mount
 from edgevpr.mavlink.messages import Severity
@@ -100,11 +100,9 @@ class MapWatch:
         self.left_out += len(event.left_out)
         if event.is_query and event.map_lost != self._is_lost:
             self._is_lost = event.map_lost
-            if self._is_lost:
-                text, severity, state = "its map cannot be read, see its log", Severity.WARNING, "cannot be read"
-            else:
-                text, severity, state = "its map is read again", Severity.INFO, "read again"
-            self._notifier.report("map", severity, text, state=state, why=event.reason)
+            severity = Severity.WARNING if self._is_lost else Severity.INFO
+            note = Reason(ReasonCode.MAP_LOST if self._is_lost else ReasonCode.MAP_BACK)
+            self._notifier.report("map", severity, note, reason=event.reason)
 
 
 class Sight:
@@ -113,8 +111,8 @@ class Sight:
     count."""
 
     def __init__(self, notifier: Notifier) -> None:
-        self._map = Trouble(notifier, "sight", "map left", "map found again")
-        self._tilt = Trouble(notifier, "tilt", "tilt too large", "tilt is fine again")
+        self._map = Trouble(notifier, "sight", Reason(ReasonCode.MAP_LEFT), ReasonCode.MAP_FOUND)
+        self._tilt = Trouble(notifier, "tilt", Reason(ReasonCode.TILT_TOO_LARGE), ReasonCode.TILT_FINE)
         self._accepted = self._misses = self._misses_lost = 0
         self._is_tilted, self._tilt_since_s = False, 0.0
 
@@ -198,10 +196,10 @@ class GpsWatch:
         if self.is_wrong != was_wrong or has_grown:
             self._reported_m = away_m
             severity = Severity.WARNING if self.is_wrong else Severity.INFO
-            news = (
-                f"GPS is {away_m:.0f} m from the map's position" if self.is_wrong else "GPS agrees with the map again"
-            )
-            self._notifier.report("gps", severity, news, said=news, off_m=round(away_m, 1), is_wrong=self.is_wrong)
+            note = Reason(ReasonCode.GPS_AGREES)
+            if self.is_wrong:
+                note = Reason(ReasonCode.GPS_DIFFERS, {"off_m": away_m})
+            self._notifier.report("gps", severity, note, off_m=round(away_m, 1), is_wrong=self.is_wrong)
 
     def _weigh(self, seen: PositionedMatch, off_m: Doubles, sd_m: float) -> None:
         """Judge GPS anew by a match that is `off_m` (2,) metres from it, with a standard deviation of `sd_m` but for
@@ -269,10 +267,7 @@ class Surveyor:
         if found is None:
             if of_map := self._reported.keys() - set(_MOUNT):
                 self._reported = {name: value for name, value in self._reported.items() if name not in of_map}
-                said = "what was said of the map is taken back, GPS contradicts it"
-                self._notifier.report(
-                    "survey", Severity.WARNING, said, ground="the map's place is unknown again", said=said
-                )
+                self._notifier.report("survey", Severity.WARNING, Reason(ReasonCode.SURVEY_WITHDRAWN))
             return
         for name, each in found.measures.items():
             before = self._reported.get(name)

@@ -287,5 +287,5 @@ def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: S
     ahead_of_rivals = float(ranking.scores[0]) - float(search.rivals[away].max(initial=0))
     needed = _MARGIN_SHARE_AT_OTHER_SPEEDS * rule.min_margin
     if not ahead_of_rivals >= needed:
-        return Reason(ReasonCode.LOW_LEAD_AT_OTHER_SPEED, {"lead": ahead_of_rivals, "needed": needed})
+        return Reason(ReasonCode.LOW_LEAD_SPEED, {"lead": ahead_of_rivals, "needed": needed})
     return None

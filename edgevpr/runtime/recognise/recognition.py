@@ -23,8 +23,7 @@ _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", 
 class Recognition:
     """Result of one frame. A field is None if its stage was not reached.
 
-    `fix` and `last_fix` are what became of the position, and of the one sent before (None: the event was not yet given
-    to the channel to the autopilot).
+    `fix` is what became of the position (None: the event was not yet given to the channel to the autopilot).
     """
 
     frame: Frame | None
@@ -51,7 +50,6 @@ class Recognition:
     steps: Steps = field(default_factory=Steps)
     cost: QueryCost = field(default_factory=QueryCost)
     fix: FixReport | None = None
-    last_fix: FixReport | None = None
 
     @property
     def view(self) -> View:

@@ -33,8 +33,8 @@ class Notes(Notifier):
         super().__init__(FlightLog(None), None)
         self.texts = []
 
-    def report(self, kind, severity, text, **fields) -> None:
-        self.texts.append(text)
+    def report(self, kind, severity, note, **fields) -> None:
+        self.texts.append(str(note))
 
 
 class Autopilot:

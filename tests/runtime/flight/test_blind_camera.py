@@ -27,7 +27,7 @@ def test_ten_pictures_of_nothing_are_said_once_and_so_is_the_ground_after_them(r
     assert all(line["reason"]["code"] == "LOW_TEXTURE" for line in queries[1:16])
     assert queries[1]["fix"] is queries[1]["place"] is None
     assert texts == [(4, "edgevpr: camera shows nothing"), (6, "edgevpr: camera shows ground again")]
-    assert [line["said"] for line in of_kind(lines, "camera")] == ["camera shows nothing", "camera shows ground again"]
+    assert [line["note"]["code"] for line in of_kind(lines, "camera")] == ["NOTHING_SHOWN", "GROUND_SHOWN"]
     assert health[NOTHING_IN_A_ROW] is Health.ACTIVE
     assert health[15] is Health.CRITICAL
     assert health[-1] is Health.ACTIVE

@@ -9,6 +9,7 @@ from flights import Flight, flight_meter, of_kind
 from pictures import textured
 
 from edgevpr.cli.top import lines_of
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import TEXT_BYTES, Severity
 from edgevpr.power.thermal import ThermalState, ThermalWatch
 from edgevpr.runtime.flight.companionwatch import CompanionWatch
@@ -78,11 +79,11 @@ def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(record
 
     meter = flight_meter(flight, machine=Machine(flight.board, ThermalWatch(tmp_path)))
     lines = flight.fly(FakeSource([textured(1, 240, 320)] * 45, clock), meter, status=Status())
-    said = [(line["problem"], line["holds"], line["why"], line["said"]) for line in of_kind(lines, "companion")]
-    begun, slow = "companion under-voltage: check 5 V supply", "companion throttled: runs slower"
+    said = [(line["problem"], line["holds"], line["why"], line["note"]["code"]) for line in of_kind(lines, "companion")]
+    begun = str(Reason(ReasonCode.UNDER_VOLTAGE))
     assert said[:2] == [
-        ("under_voltage", True, "under-voltage, throttled now", begun),
-        ("throttled", True, "under-voltage, throttled now", slow),
+        ("under_voltage", True, "under-voltage, throttled now", "UNDER_VOLTAGE"),
+        ("throttled", True, "under-voltage, throttled now", "THROTTLED"),
     ]
     assert [holds for _, holds, _, _ in said[2:]] == [False, False]
     texts = flight.link.texts()

@@ -10,12 +10,13 @@ from pictures import textured
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Health
-from edgevpr.runtime.flight.frozenwatch import BACK_TEXT, Optics
+from edgevpr.runtime.flight.frozenwatch import Optics
 
 pytestmark = pytest.mark.slow
 
 AHEAD = Optics(focal_share=0.77, looks_down=False, is_level=False)
 STAY = Reason(ReasonCode.PICTURES_STAY)
+MOVE = Reason(ReasonCode.PICTURES_MOVE)
 GIMBAL = Optics(focal_share=0.77, looks_down=True, is_level=True)
 
 
@@ -47,7 +48,7 @@ def test_pictures_that_stay_while_the_aircraft_flies_on_are_refused_until_they_m
     assert flown.autopilot.begun_anew == 1
     flown.fly_on(6, speed_m_s, start_m=180.0)
     assert flown.refused[-4:] == [None] * 4
-    assert flown.notes.texts == [str(STAY), BACK_TEXT]
+    assert flown.notes.texts == [str(STAY), str(MOVE)]
 
 
 @pytest.mark.parametrize(
@@ -207,8 +208,8 @@ def test_a_flight_refuses_frozen_pictures_and_says_so(recording, tmp_path):
     assert {line["reason"]["code"] for line in refused} == {"PICTURES_STAY"}
     assert accepted == [True] * (len(shown) - len(refused))
     assert flight.end["unusable"] == 0, "the camera has failed, and no picture"
-    assert [line["state"] for line in of_kind(lines, "source")] == [str(STAY), BACK_TEXT]
-    assert link.texts() == [(4, f"edgevpr: {STAY}"), (6, f"edgevpr: {BACK_TEXT}")]
+    assert [line["note"]["code"] for line in of_kind(lines, "source")] == ["PICTURES_STAY", "PICTURES_MOVE"]
+    assert link.texts() == [(4, f"edgevpr: {STAY}"), (6, f"edgevpr: {MOVE}")]
     assert str(STAY) in seen
     assert Health.CRITICAL in health
     assert health[-1] is Health.ACTIVE

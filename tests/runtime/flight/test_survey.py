@@ -262,7 +262,7 @@ def test_what_was_said_is_taken_back_when_gps_goes_wrong(tmp_path):
     flown = Flown(tmp_path, led(lambda t_s: 60.0 * (t_s > 700), events(eight, 1200)))
     assert flown.lines[0]["off_m"]
     assert "off_m" not in flown.lines[-1]
-    assert "taken back" in flown.lines[-1]["said"]
+    assert flown.lines[-1]["note"]["code"] == "SURVEY_WITHDRAWN"
     assert flown.mounts[-1].ahead_deg == pytest.approx(AHEAD_DEG, abs=1.5)
 
 

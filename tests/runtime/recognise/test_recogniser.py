@@ -55,7 +55,7 @@ def test_the_event_of_a_place_that_is_recognised_says_everything(walk):
     assert event.position == Position(50.003, 8.0)
     assert event.accuracy_m == pytest.approx(111.2, abs=0.5), "half of the way to the next place nobody knows better"
     assert event.ranking.slots[0] == 3
-    assert (event.hints, event.fix, event.last_fix) == (None, None, None)
+    assert (event.hints, event.fix) == (None, None)
     assert event.frame.t_mono_s == 12.5
     assert event.descriptor.fine is not None
 

@@ -60,7 +60,7 @@ def test_run_reports_a_hanging_camera_and_ends(hanging, step, tmp_path):
     assert flight.wait(END_S) == 0
     lines = list(read_log(tmp_path / "f.jsonl"))
     assert lines[-1]["kind"] == "end"
-    assert "lost" in of_kind(lines, "source")[0]["state"]
+    assert of_kind(lines, "source")[0]["condition"] == "LOST"
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -138,8 +138,8 @@ def test_learning_flight_goes_on_where_the_disk_is_full(recording, tmp_path):
     assert end["queries"] == PLACES
     assert 2 < len(learnt) == end["learnt"]["places"] < PLACES
     (stopped,) = of_kind(lines, "learning stopped")
-    assert end["learnt"]["stopped"] == stopped["problem"]
-    assert "disk" in stopped["problem"]
+    assert end["learnt"]["stopped"] == stopped["note"]["parameters"]["problem"]
+    assert "disk" in stopped["note"]["parameters"]["problem"]
     assert said.count("nothing more is learnt") == 1
     with PlaceMap.open(tmp_path / "m.gpkg") as place_map:
         assert {line["place"] for line in learnt} <= {place.place_id for place in place_map.places()}
