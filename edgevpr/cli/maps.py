@@ -109,8 +109,8 @@ def add_orthophoto(parser: ArgumentParser) -> None:
     flags.add_argument(
         "--orthophoto",
         metavar="FILE",
-        help="GeoTIFF, VRT, MBTiles, PMTiles, the tile cache of QGroundControl or Mission Planner, a folder of tiles "
-        "(z/x/y.png), or the address of tiles (https://.../{z}/{x}/{y}.png) that you may use",
+        help="GeoTIFF, VRT, MBTiles, a folder of tiles (z/x/y.png), or the address of tiles "
+        "(https://.../{z}/{x}/{y}.png) that you may use",
     )
     flags.add_argument(
         "--footprint-m",

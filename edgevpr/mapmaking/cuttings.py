@@ -65,6 +65,10 @@ class Lattice:
     def __len__(self) -> int:
         return len(self.rows)
 
+    def position_of(self, at: int) -> Position:
+        """Return the position of one place."""
+        return Position(float(self.lat_deg[at]), float(self.lon_deg[at]))
+
 
 class OrthophotoSource(RecordingSource):
     """Gives a frame for each place of the grids `lattices`, one for each footprint: a square of ground. `counts` are
@@ -80,7 +84,7 @@ class OrthophotoSource(RecordingSource):
         self.short_name = decode_name(orthophoto.short_name)
         self.counts = {"without_data": 0, "white": 0}
         self._read = 0
-        self._left = ((lattice, at) for lattice in lattices for at in range(len(lattice)))
+        self._left = self._list_places()
         variance_m2 = _GEO_REFERENCE_M**2 + (orthophoto.resolution_m / 2) ** 2
         self._covariance_m2 = variance_m2, 0.0, variance_m2
 
@@ -100,7 +104,7 @@ class OrthophotoSource(RecordingSource):
         name = f"{self.short_name}{of_several}_r{row}_c{column}"
         if not self.is_wanted(name):
             return None
-        position = Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at]))
+        position = lattice.position_of(at)
         try:
             image, valid = self._orthophoto.cut(position, lattice.footprint_m, SIDE_PX)
         except ImageError:
@@ -113,28 +117,31 @@ class OrthophotoSource(RecordingSource):
         pose = Pose(up_deg=0.0, footprint_m=lattice.footprint_m, covariance_m2=self._covariance_m2, is_surveyed=True)
         return Frame(image=image, name=name, t_mono_s=time.monotonic(), position=position, heading_deg=0.0, pose=pose)
 
-    def begin(self, spacing_m: float, technique: Technique, shown: Callable[..., Iterable[None]]) -> None:
+    def begin(
+        self, spacing_m: float, technique: Technique, shown: Callable[..., Iterable[tuple[Lattice, int]]]
+    ) -> None:
         """Log how much will be cut, and fetch the tiles for it: so an address that refuses them leaves no half map.
         `shown` shows progress."""
-        lat_deg, lon_deg = np.hstack([(lattice.lat_deg, lattice.lon_deg) for lattice in self._lattices])
-        widest_m = max(lattice.footprint_m for lattice in self._lattices)
-        count, steps = self._orthophoto.to_fetch(lat_deg, lon_deg, widest_m, SIDE_PX) or (0, iter(()))
         lattice = min(self._lattices, key=lambda each: each.footprint_m)
         spec = technique.spec
         place_bytes = spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + _BESIDE_BYTES
         across_px = lattice.footprint_m / self._orthophoto.resolution_m
         few = "" if across_px >= _SHARP_PX else f", too few to find all (with {_SHARP_PX} nearly all are found)"
         _log.info(
-            "%d places will be cut%s: %.2f km2 of ground, %.1f MB, %.0f pixels along a picture%s",
+            "%d places will be cut: %.2f km2 of ground, %.1f MB, %.0f pixels along a picture%s",
             self.total,
-            f", of {count} tiles to fetch from {self._orthophoto.name}" if count else "",
             len(lattice) * spacing_m**2 / 1e6,
             self.total * place_bytes / 1e6,
             across_px,
             few,
         )
-        for _ in shown(steps, count, "fetching tiles") if count else ():
-            pass
+        if self._orthophoto.is_remote:
+            for lattice, at in shown(self._list_places(), self.total, f"fetching tiles from {self._orthophoto.name}"):
+                self._orthophoto.cut(lattice.position_of(at), lattice.footprint_m, SIDE_PX)
+
+    def _list_places(self) -> Iterator[tuple[Lattice, int]]:
+        """Yield each place as its lattice and its number there."""
+        return ((lattice, at) for lattice in self._lattices for at in range(len(lattice)))
 
     def ground(self, spacing_m: float) -> Iterator[bytes]:
         """Yield what the pictures are cut from: the numbers of the places, and all that the file shows around them, in
@@ -146,8 +153,7 @@ class OrthophotoSource(RecordingSource):
             numbers = np.column_stack((lattice.rows, lattice.columns))
             yield numbers.tobytes()
             for at in np.unique(numbers // together, axis=0, return_index=True)[1].tolist():
-                at_deg = Position(float(lattice.lat_deg[at]), float(lattice.lon_deg[at]))
-                yield photo.as_it_is(at_deg, side_px)[0].tobytes()
+                yield photo.as_it_is(lattice.position_of(at), side_px)[0].tobytes()
 
     def close(self) -> None:
         """Close the orthophoto."""

@@ -1,4 +1,4 @@
-"""A georeferenced picture file, read with GDAL.
+"""A georeferenced picture, read with GDAL.
 
 Other modules import rasterio (GDAL and PROJ) from here, where a clear error is raised if it is not installed.
 """
@@ -43,22 +43,23 @@ Pixel = tuple[int, int]  # column and row
 
 
 class GeoRaster:
-    """An open georeferenced picture file. `crs` is its coordinate system. `transform` converts column and row (whole
-    numbers at the corners of pixels) to coordinates of `crs`. `width` and `height` are in pixels. `name` names it in
-    messages, and `short_name` the pictures cut from it."""
+    """An open georeferenced picture. `crs` is its coordinate system. `transform` converts column and row (whole numbers
+    at the corners of pixels) to coordinates of `crs`. `width` and `height` are in pixels. `name` names it in messages,
+    and `short_name` the pictures cut from it. `is_remote`: it is fetched from an address, which no message may hold."""
 
-    def __init__(self, path: Path) -> None:
-        """Open a file. Raises SourceError for one that is no picture or has no georeference."""
-        self.name, self.short_name = str(path), path.name
+    def __init__(self, opened: str | Path, name: str, short_name: str, is_remote: bool = False) -> None:
+        """Open what GDAL opens by the text `opened`. Raises SourceError for what is no picture or has no
+        georeference."""
+        self.name, self.short_name, self.is_remote = name, short_name, is_remote
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)
-                self._data = rasterio.open(path)
+                self._data = rasterio.open(opened)
         except (RasterioError, OSError) as error:
             raise SourceError(
-                f"{path} cannot be opened as an orthophoto: give a GeoTIFF, VRT, MBTiles or PMTiles file, the tile "
-                "cache of QGroundControl or Mission Planner, a folder of tiles (z/x/y.png), or an address."
-            ) from error
+                f"{name} cannot be opened as an orthophoto: give a GeoTIFF, VRT or MBTiles file, a folder of tiles "
+                "(z/x/y.png), or an address."
+            ) from (None if is_remote else error)
         self.crs, self.transform = self._data.crs, self._data.transform
         self.width, self.height = self._data.width, self._data.height
         self._bands = self._colour_bands()
@@ -100,6 +101,11 @@ class GeoRaster:
             )
             valid = self._data.dataset_mask(window=window, out_shape=shape) > 127
         except RasterioError as error:
+            if self.is_remote:
+                raise SourceError(
+                    f"{self.name} does not give all tiles of this ground: check the network and your right to fetch "
+                    "them, and run this again. Tiles fetched so far are kept."
+                ) from None
             raise ImageError(
                 f"{self.name}: the part from column {low[0]} and row {low[1]} on cannot be read ({error}): copy the "
                 "file again."

@@ -1,8 +1,9 @@
 """An orthophoto, from which pictures of squares of ground are cut: sides in metres on the ground, true north at the
 top. `cuttings` makes the frames of a map from them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TypeVar
 
 import cv2
@@ -24,8 +25,7 @@ from edgevpr.mapmaking.georaster import (
     rasterio,
     transform,
 )
-from edgevpr.mapmaking.tiles import Ground, TileRaster
-from edgevpr.mapmaking.tilestores import AddressTiles, is_address, open_tile_file, parse_host
+from edgevpr.mapmaking.tiles import Ground, describe_address, describe_folder, is_address, parse_host
 
 _EDGE_POINTS = 25  # per edge: a straight edge of the file is a curve in another coordinate system
 _MOST_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
@@ -33,33 +33,30 @@ _MOST_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
 Coordinate = TypeVar("Coordinate", float, Doubles)
 
 
-def _open_raster(source: str | Path, ground: Ground | None) -> GeoRaster | TileRaster:
-    """Open a file, a folder of tiles, or an address, see `Orthophoto`."""
+def _open_raster(source: str | Path, ground: Ground | None, links: str) -> GeoRaster:
+    """Open a file, a folder of tiles, or an address, see `Orthophoto`; `links` is an empty folder."""
     if is_address(source):
+        host = parse_host(str(source))
         if ground is None:
-            raise UsageError(f"{parse_host(str(source))} has tiles of the whole Earth: give --area.")
-        return TileRaster(AddressTiles(str(source)), ground)
-    path, kind = Path(source), ""
-    if not path.exists() and "#" in path.name:
-        name, _, kind = path.name.rpartition("#")
-        path = path.with_name(name)
+            raise UsageError(f"{host} has tiles of the whole Earth: give --area.")
+        return GeoRaster(describe_address(str(source), ground), host, host, is_remote=True)
+    path = Path(source)
     if not path.exists():
         raise SourceError(f"There is no orthophoto {source}: check the name.")
-    store = open_tile_file(path, kind)
-    return TileRaster(store, ground) if store else GeoRaster(path)
+    return GeoRaster(describe_folder(path, Path(links)) if path.is_dir() else path, str(path), path.name)
 
 
 class Orthophoto:
     """An open orthophoto. `name` names it in messages, and `short_name` the pictures cut from it. `extent_deg` is its
     bounding box (south, west, north, east), `middle` its middle, and `resolution_m` the length in metres of a pixel on
-    the ground in the middle."""
+    the ground in the middle. `is_remote`: it is fetched from an address."""
 
     def __init__(self, source: str | Path, ground: Ground | None = None) -> None:
-        """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads, PMTiles, a tile cache (FILE#MAP if it has several
-        maps), a folder of map tiles, or an address of tiles. `ground`: that of tiles which is wanted (None: all).
-        Raises SourceError, and UsageError for an address or a map that is not said in full."""
-        self._raster = _open_raster(source, ground)
-        self.name, self.short_name = self._raster.name, self._raster.short_name
+        """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads, a folder of map tiles, or an address of tiles, of
+        which `ground` is wanted. Raises SourceError, and UsageError for an address without ground or placeholders."""
+        self._links = TemporaryDirectory(prefix="edgevpr-tiles-")
+        self._raster = _open_raster(source, ground, self._links.name)
+        self.name, self.short_name, self.is_remote = self._raster.name, self._raster.short_name, self._raster.is_remote
         is_mercator = self._raster.crs == CRS.from_epsg(3857)
         self._turn = 360 if self._raster.crs.is_geographic else 2 * HALF_WORLD_M if is_mercator else 0
         try:
@@ -147,26 +144,10 @@ class Orthophoto:
         low, high = (np.clip(middle + side, 0, size).astype(int).tolist() for side in (-side_px / 2, side_px / 2))
         return self._raster.read(tuple(low), tuple(high), 1)
 
-    def to_fetch(
-        self, lat_deg: Doubles, lon_deg: Doubles, footprint_m: float, side_px: int
-    ) -> tuple[int, Iterator[None]] | None:
-        """Return how many tiles the pictures of `cut` and `as_it_is` at these places need from an address, less those
-        that are kept, and the steps that fetch them. None: it is no address."""
-        raster = self._raster
-        if not isinstance(raster, TileRaster) or not isinstance(raster.store, AddressTiles):
-            return None
-        store, across_px = raster.store, footprint_m / self.resolution_m
-        middles = np.column_stack(self._in_file(*transform(WGS84, raster.crs, lon_deg, lat_deg)))
-        reach_px = max(across_px / 2 + 2 * _shrink(across_px, side_px), side_px / 2)
-        low, high = (((middles + side) // raster.tile_px).astype(int) for side in (-reach_px, reach_px))
-        steps = np.indices((high - low).max(axis=0) + 1).reshape(2, -1).T
-        tiles = np.unique(np.concatenate([np.minimum(low + step, high) for step in steps]), axis=0)
-        missing = store.missing(raster.zoom, (raster.tile_at(*tile) for tile in tiles.tolist()))
-        return len(missing), store.fetch(raster.zoom, missing)
-
     def close(self) -> None:
         """Close the file."""
         self._raster.close()
+        self._links.cleanup()
 
 
 def _moved(way: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:

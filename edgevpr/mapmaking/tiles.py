@@ -1,30 +1,55 @@
-"""Map tiles: squares of the Web Mercator projection, each with a zoom and the numbers x and y.
+"""Map tiles (zoom/x/y: squares of the Web Mercator projection) of a folder or an address, described for GDAL's driver
+WMS, which fetches, keeps and joins them.
 
-A `TileStore` gives them as files (see `tilestores`), and `TileRaster` joins those of one zoom to one picture."""
+An address holds the user's key: messages, maps and names of files have only its host."""
 
 import math
+import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from http.client import HTTPException
+from pathlib import Path
+from typing import TypeGuard
+from urllib.error import HTTPError
+from urllib.parse import urlsplit
+from urllib.request import Request, urlopen
+from xml.sax.saxutils import escape
 
 import cv2
 import numpy as np
 
-from edgevpr.core.arrays import Bools, Image, Ints, LatLon
+from edgevpr import __version__
+from edgevpr.core.arrays import Image, LatLon
 from edgevpr.core.errors import SourceError, UsageError
-from edgevpr.core.geodesy import EARTH_RADIUS_M, compute_extent
-from edgevpr.frames.images import resized
-from edgevpr.mapmaking.georaster import CRS, HALF_WORLD_M, Pixel, rasterio
+from edgevpr.core.geodesy import EARTH_RADIUS_M, Extent, compute_extent
+from edgevpr.mapmaking.georaster import HALF_WORLD_M
 
 TILE_PX = 256  # the usual side
 _ACROSS_PX = 640  # of a footprint, in tiles as fine as a technique can use
-_COARSER = 2  # zooms below that which still do
-_NEARLY_ALL = 0.9  # of the ground that is covered best: a finer zoom, in which holes were never looked at, has less
-_SPREAD = (0.5, 0.1, 0.3, 0.7, 0.9)
-_KEPT = 64  # decoded tiles: neighbouring places share most
-_FINEST, _MOST_LAT_DEG = 24, 85.0
-
-Box = tuple[float, float, float, float]  # left, top, right and bottom, as shares of the world
+_FINEST_ZOOM = 24
+_MAX_LAT_DEG = 85.0
+_ENDINGS = (".png", ".jpg", ".jpeg", ".webp")
+_TMS_RESOURCE = "tilemapresource.xml"  # by OSGeo's Tile Map Service, whose y counts from the south
+_JOINS_COMPARED = 50
+_CLEARLY_BETTER = 0.5  # ratio of the differences along two edges; of tiles that do not join it is near 1
+_PLACEHOLDERS = ("{z}", "{x}", "{y}")
+_CONNECTIONS = 2
+_TIMEOUT_S = 30
+_MAX_TILE_BYTES = 10_000_000
+_NO_TILE = (204, 404, 410)  # HTTP status
+_ZOOMS_TRIED = 3  # from the one that is wanted: servers have different highest ones
+# A tile that the server does not have is transparent, and coarser zooms are not asked for.
+_WMS = """<GDAL_WMS><Service name="TMS"><ServerUrl>{url}</ServerUrl></Service><DataWindow>
+<UpperLeftX>{west_m!r}</UpperLeftX><UpperLeftY>{north_m!r}</UpperLeftY>
+<LowerRightX>{east_m!r}</LowerRightX><LowerRightY>{south_m!r}</LowerRightY>
+<TileLevel>{zoom}</TileLevel><TileX>{left}</TileX><TileY>{top}</TileY><YOrigin>top</YOrigin>
+<SizeX>{width}</SizeX><SizeY>{height}</SizeY></DataWindow><Projection>EPSG:3857</Projection><BandsCount>4</BandsCount>
+<BlockSizeX>{side_px}</BlockSizeX><BlockSizeY>{side_px}</BlockSizeY><OverviewCount>0</OverviewCount>
+<ZeroBlockHttpCodes>{no_tile}</ZeroBlockHttpCodes>
+<MaxConnections>{connections}</MaxConnections><UserAgent>edgevpr/{version}</UserAgent><Timeout>{timeout_s}</Timeout>
+{cache}</GDAL_WMS>"""
+_CACHE = "<Cache><Path>{folder}</Path><Expires>2147483647</Expires><CleanTimeout>0</CleanTimeout></Cache>"
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +57,7 @@ class Ground:
     """Ground to cut pictures from. `extent_deg`: south, west, north, east, with a margin; east is above 180 if it
     crosses the antimeridian. `footprint_m`: ground along a side of a picture."""
 
-    extent_deg: tuple[float, float, float, float]
+    extent_deg: Extent
     footprint_m: float
 
     @property
@@ -40,38 +65,18 @@ class Ground:
         """The zoom at which tiles of 256 pixels are as fine as a technique can use."""
         south, _, north, _ = self.extent_deg
         world_px = 2 * HALF_WORLD_M * math.cos(math.radians((south + north) / 2)) / self.footprint_m * _ACROSS_PX
-        return min(max(math.ceil(math.log2(world_px / TILE_PX)), 0), _FINEST)
+        return min(max(math.ceil(math.log2(world_px / TILE_PX)), 0), _FINEST_ZOOM)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Level:
-    """The tiles of one zoom: their number, the least x and y, the greatest plus 1, and x and y of some that are most
-    likely there. x counts on beyond the antimeridian."""
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """Tiles of one zoom: the least x and y, and the greatest plus 1."""
 
-    count: int
+    zoom: int
     left: int
     top: int
     right: int
     bottom: int
-    some: Sequence[Pixel]
-
-
-class TileStore:
-    """Tiles of several zooms. `name` names the store in messages, and `short_name` the pictures cut from it."""
-
-    name: str
-    short_name: str
-
-    def levels(self, ground: Ground | None) -> dict[int, Level]:
-        """Return the tiles that touch `ground` (None: all), by zoom."""
-        raise NotImplementedError
-
-    def get(self, zoom: int, x: int, y: int) -> bytes | None:
-        """Return a tile, as a PNG, JPEG or WebP file; None: there is none."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        """Close the file, if one is held open."""
 
 
 def ground_of(points: Sequence[LatLon], footprint_m: float) -> Ground:
@@ -79,116 +84,159 @@ def ground_of(points: Sequence[LatLon], footprint_m: float) -> Ground:
     footprint_m = min(max(1.0, footprint_m), HALF_WORLD_M)  # what is wrong with another, `make_lattice` says
     south, west, north, east = compute_extent(points)
     north_deg = math.degrees(2 * footprint_m / EARTH_RADIUS_M)
-    east_deg = north_deg / math.cos(math.radians(min(max(abs(south), abs(north)), _MOST_LAT_DEG)))
+    east_deg = north_deg / math.cos(math.radians(min(max(abs(south), abs(north)), _MAX_LAT_DEG)))
     return Ground((south - north_deg, west - east_deg, north + north_deg, east + east_deg), footprint_m)
 
 
-def bounding_box(ground: Ground | None) -> Box:
-    """Return the box of `ground` in the projection of tiles; None: the world."""
-    if ground is None:
-        return 0.0, 0.0, 1.0, 1.0
+def is_address(source: object) -> bool:
+    """Return True for the address of tiles, and False for the name of a file or folder."""
+    return bool(re.match(r"(?i)https?://", str(source)))
+
+
+def parse_host(address: str) -> str:
+    """Return the host of an address, which may be shown. Raises UsageError for an address that has none."""
+    try:
+        host = urlsplit(address).hostname
+    except ValueError:
+        host = None
+    if not host:
+        raise UsageError("The address of the orthophoto has no host: write https://HOST/.../{z}/{x}/{y}.png.")
+    return host
+
+
+def describe_folder(folder: Path, links: Path) -> str:
+    """Return what GDAL opens as the tiles of the highest zoom in a folder. It reads them by links in the folder
+    `links`, which are named from the north. Raises SourceError if there are none, or if their rows count otherwise than
+    is said."""
+    tiles = {
+        tuple(map(int, (*path.parts[-3:-1], path.stem))): path
+        for path in folder.glob("*/*/*")
+        if path.suffix.lower() in _ENDINGS and all(map(str.isdecimal, (*path.parts[-3:-1], path.stem)))
+    }
+    zoom = max((zoom for zoom, _, _ in tiles), default=0)
+    tiles = {tile: path for tile, path in tiles.items() if tile[0] == zoom}
+    first = next(filter(_is_square, (cv2.imread(str(path)) for path in tiles.values())), None)
+    if first is None:
+        raise SourceError(
+            f"{folder} holds no map tiles (PNG, JPEG or WebP, square, of 256 or 512 pixels): give another, or the "
+            "folder above the zooms (z/x/y.png)."
+        )
+    if (folder / _TMS_RESOURCE).exists():
+        tiles = {(zoom, x, 2**zoom - 1 - y): path for (_, x, y), path in tiles.items()}
+    _require_joined(folder, tiles)
+    for (_, x, y), path in tiles.items():
+        (links / str(x)).mkdir(exist_ok=True)
+        (links / str(x) / str(y)).symlink_to(path.absolute())
+    (left, top), (right, bottom) = np.min(list(tiles), axis=0)[1:].tolist(), np.max(list(tiles), axis=0)[1:].tolist()
+    return _describe(f"file://{links}/{{x}}/{{y}}", _Window(zoom, left, top, right + 1, bottom + 1), len(first))
+
+
+def _require_joined(folder: Path, tiles: dict[tuple[int, ...], Path]) -> None:
+    """Raise SourceError if the rows of tiles, named from the north, join clearly better the other way round."""
+    pairs = [(path, tiles[zoom, x, y + 1]) for (zoom, x, y), path in tiles.items() if (zoom, x, y + 1) in tiles]
+    named, other = [0.0], [0.0]
+    for paths in pairs[:: max(1, len(pairs) // _JOINS_COMPARED)]:
+        upper, lower = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths)
+        if _is_square(upper) and _is_square(lower) and upper.shape == lower.shape:
+            named.append(float(cv2.absdiff(upper[-1], lower[0]).mean()))
+            other.append(float(cv2.absdiff(lower[-1], upper[0]).mean()))
+    if sum(other) >= _CLEARLY_BETTER * sum(named):
+        return
+    if (folder / _TMS_RESOURCE).exists():
+        advice = f"from the north, and {_TMS_RESOURCE} says from the south: remove it if the tiles were written so"
+    else:
+        advice = (
+            f"from the south (TMS): write them with `gdal2tiles --xyz`, or put their {_TMS_RESOURCE} beside the zooms"
+        )
+    raise SourceError(f"{folder}: the rows of its tiles join only if y counts {advice}.")
+
+
+def describe_address(address: str, ground: Ground) -> str:
+    """Return what GDAL opens as the tiles of an address that touch `ground`, of the zoom that suits it, or of the next
+    coarser that the server has in the middle. They are kept in a folder that is named by the host, and none is
+    fetched twice. Raises UsageError for an address that has other placeholders, and SourceError if the server refuses
+    or cannot be reached."""
+    host = parse_host(address)
+    if sorted(re.findall(r"\{[^{}]*\}", address)) != sorted(_PLACEHOLDERS):
+        raise UsageError(
+            f"The address at {host} must have {{z}}, {{x}} and {{y}} where zoom, column and row of a tile stand, and "
+            "no other braces: https://HOST/.../{z}/{x}/{y}.png."
+        )
+    for zoom in range(ground.zoom, max(ground.zoom - _ZOOMS_TRIED, -1), -1):
+        window = _find_window(ground, zoom)
+        tile = _fetch_tile(address, zoom, (window.left + window.right) // 2, (window.top + window.bottom) // 2)
+        if tile is not None:
+            # A larger tile has finer pixels.
+            window = _find_window(ground, max(zoom - round(math.log2(len(tile) / TILE_PX)), 0))
+            caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+            return _describe(address, window, len(tile), Path(caches) / "edgevpr" / "tiles" / host)
+    raise SourceError(
+        f"{host} has no tile of zoom {max(ground.zoom - _ZOOMS_TRIED + 1, 0)} to {ground.zoom} in the middle of the "
+        "area (HTTP 404): check address and area; a larger --footprint-m takes coarser tiles."
+    )
+
+
+def _find_window(ground: Ground, zoom: int) -> _Window:
+    """Return the tiles of a zoom that touch the ground."""
     south, west, north, east = ground.extent_deg
     top, bottom = (
-        0.5 - math.asinh(math.tan(math.radians(min(max(lat_deg, -_MOST_LAT_DEG), _MOST_LAT_DEG)))) / (2 * math.pi)
+        0.5 - math.asinh(math.tan(math.radians(min(max(lat_deg, -_MAX_LAT_DEG), _MAX_LAT_DEG)))) / (2 * math.pi)
         for lat_deg in (north, south)
     )
-    return west / 360 + 0.5, top, east / 360 + 0.5, bottom
+    corners = west / 360 + 0.5, top, east / 360 + 0.5, bottom
+    left, first, right, last = (math.floor(each * 2**zoom) for each in corners)
+    return _Window(zoom, left, first, right + 1, last + 1)
 
 
-def full_level(zoom: int, box: Box) -> Level:
-    """Return the level of a zoom that has all tiles that touch `box`; `some` are spread over it, from the middle."""
-    across = 1 << zoom
-    left, top = math.floor(box[0] * across), math.floor(box[1] * across)
-    right, bottom = max(math.ceil(box[2] * across), left + 1), max(math.ceil(box[3] * across), top + 1)
-    some = [(int(left + u * (right - left)), int(top + v * (bottom - top))) for u in _SPREAD for v in _SPREAD]
-    count = (right - left) * (bottom - top)
-    return Level(count=count, left=left, top=top, right=right, bottom=bottom, some=some)
-
-
-def list_zoom_levels(tiles: Ints, box: Box) -> dict[int, Level]:
-    """Return the levels of those of `tiles` (N, 3), each (zoom, x, y), that touch `box`."""
-    zooms, x, y = tiles.T
-    across = 1 << zooms
-    x = x + across * (x + 1 <= box[0] * across)  # west of the box: it may be in it a turn around the Earth further on
-    inside = (x + 1 > box[0] * across) & (x < box[2] * across) & (y + 1 > box[1] * across) & (y < box[3] * across)
-    levels = {}
-    for zoom in np.unique(zooms[inside]).tolist():
-        at = np.column_stack((x, y))[inside & (zooms == zoom)]
-        (left, top), (right, bottom) = at.min(axis=0).tolist(), (at.max(axis=0) + 1).tolist()
-        some = [(int(column), int(row)) for column, row in at]
-        levels[zoom] = Level(count=len(at), left=left, top=top, right=right, bottom=bottom, some=some)
-    return levels
-
-
-class TileRaster:
-    """The tiles of one zoom as one picture: of the `ground` that is wanted (None: all) that which covers it well and is
-    fine, else the highest. The fields are those of `GeoRaster`; `tile_px` is the side of a tile."""
-
-    def __init__(self, store: TileStore, ground: Ground | None) -> None:
-        """Choose the zoom. Raises SourceError if there is no tile, and UsageError for tiles all around the Earth."""
-        self.store, self.name, self.short_name = store, store.name, store.short_name
-        levels = store.levels(ground)
-        self.zoom = _best(levels, ground) if levels else 0
-        self._tile = lru_cache(_KEPT)(self._decoded)
-        some = levels[self.zoom].some if levels else ()
-        first = next((tile for at in some if (tile := self._tile(*at)) is not None), None)
-        if first is None or first.shape[0] != first.shape[1] or first.shape[0] & first.shape[0] - 1:
-            self.close()
-            raise SourceError(
-                f"{store.name} holds no map tiles{' of the area' if ground else ''} (PNG, JPEG or WebP, square, of 256 "
-                "or 512 pixels): give another, or of a folder the one above the zooms (z/x/y.png)."
-            )
-        level, side_px = levels[self.zoom], len(first)
-        if ground is None and level.right - level.left > max(2**self.zoom / 2, 2):
-            self.close()
-            raise UsageError(f"{store.name} has tiles on both sides of the Earth: give --area.")
-        self.tile_px, self._left, self._top = side_px, level.left, level.top
-        self.width, self.height = (level.right - level.left) * side_px, (level.bottom - level.top) * side_px
-        self.crs = CRS.from_epsg(3857)
-        tile_m = 2 * HALF_WORLD_M / 2**self.zoom
-        west_m, north_m = level.left * tile_m - HALF_WORLD_M, HALF_WORLD_M - level.top * tile_m
-        self.transform = rasterio.Affine(tile_m / side_px, 0, west_m, 0, -tile_m / side_px, north_m)
-
-    def _decoded(self, x: int, y: int) -> Image | None:
-        """Return a tile, uint8 (H, W, 4) BGR and alpha; None if there is none, or it is damaged."""
-        data = self.store.get(self.zoom, x % 2**self.zoom, y)
-        tile = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-        if tile is None or tile.dtype != np.uint8:
+def _fetch_tile(address: str, zoom: int, x: int, y: int) -> Image | None:
+    """Fetch one tile; None if the server has none there. Raises SourceError."""
+    host = parse_host(address)
+    for placeholder, number in zip(_PLACEHOLDERS, (zoom, x % 2**zoom, y), strict=True):
+        address = address.replace(placeholder, str(number))
+    # The texts of these errors may hold the address, and so must not be chained.
+    try:
+        request = Request(address, headers={"User-Agent": f"edgevpr/{__version__}"})
+        with urlopen(request, timeout=_TIMEOUT_S) as answer:
+            data = answer.read(_MAX_TILE_BYTES)
+    except HTTPError as error:
+        error.close()
+        if error.code in _NO_TILE:
             return None
-        if tile.ndim == 2:
-            tile = cv2.cvtColor(tile, cv2.COLOR_GRAY2BGRA)
-        elif tile.shape[2] == 3:
-            tile = cv2.cvtColor(tile, cv2.COLOR_BGR2BGRA)
-        return np.asarray(tile, np.uint8)
-
-    def read(self, low: Pixel, high: Pixel, shrink: int) -> tuple[Image, Bools]:
-        """Read a window as `GeoRaster.read` does. There is no data where a tile is missing or damaged."""
-        (left, top), (right, bottom) = low, high
-        side = self.tile_px
-        bgra = np.zeros(((bottom - top) // shrink, (right - left) // shrink, 4), np.uint8)
-        for row in range(top // side, -(-bottom // side)):
-            for column in range(left // side, -(-right // side)):
-                tile = self._tile(*self.tile_at(column, row))
-                if tile is not None:
-                    tile = resized(tile, (side // shrink, side // shrink))
-                    at_row, at_column = (row * side - top) // shrink, (column * side - left) // shrink
-                    inside = bgra[max(at_row, 0) : at_row + len(tile), max(at_column, 0) : at_column + len(tile)]
-                    part = tile[max(-at_row, 0) :, max(-at_column, 0) :]
-                    inside[:] = part[: inside.shape[0], : inside.shape[1]]
-        return bgra[..., :3], bgra[..., 3] > 127
-
-    def tile_at(self, column: int, row: int) -> Pixel:
-        """Return x and y of a tile that is counted from the north-west one."""
-        return self._left + column, self._top + row
-
-    def close(self) -> None:
-        """Close the store."""
-        self.store.close()
+        raise SourceError(
+            f"{host} gives no tile (HTTP {error.code}): check the key in the address (401, 403) and your right to "
+            "fetch its tiles, or wait (429, 5xx), and run this again."
+        ) from None
+    except (OSError, HTTPException, ValueError):
+        raise SourceError(f"{host} cannot be reached: check the address and the network, and run this again.") from None
+    tile = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if not _is_square(tile):
+        raise SourceError(f"{host} answers with what is no tile: check the address and its key.")
+    return np.asarray(tile, np.uint8)
 
 
-def _best(levels: dict[int, Level], ground: Ground | None) -> int:
-    if ground is None:
-        return max(levels)
-    covered = {zoom: level.count / 4**zoom for zoom, level in levels.items() if zoom >= ground.zoom - _COARSER}
-    most = max(covered.values(), default=0)
-    return max((zoom for zoom, share in covered.items() if share >= _NEARLY_ALL * most), default=max(levels))
+def _is_square(tile: object) -> TypeGuard[Image]:
+    return isinstance(tile, np.ndarray) and tile.shape[0] == tile.shape[1] and not tile.shape[0] & tile.shape[0] - 1
+
+
+def _describe(address: str, window: _Window, side_px: int, cache: Path | None = None) -> str:
+    """Return the XML by which GDAL opens the tiles of a window; `cache` is the folder where it keeps them (None: they
+    are files)."""
+    tile_m = 2 * HALF_WORLD_M / 2**window.zoom
+    return _WMS.format(
+        url=escape(address.replace("{", "${")),
+        west_m=window.left * tile_m - HALF_WORLD_M,
+        north_m=HALF_WORLD_M - window.top * tile_m,
+        east_m=window.right * tile_m - HALF_WORLD_M,
+        south_m=HALF_WORLD_M - window.bottom * tile_m,
+        zoom=window.zoom,
+        left=window.left,
+        top=window.top,
+        width=(window.right - window.left) * side_px,
+        height=(window.bottom - window.top) * side_px,
+        side_px=side_px,
+        no_tile=",".join(map(str, _NO_TILE)),
+        connections=_CONNECTIONS,
+        version=__version__,
+        timeout_s=_TIMEOUT_S,
+        cache=_CACHE.format(folder=escape(str(cache))) if cache else "",
+    )
