@@ -43,22 +43,12 @@ class CompanionWatch:
                 self._report(now_s, problem, holds, state)
 
     def _report(self, now_s: float, problem: str, holds: bool, state: ThermalState) -> None:
-        begun, over = _NOTES[problem]
-        code = begun if holds else over
-        parameters = {"temperature_c": state.temperature_c} if code.parameters else {}
-        note = Reason(code, parameters)
+        code = _NOTES[problem][0 if holds else 1]
+        note = Reason(code, {"temperature_c": state.temperature_c} if code.parameters else {})
         self._reported_s[problem] = now_s
         if holds:
             self._holding[problem] = str(note)
         else:
             del self._holding[problem]
-        self._notifier.report(
-            "companion",
-            Severity.WARNING if holds else Severity.INFO,
-            note,
-            topic=f"companion {problem}",
-            problem=problem,
-            holds=holds,
-            temperature_c=state.temperature_c,
-            why=state.why,
-        )
+        severity = Severity.WARNING if holds else Severity.INFO
+        self._notifier.report("companion", severity, note, topic=f"companion {problem}", why=state.why)
