@@ -39,7 +39,10 @@ class ReasonCode(Enum):
     LOW_TEXTURE = "too little texture in the image", "{summary}: {usable:.0%} usable, {needed:.0%} needed"
     TILTED = "the image is not levelled", "{summary}: it is tilted {tilt_deg:.0f} degrees"
     TILTED_WITHOUT_HEADING = "the image is not levelled", "{summary}: tilted {tilt_deg:.0f} degrees, heading unknown"
-    TILTED_OFF_GROUND = "the image is not levelled", "{summary}: {shown:.0%} of the ground at {tilt_deg:.0f} degrees"
+    TILTED_OFF_GROUND = (
+        "the image is not levelled",
+        "{summary}: it shows {shown:.0%} of the ground under it at a tilt of {tilt_deg:.0f} degrees",
+    )
     NOT_MEMORABLE = "not memorable", "{summary}: {measure} {score:.2f}, {needed:.2f} needed"
     EMPTY_MAP = "the map has no place yet"
     UNUSABLE = "unusable", "{problem}"
@@ -57,8 +60,11 @@ class ReasonCode(Enum):
     ELSEWHERE_AGREES_BETTER = "a place elsewhere agrees better", "{summary}: ", *_FIGURES
     TRACK_CONTRADICTS = "the track filter contradicts it", "{summary}: ", *_FIGURES
     TURNED_AGREES = "the same place agrees nearly as well if the picture is turned otherwise", "{summary}: ", *_FIGURES
-    ELSEWHERE_AT_REST = "places elsewhere have not moved either", "{summary}: is it a display? mask it (`source.mask`)"
-    LANDMARKS_DISAGREE = "landmarks and regions disagree on the offset", "{summary}: {landmarks:.0f} are for another"
+    ELSEWHERE_AT_REST = (
+        "places elsewhere have not moved either",
+        "{summary}, as behind a display: mask it (`source.mask`)",
+    )
+    LANDMARKS_DISAGREE = "landmarks and regions disagree on the offset", "{summary}: {landmarks:.0f} support another"
     FEW_LANDMARKS = "too few landmarks agree", "{summary}: {landmarks:.0f}, {needed:.0f} needed at such a score"
     POSITIONS_DISAGREE = "places of the same ground disagree on the position", "{summary} by {apart_m:.0f} m"
     JUST_LEARNT = "place was learnt just now", "{summary}, within {limit_s:g} s: it repeats the autopilot's position"
@@ -81,7 +87,10 @@ class ReasonCode(Enum):
     HAS_GPS = "not needed: the autopilot has GPS"
     HAS_WRONG_GPS = "not sent: the autopilot has GPS, which the map contradicts, and takes no fix"
     MAP_CONTRADICTS_GPS = "not sent: the map has contradicted GPS from the first match on"
-    NOT_BETTER = "not needed: as good as ours", "not needed: it is {off_m:.1f} m from ours, good to {accuracy_m:.1f} m"
+    NOT_BETTER = (
+        "not needed: the autopilot's position is as good",
+        "not needed: the autopilot is {off_m:.1f} m from our position, which is good to {accuracy_m:.1f} m",
+    )
     HELD_TURNED = "held back: turned against compass", "held back: turned {turn_deg:.0f} degrees against the compass"
     HELD_OFF_GPS = "held back: far from GPS", "held back: {off_m:.0f} m from the position by GPS and the fixes before"
     HELD_OFF_PATH = (
@@ -120,8 +129,16 @@ class ReasonCode(Enum):
     OTHER_ANSWER = "see its log", "it answers {result}"
     WRONG_FORM = "wrong form", "it does not like their form"
     NO_COMMAND = "43003 not known", "its firmware has no command 43003, or was built without, as for boards of 1 MB"
-    NO_COMMAND_ANSWERED = "signing? system id?", "it answers no command: signed only, another system id, a dead line?"
-    FIXES_NOT_ANSWERED = "no command 43003?", "it answers other commands: is 43003 missing, or our component id taken?"
+    NO_COMMAND_ANSWERED = (
+        "signing? system id?",
+        "it answers no command of ours: does its port take signed messages only, does another vehicle have its ",
+        "system id, or does the line carry nothing towards it?",
+    )
+    FIXES_NOT_ANSWERED = (
+        "no command 43003?",
+        "it answers other commands: is its firmware built without 43003, or does another program have our ",
+        "component id?",
+    )
 
     # Notes of a flight. The ground station is sent the summary where the sentence is too long for a STATUSTEXT.
     FAILING = "frames fail in a row", "{count:.0f} frames in a row have failed"
@@ -135,7 +152,11 @@ class ReasonCode(Enum):
     MAP_LOST = "its map cannot be read, see its log"
     MAP_BACK = "its map is read again"
     PICTURES_MOVE = "camera is back: pictures move again"
-    SCALE_DIFFERS = "footprint is not the map's", "footprint {flown_m:.0f} m, map's {cut_m:.0f} m: set --footprint-m"
+    SCALE_DIFFERS = (
+        "footprint is not the map's",
+        "an image shows {flown_m:.0f} m of ground, the map was cut for {cut_m:.0f} m: --footprint-m {flown_m:.0f} ",
+        "finds more",
+    )
     PICTURES_TURNED = (
         "pictures are turned",
         "pictures are turned {turn_deg:.0f} degrees against the heading: if the compass is right, ",
@@ -154,10 +175,10 @@ class ReasonCode(Enum):
     LEARNING_OFF = "learning off by command"
     UNDER_VOLTAGE = "companion under-voltage: check 5 V supply"
     SUPPLY_FINE = "companion supply is fine again"
-    THROTTLED = "companion throttled", "{summary}", " at {temperature_c:.0f} degrees C", ": runs slower"
+    THROTTLED = "companion throttled", "{summary}", " at {temperature_c:.0f} C", ": runs slower"
     FULL_SPEED = "companion runs at full speed again"
-    HOT = "companion hot", "{summary}", " at {temperature_c:.0f} degrees C", ": give it cool air"
-    COOL = "companion is cool again", "{summary}", " at {temperature_c:.0f} degrees C"
+    HOT = "companion hot", "{summary}", " at {temperature_c:.0f} C", ": give it cool air"
+    COOL = "companion is cool again", "{summary}", " at {temperature_c:.0f} C"
 
     # Of a change of the governor
     BOARD_HOT = "the board is too hot", "{temperature_c:.0f} degrees, and {limit_c:.0f} are the limit"

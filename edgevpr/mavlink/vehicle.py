@@ -119,16 +119,12 @@ class Readiness(NamedTuple):
 
     def why(self, result: str) -> Reason:
         """Return the likely reason for an answer to a fix; `result` is the name of a MAV_RESULT."""
-        match result:
-            case "FAILED":
-                return Reason(self._why_failed())
-            case "TEMPORARILY_REJECTED" if self.has_gps:
-                return Reason(ReasonCode.GPS_IN_USE)
-            case "TEMPORARILY_REJECTED":
-                return Reason(ReasonCode.OTHER_AID if self.is_px4 else ReasonCode.NOT_SAID)
+        rejected = ReasonCode.OTHER_AID if self.is_px4 else ReasonCode.NOT_SAID
         codes = {
             "ACCEPTED": ReasonCode.TAKEN,
             "DENIED": ReasonCode.WRONG_FORM,
+            "FAILED": self._why_failed(),
+            "TEMPORARILY_REJECTED": ReasonCode.GPS_IN_USE if self.has_gps else rejected,
             "UNSUPPORTED": ReasonCode.NO_COMMAND,
         }
         return Reason(codes[result]) if result in codes else Reason(ReasonCode.OTHER_ANSWER, {"result": result})
