@@ -45,12 +45,6 @@ def add(commands: Any) -> None:
         help="distance in metres that counts as near (default: 25)",
     )
     parser.add_argument(
-        "--within-deg",
-        type=positive,
-        metavar="DEG",
-        help="maximum difference of headings that counts as near, in degrees",
-    )
-    parser.add_argument(
         "--out", metavar="FOLDER", help="folder for results.json and results.csv; an interrupted run resumes"
     )
     parser.add_argument("--similarity", nargs="+", metavar="FILE", help="evaluate stored similarity matrices (.npy)")
@@ -125,21 +119,21 @@ def _measure_similarities(args: Namespace) -> int:
 
 def _open_sets(args: Namespace) -> "dict[str, Dataset]":
     """Read the data sets that the flags name."""
-    from edgevpr.lab.evaluate.dataset import Nearness, load_dataset, match_positions, open_folder
+    from edgevpr.lab.evaluate.dataset import load_dataset, match_positions, open_folder
 
     if not (args.data or (args.query and args.ref)):
         raise UsageError("Name the data sets with --data or --query and --ref; or stored similarities: --similarity.")
     if args.data and args.ground_truth:
         raise UsageError("--ground-truth goes with --query and --ref: a folder of --data has its own.")
-    rule, sets = Nearness(within_m=args.within_m, within_deg=args.within_deg), {}
+    sets = {}
     if args.query and args.ref:
         query, ref = (Path(side).resolve() for side in (args.query, args.ref))
         truth = args.ground_truth
-        dataset = load_dataset(query, ref, truth) if truth else match_positions(query, ref, rule)
+        dataset = load_dataset(query, ref, truth) if truth else match_positions(query, ref, args.within_m)
         sets[f"{query.name} on {ref.name}"] = dataset
     for folder in args.data:
         path = Path(folder).resolve()
-        sets[path.name if path.name not in sets else str(path)] = open_folder(path, rule)
+        sets[path.name if path.name not in sets else str(path)] = open_folder(path, args.within_m)
     return sets
 
 

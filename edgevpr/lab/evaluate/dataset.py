@@ -4,26 +4,24 @@ sets are published by their files:
 
 * query/, ref/ and ground_truth.csv: edgevpr's own.
 * database/ and queries/, or images/test/ with both: file names like @EASTING@NORTHING@...jpg, metres of UTM (Pitts30k,
-  GSV-Cities and others in that form). References near the query are right (`Nearness`).
+  GSV-Cities and others in that form). References near the query are right.
 * query/ and ref/ with positions (positions.csv or EXIF): references near the query are right.
 """
 
 import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
-from edgevpr.core.config import bounded
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
-from edgevpr.core.geodesy import offset_m, shorter_deg
+from edgevpr.core.geodesy import offset_m
 from edgevpr.core.text import decode_name
 from edgevpr.frames.images import list_images
-from edgevpr.frames.positions import GeoTag
 from edgevpr.frames.source import read_tags
 
 _MAX_FILE_BYTES = 100_000_000  # a million queries
@@ -32,7 +30,6 @@ _SCORED = ("ok", "novel")  # statuses of a query; novel: its place is not in the
 # By the file name of each query, in the order of the file: the file names of the references that are right (none: the
 # query is off the map), and of those ignored, where a match counts as neither right nor wrong. None: it is not scored.
 GroundTruth = dict[str, tuple[frozenset[str], frozenset[str]] | None]
-Tags = dict[Path, GeoTag]  # of the pictures of a folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,15 +51,6 @@ class Dataset:
     ref_dir: Path
     references: tuple[str, ...]
     unscored: int = 0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Nearness:
-    """Rule by which a reference is right for a query: it was taken within `within_m` metres of it, and the headings
-    differ by at most `within_deg` degrees (None: whatever the headings)."""
-
-    within_m: float = bounded(0.01, 1_000_000, default=25.0)
-    within_deg: float | None = bounded(0.1, 180, default=None)
 
 
 def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str | Path) -> Dataset:
@@ -132,45 +120,48 @@ def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
         raise UsageError(f"{path} is not a CSV file in UTF-8 ({error}): save it as one.") from error
 
 
-def open_folder(folder: str | Path, rule: Nearness) -> Dataset:
-    """Read the data set in `folder`, in any layout above. Raises UsageError for an unknown layout or parts that do not
-    fit together, and SourceError for a folder without images."""
+def open_folder(folder: str | Path, within_m: float) -> Dataset:
+    """Read the data set in `folder`, in any layout above. Without a ground truth references within `within_m` metres of
+    a query are right. Raises UsageError for an unknown layout or parts that do not fit together, and SourceError for a
+    folder without images."""
     folder = Path(folder)
     query, ref = folder / "query", folder / "ref"
     if (truth := folder / "ground_truth.csv").is_file():
         return load_dataset(query, ref, truth)
     for outer in (folder, folder / "test", folder / "images" / "test"):
         if (outer / "database").is_dir() and (outer / "queries").is_dir():
-            return _read_utm_names(outer / "queries", outer / "database", rule)
+            return _read_utm_names(outer / "queries", outer / "database", within_m)
     if query.is_dir() and ref.is_dir():
-        return match_positions(query, ref, rule)
+        return match_positions(query, ref, within_m)
     raise UsageError(f"{folder} is no folder of a data set that is known: it needs {_LAYOUTS}.")
 
 
-def match_positions(query_dir: Path, ref_dir: Path, rule: Nearness) -> Dataset:
+def match_positions(query_dir: Path, ref_dir: Path, within_m: float) -> Dataset:
     """Make a data set of two folders of images with positions; queries without one are not scored. Raises UsageError
     where there are no positions, or none are near."""
     queries, references = (
-        {path: tag for path, tag in read_tags(d).items() if tag.position} for d in (query_dir, ref_dir)
+        {path: tag.position for path, tag in read_tags(folder).items() if tag.position}
+        for folder in (query_dir, ref_dir)
     )
     if not queries or not references:
         raise UsageError(
             "There are no positions to tell which places are right: give --ground-truth, or positions.csv."
         )
     query_deg, reference_deg = (
-        np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in tags.values() if tag.position])
-        for tags in (queries, references)
+        np.array([(position.lat_deg, position.lon_deg) for position in positions.values()])
+        for positions in (queries, references)
     )
     query_m, reference_m = (
         np.transpose(offset_m(*reference_deg[0], *at_deg.T)) for at_deg in (query_deg, reference_deg)
     )
-    return make_dataset(query_dir, ref_dir, _find_near(queries, query_m, references, reference_m, rule), query_dir)
+    truth = _find_near(list(queries), query_m, list(references), reference_m, within_m)
+    return make_dataset(query_dir, ref_dir, truth, query_dir)
 
 
-def _read_utm_names(query_dir: Path, ref_dir: Path, rule: Nearness) -> Dataset:
-    queries, references = ({path: GeoTag() for path in list_images(folder)} for folder in (query_dir, ref_dir))
-    query_m, reference_m = (np.array([_utm_m(path) for path in tags]) for tags in (queries, references))
-    truth = _find_near(queries, query_m, references, reference_m, Nearness(within_m=rule.within_m))
+def _read_utm_names(query_dir: Path, ref_dir: Path, within_m: float) -> Dataset:
+    queries, references = list_images(query_dir), list_images(ref_dir)
+    query_m, reference_m = (np.array([_utm_m(path) for path in paths]) for paths in (queries, references))
+    truth = _find_near(queries, query_m, references, reference_m, within_m)
     return make_dataset(query_dir, ref_dir, truth, query_dir)
 
 
@@ -184,22 +175,16 @@ def _utm_m(path: Path) -> tuple[float, float]:
         ) from None
 
 
-def _find_near(queries: Tags, query_m: Doubles, references: Tags, reference_m: Doubles, rule: Nearness) -> GroundTruth:
-    """Return the ground truth of queries by `rule`. `query_m` and `reference_m`, (N, 2), are metres east and north of a
-    common origin. Raises UsageError if no query has a right reference."""
-    truth: GroundTruth = {}
-    for (path, tag), position_m in zip(queries.items(), query_m, strict=True):
-        near = np.hypot(*(reference_m - position_m).T) <= rule.within_m
-        if rule.within_deg is not None:
-            near &= [_heading_difference_deg(tag, other) <= rule.within_deg for other in references.values()]
-        names = (decode_name(other.name) for other, is_near in zip(references, near, strict=True) if is_near)
-        truth[decode_name(path.name)] = frozenset(names), frozenset()
+def _find_near(
+    queries: Sequence[Path], query_m: Doubles, references: Sequence[Path], reference_m: Doubles, within_m: float
+) -> GroundTruth:
+    """Return the ground truth of queries: the references within `within_m` metres are right. `query_m` and
+    `reference_m`, (N, 2), are metres east and north of a common origin. Raises UsageError if no query has a right
+    reference."""
+    names, truth = [decode_name(path.name) for path in references], GroundTruth()
+    for path, position_m in zip(queries, query_m, strict=True):
+        near = np.flatnonzero(np.hypot(*(reference_m - position_m).T) <= within_m)
+        truth[decode_name(path.name)] = frozenset(names[index] for index in near), frozenset()
     if not any(judged and judged[0] for judged in truth.values()):
-        raise UsageError(f"No query was taken within {rule.within_m:g} m of a reference: allow more with --within-m.")
+        raise UsageError(f"No query was taken within {within_m:g} m of a reference: allow more with --within-m.")
     return truth
-
-
-def _heading_difference_deg(one: GeoTag, other: GeoTag) -> float:
-    if one.heading_deg is None or other.heading_deg is None:
-        raise UsageError("--within-deg needs the heading of every picture (yaw_deg in positions.csv): leave it out.")
-    return abs(shorter_deg(one.heading_deg - other.heading_deg))

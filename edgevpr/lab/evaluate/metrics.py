@@ -59,11 +59,6 @@ class Quality(Figures):
     unscored: int = 0
     with_match: Figures | None = None
 
-    @property
-    def of_matches(self) -> Figures:
-        """The figures of the queries whose place is in the map."""
-        return self.with_match or self
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueResult(Quality):

@@ -6,7 +6,7 @@ import pytest
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved
-from edgevpr.lab.evaluate.dataset import Nearness, load_dataset, open_folder
+from edgevpr.lab.evaluate.dataset import load_dataset, open_folder
 
 
 @pytest.fixture
@@ -98,38 +98,29 @@ def test_open_folder_reads_names_with_utm(tmp_path, inside):
     write_pictures(tmp_path / inside / "database", places)
     queries = tmp_path / inside / "queries"
     write_pictures(queries, ["@500005@4100000@q.jpg", "@510000@4100000@far.jpg"])
-    assert right_of(open_folder(tmp_path, Nearness())) == {
+    assert right_of(open_folder(tmp_path, 25)) == {
         "@500005@4100000@q.jpg": (places, set()),
         "@510000@4100000@far.jpg": (set(), set()),
     }
     (queries / "@500005@4100000@q.jpg").rename(queries / "@5@q.jpg")
     with pytest.raises(UsageError, match="EASTING"):
-        open_folder(tmp_path, Nearness())
+        open_folder(tmp_path, 25)
 
 
-def test_open_folder_matches_positions_by_distance_and_heading(tmp_path):
+def test_open_folder_matches_positions_by_distance(tmp_path):
     here = 47.0, 8.0
-    queries = {"q.jpg": (0, 0, 10)}
-    places = {"near.jpg": (3, 0, 20), "turned.jpg": (0, 5, 190), "beside.jpg": (20, 0, 350), "far.jpg": (60, 0, 10)}
+    queries = {"q.jpg": (0, 0), "far.jpg": (600, 0)}
+    places = {"near.jpg": (3, 0), "beside.jpg": (20, 0), "far.jpg": (60, 0)}
     for side, offsets in (("query", queries), ("ref", places)):
         write_pictures(tmp_path / side, [*offsets, "nowhere.jpg"])
-        rows = [
-            f"{name},{','.join(map(repr, moved(*here, east_m, north_m)))},{yaw_deg}"
-            for name, (east_m, north_m, yaw_deg) in offsets.items()
-        ]
-        (tmp_path / side / "positions.csv").write_text("\n".join(["file,lat,lon,yaw_deg", *rows]))
-
-    def right(**rule):
-        found = right_of(open_folder(tmp_path, Nearness(**rule)))
-        assert list(found) == ["q.jpg"]
-        return found["q.jpg"][0]
-
-    assert right() == {"near.jpg", "turned.jpg", "beside.jpg"}
-    assert right(within_m=4) == {"near.jpg"}
-    assert right(within_deg=30) == {"near.jpg", "beside.jpg"}
-    assert right(within_m=100) == {*places}
+        rows = [f"{name},{','.join(map(repr, moved(*here, *offset_m)))}" for name, offset_m in offsets.items()]
+        (tmp_path / side / "positions.csv").write_text("\n".join(["file,lat,lon", *rows]))
+    dataset = open_folder(tmp_path, 25)
+    assert right_of(dataset) == {"q.jpg": ({"near.jpg", "beside.jpg"}, set()), "far.jpg": (set(), set())}
+    assert dataset.unscored == 1
+    assert right_of(open_folder(tmp_path, 4))["q.jpg"] == ({"near.jpg"}, set())
     with pytest.raises(UsageError, match="--within-m"):
-        right(within_m=0.1)
+        open_folder(tmp_path, 0.1)
     (tmp_path / "ref" / "positions.csv").unlink()
     with pytest.raises(UsageError, match="no positions"):
-        right()
+        open_folder(tmp_path, 25)
