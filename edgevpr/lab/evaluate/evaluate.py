@@ -183,7 +183,7 @@ def mapped(
         with PlaceMap.open(path) as place_map:
             index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
             # The folder is gone when the sentences are read, and another one in the next run.
-            yield place_map, index, tuple(why.replace(f"{folder}/", "") for why in finished.not_done)
+            yield place_map, index, tuple(sentence.replace(f"{folder}/", "") for sentence in finished.not_done)
 
 
 def summarise(
