@@ -103,14 +103,7 @@ def plot(results: Mapping[str, Sequence[Quality]], path: Path) -> None:
         axes.set(xlim=(0, 1.02), ylim=(0, 1.02), xlabel="recall", ylabel="precision", title=title)
         axes.grid(alpha=0.3)
         # Below the panel, where it hides no curve.
-        axes.legend(
-            title="AUC from recall 0",
-            fontsize=7,
-            title_fontsize=7,
-            ncols=3,
-            loc="upper center",
-            bbox_to_anchor=(0.5, -0.13),
-        )
+        axes.legend(title="AUC", fontsize=7, title_fontsize=7, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.13))
     drawn.savefig(path, dpi=60)
 
 

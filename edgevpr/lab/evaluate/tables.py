@@ -13,8 +13,8 @@ ABOUT_FIGURES = (
     "95 %: interval by Wilson's score.",
     "AUC: area under the precision-recall curve from recall 0 (scikit-learn, VPR-Bench); AUC 2.3: that of equation 2.3 "
     "of the thesis, from the first point on.",
-    "R@100%P, right: share of the right best matches (VPR-Bench); in map: of the queries whose place is in the map "
-    "(VPR_Tutorial).",
+    "R@100%P, right: share of the right best matches (VPR-Bench); R@100%P, in map: of the queries whose place is in "
+    "the map (VPR_Tutorial).",
 )
 
 
@@ -53,7 +53,7 @@ CURVE: tuple[Column, ...] = (
     _share("AUC 2.3", "auc_2_3"),
     _share("P@100%R", "precision_at_100_recall"),
     _share("R@100%P, right", "recall_at_100_precision_vpr_bench"),
-    _share("in map", "recall_at_100_precision_vpr_tutorial"),
+    _share("R@100%P, in map", "recall_at_100_precision_vpr_tutorial"),
     _share("EP", "ep"),
     _share("ROC", "roc_auc"),
 )
