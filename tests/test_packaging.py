@@ -49,7 +49,6 @@ def test_wheel_has_every_module_and_nothing_else(wheel):
         "edgevpr/py.typed",
         "edgevpr/review/page.css",
         "edgevpr/review/page.js",
-        "edgevpr/review/common.css",
     }
     assert {name for name in names if not name.startswith("edgevpr/shipped/")} == code | figures | looks
 

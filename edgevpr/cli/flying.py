@@ -135,7 +135,7 @@ class _MatchPage:
     def __init__(self, args: Namespace) -> None:
         from edgevpr.review.album import Album, album_of_map
         from edgevpr.review.logged import LoggedQuery
-        from edgevpr.review.overhead import read_ground
+        from edgevpr.review.webpage import read_ground
 
         require_out(args.page, args.map)
         self._args, self._ground, self._queries = args, read_ground(args.map), list[LoggedQuery]()

@@ -7,8 +7,8 @@ from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import add_json, add_map_images, command, path_of, show, write_out
-from edgevpr.cli.wording import format_comparison, format_replay
+from edgevpr.cli.shared import add_json, add_map_images, command, show, write_out
+from edgevpr.cli.wording import format_replay
 from edgevpr.core.errors import EdgevprError
 
 if TYPE_CHECKING:
@@ -34,11 +34,9 @@ def add(commands: Any) -> None:
     form = export.add_mutually_exclusive_group(required=True)
     for name in ("geojson", "csv"):
         form.add_argument(f"--{name}", metavar="FILE", help="file to write (-: standard output)")
-    text = "replay a recorded flight, also with another configuration"
-    replay = command(commands, "replay", run_replay, text)
+    replay = command(commands, "replay", run_replay, "replay a recorded flight, and compare every line and packet")
     replay.add_argument("log", metavar="LOG", help="flight log; its last flight is replayed")
     replay.add_argument("--map", metavar="MAP", help="map of the flight (default: at its recorded path)")
-    replay.add_argument("--config", metavar="FILE", help="replay with the keys of this file, and compare the results")
     add_json(replay)
 
 
@@ -46,8 +44,8 @@ def run_report(args: Namespace) -> int:
     """Run `report`: write the HTML page of a flight."""
     from edgevpr.review.album import album_of_map, make_album
     from edgevpr.review.logged import read_flight, text
-    from edgevpr.review.overhead import read_ground
     from edgevpr.review.page import make_flight_page
+    from edgevpr.review.webpage import read_ground
     from edgevpr.runtime.flight.recording import frames_of, open_recording
 
     flight = read_flight(args.log)
@@ -85,19 +83,15 @@ def run_export(args: Namespace) -> int:
 
 
 def run_replay(args: Namespace) -> int:
-    """Run `replay`: fly a recorded flight again, and print the comparison. The exit code is 1 if anything differs from
-    the flight, but 0 with --config."""
-    from edgevpr.review.compare import compare, compare_queries
+    """Run `replay`: fly a recorded flight again, and print the comparison. The exit code is 1 if anything differs."""
+    from edgevpr.review.compare import compare
     from edgevpr.review.replay import replay
 
-    again = replay(args.log, args.map, path_of(args.config))
+    again = replay(args.log, args.map)
     end = {"guessed": again.guessed, "why_ended": again.why_ended}
-    if args.config:
-        found = compare_queries(again.flown, again.lines)
-        show({**found, **end}, args.json, format_comparison(found, again.why_ended))
-        return 0
     lines, packets = compare(again.flown, again.lines), again.packets
-    is_same = not (lines.others or packets.others)
+    has_all = not lines.after or again.why_ended is not None
+    is_same = has_all and not (lines.others or packets.others)
     value = {"lines": asdict(lines), "packets": asdict(packets), **end, "is_same": is_same}
     show(value, args.json, format_replay(again, lines, packets))
     return 0 if is_same else 1

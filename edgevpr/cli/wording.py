@@ -4,7 +4,7 @@ function returns the lines of one result; JSON has the same values by their name
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.core.text import aligned, beside, shown
+from edgevpr.core.text import beside, shown
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.making import MadeMap
@@ -125,23 +125,8 @@ def format_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iter
         yield f"{again.guessed} inputs are not on the tape where this program reads them: its costs differ."
     if again.why_ended:
         yield f"The replay ends before the flight: {again.why_ended}; {lines.after} lines come after it."
-
-
-def format_comparison(found: dict[str, Any], why_ended: str | None) -> Iterator[str]:
-    """Yield how the queries of a flight end with another configuration. `found` is the result of
-    `review.compare.compare_queries`; `why_ended` says why the replay ended before the flight did (None: it did not)."""
-    others = found["queries"]
-    ends = ((query["query"], _outcome(query["then"]), _outcome(query["now"])) for query in others)
-    yield from _first([f"{name}: {then}; what if: {now}" for name, then, now in ends])
-    figures = [
-        (name, *("-" if each is None else str(each) for each in both)) for name, both in found["summary"].items()
-    ]
-    yield from aligned([("", "flight", "what if"), *figures])
-    yield f"{found['alike']} of {found['alike'] + len(others)} queries end alike"
-    if (apart_m := found["apart_at_most_m"]) is not None:
-        yield f"their positions are at most {apart_m:.1f} m apart"
-    if why_ended:
-        yield f"The replay ends before the flight: {why_ended}."
+    elif lines.after:
+        yield f"{lines.after} lines of the flight are missing in the replay."
 
 
 def _first(texts: list[str]) -> list[str]:
@@ -154,9 +139,3 @@ def _of_line(difference: dict[str, Any]) -> str:
     if "only_in" in difference:
         return f"{where}: only in the {difference['only_in']}"
     return f"{where}: {', '.join(f'{name} was {then}, is {now}' for name, (then, now) in difference['fields'].items())}"
-
-
-def _outcome(query: dict[str, Any] | None) -> str:
-    if query is None:
-        return "no query"
-    return f"place {query['place']} accepted" if query["accepted"] else f"refused ({query['reason'] or 'unknown'})"

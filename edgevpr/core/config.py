@@ -8,7 +8,7 @@ import re
 import types
 import typing
 from collections.abc import Iterator
-from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -249,13 +249,6 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
                 target = target[section]
             target[key] = value
     return build(Config, merged, str(path or "the command line"))
-
-
-def change_config(config: Config, path: str | Path) -> Config:
-    """Return a copy of `config` with the values of the YAML file `path` in place of its own. Raises ConfigError."""
-    from edgevpr.core.yamlfile import read_yaml
-
-    return build(Config, _overlaid(asdict(config), read_yaml(path)), str(path))
 
 
 def place_logs_in(config: Config, folder: str) -> Config:

@@ -10,10 +10,8 @@ from contextlib import suppress
 from typing import Protocol
 
 from edgevpr.core.errors import LinkError
-from edgevpr.mavlink.address import LinkAddress, Sender
-from edgevpr.mavlink.conversation import LinkSettings
-from edgevpr.mavlink.fixes import Sending
-from edgevpr.mavlink.peer import Autopilot
+from edgevpr.mavlink.address import LinkAddress
+from edgevpr.mavlink.conversation import Conversation
 from edgevpr.mavlink.ports import Line, Port, open_port
 from edgevpr.mavlink.signing import OLD
 from edgevpr.mavlink.turns import Turns
@@ -27,25 +25,6 @@ FLUSH_S = 0.5
 PortState = tuple[bool, str | None, int]  # is it connected; why not, or None; how often it was opened again
 
 log = logging.getLogger(__name__)
-
-
-class Wire(Protocol):
-    """A `Conversation` as its driver uses it, within turns of the link."""
-
-    @property
-    def settings(self) -> LinkSettings: ...
-    @property
-    def autopilot(self) -> Autopilot: ...
-    @property
-    def waits(self) -> bool: ...
-    def wait_s(self, longest_s: float) -> float: ...
-    def drop_stale(self) -> None: ...
-    def announce_changes(self) -> None: ...
-    def next_packet(self) -> tuple[bytes, Sending | None] | None: ...
-    def note_departed(self, fixes: list[Sending]) -> None: ...
-    def hear(self, data: bytes, now_s: float, sender: Sender | None) -> bool: ...
-    def break_off(self, lost_fixes: int) -> None: ...
-    def end(self) -> None: ...
 
 
 class Driver(Protocol):
@@ -67,14 +46,14 @@ class Driver(Protocol):
 class DriverMaker(Protocol):
     """Makes the driver of the link `name`."""
 
-    def __call__(self, name: str, address: LinkAddress, conversation: Wire, turns: Turns, /) -> Driver: ...
+    def __call__(self, name: str, address: LinkAddress, conversation: Conversation, turns: Turns, /) -> Driver: ...
 
 
 class PortDriver:
     """The driver of a real port, which it reopens whenever the connection is lost. A missing device or server is no
     error: the thread tries to open it again and again, and `state` gives the reason."""
 
-    def __init__(self, name: str, address: LinkAddress, conversation: Wire, turns: Turns) -> None:
+    def __init__(self, name: str, address: LinkAddress, conversation: Conversation, turns: Turns) -> None:
         self._name, self._address, self._conversation, self._turns = name, address, conversation, turns
         self._settings = conversation.settings
         self._line: Line | None = None

@@ -1,6 +1,7 @@
 """The pictures of a page: found by the names that a log or a map gives them, and made small enough for one file."""
 
 import re
+from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,16 +12,17 @@ from typing import TYPE_CHECKING
 
 from edgevpr.core.arrays import Image, Mask
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
+from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.text import progress
 from edgevpr.core.types import Place
 from edgevpr.frames.positions import GeoTag
-from edgevpr.review.html import data_url
 
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
 _SIDES_PX = (480, 320, 240, 160, 112)  # of a small picture: the largest with which it fits is taken
 _LEAST_BYTES = 2500  # of a picture of the smallest side, as an address
+_TURNED_DEG = 45.0  # between the tops of a picture and of a place: more is a contradiction
 _CUT_PX = 512  # of a picture from an orthophoto, as the map was made of
 
 _FRAME = re.compile(r"frame \d{6} t=(\d+\.\d+) s")  # as `VideoSource` names them
@@ -83,6 +85,21 @@ class Album:
 
         level = levelled(tagged(picture.image, place.source_image, 0.0, tag), None, lens, below=True)
         return AlbumPicture(level.image, level.mask)
+
+    def lay(self, place: Place, lens: "Lens | None") -> AlbumPicture | None:
+        """Return the picture of a place whose top points where its pose says: levelled, as in a map made with the
+        `lens`, whose tops point north, or as it is. None if there is none, or its heading contradicts both."""
+        picture = self._find(place.source_image)
+        tag = picture.tag() if picture and picture.tag else None
+        if not tag or tag.heading_deg is None or not place.pose:
+            return self.level(place, lens)
+        is_raw, is_level = (
+            abs(shorter_deg(place.pose.up_deg - up_deg)) < _TURNED_DEG
+            for up_deg in (tag.heading_deg + (lens.up_deg if lens else 0.0), 0.0)
+        )
+        if lens and is_level:
+            return self.level(place, lens)
+        return picture if is_raw else None
 
     def _find(self, name: str) -> AlbumPicture | None:
         return next((picture for finder in self._finders if (picture := finder(name))), None)
@@ -205,7 +222,7 @@ def small_pictures(
         if image is None:
             continue
         for side_px in _SIDES_PX:
-            address = data_url("webp", small_webp(image, side_px))
+            address = f"data:image/webp;base64,{b64encode(small_webp(image, side_px)).decode()}"
             if len(address) <= room_bytes / (len(keys) - number):
                 break
         if len(address) <= room_bytes:

@@ -11,10 +11,8 @@ from edgevpr.core.text import format_probability
 from edgevpr.core.types import Place
 from edgevpr.mapmaking.calibrate import LookAlike
 from edgevpr.review.album import Album
-from edgevpr.review.html import UNKNOWN, figure, figures, foreign, heading, section
 from edgevpr.review.logged import Point
-from edgevpr.review.overhead import Layer, at_of
-from edgevpr.review.steps import Explored, Step, layer_of, make_page
+from edgevpr.review.webpage import UNKNOWN, Layer, Section, Step, at_of, figure, make_layer, make_page
 
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
@@ -66,8 +64,8 @@ def make_map_page(
         Layer("coverage gaps", "hole", gaps, "area"),
         Layer("look alike", "alike", [(one, other) for one, other in pairs if one and other], "line"),
         Layer("inconsistent GPS tags", "amiss", tags, "line"),
-        layer_of(steps, "hard to recognise", "weak"),
-        *(layer_of(steps, f"{quality} quality", quality) for quality in _QUALITIES),
+        make_layer(steps, "hard to recognise", "weak"),
+        *(make_layer(steps, f"{quality} quality", quality) for quality in _QUALITIES),
     ]
     known = {
         "places": str(len(places)),
@@ -75,20 +73,19 @@ def make_map_page(
         "coverage gaps": figure(gaps_m2 / 1e4 if covered_m2 else None, "ha"),
         "inconsistent GPS tags": str(len(tags_off_m)),
         "hard to recognise": str(len(hard)) if recognisable else UNKNOWN,
-        "look alike": f"{len(alike)} <small>of {len(look_alikes)}</small>" if look_alikes else UNKNOWN,
+        "look alike": f"{len(alike)} of {len(look_alikes)}" if look_alikes else UNKNOWN,
     }
     notes = [*_NOTES, *([] if look_alikes else [_NO_PICTURES])]
-    explored = Explored(
-        ground=ground,
-        layers=layers,
-        steps=steps,
-        albums={"place": pictures},
-        lens=lens,
-        notes=notes if ground else [],
-    )
-    title, content = f"Map {name}", "".join(f"<p>{foreign(line.strip())}</p>" for line in lines)
-    above = [heading(title, [f"{len(places)} places"]), figures(known)]
-    return make_page(title, above, explored, [section("What it holds", content)])
+    head = {
+        "title": f"Map {name}",
+        "known": [f"{len(places)} places"],
+        "figures": known,
+        "warnings": [],
+        "span_s": None,
+    }
+    held = Section("What it holds", [line.strip() for line in lines])
+    albums = {"place": pictures}
+    return make_page(head, steps, ground, layers, albums, lens=lens, notes=notes if ground else [], sections=[held])
 
 
 def _quality(place: Place) -> str:

@@ -1,18 +1,142 @@
-// Moves the ground and its steps. All that it knows is in the page: the data block "steps", and the drawings.
+// Draws the page and moves it. All that there is to show is in the data block "page", by `webpage.py`. Texts become text
+// nodes, never HTML.
 "use strict";
 (() => {
-  const block = document.getElementById("steps");
-  if (!block) return;
-  const { steps, pictures } = JSON.parse(block.textContent);
+  const data = JSON.parse(document.getElementById("page").textContent);
+  const { steps, pictures, ground, groups, span_s } = data;
   const find = (query, within = document) => within.querySelector(query);
   const all = (query, within = document) => [...within.querySelectorAll(query)];
-  const view = find(".view"), svg = view && find("svg", view), nowAt = document.getElementById("now-at");
+
+  // ---- Make elements: of HTML, and of SVG.
+  function put(made, attributes, inside) {
+    for (const [key, value] of Object.entries(attributes)) {
+      if (value !== null && value !== false) made.setAttribute(key, value === true ? "" : value);
+    }
+    made.append(...inside.filter((each) => each !== null && each !== undefined));
+    return made;
+  }
+  const html = (name, attributes = {}, ...inside) => put(document.createElement(name), attributes, inside);
+  const svg = (name, attributes = {}, ...inside) =>
+    put(document.createElementNS("http://www.w3.org/2000/svg", name), attributes, inside);
+  const section = (title, ...inside) => html("section", {}, title && html("h2", {}, title), ...inside);
+  const figure = (value) => (Math.abs(value) >= 100 ? value.toFixed(0) : `${+value.toPrecision(3)}`);
+  function clock(t_s) {
+    const all_s = Math.round(t_s), minutes = Math.floor(all_s / 60), two = (count) => String(count).padStart(2, "0");
+    const hours = minutes >= 60 ? `${Math.floor(minutes / 60)}:${two(minutes % 60)}` : minutes;
+    return `${hours}:${two(all_s % 60)}`;
+  }
+
+  // ---- The axis of time: 0 to 1000 in each chart and lane.
+  const has_times = span_s !== null;
+  const across = (t_s) => 1000 * Math.min(Math.max(t_s / (span_s || 1), 0), 1);
+  const STEPS_S = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400];
+  const step_s = has_times ? STEPS_S.find((each) => span_s / each <= 6) || span_s / 6 : 0;
+  const ticks_s = has_times ? Array.from({ length: Math.floor(span_s / step_s) + 1 || 1 }, (_, at) => at * step_s) : [];
+  const grid = (height) =>
+    svg("path", { class: "grid", d: `${ticks_s.map((t_s) => `M${across(t_s)} 0v${height}`).join("")}M0 ${height}h1000` });
+  const times = () => html("div", { class: "times" }, ...ticks_s.filter((t_s) => !t_s || t_s <= 0.97 * span_s).map(
+    (t_s) => html("span", { style: `left:${across(t_s) / 10}%` }, clock(t_s))));
+  const strip = (label, height, ...inside) => svg("svg", {
+    role: "img", "aria-label": label, viewBox: `0 0 1000 ${height}`, preserveAspectRatio: "none" }, grid(height), ...inside);
+
+  // A line through points, an area inside them, or dots: lines of length 0, whose round ends make dots.
+  function path(points, form) {
+    if (form === "dots" || points.length === 1) return points.map(([x, y]) => `M${x} ${y}h0`).join("");
+    return `M${points.map(([x, y]) => `${x} ${y}`).join("L")}${form === "area" ? "z" : ""}`;
+  }
+
+  function chart({ title, unit, series }) {
+    series = series.filter(([, , , points]) => points.length);
+    if (!series.length) return null;
+    const most = Math.max(unit ? 0 : 1, ...series.flatMap(([, , , points]) => points.map(([, value]) => value)));
+    const power = most > 0 ? 10 ** Math.floor(Math.log10(most)) : 1;
+    const top = power * [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10].find((each) => each * power >= most * 0.999);
+    const lines = series.map(([, colour, form, points]) => svg("path", { class: `${form} ${colour}`, d: path(
+      points.map(([t_s, value]) => [across(t_s).toFixed(1), (100 * (1 - Math.max(value, 0) / top)).toFixed(1)]), form) }));
+    const keys = series.map(([name, colour]) => name && html("span", { class: `key ${colour}` }, name));
+    return html("figure", { class: "chart" }, html("figcaption", {}, html("b", {}, title), ` ${unit} `, ...keys),
+      html("div", { class: "plot" },
+        html("div", { class: "scale" }, html("span", {}, figure(top)), html("span", {}, "0")),
+        html("div", {}, strip(`${title}, ${unit}`, 100, ...lines), times())));
+  }
+
+  // ---- The ground: squares or pictures of the places, and the layers over them.
+  const square = ([x, y, side, up_deg]) =>
+    ({ x: -side / 2, y: -side / 2, width: side, height: side, transform: `translate(${x} ${y}) rotate(${up_deg})` });
+  function drawGround() {
+    const [, , wide, high] = ground.box, shape = Math.min(Math.max(wide / high, 0.56), 1.8);
+    const laid = ground.squares.map((each) => (each[4] === null ? null
+      : svg("image", { class: "layer-ground", href: pictures[each[4]], ...square(each) }))).filter(Boolean);
+    const squares = laid.length ? [] : ground.squares.map((each) => svg("rect", { class: "footprints layer-ground", ...square(each) }));
+    const paths = ground.layers.map(({ colour, form, ways }) => svg("path", {
+      class: `${form} ${colour} layer-${colour}`, d: ways.map((way) => path(way, form)).join("") }));
+    const names = [...(ground.squares.length ? [["ground", "the ground seen"]] : []),
+      ...ground.layers.map(({ colour, name }) => [colour, name])];
+    const keys = names.map(([colour, name]) => {
+      const box = html("input", { type: "checkbox", checked: true });
+      box.onchange = () => {
+        for (const each of all(`.layer-${colour}`)) each.style.display = box.checked ? "" : "none";
+      };
+      return html("label", { class: `key ${colour}` }, box, name);
+    });
+    const zooms = [[2, "zoom in", "+"], [0.5, "zoom out", "−"], [0, "show all", "⤢"]].map(([by, label, text]) =>
+      html("button", { type: "button", "data-zoom": by, "aria-label": label }, text));
+    return [html("div", { class: "legend" }, ...keys),
+      html("div", { class: "view", style: `aspect-ratio:${shape};max-width:${80 * shape}vh` },
+        svg("svg", { role: "img", "aria-label": "the ground of the map", viewBox: ground.box.join(" ") },
+          ...squares, ...laid, ...paths, svg("g", { id: "now-at" })),
+        html("div", { class: "ruler", hidden: true }), html("div", { class: "north" }, "N ↑"),
+        html("div", { class: "zoom", hidden: true }, ...zooms))];
+  }
+
+  function stepper() {
+    const slide = html("div", { class: "slide" }, html("button", { type: "button", id: "play", "aria-label": "play" }, "▶"),
+      html("input", { type: "range", id: "step", min: 0, value: 0, "aria-label": "step" }), html("output", { id: "which", for: "step" }));
+    const now = html("div", { class: "now" }, html("h3"), html("div"), html("div", { class: "pair" }));
+    return html("div", { class: "stepper" }, slide, now);
+  }
+
+  // Boxes by which the reader chooses steps, each with its count and, where they have times, a lane of them.
+  function choices() {
+    const rows = groups.flatMap(([group, colour, count], number) => [
+      html("label", {}, html("input", { type: "checkbox", "data-group": number }), group, " ", html("b", {}, `${count}`)),
+      has_times && strip(group, 20, svg("path", { class: `mark ${colour}`, "data-lane": number }))].filter(Boolean));
+    const inside = has_times ? html("div", { class: "lanes" }, ...rows, html("span"), times()) : html("div", { class: "boxes" }, ...rows);
+    return html("details", { class: "choose", open: true }, html("summary", {}, "Show only some"), inside);
+  }
+
+  function sectionOf({ title, lines, rows, folded }) {
+    const [first, ...others] = rows.map((row, at) => html("tr", {}, ...row.map((text) => html(at ? "td" : "th", {}, text))));
+    const table = first && html("div", { class: "scroll" }, html("table", {}, first, ...others));
+    const details = folded ? html("details", {}, html("summary", {}, "configuration"), html("pre", {}, folded)) : null;
+    return section(title, ...lines.map((line) => html("p", {}, line)), table, details);
+  }
+
+  document.title = data.title;
+  const charts = data.charts.map(chart).filter(Boolean);
+  const notes = data.notes.length ? html("p", { class: "soft" }, data.notes.join(" ")) : null;
+  const explored = ground || steps.length ? section(ground ? "Over the ground" : "Step by step",
+    html("div", { class: "ground" }, ...(ground ? drawGround() : []), ...(steps.length ? [stepper(), choices()] : []), notes)) : null;
+  const figures = data.figures.map(([name, text]) => html("div", {}, html("dt", {}, name), html("dd", {}, text)));
+  document.body.append(...[
+    html("h1", {}, data.title), html("p", { class: "soft" }, data.known.join(", ")),
+    section("", html("dl", { class: "figures" }, ...figures)),
+    data.warnings.length ? html("section", { class: "notes" }, html("ul", {}, ...data.warnings.map((each) => html("li", {}, each)))) : null,
+    explored,
+    charts.length ? section("Over time", html("div", { class: "charts" }, ...charts)) : null,
+    ...data.sections.map(sectionOf)].filter(Boolean));
+
+  const view = find(".view"), plan = view && find("svg", view), nowAt = document.getElementById("now-at");
   const slider = document.getElementById("step"), play = document.getElementById("play");
-  let shown = steps, now = steps[0], marked = [];
+  let shown = steps, now = steps[0];
 
   // ---- Zoom and pan: the part of the drawing that is seen is the viewBox of its SVG, in metres.
+  function fit([left, top, wide, high]) { // into the shape of the view
+    const shape = Math.min(Math.max(wide / high, 0.56), 1.8), width = Math.max(wide, high * shape), height = width / shape;
+    return [left - (width - wide) / 2, top - (height - high) / 2, width, height];
+  }
   const MOST = 60; // times
-  const whole = svg ? svg.getAttribute("viewBox").split(" ").map(Number) : [0, 0, 1000, 1000];
+  const whole = ground ? fit(ground.box) : [0, 0, 1000, 1000];
   let box = whole;
   const zoomed = () => whole[2] / box[2];
 
@@ -21,7 +145,7 @@
     const high = wide * whole[3] / whole[2];
     const within = (least, most, value) => Math.min(Math.max(value, least), most);
     box = [within(whole[0], whole[0] + whole[2] - wide, x), within(whole[1], whole[1] + whole[3] - high, y), wide, high];
-    svg.setAttribute("viewBox", box.join(" "));
+    plan.setAttribute("viewBox", box.join(" "));
     view.style.touchAction = zoomed() > 1.01 ? "none" : "pan-x pan-y"; // unzoomed, a finger scrolls the page
     const most = box[2] / 4, power = 10 ** Math.floor(Math.log10(most)); // a quarter of the width
     const length = [5, 2, 1].map((each) => each * power).find((each) => each <= most);
@@ -30,12 +154,12 @@
     ruler.style.width = `${100 * length / box[2]}%`;
     ruler.textContent = length < 1000 ? `${+length.toPrecision(1)} m` : `${length / 1000} km`;
   }
-  // Zoom about the point that is [across, down] of the view, 0 to 1 each.
-  const zoom = (by, across = 0.5, down = 0.5) => {
+  // Zoom about the point that is [right, down] of the view, 0 to 1 each.
+  const zoom = (by, right = 0.5, down = 0.5) => {
     const wide = Math.min(Math.max(box[2] / by, whole[2] / MOST), whole[2]);
-    look(box[0] + across * (box[2] - wide), box[1] + down * (box[3] - wide * whole[3] / whole[2]), wide);
+    look(box[0] + right * (box[2] - wide), box[1] + down * (box[3] - wide * whole[3] / whole[2]), wide);
   };
-  const pan = (across, down) => look(box[0] + across * box[2], box[1] + down * box[3], box[2]);
+  const pan = (right, down) => look(box[0] + right * box[2], box[1] + down * box[3], box[2]);
   const share = (event) => {
     const frame = view.getBoundingClientRect();
     return [(event.clientX - frame.left) / frame.width, (event.clientY - frame.top) / frame.height];
@@ -72,13 +196,13 @@
       const before = fingers.get(event.pointerId);
       if (!before) return;
       const here = share(event), others = [...fingers].filter(([id]) => id !== event.pointerId);
-      const [across, down] = [here[0] - before[0], here[1] - before[1]];
-      moved += Math.hypot(across * view.clientWidth, down * view.clientHeight);
+      const [right, down] = [here[0] - before[0], here[1] - before[1]];
+      moved += Math.hypot(right * view.clientWidth, down * view.clientHeight);
       if (others.length) {
         const other = others[0][1], far = (point) => Math.hypot(point[0] - other[0], point[1] - other[1]) || 1e-6;
         zoom(far(here) / far(before), ...other);
       } else if (zoomed() > 1.01) {
-        pan(-across, -down);
+        pan(-right, -down);
       }
       if (moved > 5) view.setPointerCapture(event.pointerId);
       fingers.set(event.pointerId, here);
@@ -96,19 +220,6 @@
   }
 
   // ---- The step that is shown: its texts, its pictures, and its points over the ground.
-  function element(name, text, parent, attributes = {}) {
-    const made = document.createElement(name);
-    made.textContent = text;
-    Object.assign(made, attributes);
-    parent.append(made);
-    return made;
-  }
-  function draw(name, attributes, parent = nowAt) {
-    const made = document.createElementNS("http://www.w3.org/2000/svg", name);
-    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-    parent.append(made);
-  }
-
   function show(step) {
     now = step;
     const at = shown.indexOf(step), panel = find(".now");
@@ -121,22 +232,19 @@
     for (const line of all(".cursor")) line.remove();
     if (!step) return;
     slider.setAttribute("aria-valuetext", step.title);
-    for (const each of step.said) element("p", each, said);
-    for (const [caption, number] of step.pictures) {
-      const figure = element("figure", "", pair);
-      element("img", "", figure, { src: pictures[number], alt: caption });
-      element("figcaption", caption, figure);
-    }
-    if (step.x !== null) {
-      for (const chart of all('svg[preserveAspectRatio="none"]')) {
-        draw("path", { class: "cursor", d: `M${step.x} 0V${chart.viewBox.baseVal.height}` }, chart);
+    said.append(...step.said.map((each) => html("p", {}, each)));
+    pair.append(...step.pictures.map(([caption, number]) => html("figure", {},
+      html("img", { src: pictures[number], alt: caption }), html("figcaption", {}, caption))));
+    if (has_times) {
+      for (const each of all('svg[preserveAspectRatio="none"]')) {
+        each.append(svg("path", { class: "cursor", d: `M${across(step.t_s)} 0V${each.viewBox.baseVal.height}` }));
       }
     }
     if (nowAt) {
       const points = Object.entries(step.at), last = points.length && points[points.length - 1][1];
-      if (step.square) draw("path", { class: "square", d: step.square });
-      if (last && step.circle) draw("circle", { class: "claimed", cx: last[0], cy: last[1], r: step.circle });
-      for (const [name, [x, y]] of points) draw("path", { class: `spot ${name}`, d: `M${x} ${y}h0` });
+      if (step.square) nowAt.append(svg("rect", { class: "square", ...square(step.square) }));
+      if (last && step.circle) nowAt.append(svg("circle", { class: "claimed", cx: last[0], cy: last[1], r: step.circle }));
+      nowAt.append(...points.map(([name, [x, y]]) => svg("path", { class: `spot ${name}`, d: `M${x} ${y}h0` })));
       if (last && zoomed() > 1.01) bring(last);
     }
   }
@@ -144,8 +252,8 @@
     const inside = x > box[0] && x < box[0] + box[2] && y > box[1] && y < box[1] + box[3];
     if (!inside) look(x - box[2] / 2, y - box[3] / 2, box[2]);
   };
-  function choose([across, down]) {
-    const [x, y] = [box[0] + across * box[2], box[1] + down * box[3]];
+  function choose([right, down]) {
+    const [x, y] = [box[0] + right * box[2], box[1] + down * box[3]];
     const away = (step) => Math.min(...Object.values(step.at).map((point) => Math.hypot(point[0] - x, point[1] - y)));
     const near = nearest(shown, away);
     if (near && away(near) < 40 * box[2] / view.clientWidth) show(near);
@@ -164,15 +272,14 @@
       dots && dots.setAttribute("d", shown.filter((step) => step.at[name]).map(({ at }) => `M${at[name].join(" ")}h0`).join(""));
     }
     for (const marks of all("[data-lane]")) {
-      marks.setAttribute("d", inLane(marks).map((step) => `M${step.x} 0v20`).join(""));
+      marks.setAttribute("d", inLane(marks).map((step) => `M${across(step.t_s).toFixed(1)} 0v20`).join(""));
     }
     show(shown.includes(now) ? now : shown[0]);
   }
 
   // ---- Put together.
   if (view) moveGround();
-  if (!slider || !steps.length) return;
-  find(".stepper").hidden = false;
+  if (!steps.length) return;
   slider.oninput = () => show(shown[slider.value]);
   let timer = null;
   const stop = () => {
@@ -196,7 +303,7 @@
     const lane = marks.closest("svg");
     lane.addEventListener("click", (event) => {
       const frame = lane.getBoundingClientRect(), x = 1000 * (event.clientX - frame.left) / frame.width;
-      const near = nearest(inLane(marks), (step) => Math.abs(step.x - x));
+      const near = nearest(inLane(marks), (step) => Math.abs(across(step.t_s) - x));
       near && show(near);
     });
   }

@@ -7,30 +7,14 @@ Functions that return a str return HTML.
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from html import escape
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.core.text import format_probability, shown
+from edgevpr.core.text import format_probability
 from edgevpr.core.types import Place
 from edgevpr.review.album import Album
-from edgevpr.review.html import (
-    UNKNOWN,
-    Axis,
-    Series,
-    chart,
-    clock,
-    figure,
-    figures,
-    foreign,
-    heading,
-    notes,
-    section,
-    table,
-    time_axis,
-)
 from edgevpr.review.logged import (
     SENT,
     FixOutcome,
@@ -41,8 +25,19 @@ from edgevpr.review.logged import (
     text,
     value,
 )
-from edgevpr.review.overhead import Layer, at_of
-from edgevpr.review.steps import Explored, Step, layer_of, make_page
+from edgevpr.review.webpage import (
+    UNKNOWN,
+    Chart,
+    Form,
+    Layer,
+    Section,
+    Step,
+    at_of,
+    clock,
+    figure,
+    make_layer,
+    make_page,
+)
 
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
@@ -64,30 +59,27 @@ def make_flight_page(
 ) -> str:
     """Return the whole page. `frames` finds the pictures of the flight, `references` those that the map was made of.
     `no_ground` is a sentence on why there is no `ground`."""
-    queries, axis = flight.queries, time_axis(flight.span_s)
+    queries = flight.queries
     time = text(flight.start, "time") or next((text(query.line, "time") for query in queries), None)
-    title = f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time"
     start = [f"{name} {known}" for name, key in _KNOWN if (known := text(flight.start, key))]
-    above = [
-        heading(title, [f"{clock(flight.span_s)} long", *start, str(flight.path)]),
-        figures(_matches(flight) | _flown(flight)),
-        notes(_notes(flight, bool(ground), no_ground)),
-    ]
+    head = {
+        "title": f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time",
+        "known": [f"{clock(flight.span_s)} long", *start, str(flight.path)],
+        "figures": _matches(flight) | _flown(flight),
+        "warnings": _notes(flight, bool(ground), no_ground),
+        "span_s": flight.span_s,
+    }
     steps = _steps(ground, flight)
-    explored = Explored(
-        ground=ground,
-        layers=_layers(ground, flight, steps),
-        steps=steps,
-        albums={"seen": frames, "place": references},
+    return make_page(
+        head,
+        steps,
+        ground,
+        _layers(ground, flight, steps),
+        {"seen": frames, "place": references},
         lens=_lens(flight.start),
-        axis=axis,
+        charts=_charts(flight),
+        sections=[*_remarks(flight), *_settings(flight)],
     )
-    below = [
-        section("Over time", _charts(flight, axis)),
-        section("What was said", _remarks(flight)),
-        section("How it was set", _settings(flight)),
-    ]
-    return make_page(title, above, explored, below)
 
 
 def make_match_page(
@@ -99,32 +91,32 @@ def make_match_page(
 ) -> str:
     """Return the whole page of the queries of `match`. `albums` have the pictures of queries ("seen") and of the map
     ("place"), `name` is that of the map, `lens` that of the camera."""
-    title, flight = f"Matches in {name}", LoggedFlight(path=Path(), truth="GPS tags", queries=list(queries))
+    flight = LoggedFlight(path=Path(), truth="GPS tags", queries=list(queries))
+    head = {
+        "title": f"Matches in {name}",
+        "known": [f"{len(queries)} pictures"],
+        "figures": _matches(flight),
+        "warnings": [],
+        "span_s": None,
+    }
     steps = _steps(ground, flight)
-    explored = Explored(
-        ground=ground,
-        layers=_layers(ground, flight, steps),
-        steps=steps,
-        albums=albums,
-        lens=lens,
-    )
-    return make_page(title, [heading(title, [f"{len(queries)} pictures"]), figures(_matches(flight))], explored, [])
+    return make_page(head, steps, ground, _layers(ground, flight, steps), albums, lens=lens)
 
 
 def _layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
     """Return the layers of the drawing, from the bottom to the top."""
     return [
         Layer("places of the map", "places", [[at_of(place) for place in ground]]),
-        layer_of(steps, "places found", "found"),
+        make_layer(steps, "places found", "found"),
         Layer("places learnt", "learnt", [flight.learnt]),
         Layer("fixes between matches", "between", [list(filter(None, map(point, flight.between)))]),
-        layer_of(steps, flight.truth, "gps", "line"),
-        layer_of(steps, "autopilot", "autopilot", "line"),
-        layer_of(steps, "refused there", "missed"),
-        layer_of(steps, "matches", "accepted"),
-        layer_of(steps, "fixes taken", "taken"),
-        layer_of(steps, "fixes not answered", "unanswered"),
-        layer_of(steps, "fixes refused", "refused"),
+        make_layer(steps, flight.truth, "gps", "line"),
+        make_layer(steps, "autopilot", "autopilot", "line"),
+        make_layer(steps, "refused there", "missed"),
+        make_layer(steps, "matches", "accepted"),
+        make_layer(steps, "fixes taken", "taken"),
+        make_layer(steps, "fixes not answered", "unanswered"),
+        make_layer(steps, "fixes refused", "refused"),
     ]
 
 
@@ -200,7 +192,7 @@ def _lens(start: Mapping[str, Any]) -> "Lens | None":
 def _matches(flight: LoggedFlight) -> dict[str, str]:
     """Return the figures of the matches, by their names."""
     queries, accepted = flight.queries, [query for query in flight.queries if query.accepted]
-    share = f" <small>{len(accepted) / len(queries):.0%}</small>" if queries else ""
+    share = f" ({len(accepted) / len(queries):.0%})" if queries else ""
     off_m = [query.off_m for query in accepted if query.off_m is not None]
     accuracies_m = [query.accuracy_m for query in accepted if query.accuracy_m is not None]
     return {
@@ -215,7 +207,7 @@ def _matches(flight: LoggedFlight) -> dict[str, str]:
 def _flown(flight: LoggedFlight) -> dict[str, str]:
     """Return the figures that only a flight has, by their names."""
     outcomes = Counter(query.fix.outcome for query in flight.queries if query.fix)
-    between = f" <small>and {len(flight.between)} between matches</small>" if flight.between else ""
+    between = f" and {len(flight.between)} between matches" if flight.between else ""
     ends_s = [0.0, *(query.t_s for query in flight.queries if query.accepted), flight.span_s]
     return {
         "frames not usable": str(flight.unusable) if flight.unusable else UNKNOWN,
@@ -250,49 +242,50 @@ def _notes(flight: LoggedFlight, has_ground: bool, no_ground: str) -> list[str]:
     return [*flight.notes, *(sentence for is_there, sentence in known if not is_there)]
 
 
-def _charts(flight: LoggedFlight, axis: Axis) -> str:
-    def line(name: str, colour: str, factor: float, *keys: str) -> Series:
+def _charts(flight: LoggedFlight) -> list[Chart]:
+    def line(name: str, colour: str, factor: float, *keys: str) -> tuple[str, str, Form, list[tuple[float, float]]]:
         values = [(query.t_s, number(query.line, *keys)) for query in flight.queries]
-        return Series(name, colour, [(t_s, factor * value) for t_s, value in values if value is not None])
+        return name, colour, "line", [(t_s, factor * value) for t_s, value in values if value is not None]
 
-    def dots(name: str, colour: str, values: Sequence[float | None]) -> Series:
+    def dots(
+        name: str, colour: str, values: Sequence[float | None]
+    ) -> tuple[str, str, Form, list[tuple[float, float]]]:
         pairs = zip(flight.queries, values, strict=True)
-        return Series(name, colour, [(query.t_s, value) for query, value in pairs if value is not None], True)
+        return name, colour, "dots", [(query.t_s, value) for query, value in pairs if value is not None]
 
     queries, truth = flight.queries, flight.truth
-    charts = (
-        ("Confidence", "", [
+    return [
+        Chart("Confidence", "", [
             dots("accepted", "accepted", [query.confidence if query.accepted else None for query in queries]),
             dots("refused", "refused", [None if query.accepted else query.confidence for query in queries]),
         ]),
-        ("Position", "m", [
+        Chart("Position", "m", [
             dots(f"from {truth}", "gps", [query.off_m for query in queries]),
             dots("accuracy, 1 sigma", "accepted", [query.accuracy_m for query in queries]),
         ]),
-        ("A query", "ms", [
+        Chart("A query", "ms", [
             line("encode", "gps", 1e3, "costs", "t_encode_s"),
             line("match", "accepted", 1e3, "costs", "t_match_s"),
             line("CPU", "taken", 1e3, "costs", "cpu_s"),
         ]),
-        ("RAM", "MB", [line("", "accepted", 1, "costs", "rss_mb")]),
-        ("Charge", "mAh", [line("", "accepted", 1, "totals", "used_mah")]),
-        ("Temperature", "°C", [line("", "refused", 1, "board", "temperature_c")]),
-        ("Age of the newest picture", "ms", [line("", "accepted", 1e3, "totals", "latency_s")]),
-    )  # fmt: skip
-    drawn = [chart(title, unit, series, axis, top=0.0 if unit else 1.0) for title, unit, series in charts]
-    return f'<div class="charts">{"".join(drawn)}</div>' if any(drawn) else ""
+        Chart("RAM", "MB", [line("", "accepted", 1, "costs", "rss_mb")]),
+        Chart("Charge", "mAh", [line("", "accepted", 1, "totals", "used_mah")]),
+        Chart("Temperature", "°C", [line("", "refused", 1, "board", "temperature_c")]),
+        Chart("Age of the newest picture", "ms", [line("", "accepted", 1e3, "totals", "latency_s")]),
+    ]  # fmt: skip
 
 
-def _remarks(flight: LoggedFlight) -> str:
+def _remarks(flight: LoggedFlight) -> list[Section]:
+    """Return the section of what was reported in flight, as far as there is any."""
     rows = [(clock(t_s), kind, sentence) for t_s, kind, sentence in flight.remarks[:_MOST_REMARKS]]
-    left_out = f'<p class="soft">and {len(flight.remarks) - len(rows)} more lines</p>'
-    return (table(("time", "of", "said"), rows) if rows else "") + left_out * (len(flight.remarks) > len(rows))
+    left_out = len(flight.remarks) - len(rows)
+    lines = [f"{left_out} more lines are in the log."] if left_out else []
+    return [Section("What was said", lines, [("time", "of", "said"), *rows])] if rows else []
 
 
-def _settings(flight: LoggedFlight) -> str:
+def _settings(flight: LoggedFlight) -> list[Section]:
+    """Return the section of the configuration, if the log has it."""
     reason, config = text(flight.start, "decided", "reason"), value(flight.start, "config")
     if not isinstance(config, dict):
-        return ""
-    decided = f"<p>{foreign(reason)}</p>" if reason else ""
-    dumped = escape(shown(json.dumps(config, indent=1, ensure_ascii=False), keep="\n"))
-    return f"{decided}<details><summary>configuration</summary><pre>{dumped}</pre></details>"
+        return []
+    return [Section("How it was set", [reason] if reason else [], folded=json.dumps(config, indent=1))]

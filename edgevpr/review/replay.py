@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from edgevpr.core.arrays import Image
-from edgevpr.core.config import Config, build, change_config
+from edgevpr.core.config import Config, build
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.text import waiting
 from edgevpr.frames.images import read_image
@@ -24,15 +24,15 @@ from edgevpr.review.tape import (
     ReplayedDriver,
     ReplayedSigning,
     ReplayedSource,
-    Supposed,
     TapeEnded,
     read_tape,
 )
-from edgevpr.runtime.flight.boundary import TapedMachine, TapedStop, TapedTurns, tape_clock
+from edgevpr.runtime.flight.boundary import TapedStop, TapedTurns, tape_clock, tape_machine
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flight import Flight
 from edgevpr.runtime.flight.flightio import FlightIO
 from edgevpr.runtime.flight.flightlog import read_log, select_last_flight
+from edgevpr.runtime.flight.machine import Machine
 from edgevpr.runtime.flight.recording import MAP, TAPE, frame_path, open_recording
 
 _log = logging.getLogger(__name__)
@@ -51,11 +51,10 @@ class Replayed:
     guessed: int
 
 
-def replay(log: str | Path, place_map: str | None = None, changes: Path | None = None) -> Replayed:
+def replay(log: str | Path, place_map: str | None = None) -> Replayed:
     """Fly the last flight of `log` again. Its recording is in the folder that the log names, or in one of that name
-    beside the log. `place_map` is the path of its map (None: the path that it had). `changes` is a YAML file (None:
-    none) whose keys override the configuration of the flight; frames and messages stay those of the flight. Raises
-    UsageError if there is no recording, and EdgevprError if it or the map cannot be opened."""
+    beside the log. `place_map` is the path of its map (None: the path that it had). Raises UsageError if there is no
+    recording, and EdgevprError if it or the map cannot be opened."""
     flown, folder = _recorded(log)
     notes = read_tape(folder / TAPE)
     note = next(notes, None)
@@ -63,9 +62,7 @@ def replay(log: str | Path, place_map: str | None = None, changes: Path | None =
         raise EdgevprError(f"{folder / TAPE} is no tape of a flight, or was cut in its first line: nothing to replay.")
     header = note[1]
     config = build(Config, header["config"], str(folder))
-    if changes:
-        config = change_config(config, changes)
-    playback = Supposed(notes) if changes else Playback(notes)
+    playback = Playback(notes)
     board = build(Board, header["board"], "the board of the flight")
     why_ended = None
     with TemporaryDirectory(prefix="edgevpr-replay-") as temporary:
@@ -75,7 +72,7 @@ def replay(log: str | Path, place_map: str | None = None, changes: Path | None =
             place_map=_map_of(folder, Path(temporary), config, place_map or config.map),
             log=replace(config.log, path=again_log, max_mb=None),
             clock=tape_clock(Clock(sleep=playback.sleep), playback),
-            machine=TapedMachine(board, playback),
+            machine=tape_machine(Machine(board), playback),
             open_source=lambda step_s: ReplayedSource(playback, partial(_picture, folder)),
             turns=TapedTurns(Clock().mono_s, playback),
             drive=partial(ReplayedDriver, playback),

@@ -32,9 +32,6 @@ from edgevpr.runtime.flight.stop import StopNow
 Note = list[Any]  # a line of the tape: a kind, and its values
 _CLOCKS = ("mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s")
 
-# Questions about the machine: in a "what if", the newest answer on the tape is given.
-_MACHINE = ("is_live", "limit_c", "heat", "load", "rss_mb", "port", "picked", "cannot_learn")
-
 _log = logging.getLogger(__name__)
 
 
@@ -43,8 +40,7 @@ class TapeEnded(BaseException):
 
 
 class ReplayedDriver:
-    """A driver without a port and a thread: the turns of its link come from the tape, a `Playback`. In a "what if" it
-    receives what the autopilot sent in the flight, and a packet to the autopilot counts as sent at once."""
+    """A driver without a port and a thread: the turns of its link come from the tape, a `Playback`."""
 
     def __init__(
         self, playback: "Playback", name: str, address: LinkAddress, conversation: Conversation, turns: Turns
@@ -62,19 +58,10 @@ class ReplayedDriver:
         return connected, trouble, reopened
 
     def ring(self) -> None:
-        """Send what waits, in a "what if"."""
-        if not self._playback.is_exact:
-            with self._turns.taken("ring"):
-                self._send_all()
+        """Do nothing: what is sent when is on the tape."""
 
     def close(self) -> None:
         """Do nothing: all that closing does is on the tape."""
-
-    def _send_all(self) -> None:
-        while chosen := self._conversation.next_packet():
-            if sending := chosen[1]:
-                sending.settle(True)
-                self._conversation.note_departed([sending])
 
     def _perform(self, t_s: float, steps: list[Note]) -> None:
         """Repeat the `steps` of a turn at the time `t_s`."""
@@ -96,8 +83,6 @@ class ReplayedDriver:
                     conversation.hear(b64decode(data), now_s, tuple(sender) if sender else None)
                 except Exception:  # as in the flight, which then lost the link
                     _log.debug("the link failed", exc_info=True)
-            case ["said", _] if not self._playback.is_exact:
-                self._send_all()
             case ["said", then]:
                 packet, sending = conversation.next_packet() or (None, None)
                 self._leaving += [sending] if sending else []
@@ -167,8 +152,6 @@ class Playback(Tape):
     questions out of order; if it is 0, the replay has asked exactly what the flight asked.
     """
 
-    is_exact = True  # False: a "what if"
-
     def __init__(self, notes: Iterable[Note]) -> None:
         self.links: dict[str, Callable[[float, list[Note]], None]] = {}
         self.packets = Packets()
@@ -236,60 +219,6 @@ class Playback(Tape):
         if kind in _CLOCKS:
             return self._known.get(kind, 0.0)
         return self._known[kind] if kind in self._known else look()
-
-
-class Supposed(Playback):
-    """Playback for a "what if": the flight with another configuration, which may ask for and send other things than the
-    recorded flight did. Its time is that of the tape and goes on from frame to frame; computing takes no time."""
-
-    is_exact = False
-    _has_ended = False
-    _utc_ahead_s = 0.0
-
-    def sleep(self, seconds: float) -> None:
-        """Advance the time by `seconds`. The notes of that time are taken off the tape, up to the next frame."""
-        until_s = self.t_s + seconds
-        while (note := self._next()) and note[0] != "frame" and self._time_of(note) <= until_s:
-            self._step(note)
-        self.t_s = max(self.t_s, until_s)
-
-    def read(self, kind: str, look: Callable[[], Any]) -> Any:
-        """Return an answer that the flight could have got to a question of `kind`; `look` asks the real machine."""
-        if kind == "frame":
-            return self._frame()
-        if kind == "ended":
-            return self._has_ended
-        if kind in _CLOCKS:
-            times_s = {"mono_s": self.t_s, "wall_s": self.t_s, "utc_s": self.t_s + self._utc_ahead_s}
-            return times_s.get(kind, 0.0)
-        while kind in _MACHINE and kind not in self._known and (note := self._next()):
-            self._step(note)
-        return self._known[kind] if kind in _MACHINE and kind in self._known else look()
-
-    def _frame(self) -> dict[str, Any] | None:
-        """Return the next frame (None: the tape has no more). If the time is past several frames, return the newest of
-        them, as a camera would."""
-        frame: dict[str, Any] | None = None
-        while (note := self._next()) and not (frame and self._time_of(note) > self.t_s):
-            frame = note[1] or frame if note[0] == "frame" else frame
-            self._step(note)
-        self._has_ended |= frame is None
-        return frame
-
-    def _step(self, note: Note) -> None:
-        """Take the next note off the tape and act on it."""
-        self._at += 1
-        kind, *values = note
-        self.t_s = max(self.t_s, self._time_of(note))
-        if perform := self.links.get(kind):
-            perform(*values)
-        elif kind == "utc_s":
-            self._utc_ahead_s = values[0] - self.t_s
-        elif values:
-            self._known[kind] = values[0]
-
-    def _time_of(self, note: Note) -> float:
-        return float(note[1]) if note[0] == "mono_s" or note[0] in self.links else self.t_s
 
 
 def _is_moment(kind: str) -> bool:

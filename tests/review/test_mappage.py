@@ -39,7 +39,7 @@ def made(mapped, *argv):
     """The page that a command writes, and its data."""
     out = mapped / f"{argv[0]}.html"
     assert main([*map(str, argv), "--page", str(out), "--map-images", str(mapped / "ref")]) == 0
-    return out, json.loads(re.search(r'id="steps">(.*?)</script>', out.read_text("utf-8"))[1])
+    return out, json.loads(re.search(r'id="page">(.*?)</script>', out.read_text("utf-8"))[1])
 
 
 @pytest.mark.process
@@ -51,7 +51,7 @@ def test_the_page_of_a_map_shows_its_places_and_what_is_amiss_with_them(browser,
     assert "looks like place 6: " in alike[f"Place 13: {TWIN}"]
     assert all("place 13: " in said for title, said in alike.items() if TWIN not in title), "they overlap with its twin"
     with Opened(browser, out) as page:
-        assert page.locator("image").count() == 1
+        assert page.locator("image").count() == 12
         page.focus("#step")
         for _ in range(5):
             page.keyboard.press("ArrowRight")

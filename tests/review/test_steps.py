@@ -41,7 +41,7 @@ def page(browser, made):
 
 
 def test_slider_moves_texts_pictures_and_marks_by_keyboard(page, made):
-    steps = json.loads(re.search(r'id="steps">(.*?)</script>', made.read_text("utf-8"))[1])["steps"]
+    steps = json.loads(re.search(r'id="page">(.*?)</script>', made.read_text("utf-8"))[1])["steps"]
     page.focus("#step")
     seen = set()
     for at in range(3):
@@ -52,10 +52,11 @@ def test_slider_moves_texts_pictures_and_marks_by_keyboard(page, made):
         assert all(width > 100 for _, width in pictures)
         accepted = "accepted" in steps[at]["at"]
         assert page.locator(".spot.accepted").count() == page.locator(".claimed").count() == accepted
-        seen.add(page.get_attribute(".spot.found", "d") + page.get_attribute(".square", "d"))
+        seen.add(page.get_attribute(".spot.found", "d") + page.get_attribute(".square", "transform"))
         page.keyboard.press("ArrowRight")
     assert len(seen) == 3, "the marks move"
     assert "missed" in steps[2]["at"], "a refused query is shown where GPS says it was"
+    assert page.locator("image.layer-ground").count() == 12, "the map's own pictures"
     assert page.inner_text(".ruler") == "20 m"
 
 

@@ -9,29 +9,23 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, astuple, fields, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
-from edgevpr.core.config import Config
 from edgevpr.core.errors import ImageError
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import as_jpeg, decoded
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source
-from edgevpr.mavlink.address import LinkAddress, Sender
-from edgevpr.mavlink.conversation import LinkSettings
-from edgevpr.mavlink.driver import PortDriver, PortState, Wire
-from edgevpr.mavlink.fixes import Sending
-from edgevpr.mavlink.peer import Autopilot
+from edgevpr.mavlink.address import LinkAddress
+from edgevpr.mavlink.conversation import Conversation
+from edgevpr.mavlink.driver import PortDriver, PortState
 from edgevpr.mavlink.turns import Turns
-from edgevpr.power.boards import Board
 from edgevpr.power.meter import MachineLoad
 from edgevpr.power.thermal import ThermalState
 from edgevpr.runtime.flight.clock import Clock
-from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.machine import Machine
 from edgevpr.runtime.flight.stop import Stop
 from edgevpr.runtime.preflight.pick import Outlook
-from edgevpr.runtime.recognise.recogniser import Recogniser
 
 T = TypeVar("T")
 
@@ -43,6 +37,16 @@ SOURCE_STATE = {
     "latency_s": None,
     "condition": Condition.RUNNING.name,
     "state": "replayed",
+}
+# The calls by which a driver uses its conversation, and their names on the tape.
+_STEPS = {
+    "drop_stale": "waits",
+    "announce_changes": "answers",
+    "next_packet": "said",
+    "note_departed": "departed",
+    "hear": "heard",
+    "break_off": "lost",
+    "end": "closed",
 }
 _UNPACKED = "image", "position", "pose"  # of a frame, not on the tape as they are
 
@@ -65,40 +69,38 @@ def tape_clock(clock: Clock, tape: Tape) -> Clock:
     return replace(clock, **{name: partial(tape.read, name, getattr(clock, name)) for name in names})
 
 
-class TapedMachine(Machine):
-    """A machine whose answers are recorded, or played back."""
+# The questions to a machine: their names on the tape, and the types of the answers that are no JSON.
+_QUESTIONS: dict[str, tuple[str, type[Any] | None]] = {
+    "limit_c": ("limit_c", None),
+    "measure_heat": ("heat", ThermalState),
+    "measure_load": ("load", MachineLoad),
+    "rss_mb": ("rss_mb", None),
+    "pick_technique": ("picked", None),
+    "measure_speed": ("outlook", Outlook),
+    "try_map": ("cannot_learn", None),
+    "is_written": ("log is written", None),
+}
 
-    def __init__(self, board: Board, tape: Tape) -> None:
-        super().__init__(board)
-        self._tape = tape
 
-    def limit_c(self) -> float:
-        return self._tape.read("limit_c", super().limit_c)
+def tape_machine(machine: Machine, tape: Tape) -> Machine:
+    """Return the same machine with each answer recorded on the `tape`, or played back from it."""
+    return cast(Machine, _TapedMachine(machine, tape))
 
-    def measure_heat(self) -> ThermalState:
-        names = [field.name for field in fields(ThermalState)]
-        values = self._tape.read("heat", lambda: astuple(super(TapedMachine, self).measure_heat()))
-        return ThermalState(**dict(zip(names, values, strict=False)))  # an older tape has fewer values
 
-    def measure_load(self) -> MachineLoad:
-        load = self._tape.read("load", lambda: astuple(super(TapedMachine, self).measure_load()))
-        return MachineLoad(tuple(load[0]), *load[1:])
+class _TapedMachine:
+    def __init__(self, machine: Machine, tape: Tape) -> None:
+        self._machine, self._tape = machine, tape
 
-    def rss_mb(self) -> float:
-        return self._tape.read("rss_mb", super().rss_mb)
+    def __getattr__(self, name: str) -> Any:
+        kind, made = _QUESTIONS[name]
+        return partial(self._ask, kind, made, getattr(self._machine, name))
 
-    def pick_technique(self, config: Config) -> str | None:
-        return self._tape.read("picked", partial(super().pick_technique, config))
-
-    def measure_speed(self, recogniser: Recogniser, config: Config) -> Outlook:
-        measured = partial(super().measure_speed, recogniser, config)
-        return Outlook(*self._tape.read("outlook", lambda: astuple(measured())))
-
-    def try_map(self, opened: Callable[[], object]) -> str | None:
-        return self._tape.read("cannot_learn", partial(super().try_map, opened))
-
-    def is_written(self, flight_log: FlightLog) -> bool:
-        return self._tape.read("log is written", partial(super().is_written, flight_log))
+    def _ask(self, kind: str, made: type[Any] | None, measure: Callable[..., Any], *args: Any) -> Any:
+        if made is None:
+            return self._tape.read(kind, partial(measure, *args))
+        values = self._tape.read(kind, lambda: astuple(measure(*args)))
+        names = [field.name for field in fields(made)]
+        return made(**dict(zip(names, values, strict=False)))  # an older tape may have fewer values
 
 
 class TapedStop(Stop):
@@ -188,65 +190,42 @@ class TapedTurns(Turns):
 class RecordedDriver(PortDriver):
     """The driver of a port that records what it does with its conversation, and its state whenever that is read."""
 
-    def __init__(self, turns: TapedTurns, name: str, address: LinkAddress, conversation: Wire, _: Turns) -> None:
-        super().__init__(name, address, _RecordedWire(conversation, turns), turns)
+    def __init__(
+        self, turns: TapedTurns, name: str, address: LinkAddress, conversation: Conversation, _: Turns
+    ) -> None:
+        recorded = cast(Conversation, _RecordedConversation(conversation, turns))
+        super().__init__(name, address, recorded, turns)
         self._tape = turns.tape
 
     def state(self) -> PortState:
         return self._tape.read("port", super().state)
 
 
-class _RecordedWire:
-    """A conversation whose driver's calls are recorded as steps of the present turn."""
+class _RecordedConversation:
+    """A conversation for a driver, whose calls are recorded as steps of the present turn."""
 
-    def __init__(self, conversation: Wire, turns: TapedTurns) -> None:
+    def __init__(self, conversation: Conversation, turns: TapedTurns) -> None:
         self._conversation, self._turns = conversation, turns
 
-    @property
-    def settings(self) -> LinkSettings:
-        return self._conversation.settings
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._conversation, name)
+        return partial(self._call, name, value) if name in _STEPS else value
 
-    @property
-    def autopilot(self) -> Autopilot:
-        return self._conversation.autopilot
-
-    @property
-    def waits(self) -> bool:
-        return self._conversation.waits
-
-    def wait_s(self, longest_s: float) -> float:
-        return self._conversation.wait_s(longest_s)
-
-    def drop_stale(self) -> None:
-        self._note("waits")
-        self._conversation.drop_stale()
-
-    def announce_changes(self) -> None:
-        self._note("answers")
-        self._conversation.announce_changes()
-
-    def next_packet(self) -> tuple[bytes, Sending | None] | None:
-        found = self._conversation.next_packet()
-        self._note("said", found and found[0])
-        return found
-
-    def note_departed(self, fixes: list[Sending]) -> None:
-        self._note("departed", len(fixes))
-        self._conversation.note_departed(fixes)
-
-    def hear(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
+    def _call(self, name: str, method: Callable[..., Any], *args: Any) -> Any:
+        result = None
         try:
-            return self._conversation.hear(data, now_s, sender)
+            result = method(*args)
+            return result
         finally:
-            self._note("heard", data, sender, list(self.settings.signing.verdicts))
+            self._turns.steps.append((_STEPS[name], *self._describe(name, args, result)))
 
-    def break_off(self, lost_fixes: int) -> None:
-        self._note("lost", lost_fixes)
-        self._conversation.break_off(lost_fixes)
-
-    def end(self) -> None:
-        self._note("closed")
-        self._conversation.end()
-
-    def _note(self, *step: Any) -> None:
-        self._turns.steps.append(step)
+    def _describe(self, name: str, args: tuple[Any, ...], result: Any) -> tuple[Any, ...]:
+        """Return what a replay needs of a call: the bytes and their sender, the packet, the number of fixes."""
+        match name, args:
+            case "hear", (data, _, sender):
+                return data, sender, list(self._conversation.settings.signing.verdicts)
+            case "next_packet", _:
+                return (result and result[0],)
+            case "note_departed", (fixes,):
+                return (len(fixes),)
+        return args

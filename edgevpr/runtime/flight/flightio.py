@@ -30,10 +30,10 @@ from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.boundary import (
     RecordedDriver,
     RecordedSource,
-    TapedMachine,
     TapedStop,
     TapedTurns,
     tape_clock,
+    tape_machine,
 )
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flightlog import FlightLog
@@ -156,7 +156,7 @@ def record_io(io: FlightIO, recording: Recording) -> FlightIO:
     return replace(
         io,
         clock=tape_clock(io.clock, recording),
-        machine=TapedMachine(io.board, recording),
+        machine=tape_machine(io.machine, recording),
         open_source=lambda step_s: RecordedSource(io.open_source(step_s), recording, recording.keep),
         turns=turns,
         drive=partial(RecordedDriver, turns),

@@ -202,23 +202,6 @@ def test_another_answer_of_a_technique_is_a_difference_that_is_told(fly, tmp_pat
     assert len(found["lines"]["others"]) == PLACES
 
 
-def test_what_if_the_map_or_the_technique_were_another_or_more_precision_asked(fly, recording, tmp_path, capsys):
-    with autopilot() as link:
-        ended(fly("--link", link, *QUICK))
-    log, config = str(tmp_path / "flight.jsonl"), tmp_path / "what.yaml"
-    config.write_text("match: {min_score: 1.0}\n")
-    assert main(["replay", log, "--config", str(config), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["summary"]["queries"] == [PLACES, PLACES]
-    assert found["summary"]["accepted"] == [PLACES, 0]
-    config.write_text(f"technique: hog\nmap: {recording / 'hog.gpkg'}\n")
-    assert main(["replay", log, "--config", str(config)]) == 0
-    assert f"{PLACES} of {PLACES} queries end alike" in capsys.readouterr().out
-    config.write_text("match: {accept_precission: 0.9}\n")
-    assert main(["replay", log, "--config", str(config)]) == 2
-    assert "`accept_precision`" in capsys.readouterr().err
-
-
 def test_what_is_missing_is_said(fly, recording, tmp_path, capsys):
     log = tmp_path / "flight.jsonl"
     assert main(["replay", str(log)]) == 2

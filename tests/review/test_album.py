@@ -1,0 +1,48 @@
+"""The pictures of a page: found by their names, laid on the ground, and small enough."""
+
+from dataclasses import replace
+
+import pytest
+from ground import places_in, write_positions
+from rasters import HOME, textured_raster
+
+from edgevpr.core.types import Place, Pose
+from edgevpr.frames.level import Lens
+from edgevpr.review.album import album_of_map, make_album, small_pictures
+
+LENS = Lens(60.0)
+
+
+def test_lay_gives_the_picture_whose_top_points_where_the_pose_says(tmp_path):
+    places = places_in(tmp_path)
+    write_positions(tmp_path / "positions.csv", places)
+    album, turned = make_album([tmp_path]), places[4]
+    north_up = replace(turned, pose=replace(turned.pose, up_deg=0.0))
+    assert album.lay(turned, None).mask is None
+    assert album.lay(turned, LENS).mask is None, "the map was made without the lens"
+    assert album.lay(north_up, LENS).mask is not None, "it was made with it"
+    assert album.lay(north_up, None) is None, "its heading contradicts the map"
+    assert album.lay(replace(turned, source_image="gone.png"), LENS) is None
+
+
+def test_the_pictures_of_a_map_of_an_orthophoto_are_cut_from_it_again(tmp_path):
+    pytest.importorskip("rasterio")
+    pose = Pose(up_deg=0.0, footprint_m=60.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
+    places = [Place(place_id=1, source_image="town.tif_r000_c000", position=HOME, pose=pose)]
+    album = album_of_map([textured_raster(tmp_path / "town.tif")], places)
+    assert album.image("town.tif_r000_c000").std() > 10
+    assert album.image("town.tif_r000_c001") is None
+    assert album.lay(places[0], None).image.std() > 10
+    assert album_of_map([], places).image("town.tif_r000_c000") is None
+
+
+def test_pictures_get_smaller_and_then_fewer_until_they_fit(tmp_path):
+    keys = [[("seen", place.source_image)] for place in places_in(tmp_path)]
+    albums = {"seen": make_album([tmp_path])}
+    sizes = []
+    for room_bytes in (1e6, 3e4, 6e3):
+        found, left_out = small_pictures(keys, albums, room_bytes)
+        assert sum(map(len, found.values())) <= room_bytes
+        assert bool(left_out) == (len(found) < len(keys))
+        sizes.append(len(found))
+    assert sizes[0] == sizes[1] == len(keys) > sizes[2] > 0
