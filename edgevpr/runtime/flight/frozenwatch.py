@@ -232,7 +232,8 @@ class FrozenWatch:
             self._report(_NEW_AFTER_REPEATS)
         elif self.is_frozen and self._new_in_a_row >= self._new_needed:
             self.is_frozen = False
-            self._notifier.report("source", Severity.INFO, Reason(ReasonCode.PICTURES_MOVE), topic="frozen")
+            note = Reason(ReasonCode.PICTURES_MOVE)
+            self._notifier.report("source", Severity.INFO, note, topic="frozen", state=str(note))
 
     def _report(self, new_needed: int) -> None:
         was_frozen, self.is_frozen = self.is_frozen, True
@@ -242,7 +243,7 @@ class FrozenWatch:
         if self._autopilot:
             self._autopilot.begin_anew()
         if reason := self.reason:
-            self._notifier.report("source", Severity.WARNING, reason, topic="frozen")
+            self._notifier.report("source", Severity.WARNING, reason, topic="frozen", state=str(reason))
 
 
 def _velocity(vehicle: Vehicle | None) -> tuple[float, float] | None:
