@@ -29,11 +29,9 @@ def add(commands: Any) -> None:
         help="folder of frames of this flight (repeatable), or its video; not needed with a recording",
     )
     add_map_images(report)
-    export = command(commands, "export", run_export, "export matches and fixes of a flight as GeoJSON or CSV")
+    export = command(commands, "export", run_export, "export matches and fixes of a flight as GeoJSON")
     export.add_argument("log", metavar="LOG")
-    form = export.add_mutually_exclusive_group(required=True)
-    for name in ("geojson", "csv"):
-        form.add_argument(f"--{name}", metavar="FILE", help="file to write (-: standard output)")
+    export.add_argument("--geojson", required=True, metavar="FILE", help="file to write (-: standard output)")
     replay = command(commands, "replay", run_replay, "replay a recorded flight, and compare every line and packet")
     replay.add_argument("log", metavar="LOG", help="flight log; its last flight is replayed")
     replay.add_argument("--map", metavar="MAP", help="map of the flight (default: at its recorded path)")
@@ -68,17 +66,16 @@ def run_report(args: Namespace) -> int:
 
 
 def run_export(args: Namespace) -> int:
-    """Run `export`: write the points of a flight (matches, fixes, positions) as GeoJSON or CSV."""
-    from edgevpr.review.export import WRITERS, make_features
+    """Run `export`: write the points of a flight (matches, fixes, positions) as GeoJSON."""
+    from edgevpr.review.export import make_features, write_geojson
     from edgevpr.review.logged import read_flight
 
-    form, target = next((name, given) for name in WRITERS if (given := getattr(args, name)) is not None)
     features = make_features(read_flight(args.log))
-    if target == "-":
-        WRITERS[form](features, sys.stdout)
+    if args.geojson == "-":
+        write_geojson(features, sys.stdout)
     else:
-        write_out(target, args.log, partial(WRITERS[form], features))
-        print(f"{target}: {len(features)} points")
+        write_out(args.geojson, args.log, partial(write_geojson, features))
+        print(f"{args.geojson}: {len(features)} points")
     return 0
 
 

@@ -117,9 +117,9 @@ def small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
     return _encoded(".jpg", at_most(image, longest_px), (cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY))
 
 
-def small_webp(image: Image, longest_px: int, quality: int = _WEBP_QUALITY) -> bytes:
+def small_webp(image: Image, longest_px: int) -> bytes:
     """Encode a picture, uint8 (H, W[, 3 or 4]), as a WebP, which is half as large, and can be transparent."""
-    return _encoded(".webp", at_most(image, longest_px), (cv2.IMWRITE_WEBP_QUALITY, quality))
+    return _encoded(".webp", at_most(image, longest_px), (cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY))
 
 
 def at_most(image: Image, longest_px: int) -> Image:

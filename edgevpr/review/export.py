@@ -1,6 +1,5 @@
-"""Writes the points of a flight for other programs, as GeoJSON (RFC 7946) or CSV: `edgevpr export`."""
+"""Writes the points of a flight for other programs, as GeoJSON (RFC 7946): `edgevpr export`."""
 
-import csv
 import json
 from collections.abc import Sequence
 from typing import Any, TextIO
@@ -9,8 +8,6 @@ from edgevpr.review.logged import LoggedFlight, LoggedQuery, Point, number, poin
 
 # A point to export: its `kind` ("match", "fix", "between", "autopilot" or "gps"), position and properties.
 Feature = dict[str, Any]
-
-_PLACED = ("kind", "lat_deg", "lon_deg")  # what every feature has; the others are its properties
 
 
 def make_features(flight: LoggedFlight) -> list[Feature]:
@@ -53,14 +50,3 @@ def write_geojson(features: Sequence[Feature], out: TextIO) -> None:
         properties = {name: value for name, value in each.items() if name not in ("lat_deg", "lon_deg")}
         lines.append(json.dumps({"type": "Feature", "geometry": point, "properties": properties}))
     out.write('{"type": "FeatureCollection", "features": [\n' + ",\n".join(lines) + "\n]}\n")
-
-
-def write_csv(features: Sequence[Feature], out: TextIO) -> None:
-    """Write a CSV table with a heading, one point a line; the cell of a property that a point lacks is empty."""
-    names = dict.fromkeys([*_PLACED, *(name for each in features for name in each)])
-    table = csv.DictWriter(out, names, lineterminator="\n")
-    table.writeheader()
-    table.writerows({**each, **{name: f"{each[name]:.8f}" for name in _PLACED[1:]}} for each in features)
-
-
-WRITERS = {"geojson": write_geojson, "csv": write_csv}

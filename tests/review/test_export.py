@@ -1,6 +1,5 @@
 """The points of a flight for other programs."""
 
-import csv
 import io
 import json
 from collections import Counter
@@ -8,35 +7,30 @@ from collections import Counter
 from logs import query, write_log
 
 from edgevpr.cli.main import main
-from edgevpr.review.export import make_features, write_csv, write_geojson
+from edgevpr.review.export import make_features, write_geojson
 from edgevpr.review.logged import read_flight
 
 
-def written(write, features):
+def written(features):
     out = io.StringIO()
-    write(features, out)
-    return out.getvalue()
+    write_geojson(features, out)
+    return json.loads(out.getvalue())["features"]
 
 
-def test_features_of_a_real_flight_are_the_same_in_every_form(flown):
+def test_make_features_of_a_real_flight_has_all_kinds(flown):
     features = make_features(read_flight(flown / "flight.jsonl"))
     kinds = Counter(each["kind"] for each in features)
     assert (kinds["match"], kinds["autopilot"], kinds["gps"]) == (8, 10, 10)
     assert kinds["fix"] > 0
-    collection = json.loads(written(write_geojson, features))
-    rows = list(csv.DictReader(io.StringIO(written(write_csv, features))))
-    assert [each["properties"]["kind"] for each in collection["features"]] == [row["kind"] for row in rows]
-    assert len(rows) == len(features)
+    assert [each["properties"]["kind"] for each in written(features)] == [each["kind"] for each in features]
 
 
 def test_write_a_match_says_where_it_is_and_what_is_known_of_it(tmp_path):
     located = {"lat_deg": -33.5, "lon_deg": 151.25}
     flight = read_flight(write_log(tmp_path / "log", ("query", query("a", located=located))))
-    match = json.loads(written(write_geojson, make_features(flight)))["features"][0]
+    match = written(make_features(flight))[0]
     assert match["geometry"] == {"type": "Point", "coordinates": [151.25, -33.5]}
     assert match["properties"].items() >= {"kind": "match", "query": "a", "place": 3, "accuracy_m": 2.0}.items()
-    (row,) = [each for each in csv.DictReader(io.StringIO(written(write_csv, make_features(flight)))) if each["score"]]
-    assert (row["lat_deg"], row["lon_deg"], row["score"]) == ("-33.50000000", "151.25000000", "0.5")
 
 
 def test_features_of_a_fix_between_matches_is_a_point_too(tmp_path):
@@ -50,10 +44,9 @@ def test_features_of_a_fix_between_matches_is_a_point_too(tmp_path):
 def test_export_writes_a_file_or_standard_output(tmp_path, capsys):
     at = {"lat_deg": 51.0, "lon_deg": 8.0}
     log = write_log(tmp_path / "log", ("query", query("a", located=at, position=None, fix=None)))
-    for form in ("geojson", "csv"):
-        out = tmp_path / f"out.{form}"
-        assert main(["export", str(log), f"--{form}", str(out)]) == 0
-        assert capsys.readouterr().out == f"{out}: 1 points\n"
-        assert main(["export", str(log), f"--{form}", "-"]) == 0
-        assert capsys.readouterr().out == out.read_text("utf-8")
-        assert "51" in out.read_text("utf-8")
+    out = tmp_path / "out.geojson"
+    assert main(["export", str(log), "--geojson", str(out)]) == 0
+    assert capsys.readouterr().out == f"{out}: 1 points\n"
+    assert main(["export", str(log), "--geojson", "-"]) == 0
+    assert capsys.readouterr().out == out.read_text("utf-8")
+    assert "51" in out.read_text("utf-8")
