@@ -142,11 +142,20 @@ class FineMatch:
     votes: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Perspective:
+    """Perspective of a query over a place. `slope`: change of scale (right, down) across the query's picture, relative,
+    per longest side; it is the tangent of the tilt over the focal length. `sd`: standard deviation of each."""
+
+    slope: tuple[float, float]
+    sd: float
+
+
 class Technique(Protocol):
     """A technique of place recognition: it describes pictures (`encode`), and compares a query with all places by their
     coarse parts (`coarse_scores`), then with some by their fine parts (`match`). Needed only with the ability:
-    `match` with `spec.fine`, `pack` with `spec.packed`, `glance` with `spec.in_full`, `turned` and `unmoved` with
-    `spec.looks_down`."""
+    `match` with `spec.fine`, `pack` with `spec.packed`, `glance` with `spec.in_full`, `turned`, `unmoved` and
+    `measure_perspective` with `spec.looks_down`."""
 
     spec: TechniqueSpec
     candidates: int  # places compared after the scan, unless the configuration sets another number
@@ -191,6 +200,9 @@ class Technique(Protocol):
 
     def turned(self, query: Descriptor, fine: np.ndarray, match: FineMatch) -> FineMatch:
         """Compare the query with the place of a `match` again, at its height, but under other rotations only."""
+
+    def measure_perspective(self, query: Descriptor, fine: np.ndarray, match: FineMatch) -> Perspective | None:
+        """Measure the perspective of the query over the place of a `match`; None if too little of them agrees."""
 
     def unmoved(self, query: Descriptor, fine: np.ndarray) -> FineMatch:
         """Compare the query with a place as if it had been taken from the same height, not turned."""

@@ -66,6 +66,10 @@ class ReasonCode(Enum):
     )
     LANDMARKS_DISAGREE = "landmarks and regions disagree on the offset", "{summary}: {landmarks:.0f} support another"
     FEW_LANDMARKS = "too few landmarks agree", "{summary}: {landmarks:.0f}, {needed:.0f} needed at such a score"
+    TILT_SHOWN = (
+        "the image looks tilted, and its tilt is not known",
+        "{summary}: by about {tilt_deg:.0f} degrees; set `source.mount_ahead_deg`, or record roll and pitch",
+    )
     POSITIONS_DISAGREE = "places of the same ground disagree on the position", "{summary} by {apart_m:.0f} m"
     JUST_LEARNT = "place was learnt just now", "{summary}, within {limit_s:g} s: it repeats the autopilot's position"
     SEQUENCE_INCOMPLETE = "the sequence is not complete yet", "{summary}: {queries:.0f} queries of {needed:.0f}"

@@ -90,6 +90,11 @@ class View:
         """True if direction and size of the picture are known, and where in it the point under the camera is."""
         return None not in (self.up_deg, self.footprint_m, self.aside)
 
+    @property
+    def is_tilt_known(self) -> bool:
+        """True if it is known where in or beside it the point under the camera is."""
+        return self.aside is not None or self.lean_m is not None
+
     def fields(self) -> dict[str, Any]:
         """Return this view as fields of the flight log, with rounded numbers. None: unknown."""
         return {

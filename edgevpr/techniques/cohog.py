@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Bytes, Doubles, Image, Ints, Mask, Singles
-from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, Picture, TechniqueSpec, nearest_height
+from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, Perspective, Picture, TechniqueSpec, nearest_height
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.techniques import layout, overlay, placecode
 from edgevpr.techniques.contrast import stretched
-from edgevpr.techniques.displacement import aligned, find_most_similar, share, voted
+from edgevpr.techniques.displacement import aligned, find_most_similar, from_middle, share, voted
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import (
     grey_square,
@@ -33,6 +33,7 @@ from edgevpr.techniques.gradients import (
     unit_rows,
 )
 from edgevpr.techniques.layout import ROTATIONS
+from edgevpr.techniques.perspective import fit_perspective
 from edgevpr.techniques.views import HEIGHT_RATIOS, ViewRegions, Views, compute_scale, hypothesis
 
 # The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
@@ -248,6 +249,21 @@ class CoHog:
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
         off_deg = np.abs(shorter_deg(360 * np.arange(ROTATIONS) / ROTATIONS - at_deg))
         return self.match(query, fine, (first + np.flatnonzero(off_deg >= _TURNED_DEG)).tolist())
+
+    def measure_perspective(self, query: Descriptor, fine: Bytes, match: FineMatch) -> Perspective | None:
+        """See `Technique.measure_perspective`."""
+        ratio, step_deg = nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0), 360 / ROTATIONS
+        turn = round((match.rotation_deg or 0.0) / step_deg) % ROTATIONS
+        view = self._view(query, HEIGHT_RATIOS.index(ratio) * ROTATIONS + turn)
+        nearest = find_most_similar(view.regions, self._reference(fine))
+        scale, off_deg = compute_scale(self._side + 1, ratio), (match.rotation_deg or 0.0) - turn * step_deg
+        return fit_perspective(
+            from_middle(view.numbers, view.side),
+            from_middle(nearest, self._side),
+            complex((match.height_ratio or 1.0) / scale * np.exp(1j * np.radians(off_deg))),
+            complex(*(match.shift_cells or (0.0, 0.0))),
+            (self._side + 1) * scale,
+        )
 
     def unmoved(self, query: Descriptor, fine: Bytes) -> FineMatch:
         """See `Technique.unmoved`."""

@@ -170,7 +170,7 @@ def aligned(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
     Returns the match with the exact position: turned and scaled, the query's picture lies with its middle at the shift
     from that of the place's. The covariance is that of the distances by which single regions miss. Returns the match as
     it is if fewer than 8 pairs agree, or if the rotation or scale found belongs to another hypothesis."""
-    mine, there = _from_middle(*asking), _from_middle(*best)
+    mine, there = from_middle(*asking), from_middle(*best)
     turned, shift = 1 + 0j, complex(*(match.shift_cells or (0.0, 0.0)))
     for again in range(_ROUNDS + 1):
         off = there - turned * mine - shift
@@ -198,7 +198,7 @@ def aligned(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
     )
 
 
-def _from_middle(numbers: Ints, side: int) -> Array:
+def from_middle(numbers: Ints, side: int) -> Array:
     """Return the positions of regions in cells from the middle of their grid: x + iy, y downwards, complex (G,)."""
     y, x = np.divmod(numbers, side)
     return x + 1j * y - (1 + 1j) * (side - 1) / 2

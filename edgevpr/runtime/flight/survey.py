@@ -133,7 +133,7 @@ class Sightings:
         self._origin = self._origin or at
         jacobian[:, 4] = offset_m(self._origin.lat_deg, self._origin.lon_deg, at.lat_deg, at.lon_deg)
         off_m = np.array(offset_m(at.lat_deg, at.lon_deg, seen.position.lat_deg, seen.position.lon_deg))
-        own_m2 = float(np.trace(seen.scatter_m2)) / 2
+        own_m2 = float(np.trace(seen.scatter_m2)) / 2 - where.tilt_m2  # a tilt is what is sought
         shared_m2 = vehicle.gps.sd_m**2
         self._kept.append(
             Sighting(

@@ -55,8 +55,10 @@ from edgevpr.runtime.recognise.judge import (
     judge,
 )
 from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, unpacked
-from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, at_place, locate
+from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, allow_for_tilt, at_place, locate
+from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, ShownTilt, convert_to_tilt
 from edgevpr.runtime.recognise.place_filter import Followed, PlaceFilter
+from edgevpr.runtime.recognise.tilted import SUPPOSED_TILT_DEG, agrees_better_tilted
 
 _MAX_SAME_GROUND = 12  # places that may show the same ground: so many overlap on kite_ochota, which has no positions
 
@@ -226,8 +228,11 @@ class Decider:
         if verdict.accepted and self.technique.spec.looks_down and search is None:
             heading_deg = best.place.heading_deg
             is_heading_known = hints is not None and hints.heading_deg is not None and heading_deg is not None
+            tilt = self._measure_tilt(best, query)
             found = replace(
                 found,
+                tilt=tilt,
+                where=allow_for_tilt(found.where, tilt, query.view) if found.where else None,
                 at_rest_elsewhere=self._share_at_rest_elsewhere(best, ranking, query),
                 ahead_of_turned=None if is_heading_known else self._lead_over_turned(best, found.evidence, query),
             )
@@ -280,6 +285,19 @@ class Decider:
         with self.meter.step("compare"):
             fine, _ = self.place_map.fine_part(best.place.place_id)
             return evidence.agree - log_share(compute_share(self.technique.turned(query.descriptor, fine, best.match)))
+
+    def _measure_tilt(self, best: Candidate, query: EncodedFrame) -> ShownTilt:
+        """Return the tilt of the query against the place, as both show it."""
+        with self.meter.step("compare"):
+            fine, _ = self.place_map.fine_part(best.place.place_id)
+            found = self.technique.measure_perspective(query.descriptor, fine, best.match)
+            tilt = convert_to_tilt(found, query.view.focal)
+            if tilt.is_level or query.view.is_tilt_known:
+                return tilt
+            focal = query.view.focal or TYPICAL_FOCAL
+            if agrees_better_tilted(query.picture, focal, self.technique, fine, best.match):
+                return ShownTilt(math.tan(math.radians(SUPPOSED_TILT_DEG)), 0.0)
+            return tilt
 
     def _share_at_rest_elsewhere(self, candidate: Candidate, ranking: Ranking, encoded: EncodedFrame) -> float:
         """Return the share of a few places elsewhere that agree with the query at rest, as the best one (0: it is not

@@ -14,6 +14,7 @@ from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Descriptor, FineMatch, Technique
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.reasons import Reason, ReasonCode
+from edgevpr.frames.level import MAX_TILT_UNLEVELLED_DEG
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import SequenceSearch
@@ -21,6 +22,7 @@ from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Model, prior
 from edgevpr.runtime.recognise.evidence import Evidence, MapCalibration, list_evidence_kinds
 from edgevpr.runtime.recognise.locate import Located
+from edgevpr.runtime.recognise.perspective import ShownTilt
 
 NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats the position that the autopilot has just reported
 
@@ -126,7 +128,7 @@ class Findings:
     the rule needs none), and `by_flight` the probability of the place by the flight so far (None: the query is judged
     alone). `ahead_of_turned` is the lead, as in the evidence, over the same place with the picture turned otherwise
     (None: not compared). `at_rest_elsewhere` is the share of a few places elsewhere that agree at rest, where the best
-    one does too (else 0).
+    one does too (else 0). `tilt` is that of the query against the place (None: not measured).
     """
 
     ranking: Ranking = field(kw_only=False)
@@ -137,6 +139,7 @@ class Findings:
     by_flight: float | None = None
     ahead_of_turned: float | None = None
     at_rest_elsewhere: float = 0.0
+    tilt: ShownTilt | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,6 +210,8 @@ def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: Seque
         return Verdict(False, objection)
     if where and where.objection:
         return Verdict(False, where.objection)
+    if findings.tilt and findings.tilt.least_deg > MAX_TILT_UNLEVELLED_DEG:
+        return _refuse(ReasonCode.TILT_SHOWN, tilt_deg=findings.tilt.deg)
     if findings.is_new:  # a fix would only repeat the autopilot's position, and make its errors look confirmed
         return _refuse(ReasonCode.JUST_LEARNT, limit_s=NEW_FOR_S)
     return verdict

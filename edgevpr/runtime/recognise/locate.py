@@ -7,7 +7,7 @@ the same position, and their mean is more exact. Without a pose, as ahead, the p
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
 from edgevpr.runtime.recognise.levelling import TILT_SD_WITHOUT_ATTITUDE
-from edgevpr.runtime.recognise.perspective import AttitudeError, fit_attitude_error
+from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, AttitudeError, ShownTilt, fit_attitude_error
 
 # Chosen on aerial_caliterra and aerial_garfield28. Standard deviations along one axis of a shift, as shares of the
 # longest side, added to the covariance of a match: tilt and relief shift the parts of a picture differently.
@@ -41,7 +41,8 @@ class Located:
     pictures, `footprint_m` the length on the ground of the longest side, and `height_m` the height above the ground
     that follows from it, whatever was reported (None: unknown). `places` are the numbers of the places that agree on
     it. `objection` is the reason not to trust the position (None: no reason). `lean` is what the picture shows of an
-    error of the reported attitude, which the position is computed with."""
+    error of the reported attitude, which the position is computed with. `tilt_m2` is the part of both variances by a
+    tilt that is not reported."""
 
     position: Position
     covariance_m2: Covariance
@@ -52,6 +53,7 @@ class Located:
     places: tuple[int, ...] = ()
     objection: Reason | None = None
     lean: AttitudeError | None = None
+    tilt_m2: float = 0.0
 
     @property
     def accuracy_m(self) -> float:
@@ -140,6 +142,15 @@ def locate(
         objection=objection,
         lean=lean,
     )
+
+
+def allow_for_tilt(where: Located, tilt: ShownTilt, view: View) -> Located:
+    """Return a position with the covariance that it has if the query is tilted as `tilt` shows beyond what its `view`
+    has been levelled by."""
+    tangent_sd = tilt.get_sd(view.is_tilt_known)
+    tilt_m2 = (tangent_sd * (where.height_m or TYPICAL_FOCAL * (where.footprint_m or 0.0))) ** 2
+    east_m2, cross_m2, north_m2 = where.covariance_m2
+    return replace(where, covariance_m2=(east_m2 + tilt_m2, cross_m2, north_m2 + tilt_m2), tilt_m2=tilt_m2)
 
 
 def covariance_matrix(covariance: Covariance) -> Doubles:

@@ -12,11 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.core.arrays import Array
+from edgevpr.core.contract import Perspective
 from edgevpr.core.geodesy import axes_of, fit_similarity
 from edgevpr.frames.level import View
 
 _FEWEST = 12  # landmarks
 _POINT_SD, _SHEAR_SD = 2.5 / 640, 0.01  # of a landmark, as a share of the longest side; of a shear
+TYPICAL_FOCAL = 0.77  # 66 degrees across
+_LEVEL_TILT = math.tan(math.radians(8.0))
+_UNKNOWN_TILT_SD = math.tan(math.radians(20.0))  # where too little agrees to show a tilt
+_CLEAR_SD, _CLEAR_TILT = 3.0, math.tan(math.radians(5.0))  # of a tilt beyond the reported one
 # Relief moves neighbouring landmarks alike: so many of them count as one. The place's own picture is tilted too.
 _ALIKE, _PLACE_SD = 5.0, math.tan(math.radians(0.5))
 
@@ -29,6 +34,45 @@ class AttitudeError:
 
     over_height: tuple[float, float]
     sd: float
+
+
+@dataclass(frozen=True, slots=True)
+class ShownTilt:
+    """Tilt of a levelled picture against that of a place, as both show it: `tangent`, and the standard deviation `sd`
+    of each of its two axes."""
+
+    tangent: float
+    sd: float
+
+    @property
+    def deg(self) -> float:
+        """The tilt in degrees."""
+        return math.degrees(math.atan(self.tangent))
+
+    @property
+    def least_deg(self) -> float:
+        """The tilt in degrees, less two standard deviations."""
+        return math.degrees(math.atan(self.tangent - 2 * self.sd))
+
+    @property
+    def is_level(self) -> bool:
+        """True if there is no tilt, but for a few degrees."""
+        return math.hypot(self.tangent, _CLEAR_SD * self.sd) < _LEVEL_TILT
+
+    def get_sd(self, is_reported: bool) -> float:
+        """Return what it says of the error of a tilt, as a tangent. One that `is_reported` is taken to be right unless
+        the pictures clearly contradict it."""
+        is_clear = self.tangent > max(_CLEAR_SD * self.sd, _CLEAR_TILT)
+        return math.hypot(self.tangent, self.sd) if is_clear or not is_reported else 0.0
+
+
+def convert_to_tilt(found: Perspective | None, focal: float | None) -> ShownTilt:
+    """Convert a perspective (None: unknown) to a tilt by the focal length of the picture, in shares of its longest side
+    (None: unknown, that of a usual camera)."""
+    if found is None:
+        return ShownTilt(0.0, _UNKNOWN_TILT_SD)
+    focal = focal or TYPICAL_FOCAL
+    return ShownTilt(focal * math.hypot(*found.slope), focal * found.sd)
 
 
 def fit_attitude_error(asked: Array, known: Array, view: View, up_deg: float) -> AttitudeError | None:

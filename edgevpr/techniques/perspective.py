@@ -1,0 +1,65 @@
+"""The perspective by which a query lies over a place, from the regions of both that resemble each other most.
+
+Pictures of flat ground by two cameras that look straight down lie over each other by a rotation, a scale and a shift.
+If one is tilted, they lie over each other by a homography (Hartley and Zisserman 2004, section 13.1): the scale changes
+across the picture. Only regions near the shift of the match agree at first. Each round fits a homography to those that
+agree with the last one, so that more of the picture follows.
+"""
+
+import numpy as np
+
+from edgevpr.core.arrays import Array, Bools, Doubles
+from edgevpr.core.contract import Perspective
+
+_ROUNDS = 10
+_WITHIN_CELLS = 1.5  # largest distance of an agreeing region from the fit
+_LEAST_PAIRS = 12
+_PRIOR_SD = 0.17  # of the change of scale from cell to cell: far more than a picture that is taken bears
+_ALIKE = 5.0  # neighbouring regions share pixels and relief: so many count as one
+_LEAST_SCALE = 0.05  # nearer to the horizon of a homography, nothing lies anywhere
+
+
+def fit_perspective(
+    asked: Array, known: Array, turn_scale: complex, shift: complex, cells: float
+) -> Perspective | None:
+    """Fit a homography to regions of a query and the most similar ones of a place, `asked` and `known`, complex (n,),
+    in cells from the middles of the pictures, right and down. It begins with the rotation, scale and shift of a match.
+    `cells` is the number of cells along the query's longest side. Returns None if fewer than 12 regions agree."""
+    way = np.array([turn_scale.real, -turn_scale.imag, shift.real, turn_scale.imag, turn_scale.real, shift.imag, 0, 0])
+    normal = np.eye(8)
+    for _ in range(_ROUNDS):
+        agrees, _ = _compare(way, asked, known)
+        if np.count_nonzero(agrees) < _LEAST_PAIRS:
+            return None
+        (x, y), (to_x, to_y) = ((points[agrees].real, points[agrees].imag) for points in (asked, known))
+        none = np.zeros_like(x)
+        looks = np.concatenate(
+            [
+                np.column_stack([x, y, none + 1, none, none, none, -to_x * x, -to_x * y]),
+                np.column_stack([none, none, none, x, y, none + 1, -to_y * x, -to_y * y]),
+            ]
+        )
+        weight = np.tile(1 / (1 + way[6] * x + way[7] * y), 2)
+        looks *= weight[:, None]
+        normal = looks.T @ looks + np.diag([0.0] * 6 + [_PRIOR_SD**-2] * 2)
+        way = np.linalg.solve(normal, looks.T @ (weight * np.concatenate([to_x, to_y])))
+    agrees, off = _compare(way, asked, known)
+    if np.count_nonzero(agrees) < _LEAST_PAIRS:
+        return None
+    # A region is matched to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
+    variance = float((np.abs(off[agrees]) ** 2).mean()) / 2 + 1 / 12
+    covariance = _ALIKE * variance * np.linalg.inv(normal)[6:, 6:]
+    slope = (-cells * float(way[6]), -cells * float(way[7]))
+    return Perspective(slope, cells * float(np.sqrt(np.trace(covariance) / 2)))
+
+
+def _compare(way: Doubles, asked: Array, known: Array) -> tuple[Bools, Array]:
+    """Return which regions agree with a homography, bool (n,), and by how much each misses, complex (n,)."""
+    x, y = asked.real, asked.imag
+    scale = 1 + way[6] * x + way[7] * y
+    there = (way[0] * x + way[1] * y + way[2] + 1j * (way[3] * x + way[4] * y + way[5])) / np.maximum(
+        scale, _LEAST_SCALE
+    )
+    off = known - there
+    agrees: Bools = (np.maximum(np.abs(off.real), np.abs(off.imag)) <= _WITHIN_CELLS) & (scale > _LEAST_SCALE)
+    return agrees, off
