@@ -36,7 +36,7 @@ def format_build(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
     if result.already_here:
         yield f"  {result.already_here} images were in the map already"
     if result.tilted:
-        yield f"  left out: {result.tilted} tilted by more than 60 degrees (without --fov-deg or --lens: 20)"
+        yield f"  left out: {result.tilted} tilted by more than 63 degrees (without --fov-deg or --lens: 20)"
     if result.not_memorable:
         yield f"  left out: {result.not_memorable} that are not memorable"
     if result.without_data or result.says_nothing:

@@ -7,9 +7,10 @@ not follow each other: each is asked with what is known of it (`RecordedPrior`).
 """
 
 import math
+import statistics
+from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from edgevpr.core.contract import nearest_height
 from edgevpr.core.errors import UsageError
@@ -28,6 +29,7 @@ _MAX_FIX_AGE_S = 60.0
 _ALL_TRUSTED = (True, True)
 _SAME_SCALE = 1.08  # the ratio of two heights from which on it is no error of a match
 _MIN_SCALE = 0.5
+_HEIGHTS_KEPT = 5  # matches whose heights are compared with the recorded ones
 # The flight so far narrows the search where it is so sure of its position. The area then has places enough to compare
 # the best one with: it is as large as that of recorded queries, and reaches over so many places.
 _MIN_MASS = 0.99
@@ -79,36 +81,65 @@ class Hints:
 
 
 class RecordedPrior:
-    """Makes the hints for each recorded query from its own frame, whatever became of the query before. `known` are
-    members of `KNOWN_FIELDS`; what a frame lacks of them is not known of it. The rest is as in `Prior`. `map_height_m`
-    is the height at which the map was made (None: it or those of the queries are unknown; `height` means the map's).
+    """Makes the hints for each recorded query from its own frame. `known` are members of `KNOWN_FIELDS`; what a frame
+    lacks of them is not known of it. The rest is as in `Prior`. `map_height_m` is the height at which the map was made
+    (None: it or those of the queries are unknown; `height` means the map's).
+
+    The queries before count for one thing: recorded heights may all be wrong by one factor, as of a barometer over
+    sloping ground or by a wrong field of view. Until a match has confirmed them, all heights are searched. From then on
+    they are corrected by what matches show.
     """
 
     def __init__(
         self, known: Collection[str] = (), heading_within_deg: float | None = None, map_height_m: float | None = None
     ) -> None:
         self._known, self._heading_within_deg, self._map_height_m = known, heading_within_deg, map_height_m
+        self._expects_height = False
+        self._height_errors: deque[float] = deque(maxlen=_HEIGHTS_KEPT)
         self.footprint_m: float | None = None
         self.height_ratio = 1.0
         self.looks_again = True
 
     def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
         """Return the hints for a frame; `vehicle` and `margin_m`, of a flight, do not count."""
-        ratio: float | None = 1.0
+        ratio: float | None = self._height_error
         if self._map_height_m is not None:
-            ratio = frame.height_m / self._map_height_m if frame.height_m and frame.height_m > 0 else None
-        self.looks_again = "height" not in self._known or ratio is None
-        self.height_ratio = 1.0 if self.looks_again else ratio or 1.0
+            recorded_m = frame.height_m if frame.height_m and frame.height_m > 0 else None
+            ratio = recorded_m and self._height_error * recorded_m / self._map_height_m
+        self._expects_height = "height" in self._known and ratio is not None
+        self.looks_again = not (self._expects_height and self._height_errors)
+        self.height_ratio = ratio if self._expects_height and ratio else self.scale(())
         uses_heading = "heading" in self._known and self._heading_within_deg is not None
         reach = Reach(frame.position, RECORDED_REACH_M) if "reach" in self._known and frame.position else None
         return _narrowing(reach, frame.heading_deg if uses_heading else None, index)
 
-    def scale(self, height_ratios: Sequence[float]) -> float:
-        """Return 1: pictures are taken as they are."""
-        return 1.0
+    @property
+    def _height_error(self) -> float:
+        """The heights by the last matches over those recorded, median; 1.0 if they are about the same."""
+        error = statistics.median(self._height_errors) if self._height_errors else 1.0
+        return error if abs(math.log(error)) > math.log(_SAME_SCALE) else 1.0
 
-    def update(self, *match: Any, **more: Any) -> None:
-        """Learn nothing: the next query is another flight's."""
+    def scale(self, height_ratios: Sequence[float]) -> float:
+        """Return how much more ground a picture shows than its recorded height says."""
+        return self._height_error if self._map_height_m is None else 1.0
+
+    def update(
+        self,
+        match: Candidate,
+        accepted: bool,
+        t_mono_s: float,
+        scale: float = 1.0,
+        footprint_m: float | None = None,
+        layers: Layers | None = None,
+    ) -> None:
+        """Keep what an accepted match says of the recorded height. The arguments are as in `Prior.update`."""
+        ratio, pose = match.match.height_ratio, match.place.pose
+        if not (accepted and ratio):
+            return
+        if footprint_m:
+            self._height_errors.append(scale * ratio * (pose.footprint_m / footprint_m if pose else 1.0))
+        elif self._expects_height:
+            self._height_errors.append(self._height_error * ratio / self.height_ratio)
 
     def update_area(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
         """Learn nothing, as `update`."""

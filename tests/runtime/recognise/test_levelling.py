@@ -21,7 +21,7 @@ from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pix
 from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
-from edgevpr.runtime.recognise.hints import Prior
+from edgevpr.runtime.recognise.hints import Prior, RecordedPrior
 from edgevpr.runtime.recognise.levelling import Levelling, make_levelling, place_at_middle
 from edgevpr.techniques import create
 
@@ -271,6 +271,36 @@ def test_a_camera_that_looks_ahead_is_located_right_with_its_mount_and_wrong_wit
         wrong_m.append(math.dist(offset_m(50.0, 8.0, at.lat_deg, at.lon_deg), true_m))
     assert max(wrong_m[0], wrong_m[2]) < 2.5
     assert wrong_m[1] == pytest.approx(ahead_m, abs=2.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pitch_deg", [12.0, 20.0, 40.0, 60.0])
+def test_a_view_of_unreported_tilt_claims_no_more_than_it_knows(walk, ground, pitch_deg):
+    told = STRAIGHT | {"roll_deg": None, "pitch_deg": None}
+    event = walk(scaling()).step(frame(ground, 1, pitch_deg=pitch_deg, told=told))
+    ahead_m = HEIGHT_M * math.tan(math.radians(pitch_deg))
+    assert event.accepted or pitch_deg > 12
+    assert not event.accepted or event.accuracy_m > min(40.0, ahead_m / 2)
+
+
+@pytest.mark.slow
+def test_a_view_that_is_level_needs_no_report_of_it(walk, ground):
+    event = walk(scaling()).step(frame(ground, 1, told=STRAIGHT | {"roll_deg": None, "pitch_deg": None}))
+    assert recognised(event, 1)
+    assert event.accuracy_m < 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.7, 1.3])
+def test_a_recorded_height_that_is_wrong_is_corrected_by_the_first_match(walk, ground, factor):
+    prior = RecordedPrior(("height",))
+    recogniser = walk(scaling(), prior)
+    told = STRAIGHT | {"height_m": factor * HEIGHT_M}
+    first, second = (recogniser.step(frame(ground, place, told=told)) for place in (3, 2))
+    assert recognised(first, 3)
+    assert recognised(second, 2)
+    assert second.view.footprint_m == pytest.approx(FOOTPRINT_M, rel=0.05)
+    assert prior.looks_again is False
 
 
 @pytest.mark.parametrize("lens", [LENS, None])
