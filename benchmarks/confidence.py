@@ -29,8 +29,15 @@ from shipped_model import FittedSite, shipped_model
 from edgevpr.frames.images import list_images
 from edgevpr.lab.evaluate.metrics import roc_auc
 from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, MapAnswer, adapted
+from edgevpr.runtime.recognise.calibration import FEWEST_PLACES
 from edgevpr.runtime.recognise.confidence import Model
-from edgevpr.runtime.recognise.evidence import AHEAD, AHEAD_PROVEN, DOWN, DOWN_BARE, FEWEST_PLACES, Evidence
+from edgevpr.runtime.recognise.evidence import (
+    AHEAD,
+    AHEAD_PROVEN,
+    DOWN,
+    DOWN_BARE,
+    Evidence,
+)
 from edgevpr.runtime.recognise.judge import Sureness, accept_rule
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 

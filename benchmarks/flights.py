@@ -47,7 +47,7 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import make_sequence_search
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.evidence import read_calibration_for
+from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.hints import Prior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import open_recogniser

@@ -21,9 +21,9 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.evidence import read_calibration_for
 from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, AcceptRule, accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
 from edgevpr.runtime.recognise.opening import make_meter

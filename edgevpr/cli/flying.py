@@ -90,7 +90,8 @@ def run_match(args: Namespace) -> int:
     from edgevpr.cli.matched import format_match, format_matches
     from edgevpr.frames.source import open_source, read_to_end
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime.recognise.evidence import list_evidence_kinds, not_calibrated
+    from edgevpr.runtime.recognise.calibration import not_calibrated
+    from edgevpr.runtime.recognise.evidence import list_evidence_kinds
     from edgevpr.runtime.recognise.hints import parse_known_fields
     from edgevpr.runtime.recognise.opening import open_recogniser
     from edgevpr.techniques.card import find_weights

@@ -232,7 +232,7 @@ def map_info(args: Namespace) -> int:
     from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import describe_map
-    from edgevpr.runtime.recognise.evidence import not_calibrated, read_calibration_for
+    from edgevpr.runtime.recognise.calibration import not_calibrated, read_calibration_for
     from edgevpr.techniques import WITH_CONFIDENCE
 
     if args.page:
@@ -255,7 +255,7 @@ def map_info(args: Namespace) -> int:
 
 def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, float]) -> None:
     """Write the page of a map. `said` are the lines of `map info`."""
-    from edgevpr.mapmaking.calibrate import find_look_alikes
+    from edgevpr.mapmaking.look_alikes import find_look_alikes
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.review.album import album_of_map
     from edgevpr.review.mappage import MOST_ASKED, make_map_page

@@ -25,7 +25,7 @@ from edgevpr.mapmaking.making import Cuttings, FlownPictures, MapOrder, make_map
 from edgevpr.places.examine import Wanted, positions_in, select
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.preflight.pick import camera_setting
-from edgevpr.runtime.recognise.evidence import read_calibration_for
+from edgevpr.runtime.recognise.calibration import read_calibration_for
 
 TECHNIQUE = "cohog"
 MARGIN_M = 150.0  # around a tile: pictures from which its own are refined, and told from

@@ -31,7 +31,7 @@ from edgevpr.frames.positions import find_positions, find_track, read_positions,
 from edgevpr.frames.source import Source, open_source, read_to_end
 from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, measure_tilt
 from edgevpr.runtime.recognise.agreement import PROVEN, agreement
-from edgevpr.runtime.recognise.evidence import FEWEST_PLACES
+from edgevpr.runtime.recognise.calibration import FEWEST_PLACES
 from edgevpr.runtime.recognise.landmarks import describe
 
 if TYPE_CHECKING:

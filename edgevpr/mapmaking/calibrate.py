@@ -19,57 +19,44 @@ from datetime import date
 import numpy as np
 from scipy.optimize import minimize
 
-from edgevpr.core.arrays import Bools, Doubles, Image
-from edgevpr.core.arrays import Mask as Shown
-from edgevpr.core.config import MatchConfig, load_config
+from edgevpr.core.arrays import Bools, Doubles
+from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame
 from edgevpr.frames.level import Levelled
-from edgevpr.frames.mask import Mask
 from edgevpr.mapmaking.changes import changed
+from edgevpr.mapmaking.look_alikes import MapSearch, measure_look_alikes
 from edgevpr.mapmaking.mapping import Watch
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
-from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import elsewhere
 from edgevpr.places.rows import readable
-from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.calibration import FEWEST_PLACES, MapCalibration, calibration_text
 from edgevpr.runtime.recognise.confidence import Figures, Logistic, Model, prior
-from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
-from edgevpr.runtime.recognise.encoder import FrameEncoder
+from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder
 from edgevpr.runtime.recognise.evidence import (
     AHEAD,
     AHEAD_PROVEN,
     DOWN,
     DOWN_BARE,
-    FEWEST_PLACES,
     Evidence,
-    MapCalibration,
-    calibration_text,
+    count_beside,
     list_evidence_kinds,
-    read_calibration_for,
 )
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
-from edgevpr.runtime.recognise.opening import create_technique, make_meter
-from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.runtime.recognise.recognition import Recognition
 
 Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the frames of these names, as far as they are found
 
 THERE, LEFT_OUT, MIRRORED = "there", "left out", "mirrored"
 ASKED_AHEAD, ASKED_DOWN = 120, 60  # pictures, by the camera's direction; each takes longer when it looks down
-_BESIDE_PLACES = 10  # so many places before and after one without position may show the same ground
 _MOST_WITHOUT_POSITION = 0.2  # share of the places of a map that looks down, whose pictures overlap in any order
-_OVERLAPS = 2.0  # footprints between two places from which on their pictures, from any heights, share no ground
 _LEFT_OUT_COUNTS = 0.3  # weight of LEFT_OUT results: flights over ground outside the map are rarer
 # Strength with which the fit holds on to the shipped weights, and to the bias (see `fitted`). Chosen on corridor and
 # sat_marash, with the other sets in view. Looking down, with 5 and a free bias, the pictures drawn by chance decided
 # whether 14 or 39 of 80 queries of sat_marash were accepted; ahead, a bias that is held costs corridor half.
 _PULL = {AHEAD: (50.0, 0.0), AHEAD_PROVEN: (50.0, 0.0), DOWN: (200.0, 200.0), DOWN_BARE: (200.0, 200.0)}
-LEAST_ALIKE = 0.1  # confidence from which a place elsewhere looks alike
 _SEED = 15
 _EVEN = 0.5  # precision for which hardly any match is refused for low confidence
 
@@ -104,7 +91,7 @@ def ask(
     assert rule.sure is not None  # set for a technique that has a confidence model
     sure = replace(rule.sure, precision=_EVEN)
     rule = replace(rule, sure=sure)
-    search = _Search(technique, place_map, index, rule, meter=meter)
+    search = MapSearch(technique, place_map, index, rule, meter=meter)
     for place_id, picture in pictures:
         if (slot := search.slots.get(place_id)) is None:
             continue
@@ -119,77 +106,12 @@ def ask(
                 yield MapAnswer(place_id=place_id, way=way, right=False, evidence=None)
                 continue
             best = search.slots[event.best.place.place_id]
-            right = way == THERE and not elsewhere(index, slot, np.array([best]), search.near_m)[0]
+            beside = count_beside(rule.look_alikes)
+            right = way == THERE and not elsewhere(index, slot, np.array([best]), search.near_m, beside=beside)[0]
             if way == THERE and not right and may_be_same[best] and not np.isnan(index.lat_deg[best]):
                 continue  # the two pictures may overlap: it is unknown whether the match is right
             refused = not event.accepted and event.confidence >= sure.threshold(event.evidence)
             yield MapAnswer(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
-
-
-class _Search:
-    """Looks for pictures in an open map, each as a query that is alone. `slots`: the slot of each place in `index`.
-    `near_m`: metres within which pictures of the map count as neighbours, at least a footprint."""
-
-    def __init__(
-        self, technique: Technique, place_map: PlaceMap, index: PlaceIndex, rule: AcceptRule, *, meter: QueryMeter
-    ) -> None:
-        self._technique, self._place_map, self._meter = technique, place_map, meter
-        self._index, self._rule = index, rule
-        self._layers = layers_of(place_map)
-        self.near_m = max(rule.neighbour_m, self._layers.median_m or index.spacing_m() or 0.0)
-        self.slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
-
-    def same_ground(self, slot: int) -> Bools:
-        """Return bool (N,), True for each of the index's N places that may show some ground of the place `slot`."""
-        index = self._index
-        away_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
-        beside = abs(np.arange(len(index)) - slot) <= _BESIDE_PLACES
-        return np.where(np.isnan(away_m), beside, away_m <= _OVERLAPS * self.near_m)
-
-    def find(self, place_id: int, image: Image, shown: Shown | None, among: PlaceIndex) -> Recognition:
-        """Look for a picture of the place `place_id` among some places. `shown`, bool (H, W), is False where it shows
-        no ground (None: it shows ground everywhere)."""
-        encoder = FrameEncoder(technique=self._technique, mask=None if shown is None else Mask(shown, sha256=""))
-        matcher = Matcher(among, self._rule, layers=self._layers)
-        settings = WalkSettings(candidates=self._technique.candidates, all_evidence=True)
-        walk = Recogniser(encoder, self._place_map, matcher, self._meter, settings=settings)
-        return walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
-
-
-@dataclass(frozen=True, slots=True)
-class LookAlike:
-    """A place (its number), the place elsewhere that its picture was found at, and the confidence of that match."""
-
-    place_id: int
-    other_id: int
-    confidence: float
-
-
-def find_look_alikes(
-    place_map: PlaceMap, pictures: Iterable[tuple[int, Image, Shown | None]]
-) -> Iterator[LookAlike | None]:
-    """Look for each of the `pictures` (number of a place, its picture as it was encoded, the picture's mask) among the
-    places elsewhere, and yield what looks like it (None: nothing does). Yields nothing for a picture that the place was
-    not made of, for a place without a position, or for a technique without a confidence. Raises MapError for a map that
-    cannot be read."""
-    technique, config = create_technique(place_map), load_config(None, {})
-    if not list_evidence_kinds(technique.spec):
-        return
-    index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-    rule = accept_rule(technique, config.match, 1, read_calibration_for(place_map))
-    search = _Search(technique, place_map, index, rule, meter=make_meter(config, load_board("this")))
-    for place_id, image, mask in pictures:
-        slot = search.slots.get(place_id)
-        if slot is None or np.isnan(index.lat_deg[slot]):
-            continue
-        away = index.only(~search.same_ground(slot))
-        if not len(away) or not place_map.is_of(place_id, technique.encode(image, mask).coarse):
-            continue
-        event = search.find(place_id, image, mask, away)
-        if event.best is None or event.confidence is None or event.confidence < LEAST_ALIKE:
-            yield None
-        else:
-            yield LookAlike(place_id, event.best.place.place_id, event.confidence)
 
 
 def calibrate(
@@ -220,15 +142,26 @@ def calibrate(
     require(len(index) >= FEWEST_PLACES, f"it has {len(index)} places, and {FEWEST_PLACES} are needed")
     is_placed = not technique.spec.looks_down or np.isnan(index.lat_deg).mean() <= _MOST_WITHOUT_POSITION
     require(is_placed, "its places have no positions, so nobody knows which of them show the same ground")
-    as_mapped = _as_mapped(encoder, place_map, pictures, watch)
-    answers = list(ask(technique, place_map, index, accept_rule(technique, config), meter, as_mapped))
+    rule = accept_rule(technique, config)
+    if not technique.spec.looks_down:
+        near_m = MapSearch(technique, place_map, index, rule, meter=meter).near_m
+        described = (
+            (place_id, encoded.descriptor)
+            for place_id, encoded in _as_mapped(encoder, place_map, pictures, watch, len(place_map))
+        )
+        rule = replace(rule, look_alikes=measure_look_alikes(technique, place_map, index, near_m, described))
+    count = query_altered_copies(technique)
+    as_mapped = (
+        (place_id, encoded.picture) for place_id, encoded in _as_mapped(encoder, place_map, pictures, watch, count)
+    )
+    answers = list(ask(technique, place_map, index, rule, meter, as_mapped))
     at_hand = len({answer.place_id for answer in answers})
     require(
         at_hand >= FEWEST_PLACES,
         f"the pictures of {at_hand} places are at hand, and those of {FEWEST_PLACES} are needed; give the pictures "
         "that it was made of, with the same camera and mask",
     )
-    calibration = _calibration(answers, kinds, config.accept_precision)
+    calibration = replace(_calibration(answers, kinds, config.accept_precision), look_alikes=rule.look_alikes)
     place_map.record_calibration(calibration_text(calibration))
     return calibration
 
@@ -239,14 +172,14 @@ def query_altered_copies(technique: Technique) -> int:
 
 
 def _as_mapped(
-    encoder: FrameEncoder, place_map: PlaceMap, pictures: Pictures, watch: Watch[Frame]
-) -> Iterator[tuple[int, Levelled]]:
-    """Yield (a place's number, its prepared picture) for a random selection of places. A picture that has the name of a
-    place's picture, but another content, is left out."""
+    encoder: FrameEncoder, place_map: PlaceMap, pictures: Pictures, watch: Watch[Frame], count: int
+) -> Iterator[tuple[int, EncodedFrame]]:
+    """Yield (a place's number, its picture as it was encoded for the map) for `count` pictures in random order, again
+    from the first one if there are fewer. A picture that has the name of a place's picture, but another content, is
+    left out."""
     ids_by_image = {name: ids for (name,), ids in place_map.select_ids("source_image").items() if isinstance(name, str)}
     names = sorted(ids_by_image)
     names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
-    count = query_altered_copies(encoder.technique)
     frames = (frame for done in range(0, count, len(names)) for frame in pictures(names[: count - done]))
     for frame in watch(frames, count):
         encoded = encoder.encode(frame)
@@ -254,7 +187,7 @@ def _as_mapped(
         if (
             place_id := next((at for at in of_name if place_map.is_of(at, encoded.descriptor.coarse)), None)
         ) is not None:
-            yield place_id, encoded.picture
+            yield place_id, encoded
 
 
 def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: float) -> MapCalibration:

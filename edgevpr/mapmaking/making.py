@@ -23,8 +23,9 @@ from edgevpr.places.mapfiles import map_path, remove
 from edgevpr.places.mapinfo import describe_map
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight.pick import camera_setting, pick_technique
+from edgevpr.runtime.recognise.calibration import MapCalibration
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.evidence import MapCalibration, list_evidence_kinds
+from edgevpr.runtime.recognise.evidence import list_evidence_kinds
 from edgevpr.runtime.recognise.levelling import make_levelling
 from edgevpr.runtime.recognise.opening import (
     create_technique,

@@ -13,7 +13,12 @@ from edgevpr.places import mapfiles
 from edgevpr.places.examine import Watch, merge, positions_in, select, shrink
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import read_extent
-from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_text, of_several, read_calibration_for
+from edgevpr.runtime.recognise.calibration import (
+    MapCalibration,
+    calibration_text,
+    of_several,
+    read_calibration_for,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -29,7 +29,7 @@ Glance = tuple[float, Choice]  # approximate score, and the slot with its best h
 # Scan scores of each place, float32 (N,), and each hypothesis, float32 (N, H), -inf if ruled out (None: there is none).
 Scan = tuple[Singles, Singles | None]
 
-_NEIGHBOURS_WITHOUT_POSITION = 2
+MAX_BESIDE = 2  # places before and after one without a position that are its neighbours
 _COMPARED_ELSEWHERE = 5
 _TRIED_EACH = 3  # hypotheses per place
 _ASKED_UNMOVED = 9  # places elsewhere, at most
@@ -284,19 +284,19 @@ def together(one: Ranking, other: Ranking) -> Ranking:
     )
 
 
-def elsewhere(index: PlaceIndex, best: int, slots: Ints, neighbour_m: float, same: Collection[int] = ()) -> Bools:
-    """Return True for each of `slots` (K,) that is no neighbour of the slot `best`, bool (K,): it is more than
-    `neighbour_m` metres away or, if either has no position, more than two slots away. Places with an id in `same` show
-    the same ground: they count as neighbours."""
+def elsewhere(
+    index: PlaceIndex, best: int, slots: Ints, neighbour_m: float, same: Collection[int] = (), beside: int = MAX_BESIDE
+) -> Bools:
+    """Return bool (K,), True for each of `slots` (K,) that is no neighbour of the slot `best`: it is more than
+    `neighbour_m` metres or, without a position, `beside` slots away, and its id is not in `same`."""
     away_m = distance_m(index.lat_deg[best], index.lon_deg[best], index.lat_deg[slots], index.lon_deg[slots])
-    away = np.where(np.isnan(away_m), abs(slots - best) > _NEIGHBOURS_WITHOUT_POSITION, away_m > neighbour_m)
+    away = np.where(np.isnan(away_m), abs(slots - best) > beside, away_m > neighbour_m)
     return away & ~np.isin(index.place_ids[slots], tuple(same)) if same else away
 
 
 def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Collection[int] = ()) -> float | None:
     """Return the best score minus the best score of a place elsewhere (see `elsewhere`); None if none is ranked."""
-    others = ranking.slots[1:]
-    runners_up = ranking.scores[1:][elsewhere(index, int(ranking.slots[0]), others, neighbour_m, same)]
+    runners_up = ranking.scores[1:][elsewhere(index, int(ranking.slots[0]), ranking.slots[1:], neighbour_m, same)]
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from edgevpr.core.geodesy import axes_of, distance_m, moved, offset_m
 from edgevpr.core.text import format_probability
 from edgevpr.core.types import Place
-from edgevpr.mapmaking.calibrate import LookAlike
+from edgevpr.mapmaking.look_alikes import FoundLookAlike
 from edgevpr.review.album import Album
 from edgevpr.review.logged import Point
 from edgevpr.review.webpage import UNKNOWN, Layer, Section, Step, at_of, figure, make_layer, make_page
@@ -44,7 +44,7 @@ def make_map_page(
     lines: Sequence[str],
     places: Sequence[Place],
     recognisable: Mapping[int, float],
-    look_alikes: Sequence[LookAlike | None],
+    look_alikes: Sequence[FoundLookAlike | None],
     pictures: Album,
     lens: "Lens | None",
 ) -> str:
@@ -96,7 +96,7 @@ def _steps(
     places: Sequence[Place],
     recognisable: Mapping[int, float],
     tags_off_m: Mapping[int, float],
-    alike: Mapping[int, LookAlike],
+    alike: Mapping[int, FoundLookAlike],
     points: Mapping[int, Point],
 ) -> Iterable[Step]:
     images = {place.place_id: place.source_image for place in places}

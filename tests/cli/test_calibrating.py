@@ -10,7 +10,7 @@ from pictures import textured, write_flight
 from edgevpr.cli.main import main
 from edgevpr.mapmaking import calibrate
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.evidence import read_calibration
+from edgevpr.runtime.recognise.calibration import read_calibration
 
 PLACES = 8
 

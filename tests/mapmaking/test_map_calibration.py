@@ -18,9 +18,9 @@ from edgevpr.mapmaking.changes import changed
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.recognise.calibration import read_calibration
 from edgevpr.runtime.recognise.confidence import Logistic
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.evidence import read_calibration
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
 from edgevpr.techniques import create
@@ -83,7 +83,8 @@ def test_a_calibration_is_kept_in_the_map(place_map):
     pictures, asked = at_hand(*map(frame, range(PLACES)))
     found = calibrated(place_map, pictures)
     assert read_calibration(place_map.calibration) == found
-    assert sorted(asked) == sorted(2 * [f"{number}.png" for number in range(PLACES)])
+    assert sorted(asked) == sorted(3 * [f"{number}.png" for number in range(PLACES)]), "once for its look-alikes"
+    assert sorted(found.look_alikes.places) == list(range(1, PLACES + 1))
     assert (found.asked, found.precision) == (2 * PLACES, CONFIG.accept_precision)
     assert sorted(found.recognisable) == list(range(1, PLACES + 1))
     assert list(found.models) == ["ahead", "ahead_proven"]

@@ -14,8 +14,8 @@ from edgevpr.mapmaking.missions import Area, Waypoint, read_area
 from edgevpr.mapmaking.subset import subset
 from edgevpr.places.examine import merge, unwatched
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.runtime.recognise.calibration import MapCalibration, calibration_text, read_calibration_for
 from edgevpr.runtime.recognise.confidence import prior
-from edgevpr.runtime.recognise.evidence import MapCalibration, calibration_text, read_calibration_for
 from edgevpr.techniques import create
 
 HOME = 47.0, 8.0

@@ -34,9 +34,9 @@ from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack, queries_ah
 from edgevpr.power.meter import query_cost
 from edgevpr.runtime.preflight.probe import disk_bytes, ram_bytes
+from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.evidence import read_calibration_for
 from edgevpr.runtime.recognise.hints import RecordedPrior, explain_useless, parse_known_fields
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.opening import make_meter

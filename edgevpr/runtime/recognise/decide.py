@@ -17,6 +17,7 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import (
+    MAX_BESIDE,
     NOTHING,
     Expectation,
     Query,
@@ -39,6 +40,7 @@ from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder
 from edgevpr.runtime.recognise.evidence import (
     Evidence,
     compute_share,
+    count_beside,
     gather_evidence,
     log_count,
     log_share,
@@ -115,11 +117,13 @@ class Verifier:
         found = None if known is None else agreement(self.landmarks, known, expected)
         return 0 if found is None or found.is_at_rest else found.inliers
 
-    def count_rival(self, ranking: Ranking, neighbour_m: float, same: Collection[int] = ()) -> int:
+    def count_rival(
+        self, ranking: Ranking, neighbour_m: float, same: Collection[int] = (), beside: int = MAX_BESIDE
+    ) -> int:
         """Return the number of landmarks of the query and of the best place elsewhere (see `places.retrieve.elsewhere`)
         that agree on the overlay of its match: 0 if there is no place elsewhere, the largest possible number if its
         landmarks are unknown. Places with the numbers `same` are not elsewhere."""
-        away = ranking.slots[elsewhere(self._index, int(ranking.slots[0]), ranking.slots, neighbour_m, same)]
+        away = ranking.slots[elsewhere(self._index, int(ranking.slots[0]), ranking.slots, neighbour_m, same, beside)]
         if not len(away):
             return 0
         expected, known = self._place(ranking, int(away[0]))
@@ -265,12 +269,13 @@ class Decider:
             with step("verify"):
                 same = verifier.find_same_ground(ranking)
         if rule.sure:
-            evidence = gather_evidence(ranking, index, rule.neighbour_m, proof, same, spec.looks_down)
+            evidence = gather_evidence(ranking, index, rule.neighbour_m, proof, same, spec.looks_down, rule.look_alikes)
         is_ahead = verifies and not spec.looks_down  # landmarks then only speak for a match, where they can decide
         if is_ahead and rule.sure and evidence and (self.settings.all_evidence or rule.sure.is_open(evidence)):
             with step("verify"):
-                inliers, rival = verifier.count_inliers(ranking), verifier.count_rival(ranking, rule.neighbour_m)
-            evidence = replace(evidence, proof=log_times_more(inliers, rival))
+                inliers = verifier.count_inliers(ranking)
+                rival = verifier.count_rival(ranking, rule.neighbour_m, beside=count_beside(rule.look_alikes))
+            evidence = replace(evidence, proof=log_times_more(inliers, rival), landmarks=log_count(inliers))
         if evidence and proof and evidence.is_hardly_ahead:
             with step("verify"):
                 rival = verifier.count_rival(ranking, rule.neighbour_m, same)

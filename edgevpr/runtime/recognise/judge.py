@@ -19,8 +19,9 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, elsewhere, margin
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.agreement import Agreement
+from edgevpr.runtime.recognise.calibration import MapCalibration
 from edgevpr.runtime.recognise.confidence import Model, prior
-from edgevpr.runtime.recognise.evidence import Evidence, MapCalibration, list_evidence_kinds
+from edgevpr.runtime.recognise.evidence import Evidence, LookAlikes, list_evidence_kinds
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.perspective import ShownTilt
 
@@ -51,9 +52,11 @@ _MIN_SCORE_SHARE_WITH_LANDMARKS = 0.5
 # The least lead over the same place with the picture turned otherwise. Over sat_marash's ground, heading unknown, 273
 # of 276 right matches have more, and two of three wrong ones less: a bridge taken for its other end.
 _MIN_LEAD_OVER_TURNED = math.log(1.75)
-# Probabilities: the highest where a place elsewhere agrees as well; the least for accepting, at any precision, by the
-# match alone, and by the flight so far.
+# Probabilities: the highest where a place elsewhere agrees as well, and ahead, without the landmarks that are needed
+# (of 111 queries of corridor, asked in a map without their part of it, regions alone had 12 accepted); the least for
+# accepting, at any precision, by the match alone, and by the flight so far.
 _MAX_WITH_TWIN = 0.5
+_MAX_UNPROVEN = 0.9
 _MIN_CONFIDENCE = 0.9
 _MIN_BY_FLIGHT = 0.99
 # How many times the flight must raise the odds of a match for the precision to be enough. By itself a match often needs
@@ -73,9 +76,12 @@ class Sureness:
     precision: float
 
     def confidence(self, evidence: Evidence) -> float:
-        """Return the probability that the match is right: at most 0.5 if a place elsewhere agrees about as well."""
+        """Return the probability that the match is right: at most 0.5 if another place agrees about as well, and 0.9
+        if landmarks are needed and do not agree."""
         confidence = self.models[evidence.kind].confidence(evidence.figures())
-        return confidence if evidence.leads else min(confidence, _MAX_WITH_TWIN)
+        if not evidence.leads:
+            return min(confidence, _MAX_WITH_TWIN)
+        return min(confidence, _MAX_UNPROVEN) if evidence.needs_landmarks else confidence
 
     def of_map(self, evidence: Evidence) -> float:
         """Return the probability that the query of this evidence shows ground of the map."""
@@ -105,6 +111,7 @@ class AcceptRule:
     * `min_quality`: the least quality of the query's picture
     * `sure`: the confidence needed besides (None: score and lead alone decide)
     * `worth_a_look`: the least score at which landmarks are compared and, with `sure`, a match can be accepted
+    * `look_alikes`: places of the map that look alike (None: unknown)
     """
 
     min_score: float
@@ -113,6 +120,7 @@ class AcceptRule:
     min_quality: float = 0.0
     sure: Sureness | None = None
     worth_a_look: float = 0.0
+    look_alikes: LookAlikes | None = None
 
 
 ACCEPT_NOTHING = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)
@@ -171,6 +179,7 @@ def accept_rule(
         min_quality=technique.min_quality,
         sure=Sureness(models, config.accept_precision) if kinds else None,
         worth_a_look=_MIN_SCORE_SHARE_WITH_LANDMARKS * technique.min_score,
+        look_alikes=calibration.look_alikes if calibration and kinds else None,
     )
 
 

@@ -17,9 +17,10 @@ from edgevpr.places.sequence import bytes_beside_place, make_sequence_search, se
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.evidence import list_evidence_kinds, read_calibration_for
+from edgevpr.runtime.recognise.evidence import list_evidence_kinds
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
 from edgevpr.runtime.recognise.hints import Prior, RecordedPrior
 from edgevpr.runtime.recognise.judge import accept_rule

@@ -23,7 +23,7 @@ from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.flight.startup import apply_recorded_rate
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import outlook
-from edgevpr.runtime.recognise.evidence import not_calibrated, read_calibration_for
+from edgevpr.runtime.recognise.calibration import not_calibrated, read_calibration_for
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.levelling import load_calibrated_lens
 from edgevpr.runtime.recognise.opening import open_recogniser

@@ -19,11 +19,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.confidence import prior, select_model
-from edgevpr.runtime.recognise.evidence import (
-    OF_MAP,
-    OF_PLACE,
-    Evidence,
+from edgevpr.runtime.recognise.calibration import (
     MapCalibration,
     calibration_text,
     not_calibrated,
@@ -32,6 +28,8 @@ from edgevpr.runtime.recognise.evidence import (
     read_calibration_for,
     require_usable,
 )
+from edgevpr.runtime.recognise.confidence import prior, select_model
+from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE, Evidence
 from edgevpr.runtime.recognise.judge import Sureness
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.techniques import create

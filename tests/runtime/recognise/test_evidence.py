@@ -10,6 +10,7 @@ from sureness import agreed, bare_index
 from edgevpr.core.contract import FineMatch, Support
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.places.retrieve import Ranking
+from edgevpr.runtime.recognise.calibration import require_usable
 from edgevpr.runtime.recognise.confidence import prior
 from edgevpr.runtime.recognise.evidence import (
     AHEAD,
@@ -18,10 +19,12 @@ from edgevpr.runtime.recognise.evidence import (
     DOWN_BARE,
     OF_MAP,
     OF_PLACE,
+    LookAlike,
+    LookAlikes,
     gather_evidence,
     list_evidence_kinds,
+    log_count,
     log_times_more,
-    require_usable,
 )
 from edgevpr.techniques import create
 
@@ -44,8 +47,9 @@ def ahead(score, back=0.2, likeness=0.7, log_rank=0.0):
     return FineMatch(score, coverage=0.3, support=support)
 
 
-def looked_ahead(matches):
-    return gather_evidence(ranked(matches), INDEX, NEIGHBOUR_M, None, (), down=False)
+def looked_ahead(matches, look_alikes=None):
+    index = replace(INDEX, place_ids=np.arange(len(INDEX)))
+    return gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (), down=False, look_alikes=look_alikes)
 
 
 def looked_down(matches, proof=None, same=()):
@@ -63,6 +67,49 @@ def test_evidence_has_the_names_that_models_ask_for():
         assert evidence.kind == kind
         assert set(evidence.figures()) >= {*OF_MAP[kind], *OF_PLACE[kind]}
         assert evidence.describe().keys() <= ReasonCode.LOW_CONFIDENCE.parameters
+
+
+def test_gather_evidence_takes_the_next_place_for_a_rival_among_single_views():
+    matches = {5: ahead(0.2), 6: ahead(0.19), 20: ahead(0.02)}
+    along_a_way, single = (looked_ahead(matches, LookAlikes(overlap, {})) for overlap in (True, False))
+    assert along_a_way.lead == looked_ahead(matches).lead > single.lead > 0
+    assert single.twin is None
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_gather_evidence_compares_with_what_looks_most_like_the_place(overlap):
+    known = LookAlikes(overlap, {5: LookAlike(20, math.log(0.1), math.log(0.08)), 20: LookAlike(5, -3.0, -2.5)})
+    of_twin, of_another = (looked_ahead({5: ahead(a), 20: ahead(b)}, known) for a, b in ((0.2, 0.1), (0.1, 0.2)))
+    assert of_twin.twin == pytest.approx(math.log(0.1 / 0.08))
+    assert of_twin.has_twin
+    assert not replace(of_twin, lead=math.log(4.01)).has_twin, "it is clearly beaten"
+    assert not of_another.has_twin
+    assert of_twin.apart == (None if overlap else pytest.approx(math.log(0.2 / 0.1)))
+    assert known.twins == 1
+
+
+AHEAD_OF_ALL = replace(looked_ahead({5: ahead(0.2)}), lead=math.log(1.51), rank_gap=0.0)
+HARDLY_AHEAD = replace(AHEAD_OF_ALL, lead=math.log(1.49))
+
+
+@pytest.mark.parametrize(
+    ("evidence", "needed"),
+    [
+        (AHEAD_OF_ALL, False),
+        (HARDLY_AHEAD, True),
+        (replace(HARDLY_AHEAD, landmarks=log_count(8)), True),
+        (replace(HARDLY_AHEAD, landmarks=log_count(9)), False),
+        (replace(HARDLY_AHEAD, landmarks=log_count(15), rank_gap=0.11, proof=log_times_more(15, 3)), True),
+        (replace(HARDLY_AHEAD, landmarks=log_count(16), rank_gap=0.11, proof=log_times_more(16, 3)), False),
+        (replace(AHEAD_OF_ALL, rank_gap=0.11), False),
+        (replace(HARDLY_AHEAD, apart=math.log(1.51)), False),
+        (replace(AHEAD_OF_ALL, apart=math.log(1.49)), True),
+        (replace(AHEAD_OF_ALL, apart=math.log(1.49), proof=log_times_more(9, 3)), False),
+        (replace(HARDLY_AHEAD, likeness=None), False),
+    ],
+)
+def test_needs_landmarks_where_regions_ahead_do_not_prove_a_match(evidence, needed):
+    assert evidence.needs_landmarks == needed
 
 
 def test_a_technique_has_the_kinds_of_its_camera():

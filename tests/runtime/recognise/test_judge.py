@@ -14,7 +14,7 @@ from edgevpr.core.contract import FineMatch
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import SequenceSearch
-from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, OF_MAP, OF_PLACE, Evidence
+from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, OF_MAP, OF_PLACE, Evidence, log_count
 from edgevpr.runtime.recognise.judge import AcceptRule, Findings, accept_rule, is_at_rest, judge
 from edgevpr.techniques import create
 
@@ -58,6 +58,16 @@ def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted)
 def test_more_evidence_is_asked_for_only_where_it_can_decide(confidence, of_map, lead, is_open):
     sure = told(lambda evidence: confidence, lambda evidence: of_map)
     assert sure.is_open(replace(CLEAR, lead=lead)) == is_open
+
+
+def test_regions_ahead_that_prove_nothing_are_accepted_only_with_landmarks_or_by_the_flight():
+    rule = sure_rule(lambda evidence: 1.0, needed=0.9999)
+    hardly = replace(CLEAR, likeness=0.9, rank_gap=0.0, proof=0.0, lead=0.3)
+    assert not judged(rule=rule, evidence=hardly).accepted
+    assert judged(rule=rule, evidence=replace(hardly, landmarks=log_count(9))).accepted
+    assert judged(rule=rule, evidence=hardly, by_flight=0.9999).accepted
+    twin = replace(hardly, landmarks=log_count(30), twin=0.1)
+    assert rule.sure.confidence(twin) == 0.5
 
 
 @pytest.mark.parametrize(
