@@ -1,0 +1,59 @@
+"""Places built alike, looking ahead: `python look_alikes.py [--sets A,B]` prints what the map of each set accepts,
+calibrated as `map build` does.
+
+Every query is asked twice: in the map, and in the map without its place and what shows the same ground. What is
+accepted then is wrong. *unproven* are those of the right ones with which no more than 8 landmarks agree: what it would
+cost to ask for landmarks of every match.
+"""
+
+import argparse
+
+import base
+import numpy as np
+import walks
+from base import DATA
+
+from edgevpr.places.retrieve import elsewhere
+from edgevpr.runtime.recognise.calibration import read_calibration_for
+from edgevpr.runtime.recognise.decide import Matcher
+from edgevpr.runtime.recognise.evidence import INLIERS_BY_CHANCE, count_beside
+
+SETS = ("thumbs_essex", "corridor", "grief_stromovka_seasons")
+_BESIDE_LEFT_OUT = 8  # places along a way
+_COLUMNS = {name: f"{{{name}}}" for name in ("set", "queries", "right", "unproven", "wrong", "left_out")}
+
+
+def measure(name: str) -> base.Row:
+    """Ask all queries of one set."""
+    folder = DATA / name
+    dataset = walks.dataset_of(folder)
+    row: base.Row = {"set": name, "queries": len(dataset.queries), "right": 0, "unproven": 0, "wrong": 0, "left_out": 0}
+    with walks.map_of(folder, images=folder / "ref") as (place_map, index, technique):
+        calibration = read_calibration_for(place_map)
+        beside = _BESIDE_LEFT_OUT if count_beside(calibration.look_alikes if calibration else None) else 0
+        walk, slots = walks.walk(place_map, index, technique), np.arange(len(index))
+        with_landmarks = walks.walk(place_map, index, technique, all_evidence=True)
+        for query in dataset.queries:
+            walk.change(matcher=Matcher(index, walk.rule))
+            event = walk.step(walks.frame(query.path))
+            if event.accepted:
+                found = event.best.place.source_image
+                is_right = found in query.right or found in query.ignored
+                row["right" if is_right else "wrong"] += 1
+                landmarks = with_landmarks.step(walks.frame(query.path)).evidence.landmarks
+                row["unproven"] += is_right and landmarks <= np.log1p(INLIERS_BY_CHANCE)
+            known = [slot for slot in slots if dataset.references[slot] in {*query.right, *query.ignored}]
+            kept = np.all([elsewhere(index, slot, slots, 0.0, beside=beside) for slot in known], axis=0)
+            walk.change(matcher=Matcher(index.only(kept), walk.rule))
+            row["left_out"] += walk.step(walks.frame(query.path)).accepted
+    return row
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sets", default=",".join(SETS), help="names of sets, comma-separated")
+    print(base.table([measure(name) for name in parser.parse_args().sets.split(",")], _COLUMNS))
+
+
+if __name__ == "__main__":
+    base.run(main)
