@@ -26,10 +26,10 @@ def format_match(event: "Recognition") -> dict[str, Any]:
 
     fields = fields_of(event, exact=True)
     number, image, at = (fields.pop(name) for name in ("place", "reference_image", "position"))
-    accuracy_m, fix = fields.pop("accuracy_m"), fields.pop("located")
+    accuracy_m, fix, where = fields.pop("accuracy_m"), fields.pop("located"), event.located
     tag, from_tag_m = event.frame and event.frame.position, None
-    if fix:
-        fix |= {"accuracy_m": accuracy_m, "of_place": not fix["places"]}
+    if fix and where:
+        fix |= {"accuracy_m": accuracy_m, "on_map_m": round(where.accuracy_m, 2), "of_place": not fix["places"]}
         if tag:
             from_tag_m = round(float(distance_m(tag.lat_deg, tag.lon_deg, fix["lat_deg"], fix["lon_deg"])), 2)
     nowhere = dict.fromkeys(("lat_deg", "lon_deg", "alt_m"))
@@ -92,7 +92,8 @@ def _summary(found: Sequence[dict[str, Any]], fixes: Sequence[dict[str, Any]]) -
     yield f"{len(found)} queries, {len(found) - refused.total()} accepted{why}"
     if not fixes:
         return
-    said = f"± m: 1 sigma of the fix, {median(each['position']['accuracy_m'] for each in fixes):.1f} m in the median"
+    in_world_m, on_map_m = (median(each["position"][key] for each in fixes) for key in ("accuracy_m", "on_map_m"))
+    said = f"± m: 1 sigma of the fix in the world, {in_world_m:.1f} m in the median; on the map {on_map_m:.1f} m"
     if away_m := [each["from_gps_tag_m"] for each in fixes if each["from_gps_tag_m"] is not None]:
         said += f"; {median(away_m):.1f} m from the GPS tags, which have errors of their own"
     yield said
