@@ -62,7 +62,7 @@ def add(commands: Any) -> None:
     )
     for name, (*_, text) in _NUMBERS.items():
         over.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
-    demo = command(commands, "demo", run_demo, "map and match a generated flight, and make its page")
+    demo = command(commands, "demo", run_demo, "map and match a generated flight, and draw a picture of it")
     demo.add_argument("--out", default="demo_out", metavar="DIR", help="folder to write (default: demo_out)")
 
 

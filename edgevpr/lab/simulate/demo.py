@@ -8,14 +8,26 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
-from edgevpr.core.arrays import LatLon
+from edgevpr.core.arrays import Image, LatLon
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import progress
+from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
-from edgevpr.lab.simulate.generated import SCENE_DEPTH_M, SCENE_WIDTH_M, later_flight, mapping_flight, write_flight
+from edgevpr.lab.simulate.camera import lit, view_on_ground
+from edgevpr.lab.simulate.generated import (
+    SCENE_DEPTH_M,
+    SCENE_WIDTH_M,
+    GeneratedFlight,
+    later_flight,
+    mapping_flight,
+    to_metres,
+    write_flight,
+)
 from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.review.logged import LoggedQuery, read_flight
 
@@ -24,19 +36,30 @@ _INTERVAL_S = 0.2  # of the later flight, which is flown by the times of its pic
 _CAMERA = ("--camera", "nadir", "--fov-deg", 66)  # that of the generated flights
 # A place is the right one where the two pictures share 30 % of their ground, which is 78 m long from a height of 80 m.
 RIGHT_M = 55.0
+_PICTURE_PX = (1600, 1050)
+# Colours (blue, green, red) of the places, of the later flight, and of the matches by their outcome.
+_MAPPED, _LATER = (255, 255, 255), (10, 214, 255)
+_RIGHT, _WRONG, _REJECTED = (91, 191, 47), (59, 56, 229), (36, 165, 245)
+_LEGEND = {
+    "places of flight 1": _MAPPED,
+    "flight 2": _LATER,
+    "accepted": _RIGHT,
+    "accepted, wrong": _WRONG,
+    "rejected: no position is sent": _REJECTED,
+}
 
 
 def run_demo(folder: str | Path) -> str:
     """Generate both flights, map the first one, fly the second one against a simulated flight controller; return the
     results, as text.
 
-    Leaves in `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and report.html.
+    Leaves in `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and demo.png.
     Raises EdgevprError where a part of it fails.
     """
     folder = Path(folder)
-    map_path, log_path, page_path = (folder / name for name in ("map.gpkg", "flight.jsonl", "report.html"))
+    map_path, log_path, picture_path = (folder / name for name in ("map.gpkg", "flight.jsonl", "demo.png"))
     first, second = folder / "flight-1", folder / "flight-2"
-    for old in (*folder.glob("map.gpkg*"), log_path, page_path):
+    for old in (*folder.glob("map.gpkg*"), log_path, picture_path):
         old.unlink(missing_ok=True)
     scene = make_scene(_SEED, SCENE_WIDTH_M, SCENE_DEPTH_M)
     mapping, later = mapping_flight(_SEED), replace(later_flight(_SEED), interval_s=_INTERVAL_S)
@@ -49,9 +72,11 @@ def run_demo(folder: str | Path) -> str:
         run_command("map", "build", map_path, *images, "--technique", "cohog", "--no-calibrate")
         source = ("--source", second / "images", *_CAMERA)
         run_command("run", "--map", map_path, *source, "--link", link, "--log", log_path)
-    pictures = ("--images", second / "images", "--map-images", first / "images")
-    run_command("report", log_path, *pictures, "--out", page_path)
-    return f"{summarise(*read_queries(log_path, first, second))}\npage              {page_path}: open it in a browser"
+    queries, places = read_queries(log_path, first, second)
+    _draw(picture_path, lit(scene, mapping.light, mapping.seed), mapping, queries)
+    return f"""{summarise(queries, places)}
+picture           {picture_path}
+page              edgevpr report {log_path} --out {folder / "report.html"}"""
 
 
 @contextmanager
@@ -120,3 +145,54 @@ accepted          {len(accepted)}, {sum(not is_right(query) for query in accepte
 rejected          {len(queries) - len(accepted)}, among them {off_map_rejected} of the {off_map} beyond the map
 position error    median {np.median(errors_m):.1f} m, 90 % within {np.quantile(errors_m, 0.9):.1f} m, \
 largest {max(errors_m):.1f} m (of the accepted; places are 21 m apart)"""
+
+
+def _colour(query: LoggedQuery) -> tuple[int, int, int]:
+    if not query.accepted:
+        return _REJECTED
+    return _RIGHT if is_right(query) else _WRONG
+
+
+def _draw(path: Path, ground: Image, mapping: GeneratedFlight, queries: Sequence[LoggedQuery]) -> None:
+    """Draw both tracks on the lit landscape `ground`, uint8 (H, W, 3) BGR, and write the picture to `path`. Land
+    outside of the map is darkened, and a line joins each query to the place that was recognised."""
+    scale = _PICTURE_PX[0] / SCENE_WIDTH_M
+
+    def pixels(points_m: ArrayLike) -> list[tuple[int, int]]:
+        return [(round(east * scale), round(_PICTURE_PX[1] - north * scale)) for east, north in np.asarray(points_m)]
+
+    seen = np.zeros(_PICTURE_PX[::-1], np.uint8)
+    for pose in mapping.poses:
+        if (corners_m := view_on_ground(pose, mapping.camera)) is not None:
+            cv2.fillConvexPoly(seen, np.array(pixels(corners_m)), 1)
+    picture = cv2.resize(ground, _PICTURE_PX, interpolation=cv2.INTER_AREA)
+    picture = np.where(seen[..., None] > 0, picture, picture // 3 + 20).astype(np.uint8)
+    places = pixels([(pose.east_m, pose.north_m) for pose in mapping.poses])
+    found = [query for query in queries if query.true_at and query.place_at]
+    taken = pixels([to_metres(*query.true_at) for query in found if query.true_at])
+    matched = pixels([to_metres(*query.place_at) for query in found if query.place_at])
+    for track, colour in ((places, _MAPPED), (taken, _LATER)):
+        cv2.polylines(picture, [np.array(track)], False, colour, 2, cv2.LINE_AA)
+    for place in places:
+        cv2.circle(picture, place, 4, _MAPPED, -1, cv2.LINE_AA)
+    for query, here, there in zip(found, taken, matched, strict=True):
+        cv2.line(picture, here, there, _colour(query), 3 if query.accepted else 1, cv2.LINE_AA)
+        cv2.circle(picture, here, 7, _colour(query), -1, cv2.LINE_AA)
+    for row, (text, colour) in enumerate(_LEGEND.items()):
+        cv2.putText(picture, text, (20, 920 + 28 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
+    cv2.imwrite(str(path), np.hstack([picture, _pairs(path.parent, found)]))
+
+
+def _pairs(folder: Path, queries: Sequence[LoggedQuery]) -> Image:
+    """Draw ten queries, evenly spread over the flight, each with the picture of its place: uint8 (H, W, 3) BGR."""
+    pairs: list[Image] = []
+    for index in np.linspace(0, len(queries) - 1, 10).astype(int):
+        query = queries[index]
+        files = (folder / "flight-2/images" / query.name, folder / f"flight-1/images/{query.reference_image}")
+        pictures = [cv2.resize(read_image(file), (240, 180), interpolation=cv2.INTER_AREA) for file in files]
+        pair = cv2.copyMakeBorder(np.hstack(pictures), 25, 5, 5, 5, cv2.BORDER_CONSTANT, value=_colour(query))
+        outcome = "rejected" if query.off_m is None else f"{query.off_m:.1f} m off"
+        text = f"query, and its place: {outcome}, score {query.line['score']:.2f}"
+        cv2.putText(pair, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+        pairs.append(pair.astype(np.uint8))
+    return np.hstack([np.vstack(pairs[:5]), np.vstack(pairs[5:])])

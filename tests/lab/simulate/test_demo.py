@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 
+import cv2
 import pytest
 
 from edgevpr.core.errors import EdgevprError
@@ -21,8 +22,8 @@ def small(monkeypatch):
         monkeypatch.setattr(demo, name, lambda seed, flight=flight: replace(flight(seed), poses=flight(seed).poses[:6]))
 
 
-def test_run_demo_maps_flies_and_makes_the_page(small, tmp_path):
-    for left_over in ("map.gpkg", "map.gpkg-wal", "flight.jsonl", "report.html"):
+def test_run_demo_maps_flies_and_draws(small, tmp_path):
+    for left_over in ("map.gpkg", "map.gpkg-wal", "flight.jsonl", "demo.png"):
         (tmp_path / left_over).write_text('{"kind": "query"}\n')
     said = demo.run_demo(tmp_path)
     queries, _ = demo.read_queries(tmp_path / "flight.jsonl", tmp_path / "flight-1", tmp_path / "flight-2")
@@ -30,7 +31,9 @@ def test_run_demo_maps_flies_and_makes_the_page(small, tmp_path):
     mavlink = list(select_last_flight(tmp_path / "flight.jsonl"))[-1]["mavlink"]
     assert mavlink["received"]["HEARTBEAT"] > 0
     assert set(mavlink["acks"]) <= {"ACCEPTED"}
-    assert "frame_0005.jpg" in (tmp_path / "report.html").read_text("utf-8")
+    picture = cv2.imread(str(tmp_path / "demo.png"))
+    assert picture.shape == (1050, 2580, 3)
+    assert picture.std() > 20
     assert "recall@1" in said
 
 
