@@ -23,7 +23,7 @@ def add(commands: Any) -> None:
         "--images",
         metavar="SOURCE",
         nargs="+",
-        help="folders of photographs, or tables (.csv) of files or addresses (s3://...) with positions",
+        help="folders of photographs, or tables (.csv) of files with positions",
     )
     add_orthophoto(build)
     build.add_argument("--config", metavar="FILE", help="configuration of the flights: camera, mask, salience")

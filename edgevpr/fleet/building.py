@@ -33,20 +33,20 @@ _CONNECT_S = 10.0
 def tasks_of_photos(photos: Photos, places_per_tile: int, zoom: int | None) -> tuple[list[TileTask], int]:
     """Divide photographs into tiles, of `zoom` (None: so that none has more than `places_per_tile`). Returns the tasks,
     and how many photographs have no position, and so no tile."""
-    points = {uri: tag.position for uri, tag in photos.items() if tag.position}
+    points = {path: tag.position for path, tag in photos.items() if tag.position}
     if not points:
         raise UsageError("No photograph has a position, and without it has no tile: give a positions.csv beside them.")
     lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points.values()]).T
     zoom = zoom_of_places(lat_deg, lon_deg, places_per_tile) if zoom is None else zoom
-    uris, northwards, tasks = list(points), np.argsort(lat_deg), []
+    paths, northwards, tasks = list(points), np.argsort(lat_deg), []
     squares = locate(lat_deg, lon_deg, zoom)
     for square in np.unique(squares, axis=0):
         tile = Tile(zoom, *square.tolist())
         extent_deg = widen_extent(tile.extent_deg, MARGIN_M)
         near = northwards[slice(*np.searchsorted(lat_deg, extent_deg[::2], sorter=northwards))]
         near = np.sort(near[is_in_extent(extent_deg, lat_deg[near], lon_deg[near])])
-        inside = frozenset(uris[at] for at in near[(squares[near] == square).all(axis=1)])
-        tasks.append(TileTask(tile=tile, photos={uris[at]: photos[uris[at]] for at in near}, inside=inside))
+        inside = frozenset(paths[at] for at in near[(squares[near] == square).all(axis=1)])
+        tasks.append(TileTask(tile=tile, photos={paths[at]: photos[paths[at]] for at in near}, inside=inside))
     return tasks, len(photos) - len(points)
 
 

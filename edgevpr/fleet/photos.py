@@ -1,19 +1,14 @@
 """The photographs of a fleet, from many folders and tables, and those of one tile, brought to where it is mapped.
 
-A table is a positions.csv whose column `file` has paths, relative to the table, or addresses that fsspec opens, such as
-s3://bucket/0001.jpg. A photograph is known by its content: where it lies may change, and cameras begin their names anew
-on every card."""
+A table is a positions.csv whose column `file` has paths, relative to the table. A photograph is known by its content:
+where it lies may change, and cameras begin their names anew on every card."""
 
 import hashlib
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import urlsplit
 
-import fsspec
-
-from edgevpr.core.errors import SourceError, UsageError
+from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import decode_name
 from edgevpr.frames.images import EXTENSIONS, is_image
@@ -21,19 +16,20 @@ from edgevpr.frames.positions import GeoTag, read_positions, write_positions
 from edgevpr.frames.source import read_tags
 
 _CHUNK_BYTES = 1 << 20
-_HASH_DIGITS, _MOST_LETTERS = 12, 40  # of a name: that of a file has 255 bytes
+_HASH_DIGITS = 12
+_MAX_WORD_CHARS = 40  # of a name: that of a file has 255 bytes
 _SAME_M = 1.0  # between two positions of one photograph: written with fewer digits
 
 
-Photos = Mapping[str, GeoTag]  # what is known of photographs, by their paths or addresses
+Photos = Mapping[str, GeoTag]  # what is known of photographs, by their paths
 
 
 @dataclass(frozen=True, slots=True)
 class Gathered:
-    """Photographs in a folder. `uris`: where each came from, by the name that it has there and in a map. `contents`: a
-    text for each, of its content and its tag. `unusable`: a sentence about each other one, by its path or address."""
+    """Photographs in a folder. `paths`: where each came from, by the name that it has there and in a map. `contents`: a
+    text for each, of its content and its tag. `unusable`: a sentence about each other one, by its path."""
 
-    uris: dict[str, str]
+    paths: dict[str, str]
     contents: list[str]
     unusable: dict[str, str]
 
@@ -43,11 +39,11 @@ def list_photos(sources: Sequence[str]) -> Photos:
     that cannot be read, and for a photograph that has two positions."""
     found: dict[str, tuple[GeoTag, str]] = {}
     for source in sources:
-        for uri, tag in _of_source(source):
-            before, of_source = found.setdefault(uri, (tag, source))
+        for path, tag in _of_source(source):
+            before, of_source = found.setdefault(path, (tag, source))
             if not _agree(before, tag):
-                raise UsageError(f"{uri} has one position in {of_source} and another in {source}: give one of them.")
-    return {uri: tag for uri, (tag, _) in found.items()}
+                raise UsageError(f"{path} has one position in {of_source} and another in {source}: give one of them.")
+    return {path: tag for path, (tag, _) in found.items()}
 
 
 def _agree(tag: GeoTag, other: GeoTag) -> bool:
@@ -63,7 +59,7 @@ def _of_source(source: str) -> Iterator[tuple[str, GeoTag]]:
         yield from ((str(image.absolute()), tag) for image, tag in read_tags(path).items())
     elif path.suffix.lower() == ".csv":
         folder = path.absolute().parent
-        yield from ((file if "://" in file else str(folder / file), tag) for file, tag in read_positions(path).items())
+        yield from ((str(folder / file), tag) for file, tag in read_positions(path).items())
     else:
         raise UsageError(f"--images {source} is no folder and no table of positions (.csv): give one of them.")
 
@@ -73,55 +69,44 @@ def content_in(name: str) -> str:
     return Path(name).stem.rpartition("_")[2]
 
 
-def _name(uri: str, sha256: str) -> str:
+def _name(path: str, sha256: str) -> str:
     """Return the name of a photograph in a map: its folder's, its own, so that names sort as the pictures were taken,
     and the hash of its content."""
-    path = urlsplit(uri).path if uri.startswith(("http://", "https://")) else uri
     *folder, file = decode_name(path).rsplit("/", 2)[-2:]
     words = [*folder, Path(file).stem]
-    return "_".join([*(word[-_MOST_LETTERS:] for word in words), sha256[:_HASH_DIGITS]]) + Path(file).suffix
+    return "_".join([*(word[-_MAX_WORD_CHARS:] for word in words), sha256[:_HASH_DIGITS]]) + Path(file).suffix
 
 
 def gather(photos: Photos, folder: Path) -> Gathered:
-    """Bring photographs into a folder, with a positions.csv of them. Of those of one content the first counts. Raises
-    SourceError where a store cannot be reached, or does not give what it has."""
+    """Link photographs into a folder, with a positions.csv of them. Of those of one content the first counts."""
     found = Gathered({}, [], {})
     first: dict[str, str] = {}  # where a content was found first, by its hash
-    for uri, tag in photos.items():
-        unfinished, is_here = folder / ".unfinished", "://" not in uri
+    for path, tag in photos.items():
         try:
-            sha256 = _copied(uri, Path(os.devnull) if is_here else unfinished)
+            sha256 = _hash_file(path)
         except FileNotFoundError:
-            found.unusable[uri] = f"{uri} is not there: correct the table, or bring it back"
+            found.unusable[path] = f"{path} is not there: correct the table, or bring it back"
             continue
-        except Exception as error:  # each store has errors of its own
-            problem = f"{uri} cannot be read ({' '.join(str(error).split()) or type(error).__name__})"
-            if not is_here:  # the next photographs would fail, too: this is not to make a map with holes
-                raise SourceError(f"{problem}: run this again when it can.") from None
-            found.unusable[uri] = problem
+        except OSError as error:
+            found.unusable[path] = f"{path} cannot be read ({error.strerror})"
             continue
-        same, name = first.setdefault(sha256, uri), _name(uri, sha256)
-        if same != uri:
+        same, name = first.setdefault(sha256, path), _name(path, sha256)
+        if same != path:
             if not _agree(photos[same], tag):
-                found.unusable[uri] = f"{uri} is the picture {same}, and has another position"
+                found.unusable[path] = f"{path} is the picture {same}, and has another position"
         elif not is_image(name):
-            found.unusable[uri] = f"{uri} is no picture ({' '.join(EXTENSIONS)})"
+            found.unusable[path] = f"{path} is no picture ({' '.join(EXTENSIONS)})"
         else:
-            if is_here:
-                (folder / name).symlink_to(uri)
-            else:
-                unfinished.rename(folder / name)
-            found.uris[name] = uri
+            (folder / name).symlink_to(path)
+            found.paths[name] = path
             found.contents.append(f"{sha256} {tag!r}")
-    write_positions(folder / "positions.csv", {name: photos[uri] for name, uri in found.uris.items()})
+    write_positions(folder / "positions.csv", {name: photos[path] for name, path in found.paths.items()})
     return found
 
 
-def _copied(uri: str, target: Path) -> str:
-    """Copy what is at a path or an address, and return the hash of it."""
+def _hash_file(path: str) -> str:
     sha256 = hashlib.sha256()
-    with fsspec.open(uri, "rb") if "://" in uri else open(uri, "rb") as source, target.open("wb") as copy:
+    with open(path, "rb") as source:
         while chunk := source.read(_CHUNK_BYTES):
             sha256.update(chunk)
-            copy.write(chunk)
     return sha256.hexdigest()

@@ -47,7 +47,7 @@ class FleetOrder:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TileTask:
     """A `tile` to be mapped, and what of: `cuttings` of an orthophoto, or `photos`, in the tile and around it, those
-    `inside` by their addresses."""
+    `inside` by their paths."""
 
     tile: Tile
     cuttings: Cuttings | None = None
@@ -93,13 +93,13 @@ def build_tile(task: TileTask, order: FleetOrder) -> DoneTile:
 class _Inputs:
     """All that a tile is mapped from: the `pictures`, the hash of their content and of the settings, and sentences
     about those of the tile that cannot be used. `is_named` returns True for the name of one of them, and `inside` the
-    places that lie in the tile, and not only near it. `uris`: addresses of photographs, by name."""
+    places that lie in the tile, and not only near it. `paths`: those of photographs, by name."""
 
     pictures: Cuttings | FlownPictures
     sha256: str
     is_named: Callable[[str], bool]
     inside: Wanted
-    uris: Mapping[str, str] = field(default_factory=dict)
+    paths: Mapping[str, str] = field(default_factory=dict)
     unusable: list[str] = field(default_factory=list)
 
 
@@ -128,17 +128,17 @@ def _of_photos(order: FleetOrder, task: TileTask, folder: Path) -> _Inputs:
     """Bring the photographs of a tile into a folder. Raises NoPlaceError if none of the tile can be used."""
     folder.mkdir()
     needs_near = order.refine or order.calibrate
-    found = gather({uri: tag for uri, tag in task.photos.items() if needs_near or uri in task.inside}, folder)
-    contents, uris = set(map(content_in, found.uris)), found.uris
+    found = gather({path: tag for path, tag in task.photos.items() if needs_near or path in task.inside}, folder)
+    contents, paths = set(map(content_in, found.paths)), found.paths
     return _Inputs(
         pictures=FlownPictures(source=str(folder)),
         sha256=_hash_of(order, sorted(found.contents)),
         is_named=lambda name: content_in(name) in contents,
         inside=lambda place_map: [
-            place.place_id for place in place_map.places() if uris[place.source_image] in task.inside
+            place.place_id for place in place_map.places() if paths[place.source_image] in task.inside
         ],
-        uris=uris,
-        unusable=[text for uri, text in found.unusable.items() if uri in task.inside],
+        paths=paths,
+        unusable=[text for path, text in found.unusable.items() if path in task.inside],
     )
 
 
@@ -157,13 +157,13 @@ def _built(task: TileTask, order: FleetOrder, scratch: Path) -> DoneTile:
                 return _describe(done, there)
     if lost := _lost(target, inputs.is_named):
         return replace(done, problem=lost)
-    if task.photos and not task.inside.intersection(inputs.uris.values()):
+    if task.photos and not task.inside.intersection(inputs.paths.values()):
         return done
 
     def report_unusable(error: ImageError) -> None:
-        name = next((name for name in inputs.uris if f"{folder / name}" in str(error)), None)
-        if name is None or inputs.uris[name] in task.inside:  # the task of its own tile reports any other
-            unusable.append(str(error).replace(f"{folder / name}", inputs.uris[name]) if name else str(error))
+        name = next((name for name in inputs.paths if f"{folder / name}" in str(error)), None)
+        if name is None or inputs.paths[name] in task.inside:  # the task of its own tile reports any other
+            unusable.append(str(error).replace(f"{folder / name}", inputs.paths[name]) if name else str(error))
 
     path, whole = scratch / "inside.gpkg", scratch / "map.gpkg"
     ordered = MapOrder(

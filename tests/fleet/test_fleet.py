@@ -162,7 +162,7 @@ def photographs(folder, names, first):
     write_positions(folder / "positions.csv", tags)
 
 
-def test_photographs_of_several_folders_and_a_table_of_addresses_are_mapped_where_they_were_taken(cluster, tmp_path):
+def test_photographs_of_several_folders_and_a_table_are_mapped_where_they_were_taken(cluster, tmp_path):
     names = [f"DJI_{number:04d}.png" for number in range(8)]
     for number, folder in enumerate(("monday", "tuesday", "wednesday")):
         photographs(tmp_path / folder, names, 8 * number)
@@ -170,7 +170,7 @@ def test_photographs_of_several_folders_and_a_table_of_addresses_are_mapped_wher
     (tmp_path / "tuesday" / "none.png").write_bytes((tmp_path / "tuesday" / names[0]).read_bytes())
     table = tmp_path / "wednesday.csv"
     lines = (tmp_path / "wednesday" / "positions.csv").read_text().splitlines()
-    lines[1:] = [line.replace("DJI_", f"file://{tmp_path}/wednesday/DJI_", 1) for line in lines[1:]]
+    lines[1:] = [line.replace("DJI_", "wednesday/DJI_", 1) for line in lines[1:]]
     table.write_text("\n".join([*lines, lines[-1].replace("_0007", "_0099")]))
     sources = [str(tmp_path / "monday"), str(tmp_path / "tuesday"), str(table)]
     tasks, without_position = building.tasks_of_photos(photos.list_photos(sources), 10, None)
@@ -216,7 +216,7 @@ def test_photographs_that_are_moved_or_named_twice_are_neither_mapped_again_nor_
     assert placed(moved, cards[1]) == (4, False)
     lines = (moved / "positions.csv").read_text().splitlines()
     table = tmp_path / "table.csv"
-    table.write_text("\n".join([lines[0], *(f"file://{moved}/{line}" for line in lines[1:])]))
+    table.write_text("\n".join([lines[0], *(f"archive/DCIM/{line}" for line in lines[1:])]))
     assert placed(table, moved, cards[1]) == (4, False)
     photographs(tmp_path / "c", ["1.png"], 5)
     assert placed(table, cards[1], tmp_path / "c") == (5, True)
@@ -228,11 +228,12 @@ def test_a_photograph_of_two_positions_is_refused_or_left_out(tmp_path):
     write_positions(table, {"a/1.png": elsewhere})
     with pytest.raises(UsageError, match=r"1\.png has one position in .*a and another in .*a\.csv"):
         photos.list_photos([str(tmp_path / "a"), str(table)])
-    write_positions(table, {f"file://{tmp_path}/a/1.png": elsewhere})
+    (tmp_path / "b.png").write_bytes((tmp_path / "a" / "1.png").read_bytes())
+    write_positions(table, {"b.png": elsewhere})
     (tmp_path / "here").mkdir()
     found = photos.gather(photos.list_photos([str(tmp_path / "a"), str(table)]), tmp_path / "here")
-    assert len(found.uris) == 1
-    assert "and has another position" in found.unusable[f"file://{tmp_path}/a/1.png"]
+    assert len(found.paths) == 1
+    assert "and has another position" in found.unusable[str(tmp_path / "b.png")]
 
 
 def test_two_runs_into_one_folder_are_refused(tmp_path, cluster, tiled):
