@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
-from typing import TypeGuard
+from typing import NamedTuple, TypeGuard
 from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
@@ -39,17 +39,6 @@ _TIMEOUT_S = 30
 _MAX_TILE_BYTES = 10_000_000
 _NO_TILE = (204, 404, 410)  # HTTP status
 _ZOOMS_TRIED = 3  # from the one that is wanted: servers have different highest ones
-# A tile that the server does not have is transparent, and coarser zooms are not asked for.
-_WMS = """<GDAL_WMS><Service name="TMS"><ServerUrl>{url}</ServerUrl></Service><DataWindow>
-<UpperLeftX>{west_m!r}</UpperLeftX><UpperLeftY>{north_m!r}</UpperLeftY>
-<LowerRightX>{east_m!r}</LowerRightX><LowerRightY>{south_m!r}</LowerRightY>
-<TileLevel>{zoom}</TileLevel><TileX>{left}</TileX><TileY>{top}</TileY><YOrigin>top</YOrigin>
-<SizeX>{width}</SizeX><SizeY>{height}</SizeY></DataWindow><Projection>EPSG:3857</Projection><BandsCount>4</BandsCount>
-<BlockSizeX>{side_px}</BlockSizeX><BlockSizeY>{side_px}</BlockSizeY><OverviewCount>0</OverviewCount>
-<ZeroBlockHttpCodes>{no_tile}</ZeroBlockHttpCodes>
-<MaxConnections>{connections}</MaxConnections><UserAgent>edgevpr/{version}</UserAgent><Timeout>{timeout_s}</Timeout>
-{cache}</GDAL_WMS>"""
-_CACHE = "<Cache><Path>{folder}</Path><Expires>2147483647</Expires><CleanTimeout>0</CleanTimeout></Cache>"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +57,7 @@ class Ground:
         return min(max(math.ceil(math.log2(world_px / TILE_PX)), 0), _FINEST_ZOOM)
 
 
-@dataclass(frozen=True, slots=True)
-class _Window:
+class _Window(NamedTuple):
     """Tiles of one zoom: the least x and y, and the greatest plus 1."""
 
     zoom: int
@@ -127,7 +115,7 @@ def describe_folder(folder: Path, links: Path) -> str:
     for (_, x, y), path in tiles.items():
         (links / str(x)).mkdir(exist_ok=True)
         (links / str(x) / str(y)).symlink_to(path.absolute())
-    (left, top), (right, bottom) = np.min(list(tiles), axis=0)[1:].tolist(), np.max(list(tiles), axis=0)[1:].tolist()
+    (_, left, top), (_, right, bottom) = (edge(list(tiles), axis=0).tolist() for edge in (np.min, np.max))
     return _describe(f"file://{links}/{{x}}/{{y}}", _Window(zoom, left, top, right + 1, bottom + 1), len(first))
 
 
@@ -220,23 +208,22 @@ def _is_square(tile: object) -> TypeGuard[Image]:
 
 def _describe(address: str, window: _Window, side_px: int, cache: Path | None = None) -> str:
     """Return the XML by which GDAL opens the tiles of a window; `cache` is the folder where it keeps them (None: they
-    are files)."""
+    are files). A tile that is not there is transparent, and coarser zooms are not asked for."""
     tile_m = 2 * HALF_WORLD_M / 2**window.zoom
-    return _WMS.format(
-        url=escape(address.replace("{", "${")),
-        west_m=window.left * tile_m - HALF_WORLD_M,
-        north_m=HALF_WORLD_M - window.top * tile_m,
-        east_m=window.right * tile_m - HALF_WORLD_M,
-        south_m=HALF_WORLD_M - window.bottom * tile_m,
-        zoom=window.zoom,
-        left=window.left,
-        top=window.top,
-        width=(window.right - window.left) * side_px,
-        height=(window.bottom - window.top) * side_px,
-        side_px=side_px,
-        no_tile=",".join(map(str, _NO_TILE)),
-        connections=_CONNECTIONS,
-        version=__version__,
-        timeout_s=_TIMEOUT_S,
-        cache=_CACHE.format(folder=escape(str(cache))) if cache else "",
-    )
+    kept = f"<Path>{escape(str(cache))}</Path><Expires>2147483647</Expires><CleanTimeout>0</CleanTimeout>"
+    return f"""<GDAL_WMS>
+<Service name="TMS"><ServerUrl>{escape(address.replace("{", "${"))}</ServerUrl></Service>
+<DataWindow>
+<UpperLeftX>{window.left * tile_m - HALF_WORLD_M!r}</UpperLeftX>
+<UpperLeftY>{HALF_WORLD_M - window.top * tile_m!r}</UpperLeftY>
+<LowerRightX>{window.right * tile_m - HALF_WORLD_M!r}</LowerRightX>
+<LowerRightY>{HALF_WORLD_M - window.bottom * tile_m!r}</LowerRightY>
+<TileLevel>{window.zoom}</TileLevel><TileX>{window.left}</TileX><TileY>{window.top}</TileY><YOrigin>top</YOrigin>
+<SizeX>{(window.right - window.left) * side_px}</SizeX><SizeY>{(window.bottom - window.top) * side_px}</SizeY>
+</DataWindow>
+<Projection>EPSG:3857</Projection><BandsCount>4</BandsCount><OverviewCount>0</OverviewCount>
+<BlockSizeX>{side_px}</BlockSizeX><BlockSizeY>{side_px}</BlockSizeY>
+<ZeroBlockHttpCodes>{",".join(map(str, _NO_TILE))}</ZeroBlockHttpCodes>
+<MaxConnections>{_CONNECTIONS}</MaxConnections><Timeout>{_TIMEOUT_S}</Timeout>
+<UserAgent>edgevpr/{__version__}</UserAgent>{f"<Cache>{kept}</Cache>" if cache else ""}
+</GDAL_WMS>"""
