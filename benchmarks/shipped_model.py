@@ -57,7 +57,8 @@ def shipped_model(kind: str, sites: Sequence[FittedSite], made_of: str) -> Model
     model = Model(of_map=of_map, of_place=of_place, scale=unknown, made=today, made_of=made_of)
     bare = [(site, model) for site in sites]
     own = [(site, adapted(model, kind, site.answers, site.name)) for site in sites if site.answers]
-    return replace(model, scale=_scale(bare), adapted_scale=_scale(own) if own else None)
+    matches = sum(len(site.own) + len(site.foreign) for site in sites)
+    return replace(model, matches=matches, scale=_scale(bare), adapted_scale=_scale(own) if own else None)
 
 
 def _regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence], bool]]) -> Logistic:

@@ -21,6 +21,7 @@ class Told:
     confidence: Callable[[Figures], float]
     of_map: Callable[[Figures], float] | None = None
     needed: float = NEEDED
+    most_shown: float = 1.0
 
     def confidence_of_map(self, evidence: Figures) -> float:
         return (self.of_map or self.confidence)(evidence)

@@ -236,6 +236,7 @@ def adapted(model: Model, kind: str, answers: Iterable[MapAnswer], made_of: str)
         scale=model.adapted_scale or model.scale,
         made=date.today().isoformat(),
         made_of=made_of,
+        matches=model.matches,
     )
 
 

@@ -28,6 +28,7 @@ from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.evidence import (
     SHARE_BY_CHANCE,
+    SMALL_LEAD,
     LookAlike,
     LookAlikes,
     compute_share,
@@ -97,6 +98,10 @@ def measure_look_alikes(
     def is_beside(slot: int) -> Bools:
         return np.asarray(abs(all_slots - slot) == 1)
 
+    def is_opposite(slot: int) -> Bools:
+        """As many places as are beside one, from half the map away."""
+        return np.isin(all_slots, (slot + len(index) // 2 + np.array([0, 1])) % len(index))
+
     # Logarithms, by the slots of both places. It depends a little on which of two pictures asks.
     agree: dict[int, dict[int, float]] = {slot: {} for slot in slots.values()}
     for place_id, descriptor in pictures:
@@ -104,16 +109,14 @@ def measure_look_alikes(
             continue
         far = find_elsewhere(slot, MAX_BESIDE) & ~is_beside(slot)
         near = ~far & (all_slots != slot)
-        for other, found in _compare_among(technique, place_map, index, descriptor, (far, near)):
+        for other, found in _compare_among(technique, place_map, index, descriptor, (far, near, is_opposite(slot))):
             for one, two in ((slot, other), (other, slot)):
                 agree[one][two] = max(found, agree[one].get(two, found))
     best_beside = {slot: _find_best(others, is_beside(slot))[1] for slot, others in agree.items()}
-    best_far = [
-        _find_best(others, find_elsewhere(slot, MAX_BESIDE) & ~is_beside(slot))[1] for slot, others in agree.items()
-    ]
+    best_opposite = [_find_best(others, is_opposite(slot))[1] for slot, others in agree.items()]
     usual, chance = float(np.median(list(best_beside.values()))), log_share(SHARE_BY_CHANCE)
-    # Along a way, pictures agree better with those before and after them than with any other.
-    overlap = usual >= max(chance, float(np.median(best_far)))
+    # Along a way, pictures agree better with those before and after them than with as many others.
+    overlap = usual >= max(chance, float(np.median(best_opposite)) + SMALL_LEAD)
     places = {}
     for slot, others in agree.items():
         twin, found = _find_best(others, find_elsewhere(slot, MAX_BESIDE if overlap else 0))

@@ -129,6 +129,7 @@ def of_several(maps: Sequence[MapCalibration | None]) -> MapCalibration | None:
             adapted_scale=shipped.adapted_scale if len(known) < len(maps) else None,
             made=min(each.made for each in known),
             made_of=f"the calibrations of {len(known)} of {len(maps)} maps",
+            matches=shipped.matches,
         )
     return MapCalibration(
         models=models,

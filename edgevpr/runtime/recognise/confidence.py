@@ -29,6 +29,8 @@ _MOST = 40.0  # limit of a logit: beyond it, a probability is 0 or 1 in float64
 # was taken for another, and a foreign picture for a place of aerial_swindale; and where a model is not adapted to its
 # map, foreign pictures for places of grief_michigan_monthly, of which there are five.
 _ADAPTED, _NOT_ADAPTED = 0.5, 0.1
+# Matches that a model was fitted to, where a map was calibrated before they were stored.
+_UNKNOWN_MATCHES = 1000
 _LEAST = 1e-15  # least chance, so that its logarithm exists
 # Power of the share of rotations tried, as a factor of a chance: 1 if rotations were independent, but streets and
 # furrows have directions. Of 2,015 foreign and mirrored pictures, asked with random headings in the maps of sat_marash
@@ -89,7 +91,8 @@ class Model:
     tells whether the query shows ground of the map, `of_place` whether the best place is the right one, and `scale`
     converts their logits. Of a map joined of several, `of_other_places` are those of the others: the least logit
     counts. `adapted_scale` replaces `scale` once the model is adapted to a map (None: this model is
-    adapted). `made` is its date, and `made_of` describes in words the data it was fitted to."""
+    adapted). `made` is its date, `made_of` describes in words the data it was fitted to, and `matches` is the number of
+    matches of many sites that the scale was fitted to."""
 
     of_map: Logistic
     of_place: Logistic
@@ -98,6 +101,7 @@ class Model:
     adapted_scale: Scale | None = None
     made: str
     made_of: str
+    matches: int = _UNKNOWN_MATCHES
 
     def chance(self, evidence: Figures) -> float:
         """Return the probability (0..1) that a wrong match offers as much evidence; 1 if any of it is not finite. If
@@ -111,6 +115,11 @@ class Model:
     def confidence(self, evidence: Figures) -> float:
         """Return the probability that the match is right, 0..1."""
         return self.scale.confidence(self.chance(evidence))
+
+    @property
+    def most_shown(self) -> float:
+        """Return the highest confidence that the data support: how seldom a match is wrong that none of so many was."""
+        return 1 - 1 / max(self.matches, 1)
 
     def confidence_of_map(self, evidence: Figures) -> float:
         """Return the probability, 0..1, that the query shows ground of the map, no matter which place."""

@@ -241,7 +241,7 @@ class Decider:
                 ahead_of_turned=None if is_heading_known else self._lead_over_turned(best, found.evidence, query),
             )
             verdict = judge(found, index, rule, search)
-        confidence = rule.sure.confidence(found.evidence) if rule.sure and found.evidence else None
+        confidence = rule.sure.shown(found.evidence) if rule.sure and found.evidence else None
         return Decision(
             verdict=verdict, hints=hints, best=best, findings=found, confidence=confidence, followed=followed
         )

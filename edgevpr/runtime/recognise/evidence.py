@@ -43,7 +43,7 @@ _MIN_SHARE = 1e-3  # so that its logarithm exists
 INLIERS_BY_CHANCE = 8
 SHARE_BY_CHANCE = 0.07  # that pictures of foreign ground reach; stands for a place elsewhere if there is none
 # A place that leads by a smaller factor must be told by its landmarks from the best one elsewhere.
-_SMALL_LEAD = math.log(1.5)
+SMALL_LEAD = math.log(1.5)
 _NO_LEAD = math.log(1.05)
 # Ahead, the most by which the regions of another place may rank better. Chosen on corridor, where one match was
 # accepted beside the right places.
@@ -108,13 +108,13 @@ class Evidence:
         if self.is_hardly_ahead and (self.rank_gap or 0.0) > _MAX_RANK_GAP:
             return (self.proof or 0.0) < _TWICE
         if self.apart is not None:
-            return self.apart < _SMALL_LEAD and not self.proof
+            return self.apart < SMALL_LEAD and not self.proof
         return self.is_hardly_ahead and _to_count(self.landmarks or 0.0) <= INLIERS_BY_CHANCE
 
     @property
     def is_hardly_ahead(self) -> bool:
         """True if a place elsewhere agrees nearly as well, so that its landmarks must be compared too."""
-        return self.lead < _SMALL_LEAD
+        return self.lead < SMALL_LEAD
 
     def describe(self) -> dict[str, float | None]:
         """Return this evidence as parameters of a `Reason` of the judge, without logarithms."""

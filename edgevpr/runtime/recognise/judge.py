@@ -83,6 +83,10 @@ class Sureness:
             return min(confidence, _MAX_WITH_TWIN)
         return min(confidence, _MAX_UNPROVEN) if evidence.needs_landmarks else confidence
 
+    def shown(self, evidence: Evidence) -> float:
+        """Return the confidence as it is reported: no higher than the data support that its model was fitted to."""
+        return min(self.confidence(evidence), self.models[evidence.kind].most_shown)
+
     def of_map(self, evidence: Evidence) -> float:
         """Return the probability that the query of this evidence shows ground of the map."""
         return self.models[evidence.kind].confidence_of_map(evidence.figures())
@@ -249,7 +253,7 @@ def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
     if evidence is None:
         return _refuse(ReasonCode.NOT_CALIBRATED)
     confidence, needed = sure.confidence(evidence), sure.threshold(evidence)
-    figures = {"track": followed, "confidence": confidence, "needed": needed, **evidence.describe()}
+    figures = {"track": followed, "confidence": sure.shown(evidence), "needed": needed, **evidence.describe()}
     by_itself = confidence >= needed
     code = ReasonCode.ACCEPTED_BY_CONFIDENCE
     if not (by_itself or (followed is not None and _is_sure_by_flight(followed, confidence, needed, sure.precision))):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sureness import NEEDED, agreed, bare_index, sure_rule, told
+from sureness import NEEDED, Told, agreed, bare_index, sure_rule, told
 
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import FineMatch
@@ -15,7 +15,7 @@ from edgevpr.core.reasons import ReasonCode
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, OF_MAP, OF_PLACE, Evidence, log_count
-from edgevpr.runtime.recognise.judge import AcceptRule, Findings, accept_rule, is_at_rest, judge
+from edgevpr.runtime.recognise.judge import AcceptRule, Findings, Sureness, accept_rule, is_at_rest, judge
 from edgevpr.techniques import create
 
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
@@ -58,6 +58,13 @@ def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted)
 def test_more_evidence_is_asked_for_only_where_it_can_decide(confidence, of_map, lead, is_open):
     sure = told(lambda evidence: confidence, lambda evidence: of_map)
     assert sure.is_open(replace(CLEAR, lead=lead)) == is_open
+
+
+def test_sureness_shows_no_more_than_the_data_support():
+    sure = Sureness(dict.fromkeys(OF_MAP, Told(lambda evidence: 1.0, most_shown=0.9998)), 0.999)
+    assert (sure.confidence(CLEAR), sure.shown(CLEAR)) == (1.0, 0.9998)
+    down = accept_rule(create("cohog", {"camera": "nadir"}), load_config(None).match).sure
+    assert down.shown(replace(CLEAR, lead=30.0)) <= 1 - 1 / 10_000
 
 
 def test_regions_ahead_that_prove_nothing_are_accepted_only_with_landmarks_or_by_the_flight():
