@@ -10,6 +10,7 @@ from mavlink_peers import AutopilotThread, Peer, UdpPort, link_to, wait_until
 from pictures import textured
 
 from edgevpr.core.errors import ImageError
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.frames.devices import DeviceCapture
 from edgevpr.frames.live import LiveSource
 from edgevpr.frames.shot import Condition
@@ -126,7 +127,7 @@ def test_send_fix_drops_a_fix_of_an_old_frame(link):
     link, clock = link
     sending = link.send_fix(fix(clock, age_s=6.2))
     sending.wait(10.0)
-    assert (sending.sent, sending.why) == (False, "its frame is 6.2 s old, and 5 s are the limit")
+    assert (sending.sent, sending.why.code) == (False, ReasonCode.FRAME_TOO_OLD)
     assert (link.stats().fixes_sent, link.stats().dropped_stale_fixes) == (0, 1)
 
 
@@ -183,6 +184,6 @@ def test_send_fix_waits_a_second_for_an_autopilot(kind):
     assert sending.sent is None
     clock.now_s += 1.1
     wait_until(lambda: link.stats().dropped_stale_fixes == 1)
-    assert (sending.sent, sending.why) == (False, "no autopilot was there to take it within 1 s")
+    assert (sending.sent, sending.why) == (False, Reason(ReasonCode.NO_AUTOPILOT, {"limit_s": 1.0}))
     link.close()
     port.close()
