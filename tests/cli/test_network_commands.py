@@ -11,7 +11,7 @@ from edgevpr.cli.main import main
 from edgevpr.core.config import FORMS, load_config
 from edgevpr.core.errors import ConfigError
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.preflight.pick import outlook
+from edgevpr.runtime.preflight.pick import explain_technique
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.techniques import create, vectors
 
@@ -53,7 +53,7 @@ def test_open_recogniser_uses_the_form_of_the_configuration(flight):
     config = load_config(None, {"map": str(path), "match.form": "1bit"})
     recogniser = open_recogniser(config, load_board("this"))
     assert recogniser.index.rows.shape == (6, 8)
-    reason = outlook(recogniser, config).reason
+    reason = explain_technique(recogniser, is_named=False)
     assert reason.startswith("technique calc 1bit: the map was built with it; weights of tiny: A tiny network")
     recogniser.place_map.close()
     with pytest.raises(ConfigError, match=r"match\.form"):

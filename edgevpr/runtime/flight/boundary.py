@@ -25,7 +25,6 @@ from edgevpr.power.thermal import ThermalState
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.machine import Machine
 from edgevpr.runtime.flight.stop import Stop
-from edgevpr.runtime.preflight.pick import Outlook
 
 T = TypeVar("T")
 
@@ -76,7 +75,6 @@ _QUESTIONS: dict[str, tuple[str, type[Any] | None]] = {
     "measure_load": ("load", MachineLoad),
     "rss_mb": ("rss_mb", None),
     "pick_technique": ("picked", None),
-    "measure_speed": ("outlook", Outlook),
     "try_map": ("cannot_learn", None),
     "is_written": ("log is written", None),
 }

@@ -104,8 +104,7 @@ class Flight:
                 recogniser, learner, cannot_learn = open_map(config, io)
                 stack.callback(recogniser.place_map.close)
                 flight_log = stack.enter_context(_open_log(io))
-                found = io.machine.measure_speed(recogniser, config)
-            flight_log.write("start", **log_start(config, io, recogniser, found))
+            flight_log.write("start", **log_start(config, io, recogniser))
             step_s, settings = 1 / choose_rate_hz(config, recogniser), config.mavlink
             navigator = Navigator(settings.min_accuracy_m, step_s, not settings.send_fixes, config.source.gimbal)
             origin = find_origin(recogniser.place_map, config.source) if settings.set_origin else None

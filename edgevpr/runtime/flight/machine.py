@@ -1,4 +1,4 @@
-"""This computer as a flight asks it: heat, load, memory, what its disk takes, and how fast it recognises."""
+"""This computer as a flight asks it: heat, load, memory, and what its disk takes."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,9 +10,8 @@ from edgevpr.power.machine import rss_mb
 from edgevpr.power.meter import MachineLoad, machine_load
 from edgevpr.power.thermal import ThermalState, ThermalWatch, limit_c
 from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.preflight.pick import Outlook, outlook, pick_technique
+from edgevpr.runtime.preflight.pick import pick_technique
 from edgevpr.runtime.recognise.opening import has_map
-from edgevpr.runtime.recognise.recogniser import Recogniser
 
 _NEW_MAP_PLACES = 1000  # places that a technique chosen for an empty map must be fast enough for
 
@@ -47,10 +46,6 @@ class Machine:
         if is_new and config.technique is None:
             return pick_technique(config.board, _NEW_MAP_PLACES, config.source.camera)
         return config.technique
-
-    def measure_speed(self, recogniser: Recogniser, config: Config) -> Outlook:
-        """Measure how fast the technique of a recogniser is."""
-        return outlook(recogniser, config)
 
     def try_map(self, opened: Callable[[], object]) -> str | None:
         """Open a map by `opened`, and return why that fails (None: it does not)."""

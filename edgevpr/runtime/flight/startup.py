@@ -17,14 +17,13 @@ from edgevpr import __version__
 from edgevpr.core.config import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Config, SourceConfig
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError, PlaceError
-from edgevpr.core.types import FIX_MAX_AGE_S, Position
+from edgevpr.core.types import Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import MapIdentity, read_identity
 from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.flight.flightio import FlightIO
-from edgevpr.runtime.preflight.choose import too_late
-from edgevpr.runtime.preflight.pick import Outlook
+from edgevpr.runtime.preflight.pick import explain_technique
 from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.levelling import lens_of
 from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
@@ -102,19 +101,17 @@ def find_origin(place_map: PlaceMap, source: SourceConfig) -> Position | None:
     return first and Position(first.lat_deg, first.lon_deg, median(altitudes_m) if altitudes_m else None)
 
 
-def log_start(config: Config, io: FlightIO, recogniser: Recogniser, found: Outlook) -> dict[str, Any]:
+def log_start(config: Config, io: FlightIO, recogniser: Recogniser) -> dict[str, Any]:
     """Log which technique is used, and what its fixes or figures lack; return the fields of the flight log's first
     line."""
     board = io.board
     _log.info("version %s on %s", __version__, board.title)
-    _log.info("%s", found.reason)
-    sends = config.mavlink.link is not None and config.mavlink.send_fixes
-    if sends and found.t_query_s is not None and found.t_query_s > FIX_MAX_AGE_S:
-        _log.warning("no fix will be sent: %s", too_late(found.t_query_s))
+    reason = explain_technique(recogniser, is_named=config.technique is not None)
+    _log.info("%s", reason)
     if not board.verified:
         _log.warning("mAh are estimates: the power of %s is unverified (%s)", board.title, board.source)
     decided = {
-        "reason": found.reason,
+        "reason": reason,
         "rule": recogniser.rule,
         "candidates": recogniser.candidates,
         "sequence": recogniser.sequence,

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 from edgevpr.core.text import shown
 
-# Asked for at the start: measuring a technique or loading a map takes minutes on a slow board.
+# Asked for at the start: loading a map or picking a technique takes minutes on a slow board.
 LONGEST_START_US = 1_800_000_000
 _SEND_TIMEOUT_S = 0.5
 

@@ -1,12 +1,12 @@
-"""Automatic choice of a technique if none is named, and the check whether the board can afford the one that flies."""
+"""Automatic choice of a technique if none is named, and what the one that flies costs the board."""
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from edgevpr import techniques
 from edgevpr.core.config import Config
 from edgevpr.core.contract import Technique, TechniqueSpec
-from edgevpr.core.errors import MapError, ModelError
+from edgevpr.core.errors import ModelError
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.preflight.choose import (
     Demand,
@@ -26,15 +26,6 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import find_weights
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Outlook:
-    """Expectation of a flight, made before it. `reason`: the technique that is used and why, in one line for the log.
-    `t_query_s`: seconds that a query will take (None: the technique could not be tried)."""
-
-    reason: str
-    t_query_s: float | None
 
 
 def pick_technique(board_name: str, places: int, camera: str | None = None) -> str:
@@ -65,25 +56,21 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
     return chosen.name
 
 
-def outlook(recogniser: Recogniser, config: Config) -> Outlook:
-    """Report the technique that the flight uses and why, and measure now whether the board can afford it. A failed
-    measurement is only reported: it must not prevent a flight."""
-    technique, t_query_s = recogniser.technique, None
-    try:
-        option, cost = _measure_option(recogniser, config)
-        t_query_s = option.fit.t_query_s
-    except (MapError, ModelError, OSError) as error:  # OSError: the trial map needs a little room for temporary files
-        cost = f"what it takes could not be tried ({error})"
-    parts = ["the map was built with it" if config.technique is None else "it was named"]
-    if weights := find_weights(technique.spec):
+def explain_technique(recogniser: Recogniser, is_named: bool) -> str:
+    """Return the technique that a flight uses, and why, in one line for the log. `is_named`: the configuration names
+    it."""
+    spec = recogniser.technique.spec
+    parts = ["it was named" if is_named else "the map was built with it"]
+    if weights := find_weights(spec):
         parts.append(f"weights of {weights}")
     if left_out := len(recogniser.place_map) - len(recogniser.index):
         parts.append(f"{left_out} places are left to the map file")
-    return Outlook(f"technique {_label(technique.spec)}: {'; '.join([*parts, cost])}", t_query_s)
+    return f"technique {_label(spec)}: {'; '.join(parts)}"
 
 
-def _measure_option(recogniser: Recogniser, config: Config) -> tuple[Option, str]:
-    """Return two things: the technique of a flight as an option; and its accuracy and cost as text."""
+def measure_flight(recogniser: Recogniser, config: Config) -> tuple[float, str]:
+    """Measure what a flight costs the board. Returns the seconds that a query takes, and accuracy and cost as text.
+    Raises EdgevprError, and OSError if there is no room for a small temporary map."""
     board, spec = recogniser.meter.board, recogniser.technique.spec
     costs = _measure_costs(recogniser.technique, board)
     costs = replace(
@@ -98,7 +85,7 @@ def _measure_option(recogniser: Recogniser, config: Config) -> tuple[Option, str
         camera=_camera(spec),
     )
     option = make_option(board, _label(spec), spec.name, costs, demand)
-    return option, describe_option(board, option, demand)
+    return option.fit.t_query_s, describe_option(board, option, demand)
 
 
 def limit_candidates(technique: Technique) -> tuple[int, ...]:

@@ -22,7 +22,7 @@ from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.flight.startup import apply_recorded_rate
 from edgevpr.runtime.preflight.choose import too_late
-from edgevpr.runtime.preflight.pick import outlook
+from edgevpr.runtime.preflight.pick import explain_technique, measure_flight
 from edgevpr.runtime.recognise.calibration import not_calibrated, read_calibration_for
 from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.levelling import load_calibrated_lens
@@ -74,18 +74,18 @@ def _check_map(config: Config, board: Board) -> str:
                 return f"{path}, empty so far"
     recogniser = open_recogniser(config, board, narrowed=True)
     with closing(recogniser.place_map) as place_map:
-        expected = outlook(recogniser, config)
+        t_query_s, cost = measure_flight(recogniser, config)
+        reason = f"{explain_technique(recogniser, is_named=config.technique is not None)}; {cost}"
         confidence = ""
         if recogniser.rule.sure:
             calibration = read_calibration_for(place_map)
             confidence = f"; {calibration.described() if calibration else not_calibrated(len(place_map))}"
-    t_query_s = expected.t_query_s or 0.0
     if config.mavlink.link and config.mavlink.send_fixes and t_query_s > FIX_MAX_AGE_S:
         raise EdgevprError(
             f"No fix would ever be sent ({too_late(t_query_s)}): use a faster board, fewer places or candidates, "
-            f"or a technique that costs less; {expected.reason}."
+            f"or a technique that costs less; {reason}."
         )
-    return f"{config.map}, {expected.reason}{confidence}"
+    return f"{config.map}, {reason}{confidence}"
 
 
 def _check_source(config: Config, offline: bool) -> str:
