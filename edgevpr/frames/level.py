@@ -186,6 +186,12 @@ def levelled(
     return _warped(frame.image, overlay, warp, view)
 
 
+def level_rotation(frame: Frame, lens: Lens) -> Doubles:
+    """Return the rotation (3, 3) from the axes of the lens to those of a level picture with the same top, by roll and
+    pitch of a frame (unknown: taken as 0) and the mount of the lens."""
+    return _Taking(frame, None, lens).straight
+
+
 def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> float | None:
     """Return the ground length in metres of a picture's longest side if it were level, by the height of `frame` or,
     where it has none, of `vehicle`. None: unknown."""

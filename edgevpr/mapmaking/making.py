@@ -14,9 +14,11 @@ from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.geodesy import Extent
 from edgevpr.core.text import at_work
 from edgevpr.core.types import Frame
+from edgevpr.frames.level import STRAIGHT_DOWN
 from edgevpr.frames.mask import Mask, load_mask
 from edgevpr.frames.source import Source, open_source, read_to_end
 from edgevpr.mapmaking import advice
+from edgevpr.mapmaking.headings import find_headings
 from edgevpr.mapmaking.mapping import Covered, Gaps, MappingResult, build_map, measure_ground
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove
@@ -26,7 +28,7 @@ from edgevpr.runtime.preflight.pick import camera_setting, pick_technique
 from edgevpr.runtime.recognise.calibration import MapCalibration
 from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.evidence import list_evidence_kinds
-from edgevpr.runtime.recognise.levelling import make_levelling
+from edgevpr.runtime.recognise.levelling import lens_of, make_levelling, read_mount
 from edgevpr.runtime.recognise.opening import (
     create_technique,
     made_for,
@@ -174,8 +176,11 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 advice.warn_of_display(pictures, mask)
             else:
                 place_map.add_attribution(pictures.attribution)
+            frames: Iterator[Frame] = filter(None, shown(read_to_end(source, unusable), source.total, "mapping"))
+            if technique.spec.looks_down and isinstance(pictures, FlownPictures) and (camera := lens_of(config.source)):
+                frames = find_headings(frames, camera)
             result = build_map(
-                (frame for frame in shown(read_to_end(source, unusable), source.total, "mapping") if frame),
+                frames,
                 replace(
                     encoder_of(config, pictures, technique), gate=open_salience_gate(config.salience, here.threads)
                 ),
@@ -290,7 +295,7 @@ def _open_flown(
     elif camera:  # a technique that knows no camera refuses one that was asked for
         settings = settings | {"camera": camera}
     technique = _make_technique(order, place_map, name, settings)
-    if technique.spec.looks_down and not config.source.gimbal:
+    if technique.spec.looks_down and not config.source.gimbal and read_mount(config.source) == STRAIGHT_DOWN:
         advice.require_level(pictures, config.source.fov_deg)
     return source, technique
 

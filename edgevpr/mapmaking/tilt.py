@@ -18,7 +18,7 @@ MAX_UNKNOWN_TILT_DEG = 20.0  # beyond it the ground in the middle lies far from 
 TYPICAL_FOV_DEG = 66.0
 MIN_PAIRS = 8
 _WIDTH_PX = 640
-_FEATURES = 1500
+FEATURES = 1500
 _REPROJECTION_PX = 3.0
 _MIN_INLIERS = 40
 _MIN_EXTENT = 0.25  # of the longest side, in both directions: points in a corner do not show how motion varies
@@ -40,10 +40,10 @@ def measure_tilt(images: Iterable[Image], fov_deg: float | None = None) -> Tilt 
 
     `images` are uint8 (H, W[, 3]), in the order of flight. `fov_deg` is the field of view of the longest side; None:
     unknown, then TYPICAL_FOV_DEG."""
-    orb = cv2.ORB.create(_FEATURES)
+    orb = cv2.ORB.create(FEATURES)
     slopes: list[Doubles] = []
-    reference: _Features | None = None
-    for features in filter(None, (_detect(orb, image) for image in images)):
+    reference: Features | None = None
+    for features in filter(None, (detect_features(orb, image) for image in images)):
         motion = _measure_motion(reference, features) if reference else None
         if motion and motion.length < _MIN_MOTION:
             continue  # taken in quick succession: the next one shows more
@@ -60,14 +60,14 @@ def measure_tilt(images: Iterable[Image], fov_deg: float | None = None) -> Tilt 
     return Tilt(math.degrees(math.atan(focal * float(np.hypot(*median)))), len(slopes))
 
 
-class _Features(NamedTuple):
+class Features(NamedTuple):
     """Features of an image: `points` (n, 2), shares of its longest side from its middle, and their descriptors."""
 
     points: Doubles
     descriptors: np.ndarray
 
 
-def _detect(orb: cv2.ORB, image: Image) -> _Features | None:
+def detect_features(orb: cv2.ORB, image: Image) -> Features | None:
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     scale = min(1.0, _WIDTH_PX / max(grey.shape))
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -75,7 +75,22 @@ def _detect(orb: cv2.ORB, image: Image) -> _Features | None:
     if not found:
         return None
     middle = np.array(small.shape[1::-1]) / 2
-    return _Features((np.array([point.pt for point in found]) - middle) / max(small.shape), descriptors)
+    return Features((np.array([point.pt for point in found]) - middle) / max(small.shape), descriptors)
+
+
+def match_features(before: Features, after: Features) -> tuple[Doubles, Doubles] | None:
+    """Return the points (n, 2) of the same ground in two images, both as shares of the longest side from the middle;
+    None if they are too few."""
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(before.descriptors, after.descriptors)
+    if len(matches) < _MIN_INLIERS:
+        return None
+    start = before.points[[match.queryIdx for match in matches]]
+    end = after.points[[match.trainIdx for match in matches]]
+    homography, inliers = cv2.findHomography(start, end, cv2.RANSAC, _REPROJECTION_PX / _WIDTH_PX)
+    if homography is None or inliers.sum() < _MIN_INLIERS:
+        return None
+    is_inlier = inliers.ravel() > 0
+    return start[is_inlier], end[is_inlier]
 
 
 class _Motion(NamedTuple):
@@ -87,18 +102,12 @@ class _Motion(NamedTuple):
     slope: Doubles
 
 
-def _measure_motion(before: _Features, after: _Features) -> _Motion | None:
+def _measure_motion(before: Features, after: Features) -> _Motion | None:
     """Return the motion between two images; None if they share too little."""
-    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(before.descriptors, after.descriptors)
-    if len(matches) < _MIN_INLIERS:
+    pairs = match_features(before, after)
+    if pairs is None:
         return None
-    start = before.points[[match.queryIdx for match in matches]]
-    end = after.points[[match.trainIdx for match in matches]]
-    homography, inliers = cv2.findHomography(start, end, cv2.RANSAC, _REPROJECTION_PX / _WIDTH_PX)
-    if homography is None or inliers.sum() < _MIN_INLIERS:
-        return None
-    is_inlier = inliers.ravel() > 0
-    start, end = start[is_inlier], end[is_inlier]
+    start, end = pairs
     if np.ptp(start, axis=0).min() < _MIN_EXTENT:
         return None
     at = np.column_stack([np.ones(len(start)), (start + end) / 2])

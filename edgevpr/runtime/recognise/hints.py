@@ -138,7 +138,7 @@ class RecordedPrior:
             return
         if footprint_m:
             self._height_errors.append(scale * ratio * (pose.footprint_m / footprint_m if pose else 1.0))
-        elif self._expects_height:
+        elif self._expects_height and self._map_height_m is not None:
             self._height_errors.append(self._height_error * ratio / self.height_ratio)
 
     def update_area(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:

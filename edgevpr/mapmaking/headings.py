@@ -1,0 +1,81 @@
+"""Headings of a tilted camera that nobody recorded, by the motion from image to image.
+
+The ground that a tilted camera shows lies far from the aircraft, in the direction that it looks. Neighbouring images
+are levelled by the known tilt. Then the same ground has moved by a turn and a shift. The course over ground between
+both positions, less the direction of the shift, is the heading.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from edgevpr.core.arrays import Array, Doubles
+from edgevpr.core.geodesy import fit_similarity, offset_m, shorter_deg
+from edgevpr.core.types import Frame
+from edgevpr.frames.level import MAX_TILT_DEG, MAX_TILT_UNLEVELLED_DEG, Lens, level_rotation
+from edgevpr.mapmaking.tilt import FEATURES, Features, detect_features, match_features
+
+_LEAST_STEP_M = 3.0  # between two positions: below it their errors turn the course
+_MAX_DIFFERENCE_DEG = 20.0  # of the headings by the motion before and after an image: with more, one of them is wrong
+_MAX_SCALE = 1.2  # by which the same ground may differ between two images: with more, tilt or height have changed
+
+
+def find_headings(frames: Iterable[Frame], lens: Lens) -> Iterator[Frame]:
+    """Yield frames. Those that are tilted by 20 to 60 degrees and have no heading get one, as far as the motion from
+    the frame before and to the frame after shows it."""
+    orb = cv2.ORB.create(FEATURES)
+    last: tuple[Frame, Features | None, float | None] | None = None
+    for frame in frames:
+        rotation = level_rotation(frame, lens)
+        tilt_deg = math.degrees(math.acos(min(1.0, float(rotation[2, 2]))))
+        is_sought = frame.heading_deg is None and MAX_TILT_UNLEVELLED_DEG < tilt_deg <= MAX_TILT_DEG
+        features = detect_features(orb, frame.image) if is_sought else None
+        heading_deg = turn_deg = None
+        if last and last[1] and features:
+            found = _compare(last[0], last[1], frame, features, lens)
+            heading_deg, turn_deg = found or (None, None)
+        if last:
+            before_deg = None if heading_deg is None or turn_deg is None else heading_deg - turn_deg
+            yield _with_heading(last[0], last[2], before_deg)
+        last = frame, features, heading_deg
+    if last:
+        yield _with_heading(last[0], last[2], None)
+
+
+def _compare(before: Frame, start: Features, after: Frame, end: Features, lens: Lens) -> tuple[float, float] | None:
+    """Return the heading of the frame `after`, and the turn to it since `before`, degrees; None if the two are too near
+    to each other or share too little."""
+    if before.position is None or after.position is None:
+        return None
+    here, there = ((at.lat_deg, at.lon_deg) for at in (before.position, after.position))
+    east_m, north_m = offset_m(*here, *there)
+    pairs = match_features(start, end) if math.hypot(east_m, north_m) >= _LEAST_STEP_M else None
+    if pairs is None:
+        return None
+    was, now = (_lay(points, frame, lens) for points, frame in zip(pairs, (before, after), strict=True))
+    turn_scale, shift = fit_similarity(was, now)
+    if not 1 / _MAX_SCALE < abs(turn_scale) < _MAX_SCALE:
+        return None
+    # The ground moves the other way than the camera; x is to the right, y down the picture, and so back.
+    bearing_deg = math.degrees(math.atan2(-shift.real, shift.imag))
+    course_deg = math.degrees(math.atan2(east_m, north_m))
+    return course_deg - bearing_deg - lens.up_deg, -math.degrees(math.atan2(turn_scale.imag, turn_scale.real))
+
+
+def _lay(points: Doubles, frame: Frame, lens: Lens) -> Array:
+    """Return where points of an image (n, 2) lie on the ground, in heights right and down of the point under the
+    camera, complex (n,)."""
+    focal = 0.5 / math.tan(math.radians(lens.fov_deg) / 2)
+    rays = level_rotation(frame, lens) @ np.column_stack([points / focal, np.ones(len(points))]).T
+    return np.asarray((rays[0] + 1j * rays[1]) / np.maximum(rays[2], 0.1))
+
+
+def _with_heading(frame: Frame, before_deg: float | None, after_deg: float | None) -> Frame:
+    """Return a frame with the mean of the headings by the motion before and after it, if they agree (None: unknown)."""
+    known = [heading_deg for heading_deg in (before_deg, after_deg) if heading_deg is not None]
+    if not known or abs(shorter_deg(known[0] - known[-1])) > _MAX_DIFFERENCE_DEG:
+        return frame
+    return replace(frame, heading_deg=float(np.mod(known[0] + shorter_deg(known[-1] - known[0]) / 2, 360)))
