@@ -28,6 +28,8 @@ MAX_TILT_UNLEVELLED_DEG = 20.0
 _LEAST_DOWN = 0.1
 # Standard deviations of a tilt, as tangents: of one that is reported, and of one that only the camera's mount tells.
 _REPORTED_TILT_SD, _MOUNT_TILT_SD = math.tan(math.radians(1.0)), math.tan(math.radians(3.0))
+# Of a height, as a share: the ground that a tilted camera shows is higher or lower than that below (tilt_ariel).
+_HEIGHT_SD = 0.1
 _LEAST_TILT_DEG, _LEAST_TURN_DEG, _LEAST_ZOOM = 1.0, 1.0, 0.03  # smaller corrections do not affect matches
 # Limits of a picture's footprint over the wanted footprint. Beyond them too few of its pixels are left, or too little
 # of the output is filled, and the height is more likely wrong than so far from the map's.
@@ -306,8 +308,10 @@ class _Taking:
         the height. Of a reported one, the 1 is part of the errors of all positions."""
         if not self.is_tilt_known:
             return 0.0
-        steep, focal = math.tan(math.radians(self.tilt_deg)) ** 2, zoom * self.focal_px / self.longest_px
-        return float(focal * (_REPORTED_TILT_SD * steep if self._is_attitude_known else _MOUNT_TILT_SD * (1 + steep)))
+        tangent, focal = math.tan(math.radians(self.tilt_deg)), zoom * self.focal_px / self.longest_px
+        by_tilt = _REPORTED_TILT_SD * tangent**2 if self._is_attitude_known else _MOUNT_TILT_SD * (1 + tangent**2)
+        by_height = _HEIGHT_SD * tangent if self.tilt_deg > MAX_TILT_UNLEVELLED_DEG else 0.0
+        return float(focal * math.hypot(by_tilt, by_height))
 
 
 def _attitude(frame: Frame, vehicle: Vehicle | None) -> Iterator[float | None]:

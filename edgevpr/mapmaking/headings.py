@@ -29,10 +29,7 @@ def find_headings(frames: Iterable[Frame], lens: Lens) -> Iterator[Frame]:
     orb = cv2.ORB.create(FEATURES)
     last: tuple[Frame, Features | None, float | None] | None = None
     for frame in frames:
-        rotation = level_rotation(frame, lens)
-        tilt_deg = math.degrees(math.acos(min(1.0, float(rotation[2, 2]))))
-        is_sought = frame.heading_deg is None and MAX_TILT_UNLEVELLED_DEG < tilt_deg <= MAX_TILT_DEG
-        features = detect_features(orb, frame.image) if is_sought else None
+        features = detect_features(orb, frame.image) if lacks_heading(frame, lens) else None
         heading_deg = turn_deg = None
         if last and last[1] and features:
             found = _compare(last[0], last[1], frame, features, lens)
@@ -43,6 +40,12 @@ def find_headings(frames: Iterable[Frame], lens: Lens) -> Iterator[Frame]:
         last = frame, features, heading_deg
     if last:
         yield _with_heading(last[0], last[2], None)
+
+
+def lacks_heading(frame: Frame, lens: Lens) -> bool:
+    """Tell whether a frame that is tilted by 20 to 60 degrees has no heading."""
+    tilt_deg = math.degrees(math.acos(min(1.0, float(level_rotation(frame, lens)[2, 2]))))
+    return frame.heading_deg is None and MAX_TILT_UNLEVELLED_DEG < tilt_deg <= MAX_TILT_DEG
 
 
 def _compare(before: Frame, start: Features, after: Frame, end: Features, lens: Lens) -> tuple[float, float] | None:

@@ -18,7 +18,7 @@ from edgevpr.frames.level import STRAIGHT_DOWN
 from edgevpr.frames.mask import Mask, load_mask
 from edgevpr.frames.source import Source, open_source, read_to_end
 from edgevpr.mapmaking import advice
-from edgevpr.mapmaking.headings import find_headings
+from edgevpr.mapmaking.headings import find_headings, lacks_heading
 from edgevpr.mapmaking.mapping import Covered, Gaps, MappingResult, build_map, measure_ground
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove
@@ -264,8 +264,17 @@ def calibrate_map(
     with _needing_scipy():
         from edgevpr.mapmaking.calibrate import calibrate
 
-    def frames(names: Collection[str]) -> Iterator[Frame]:
+    lens = lens_of(config.source) if technique.spec.looks_down and isinstance(pictures, FlownPictures) else None
+
+    def read(names: Collection[str] | None) -> Iterator[Frame]:
         yield from filter(None, read_to_end(pictures.open(names), lambda error: None))
+
+    def frames(names: Collection[str]) -> Iterator[Frame]:
+        first = next(read(names), None)
+        if lens is None or first is None or not lacks_heading(first, lens):
+            yield from read(names)
+        else:  # the images between show the motion
+            yield from (frame for frame in find_headings(read(None), lens) if frame.name in names)
 
     return calibrate(
         encoder_of(config, pictures, technique),
