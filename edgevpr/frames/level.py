@@ -29,7 +29,7 @@ _LEAST_DOWN = 0.1
 # Standard deviations of a tilt, as tangents: of one that is reported, and of one that only the camera's mount tells.
 _REPORTED_TILT_SD, _MOUNT_TILT_SD = math.tan(math.radians(1.0)), math.tan(math.radians(3.0))
 # Of a height, as a share: the ground that a tilted camera shows is higher or lower than that below (tilt_ariel).
-_HEIGHT_SD = 0.1
+_HEIGHT_SD = 0.13
 _LEAST_TILT_DEG, _LEAST_TURN_DEG, _LEAST_ZOOM = 1.0, 1.0, 0.03  # smaller corrections do not affect matches
 # Limits of a picture's footprint over the wanted footprint. Beyond them too few of its pixels are left, or too little
 # of the output is filled, and the height is more likely wrong than so far from the map's.

@@ -60,7 +60,7 @@ from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, u
 from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, allow_for_tilt, at_place, locate
 from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, ShownTilt, convert_to_tilt
 from edgevpr.runtime.recognise.place_filter import Followed, PlaceFilter
-from edgevpr.runtime.recognise.tilted import SUPPOSED_TILT_DEG, agrees_better_tilted
+from edgevpr.runtime.recognise.tilted import SUPPOSED_TILT, agrees_better_tilted
 
 _MAX_SAME_GROUND = 12  # places that may show the same ground: so many overlap on kite_ochota, which has no positions
 
@@ -301,7 +301,7 @@ class Decider:
                 return tilt
             focal = query.view.focal or TYPICAL_FOCAL
             if agrees_better_tilted(query.picture, focal, self.technique, fine, best.match):
-                return ShownTilt(math.tan(math.radians(SUPPOSED_TILT_DEG)), 0.0)
+                return SUPPOSED_TILT
             return tilt
 
     def _share_at_rest_elsewhere(self, candidate: Candidate, ranking: Ranking, encoded: EncodedFrame) -> float:

@@ -15,8 +15,11 @@ from edgevpr.core.arrays import Array, Doubles
 from edgevpr.core.contract import FineMatch, Technique
 from edgevpr.frames.homography import Homography, cut_polygon
 from edgevpr.frames.level import Levelled
+from edgevpr.runtime.recognise.perspective import ShownTilt
 
-SUPPOSED_TILT_DEG = 40.0
+_SUPPOSED_TILT_DEG = 40.0
+# Any tilt that is nearer to it than to none: too little is known to refuse a match, and enough for what it may claim.
+SUPPOSED_TILT = ShownTilt(math.tan(math.radians(_SUPPOSED_TILT_DEG)), math.tan(math.radians(_SUPPOSED_TILT_DEG)) / 2)
 _DIRECTIONS = 6
 # A match of a tilted picture is one of its near part: its middle shows more ground than the match says.
 _SCALES = (1.25, 1.5)
@@ -30,7 +33,7 @@ def agrees_better_tilted(picture: Levelled, focal: float, technique: Technique, 
     straight = _score(picture, focal, technique, fine, match, np.eye(3))
     farther = [replace(match, height_ratio=scale * (match.height_ratio or 1.0)) for scale in _SCALES]
     towards = 2 * math.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-    turns = np.radians(SUPPOSED_TILT_DEG) * np.column_stack([-np.sin(towards), np.cos(towards), np.zeros(_DIRECTIONS)])
+    turns = np.radians(_SUPPOSED_TILT_DEG) * np.column_stack([-np.sin(towards), np.cos(towards), np.zeros(_DIRECTIONS)])
     return any(
         _score(picture, focal, technique, fine, supposed, cv2.Rodrigues(turn)[0]) > straight
         for supposed in farther
