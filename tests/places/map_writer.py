@@ -1,5 +1,7 @@
 """A program of its own that adds places and says which are confirmed; the tests kill it at any moment."""
 
+import contextlib
+import sqlite3
 import sys
 from pathlib import Path
 
@@ -37,8 +39,15 @@ def make_map(path: Path, places: int) -> Path:
     return path
 
 
+def write_sql(path: Path, *statements: str) -> None:
+    """Write to a map as another program does."""
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        for statement in statements:
+            db.executescript(statement)
+
+
 if __name__ == "__main__":
     path, start = sys.argv[1], int(sys.argv[2])
-    place_map = PlaceMap.open_for_adding(path) if start else PlaceMap.create(path, SPEC)
+    place_map = PlaceMap.open_for_adding(path)
     for number in range(start, start + 100_000):
         print(place_map.add(frame(number), descriptor(number)), flush=True)

@@ -334,11 +334,6 @@ def test_of_a_place_that_both_compared_the_better_match_counts():
     assert both.unread.tolist() == [3]
 
 
-def test_a_rival_of_the_first_look_stays_a_rival():
-    both = together(ranking({1: 0.2, 8: 0.19}), ranking({1: 0.21, 6: 0.02}))
-    assert both.slots.tolist() == [1, 8, 6]
-
-
 def test_two_looks_have_tried_the_rotations_of_both():
     known, all_of_them = (dataclasses.replace(ranking({1: 0.2}), tried=tried) for tried in (0.125, 1.0))
     assert together(known, known).tried == 0.25

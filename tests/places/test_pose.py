@@ -1,14 +1,14 @@
 """How a picture lies on the ground, and its landmarks, kept in the map file."""
 
 import dataclasses
-import sqlite3
 
 import pytest
-from test_mapfile import SPEC, descriptor, frame
+from map_writer import SPEC, descriptor, frame, write_sql
 
 from edgevpr.core.errors import PlaceError
 from edgevpr.core.types import Pose, Position
 from edgevpr.places.examine import check, examine, merge, repair
+from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 
 POSE = Pose(up_deg=271.5, footprint_m=66.0, covariance_m2=(4.0, -1.0, 2.25), recorded=Position(50.1, 8.2))
@@ -55,9 +55,7 @@ def test_pose_and_landmarks_come_back_and_a_place_may_have_none(posed, tmp_path)
     ],
 )
 def test_a_pose_that_cannot_be_true_is_not_believed(posed, change, says):
-    with sqlite3.connect(posed) as db:
-        db.execute(f"UPDATE places SET {change} WHERE place_id = 1")
-    db.close()
+    write_sql(posed, f"UPDATE places SET {change} WHERE place_id = 1")
     with PlaceMap.open(posed) as place_map:
         (broken,) = [each for each in examine(place_map) if each.problem]
         assert broken.place_id == 1
@@ -66,9 +64,7 @@ def test_a_pose_that_cannot_be_true_is_not_believed(posed, change, says):
 
 
 def test_repair_keeps_a_place_whose_landmarks_alone_are_damaged_without_them(posed):
-    with sqlite3.connect(posed) as db:
-        db.execute("UPDATE places SET landmarks = x'00' WHERE place_id = 1")
-    db.close()
+    write_sql(posed, "UPDATE places SET landmarks = x'00' WHERE place_id = 1")
     found = check(posed)
     assert (found.places, found.total, len(found.damaged)) == (2, 2, 1)
     repair(posed)
@@ -79,11 +75,7 @@ def test_repair_keeps_a_place_whose_landmarks_alone_are_damaged_without_them(pos
 
 
 def test_a_place_moved_by_another_program_keeps_its_pose_and_forgets_where_it_was_recorded(posed):
-    from edgevpr.places.geopackage import point_blob
-
-    with sqlite3.connect(posed) as db:
-        db.execute("UPDATE places SET geom = ? WHERE place_id = 1", (point_blob(51.0, 9.0),))
-    db.close()
+    write_sql(posed, f"UPDATE places SET geom = x'{point_blob(51.0, 9.0).hex()}' WHERE place_id = 1")
     with PlaceMap.open(posed) as place_map:
         (place,) = place_map.places([1])
     assert place.pose == dataclasses.replace(POSE, recorded=None)

@@ -1,7 +1,9 @@
 """A power cut while a map is written: its write-ahead log ends at any byte, or what it should hold is zeros."""
 
+import contextlib
 import random
 import shutil
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -56,11 +58,14 @@ def copied(killed: Path, folder: Path, log: bytes) -> Path:
 
 
 def places_of(path: Path) -> int:
-    """How many places a map has, each as it was added."""
+    """How many places a map has, each as it was added; the log is merged, and SQLite finds the file whole."""
     with PlaceMap.open(path) as place_map:
         assert place_map.spec == SPEC
         places = list(place_map.places())
         assert [place.source_image for place in places] == [frame(number).name for number in range(len(places))]
         for place in places:
             np.testing.assert_array_equal(place_map.fine_part(place.place_id)[0], descriptor(place.place_id - 1).fine)
-        return len(places)
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
+    with contextlib.closing(sqlite3.connect(path)) as db:
+        assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    return len(places)
