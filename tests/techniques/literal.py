@@ -1,6 +1,7 @@
 """Chapter 6 of the thesis, word by word: loops, float64, nothing clever. The golden standard of the techniques."""
 
 import math
+from collections import Counter
 
 import cv2
 import numpy as np
@@ -28,14 +29,8 @@ def disc(image, x, y, radius):
 
 def filled_bins(image, radius=5):
     """Algorithm "Computing Entropy Map", section 6.2.1."""
-    entropy = np.zeros(image.shape)
-    for y in range(image.shape[0]):
-        for x in range(image.shape[1]):
-            bins = [0] * 256
-            for intensity in disc(image, x, y, radius):
-                bins[intensity] += 1
-            entropy[y, x] = math.log2(sum(1 for items in bins if items)) / 8
-    return entropy
+    height, width = image.shape
+    return np.array([[math.log2(len(set(disc(image, x, y, radius)))) / 8 for x in range(width)] for y in range(height)])
 
 
 def shannon(image, radius=5):
@@ -44,11 +39,8 @@ def shannon(image, radius=5):
     entropy = np.zeros(small.shape)
     for y in range(100):
         for x in range(100):
-            bins = [0] * 256
             intensities = disc(small, x, y, radius)
-            for intensity in intensities:
-                bins[intensity] += 1
-            shares = [items / len(intensities) for items in bins if items]
+            shares = [items / len(intensities) for items in Counter(intensities).values()]
             entropy[y, x] = -sum(p * math.log2(p) for p in shares) / 8
     return cv2.resize(entropy, image.shape[::-1], interpolation=cv2.INTER_LINEAR)
 
@@ -78,12 +70,7 @@ def blocks(cells):
     out = []
     for row in range(rows - 1):
         for col in range(cols - 1):
-            vector = [
-                *cells[row, col],
-                *cells[row, col + 1],
-                *cells[row + 1, col],
-                *cells[row + 1, col + 1],
-            ]
+            vector = cells[row : row + 2, col : col + 2].ravel()
             # OpenCV enlarges a flat region on ARM to 90.000003 here and there: that is no gradient.
             length = math.sqrt(sum(value * value for value in vector))
             out.append([value / length if length > 1e-5 else 0.0 for value in vector])

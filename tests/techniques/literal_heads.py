@@ -1,36 +1,33 @@
-"""The heads, word by word from their papers: loops, float64, nothing clever. The golden standard of the heads."""
+"""The heads, step by step from their papers: float64, nothing clever. The golden standard of the heads."""
 
 import math
 
 import numpy as np
 
 
+def normalised(vectors):
+    """Each row at length 1."""
+    return vectors / np.sqrt((vectors**2).sum(axis=-1, keepdims=True))
+
+
 def pyramid(features, levels):
     """He et al. 2014: bin i of n covers floor(i a / n) to ceil((i + 1) a / n)."""
-    channels, height, width = features.shape
-    out = []
-    for n in levels:
-        for row in range(n):
-            for column in range(n):
-                for channel in range(channels):
-                    largest = -math.inf
-                    for y in range(math.floor(row * height / n), math.ceil((row + 1) * height / n)):
-                        for x in range(math.floor(column * width / n), math.ceil((column + 1) * width / n)):
-                            largest = max(largest, float(features[channel, y, x]))
-                    out.append(largest)
-    return np.array(out)
+
+    def cover(i, n, a):
+        return slice(math.floor(i * a / n), math.ceil((i + 1) * a / n))
+
+    _, height, width = features.shape
+    bins = [(n, row, column) for n in levels for row in range(n) for column in range(n)]
+    return np.concatenate(
+        [features[:, cover(row, n, height), cover(column, n, width)].max(axis=(1, 2)) for n, row, column in bins]
+    )
 
 
 def projected(vector, row, signs, length):
     """The whole matrix, value by value: row j is the Gaussian vector moved on by j, each column with its sign."""
     size = len(vector)
-    matrix = np.zeros((length, size))
-    for j in range(length):
-        for i in range(size):
-            matrix[j, i] = row[(i - j) % size] * signs[i]
-    return np.array([sum(matrix[j, i] * float(vector[i]) for i in range(size)) for j in range(length)]) / math.sqrt(
-        length
-    )
+    matrix = np.array([[row[(i - j) % size] * signs[i] for i in range(size)] for j in range(length)])
+    return matrix @ vector.astype(float) / math.sqrt(length)
 
 
 def rmac_regions(height, width):
@@ -56,44 +53,30 @@ def rmac_regions(height, width):
 
 
 def rmac_vectors(features, regions):
-    out = []
-    for top, left, side in regions:
-        vector = []
-        for plane in features:
-            largest = max(float(plane[y, x]) for y in range(top, top + side) for x in range(left, left + side))
-            vector.append(math.copysign(math.sqrt(abs(largest)), largest))
-        length = math.sqrt(sum(value * value for value in vector))
-        out.append([value / length for value in vector])
-    return np.array(out)
-
-
-def rmac_aggregate(vectors):
-    total = [sum(column) for column in vectors.T]
-    length = math.sqrt(sum(value * value for value in total))
-    return np.array([value / length for value in total])
+    """The largest of each channel in each region, to the power of one half."""
+    largest = np.array(
+        [features[:, top : top + side, left : left + side].max(axis=(1, 2)) for top, left, side in regions], float
+    )
+    return normalised(np.sign(largest) * np.sqrt(abs(largest)))
 
 
 def vlad(local, words, soft_sharpness=None):
     """Equation 1 of NetVLAD, with the nearest word (None) or with equation 2."""
     sums = np.zeros(words.shape)
-    for x in local:
-        distances = [sum((float(a) - float(b)) ** 2 for a, b in zip(x, c, strict=True)) for c in words]
-        if soft_sharpness is None:
-            weights = [0.0] * len(words)
-            weights[distances.index(min(distances))] = 1.0
-        else:
-            powers = [math.exp(-soft_sharpness * d) for d in distances]
-            weights = [power / sum(powers) for power in powers]
+    for x in local.astype(float):
+        distances = ((x - words) ** 2).sum(axis=1)
+        weights = np.arange(len(words)) == distances.argmin()
+        if soft_sharpness is not None:
+            powers = np.exp(-soft_sharpness * distances)
+            weights = powers / powers.sum()
         for k, weight in enumerate(weights):
-            for d in range(len(x)):
-                sums[k, d] += weight * (float(x[d]) - float(words[k, d]))
+            sums[k] += weight * (x - words[k])
     return sums
 
 
 def intra_normalised(sums):
-    rows = [row / math.sqrt(sum(v * v for v in row)) if any(row) else row for row in sums]
-    flat = np.concatenate(rows)
-    return flat / math.sqrt(sum(v * v for v in flat))
+    """Each word's sum at length 1, and then all of them together."""
+    return normalised(np.concatenate([normalised(row) if any(row) else row for row in sums]))
 
 
 def regions(features, count):
@@ -115,30 +98,23 @@ def regions(features, count):
 
 
 def under_box(features, inside):
+    """The sum of each channel in the box around a region."""
     ys, xs = [y for y, _ in inside], [x for _, x in inside]
-    sums = [
-        sum(float(plane[y, x]) for y in range(min(ys), max(ys) + 1) for x in range(min(xs), max(xs) + 1))
-        for plane in features
-    ]
-    length = math.sqrt(sum(v * v for v in sums))
-    return np.array([v / length for v in sums])
+    box = features[:, min(ys) : max(ys) + 1, min(xs) : max(xs) + 1]
+    return normalised(box.astype(float).sum(axis=(1, 2)))
 
 
 def mutual_score(query, place):
-    total = 0.0
-    for i in range(len(query)):
-        forth = [sum(a * b for a, b in zip(query[i], other, strict=True)) for other in place]
-        j = forth.index(max(forth))
-        back = [sum(a * b for a, b in zip(place[j], other, strict=True)) for other in query]
-        if back.index(max(back)) == i:
-            total += max(forth[j], 0.0)
-    return total / max(len(query), len(place))
+    """The sum of what those pairs have in common of which each is the other's best, over the larger number."""
+    likeness = query @ place.T
+    best = likeness.argmax(axis=1)
+    mutual = [max(likeness[i, j], 0.0) for i, j in enumerate(best) if likeness[:, j].argmax() == i]
+    return sum(mutual) / max(len(query), len(place))
 
 
 def bag_of_words(local, words):
-    present = [0] * len(words)
-    for x in local:
-        distances = [sum((float(a) - float(b)) ** 2 for a, b in zip(x, c, strict=True)) for c in words]
-        present[distances.index(min(distances))] = 1
-    length = math.sqrt(sum(present))
-    return np.array([n / length for n in present])
+    """Which words are the nearest of some vector."""
+    present = np.zeros(len(words))
+    for x in local.astype(float):
+        present[((x - words) ** 2).sum(axis=1).argmin()] = 1
+    return normalised(present)

@@ -3,6 +3,7 @@
 The expected numbers are those of x86-64 and of aarch64 (a Cortex-A53), of which every one was seen to be the same.
 """
 
+import itertools
 import os
 import subprocess
 import sys
@@ -33,32 +34,6 @@ def whole_numbers():
     return ((x * x // 97 + y * y // 61 + x * y // 173 + (x // 9 * 37 ^ y // 7 * 29)) % 256).astype(np.uint8)
 
 
-@pytest.fixture
-def picture():
-    return whole_numbers()
-
-
-def test_a_network_sees_the_same_picture(picture):
-    rule = InputRule(
-        layout="NCHW", height=512, width=512, colour="grey", equalise=False, resize="linear", scale=1.0, mean=[0.0]
-    )
-    assert zlib.crc32(prepare(picture, rule).astype(np.uint8)) == 2049827080
-
-
-def test_a_place_has_the_same_code(picture):
-    technique = create("cohog")
-    found = technique.encode(picture)
-    mean = np.full((12, 12, 8), 90.0, np.float32)
-    assert zlib.crc32(found.coarse) == 3849885506
-    assert zlib.crc32(technique.pack(found.coarse[None], mean)) == 319593651
-
-
-def test_a_query_is_turned_to_the_same_picture(picture):
-    technique = create("cohog", {"camera": "nadir"})
-    turned, allowed, _ = technique._views_of(technique.encode(picture))._picture_of(1.0, 5)
-    assert (zlib.crc32(turned), zlib.crc32(allowed)) == (1188350251, 19798888)
-
-
 def dim_picture():
     """A picture with few grey levels, which is stretched."""
     y, x = np.mgrid[:480, :640]
@@ -66,13 +41,13 @@ def dim_picture():
 
 
 PICTURES = {"ordinary": whole_numbers, "dim": dim_picture}
-
-
 TOLD = {
     "forward, ordinary": "3849885506 598602243 4103587366 2563522183",
     "nadir, ordinary": "959436069 1475824441 556021769 4160277071",
     "forward, dim": "3324972193 3205433921 289916544 2563522183",
     "nadir, dim": "2264144535 3508613677 564903546 4160277071",
+    "packed": "319593651",
+    "seen by a network": "2049827080",
 }
 
 
@@ -91,13 +66,27 @@ def told_by(**environment):
 
 
 def tell():
-    for each in TOLD:
-        camera, kind = each.split(", ")
+    for camera, kind in itertools.product(("forward", "nadir"), PICTURES):
         found = create("cohog", {"camera": camera}).encode(PICTURES[kind]())
-        print(f"{each}:", *(zlib.crc32(part) for part in (found.coarse, found.fine, found.regions, found.good)))
+        report(f"{camera}, {kind}", found.coarse, found.fine, found.regions, found.good)
+    picture, forward = whole_numbers(), create("cohog")
+    report("packed", forward.pack(forward.encode(picture).coarse[None], np.full((12, 12, 8), 90.0, np.float32)))
+    rule = {"layout": "NCHW", "height": 512, "width": 512, "colour": "grey", "equalise": False, "resize": "linear"}
+    report("seen by a network", prepare(picture, InputRule(**rule, scale=1.0, mean=[0.0])).astype(np.uint8))
+
+
+def report(what, *parts):
+    print(f"{what}:", *map(zlib.crc32, parts))
 
 
 @pytest.mark.process
 @pytest.mark.parametrize("processor", [{}, *_PROCESSORS.values()], ids=["this one", *_PROCESSORS])
 def test_all_that_is_made_of_a_picture_is_the_same_whatever_the_processor_can_do(processor):
     assert told_by(**processor) == TOLD
+
+
+def test_a_query_is_turned_to_the_same_picture():
+    """Where there is FMA: without it some pixels differ, which no map holds."""
+    technique = create("cohog", {"camera": "nadir"})
+    turned, allowed, _ = technique._views_of(technique.encode(whole_numbers()))._picture_of(1.0, 5)
+    assert (zlib.crc32(turned), zlib.crc32(allowed)) == (1188350251, 19798888)

@@ -60,7 +60,7 @@ def test_rmac_vectors_and_aggregate():
     where = regions.square_regions(7, 9)
     vectors = regions.regional_vectors(SIGNED, where)
     np.testing.assert_allclose(vectors, literal.rmac_vectors(SIGNED, where), rtol=1e-5, atol=1e-6)
-    expected = literal.rmac_aggregate(literal.rmac_vectors(SIGNED, where))
+    expected = literal.normalised(literal.rmac_vectors(SIGNED, where).sum(axis=0))
     np.testing.assert_allclose(words.unit(vectors.sum(axis=0)), expected, rtol=1e-5, atol=1e-6)
 
 

@@ -9,19 +9,6 @@ from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques import create
 from edgevpr.techniques.session import open_backbone
 
-NAMES = ("alexnet", "amosnet", "hybridnet", "netvlad", "rmac", "region_vlad", "cross_region_bow")
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_masked_pixels_do_not_count(name):
-    it = create(name)
-    image, mask = textured(5), np.ones((120, 160), bool)
-    mask[70:] = False
-    changed = np.where(mask, image, textured(6))
-    assert (changed != image).any()
-    assert it.encode(image, mask).coarse.tobytes() == it.encode(changed, mask).coarse.tobytes()
-    assert it.encode(image, mask).coarse.tobytes() != it.encode(image).coarse.tobytes()
-
 
 @pytest.mark.parametrize(
     ("name", "settings", "error", "says"),

@@ -66,17 +66,6 @@ def test_light_and_contrast_change_nothing_and_a_flat_patch_says_so():
     assert (flat.coarse.reshape(32, 64)[:8, :16] == 128).all()
 
 
-def test_what_is_masked_has_no_say():
-    technique = SeqSlam()
-    picture = textured(5, 32, 64)
-    allowed = np.ones((32, 64), bool)
-    allowed[4:20, 10:30] = False
-    painted = picture.copy()
-    painted[~allowed] = 255
-    np.testing.assert_array_equal(technique.encode(picture, allowed).coarse, technique.encode(painted, allowed).coarse)
-    assert (technique.encode(painted, allowed).coarse.reshape(32, 64)[~allowed] == 128).all()
-
-
 def test_scores_are_the_enhanced_mean_absolute_differences_of_the_paper():
     technique = SeqSlam()
     rows = rows_of(technique, 40)
