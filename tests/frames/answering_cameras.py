@@ -75,9 +75,9 @@ def http(status, kind="text/plain", body=b"nothing"):
     return answer
 
 
-def multipart(kind="image/jpeg", extension=".jpg", has_length=True, *, connections=None, numbers=None, every_s=0.1):
-    """A multipart stream of the pictures `numbers` (all in turn). The times of sending go into a list for each
-    connection, in `connections`."""
+def multipart(kind="image/jpeg", extension=".jpg", has_length=True, *, connections=None):
+    """A multipart stream of all pictures in turn. The times of sending go into a list for each connection, in
+    `connections`."""
 
     def answer(connection, asked):
         read_request(asked)
@@ -85,12 +85,12 @@ def multipart(kind="image/jpeg", extension=".jpg", has_length=True, *, connectio
         sent_s: list[float] = []
         if connections is not None:
             connections.append(sent_s)
-        for number in itertools.count() if numbers is None else numbers:
+        for number in itertools.count():
             data = encoded(number, extension)
             length = f"Content-Length: {len(data)}\r\n" if has_length else ""
             sent_s.append(time.monotonic())
             connection.sendall(f"--part\r\nContent-Type: {kind}\r\n{length}\r\n".encode() + data + b"\r\n")
-            time.sleep(every_s)
+            time.sleep(0.1)
 
     return answer
 

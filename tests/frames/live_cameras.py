@@ -10,8 +10,8 @@ from rtsp_camera import RtspCamera, free_port
 WIDTH, HEIGHT = 160, 120
 
 
-def start_ffmpeg(*output: str, rate: float = 1.0) -> subprocess.Popen:
-    picture = ["-readrate", str(rate), "-f", "lavfi", "-i", f"testsrc=size={WIDTH}x{HEIGHT}:rate=60"]
+def start_ffmpeg(*output: str) -> subprocess.Popen:
+    picture = ["-re", "-f", "lavfi", "-i", f"testsrc=size={WIDTH}x{HEIGHT}:rate=60"]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *picture, "-g", "5", *output]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL)
 
@@ -22,10 +22,9 @@ def stop(process: subprocess.Popen) -> None:
 
 
 class FfmpegCamera:
-    """MPEG-TS over UDP or TCP, or MJPEG over HTTP. Its time stamps run `rate` times as fast as the clock."""
+    """MPEG-TS over UDP or TCP, or MJPEG over HTTP."""
 
-    def __init__(self, kind: str, rate: float = 1.0):
-        self._rate = rate
+    def __init__(self, kind: str):
         port = free_port()
         self.uri = f"{kind}://127.0.0.1:{port}"
         self._output = {
@@ -33,10 +32,9 @@ class FfmpegCamera:
             "tcp": ["-c:v", "mpeg2video", "-f", "mpegts", f"{self.uri}?listen=1"],
             "http": ["-c:v", "mjpeg", "-f", "mpjpeg", "-listen", "1", self.uri],
         }[kind]
-        self._process: subprocess.Popen | None = None
 
     def switch_on(self) -> None:
-        self._process = start_ffmpeg(*self._output, rate=self._rate)
+        self._process = start_ffmpeg(*self._output)
 
     def switch_off(self) -> None:
         stop(self._process)

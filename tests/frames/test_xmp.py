@@ -28,9 +28,8 @@ def read(tmp_path):
 
     def of(content):
         jpeg = photographs.encoded(".jpg", photographs.picture())
-        payload = b"http://ns.adobe.com/xap/1.0/\x00" + content
         path = tmp_path / "photo.jpg"
-        path.write_bytes(jpeg[:2] + b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload + jpeg[2:])
+        path.write_bytes(photographs.with_app1(jpeg, content, b"http://ns.adobe.com/xap/1.0/\x00"))
         return read_xmp(path)
 
     return of
