@@ -108,7 +108,7 @@ def test_a_firmware_is_asked_only_for_the_report_of_its_own_filter(firmware, fil
     assert {24, 30, 33, 132, 136} <= asked
 
 
-def test_a_receiver_says_position_velocity_and_what_they_are_good_to():
+def test_gps_input_says_position_velocity_and_what_they_are_good_to_or_that_it_has_none():
     heard = sent_and_received(messages.gps_input(STATE, 1, 100.0, 1_700_000_000.25))
     assert (heard.gps_id, heard.fix_type, heard.lat, heard.lon) == (1, 3, 471234567, 87654321)
     assert (heard.ve, heard.vn, heard.vd) == (3.0, -4.0, 0.5)
@@ -119,9 +119,6 @@ def test_a_receiver_says_position_velocity_and_what_they_are_good_to():
     assert (heard.time_week, heard.time_week_ms) == (2288, (2 * 86_400 + 80_000 + 18) * 1000 + 250)
     assert heard.satellites_visible < 10, "a real receiver is to be preferred"
     assert heard.yaw == 0, "which says nothing"
-
-
-def test_a_receiver_without_a_fix_says_so_and_one_without_a_clock_says_no_time():
     heard = sent_and_received(messages.gps_input(None, 0, 100.0, None))
     assert (heard.gps_id, heard.fix_type, heard.satellites_visible) == (0, mavlink.GPS_FIX_TYPE_NO_FIX, 0)
     assert (heard.time_week, heard.time_week_ms) == (0, 0)

@@ -156,15 +156,6 @@ def test_the_certainty_is_with_gps_that_of_the_receiver(autopilot, message, h_ac
     assert autopilot.sd_m() == pytest.approx(sd_m), "the better one counts"
 
 
-def test_the_uncertainty_grows_from_the_loss_of_gps_on(autopilot):
-    autopilot.gps(h_acc=3000)
-    autopilot.sd_m()
-    autopilot.gps(fix_type=1)
-    autopilot.wait(310.0)
-    autopilot.filter(REL)  # it reckons
-    assert autopilot.sd_m() == pytest.approx(math.hypot(3.0, DRIFT_M_S * 310))
-
-
 @pytest.mark.parametrize("flags", [0, CONST_POS, ABS | REL | CONST_POS, mavlink.EKF_ATTITUDE])
 def test_a_filter_that_says_it_has_no_position_ends_the_certainty(autopilot, flags):
     autopilot.gps()
@@ -196,17 +187,14 @@ def test_a_filter_that_says_how_good_it_is_is_believed_while_it_speaks(autopilot
     autopilot.sd_m()
     autopilot.gps(fix_type=1)
     autopilot.wait(10.0)
+    for accuracy_m in (0.0, math.nan, math.inf):
+        autopilot.px4_filter(accuracy_m)
+        assert autopilot.sd_m() == pytest.approx(math.hypot(3.0, DRIFT_M_S * 10)), "it grows since GPS was lost"
     autopilot.px4_filter(14.0)
     assert autopilot.sd_m() == 14.0
     autopilot.wait(5.0)
-    assert autopilot.sd_m() == pytest.approx(math.hypot(3.0, DRIFT_M_S * 15)), "silent"
-
-
-@pytest.mark.parametrize("nothing", [0.0, math.nan, math.inf])
-def test_an_accuracy_that_is_none_is_not_believed(autopilot, nothing):
-    autopilot.gps(h_acc=3000)
-    autopilot.px4_filter(nothing)
-    assert autopilot.sd_m() == pytest.approx(3.0)
+    autopilot.filter(REL)
+    assert autopilot.sd_m() == pytest.approx(math.hypot(3.0, DRIFT_M_S * 15)), "it says no accuracy, and reckons"
 
 
 def test_another_autopilot_is_not_known_as_well_and_starts_with_a_clean_slate(autopilot):
@@ -251,6 +239,7 @@ def test_best_receiver_has_position_velocity_and_altitude_of_its_newest_report()
     assert (best.sd_m, best.t_s, best.alt_m) == (0.5, t_s, 300.0)
     assert best.velocity_m_s == pytest.approx((0.0, 10.0))
     assert best.steady_for_s == pytest.approx(3 - STEP_S, abs=0.01)
+    assert receivers.best(t_s, own="GPS_RAW_INT") is None, "edgevpr plays it"
 
 
 @pytest.mark.parametrize(
@@ -272,11 +261,6 @@ def test_receiver_without_a_new_fix_is_gone():
     receivers, t_s = flown(3)
     receivers.handle(report(t_s, fix_type=1), t_s)
     assert receivers.best(t_s) is None
-
-
-def test_receiver_that_edgevpr_plays_is_left_out():
-    receivers, t_s = flown(3)
-    assert receivers.best(t_s, own="GPS_RAW_INT") is None
 
 
 def test_receiver_that_reports_no_speed_has_no_velocity():
