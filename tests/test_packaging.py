@@ -60,7 +60,7 @@ def test_wheel_works_without_the_checkout(wheel, tmp_path):
     subprocess.run([*pip, "--target", site, wheel], capture_output=True, check=True)
     script = (
         "import edgevpr; from edgevpr.core.config import load_config; from edgevpr.power.boards import load_board\n"
-        "from edgevpr.runtime.service.install import render_unit\n"
+        "from edgevpr.runtime.service.unit import render_unit\n"
         "print(edgevpr.__file__, load_config(None).battery.pack, 'MemoryMax=' in render_unit(load_board('rpi-5')))"
     )
     environment = os.environ | {"PYTHONPATH": str(site)}

@@ -64,20 +64,11 @@ def add(commands: Any) -> None:
     check.add_argument("--offline", action="store_true", help="do not wait for a frame or a heartbeat")
     add_json(check)
 
-    services = group(commands, "service", "print or install the systemd service")
+    services = group(commands, "service", "print the systemd unit")
     unit = command(services, "print", service_print, "print the systemd unit")
     unit.add_argument(
         "--board", default="this", metavar="NAME", help="board that the unit is for (default: this computer)"
     )
-    install = command(
-        services, "install", service_install, "install the service: user, folders, program, unit and udev rules"
-    )
-    install.add_argument("--config", metavar="FILE", help="configuration to copy to /etc/edgevpr/config.yaml")
-    uninstall = command(
-        services, "uninstall", service_uninstall, "remove the service; keep maps, logs and configuration"
-    )
-    for each in (install, uninstall):
-        each.add_argument("--dry-run", action="store_true", help="print each step without doing it")
 
     doctor = command(commands, "doctor", run_doctor, "check the autopilot's parameters and this computer (read-only)")
     doctor.add_argument("--config", metavar="FILE", help="configuration of the flight; flags override it")
@@ -221,29 +212,7 @@ def _show_findings(findings: "Sequence[Finding]", as_json: bool, **others: Any) 
 def service_print(args: Namespace) -> int:
     """Run `service print`: print the systemd unit for a board."""
     from edgevpr.power.boards import load_board
-    from edgevpr.runtime.service.install import render_unit
+    from edgevpr.runtime.service.unit import render_unit
 
     print(render_unit(load_board(args.board)), end="")
     return 0
-
-
-def service_install(args: Namespace) -> int:
-    """Run `service install`: install the service on this machine."""
-    from edgevpr.runtime.service.install import install
-
-    install(path_of(args.config), args.dry_run, _print_step)
-    _print_step("next   sudo -u edgevpr /opt/edgevpr/bin/edgevpr check --config /etc/edgevpr/config.yaml")
-    _print_step("next   systemctl enable --now edgevpr (restart, where an earlier one runs)")
-    return 0
-
-
-def service_uninstall(args: Namespace) -> int:
-    """Run `service uninstall`: remove the service from this machine."""
-    from edgevpr.runtime.service.install import uninstall
-
-    uninstall(args.dry_run, _print_step)
-    return 0
-
-
-def _print_step(line: str) -> None:
-    print(shown(line), flush=True)  # some steps take minutes

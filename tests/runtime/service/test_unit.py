@@ -10,7 +10,7 @@ import pytest
 
 from edgevpr.core.errors import UsageError
 from edgevpr.power.boards import board_names, load_board
-from edgevpr.runtime.service.install import render_unit
+from edgevpr.runtime.service.unit import render_unit
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 UNIT = DEPLOY / "edgevpr.service"
@@ -83,6 +83,18 @@ def test_render_unit_escapes_the_name_of_the_board():
     unit = render_unit(replace(load_board("rpi-zero-2w"), name="x\nExecStartPre=/bin/sh"))
     assert "\n# Board: x\\nExecStartPre=/bin/sh\n" in unit
     assert directives(unit)["ExecStartPre"] == directives(UNIT.read_text())["ExecStartPre"]
+
+
+def test_unit_finds_what_the_commands_of_the_page_install():
+    said, page = directives(UNIT.read_text()), (DEPLOY / "README.md").read_text()
+    commands = "".join(re.findall(r"(?ms)^```sh$(.*?)^```$", page))
+    program, config = said["ExecStart"].split()[0], said["ExecStart"].split()[-1]
+    assert f"venv {program.removesuffix('/bin/edgevpr')}\n" in commands
+    assert f" {config}\n" in commands
+    assert f"--groups {said['SupplementaryGroups'].replace(' ', ',')} " in commands
+    user = said["User"]
+    assert re.search(f"useradd .* {user}\n", commands)
+    assert f"install -d -o {user} -g {user} {said['ReadWritePaths'].replace('-/', '/')}\n" in commands
 
 
 def test_unit_keeps_trying_in_flight_but_not_after_a_usage_error():

@@ -1,0 +1,19 @@
+"""The systemd unit of a flight, which `edgevpr service print` prints; deploy/README.md installs it."""
+
+import re
+
+from edgevpr.core.files import shipped
+from edgevpr.core.text import printable
+from edgevpr.power.boards import Board
+
+
+def render_unit(board: Board) -> str:
+    """Return the text of deploy/edgevpr.service with the limits of a board."""
+    changed = {
+        "# Board: ": printable(board.name),
+        "MemoryMax=": f"{board.memory_max_mb * 1e6:.0f}",
+        "CPUQuota=": f"{100 * board.cpu_share * board.cores:.0f}%",
+    }
+    keys = re.compile(f"(?m)^({'|'.join(changed)}).*$")
+    text = (shipped("deploy") / "edgevpr.service").read_text(encoding="utf-8")
+    return keys.sub(lambda line: line[1] + changed[line[1]], text)
