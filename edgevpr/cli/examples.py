@@ -42,7 +42,6 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "match": (
         ("where later pictures were taken", "valley.gpkg --images later/"),
         ("with what a flight knows beside them", "valley.gpkg --images later/ --known heading,height"),
-        ("a page of what was found", "valley.gpkg --images later/ --page found.html --map-images photos/"),
     ),
     "run": (
         (
@@ -56,7 +55,6 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "doctor": (("what is wrong with autopilot and board", "--link serial:/dev/ttyAMA0:921600"),),
     "top": (("watch the flight of the service", ""),),
     "report": (("a page of a flight", "flight.jsonl --out report.html --images later/ --map-images photos/"),),
-    "export": (("its points for QGIS", "flight.jsonl --geojson flight.geojson"),),
     "replay": (("fly it again, and compare each line", "flight.jsonl --map valley.gpkg"),),
     "profile": (
         ("a map on a board", "--map valley.gpkg --board rpi-4b --battery 4S5200 --flight-min 20"),

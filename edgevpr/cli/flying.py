@@ -3,7 +3,7 @@
 import os
 from argparse import Namespace
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,6 @@ from edgevpr.cli.shared import (
     add_json,
     add_keys,
     add_known,
-    add_map_images,
     add_positions,
     add_recording,
     command,
@@ -20,17 +19,14 @@ from edgevpr.cli.shared import (
     leave_out,
     load_command_config,
     path_of,
-    require_out,
     show,
-    write_out,
 )
-from edgevpr.core.config import Config, place_logs_in
+from edgevpr.core.config import place_logs_in
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.text import progress, shown
+from edgevpr.core.text import progress
 
 if TYPE_CHECKING:
     from edgevpr.runtime.recognise.recogniser import Recogniser
-    from edgevpr.runtime.recognise.recognition import Recognition
     from edgevpr.runtime.service.finding import Finding
 
 _MATCHING_KEYS = (
@@ -50,8 +46,6 @@ def add(commands: Any) -> None:
     add_keys(match, *_MATCHING_KEYS)
     match.add_argument("--follow", action="store_true", help="treat the images as one flight, in order (cohog only)")
     add_known(match)
-    match.add_argument("--page", metavar="FILE", help="write an HTML page that opens offline")
-    add_map_images(match)
     add_json(match)
 
     run = command(commands, "run", run_flight, "recognise places in flight and send positions to the autopilot")
@@ -89,7 +83,6 @@ def run_match(args: Namespace) -> int:
 
     config, known = load_command_config(args, args.config, map=args.map), parse_known_fields(args.known)
     recogniser = open_recogniser(config, load_board(config.board), known=known, follows=args.follow)
-    page = _MatchPage(args) if args.page else None
     found = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=path_of(args.positions), live=False)
@@ -104,8 +97,6 @@ def run_match(args: Namespace) -> int:
             leave_out(ImageError(f"{frame.name}: {event.reason}"), unusable)
             continue
         found.append(format_match(event) | {"calibrated": is_calibrated})
-        if page:
-            page.take(event)
         if known:
             found[-1]["hints"] = event.hints and event.hints.fields()
     lines = list(format_matches(found))
@@ -116,44 +107,7 @@ def run_match(args: Namespace) -> int:
     if weights := find_weights(recogniser.technique.spec):
         lines.append(f"Weights of {weights}.")
     show(found, args.json, "\n".join(lines))
-    if page:
-        page.write(config)
     return exit_code(unusable)
-
-
-class _MatchPage:
-    """The page of `match`, for which queries are collected as they come."""
-
-    def __init__(self, args: Namespace) -> None:
-        from edgevpr.review.album import Album, album_of_map
-        from edgevpr.review.logged import LoggedQuery
-        from edgevpr.review.webpage import read_ground
-
-        require_out(args.page, args.map)
-        self._args, self._ground, self._queries = args, read_ground(args.map), list[LoggedQuery]()
-        self._albums = {"seen": Album(), "place": album_of_map(args.map_images, self._ground)}
-
-    def take(self, event: "Recognition") -> None:
-        """Take the event of a query."""
-        from edgevpr.review.logged import read_query
-        from edgevpr.runtime.recognise.recognition import fields_of
-
-        query, tag = read_query(fields_of(event, exact=True), 0.0), event.frame and event.frame.position
-        tagged_at = (tag.lat_deg, tag.lon_deg) if tag else None
-        self._queries.append(replace(query, gps_at=tagged_at, true_at=tagged_at))
-        if event.frame:
-            self._albums["seen"].keep(event.frame.name, event.frame.image)
-
-    def write(self, config: Config) -> None:
-        """Write the page."""
-        from edgevpr.review.page import make_match_page
-        from edgevpr.runtime.recognise.levelling import lens_of
-
-        name = Path(self._args.map).name
-        page = make_match_page(self._queries, name, self._ground, self._albums, lens_of(config.source))
-        write_out(self._args.page, self._args.map, lambda out: out.write(page))
-        if not self._args.json:
-            print(f"{self._args.page}: {len(self._queries)} queries")
 
 
 def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recogniser") -> None:

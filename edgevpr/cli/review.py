@@ -1,10 +1,8 @@
-"""Commands for after a flight: `edgevpr report` and `edgevpr export`, which read its log, and `edgevpr replay`, which
-flies a recorded flight again on the ground."""
+"""Commands for after a flight: `edgevpr report`, a page of its log, and `edgevpr replay`, which flies a recorded flight
+again on the ground."""
 
-import sys
 from argparse import Namespace
 from dataclasses import asdict
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_json, add_map_images, command, show, write_out
@@ -29,9 +27,6 @@ def add(commands: Any) -> None:
         help="folder of frames of this flight (repeatable), or its video; not needed with a recording",
     )
     add_map_images(report)
-    export = command(commands, "export", run_export, "export matches and fixes of a flight as GeoJSON")
-    export.add_argument("log", metavar="LOG")
-    export.add_argument("--geojson", required=True, metavar="FILE", help="file to write (-: standard output)")
     replay = command(commands, "replay", run_replay, "replay a recorded flight, and compare every line and packet")
     replay.add_argument("log", metavar="LOG", help="flight log; its last flight is replayed")
     replay.add_argument("--map", metavar="MAP", help="map of the flight (default: at its recorded path)")
@@ -62,20 +57,6 @@ def run_report(args: Namespace) -> int:
     page = make_flight_page(flight, ground, frames, references, no_ground)
     write_out(args.out, args.log, lambda out: out.write(page))
     print(f"{args.out}: {len(flight.queries)} queries of {args.log}")
-    return 0
-
-
-def run_export(args: Namespace) -> int:
-    """Run `export`: write the points of a flight (matches, fixes, positions) as GeoJSON."""
-    from edgevpr.review.export import make_features, write_geojson
-    from edgevpr.review.logged import read_flight
-
-    features = make_features(read_flight(args.log))
-    if args.geojson == "-":
-        write_geojson(features, sys.stdout)
-    else:
-        write_out(args.geojson, args.log, partial(write_geojson, features))
-        print(f"{args.geojson}: {len(features)} points")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Reads a flight log into checked values, for the report and the exports. A field that a log lacks, or that is damaged
+"""Reads a flight log into checked values, for the report. A field that a log lacks, or that is damaged
 or of another type, becomes None."""
 
 import logging
@@ -83,12 +83,9 @@ class LoggedFlight:
     """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `remarks` are the
     lines with a text for people: time, kind and text. `unusable` is the number of frames that never became queries,
     `learnt` the positions of places learnt in flight, `between` the lines of fixes sent between matches. Times are
-    seconds after its start; it is `span_s` long. `truth` names the positions by which matches are judged, and `notes`
-    are sentences for the head of its page."""
+    seconds after its start; it is `span_s` long."""
 
     path: Path = Path()
-    truth: str = "GPS"
-    notes: tuple[str, ...] = ()
     start: dict[str, Any] = field(default_factory=dict)
     end: dict[str, Any] = field(default_factory=dict)
     queries: list[LoggedQuery] = field(default_factory=list)
@@ -126,7 +123,7 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
                 flight.end = line
             case "query":
                 t_frame_s = number(line, "t_frame_s")
-                query = read_query(line, t_s if t_frame_s is None else max(0.0, t_frame_s - (start_s or 0.0)))
+                query = _read_query(line, t_s if t_frame_s is None else max(0.0, t_frame_s - (start_s or 0.0)))
                 queries[query.name] = query
                 flight.queries.append(query)
             case "answer":
@@ -149,8 +146,8 @@ def _apply_answer(fix: LoggedFix, line: dict[str, Any]) -> None:
     fix.why = read_reason(line.get("why")) or fix.why
 
 
-def read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
-    """Read a log line of kind "query", or the fields of one (see `recognition.fields_of`)."""
+def _read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
+    """Read a log line of kind "query"."""
     t_frame_s = number(line, "t_frame_s")
     accepted = line.get("accepted") is True
     gps_at = _gps_at(line, t_frame_s)

@@ -1,5 +1,4 @@
-"""The report of a flight (`edgevpr report`) and the page of `edgevpr match`: one HTML page each, with its pictures
-inside, without network.
+"""The report of a flight (`edgevpr report`): one HTML page with its pictures inside, without network.
 
 Functions that return a str return HTML.
 """
@@ -8,7 +7,6 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -82,27 +80,6 @@ def make_flight_page(
     )
 
 
-def make_match_page(
-    queries: Sequence[LoggedQuery],
-    name: str,
-    ground: Sequence[Place],
-    albums: Mapping[str, Album],
-    lens: "Lens | None" = None,
-) -> str:
-    """Return the whole page of the queries of `match`. `albums` have the pictures of queries ("seen") and of the map
-    ("place"), `name` is that of the map, `lens` that of the camera."""
-    flight = LoggedFlight(path=Path(), truth="GPS tags", queries=list(queries))
-    head = {
-        "title": f"Matches in {name}",
-        "known": [f"{len(queries)} pictures"],
-        "figures": _matches(flight),
-        "warnings": [],
-        "span_s": None,
-    }
-    steps = _steps(ground, flight)
-    return make_page(head, steps, ground, _layers(ground, flight, steps), albums, lens=lens)
-
-
 def _layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
     """Return the layers of the drawing, from the bottom to the top."""
     return [
@@ -110,7 +87,7 @@ def _layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]
         make_layer(steps, "places found", "found"),
         Layer("places learnt", "learnt", [flight.learnt]),
         Layer("fixes between matches", "between", [list(filter(None, map(point, flight.between)))]),
-        make_layer(steps, flight.truth, "gps", "line"),
+        make_layer(steps, "GPS", "gps", "line"),
         make_layer(steps, "autopilot", "autopilot", "line"),
         make_layer(steps, "refused there", "missed"),
         make_layer(steps, "matches", "accepted"),
@@ -124,11 +101,11 @@ def _steps(ground: Sequence[Place], flight: LoggedFlight) -> list[Step]:
     """Return a step for each query of a flight over the places of `ground`."""
     places = {place.place_id: place for place in ground}
     has_link = any(query.has_link for query in flight.queries)
-    return [_step(query, places.get(query.place or 0), flight, has_link) for query in flight.queries]
+    return [_step(query, places.get(query.place or 0), flight.span_s > 0, has_link) for query in flight.queries]
 
 
-def _step(query: LoggedQuery, place: Place | None, flight: LoggedFlight, has_link: bool) -> Step:
-    """Return the step of a query. `has_link`: the flight had a link to an autopilot."""
+def _step(query: LoggedQuery, place: Place | None, has_times: bool, has_link: bool) -> Step:
+    """Return the step of a query. `has_times`: its flight lasted. `has_link`: the flight had a link to an autopilot."""
     fix, verdict = query.fix, "accepted" if query.accepted else "refused"
     points = {
         "found": query.place_at,
@@ -145,14 +122,14 @@ def _step(query: LoggedQuery, place: Place | None, flight: LoggedFlight, has_lin
         if fix.outcome in SENT:
             points[_FIX_COLOURS[fix.outcome]] = fix.at
     if (query.off_m or 0.0) > _FAR_M:
-        groups[f"match over {_FAR_M:.0f} m from {flight.truth}"] = "refused"
+        groups[f"match over {_FAR_M:.0f} m from GPS"] = "refused"
     if has_link and query.has_link is False:
         groups["autopilot silent"] = "refused"
     pictures = [("seen", query.name, f"seen: {query.name}")]
     pictures.append(("place", query.reference_image or "", f"place found: {query.reference_image}"))
     return Step(
-        title=f"{f'{clock(query.t_s)} – ' if flight.span_s else ''}{query.name}: {verdict}",
-        said=[_place_found(query), _position(query, flight.truth), str(query.reason or ""), fixed],
+        title=f"{f'{clock(query.t_s)} – ' if has_times else ''}{query.name}: {verdict}",
+        said=[_place_found(query), _position(query), str(query.reason or ""), fixed],
         groups=groups,
         at={name: at for name, at in {**points, "accepted": query.at}.items() if at},  # the last has the circle
         circle_m=query.accuracy_m if query.at else None,
@@ -170,11 +147,11 @@ def _place_found(query: LoggedQuery) -> str:
     return f"place {query.place} ({query.reference_image or 'without a name'}), score {score}{confidence}"
 
 
-def _position(query: LoggedQuery, truth: str) -> str:
+def _position(query: LoggedQuery) -> str:
     if not query.at:
         return ""
     accuracy = "" if query.accuracy_m is None else f", accurate to {figure(query.accuracy_m, 'm')}"
-    off = "" if query.off_m is None else f", {figure(query.off_m, 'm')} from {truth}"
+    off = "" if query.off_m is None else f", {figure(query.off_m, 'm')} from GPS"
     return f"position {query.at[0]:.6f}, {query.at[1]:.6f}{accuracy}{off}"
 
 
@@ -199,8 +176,8 @@ def _matches(flight: LoggedFlight) -> dict[str, str]:
         "queries": str(len(queries)),
         "accepted": f"{len(accepted)}{share}",
         "accuracy, median": figure(median(accuracies_m) if accuracies_m else None, "m"),
-        f"from {flight.truth}, median": figure(median(off_m) if off_m else None, "m"),
-        f"from {flight.truth}, most": figure(max(off_m, default=None), "m"),
+        "from GPS, median": figure(median(off_m) if off_m else None, "m"),
+        "from GPS, most": figure(max(off_m, default=None), "m"),
     }
 
 
@@ -239,7 +216,7 @@ def _notes(flight: LoggedFlight, has_ground: bool, no_ground: str) -> list[str]:
         ),
         (not no_ground, no_ground),
     ]
-    return [*flight.notes, *(sentence for is_there, sentence in known if not is_there)]
+    return [sentence for is_there, sentence in known if not is_there]
 
 
 def _charts(flight: LoggedFlight) -> list[Chart]:
@@ -253,14 +230,14 @@ def _charts(flight: LoggedFlight) -> list[Chart]:
         pairs = zip(flight.queries, values, strict=True)
         return name, colour, "dots", [(query.t_s, value) for query, value in pairs if value is not None]
 
-    queries, truth = flight.queries, flight.truth
+    queries = flight.queries
     return [
         Chart("Confidence", "", [
             dots("accepted", "accepted", [query.confidence if query.accepted else None for query in queries]),
             dots("refused", "refused", [None if query.accepted else query.confidence for query in queries]),
         ]),
         Chart("Position", "m", [
-            dots(f"from {truth}", "gps", [query.off_m for query in queries]),
+            dots("from GPS", "gps", [query.off_m for query in queries]),
             dots("accuracy, 1 sigma", "accepted", [query.accuracy_m for query in queries]),
         ]),
         Chart("A query", "ms", [

@@ -1,4 +1,4 @@
-"""The page of a map, and that of what `match` finds in it."""
+"""The page of a map."""
 
 import json
 import re
@@ -35,17 +35,13 @@ def mapped(tmp_path_factory):
     return folder
 
 
-def made(mapped, *argv):
-    """The page that a command writes, and its data."""
-    out = mapped / f"{argv[0]}.html"
-    assert main([*map(str, argv), "--page", str(out), "--map-images", str(mapped / "ref")]) == 0
-    return out, json.loads(re.search(r'id="page">(.*?)</script>', out.read_text("utf-8"))[1])
-
-
 @pytest.mark.process
 @pytest.mark.slow
 def test_the_page_of_a_map_shows_its_places_and_what_is_amiss_with_them(browser, mapped):
-    out, data = made(mapped, "map", "info", mapped / "valley.gpkg")
+    out = mapped / "map.html"
+    argv = ["map", "info", mapped / "valley.gpkg", "--page", out, "--map-images", mapped / "ref"]
+    assert main(list(map(str, argv))) == 0
+    data = json.loads(re.search(r'id="page">(.*?)</script>', out.read_text("utf-8"))[1])
     alike = {each["title"]: each["said"][-1] for each in data["steps"] if "looks like" in each["said"][-1]}
     assert "looks like place 13: " in alike["Place 6: 05.png"]
     assert "looks like place 6: " in alike[f"Place 13: {TWIN}"]
@@ -62,17 +58,6 @@ def test_the_page_of_a_map_shows_its_places_and_what_is_amiss_with_them(browser,
         assert page.inner_text(".now h3") == "Place 3: 02.png"
         assert page.locator(".line.amiss").count() == 1
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-
-
-@pytest.mark.process
-@pytest.mark.slow
-def test_the_page_of_match_shows_queries_beside_places(browser, mapped, capsys):
-    out, data = made(mapped, "match", mapped / "valley.gpkg", "--images", mapped / "ref")
-    accepted = int(re.search(r"(\d+) accepted", capsys.readouterr().out)[1])
-    assert len(data["steps"]) == 13
-    assert sum(each["title"].endswith(": accepted") for each in data["steps"]) == accepted
-    with Opened(browser, out, 1200) as page:
-        assert page.eval_on_selector_all(".now img", "all => all.map(each => each.naturalWidth > 0)") == [True, True]
 
 
 @pytest.mark.slow

@@ -74,7 +74,7 @@ class Recognition:
 
 def fields_of(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
     """Return the event as a dict for the flight log (kind "query"), or with an `exact` confidence, of which six digits
-    would make 1 where it is nearly sure. `edgevpr match`, its page and the status of a flight are made of it too.
+    would make 1 where it is nearly sure. `edgevpr match` and the status of a flight are made of it too.
 
     Always there: query, place (number), reference_image, score, position (of the place), shift, covariance and rotation
     of the match (all null if no place was found), accepted, reason, accuracy_m, located (the aircraft's position; null
