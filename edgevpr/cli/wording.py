@@ -93,6 +93,8 @@ def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Itera
         yield f"  pose        of {info.with_pose} places, accurate to {info.position_sd_m:.1f} m; {seen}"
     if info.of_low_quality:
         yield f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps"
+    if info.one_way_deg is not None:
+        yield f"  one way     {info.described_way}"
     if info.attribution:
         yield f"  cut from    {info.attribution}"
     if confidence:

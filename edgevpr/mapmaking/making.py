@@ -197,10 +197,13 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
         finished = finish_map(
             place_map, technique, config, pictures, shown, refine=order.refine, calibrate=order.calibrate
         )
+        info = describe_map(place_map)
+        if info.one_way_deg is not None:
+            _log.warning("%s", info.described_way)
         return MadeMap(
             technique=technique.spec.name,
             places=len(place_map),
-            with_position=describe_map(place_map).with_position,
+            with_position=info.with_position,
             result=replace(result, **counts),
             covered=covered,
             refined=finished.refined,

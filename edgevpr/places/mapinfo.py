@@ -2,10 +2,14 @@
 
 import hashlib
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 
+import numpy as np
+
 from edgevpr.core.contract import TechniqueSpec
-from edgevpr.core.geodesy import Extent
+from edgevpr.core.errors import PlaceError
+from edgevpr.core.geodesy import Extent, offset_m
 from edgevpr.places import rows
 from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
@@ -17,6 +21,9 @@ SELECT count(*), count(geom), total(is_low_quality = 1), count(up_deg),
     max(CASE typeof(time) WHEN 'text' THEN time END)
 FROM places
 """
+_MIN_COURSES = 10  # fewer say nothing of how a map was flown
+_SAME_PASS_STEPS = 3.0  # longest time from one place to the next of the same pass, in median steps
+_SAME_COURSE = 0.9  # length of the mean of unit vectors along the courses, from which on all are one direction
 _EXTENT = "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name = 'places'"
 
 
@@ -27,7 +34,8 @@ class MapInfo:
     `of_low_quality` is the number added only because there would have been too wide a gap. Of the places with a pose,
     `footprints_m` are the lengths on the ground of a picture's longest side (see `Layers`), and `position_sd_m` is the
     standard deviation of the positions along one axis, as root mean square. `attribution` names the owners of
-    orthophotos."""
+    orthophotos. `one_way_deg` is the course of a map that looks down and was flown in X
+    shifts such a map along it, and nothing in the map shows that."""
 
     path: str
     spec: TechniqueSpec
@@ -41,7 +49,16 @@ class MapInfo:
     footprints_m: tuple[float, ...]
     position_sd_m: float | None
     attribution: str | None
+    one_way_deg: float | None
     file_bytes: int
+
+    @property
+    def described_way(self) -> str:
+        """What a map that was flown in one direction cannot show, as a sentence."""
+        return (
+            f"all places were flown over at a course of about {self.one_way_deg:.0f} degrees: a camera that triggers "
+            "late has shifted them all by its delay times the speed, which only lines flown the other way show"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +90,7 @@ def describe_map(place_map: PlaceMap) -> MapInfo:
         footprints_m=layers_of(place_map).footprints_m,
         position_sd_m=None if var_m2 is None else math.sqrt(max(0.0, var_m2) / 2),
         attribution=place_map.attribution,
+        one_way_deg=_find_one_way_deg(place_map) if place_map.spec.parameters.get("camera") == "nadir" else None,
         file_bytes=place_map.path.stat().st_size,
     )
 
@@ -83,6 +101,27 @@ def read_extent(place_map: PlaceMap) -> Extent | None:
         extent = place_map.db.execute(_EXTENT).fetchone()
     is_extent = extent and all(isinstance(side, (int, float)) and math.isfinite(side) for side in extent)
     return extent if is_extent else None
+
+
+def _find_one_way_deg(place_map: PlaceMap) -> float | None:
+    """Return the course over ground, degrees, if all places were flown over in about one direction; None if not, or if
+    that is not known, as their times are not."""
+    tags: list[tuple[float, float, float]] = []
+    with suppress(PlaceError):  # those before a damaged place say enough
+        for place in place_map.places():
+            if place.t_utc_s is not None and place.position:
+                tags.append((place.t_utc_s, place.position.lat_deg, place.position.lon_deg))
+    if len(tags) <= _MIN_COURSES:
+        return None
+    t_s, lat_deg, lon_deg = np.array(sorted(tags)).T
+    step_s = np.diff(t_s)
+    east_m, north_m = offset_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])
+    step_m = east_m + 1j * north_m
+    courses = step_m[(step_s <= _SAME_PASS_STEPS * np.median(step_s)) & (step_m != 0)]
+    if len(courses) < _MIN_COURSES:
+        return None
+    mean = np.mean(courses / np.abs(courses))
+    return math.degrees(math.atan2(mean.real, mean.imag)) % 360 if abs(mean) >= _SAME_COURSE else None
 
 
 def read_identity(place_map: PlaceMap) -> MapIdentity:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 import re
 import shutil
 
@@ -11,6 +12,8 @@ from map_writer import SPEC, descriptor, frame, make_map, write_sql
 
 from edgevpr.core.contract import PartSpec
 from edgevpr.core.errors import MapError, PlaceError
+from edgevpr.core.geodesy import moved
+from edgevpr.core.types import Position
 from edgevpr.places.examine import merge, repair, shrink
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
@@ -277,3 +280,21 @@ def test_read_identity_is_that_of_a_copy_until_anything_changes(map_path, tmp_pa
     with contextlib.closing(connect(map_path, "rw")) as db:
         db.execute(change)
     assert identity(map_path).sha256 != before.sha256
+
+
+@pytest.mark.parametrize(
+    ("courses_deg", "one_way_deg"),
+    [([90.0] * 4, 90.0), ([90.0, 270.0] * 2, None), ([0.0, 90.0, 180.0, 270.0], None), ([80.0, 100.0] * 2, 90.0)],
+)
+def test_describe_map_tells_the_course_of_a_map_whose_lines_are_flown_one_way(tmp_path, courses_deg, one_way_deg):
+    spec = dataclasses.replace(SPEC, parameters={"camera": "nadir"})
+    with PlaceMap.create(tmp_path / "map.gpkg", spec) as place_map:
+        for line, course_deg in enumerate(courses_deg):
+            for nth in range(8):
+                step_m = 20.0 * nth * np.exp(1j * math.radians(90.0 - course_deg)) + 40j * line
+                lat_deg, lon_deg = moved(50.0, 8.0, step_m.real, step_m.imag)
+                taken_s = 1.7e9 + 60.0 * line + nth  # the way back to the next line is flown without pictures
+                added = dataclasses.replace(frame(8 * line + nth), position=Position(lat_deg, lon_deg), t_utc_s=taken_s)
+                place_map.add(added, descriptor(nth))
+        info = describe_map(place_map)
+    assert info.one_way_deg == (None if one_way_deg is None else pytest.approx(one_way_deg, abs=1.0))
