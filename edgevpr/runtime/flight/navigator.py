@@ -42,7 +42,8 @@ _ALT_SD_M = 3.0
 # An autopilot takes the ten positions of a second as independent. Their errors are correlated for about five seconds:
 # fifty of them say as much as one, so each is sent with its error times this. Without it, they outweighed the gyros:
 # an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
-_CORRELATION_FACTOR = math.sqrt(50)
+# A smaller factor would be the more honest claim, and lets the loop run away: benchmarks/results/loop.md.
+CORRELATION_FACTOR = math.sqrt(50)
 _PX4_CORRELATION_FACTOR = 1.5
 _ATTITUDE_ERROR_VALID_S = 5.0
 _PX4_CHANNELS = Channel.SENSOR, Channel.VISION
@@ -309,7 +310,7 @@ class Navigator(Listener):
         """Return the factor of the errors of a continuous position. PX4 is told them as they are, while pictures show
         how wrong its attitude is, or need none: then our errors are not those that our own positions have caused."""
         is_apart = self._is_level or t_s - self._attitude_error_s <= _ATTITUDE_ERROR_VALID_S
-        return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_apart else _CORRELATION_FACTOR
+        return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_apart else CORRELATION_FACTOR
 
     def _claimed_m(self, estimate: NavState) -> float:
         """Return the accuracy to be sent with an estimate: never better than the error that all fixes share."""

@@ -84,7 +84,7 @@ def test_it_holds_for_every_accuracy_that_is_asked_for(min_accuracy_m, gyro_sd, 
 @pytest.mark.parametrize("min_accuracy_m", [0.1, 1.0])
 def test_a_claim_as_good_as_the_matches_would_not_hold_where_no_picture_shows_the_lean(min_accuracy_m, monkeypatch):
     """And with gyros that are taken to be as good as they are. This is how a PX4 was lost within a minute."""
-    monkeypatch.setattr(navigator, "_CORRELATION_FACTOR", 1.0)
+    monkeypatch.setattr(navigator, "CORRELATION_FACTOR", 1.0)
     trusting = replace(drift.INERTIAL, acceleration_noise=0.02)
     monkeypatch.setattr(navigator, "INERTIAL_PX4", trusting)
     assert flown(min_accuracy_m, GOOD, shows_lean=False)[0].max() > 20.0
