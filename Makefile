@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig never-worse from-space sites sweeps clean
+.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig never-worse from-space tilted sites sweeps clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -99,6 +99,11 @@ never-worse: $(VENV)/installed
 from-space: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[maps]'
 	$(BIN)/python benchmarks/from_space.py
+
+# The same flight by cameras that look ahead of straight down, into benchmarks/results/: ten minutes.
+tilted: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[maps]'
+	$(BIN)/python benchmarks/tilted.py
 
 clean:
 	rm -rf $(VENV) demo_out dist build site

@@ -93,19 +93,29 @@ def patchwork(source: Path, path: Path) -> Path:
     return path
 
 
-def flown(raster: Path) -> Iterator[Frame]:
-    """Take the pictures of the flight: a frame each, with all that an autopilot tells."""
-    photo, rng, camera = Orthophoto(raster), np.random.default_rng(_SEED), Camera(noise_sigma=2.0)
+def flown(raster: Path, fov_deg: float = FOV_DEG, tilt_deg: float = 0.0) -> Iterator[Frame]:
+    """Take the pictures of the flight: a frame each, with all that an autopilot tells. A camera that looks ahead by
+    `tilt_deg` sees the same ground."""
+    half = np.tan(np.radians(fov_deg / 2))
+    photo, rng, camera = Orthophoto(raster), np.random.default_rng(_SEED), Camera(focal_px=float(320 / half))
+    height_m = FOOTPRINT_M / 2 / float(half)
+    ahead_m = height_m * np.tan(np.radians(tilt_deg))
     south, west, north, east = photo.extent_deg
     high_m, wide_m = (float(distance_m(south, west, *at)) for at in ((north, west), (south, east)))
     inside_m = 0.75 * FOOTPRINT_M
     shots = []
     for row in np.linspace(inside_m, high_m - inside_m, _GRID[1]):
         for column in np.linspace(inside_m, wide_m - inside_m, _GRID[0])[:: -1 if len(shots) // _GRID[0] % 2 else 1]:
-            at = Position(*moved(south, west, column, row))
-            shots.append(GeoTag(position=at, height_m=HEIGHT_M, heading_deg=float(rng.uniform(0, 360))))
+            heading_deg = float(rng.uniform(0, 360))
+            back_m = -ahead_m * np.array([np.sin(np.radians(heading_deg)), np.cos(np.radians(heading_deg))])
+            at = Position(*moved(south, west, column + back_m[0], row + back_m[1]))
+            shots.append(GeoTag(position=at, height_m=height_m, heading_deg=heading_deg))
+            if tilt_deg:
+                shots[-1] = replace(shots[-1], roll_deg=0.0, pitch_deg=tilt_deg)
     for number, (shot, pose) in enumerate(zip(shots, make_poses(shots, _SEED), strict=True)):
         image = seen_from(photo, shot.position, pose, camera, _LIGHT, rng)
+        if image is None and tilt_deg:
+            continue  # a tilted view reaches far
         if image is None:
             raise base.EdgevprError(f"Picture {number} leaves {raster}: choose another grid.")
         yield Frame(
@@ -113,7 +123,7 @@ def flown(raster: Path) -> Iterator[Frame]:
             name=f"{number:03d}",
             t_mono_s=_STEP_S * number,
             position=shot.position,
-            height_m=HEIGHT_M,
+            height_m=height_m,
             **{name: getattr(pose, name) for name in ("heading_deg", "roll_deg", "pitch_deg")},
         )
     photo.close()
@@ -134,15 +144,15 @@ def foreign(folder: Path) -> Iterator[Frame]:
             yield Frame(image=turned, name=path.name, t_mono_s=0.0, heading_deg=turn_deg, height_m=HEIGHT_M)
 
 
-def matched(path: Path, frames: Iterable[Frame], known: str) -> Row:
+def matched(path: Path, frames: Iterable[Frame], known: str, fov_deg: float = FOV_DEG) -> Row:
     """Match each picture by what is `known`: nothing, heading and height, or the pictures of the flight before it."""
     is_told, is_flown = known == _KNOWN, known == _FLOWN
     config = walks.config(
-        map=str(path), **{"source.camera": "nadir"}, **({"source.fov_deg": FOV_DEG} if is_told else {})
+        map=str(path), **{"source.camera": "nadir"}, **({"source.fov_deg": fov_deg} if is_told else {})
     )
     told = ("heading", "height") if is_told else ()
     recogniser = open_recogniser(config, load_board("this"), known=told, narrowed=is_flown, follows=is_flown)
-    right, errors_m = 0, []
+    right, errors_m, claims_m = 0, [], []
     for frame in frames:
         told = frame if is_told else replace(frame, heading_deg=None, height_m=None, roll_deg=None, pitch_deg=None)
         event = recogniser.step(replace(told, position=None))
@@ -156,6 +166,7 @@ def matched(path: Path, frames: Iterable[Frame], known: str) -> Row:
             right += float(distance_m(*here, place.lat_deg, place.lon_deg)) < FOOTPRINT_M / 2
         if event.accepted and event.position:
             errors_m[-1] = float(distance_m(*here, event.position.lat_deg, event.position.lon_deg))
+            claims_m.append((errors_m[-1], event.accuracy_m))
     recogniser.place_map.close()
     accepted = ~np.isnan(errors_m)
     found: Row = {"known": known, "places": len(recogniser.index), "queries": len(errors_m), "right": right}
@@ -163,6 +174,11 @@ def matched(path: Path, frames: Iterable[Frame], known: str) -> Row:
     if accepted.any() and np.isfinite(np.array(errors_m)[accepted]).all():
         found["error"] = {"median_m": round(float(np.nanmedian(errors_m)), 1)}
         found["error"]["p90_m"] = round(float(np.nanquantile(errors_m, 0.9)), 1)
+    if claims_m:
+        off_m, claimed_m = np.array(claims_m).T
+        found["claim_m"] = round(float(np.median(claimed_m)), 1)
+        found["within"] = round(float(np.mean(off_m <= 2 * claimed_m)), 2)
+        found["too_sure"] = int(np.sum((off_m > 2 * claimed_m) & (claimed_m < 40)))
     if len(errors_m) == _GRID[0] * _GRID[1]:
         by_row = accepted.reshape(_GRID[::-1]).sum(axis=1)
         found["by_row"] = {"least": int(by_row.min()), "most": int(by_row.max())}

@@ -1,0 +1,55 @@
+"""Tilted views over a picture from space of another day: `make tilted`.
+
+The flight of [from_space](from_space.md), by a camera of 28 degrees across that looks ahead of straight down and sees
+the same ground, is asked in a map of the raster `before` of sat_marash: every second picture, each alone. Known are
+heading and height and, where `tilt` is told, roll and pitch; without, a picture is taken to look straight down.
+Pictures that show ground beyond the raster are left out. `within`: share of the accepted whose error is at most two
+standard deviations as claimed; `too sure`: those that are not, and claim less than 40 m.
+
+The map is cut at one footprint. Constants of edgevpr were chosen on this set, those of levelling on other views of it.
+"""
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import base
+import from_space
+from base import Row
+
+FOV_DEG, TILTS_DEG = 28.0, (0.0, 20.0, 45.0, 60.0)
+_COLUMNS = {
+    "tilt": "{tilt:.0f}",
+    "told": "{told}",
+    **{name: f"{{{name}}}" for name in ("queries", "accepted")},
+    "error m": "{error[median_m]} / {error[p90_m]}",
+    "claim m": "{claim_m}",
+    "within": "{within}",
+    "too sure": "{too_sure}",
+}
+
+
+def measure(folder: Path, work: Path) -> list[Row]:
+    path, rows = work / "before.gpkg", []
+    size = ("--footprint-m", f"{from_space.FOOTPRINT_M:.1f}", "--spacing-m", f"{from_space.SPACING_M:g}")
+    base.edgevpr("map", "build", path, "--orthophoto", folder / "raster" / "before.vrt", *size)
+    for tilt_deg in TILTS_DEG:
+        frames = list(from_space.flown(folder / "raster" / "after.vrt", FOV_DEG, tilt_deg))[::2]
+        untold = [replace(frame, roll_deg=None, pitch_deg=None) for frame in frames]
+        for told, pictures in (("heading, height, tilt", frames), ("heading, height", untold)):
+            found = from_space.matched(path, pictures, "heading, height", FOV_DEG)
+            rows.append({"tilt": tilt_deg, "told": told, **found})
+            print(rows[-1], flush=True)
+    return rows
+
+
+def main() -> None:
+    (folder,) = base.find_sets(names=[from_space.SET])
+    with tempfile.TemporaryDirectory(prefix="edgevpr-tilted-") as work:
+        found = {**base.made_by(), "rows": measure(folder, Path(work))}
+    parts = ["# Tilted views", base.told(__doc__), base.table(found["rows"], _COLUMNS)]
+    base.write("tilted", found, "\n\n".join([*parts, base.made_line(found, "make tilted")]))
+
+
+if __name__ == "__main__":
+    base.run(main)
