@@ -27,11 +27,12 @@ import cv2
 import numpy as np
 import psutil
 from rtsp_camera import free_port
+from simulated.autopilot import serve
+from simulated.controller import FlightController
+from simulated.motion import AlongTrack, TrueState
 
 from edgevpr.core.arrays import Image
-from edgevpr.lab.simulate.autopilot import serve
 from edgevpr.lab.simulate.camera import Camera, CameraPose, lit, photograph
-from edgevpr.lab.simulate.controller import FlightController
 from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
     SCENE_WIDTH_M,
@@ -41,7 +42,6 @@ from edgevpr.lab.simulate.generated import (
     write_flight,
 )
 from edgevpr.lab.simulate.landscape import make_scene
-from edgevpr.lab.simulate.motion import AlongTrack, TrueState
 from edgevpr.mavlink.messages import POSITION_FIX
 
 SEED = 4

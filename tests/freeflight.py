@@ -6,15 +6,16 @@ import math
 from itertools import pairwise
 from statistics import fmean
 
+from simulated.ardupilot_rules import _GPS
+from simulated.controller import FlightController
+from simulated.firmware import FAILED, OK
+from simulated.motion import Motion, TrueState
+from simulated.reports import compute_yaw
+from simulated.sensors import FIX_3D
+
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position
-from edgevpr.lab.simulate.ardupilot_rules import _GPS
-from edgevpr.lab.simulate.controller import FlightController
-from edgevpr.lab.simulate.firmware import FAILED, OK
 from edgevpr.lab.simulate.generated import ORIGIN
-from edgevpr.lab.simulate.motion import Motion, TrueState
-from edgevpr.lab.simulate.reports import compute_yaw
-from edgevpr.lab.simulate.sensors import FIX_3D
 from edgevpr.mavlink.wire import mavlink
 
 GRAVITY_M_S2 = 9.81

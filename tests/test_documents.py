@@ -5,16 +5,19 @@ import shlex
 from pathlib import Path
 
 import pytest
+from simulated import autopilot
 
 from edgevpr.cli.main import command_line
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "deploy/README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+SIMULATED_AUTOPILOT = f"python {Path(autopilot.__file__).relative_to(ROOT)} "
 BLOCK = re.compile(r"^```(?:sh|text|console)?\n(.*?)^```", re.M | re.S)
 
 
 def read_commands(page: Path) -> list[str]:
-    """Return the commands of edgevpr in the blocks of a page, without prompts, comments and continuations."""
+    """Return the commands of edgevpr and of the simulated autopilot in the blocks of a page, without prompts, comments
+    and continuations."""
     commands = []
     for block in BLOCK.findall(page.read_text("utf-8")):
         lines = block.replace("\\\n", " ").splitlines()
@@ -24,15 +27,17 @@ def read_commands(page: Path) -> list[str]:
                 continue
             for command in re.split(r"&&|;|\|", line.removeprefix("$ ").partition("  #")[0]):
                 words = command.strip()
-                if words.startswith("edgevpr ") and "..." not in words:
+                if words.startswith(("edgevpr ", SIMULATED_AUTOPILOT)) and "..." not in words:
                     commands.append(words)
     return commands
 
 
 def is_valid(command: str) -> bool:
     """Return whether the command line takes a command; a wrong one is explained on stderr."""
+    is_simulated = command.startswith(SIMULATED_AUTOPILOT)
+    parser = autopilot.command_line() if is_simulated else command_line()
     try:
-        command_line().parse_args(shlex.split(command, comments=True)[1:])
+        parser.parse_args(shlex.split(command, comments=True)[2 if is_simulated else 1 :])
     except SystemExit as ended:
         return ended.code == 0
     return True

@@ -8,6 +8,7 @@ import pytest
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from mavlink_peers import AutopilotThread, Peer, UdpPort, link_to, wait_until
 from pictures import textured
+from simulated.motion import TrueState
 
 from edgevpr.core.errors import ImageError
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -15,7 +16,6 @@ from edgevpr.frames.devices import DeviceCapture
 from edgevpr.frames.live import LiveSource
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
-from edgevpr.lab.simulate.motion import TrueState
 from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.messages import Fix, Severity
 from edgevpr.mavlink.wire import mavlink

@@ -61,7 +61,6 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
         ("every technique on a small board", "--places 10000 --board rpi-zero-2w --camera nadir"),
     ),
     "eval": (("techniques on a data set", "--data my_set/ --techniques cohog,hog --camera nadir"),),
-    "simulate autopilot": (("a plane that loses GPS", "--track later/positions.csv --gps-s 30"),),
     "simulate flight": (
         ("a generated mapping flight", "mapping"),
         ("a later one over the same ground", "later --which query"),

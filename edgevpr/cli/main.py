@@ -22,7 +22,7 @@ EXIT_CODES = {
     "be used.",
     2: "The request is wrong: the words of the command, the configuration, or a table or a log that it names. Nothing "
     "was begun, and trying again does not help: systemd starts the service no more. `check` ends so where `run` does.",
-    130: "Stopped by Ctrl-C. What is ended so (`run`, `top`, `simulate autopilot`) ends with 0 or 1.",
+    130: "Stopped by Ctrl-C. What is ended so (`run`, `top`) ends with 0 or 1.",
 }
 _GROUPS = (positions, maps, fleet, flying, top, review, profile, evaluation, simulation, networks)
 

@@ -116,7 +116,7 @@ def add_known(parser: ArgumentParser) -> None:
 
 
 def add_parameters(parser: ArgumentParser, text: str, form: str = "KEY=VALUE") -> None:
-    """Add --param, for parameters of a technique or a vehicle. It may be repeated. `text` is its help."""
+    """Add --param, for parameters of a technique. It may be repeated. `text` is its help."""
     parser.add_argument("--param", action="append", default=[], metavar=form, help=text)
 
 
@@ -143,11 +143,11 @@ def load_command_config(args: Namespace, path: str | None = None, **others: Any)
     return load_config(path, said | others)
 
 
-def parse_parameters(pairs: list[str], example: str = "gt=0.4") -> dict[str, str]:
+def parse_parameters(pairs: list[str]) -> dict[str, str]:
     """Read ["gt=0.4"] as {"gt": "0.4"}. Raises UsageError for another form."""
     for pair in pairs:
         if "=" not in pair:
-            raise UsageError(f"--param {pair}: write KEY=VALUE, e.g. {example}.")
+            raise UsageError(f"--param {pair}: write KEY=VALUE, e.g. gt=0.4.")
     return dict(pair.split("=", 1) for pair in pairs)
 
 

@@ -1,18 +1,13 @@
-"""`edgevpr simulate` and `edgevpr demo`: write the images of a generated flight, run a simulated flight controller, and
-demonstrate all steps from map to match."""
+"""`edgevpr simulate` and `edgevpr demo`: write the images of a generated flight, and demonstrate all steps from map to
+match."""
 
-import math
-import signal
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from edgevpr.cli.shared import add_json, add_parameters, command, group, parse_parameters, positive, show
+from edgevpr.cli.shared import command, group
 from edgevpr.core.errors import UsageError
 
-# The vehicles of edgevpr.lab.simulate.controller, which is not imported for a page of help.
-_VEHICLES = ("arduplane", "arducopter", "px4-copter", "px4-plane")
-_PARAMETER = "GPS2_TYPE=14"  # an example
 # Number flags of a flight over an orthophoto: (default, least, greatest, help text).
 _NUMBERS: dict[str, tuple[float | None, float, float, str]] = {
     "height_m": (None, 1.0, 10_000.0, "height above ground in metres (default: that of the track)"),
@@ -23,29 +18,7 @@ _NUMBERS: dict[str, tuple[float | None, float, float, str]] = {
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    simulations = group(commands, "simulate", "generate flights, simulate an autopilot")
-    autopilot = command(simulations, "autopilot", simulate_autopilot, "simulate an autopilot that answers and counts")
-    autopilot.add_argument(
-        "--link",
-        default="udpin:127.0.0.1:14550",
-        metavar="URL",
-        help="address to listen at (default: udpin:127.0.0.1:14550)",
-    )
-    autopilot.add_argument(
-        "--track", metavar="CSV", help="positions.csv with times, to fly along from the first message of a flight on"
-    )
-    autopilot.add_argument("--vehicle", choices=_VEHICLES, default=_VEHICLES[0], help=f"({_VEHICLES[0]})")
-    autopilot.add_argument(
-        "--no-gps", action="store_true", help="start without GPS, as always without --track; then fixes are accepted"
-    )
-    autopilot.add_argument(
-        "--gps-s",
-        type=positive,
-        metavar="X",
-        help="lose GPS this many seconds after the start of --track, in an unknown wind of 6 m/s",
-    )
-    add_parameters(autopilot, f"a parameter of the vehicle, e.g. {_PARAMETER}, as if set before it was started")
-    add_json(autopilot)
+    simulations = group(commands, "simulate", "generate the images of flights")
     text = "generate the images and positions.csv of a flight"
     flight = command(simulations, "flight", simulate_flight, text)
     flight.add_argument("out", metavar="DIR")
@@ -70,22 +43,6 @@ def _seed(text: str) -> int:
     if (value := int(text)) < 0:
         raise ValueError
     return value
-
-
-def simulate_autopilot(args: Namespace) -> int:
-    """Run `simulate autopilot`: run a simulated flight controller, and then print what it received."""
-    from edgevpr.lab.simulate.autopilot import run_autopilot
-    from edgevpr.lab.simulate.motion import read_track
-
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: it says what it has heard
-    track = read_track(args.track) if args.track else None
-    has_gps = track is not None and not args.no_gps
-    if args.gps_s and not has_gps:
-        raise UsageError("--gps-s goes with --track, and without --no-gps: there is no GPS to be lost.")
-    flight: dict[str, Any] = {"track": track, "gps": has_gps, "gps_until_s": args.gps_s or math.inf}
-    parameters = parse_parameters(args.param, _PARAMETER)
-    show(run_autopilot(args.link, vehicle=args.vehicle, parameters=parameters, **flight), args.json)
-    return 0
 
 
 def simulate_flight(args: Namespace) -> int:

@@ -224,7 +224,6 @@ def test_main_exits_with_documented_codes_and_check_as_run_does(capsys, flight, 
         (2, ["report", tmp_path / "no.jsonl", "--out", tmp_path / "r.html"]),
         (2, ["replay", tmp_path / "no.jsonl"]),
         (2, ["doctor"]),
-        (2, ["simulate", "autopilot", "--link", "udp:1"]),
     ]
     for code, argv in words:
         assert main([str(word) for word in argv]) == code, argv

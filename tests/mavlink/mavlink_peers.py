@@ -11,7 +11,8 @@ from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
 
-from edgevpr.lab.simulate.autopilot import AutopilotSummary, run_autopilot
+from simulated.autopilot import AutopilotSummary, run_autopilot
+
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.link import Link

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conversing import STATE, Autopilot, Ear
+from simulated.firmware import ARDUPILOT as ARDUPILOT_PARAMETERS
+from simulated.firmware import PX4 as PX4_PARAMETERS
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
-from edgevpr.lab.simulate.firmware import ARDUPILOT as ARDUPILOT_PARAMETERS
-from edgevpr.lab.simulate.firmware import PX4 as PX4_PARAMETERS
 from edgevpr.mavlink.ardupilot_parameters import choose_ardupilot_channel
 from edgevpr.mavlink.channel import Channel, Kind
 from edgevpr.mavlink.messages import Fix

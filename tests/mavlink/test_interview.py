@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import pytest
 from conversing import Autopilot
+from simulated.firmware import ARDUPILOT, PX4
 
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.lab.simulate.firmware import ARDUPILOT, PX4
 from edgevpr.mavlink.channel import OLD_NAMES, Channel
 from edgevpr.mavlink.messages import Fix, Severity
 from edgevpr.mavlink.wire import mavlink

@@ -1,8 +1,8 @@
 """The table of parameters: what is right, what is dangerous, and what to change."""
 
 import pytest
+from simulated.firmware import ARDUPILOT, PX4
 
-from edgevpr.lab.simulate.firmware import ARDUPILOT, PX4
 from edgevpr.mavlink.channel import OLD_NAMES, Channel, Kind
 from edgevpr.mavlink.interview import TABLES
 from edgevpr.mavlink.wire import mavlink

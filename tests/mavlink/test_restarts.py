@@ -2,9 +2,9 @@
 
 import pytest
 from conversing import Autopilot, Ear
+from simulated.firmware import ARDUPILOT
 
 from edgevpr.core.types import Position
-from edgevpr.lab.simulate.firmware import ARDUPILOT
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.wire import mavlink
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from air import match_at
 from fakes import FakeClock
+from simulated.controller import STEP_S, FlightController
+from simulated.motion import Hover, displacement_m
 
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import Levelled, View
-from edgevpr.lab.simulate.controller import STEP_S, FlightController
 from edgevpr.lab.simulate.generated import ORIGIN
-from edgevpr.lab.simulate.motion import Hover, displacement_m
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.messages import Health

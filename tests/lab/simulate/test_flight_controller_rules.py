@@ -5,10 +5,10 @@ import math
 import pytest
 from freeflight import Piloted
 from pilots import state_at
+from simulated.controller import FlightController
+from simulated.motion import GRAVITY_M_S2, Hover, TrueState, tilt_for
 
-from edgevpr.lab.simulate.controller import FlightController
 from edgevpr.lab.simulate.generated import ORIGIN
-from edgevpr.lab.simulate.motion import GRAVITY_M_S2, Hover, TrueState, tilt_for
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.wire import mavlink

@@ -1,6 +1,5 @@
 """The simulated flight controller: strict, and honest about what it saw."""
 
-import json
 import math
 import socket
 import subprocess
@@ -8,15 +7,13 @@ import sys
 import time
 
 import pytest
-from documented import require_documented
 from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, link_to, wait_until
+from simulated import autopilot
+from simulated.autopilot import run_autopilot
+from simulated.controller import FlightController
+from simulated.motion import AlongTrack, TrueState, interpolate_track, read_track
 
-from edgevpr.cli.main import main
-from edgevpr.cli.simulation import _VEHICLES
 from edgevpr.core.errors import LinkError, UsageError
-from edgevpr.lab.simulate.autopilot import run_autopilot
-from edgevpr.lab.simulate.controller import VEHICLES, FlightController
-from edgevpr.lab.simulate.motion import AlongTrack, TrueState, interpolate_track, read_track
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.asking import Inquiry, read_autopilot
@@ -182,15 +179,14 @@ def test_run_autopilot_reports_a_link_that_cannot_be_opened(link):
 
 
 @pytest.mark.process
-def test_simulate_autopilot_sets_parameters_and_prints_its_summary():
+def test_script_sets_parameters_and_prints_its_summary():
     number = free_port()
-    link = f"udpin:127.0.0.1:{number}"
-    command = ["simulate", "autopilot", "--vehicle", "arducopter", "--param", "GPS2_TYPE=14", "--link", link, "--json"]
+    flags = ["--vehicle", "arducopter", "--param", "GPS2_TYPE=14", "--link", f"udpin:127.0.0.1:{number}"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "edgevpr", *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, autopilot.__file__, *flags], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     try:
-        said = process.stderr.readline()
+        assert "a simulated arducopter that has lost GPS" in process.stderr.readline()
         with Inquiry(parse_link(f"udpout:127.0.0.1:{number}")) as asking:
             assert asking.heartbeat().type == mavlink.MAV_TYPE_QUADROTOR
             assert asking.parameters(["GPS2_TYPE"], bytewise=False) == {"GPS2_TYPE": 14}
@@ -199,31 +195,6 @@ def test_simulate_autopilot_sets_parameters_and_prints_its_summary():
     finally:
         process.kill()
         process.wait()
-    assert said == f"edgevpr: a simulated arducopter that has lost GPS, system 1, is up at {link}\n"
     assert more == ""
-    assert json.loads(printed)["companion"] is None, "who only asks is none"
-    require_documented("edgevpr simulate autopilot", printed)
-
-
-@pytest.mark.parametrize(
-    ("written", "sentence"),
-    [
-        ("GPS2_TIPE=14", "it has AHRS_EKF_TYPE, "),
-        ("GPS2_TYPE=1.5", "its value is a whole number"),
-        ("GPS2_TYPE=99999999999", "its value is a whole number"),
-        ("SIM_WIND_SPD=nan", "its value is a number"),
-        ("SIM_WIND_SPD=fast", "its value is a number"),
-        ("GPS2_TYPE", "write KEY=VALUE, e.g. GPS2_TYPE=14."),
-    ],
-)
-def test_simulate_autopilot_refuses_a_wrong_parameter_in_a_sentence(written, sentence, capsys):
-    link = f"udpin:127.0.0.1:{free_port()}"
-    assert main(["simulate", "autopilot", "--link", link, "--param", written]) == 2
-    printed, said = capsys.readouterr()
-    assert printed == ""
-    assert sentence in said
-    assert said.count("\n") == 1
-
-
-def test_simulate_autopilot_offers_every_vehicle():
-    assert set(_VEHICLES) == set(VEHICLES)
+    summary = dict(line.split(maxsplit=1) for line in printed.splitlines())
+    assert (summary["companion"], summary["fixes_accepted"]) == ("None", "0"), "who only asks is none"

@@ -1,24 +1,31 @@
 """A simulated autopilot at the other end of a MAVLink link, as strict as a real one: `FlightController` connected to a
-port and to the clock. Used by `edgevpr simulate` and by tests. A *companion* is an onboard computer, such as the one
-that runs edgevpr."""
+port and to the clock. Used by tests, and by people: `python tests/simulated/autopilot.py --help`. A *companion* is an
+onboard computer, such as the one that runs edgevpr."""
 
 import logging
 import math
 import select
+import signal
+import sys
 import threading
 import time
+from argparse import ArgumentParser
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from types import MappingProxyType
 
-from edgevpr.core.errors import LinkError
-from edgevpr.lab.simulate.controller import STEP_S, FlightController
-from edgevpr.lab.simulate.motion import AlongTrack, FlownTrack, Motion
+from edgevpr.cli.shared import parse_parameters
+from edgevpr.core.errors import EdgevprError, LinkError
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.messages import AUTOPILOT
 from edgevpr.mavlink.ports import Port, open_port
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink
+
+sys.path.append(str(Path(__file__).parents[1]))
+from simulated.controller import STEP_S, VEHICLES, FlightController
+from simulated.motion import AlongTrack, FlownTrack, Motion, read_track
 
 _QUESTIONS = {"HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PING", "TIMESYNC"}
 _MAX_WAITING_BYTES = 65_536  # of a port that accepts none: messages beyond that are lost
@@ -154,3 +161,35 @@ def _is_question(message: Message) -> bool:
     if message.get_type() in ("COMMAND_INT", "COMMAND_LONG"):
         return bool(message.command == mavlink.MAV_CMD_REQUEST_MESSAGE)
     return message.get_type() in _QUESTIONS
+
+
+def command_line() -> ArgumentParser:
+    """Make the parser of this file's command line."""
+    parser = ArgumentParser(description="Simulate an autopilot that answers and counts, until Ctrl-C.")
+    parser.add_argument("--link", default="udpin:127.0.0.1:14550", metavar="URL", help="address to listen at")
+    parser.add_argument("--track", metavar="CSV", help="positions.csv to fly along once a flight is heard")
+    parser.add_argument("--vehicle", choices=VEHICLES, default="arduplane")
+    parser.add_argument("--no-gps", action="store_true", help="start without GPS, as always without --track")
+    parser.add_argument("--param", action="append", default=[], metavar="KEY=VALUE", help="set its parameter KEY")
+    return parser
+
+
+def main() -> None:
+    """Simulate an autopilot by the command line, and print what it received."""
+    parser = command_line()
+    args = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: it prints what it received
+    try:
+        track = read_track(args.track) if args.track else None
+        parameters = parse_parameters(args.param)
+        gps = track is not None and not args.no_gps
+        summary = run_autopilot(args.link, track=track, vehicle=args.vehicle, gps=gps, parameters=parameters)
+    except EdgevprError as error:
+        parser.error(str(error))
+    for name, value in asdict(summary).items():
+        print(f"{name:15} {value}")
+
+
+if __name__ == "__main__":
+    main()

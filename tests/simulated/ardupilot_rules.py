@@ -9,7 +9,8 @@ behaviour of a copter without GPS was observed in ArduPilot's own simulator.
 import math
 
 from edgevpr.core.arrays import LatLon
-from edgevpr.lab.simulate.firmware import (
+from edgevpr.mavlink.wire import Message, mavlink
+from simulated.firmware import (
     ARDUPILOT,
     ARDUPILOT_PLANE,
     DENIED,
@@ -19,9 +20,8 @@ from edgevpr.lab.simulate.firmware import (
     Firmware,
     Origin,
 )
-from edgevpr.lab.simulate.motion import Motion, displace
-from edgevpr.lab.simulate.sensors import FIX_3D, PositionMeasurement
-from edgevpr.mavlink.wire import Message, mavlink
+from simulated.motion import Motion, displace
+from simulated.sensors import FIX_3D, PositionMeasurement
 
 _DEAD_RECKONING_S = 1.0
 _POSITION_LOST_S = 7.0

@@ -10,10 +10,10 @@ from typing import ClassVar
 
 from edgevpr.core.arrays import LatLon
 from edgevpr.core.errors import UsageError
-from edgevpr.lab.simulate.estimator import Estimator
-from edgevpr.lab.simulate.motion import Motion, displace, displacement_m
-from edgevpr.lab.simulate.sensors import PositionMeasurement, Receivers
 from edgevpr.mavlink.wire import Message, mavlink, parameter_value
+from simulated.estimator import Estimator
+from simulated.motion import Motion, displace, displacement_m
+from simulated.sensors import PositionMeasurement, Receivers
 
 # Standard deviations that an innovation may have: EK3_POS_I_GATE, EK3_VEL_I_GATE, EKF2_GPS_P_GATE
 GATE_SD = 5.0

@@ -12,10 +12,10 @@ import math
 from dataclasses import dataclass
 
 from edgevpr.core.arrays import LatLon
-from edgevpr.lab.simulate.firmware import FAILED, GATE_SD, NOT_NOW, OK, POSITION_NOISE_M, PX4, Firmware
-from edgevpr.lab.simulate.motion import Motion, displace
-from edgevpr.lab.simulate.sensors import FIX_3D, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
+from simulated.firmware import FAILED, GATE_SD, NOT_NOW, OK, POSITION_NOISE_M, PX4, Firmware
+from simulated.motion import Motion, displace
+from simulated.sensors import FIX_3D, PositionMeasurement
 
 _AIDING_GONE_S = 1.0  # no_aid_timeout_max
 _GOOD_RATIO = 0.1

@@ -4,13 +4,13 @@ is an argument, in seconds from its start. Used by `autopilot` and by tests."""
 import math
 from collections.abc import Callable
 
-from edgevpr.lab.simulate.ardupilot_rules import ArduPilot
-from edgevpr.lab.simulate.firmware import DENIED, FAILED, OK, UNSUPPORTED, Firmware
-from edgevpr.lab.simulate.motion import Motion
-from edgevpr.lab.simulate.px4_rules import Px4
-from edgevpr.lab.simulate.reports import FILTER_REPORTS, REPORTS, Report
 from edgevpr.mavlink.messages import AUTOPILOT
 from edgevpr.mavlink.wire import Message, mavlink
+from simulated.ardupilot_rules import ArduPilot
+from simulated.firmware import DENIED, FAILED, OK, UNSUPPORTED, Firmware
+from simulated.motion import Motion
+from simulated.px4_rules import Px4
+from simulated.reports import FILTER_REPORTS, REPORTS, Report
 
 STEP_S = 0.02
 VEHICLES: dict[str, Callable[[Motion], Firmware]] = {

@@ -4,10 +4,10 @@ message, or None if there is nothing to report. Used by `controller`."""
 import math
 from collections.abc import Callable
 
-from edgevpr.lab.simulate.firmware import Firmware
-from edgevpr.lab.simulate.motion import GRAVITY_M_S2, TrueState, tilt_for
-from edgevpr.lab.simulate.sensors import NOTHING, PositionMeasurement
 from edgevpr.mavlink.wire import Message, mavlink
+from simulated.firmware import Firmware
+from simulated.motion import GRAVITY_M_S2, TrueState, tilt_for
+from simulated.sensors import NOTHING, PositionMeasurement
 
 Report = Callable[[Firmware], Message | None]
 _UNKNOWN_16 = 65_535

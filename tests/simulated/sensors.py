@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from edgevpr.core.arrays import LatLon
-from edgevpr.lab.simulate.motion import TrueState, displace, displacement_m
 from edgevpr.mavlink.wire import Message, mavlink
+from simulated.motion import TrueState, displace, displacement_m
 
 NO_FIX, FIX_3D = mavlink.GPS_FIX_TYPE_NO_FIX, mavlink.GPS_FIX_TYPE_3D_FIX
 _BEST_FIX = mavlink.GPS_FIX_TYPE_RTK_FIXED  # as ArduPilot's simulator has it

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from edgevpr.lab.simulate.motion import GRAVITY_M_S2
+from simulated.motion import GRAVITY_M_S2
 
 LEAST_SD_M = 0.3
 _LOOP_S = 0.01  # EKF_TARGET_DT: noise is given as a standard deviation for one step of this length
