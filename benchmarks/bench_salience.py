@@ -21,7 +21,7 @@ import detectors
 import numpy as np
 import walks
 from base import DATA, Row, camera_of
-from matchability import NOT_LEARNT, fit, label_site, leave_one_out, site_of, write_network
+from train_matchability import NOT_LEARNT, fit, label_site, leave_one_out, site_of, write_network
 
 from edgevpr.core.config import load_config
 from edgevpr.core.text import progress

@@ -1,8 +1,8 @@
 """Networks of the gate, each with a card: one tells how well the parts of a frame can be remembered (thesis 3.2.1), the
 other, an object detector, which of its pixels show nothing movable (thesis 3.2.2).
 
-`benchmarks/matchability.py` fits a network of memorability of another meaning: how likely a crop is to be found again
-in another picture.
+`models/recipes/train_matchability.py` fits a network of memorability of another meaning: how likely a crop is to be
+found again in another picture.
 
 Each family of detectors has a decoder here. It takes the outputs in the order of the card and the input's (height,
 width) in pixels, and returns

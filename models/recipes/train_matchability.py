@@ -1,5 +1,5 @@
 """How the network of matchability is fitted that edgevpr ships: it says how likely a picture's parts are found again
-(thesis 7.2, item 2). `python benchmarks/matchability.py OUT.onnx` fits it to the sets that were used for it.
+(thesis 7.2, item 2). `python models/recipes/train_matchability.py OUT.onnx` fits it to the sets that were used for it.
 
 A map of a site is asked about each of its own places, changed in view, light and sharpness, from hardly at all to
 beyond recognition. Labels come so without any truth: the right answer is the place itself. Its neighbours are left out,
@@ -16,10 +16,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import base
 import numpy as np
 import torch
-import walks
 from torch import nn
 from torch.nn import functional
 from write_onnx import ModelFile, write_model
@@ -31,6 +29,11 @@ from edgevpr.lab.evaluate.metrics import roc_auc
 from edgevpr.runtime.recognise.gate_networks import prepare_crops
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import InputRule
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks"))
+
+import base
+import walks
 
 # Sets of which no network learns: of five places, and of 64x32 pixels.
 NOT_LEARNT = ("grief_michigan_monthly", "grief_stromovka_monthly", "nordland_tiny")
@@ -251,8 +254,8 @@ def main() -> None:
     sites = [site_of(name, labels) for name, labels in labelled.items()]
     unseen = [each for each in leave_one_out(sites, 1)["generated"].values() if each is not None]
     source = (
-        f"benchmarks/matchability.py; {sum(map(len, labelled.values()))} pictures of {', '.join(labelled)}; on "
-        f"a site left out {np.mean(unseen):.2f} of pairs of changed pictures in the right order"
+        f"models/recipes/train_matchability.py; {sum(map(len, labelled.values()))} pictures of "
+        f"{', '.join(labelled)}; on a site left out {np.mean(unseen):.2f} of pairs of changed pictures in the right order"
     )
     write_network(fit(sites, 1), Path(sys.argv[1]), "Matchability, trained by edgevpr", source, sites[0])
 
