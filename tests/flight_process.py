@@ -1,14 +1,17 @@
 """`edgevpr run` as a process of its own, looked at from outside: its log, its memory, its CPU time."""
 
+import json
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import cv2
+from mavlink_peers import free_port
 from pictures import textured
 
 from edgevpr.runtime.flight.flightlog import read_log
@@ -35,6 +38,27 @@ def start(
         text=True,
         env={**os.environ, **environment},
     )
+
+
+@contextmanager
+def simulated_autopilot(*flags: str):
+    """A simulated flight controller as a process, up: its link, and a call that ends it and tells what it saw."""
+    port = free_port()
+    command = ["-m", "edgevpr", "simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--json", *flags]
+    process = subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+    def asked() -> dict[str, Any]:
+        process.terminate()
+        return json.loads(process.communicate(timeout=_PATIENCE_S)[0])
+
+    try:
+        assert "is up" in process.stderr.readline()
+        yield f"udpout:127.0.0.1:{port}", asked
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        process.stderr.close()
 
 
 def wait_for(kind: str, log: Path, process: subprocess.Popen) -> dict[str, Any]:

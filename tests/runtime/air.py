@@ -42,7 +42,7 @@ def match_at(
         frame=Frame(image=_PICTURE, name=f"{t_s:.1f} s", t_mono_s=t_s),
         vehicle=vehicle,
         picture=view and Levelled(_PICTURE, None, view),
-        best=Candidate(Place(place_id=places[0], source_image="", position=position), FineMatch(0.5)),
+        best=Candidate(Place(place_id=places[0] if places else 1, source_image="", position=position), FineMatch(0.5)),
         accepted=True,
         located=Located(position=position, covariance_m2=(sd_m**2, 0.0, sd_m**2), places=tuple(places), lean=lean),
         accuracy_m=sd_m,

@@ -129,3 +129,16 @@ def flight_meter(flight: Flight, kind: type[FlightMeter] = FlightMeter, **more) 
 
 def of_kind(lines: list[dict], kind: str) -> list[dict]:
     return [line for line in lines if line["kind"] == kind]
+
+
+def nothing() -> None:
+    """Do nothing to a map."""
+
+
+def fly_acts(place_map: Path, log: Path, acts) -> tuple[list[dict], list[dict], Flight]:
+    """Fly over the first places of a map, an act before each frame. Returns the queries, all lines, and the flight."""
+    clock, calls = FakeClock(), iter(acts)
+    flight = Flight(place_map, log, clock, FakeLink(clock), **{"source.rate_hz": 1.0})
+    seen = [textured(number % PLACES, 240, 320) for number in range(len(acts))]
+    lines = flight.fly(FakeSource(seen, clock, work=lambda: next(calls)()))
+    return of_kind(lines, "query"), lines, flight

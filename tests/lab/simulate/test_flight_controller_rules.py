@@ -86,17 +86,6 @@ def test_ardupilot_fails_a_fix_for_a_second_after_the_loss_and_without_an_origin
     assert flown.fix() == ACCEPTED
 
 
-def test_plane_drifts_only_with_the_wind_that_it_does_not_know():
-    known = Flown("arduplane", SIM_WIND_SPD=6).in_air()
-    known.wait(30)
-    known.controller.set("SIM_GPS1_ENABLE", 0)
-    assert known.wait(60).error_m < 10
-    unknown = lost("arduplane").wait(150)
-    assert unknown.error_m == pytest.approx(767, rel=0.05)
-    assert unknown.truth.roll_deg > 20, "it circles"
-    assert unknown.controller.brain.is_armed
-
-
 def gps_input(place: TrueState, north_m: float = 0.0, satellites: int = 6, fix_type: int = 3, accuracy_m: float = 1.0):
     velocity_m_s = place.velocity_m_s.real, place.velocity_m_s.imag, 0.0
     at = place.lat_deg + north_m / 111_195, place.lon_deg, place.alt_m
@@ -141,12 +130,6 @@ def test_primary_receiver_with_better_fix_wins_at_once():
     flown = beside_own(1, told={"fix_type": 4})
     assert flown.controller.brain.receivers.primary.fix_type == 4
     assert flown.wait(5).controller.brain.receivers.primary.fix_type == 3, "ours is silent"
-
-
-@pytest.mark.parametrize(("primary", "switch"), [(1, 0), (1, 4)])
-def test_gps_primary_chooses_receiver(primary, switch):
-    assert beside_own(20, GPS_PRIMARY=primary, GPS_AUTO_SWITCH=switch).error_m == pytest.approx(1.0, abs=0.1)
-    assert beside_own(20, GPS_PRIMARY=0, GPS_AUTO_SWITCH=switch).error_m < 0.1
 
 
 def test_receivers_are_blended_by_their_accuracies():
@@ -244,12 +227,6 @@ def test_px4_on_the_ground_without_gps_starts_from_a_fix():
     assert "GLOBAL_POSITION_INT" in {each.get_type() for each in flown.said}, "streams that come by themselves"
 
 
-def test_px4_copter_without_any_aid_has_no_position_after_five_seconds():
-    flown = lost("px4-copter").wait(4)
-    assert flown.flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
-    assert not flown.wait(3).flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
-
-
 def sensed(flown: Flown, north_m: float = 0.0, eph_m: float = 5.0, number: int = 1):
     at = flown.truth.lat_deg + north_m / 111_195, flown.truth.lon_deg
     message = messages.position_sensor(state_at(0.0, *at, accuracy_m=eph_m))
@@ -309,22 +286,6 @@ def test_px4_beside_good_gps_refuses_ours_that_contradict_and_fuses_those_within
     flown = sends(Flown("px4-copter").in_air(), 20, north_m=100.0, eph_m=1.0)
     assert flown.error_m < 0.1
     assert 0.05 < sends(flown, 20, north_m=2.0, eph_m=1.0).error_m < 1
-
-
-def test_px4_stops_to_fuse_a_receiver_that_is_flagged_as_spoofed_after_seven_seconds():
-    flown, fused = Flown("px4-copter").in_air(), mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
-    flown.controller.set("SIM_GPS_SPOOF", 1)
-    assert flown.wait(6).flags & fused
-    assert not flown.wait(3).flags & fused
-    flown.controller.set("SIM_GPS_SPOOF", 0)
-    assert flown.wait(2).flags & fused
-
-
-def test_px4_takes_no_position_from_gps_while_its_parameter_forbids_it():
-    flown, fused = Flown("px4-copter").in_air(), mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
-    for control, is_fused in ((0, False), (7, True), (4, False)):
-        flown.controller.set("EKF2_GPS_CTRL", control)
-        assert bool(flown.wait(2).flags & fused) == is_fused
 
 
 def test_parameters_are_listed_with_their_indices():

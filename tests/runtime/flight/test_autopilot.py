@@ -145,6 +145,7 @@ def test_ten_pictures_of_nothing_are_reported_once_and_so_is_the_ground_after_th
     lines = flight_over(recording, tmp_path, link, clock).fly(source)
     queries, reported = of_kind(lines, "query"), ["camera shows nothing", "camera shows ground again"]
     assert [line["accepted"] for line in queries] == [True, *[False] * 15, *[True] * 3]
+    assert all(line["reason"]["code"] == "LOW_TEXTURE" for line in queries[1:16])
     assert queries[1]["fix"] is queries[1]["place"] is None
     assert link.texts() == [(4, f"edgevpr: {reported[0]}"), (6, f"edgevpr: {reported[1]}")]
     assert [line["note"]["code"] for line in of_kind(lines, "camera")] == ["NOTHING_SHOWN", "GROUND_SHOWN"]

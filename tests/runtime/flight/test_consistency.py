@@ -1,25 +1,22 @@
 """A fix that contradicts the autopilot's own position is held back until a second, independent one says the same."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from air import match_at
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import STEP_DEG, Flight, of_kind
 from pictures import textured
 
-from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.core.types import Candidate, Frame, Place, Position, QueryCost, Steps
-from edgevpr.frames.level import Levelled, View
+from edgevpr.core.types import Position
+from edgevpr.frames.level import View
 from edgevpr.runtime.flight.consistency import ComparedFix, Consistency
 from edgevpr.runtime.flight.measurements import FrameMeasurement, PositionedMatch
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.recognise.locate import Located
-from edgevpr.runtime.recognise.recognition import Recognition
 
-NO_COST = QueryCost(
-    t_encode_s=0, t_match_s=0, u_encode=0, u_match=0, cpu_s=0, rss_mb=0, used_mah=0, marginal_mah=0
-)  # fmt: skip
 HOME = 50.0, 8.0
 START_S = 1000.0
 
@@ -47,24 +44,9 @@ class Aircraft:
         if heard:
             self.go_on(START_S + after_s)
         here = moved(self.vehicle.lat_deg, self.vehicle.lon_deg, *off_m)
-        frame = Frame(image=np.zeros((8, 8), np.uint8), name="f", t_mono_s=START_S + after_s)
-        place = Place(place_id=places[0] if places else 1, source_image="", position=Position(*here))
-        event = Recognition(
-            frame=frame,
-            picture=Levelled(frame.image, None, View(up_deg=0.0)),
-            vehicle=self.vehicle,
-            best=Candidate(place, FineMatch(0.5)),
-            accepted=True,
-            located=Located(
-                position=Position(*here),
-                covariance_m2=(fix_sd_m**2, 0.0, fix_sd_m**2),
-                places=places,
-                heading_deg=turned_deg,
-            ),
-            accuracy_m=fix_sd_m,
-            steps=Steps(),
-            cost=NO_COST,
-        )
+        view = View(up_deg=0.0)
+        event = match_at(Position(*here), START_S + after_s, self.vehicle, fix_sd_m, places, view)
+        event = replace(event, located=replace(event.located, heading_deg=turned_deg))
         return self.navigator.advise(event, START_S + after_s)
 
     def held(self, *fixes):

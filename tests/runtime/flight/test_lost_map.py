@@ -7,7 +7,7 @@ import sqlite3
 
 import pytest
 from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
-from flights import PLACES, Flight, of_kind
+from flights import PLACES, Flight, fly_acts, nothing, of_kind
 from pictures import textured
 
 from edgevpr.places.geopackage import point_blob
@@ -20,20 +20,6 @@ SAID = [(4, "edgevpr: its map cannot be read, see its log"), (6, "edgevpr: its m
 def place_map(recording, tmp_path):
     shutil.copy(recording / "cohog.gpkg", tmp_path / "m.gpkg")
     return tmp_path / "m.gpkg"
-
-
-def fly(place_map, log, acts):
-    """A flight over the first places of the map; before each frame one of the acts is done."""
-    clock = FakeClock()
-    flight = Flight(place_map, log, clock, FakeLink(clock), **{"source.rate_hz": 1.0})
-    calls = iter(acts)
-    pictures = [textured(n % PLACES, 240, 320) for n in range(len(acts))]
-    lines = flight.fly(FakeSource(pictures, clock, work=lambda: next(calls)()))
-    return of_kind(lines, "query"), lines, flight
-
-
-def nothing():
-    pass
 
 
 class Locked:
@@ -60,7 +46,7 @@ def test_a_locked_map_refuses_at_once_and_is_used_again_when_it_is_free(place_ma
 
     maps, opened = [], PlaceMap.open
     monkeypatch.setattr(PlaceMap, "open", lambda path: maps.append(opened(path)) or maps[-1])
-    queries, lines, flight = fly(
+    queries, lines, flight = fly_acts(
         place_map, tmp_path / "log", [look, other.lock, *[nothing] * 8, other.unlock, look, look]
     )
     assert waits_ms == [50, 50, 50], "no query waits for longer, also when the file has been opened anew"
@@ -98,7 +84,7 @@ def test_a_map_that_is_gone_refuses_and_is_used_again_when_it_is_back(recording,
             place_map.unlink()
         place_map.write_bytes(whole)
 
-    queries, _, flight = fly(place_map, tmp_path / "log", [nothing, lose, nothing, nothing, restore, nothing])
+    queries, _, flight = fly_acts(place_map, tmp_path / "log", [nothing, lose, nothing, nothing, restore, nothing])
     assert [line["accepted"] for line in queries] == [True, False, False, False, True, True], queries[-1]["reason"]
     assert all(line["reason"]["code"] == "MAP_UNREADABLE" for line in queries[1:4])
     assert flight.link.texts() == SAID
@@ -124,7 +110,7 @@ def test_another_map_in_its_place_is_refused_and_said_once(recording, tmp_path, 
         else:
             other.rename(place_map)
 
-    queries, _, flight = fly(place_map, tmp_path / "log", [nothing, replace, *[nothing] * 4])
+    queries, _, flight = fly_acts(place_map, tmp_path / "log", [nothing, replace, *[nothing] * 4])
     assert [line["accepted"] for line in queries] == [True, *[False] * 5]
     assert all(line["reason"]["code"] == "MAP_UNREADABLE" for line in queries[1:])
     assert flight.link.texts() == SAID[:1]

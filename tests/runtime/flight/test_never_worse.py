@@ -16,6 +16,7 @@ GPS_INPUT = {"SIM_GPS1_TYPE": 5, "GPS2_TYPE": 14}  # the receiver's fix is a pla
 ODOMETRY = {"VISO_TYPE": 1, "EK3_SRC2_POSXY": 6}
 SENSOR = {"EKF2_AGP0_CTRL": 1}
 VISION = {"EKF2_AGP0_CTRL": 0, "EKF2_EV_CTRL": 1}
+HAS_POSITION = mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_HORIZ_ABS
 
 px4_channels = pytest.mark.parametrize("parameters", [SENSOR, VISION], ids=["message 296", "ODOMETRY"])
 with_and_without_matches = pytest.mark.parametrize("matches", [True, False], ids=["matches", "no matches"])
@@ -50,6 +51,8 @@ def test_source_set_with_odometry_does_not_run_away_beside_gps(matches):
     def choose_second_set(flight):
         if flight.conversation:
             flight.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2)
+            answered_s = flight.conversation.autopilot.answered_s[mavlink.MAV_CMD_SET_EKF_SOURCE_SET]
+            assert answered_s == pytest.approx(1000.0 + flight.now_s, abs=0.1)
 
     assert_no_worse("arducopter", choose_second_set, matches=matches, **ODOMETRY)
 
@@ -146,3 +149,33 @@ def test_map_that_is_off_moves_no_aircraft_with_good_gps(vehicle, parameters):
         flight.map_off_m = 8
 
     assert_no_worse(vehicle, shift_map, watched_s=60.0, **parameters)
+
+
+def test_copter_whose_second_receiver_we_are_flies_on_after_the_loss_of_gps():
+    flight = ClosedLoop("arducopter", **GPS_INPUT).fly(20)
+    lost_s = flight.set("SIM_GPS1_ENABLE", 0).now_s
+    assert flight.fly(40).error_m[-1] < 4
+    assert flight.brain.flags() & HAS_POSITION, "without it a copter lands"
+    sent = [message for t_s, message in flight.sent if message.get_type() == "GPS_INPUT" and t_s > lost_s]
+    assert len(sent) == pytest.approx(400, abs=8), "ten a second"
+    assert {(each.gps_id, each.fix_type) for each in sent} == {(1, mavlink.GPS_FIX_TYPE_3D_FIX)}
+    flight.matches = flight.sees_motion = False
+    flight.fly(75)
+    *_, last = (message for _, message in flight.sent if message.get_type() == "GPS_INPUT")
+    assert last.fix_type == mavlink.GPS_FIX_TYPE_NO_FIX, "a minute without a match"
+    assert not flight.brain.flags() & HAS_POSITION
+
+
+def test_plane_gets_single_fixes_after_the_loss_only_and_takes_them():
+    flight = ClosedLoop("arduplane", matches=False).fly(10)
+    flight.matches, flight.sees_motion = True, False
+    assert not flight.fly(20).positions_sent(0)
+    lost_s = flight.set("SIM_GPS1_ENABLE", 0).set("SIM_WIND_SPD", 6).now_s
+    since_s = flight.fly(15).now_s
+    _, error_m = flight.fly(45).worst_m(since_s)
+    assert error_m < 15
+    assert len(flight.positions_sent(lost_s)) > 30
+    assert {message.get_type() for _, message in flight.sent} & {"GPS_INPUT", "COMMAND_INT"} == {"COMMAND_INT"}
+    flight.matches = False
+    assert flight.fly(20).error_m[-1] < 40, "the wind that matches have shown carries on"
+    assert flight.fly(60).error_m[-1] > 50, "alone it drifts away"

@@ -1,84 +1,93 @@
-"""The autopilot is asked for another set of sources (42007) where its operator allows it, once, over a real link."""
+"""The autopilot is asked for another set of sources (42007) where its operator allows it, once."""
 
 import math
+from dataclasses import replace
 
 import pytest
-from controlled import Controlled
+from air import Air
+from fakes import FakeClock, FakeLink, to_autopilot
 
 from edgevpr.core.config import SourceSetsConfig
-from edgevpr.mavlink.wire import mavlink
+from edgevpr.mavlink.messages import SOURCE_SET, Health
+from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.autopilot import SourceSets
+from edgevpr.runtime.flight.navigator import Navigator
 
 pytestmark = pytest.mark.slow
 
 NEVER = -math.inf
-ASK = mavlink.MAV_CMD_SET_EKF_SOURCE_SET
+SETS = {"source_sets.gps": 1, "source_sets.no_gps": 2}
 ALLOWED = SourceSetsConfig(gps=1, no_gps=2)
+LOAD = MachineLoad((0.5,), 1, 2)
 
 
-def asked(flown):
-    return [int(each.param1) for _, each in flown.commands(ASK)]
+class Flown(Air):
+    """A flight whose autopilot answers at once to what it is asked; `asked` are the times and numbers."""
 
+    def __init__(self, **settings):
+        super().__init__(Navigator(1.0, 1.0, is_muted=not settings.get("send_fixes", True)))
+        self.clock, self.asked = FakeClock(0.0), []
+        self.link = FakeLink(self.clock, vehicle=lambda: self.vehicle)
+        stats = self.link.stats
+        self.link.stats = lambda: replace(stats(), answered_s={SOURCE_SET: self.asked[-1][0]} if self.asked else {})
+        self.autopilot = to_autopilot(self.link, self.navigator, self.clock, **settings)
+        super().fly(20)
 
-def in_air(flown):
-    flown.until(lambda: flown.controller.why_not_arm() is None)
-    flown.controller.arm()
-    return flown.fly(20)
+    def fly(self, seconds):
+        for _ in range(seconds):
+            super().fly(1)
+            self.clock.now_s = self.t_s
+            self.link.sent.clear()
+            self.autopilot.report(Health.ACTIVE, LOAD, None)
+            commands = [each for each in self.link.sent if each.get_type() == "COMMAND_LONG"]
+            to = {(each.command, each.target_system, each.target_component) for each in commands}
+            assert to <= {(SOURCE_SET, 1, 1)}
+            self.asked += [(self.t_s, int(each.param1)) for each in commands]
+        return self
 
+    def find_gps(self):
+        self.has_receiver = self.has_gps = True
 
-def lose_and_find(flown):
-    flown.controller.set("SIM_GPS1_ENABLE", 0)
-    flown.fly(20)
-    flown.controller.set("SIM_GPS1_ENABLE", 1)
-    flown.fly(20)
+    @property
+    def numbers(self):
+        return [number for _, number in self.asked]
 
 
 def test_the_set_without_gps_is_asked_for_once_and_the_other_after_ten_seconds_of_gps():
-    with Controlled("arduplane", source_sets=ALLOWED) as flown:
-        in_air(flown)
-        assert asked(flown) == []
-        lost_s = flown.now_s
-        flown.controller.set("SIM_GPS1_ENABLE", 0)
-        flown.fly(20)
-        assert asked(flown) == [2]
-        assert flown.commands(ASK)[0][0] < lost_s + 6
-        assert flown.brain._source_set == 2
-        found_s = flown.now_s
-        flown.controller.set("SIM_GPS1_ENABLE", 1)
-        flown.fly(20)
-        assert asked(flown) == [2, 1]
-        assert flown.commands(ASK)[1][0] >= found_s + 10
-        assert flown.brain._source_set == 1
-        assert {(each.target_system, each.target_component) for _, each in flown.commands(ASK)} == {(1, 1)}
+    flown = Flown(**SETS).fly(5)
+    assert flown.numbers == []
+    lost_s = flown.t_s
+    flown.lose_gps()
+    assert flown.fly(20).numbers == [2]
+    assert flown.asked[0][0] < lost_s + 6
+    found_s = flown.t_s
+    flown.find_gps()
+    assert flown.fly(20).numbers == [2, 1]
+    assert flown.asked[1][0] >= found_s + 10
 
 
 def test_a_receiver_that_is_wrong_counts_as_none():
-    with Controlled("arduplane", source_sets=ALLOWED) as flown:
-        in_air(flown)
-        flown.autopilot.compare_gps(100.0, is_wrong=True, have_agreed=True)
-        flown.fly(3)
-        assert asked(flown) == [2]
-        flown.autopilot.compare_gps(3.0, is_wrong=False, have_agreed=True)
-        flown.fly(15)
-        assert asked(flown) == [2, 1]
+    flown = Flown(**SETS)
+    flown.autopilot.compare_gps(100.0, is_wrong=True, have_agreed=True)
+    assert flown.fly(3).numbers == [2]
+    flown.autopilot.compare_gps(3.0, is_wrong=False, have_agreed=True)
+    assert flown.fly(15).numbers == [2, 1]
 
 
 def test_a_receiver_that_never_agreed_with_the_map_stays_in_use():
-    with Controlled("arduplane", source_sets=ALLOWED) as flown:
-        in_air(flown)
-        flown.autopilot.compare_gps(100.0, is_wrong=True, have_agreed=False)
-        flown.fly(3)
-        assert asked(flown) == []
+    flown = Flown(**SETS)
+    flown.autopilot.compare_gps(100.0, is_wrong=True, have_agreed=False)
+    assert flown.fly(3).numbers == []
 
 
 @pytest.mark.parametrize(
-    ("gps", "no_gps", "send_fixes"), [(None, None, True), (1, None, True), (None, 2, True), (1, 2, False)]
+    "settings", [{}, {"source_sets.gps": 1}, {"source_sets.no_gps": 2}, SETS | {"send_fixes": False}]
 )
-def test_without_both_numbers_and_in_a_dry_run_none_is_asked_for(gps, no_gps, send_fixes):
-    with Controlled("arduplane", source_sets=SourceSetsConfig(gps, no_gps), send_fixes=send_fixes) as flown:
-        in_air(flown)
-        lose_and_find(flown)
-        assert asked(flown) == []
+def test_without_both_numbers_and_in_a_dry_run_none_is_asked_for(settings):
+    flown = Flown(**settings)
+    flown.lose_gps()
+    flown.fly(20).find_gps()
+    assert flown.fly(20).numbers == []
 
 
 def test_a_question_that_is_not_answered_is_asked_again():

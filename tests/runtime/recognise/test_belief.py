@@ -49,17 +49,6 @@ def is_at(posterior, place):
     return abs(posterior.at[0] - place) <= 2
 
 
-@pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])
-@pytest.mark.parametrize("total", [0.0, 0.2, 0.9, 0.999])
-def test_a_query_without_history_is_believed_as_it_stands(ground, total):
-    rng = np.random.default_rng(1)
-    p = rng.random(40)
-    query = seen(rng.uniform(0, 2000, (40, 2)), total * p / p.sum())
-    posterior = Belief(ground).update(query, STEP, 3000)
-    np.testing.assert_allclose(posterior.p, query.p, atol=1e-12)
-    assert posterior.lost == pytest.approx(1 - total)
-
-
 @pytest.mark.parametrize("start", ["lost", "known"])
 def test_one_query_says_no_more_than_it_says_alone_where_it_fits_no_history(start):
     rng, belief = np.random.default_rng(1), Belief(IN_ORDER)
@@ -78,53 +67,11 @@ def test_queries_that_fit_each_other_say_more_than_each_alone(speed):
     assert posteriors[0].mass < 0.85
 
 
-def test_between_two_places_that_look_alike_the_way_there_decides():
-    belief = Belief(IN_ORDER)
-    for n in range(12):
-        before, after = belief.update(seen([10 + n], [0.8]), STEP, PLACES), None
-    for n in range(12, 15):
-        after = belief.update(seen([10 + n, 70 + n], [0.48, 0.48]), STEP, PLACES)
-    assert before.mass > 0.99
-    assert after.mass > 0.99
-    assert is_at(after, 24)
-
-
-def test_it_recovers_from_a_jump_within_ten_queries():
-    rng, belief = np.random.default_rng(4), Belief(IN_ORDER)
-    fly(belief, range(10, 30), rng)
-    posteriors = fly(belief, range(70, 80), rng, p=0.9)
-    wrong = [each for each, place in zip(posteriors, range(70, 80), strict=True) if not is_at(each, place)]
-    assert all(each.mass < SURE for each in wrong)
-    assert posteriors[-1].mass >= SURE
-    assert is_at(posteriors[-1], 79)
-
-
-def test_it_is_lost_within_five_queries_after_leaving_the_map():
-    rng, belief = np.random.default_rng(5), Belief(IN_ORDER)
-    assert fly(belief, range(10, 40), rng)[-1].mass >= SURE
-    away = [belief.update(view_of_nothing(rng), STEP, PLACES) for _ in range(40)]
-    assert max(each.mass for each in away) < SURE
-    assert all(each.lost > 0.5 for each in away[4:])
-    back = fly(belief, range(60, 70), rng, p=0.9)
-    assert back[-1].mass >= SURE
-    assert is_at(back[-1], 69)
-
-
 @pytest.mark.parametrize("p", [0.3, 0.6, 0.9])
 def test_a_hover_over_what_looks_alike_says_what_one_look_says(p):
     belief = Belief(IN_ORDER)
     masses = [belief.update(seen([50], [p]), STEP, PLACES).mass for _ in range(300)]
     assert max(masses) <= p + 1e-9
-
-
-@pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])
-@pytest.mark.parametrize("p", [0.9, 0.9999])
-def test_a_hover_does_not_wear_out_what_is_known(ground, p):
-    belief = Belief(ground)
-    for _ in range(300):
-        posterior = belief.update(seen([50], [p]), STEP, PLACES)
-        assert p - 0.1 < posterior.mass <= p + 1e-9
-    assert posterior.p[0] > 0.6
 
 
 def test_during_a_hover_the_newest_look_replaces_the_one_before():
@@ -175,15 +122,6 @@ def test_odometry_helps_and_its_lies_do_not_mislead(odometry, speed_m):
     assert max(off_m) < SPACING_M
     assert posteriors[-1].mass > 0.99
     assert posteriors[-1].lost < 0.01
-
-
-def test_heading_and_covariance_are_those_of_what_is_near():
-    track_m = 20.0 * np.column_stack([np.arange(10), np.arange(10)])
-    estimate = over(track_m, Belief(IN_METRES), tuple)[-1]
-    assert estimate.heading_deg == pytest.approx(350, abs=1)
-    sd_m = np.sqrt(np.linalg.eigvalsh(estimate.covariance))
-    assert 2 < sd_m[0] <= sd_m[1] < 15
-    assert Belief(IN_ORDER).update(seen([3], [0.5]), STEP, 9).heading_deg is None
 
 
 def test_where_all_places_look_the_same_none_is_believed():

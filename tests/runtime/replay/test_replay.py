@@ -3,15 +3,11 @@
 import json
 import shutil
 import signal
-import socket
-import subprocess
-import sys
 import time
-from contextlib import contextmanager
 
 import pytest
 import yaml
-from flight_process import start, wait_for
+from flight_process import simulated_autopilot, start, wait_for
 from flights import PLACES, of_kind
 from mavlink_peers import Peer, UdpPort
 
@@ -25,25 +21,6 @@ from edgevpr.runtime.flight.recording import TAPE, recordings
 pytestmark = pytest.mark.slow
 
 QUICK = "--rate-hz", "15"
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-@contextmanager
-def autopilot(vehicle="arduplane", *flags):
-    """A simulated flight controller as a process; gives its link."""
-    port = free_port()
-    command = ["-m", "edgevpr", "simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--vehicle", vehicle]
-    process = subprocess.Popen([sys.executable, *command, *flags], stdout=subprocess.DEVNULL)
-    try:
-        yield f"udpout:127.0.0.1:{port}"
-    finally:
-        process.kill()
-        process.wait()
 
 
 @pytest.fixture
@@ -75,7 +52,7 @@ def is_the_same(log, **how):
 
 
 def test_a_flight_with_an_autopilot_is_the_same_to_the_byte(fly, tmp_path):
-    with autopilot() as link:
+    with simulated_autopilot() as (link, _):
         ended(fly("--link", link, *QUICK))
     again, lines = is_the_same(tmp_path / "flight.jsonl")
     assert again.why_ended is None
@@ -88,7 +65,7 @@ def test_a_flight_with_an_autopilot_is_the_same_to_the_byte(fly, tmp_path):
 
 @pytest.mark.parametrize("vehicle", ["px4-plane", "arducopter"])
 def test_whatever_the_autopilot_and_its_channel(fly, tmp_path, vehicle):
-    with autopilot(vehicle, "--no-gps") as link:
+    with simulated_autopilot("--vehicle", vehicle, "--no-gps") as (link, _):
         ended(fly("--link", link, "--rate-hz", "8"))
     again, _ = is_the_same(tmp_path / "flight.jsonl")
     assert again.lines[-1]["mavlink"]["received"]["HEARTBEAT"] > 0
@@ -96,7 +73,7 @@ def test_whatever_the_autopilot_and_its_channel(fly, tmp_path, vehicle):
 
 def test_a_flight_goes_on_when_its_terminal_closes_and_a_signal_that_ends_it_is_replayed(fly, tmp_path):
     log = tmp_path / "flight.jsonl"
-    with autopilot() as link:
+    with simulated_autopilot() as (link, _):
         flight = fly("--link", link, "--rate-hz", "5")
         wait_for("query", log, flight)
         flight.send_signal(signal.SIGHUP)
@@ -124,7 +101,7 @@ def test_a_flight_by_the_times_of_its_pictures_is_the_same(fly, recording, tmp_p
 
 def test_a_flight_that_was_killed_is_replayed_to_where_its_tape_ends(fly, tmp_path):
     log = tmp_path / "flight.jsonl"
-    with autopilot() as link:
+    with simulated_autopilot() as (link, _):
         flight = fly("--link", link, "--rate-hz", "10")
         while len(of_kind(read_log(log), "query") if log.exists() else ()) < 12:
             assert flight.poll() is None

@@ -1,18 +1,14 @@
 """`edgevpr run` as a process of its own: real frames, a real link, signals, and a log that survives."""
 
-import json
 import os
 import signal
 import socket
-import subprocess
-import sys
 import time
 from contextlib import contextmanager
 
 import pytest
-from flight_process import cpu_s, start, wait_for
+from flight_process import cpu_s, simulated_autopilot, start, wait_for
 from flights import PLACES, STEP_DEG, of_kind
-from mavlink_peers import free_port
 
 from edgevpr.cli.main import main
 from edgevpr.runtime.flight import startup
@@ -38,29 +34,8 @@ def wait_for_queries(log, count, process):
         time.sleep(0.02)
 
 
-@contextmanager
-def autopilot():
-    """A simulated flight controller as a process, up; gives its link, and a call that ends it and tells what it saw."""
-    port = free_port()
-    command = ["-m", "edgevpr", "simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--json"]
-    process = subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-    def asked():
-        process.terminate()
-        return json.loads(process.communicate(timeout=60)[0])
-
-    try:
-        assert "is up" in process.stderr.readline()
-        yield f"udpout:127.0.0.1:{port}", asked
-    finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
-        process.stderr.close()
-
-
 def test_run_sends_what_the_log_says(fly, tmp_path):
-    with autopilot() as (link, asked):
+    with simulated_autopilot() as (link, asked):
         run = fly("--link", link, "--rate-hz", "3")  # ten seconds: a vehicle must have been heard before the first fix
         said = run.communicate(timeout=120)[1]
         seen = asked()
@@ -96,7 +71,7 @@ WITHHELD = {"DRY_RUN", "NO_TELEMETRY"}  # the second for five seconds
 
 
 def test_dry_run_sends_all_but_fixes(fly, tmp_path):
-    with autopilot() as (link, asked):
+    with simulated_autopilot() as (link, asked):
         said = fly("--link", link, "--rate-hz", "20", "--dry-run").communicate(timeout=120)[1]
         seen = asked()
     assert "COMMAND_INT" not in seen["messages"]
