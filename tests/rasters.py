@@ -22,6 +22,16 @@ def ground_m(lat_deg, lon_deg) -> tuple[np.ndarray, np.ndarray]:
     return east_m, np.radians(np.subtract(lat_deg, HOME.lat_deg)) * along_m
 
 
+def write_mission(path: Path, waypoints) -> Path:
+    """Write waypoints (MAV_FRAME, lat_deg, lon_deg, alt_m) as a file of Mission Planner."""
+    rows = [
+        f"{at}\t0\t{frame}\t16\t0\t0\t0\t0\t{lat}\t{lon}\t{alt}\t1"
+        for at, (frame, lat, lon, alt) in enumerate(waypoints)
+    ]
+    path.write_text("\n".join(["QGC WPL 110", *rows]))
+    return path
+
+
 def marked(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
     """Brightness of the ground, float64: 60, and 210 in the middle of each mark."""
     bright = np.full(np.shape(east_m), 60.0)

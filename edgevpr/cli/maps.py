@@ -127,7 +127,7 @@ def add_orthophoto(parser: ArgumentParser) -> None:
     flags.add_argument(
         "--area",
         metavar="AREA",
-        help="area to map: a mission or GeoJSON (a path counts with a footprint on either side), or LAT,LON,RADIUS_M",
+        help="area to map: a mission (its path counts with a footprint on either side), or LAT,LON,RADIUS_M",
     )
 
 

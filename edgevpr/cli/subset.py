@@ -21,7 +21,7 @@ def add(of_map: Callable[..., Any]) -> None:
         "--mission",
         metavar="FILE",
         required=True,
-        help="Mission Planner waypoints, QGroundControl .plan, GeoJSON, KML, or LAT,LON,RADIUS_M",
+        help="Mission Planner waypoints, QGroundControl .plan, or LAT,LON,RADIUS_M",
     )
     parser.add_argument("--out", metavar="MAP", required=True, help="map to write")
     parser.add_argument(

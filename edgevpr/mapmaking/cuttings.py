@@ -190,7 +190,7 @@ def _make_area_around(extent_deg: Extent) -> Area:
     south, west, north, east = extent_deg
     lat_deg, lon_deg = _EDGE_MARGIN * (north - south), _EDGE_MARGIN * (east - west)
     south, west, north, east = south - lat_deg, west - lon_deg, north + lat_deg, east + lon_deg
-    return Area((([(south, west), (south, east), (north, east), (north, west), (south, west)],),), ())
+    return Area(polygons=([(south, west), (south, east), (north, east), (north, west), (south, west)],))
 
 
 def extent_of_cuttings(cuttings: "Cuttings") -> Extent:
@@ -211,7 +211,7 @@ def _open_orthophoto(cuttings: "Cuttings", area: Area | None) -> Orthophoto:
 def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, area: Area | None = None) -> Lattice:
     """Make a grid of places `spacing_m` apart over the orthophoto. A square with sides of `footprint_m` around each
     place is inside its bounding box. With an `area` (None: no limit), keep only the places of this grid that are in
-    its polygons or within `footprint_m` of its paths.
+    its polygons or within `footprint_m` of its path.
 
     Raises UsageError if footprint or spacing do not fit the orthophoto, or there are more than a million places, and
     NoPlaceError if there are none.

@@ -1,14 +1,13 @@
-"""Reading of areas and paths to be flown over: waypoint files, plans of QGroundControl, GeoJSON and KML. They limit the
-part of an orthophoto from which a map is made, and of a map the part that a flight takes."""
+"""Reading of areas and paths to be flown over: waypoint files and plans of QGroundControl. They limit the part of an
+orthophoto from which a map is made, and of a map the part that a flight takes."""
 
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -33,9 +32,7 @@ _CIRCLE_CORNERS = 72
 _MAX_RADIUS_M = 200_000.0
 _QUARTER_SEGMENTS = 64  # of a buffer's round corners: exact to 0.01 % of its width
 _FAR_M = 1e8
-_MALFORMED = (
-    ElementTree.ParseError, ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError,
-)  # fmt: skip
+_MALFORMED = (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError)
 
 Ring = list[LatLon]
 Projection = Callable[[Doubles, Doubles], tuple[Any, Any]]  # latitudes and longitudes, to x and y in metres
@@ -52,25 +49,25 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """The areas and paths in a file. Each of `polygons` is a tuple of rings (the outline, then holes) of points (lat,
-    lon) in degrees. Each of `paths` is a tuple of waypoints in the order of flight."""
+    """The areas and the path in a file. Each of `polygons` is a closed outline of points (lat, lon) in degrees. `path` are
+    the waypoints in the order of flight."""
 
-    polygons: tuple[tuple[Ring, ...], ...]
-    paths: tuple[tuple[Waypoint, ...], ...]
+    polygons: tuple[Ring, ...] = ()
+    path: tuple[Waypoint, ...] = ()
 
     @property
     def points(self) -> list[LatLon]:
-        """All corners of polygons and points of paths."""
-        points = [(waypoint.lat_deg, waypoint.lon_deg) for path in self.paths for waypoint in path]
-        return points + [point for rings in self.polygons for ring in rings for point in ring]
+        """All corners of polygons and points of the path."""
+        points = [(waypoint.lat_deg, waypoint.lon_deg) for waypoint in self.path]
+        return points + [point for ring in self.polygons for point in ring]
 
     @property
     def extent_deg(self) -> tuple[float, float, float, float]:
-        """The bounding box of polygons and paths: (south, west, north, east) in degrees, see `compute_extent`."""
+        """The bounding box of polygons and path: (south, west, north, east) in degrees, see `compute_extent`."""
         return compute_extent(self.points)
 
     def on_plane(self, project: Projection, polygon_margin_m: float, path_margin_m: float) -> "shapely.Geometry":
-        """Return the ground within these margins of the polygons and of the paths, on a plane."""
+        """Return the ground within these margins of the polygons and of the path, on a plane."""
 
         def corners_m(points: Sequence[LatLon]) -> Doubles:
             # What cannot be projected is far away.
@@ -78,11 +75,11 @@ class Area:
             return np.nan_to_num(corners, nan=_FAR_M, posinf=_FAR_M)
 
         shapes = []
-        for rings in self.polygons:
-            outline, *holes = map(corners_m, rings)
-            shapes.append((shapely.make_valid(shapely.Polygon(outline, holes)), polygon_margin_m))
-        for path in self.paths:
-            points = [(waypoint.lat_deg, waypoint.lon_deg) for waypoint in (*path, path[-1])]  # a line has two or more
+        for ring in self.polygons:
+            shapes.append((shapely.make_valid(shapely.Polygon(corners_m(ring))), polygon_margin_m))
+        if self.path:
+            way = (*self.path, self.path[-1])  # a line has two points or more
+            points = [(waypoint.lat_deg, waypoint.lon_deg) for waypoint in way]
             shapes.append((shapely.LineString(corners_m(points)), path_margin_m))
         ground = shapely.union_all(
             [shapely.buffer(shape, margin_m, quad_segs=_QUARTER_SEGMENTS) for shape, margin_m in shapes]
@@ -92,8 +89,8 @@ class Area:
 
 
 def read_area(path: str | Path) -> Area:
-    """Read a waypoint file (QGC WPL 110), a .plan of QGroundControl, GeoJSON in degrees, or KML; or the circle that the
-    text LAT,LON,RADIUS_M describes. Raises UsageError for a file that is none of them, holds no position, or has one
+    """Read a waypoint file (QGC WPL 110), a .plan of QGroundControl, or the circle that the text LAT,LON,RADIUS_M
+    describes. Raises UsageError for a file that is none of them, holds no position, or has one
     beyond -90..90 or -180..180 degrees."""
     try:
         if _CIRCLE.fullmatch(str(path)):
@@ -102,17 +99,17 @@ def read_area(path: str | Path) -> Area:
         if text.startswith("QGC WPL"):
             area = _read_waypoints(text.splitlines())
         else:
-            area = _read_kml(text) if text.lstrip().startswith("<") else _read_json(json.loads(text))
+            area = _read_plan(json.loads(text)["mission"]["items"])
     except OSError as error:
         raise UsageError(
-            f"{path} cannot be read ({error.strerror}): give a mission file, GeoJSON, or LAT,LON,RADIUS_M."
+            f"{path} cannot be read ({error.strerror}): give a mission file, or LAT,LON,RADIUS_M."
         ) from error
     except _MALFORMED:
         raise UsageError(
-            f"{path} is no waypoint file (QGC WPL 110), no .plan of QGroundControl, and no GeoJSON or KML that can "
-            "be understood: save it again."
+            f"{path} is no waypoint file (QGC WPL 110) and no .plan of QGroundControl that can be understood: save it "
+            "again."
         ) from None
-    if not area.polygons and not area.paths:
+    if not area.polygons and not area.path:
         raise UsageError(f"{path} holds no polygon and no position to fly to: save the mission or the area again.")
     if any(abs(lat_deg) > 90 or abs(lon_deg) > 180 for lat_deg, lon_deg in area.points):
         raise UsageError(f"{path} has positions beyond the globe: they must be degrees of WGS-84.")
@@ -127,7 +124,7 @@ def _circle(lat_deg: float, lon_deg: float, radius_m: float) -> Area:
         )
     turns = (2 * math.pi * corner / _CIRCLE_CORNERS for corner in range(_CIRCLE_CORNERS + 1))
     ring = [moved(lat_deg, lon_deg, radius_m * math.sin(turn), radius_m * math.cos(turn)) for turn in turns]
-    return Area(((ring,),), ())
+    return Area(polygons=(ring,))
 
 
 def _read_waypoints(lines: list[str]) -> Area:
@@ -138,7 +135,7 @@ def _read_waypoints(lines: list[str]) -> Area:
         if len(values) != _WAYPOINT_COLUMNS:
             raise ValueError
         path += _waypoint(int(values[3]), int(values[2]), values[8:11])
-    return Area((), (tuple(path),) if path else ())
+    return Area(path=tuple(path))
 
 
 def _waypoint(command: int, frame: int, where: Sequence[float | str | None]) -> list[Waypoint]:
@@ -151,66 +148,11 @@ def _waypoint(command: int, frame: int, where: Sequence[float | str | None]) -> 
     return [Waypoint(lat_deg, lon_deg, alt_m if frame in _OVER_GROUND and alt_m > 0 else None)]
 
 
-def _read_kml(text: str) -> Area:
-    """Read the polygons, lines and points of KML (OGC 12-007r2), whatever they are wrapped in."""
-    polygons: list[tuple[Ring, ...]] = []
-    paths: list[tuple[Waypoint, ...]] = []
-    for element in ElementTree.fromstring(text).iter():
-        kind = element.tag.rpartition("}")[2]
-        if kind in ("Polygon", "LineString", "Point"):
-            texts = [each.text or "" for each in element.findall(".//{*}coordinates")]
-            lines = [[_lat_lon(point.split(",")) for point in line.split()] for line in texts]
-            if kind == "Polygon":
-                polygons.append(tuple(lines))
-            else:
-                paths += [tuple(Waypoint(*point) for point in line) for line in lines if line]
-    return Area(tuple(polygons), tuple(paths))
-
-
-def _read_json(content: Any) -> Area:
-    if content.get("fileType") == "Plan":
-        return _read_plan(content["mission"]["items"])
-    polygons: list[tuple[Ring, ...]] = []
-    paths: list[tuple[Waypoint, ...]] = []
-    for kind, coordinates in _geometries(content):
-        parts = coordinates if kind.startswith("Multi") else [coordinates]
-        if kind.endswith("Polygon"):
-            polygons += [tuple(map(_ring, rings)) for rings in parts]
-        elif kind in ("Point", "MultiPoint", "LineString", "MultiLineString"):
-            lines = [[point] for point in parts] if kind.endswith("Point") else parts
-            paths += [tuple(Waypoint(*_lat_lon(point)) for point in line) for line in lines]
-        else:
-            raise ValueError
-    return Area(tuple(filter(None, polygons)), tuple(filter(None, paths)))
-
-
-def _geometries(content: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the plain geometries in any GeoJSON object, each as (kind such as "Polygon", coordinates)."""
-    if "coordinates" in content:
-        yield content["type"], content["coordinates"]
-    elif content["type"] == "Feature":
-        yield from _geometries(content["geometry"]) if content["geometry"] else ()
-    else:
-        for part in content["features" if content["type"] == "FeatureCollection" else "geometries"]:
-            yield from _geometries(part)
-
-
-def _lat_lon(point: Sequence[float | str]) -> LatLon:
-    """Return a point of GeoJSON or KML, which have longitude first, as (lat, lon)."""
-    return _finite(point[1]), _finite(point[0])
-
-
-def _ring(points: list[list[float]]) -> Ring:
-    if len(points) < 4:
-        raise ValueError
-    return [_lat_lon(point) for point in points]
-
-
 def _read_plan(items: list[dict[str, Any]]) -> Area:
     """Read the items of a plan: simple items, and surveys and corridors, which have both a polygon and the waypoints
     computed from it. A plan has null for numbers that it leaves to the autopilot."""
     path: list[Waypoint] = []
-    polygons: list[tuple[Ring, ...]] = []
+    polygons: list[Ring] = []
     for item in items:
         if item["type"] == "SimpleItem":
             path += _waypoint(int(item["command"]), int(item["frame"]), item["params"][4:7])
@@ -220,8 +162,8 @@ def _read_plan(items: list[dict[str, Any]]) -> Area:
         points = style.get("VisualTransectPoints", ())
         path += [Waypoint(_finite(lat_deg), _finite(lon_deg), height_m) for lat_deg, lon_deg, *_ in points]
         corners = [(_finite(lat_deg), _finite(lon_deg)) for lat_deg, lon_deg, *_ in item.get("polygon", ())]
-        polygons += [([*corners, corners[0]],)] if corners else []
-    return Area(tuple(polygons), (tuple(path),) if path else ())
+        polygons += [[*corners, corners[0]]] if corners else []
+    return Area(tuple(polygons), tuple(path))
 
 
 def _finite(value: float | str | None) -> float:

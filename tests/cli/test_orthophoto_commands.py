@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
 
-from rasters import HOME, textured_raster
+from rasters import HOME, textured_raster, write_mission
 
 from edgevpr.cli.main import main
 from edgevpr.core.geodesy import distance_m, moved
@@ -26,10 +26,8 @@ def ground(tmp_path_factory):
 @pytest.fixture
 def track(tmp_path):
     """A path of 142 m, 12 m north of the middle."""
-    ends = [moved(HOME.lat_deg, HOME.lon_deg, east_m, 12.0)[::-1] for east_m in (-71, 71)]
-    path = tmp_path / "track.geojson"
-    path.write_text(json.dumps({"type": "LineString", "coordinates": ends}))
-    return str(path)
+    ends = [(0, *moved(HOME.lat_deg, HOME.lon_deg, east_m, 12.0), 0) for east_m in (-71, 71)]
+    return str(write_mission(tmp_path / "track.waypoints", ends))
 
 
 def run(*command: str) -> int:

@@ -10,7 +10,7 @@ from walks import map_of
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Frame, Position
-from edgevpr.mapmaking.missions import Area, Waypoint, read_area
+from edgevpr.mapmaking.missions import Area, Waypoint
 from edgevpr.mapmaking.subset import subset
 from edgevpr.places.examine import merge, unwatched
 from edgevpr.places.mapfile import PlaceMap
@@ -55,7 +55,7 @@ def names_in(path):
 
 
 def path_over(*points):
-    return Area((), (tuple(Waypoint(*at(*point)) for point in points),))
+    return Area(path=tuple(Waypoint(*at(*point)) for point in points))
 
 
 @pytest.mark.parametrize("of_one", [True, False])
@@ -73,13 +73,12 @@ def test_subset_reads_only_the_maps_near_the_mission(tiles, tmp_path):
     assert (found.maps, names_in(tmp_path / "f.gpkg")) == (1, [f"0{row}" for row in range(SIDE)])
 
 
-def test_places_in_a_polygon_are_taken_and_those_deep_in_its_hole_are_not(tiles, tmp_path):
-    square = [at(-50, -50), at(450, -50), at(450, 450), at(-50, 450), at(-50, -50)]
-    hole = [at(150, 150), at(250, 150), at(250, 250), at(150, 250), at(150, 150)]
-    subset(tiles, Area(((square, hole),), ()), 20.0, tmp_path / "f.gpkg", None, unwatched)
-    assert set(names_in(tmp_path / "f.gpkg")) == {f"{c}{r}" for c in range(5) for r in range(5)} - {"22"}
-    subset(tiles, Area(((square, hole),), ()), 60.0, tmp_path / "g.gpkg", None, unwatched)
-    assert "22" in names_in(tmp_path / "g.gpkg")
+def test_places_in_a_polygon_are_taken(tiles, tmp_path):
+    square = [at(-50, -50), at(250, -50), at(250, 450), at(-50, 450), at(-50, -50)]
+    subset(tiles, Area(polygons=(square,)), 20.0, tmp_path / "f.gpkg", None, unwatched)
+    assert set(names_in(tmp_path / "f.gpkg")) == {f"{c}{r}" for c in range(3) for r in range(5)}
+    subset(tiles, Area(polygons=(square,)), 60.0, tmp_path / "g.gpkg", None, unwatched)
+    assert "32" in names_in(tmp_path / "g.gpkg")
 
 
 def test_a_budget_keeps_the_places_that_leave_the_smallest_gaps(tiles, tmp_path):
@@ -117,18 +116,3 @@ def test_what_cannot_be_taken_is_said_and_leaves_nothing(tiles, tmp_path):
     with pytest.raises(MapError, match="holds no map"):
         subset(tmp_path, path_over((0, 0)), 50.0, tmp_path / "f.gpkg", None, unwatched)
     assert not list(tmp_path.iterdir())
-
-
-def test_polygons_and_points_of_kml_are_read(tmp_path):
-    ring = "8,47 8.1,47 8.1,47.1 8,47.1 8,47"
-    (tmp_path / "a.kml").write_text(
-        '<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><MultiGeometry><Polygon><outerBoundaryIs>'
-        f"<LinearRing><coordinates>\n{ring}\n</coordinates></LinearRing></outerBoundaryIs></Polygon>"
-        "<Point><coordinates>8.05,47.05,3</coordinates></Point></MultiGeometry></Placemark></Document></kml>"
-    )
-    area = read_area(tmp_path / "a.kml")
-    assert area.polygons == (([(47.0, 8.0), (47.0, 8.1), (47.1, 8.1), (47.1, 8.0), (47.0, 8.0)],),)
-    assert area.paths == ((Waypoint(47.05, 8.05),),)
-    (tmp_path / "b.kml").write_text("<kml><Polygon>")
-    with pytest.raises(UsageError, match="no GeoJSON or KML that can be understood"):
-        read_area(tmp_path / "b.kml")

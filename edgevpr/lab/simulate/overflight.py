@@ -57,7 +57,7 @@ def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list
 
 
 def _of_mission(path: str | Path, every_m: float) -> list[GeoTag]:
-    waypoints = [way for part in read_area(path).paths for way in part]
+    waypoints = read_area(path).path
     if len(waypoints) < 2:
         return []
     lat_deg, lon_deg = (np.array([getattr(way, name) for way in waypoints]) for name in ("lat_deg", "lon_deg"))

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
 
-from rasters import HOME, MARKS_M, marked_raster
+from rasters import HOME, MARKS_M, marked_raster, write_mission
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m, moved
@@ -94,10 +94,8 @@ def test_read_shots_has_a_picture_for_each_line(tmp_path):
 
 
 def test_read_shots_follows_the_waypoints_of_a_mission(tmp_path):
-    path = tmp_path / "mission.waypoints"
-    rows = [(0, 0, 50.0, 11.9, 500), (1, 3, 50.001, 11.9, 60), (2, 3, 50.001, 11.902, 80)]
-    lines = [f"{at}\t0\t{frame}\t16\t0\t0\t0\t0\t{lat}\t{lon}\t{alt}\t1" for at, frame, lat, lon, alt in rows]
-    path.write_text("\n".join(["QGC WPL 110", *lines]))
+    rows = [(0, 50.0, 11.9, 500), (3, 50.001, 11.9, 60), (3, 50.001, 11.902, 80)]
+    path = write_mission(tmp_path / "mission.waypoints", rows)
     shots = read_shots(path, None, 10.0)
     assert len(shots) == 1 + int((111.2 + 142.9) / 10)
     seconds = [shot.t_utc_s - shots[0].t_utc_s for shot in shots]
@@ -117,13 +115,11 @@ def test_read_shots_refuses_a_track_without_path_or_height(tmp_path):
     ):
         with pytest.raises(UsageError, match=said):
             read_shots(csv_of(tmp_path, text), None, 20.0)
-    line = tmp_path / "line.geojson"
-    line.write_text('{"type": "LineString", "coordinates": [[11.9, 50], [11.9, 60]]}')
+    line = write_mission(tmp_path / "line.waypoints", [(0, 50, 11.9, 0), (0, 60, 11.9, 0)])
     with pytest.raises(UsageError, match="--height-m"):
         read_shots(line, None, 20_000.0)
-    line.write_text('{"type": "Point", "coordinates": [11.9, 50]}')
     with pytest.raises(UsageError, match="waypoints"):
-        read_shots(line, 80.0, 1.0)
+        read_shots(write_mission(line, [(0, 50, 11.9, 0)]), 80.0, 1.0)
 
 
 def test_write_overflight_writes_the_truth_and_is_the_same_each_time(tmp_path, orthophoto):
