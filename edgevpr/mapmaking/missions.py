@@ -49,8 +49,8 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """The areas and the path in a file. Each of `polygons` is a closed outline of points (lat, lon) in degrees. `path` are
-    the waypoints in the order of flight."""
+    """The areas and the path in a file. Each of `polygons` is a closed outline of points (lat, lon) in degrees. The
+    waypoints of `path` are in the order of flight."""
 
     polygons: tuple[Ring, ...] = ()
     path: tuple[Waypoint, ...] = ()
