@@ -255,7 +255,8 @@ def main() -> None:
     unseen = [each for each in leave_one_out(sites, 1)["generated"].values() if each is not None]
     source = (
         f"models/recipes/train_matchability.py; {sum(map(len, labelled.values()))} pictures of "
-        f"{', '.join(labelled)}; on a site left out {np.mean(unseen):.2f} of pairs of changed pictures in the right order"
+        f"{', '.join(labelled)}; on a site left out {np.mean(unseen):.2f} of pairs of changed pictures in the right "
+        "order"
     )
     write_network(fit(sites, 1), Path(sys.argv[1]), "Matchability, trained by edgevpr", source, sites[0])
 
