@@ -36,6 +36,7 @@ class ReasonCode(Enum):
     NOT_SEARCHED = "not searched for"
     PICTURES_STAY = "camera frozen: pictures stay the same"
     PICTURES_REPEAT = "camera frozen: pictures repeat"
+    AGE_UNKNOWN = "age of pictures unknown", "{summary}, none is used: they do not fit the aircraft's motion"
     LOW_TEXTURE = "too little texture in the image", "{summary}: {usable:.0%} usable, {needed:.0%} needed"
     TILTED = "the image is not levelled", "{summary}: it is tilted {tilt_deg:.0f} degrees"
     TILTED_WITHOUT_HEADING = "the image is not levelled", "{summary}: tilted {tilt_deg:.0f} degrees, heading unknown"
@@ -156,11 +157,9 @@ class ReasonCode(Enum):
     MAP_LOST = "its map cannot be read, see its log"
     MAP_BACK = "its map is read again"
     PICTURES_MOVE = "camera is back: pictures move again"
-    SCALE_DIFFERS = (
-        "footprint is not the map's",
-        "an image shows {flown_m:.0f} m of ground, the map was cut for {cut_m:.0f} m: --footprint-m {flown_m:.0f} ",
-        "finds more",
-    )
+    AGE_KNOWN = "age of pictures known again"
+    DELAY_FOUND = "pictures are late: corrected", "pictures are {delay_s:.1f} s older than they claim: corrected"
+    DELAY_GONE = "pictures are as old as they claim"
     PICTURES_TURNED = (
         "pictures are turned",
         "pictures are turned {turn_deg:.0f} degrees against the heading: if the compass is right, ",

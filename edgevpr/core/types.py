@@ -98,7 +98,8 @@ class Frame:
     """One picture and the data known of it (None: unknown).
 
     `image`: uint8, (H, W) grey or (H, W, 3) BGR. `t_mono_s`: time of taking, seconds of the monotonic clock; `t_sd_s`:
-    its standard deviation. `t_utc_s`: seconds since 1970. `heading_deg`: 0..360 clockwise from true north.
+    its standard deviation; `delay_sd_s`: of a hidden delay beside it, as is usual for such a camera. `t_utc_s`: seconds
+    since 1970. `heading_deg`: 0..360 clockwise from true north.
     `roll_deg`, `pitch_deg`: of the airframe, positive with the right wing down, and with the nose up; of a camera on a
     gimbal, its deviation from straight down. `height_m`: above the ground.
     """
@@ -114,6 +115,7 @@ class Frame:
     height_m: float | None = None
     pose: Pose | None = None
     t_sd_s: float = FRAME_TIME_SD_S
+    delay_sd_s: float = FRAME_TIME_SD_S
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,10 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.types import FRAME_TIME_SD_S
 
+# Standard deviation of a hidden delay: from the light to the stamp, or where there is none to the arrival, an encoder
+# and its buffer take so long, which nothing in the stream shows.
+HIDDEN_DELAY_SD_S = 0.3
+
 _RESTART_S = 5.0  # a larger change of the delay: the sender has restarted, or something has held the stream up
 _BACKLOG_S = 0.005  # a picture with a delay shorter than the least so far by more than this was in a backlog
 _IN_TIME = 3  # pictures in a row not in a backlog after which there is none any more

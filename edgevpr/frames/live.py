@@ -123,10 +123,10 @@ class LiveSource(Source):
             if conversion.image is None:
                 self.refused[Refusal.DAMAGED.value] += 1
                 return None
-        t_mono_s, t_sd_s = conversion.shot.t_mono_s, conversion.shot.t_sd_s
-        name = f"frame {conversion.number:06d} t={t_mono_s - self._t_start_s:.3f} s"
+        shot = conversion.shot
+        name = f"frame {conversion.number:06d} t={shot.t_mono_s - self._t_start_s:.3f} s"
         image = self.twins.require_single(conversion.image)
-        return Frame(image=image, name=name, t_mono_s=t_mono_s, t_sd_s=t_sd_s)
+        return Frame(image=image, name=name, t_mono_s=shot.t_mono_s, t_sd_s=shot.t_sd_s, delay_sd_s=shot.delay_sd_s)
 
     def close(self) -> None:
         """Stop all threads; return after about a second at most, whether they have ended or not."""

@@ -20,6 +20,8 @@ from contextlib import suppress
 
 from edgevpr.core.errors import SourceError
 from edgevpr.core.text import shown
+from edgevpr.core.types import FRAME_TIME_SD_S
+from edgevpr.frames.age import HIDDEN_DELAY_SD_S
 from edgevpr.frames.shot import OpeningError, Refusal, Shot
 from edgevpr.frames.streams import StreamCapture, open_raw
 
@@ -77,7 +79,9 @@ def open_by_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
     end_s = time.monotonic() + _FIRST_PICTURE_S
     while process.poll() is None and (left_s := end_s - time.monotonic()) > 0:
         with suppress(OpeningError):
-            stream = open_raw(f"tcp://127.0.0.1:{port}", clock, "mjpeg", left_s)
+            # A pipeline may read a stream.
+            delay_sd_s = HIDDEN_DELAY_SD_S if uri.startswith("gst:") else FRAME_TIME_SD_S
+            stream = open_raw(f"tcp://127.0.0.1:{port}", clock, "mjpeg", left_s, delay_sd_s)
             if time.monotonic() < end_s:
                 return ProgramCapture(stream, process)
             stream.release()  # FFmpeg calls a stream open when its time is over, without a picture too

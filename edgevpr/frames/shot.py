@@ -58,13 +58,15 @@ class Refusal(Enum):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shot:
     """A complete picture. `t_mono_s`: when it was taken, at most its arrival (seconds of the monotonic clock);
-    `t_sd_s`: standard deviation of that. `look`: coarse grey copy, uint8 (h, w). `pixels`: converts and returns a
-    picture that is used, uint8 (H, W, 3) BGR or (H, W) grey."""
+    `t_sd_s`: standard deviation of that; `delay_sd_s`: of a hidden delay beside it, as is usual for such a camera.
+    `look`: coarse grey copy, uint8 (h, w). `pixels`: converts and returns a picture that is used, uint8 (H, W, 3) BGR
+    or (H, W) grey."""
 
     t_mono_s: float
     look: Image
     pixels: Callable[[], Image]
     t_sd_s: float = FRAME_TIME_SD_S
+    delay_sd_s: float = FRAME_TIME_SD_S
 
 
 class OpeningError(Exception):

@@ -6,7 +6,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from edgevpr.frames.age import StampedTime, Taken, UnstampedTime
+from edgevpr.core.types import FRAME_TIME_SD_S
+from edgevpr.frames.age import HIDDEN_DELAY_SD_S, StampedTime, Taken, UnstampedTime
 from edgevpr.frames.decoding import Fetched, TransportError, WholePictures, open_pictures
 from edgevpr.frames.rtp import describe_rtp
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, StreamFacts
@@ -58,11 +59,14 @@ def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "Stre
     return StreamCapture(_open(uri), clock, opened_s)
 
 
-def open_raw(uri: str, clock: Callable[[], float], form: str, timeout_s: float) -> "StreamCapture":
+def open_raw(
+    uri: str, clock: Callable[[], float], form: str, timeout_s: float, delay_sd_s: float = FRAME_TIME_SD_S
+) -> "StreamCapture":
     """Open a stream of a format without time stamps, `form` by its name in FFmpeg, whose first picture is waited for
-    `timeout_s` seconds. Raises OpeningError with the cause."""
+    `timeout_s` seconds. `delay_sd_s`: see `Shot`. Raises OpeningError with the cause."""
     opened_s = clock()
-    return StreamCapture(open_pictures(uri, _RAW_OPTIONS, (timeout_s, READ_TIMEOUT_S), form), clock, opened_s)
+    whole = open_pictures(uri, _RAW_OPTIONS, (timeout_s, READ_TIMEOUT_S), form)
+    return StreamCapture(whole, clock, opened_s, delay_sd_s)
 
 
 def _open(uri: str) -> WholePictures:
@@ -81,10 +85,16 @@ def _open(uri: str) -> WholePictures:
 
 class StreamCapture:
     """The pictures of an open stream: a `Capture`. `whole` decodes it. `clock` is the monotonic clock in seconds, and
-    `opened_s` its time just before the opening."""
+    `opened_s` its time just before the opening. `delay_sd_s`: see `Shot`."""
 
-    def __init__(self, whole: WholePictures, clock: Callable[[], float], opened_s: float) -> None:
-        self._whole, self._clock = whole, clock
+    def __init__(
+        self,
+        whole: WholePictures,
+        clock: Callable[[], float],
+        opened_s: float,
+        delay_sd_s: float = HIDDEN_DELAY_SD_S,
+    ) -> None:
+        self._whole, self._clock, self._delay_sd_s = whole, clock, delay_sd_s
         self._stamped = StampedTime() if whole.is_stamped else None
         self._unstamped = UnstampedTime(opened_s)
         self._ready: deque[Shot | Refusal] = deque()
@@ -137,7 +147,8 @@ class StreamCapture:
         if taken is None:
             return Refusal.LATE
         look, pixels = self._whole.look(picture), self._whole.conversion(picture)
-        return Shot(t_mono_s=taken.t_s, t_sd_s=taken.sd_s, look=look, pixels=pixels)
+        times = {"t_mono_s": taken.t_s, "t_sd_s": taken.sd_s, "delay_sd_s": self._delay_sd_s}
+        return Shot(look=look, pixels=pixels, **times)
 
 
 class Arrivals:

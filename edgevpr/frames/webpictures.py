@@ -12,6 +12,7 @@ from urllib.parse import unquote, urlsplit
 
 from edgevpr.core.errors import ImageError
 from edgevpr.core.types import FRAME_TIME_SD_S
+from edgevpr.frames.age import HIDDEN_DELAY_SD_S
 from edgevpr.frames.depth import DepthRange
 from edgevpr.frames.images import as_jpeg, decode_image, jpeg_is_whole
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, coarse
@@ -86,7 +87,8 @@ class Snapshots:
         plane = image if image.ndim == 2 else image[:, :, 1]
         taken_s = before_s if self._is_kept else self._asked_s
         sd_s = max(FRAME_TIME_SD_S, self._period_s if self._is_kept else answered_s - self._asked_s)
-        return Shot(t_mono_s=taken_s, t_sd_s=sd_s, look=coarse(plane), pixels=lambda: image)
+        times = {"t_mono_s": taken_s, "t_sd_s": sd_s, "delay_sd_s": HIDDEN_DELAY_SD_S}
+        return Shot(look=coarse(plane), pixels=lambda: image, **times)
 
     def cancel(self) -> None:
         """Do nothing: a request lasts a few seconds at most."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from edgevpr.core.config import MavlinkConfig, SourceSetsConfig
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.core.types import FixReport
+from edgevpr.core.types import FixReport, Frame
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.fixes import Sending
 from edgevpr.mavlink.link import Link
@@ -16,7 +16,7 @@ from edgevpr.mavlink.messages import Fix
 from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.flight.notifier import Notifier
+from edgevpr.runtime.flight.notifier import Notifier, Trouble
 from edgevpr.runtime.flight.output import Output
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -25,6 +25,9 @@ from edgevpr.runtime.recognise.recognition import Recognition
 _SETTLED_WITHIN_S = 0.02
 
 DRY_RUN = Reason(ReasonCode.DRY_RUN)
+
+_UNKNOWN_AGE = Reason(ReasonCode.AGE_UNKNOWN)
+_REPORTED_DELAY_S = 0.3
 
 _ASKED_AGAIN_S = 2.0  # for a source set, while that is not answered
 _GPS_GOOD_FOR_S = 10.0  # so long GPS must be good before the source set with GPS is asked for again
@@ -45,6 +48,10 @@ class ToAutopilot:
         self._unanswered: list[tuple[str, Sending]] = []
         self._held, self._is_holding = 0, False
         self._output = Output.STARTING  # as it was last reported
+        self._unknown_age, self._delay_s = (
+            Trouble(notifier, "age", _UNKNOWN_AGE, ReasonCode.AGE_KNOWN),
+            0.0,
+        )  # as last reported
 
     @property
     def summary(self) -> str:
@@ -122,6 +129,37 @@ class ToAutopilot:
                 fix = _reported(event.name, sending)
             self._tell(event, used_mah)
         return replace(event, fix=fix)
+
+    def correct_age(self, frame: Frame) -> Frame:
+        """Return a frame with the hidden delay of the camera's pictures taken out of its time."""
+        with self._link.turn("age of a frame"):
+            return self._navigator.age.correct(frame)
+
+    def check_age(self, event: Recognition) -> Recognition:
+        """Return an event with a match, without it if its picture is of unknown age, and report when that begins and
+        ends, and the delay that is taken out."""
+        with self._link.turn("age"):
+            age = self._navigator.age
+            age.judge(event)
+        self._unknown_age.update(age.is_unknown)
+        if abs(age.delay_s - self._delay_s) > _REPORTED_DELAY_S:
+            self._delay_s = age.delay_s
+            note = self._delay_note or Reason(ReasonCode.DELAY_GONE)
+            self._notifier.report("age", messages.Severity.INFO, note, delay_s=age.delay_s)
+        if not age.is_unknown:
+            return event
+        return replace(event, accepted=False, located=None, accuracy_m=None, reason=_UNKNOWN_AGE)
+
+    @property
+    def age_summary(self) -> str | None:
+        """What people should know of the age of the pictures (None: nothing)."""
+        note = _UNKNOWN_AGE if self._unknown_age.is_so else self._delay_note
+        return None if note is None else str(note)
+
+    @property
+    def _delay_note(self) -> Reason | None:
+        is_late = self._delay_s > _REPORTED_DELAY_S
+        return Reason(ReasonCode.DELAY_FOUND, {"delay_s": self._delay_s}) if is_late else None
 
     def add_motion(self, event: Recognition) -> None:
         """Report to the navigator the motion that a picture shows which is no query."""

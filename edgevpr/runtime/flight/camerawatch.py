@@ -16,9 +16,6 @@ from edgevpr.runtime.recognise.opening import make_meter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# Accepted matches, and a picture's footprint over that of the map, between which nothing is said: as much is found, by
-# benchmarks/results/from_space.md.
-_SCALED_BY, _SCALES = 10, (0.87, 1.4)
 # Accepted matches in a row by which pictures are turned, and the least turn; with this length of the mean of their
 # directions they agree to some ten degrees. A compass is rarely wrong by so much, a camera is by 90 or 180.
 _TURNED_BY, _TURNED_DEG, _AGREE = 10, 20.0, 0.97
@@ -26,29 +23,6 @@ _MISSES_TO_TRY = 15  # queries without a match before a mirrored picture is trie
 _MISSES_TO_TRY_AGAIN = 30
 _MAX_TRIES = 8  # each costs two queries
 _MIRRORED_TO_REPORT = 2  # tries in a row that match: one may be wrong
-
-
-class ScaleWatch:
-    """Says once if pictures show clearly more or less ground than those that were cut from an orthophoto for the map: a
-    map cut to the right size finds more. It goes by the first matches that are accepted."""
-
-    def __init__(self, notifier: Notifier) -> None:
-        self._notifier = notifier
-        self._seen: list[tuple[float, float]] = []  # ground along a picture in flight, and in the map, metres
-
-    def update(self, event: Recognition) -> None:
-        """Take the ground that the match of an event shows."""
-        pose, where = event.best and event.best.place.pose, event.located
-        if len(self._seen) == _SCALED_BY or not (where and where.height_ratio and pose and pose.is_surveyed):
-            return
-        self._seen.append((pose.footprint_m * where.height_ratio, pose.footprint_m))
-        if len(self._seen) < _SCALED_BY:
-            return
-        flown_m, cut_m = np.median(self._seen, axis=0).tolist()
-        if not _SCALES[0] <= flown_m / cut_m <= _SCALES[1]:
-            note = Reason(ReasonCode.SCALE_DIFFERS, {"flown_m": flown_m, "cut_m": cut_m})
-            ground = f"footprint {flown_m:.0f} m, map's {cut_m:.0f} m"
-            self._notifier.report("camera", Severity.WARNING, note, ground=ground)
 
 
 class TurnWatch:

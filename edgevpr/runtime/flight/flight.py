@@ -21,7 +21,7 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, report_unsent
-from edgevpr.runtime.flight.camerawatch import MirrorWatch, ScaleWatch, TurnWatch
+from edgevpr.runtime.flight.camerawatch import MirrorWatch, TurnWatch
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.flightio import FlightIO, FlightParts, open_real_io
 from edgevpr.runtime.flight.flightlog import FlightLog
@@ -84,7 +84,6 @@ class Flight:
             self._vitals.update,
             self._map_watch.update,
             Sight(notifier).update,
-            ScaleWatch(notifier).update,
             TurnWatch(notifier, config.source).update,
             MirrorWatch(notifier, parts.recogniser, config).update,
             HeightWatch(notifier, parts.autopilot).update,
@@ -170,7 +169,8 @@ class Flight:
         """Return what people should know beside the counts, each a few words (None: nothing)."""
         learnt = self._parts.learner.summary if self._parts.learner else None
         held = self._governing.governor.held
-        return self._commands.summary, held, learnt, self._map_watch.summary, self._parts.flight_log.state
+        age = self._parts.autopilot.age_summary if self._parts.autopilot else None
+        return self._commands.summary, age, held, learnt, self._map_watch.summary, self._parts.flight_log.state
 
     def _run_pass(self) -> None:
         """Run one pass of the loop, with one frame at most."""
@@ -210,10 +210,14 @@ class Flight:
         """Recognise a frame or, unless it `is_query`, measure its stride; refuse one of pictures that are frozen."""
         if isinstance(frame, ImageError):
             return self._parts.recogniser.report_unread(frame)
-        vehicle = self._parts.link.vehicle_at(frame.t_mono_s) if self._parts.link else None
-        if self._parts.source.is_live and (reason := self._frozen.judge(frame, vehicle)):
+        parts, is_live = self._parts, self._parts.source.is_live
+        if is_live and parts.autopilot:
+            frame = parts.autopilot.correct_age(frame)
+        vehicle = parts.link.vehicle_at(frame.t_mono_s) if parts.link else None
+        if is_live and (reason := self._frozen.judge(frame, vehicle)):
             return Recognition(frame=frame, vehicle=vehicle, reason=reason)
-        return (self._parts.recogniser.step if is_query else self._parts.recogniser.measure_motion)(frame, vehicle)
+        event = (parts.recogniser.step if is_query else parts.recogniser.measure_motion)(frame, vehicle)
+        return parts.autopilot.check_age(event) if is_live and parts.autopilot and event.accepted else event
 
     def _is_time_for_stride(self) -> bool:
         """Tell whether to take a picture that is no query, for its motion: between rare queries, without GPS. The

@@ -85,6 +85,11 @@ class Navigation:
         """Time of the last GPS position that was used; -inf if there was none."""
         return self._gps_s
 
+    @property
+    def path_velocity_m_s(self) -> Doubles | None:
+        """Velocity (2,) of the path now, which no match has corrected; None if it is not known."""
+        return self._valid_path.now.velocity_m_s if self._valid_path else None
+
     def is_followed_at(self, t_s: float) -> bool:
         """Tell whether the path is followed from frame to frame, by strides that it does not contradict, and queries
         are so frequent that several can contradict it soon."""

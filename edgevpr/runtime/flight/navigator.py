@@ -15,6 +15,7 @@ from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.receivers import PLAUSIBLE_SD_M
 from edgevpr.mavlink.vehicle import Attitude
+from edgevpr.runtime.flight.agewatch import AgeWatch
 from edgevpr.runtime.flight.consistency import Consistency
 from edgevpr.runtime.flight.drift import INERTIAL, INERTIAL_PX4, RECKONED, Drift
 from edgevpr.runtime.flight.measurements import (
@@ -72,13 +73,14 @@ def _withhold(code: ReasonCode) -> Advice:
 class Navigator(Listener):
     """Navigates for one autopilot: estimates the aircraft's position, and decides what is sent. `map_sd_m` is the
     standard deviation of the error that all fixes share, `every_s` the time between two queries. With `is_muted`, in a
-    dry run, nothing is given but advice. `is_level`: the camera hangs in a gimbal, whatever the airframe's attitude."""
+    dry run, nothing is given but advice. `is_level`: the camera hangs in a gimbal, whatever the airframe's attitude.
+    `age`: the hidden delay of the pictures, by the motion that is reported."""
 
     def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False, is_level: bool = False) -> None:
         self._is_muted, self._is_level = is_muted, is_level
         self._map_sd_m, self._next_s = map_sd_m, min(every_s, BETWEEN_S)  # from one fix to the next
         self._navigation = Navigation(RECKONED, map_sd_m)
-        self._consistency = Consistency()
+        self._consistency, self.age = Consistency(), AgeWatch()
         self._slew = Slew()
         self._vehicle: Vehicle | None = None
         self._attitude: Attitude | None = None
@@ -136,6 +138,9 @@ class Navigator(Listener):
         navigation = self._navigation
         navigation.add_report(vehicle, self._believes_gps, self._sent_s > -math.inf)
         self._watch.update(vehicle, navigation.fixed_s, navigation.has_gps)
+        if navigation.path_velocity_m_s is not None:
+            has_gps = navigation.has_gps and not self._channel.is_continuous
+            self.age.add_motion(vehicle.t_heard_s, navigation.path_velocity_m_s, vehicle.heading_deg, has_gps)
 
     def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Process the specific force that the accelerometers measure, m/s2 (nose, right, down), and the attitude."""
@@ -182,7 +187,7 @@ class Navigator(Listener):
         """Return a fix by what the matches before have shown, for the time in which none is accepted; None where the
         autopilot is no better off with it, or a match has contradicted what is known."""
         vehicle = self._vehicle
-        if self._is_muted or self._channel is not Channel.COMMAND:
+        if self._is_muted or self._channel is not Channel.COMMAND or self.age.is_unknown:
             return None
         if self._consistency.is_contradicted(now_s, self._navigation.is_followed_at(now_s)):
             return None

@@ -11,7 +11,7 @@ from pictures import textured
 from edgevpr.core.config import load_config
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.frames.level import View
-from edgevpr.runtime.flight.camerawatch import ScaleWatch, TurnWatch
+from edgevpr.runtime.flight.camerawatch import TurnWatch
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.flight.watching import Sight
@@ -100,32 +100,6 @@ def test_a_flight_that_leaves_its_map_and_comes_back_says_so(recording, tmp_path
     lines = flight.fly(FakeSource(pictures, clock))
     assert link.texts() == [(4, "edgevpr: map left"), (6, "edgevpr: map found again")]
     assert [line["note"]["code"] for line in of_kind(lines, "sight")] == ["MAP_LEFT", "MAP_FOUND"]
-
-
-@pytest.mark.parametrize(
-    ("ratio", "is_surveyed", "said"),
-    [
-        (0.8, True, ["footprint 128 m, map's 160 m"]),
-        (1.6, True, ["footprint 256 m, map's 160 m"]),
-        (0.9, True, []),
-        (1.3, True, []),
-        (0.8, False, []),
-    ],
-)
-def test_pictures_of_another_scale_than_those_of_an_orthophoto_are_said_once(tmp_path, ratio, is_surveyed, said):
-    clock = FakeClock()
-    link = FakeLink(clock)
-    watch = ScaleWatch(Notifier(FlightLog(tmp_path / "log", clock=clock), link))
-    place = SimpleNamespace(pose=SimpleNamespace(footprint_m=160.0, is_surveyed=is_surveyed))
-    found = SimpleNamespace(best=SimpleNamespace(place=place), located=SimpleNamespace(height_ratio=ratio))
-    wrong = SimpleNamespace(best=found.best, located=SimpleNamespace(height_ratio=1.9))
-    missed = SimpleNamespace(best=found.best, located=None)
-    for event in [found, missed, wrong] * 4:
-        watch.update(event)
-    assert link.texts() == []
-    for event in [missed, found, found, found]:
-        watch.update(event)
-    assert [text.removeprefix("edgevpr: ") for _, text in link.texts()] == said
 
 
 @pytest.mark.parametrize(
