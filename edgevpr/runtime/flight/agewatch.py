@@ -146,7 +146,7 @@ class AgeWatch:
         self.is_unknown |= found is Comparison.OF_ANOTHER_AGE
         if self.is_unknown:
             self._others.append(seen)
-            if own and own.sd_s < _DETERMINED_S and found is not Comparison.OUTLIER:
+            if own and own.sd_s < _MAY_CHANGE_S and found is not Comparison.OUTLIER:
                 self._sightings = [*self._sightings[1 - _MAX_MATCHES :], replace(seen, delay_s=own.s)]
             self._resume()
         elif self._outliers == _OUTLIERS:
