@@ -36,7 +36,8 @@ _ANYWHERE_M = 1e3
 _WIND_SD_M_S, _GUST_SD_M_S = 8.0, 0.5
 _GPS_SD_M_S, _GPS_WANDER_M_S = 0.2, 0.05
 _MATCH_SD_M = 1.5
-_COMPASS_SD_DEG, _COMPASS_WANDER_DEG, _DIRECTION_SD_DEG = 30.0, 0.3, 2.0
+_COMPASS_WANDER_DEG, _DIRECTION_SD_DEG, _COMPASS_GAIN = 0.3, 2.0, 0.25
+_ANY_COMPASS = 0.0, 30.0
 # A match contradicts the delay so far if that explains it badly, and another one far better; it agrees with it if that
 # explains it, and another one does not: chi-square with three degrees of freedom. From one opening of a stream to the
 # next a delay may change by so much; one that differs by 1.5 s is another one.
@@ -94,6 +95,7 @@ class AgeWatch:
         self._others: list[Sighting] = []  # those since the age became unknown
         self._delay: Delay | None = None
         self._learnt, self._learnt_s = np.zeros(len(DELAYS_S)), -math.inf  # against each delay, by matches until then
+        self._compass_deg, self._compass_s = math.nan, 0.0  # headings seen less those reported, until then
         self._usual_s, self._taken_out_s = FRAME_TIME_SD_S, 0.0
         self._agreeing = self._outliers = 0
 
@@ -154,6 +156,7 @@ class AgeWatch:
         elif not self._outliers and (not self._sightings or seen.t_s - self._sightings[-1].t_s >= _EVERY_S):
             self._sightings = [*self._sightings[1 - _MAX_MATCHES :], seen]
             self._learn(seen.t_s)
+            self._compare_compass(seen)
 
     def _learn(self, now_s: float) -> None:
         """Estimate the delay anew with one match more."""
@@ -167,6 +170,16 @@ class AgeWatch:
         self._delay = _estimate(shown + np.where(over < 0, (_NEWER * over) ** 2, np.minimum(over**2, _MOST_AGAINST)))
         if now_s - new[0].t_s > _KEPT_S / 2 or len(new) == _MAX_MATCHES:
             self._learnt_s, self._learnt = now_s, _REMEMBERED * (shown - shown.min())
+
+    def _compare_compass(self, seen: Sighting) -> None:
+        """Learn by how much the headings of pictures and compass differ, while the delay is as usual."""
+        times_s, _, _, headings_deg, *_ = np.array(self._motion).T
+        taken_s = seen.t_s - (self._delay.s if self._delay else 0.0)
+        off_deg = float(shorter_deg(seen.heading_deg - np.interp(taken_s, times_s, headings_deg)))
+        if math.isfinite(off_deg):
+            before_deg = self._compass_deg if math.isfinite(self._compass_deg) else off_deg
+            self._compass_deg = before_deg + _COMPASS_GAIN * float(shorter_deg(off_deg - before_deg))
+            self._compass_s = seen.t_s
 
     def _resume(self) -> None:
         """Use pictures again if they are as old as before, or have shown by themselves how old they are now."""
@@ -205,21 +218,28 @@ class AgeWatch:
         return Sighting(t_s=t_s, east_m=float(east_m), north_m=float(north_m), heading_deg=heading_deg, sd_m=sd_m)
 
     def _compare(self, seen: Sighting) -> tuple[Comparison, Delay | None]:
-        """Compare a match with the delay of those before it; return also its own delay, by those before it."""
+        """Compare a match with the delay of those before it; return also its own delay (None: none fits)."""
         before = self._sightings[-_COMPARED:]
         if self._delay is None or len(before) < _LEAST_MATCHES:
             return Comparison.UNKNOWN, None
         usual_s = self._delay.s
         delays_s = np.tile([usual_s if each.delay_s is None else each.delay_s for each in before], (len(DELAYS_S), 1))
-        more = self._cost([*before, seen], np.column_stack([delays_s, DELAYS_S])) - self._cost(before, delays_s[:1])
-        apart_s, own = np.abs(DELAYS_S - usual_s), _estimate(more)
+        since_s = max(0.0, before[0].t_s - self._compass_s)
+        known = self._compass_deg, math.hypot(_DIRECTION_SD_DEG, _COMPASS_WANDER_DEG * math.sqrt(since_s))
+        compass = known if math.isfinite(self._compass_deg) else _ANY_COMPASS
+        more = self._cost([*before, seen], np.column_stack([delays_s, DELAYS_S]), compass)
+        more = more - self._cost(before, delays_s[:1], compass)
+        apart_s, own = np.abs(DELAYS_S - usual_s), _estimate(more) if more.min() < _AGREES else None
         near, far = more[apart_s <= _MAY_CHANGE_S].min(), more[apart_s > _OF_ANOTHER_AGE_S].min()
         if near > _CONTRADICTS:
             return (Comparison.OF_ANOTHER_AGE if more.min() < near - _EXPLAINS else Comparison.OUTLIER), own
         return (Comparison.AGREES if near < min(_AGREES, far - _AGREES_BETTER) else Comparison.UNKNOWN), own
 
-    def _cost(self, sightings: list[Sighting], delays_s: Doubles) -> Doubles:
-        """Return how badly matches fit the reported motion with delays (k, n), in each of k cases: chi-square (k,)."""
+    def _cost(
+        self, sightings: list[Sighting], delays_s: Doubles, compass: tuple[float, float] = _ANY_COMPASS
+    ) -> Doubles:
+        """Return how badly matches fit the reported motion with delays (k, n), in each of k cases: chi-square (k,).
+        `compass`: by how much headings seen exceed those reported, and the standard deviation, degrees."""
         moved_s, east_m, north_m, turned_deg, _, _, grown, start = np.array(self._motion).T
         rows = [(each.t_s, each.east_m, each.north_m, each.heading_deg, each.sd_m) for each in sightings]
         t_s, *seen_m, seen_deg, sd_m = np.array(rows).T
@@ -233,10 +253,10 @@ class AgeWatch:
         for seen, moved in zip(seen_m, (east_m, north_m), strict=True):
             off_m = seen - np.interp(taken_s, moved_s, moved)
             cost += np.einsum("ki,kij,kj->k", off_m, inverse, off_m)
-        off_deg = np.asarray(shorter_deg(seen_deg - np.interp(taken_s, moved_s, turned_deg)))
+        off_deg = np.asarray(shorter_deg(seen_deg - np.interp(taken_s, moved_s, turned_deg) - compass[0]))
         is_known = np.isfinite(off_deg).all(axis=0)
         off_deg, first_s = off_deg[:, is_known], first_s[:, is_known][:, :, is_known]
-        wander_deg2 = _COMPASS_SD_DEG**2 + _COMPASS_WANDER_DEG**2 * first_s
+        wander_deg2 = compass[1] ** 2 + _COMPASS_WANDER_DEG**2 * first_s
         inverse = np.linalg.inv(wander_deg2 + _DIRECTION_SD_DEG**2 * np.eye(off_deg.shape[1]))
         cost += np.einsum("ki,kij,kj->k", off_deg, inverse, off_deg)
         return cost
