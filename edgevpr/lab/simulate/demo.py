@@ -1,10 +1,8 @@
 """The demonstration `edgevpr demo`: two generated flights, and the real commands between them, each as a process."""
 
-import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,8 +48,8 @@ _LEGEND = {
 
 
 def run_demo(folder: str | Path) -> str:
-    """Generate both flights, map the first one, fly the second one against a simulated flight controller; return the
-    results, as text.
+    """Generate both flights, map the first one, fly the second one without a flight controller; return the results, as
+    text.
 
     Leaves in `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and demo.png.
     Raises EdgevprError where a part of it fails.
@@ -66,31 +64,14 @@ def run_demo(folder: str | Path) -> str:
     for out, flight, label in ((first, mapping, "flight 1, to map     "), (second, later, "flight 2, hours later")):
         for _ in progress(write_flight(out, scene, flight), len(flight.poses), label):
             pass
-    # The flight controller is started first: it listens long before the map is built.
-    with run_autopilot() as link:
-        images = ("--images", first / "images", *_CAMERA)
-        run_command("map", "build", map_path, *images, "--technique", "cohog", "--no-calibrate")
-        source = ("--source", second / "images", *_CAMERA)
-        run_command("run", "--map", map_path, *source, "--link", link, "--log", log_path)
+    images = ("--images", first / "images", *_CAMERA)
+    run_command("map", "build", map_path, *images, "--technique", "cohog", "--no-calibrate")
+    run_command("run", "--map", map_path, "--source", second / "images", *_CAMERA, "--log", log_path)
     queries, places = read_queries(log_path, first, second)
     _draw(picture_path, lit(scene, mapping.light, mapping.seed), mapping, queries)
     return f"""{summarise(queries, places)}
 picture           {picture_path}
 page              edgevpr report {log_path} --out {folder / "report.html"}"""
-
-
-@contextmanager
-def run_autopilot() -> Iterator[str]:
-    """Run `edgevpr simulate autopilot` at a free port, and yield the address to reach it by."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{probe.getsockname()[1]}"
-    command = _command("simulate", "autopilot", "--link", f"udpin:{address}")
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        try:
-            yield f"udpout:{address}"
-        finally:
-            process.terminate()
 
 
 def run_command(*words: object) -> None:

@@ -1,4 +1,4 @@
-"""The demonstration on a small landscape: real processes, a real link, a real picture."""
+"""The demonstration on a small landscape: real processes, a real picture."""
 
 from dataclasses import replace
 from functools import partial
@@ -10,9 +10,8 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.lab.simulate import demo
 from edgevpr.lab.simulate.generated import later_flight, mapping_flight
 from edgevpr.lab.simulate.landscape import make_scene
-from edgevpr.runtime.flight.flightlog import select_last_flight
 
-pytestmark = [pytest.mark.process, pytest.mark.network, pytest.mark.slow]
+pytestmark = [pytest.mark.process, pytest.mark.slow]
 
 
 @pytest.fixture
@@ -28,22 +27,14 @@ def test_run_demo_maps_flies_and_draws(small, tmp_path):
     said = demo.run_demo(tmp_path)
     queries, _ = demo.read_queries(tmp_path / "flight.jsonl", tmp_path / "flight-1", tmp_path / "flight-2")
     assert len(queries) == 6
-    mavlink = list(select_last_flight(tmp_path / "flight.jsonl"))[-1]["mavlink"]
-    assert mavlink["received"]["HEARTBEAT"] > 0
-    assert set(mavlink["acks"]) <= {"ACCEPTED"}
     picture = cv2.imread(str(tmp_path / "demo.png"))
     assert picture.shape == (1050, 2580, 3)
     assert picture.std() > 20
     assert "recall@1" in said
 
 
-def test_run_demo_names_a_command_that_fails_and_leaves_nothing_running(small, tmp_path, monkeypatch):
-    started = []
-    popen = demo.subprocess.Popen
-    monkeypatch.setattr(demo.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
+def test_run_demo_names_a_command_that_fails(small, tmp_path, monkeypatch):
     command = demo._command
     monkeypatch.setattr(demo, "_command", lambda *words: command(*words, *(["--often"] if words[0] == "run" else [])))
     with pytest.raises(EdgevprError, match=r"`edgevpr run.* 2"):
         demo.run_demo(tmp_path / "out")
-    assert len(started) == 3, "flight controller, map, flight"
-    assert all(process.poll() is not None for process in started)
