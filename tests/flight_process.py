@@ -1,6 +1,5 @@
 """`edgevpr run` as a process of its own, looked at from outside: its log, its memory, its CPU time."""
 
-import json
 import os
 import subprocess
 import sys
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-from mavlink_peers import free_port
+from mavlink_peers import AutopilotThread, free_port
 from pictures import textured
 
 from edgevpr.runtime.flight.flightlog import read_log
@@ -41,24 +40,14 @@ def start(
 
 
 @contextmanager
-def simulated_autopilot(*flags: str):
-    """A simulated flight controller as a process, up: its link, and a call that ends it and tells what it saw."""
+def simulated_autopilot(**how):
+    """A simulated flight controller: its link, and a call that ends it and returns what it has received."""
     port = free_port()
-    command = ["-m", "edgevpr", "simulate", "autopilot", "--link", f"udpin:127.0.0.1:{port}", "--json", *flags]
-    process = subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-    def asked() -> dict[str, Any]:
-        process.terminate()
-        return json.loads(process.communicate(timeout=_PATIENCE_S)[0])
-
+    autopilot = AutopilotThread(f"udpin:127.0.0.1:{port}", **how)
     try:
-        assert "is up" in process.stderr.readline()
-        yield f"udpout:127.0.0.1:{port}", asked
+        yield f"udpout:127.0.0.1:{port}", autopilot.finish
     finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
-        process.stderr.close()
+        autopilot.finish()
 
 
 def wait_for(kind: str, log: Path, process: subprocess.Popen) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from edgevpr.runtime.flight.path import to_ground_acceleration
 
 ACCEPTED, DENIED, FAILED = (getattr(mavlink, f"MAV_RESULT_{name}") for name in ("ACCEPTED", "DENIED", "FAILED"))
 NOT_NOW, UNSUPPORTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED, mavlink.MAV_RESULT_UNSUPPORTED
-HAS_POSITION = mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_HORIZ_ABS
 
 
 class Flown:
@@ -200,33 +199,6 @@ def test_copter_flies_by_odometry_without_any_gps():
     assert "VisOdom" in flown.controller.why_not_arm()
 
 
-def test_source_set_is_chosen_by_command():
-    flown = Flown("arducopter", VISO_TYPE=1, EK3_SRC2_POSXY=6).in_air()
-    assert flown.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 4) == DENIED
-    assert flown.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2) == ACCEPTED
-    assert not flown.wait(9).flags & HAS_POSITION, "nothing comes on that one"
-    assert Flown("px4-copter").command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2) == UNSUPPORTED
-
-
-def test_px4_takes_a_fix_while_it_reckons_and_names_no_frame():
-    flown = lost("px4-plane").wait(0.5)
-    assert flown.wait(60).error_m > 200
-    assert flown.fix(frame=mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, param1=math.nan, param3=math.nan) == ACCEPTED
-    assert flown.error_m < 1
-    assert flown.controller.brain.estimator.sd_m == 50, "where the sender says none"
-    assert flown.fix(param2=math.nan) == NOT_NOW
-    assert flown.fix(x=1_000_000_000) == FAILED
-
-
-def test_px4_on_the_ground_without_gps_starts_from_a_fix():
-    flown = Flown("px4-copter", SIM_GPS1_ENABLE=0).wait(5)
-    assert flown.flags & mavlink.ESTIMATOR_CONST_POS_MODE
-    assert flown.fix() == ACCEPTED
-    flown.wait(0.5)
-    assert flown.flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
-    assert "GLOBAL_POSITION_INT" in {each.get_type() for each in flown.said}, "streams that come by themselves"
-
-
 def sensed(flown: Flown, north_m: float = 0.0, eph_m: float = 5.0, number: int = 1):
     at = flown.truth.lat_deg + north_m / 111_195, flown.truth.lon_deg
     message = messages.position_sensor(state_at(0.0, *at, accuracy_m=eph_m))
@@ -250,19 +222,6 @@ def test_px4_fuses_message_296():
     assert not flown.flags & (mavlink.ESTIMATOR_POS_HORIZ_ABS | fused)
 
 
-def test_px4_follows_a_jump_of_message_296_after_seven_seconds():
-    flown = lost("px4-plane", wind_m_s=0).wait(2)
-    for _ in range(10):
-        flown.tell(sensed(flown, eph_m=1.0))
-        flown.wait(1)
-    for second in range(12):
-        flown.tell(sensed(flown, north_m=300.0, eph_m=1.0))
-        flown.wait(1)
-        if second < 5:
-            assert flown.error_m < 30
-    assert flown.error_m == pytest.approx(300, abs=30)
-
-
 def sends(flown: Flown, seconds: float, north_m: float, **how) -> Flown:
     for _ in range(round(seconds * 10)):
         flown.tell(sensed(flown, north_m, **how))
@@ -280,18 +239,6 @@ def test_px4_refuses_gps_that_contradicts_while_ours_is_active_and_resets_to_it_
     assert flown.wait(4).error_m > 50, "it waits five seconds for ours"
     assert flown.wait(3).error_m < 1
     assert not flown.flags & mavlink.ESTIMATOR_GPS_GLITCH
-
-
-def test_px4_beside_good_gps_refuses_ours_that_contradict_and_fuses_those_within_the_gate():
-    flown = sends(Flown("px4-copter").in_air(), 20, north_m=100.0, eph_m=1.0)
-    assert flown.error_m < 0.1
-    assert 0.05 < sends(flown, 20, north_m=2.0, eph_m=1.0).error_m < 1
-
-
-def test_parameters_are_listed_with_their_indices():
-    listed = Flown("px4-copter").tell(mavlink.MAVLink_param_request_list_message(1, 1))
-    assert {each.param_id for each in listed} >= {"EKF2_AGP0_CTRL", "SIM_GPS1_ENABLE"}
-    assert [each.param_index for each in listed] == list(range(listed[0].param_count))
 
 
 @pytest.mark.parametrize("acceleration_m_s2", [3 + 1j, -2j, 0j])

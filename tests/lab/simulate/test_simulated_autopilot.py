@@ -1,7 +1,6 @@
 """The simulated flight controller: strict, and honest about what it saw."""
 
 import math
-import socket
 import subprocess
 import sys
 import time
@@ -9,11 +8,9 @@ import time
 import pytest
 from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, link_to, wait_until
 from simulated import autopilot
-from simulated.autopilot import run_autopilot
 from simulated.controller import FlightController
 from simulated.motion import AlongTrack, TrueState, interpolate_track, read_track
 
-from edgevpr.core.errors import LinkError, UsageError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.asking import Inquiry, read_autopilot
@@ -60,37 +57,6 @@ def test_run_autopilot_answers_and_counts():
     assert (summary.fixes_accepted, summary.fixes_denied) == (2, 1)
     assert summary.messages["COMMAND_INT"] == 5
     assert (summary.lost_packets, summary.bad_bytes) == (3, 5)
-
-
-def test_run_autopilot_flies_along_a_track_once_a_companion_is_there(tmp_path):
-    csv = tmp_path / "positions.csv"
-    rows = [
-        "b.jpg,50.002,8.0,110,90,2026-02-14T00:30:00.4Z",
-        "a.jpg,50.000,8.0,100,0,2026-02-14T00:30:00Z",
-        "c.jpg,,,,,",
-    ]
-    csv.write_text("\n".join(["file,lat,lon,alt,yaw_deg,time", *rows]))
-    number = free_port()
-    with link_to(f"udpin:127.0.0.1:{number}") as link:
-        link.want_position()
-        autopilot = AutopilotThread(f"udpout:127.0.0.1:{number}", track=read_track(csv))
-        seen = []
-
-        def at_the_end():
-            position = link.vehicle()
-            if position and (not seen or position.t_heard_s != seen[-1].t_heard_s):
-                seen.append(position)
-            return len(seen) > 3 and seen[-1].lat_deg == seen[-2].lat_deg
-
-        wait_until(at_the_end, "the end of the track")
-        autopilot.finish()
-    north = [position.lat_deg for position in seen]
-    assert north == sorted(north)
-    assert len(set(north)) >= 2, "on the way, too"
-    assert (seen[-1].lat_deg, seen[-1].lon_deg, seen[-1].alt_m, seen[-1].heading_deg) == (50.002, 8.0, 110.0, 90.0)
-    assert 0 <= seen[0].heading_deg <= 90
-    east_m_s, north_m_s = seen[-1].velocity_m_s
-    assert (east_m_s, north_m_s) == (0.0, 0.0), "it stays where the track ends"
 
 
 @pytest.mark.slow
@@ -164,18 +130,6 @@ def test_attitude_is_that_of_the_track_else_level(tmp_path, rows, attitude_deg, 
     degrees = [math.degrees(angle) for angle in (attitude.roll, attitude.pitch, attitude.yaw)]
     assert degrees == pytest.approx(attitude_deg, abs=1e-3)
     assert (position.relative_alt, position.hdg) == (height_mm, pytest.approx(heading_cdeg, abs=1))
-
-
-def test_read_track_refuses_one_without_times(tmp_path):
-    (tmp_path / "p.csv").write_text("file,lat,lon\na.jpg,50,8\n")
-    with pytest.raises(UsageError, match="lon and"):
-        read_track(tmp_path / "p.csv")
-
-
-@pytest.mark.parametrize("link", ["tcp:127.0.0.1:{}", "serial:/dev/no-such-device:{}"])
-def test_run_autopilot_reports_a_link_that_cannot_be_opened(link):
-    with pytest.raises(LinkError, match="opened"):
-        run_autopilot(link.format(free_port(socket.SOCK_STREAM)))
 
 
 @pytest.mark.process

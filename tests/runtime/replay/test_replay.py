@@ -65,7 +65,7 @@ def test_a_flight_with_an_autopilot_is_the_same_to_the_byte(fly, tmp_path):
 
 @pytest.mark.parametrize("vehicle", ["px4-plane", "arducopter"])
 def test_whatever_the_autopilot_and_its_channel(fly, tmp_path, vehicle):
-    with simulated_autopilot("--vehicle", vehicle, "--no-gps") as (link, _):
+    with simulated_autopilot(vehicle=vehicle) as (link, _):
         ended(fly("--link", link, "--rate-hz", "8"))
     again, _ = is_the_same(tmp_path / "flight.jsonl")
     assert again.lines[-1]["mavlink"]["received"]["HEARTBEAT"] > 0

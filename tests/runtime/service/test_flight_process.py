@@ -45,21 +45,21 @@ def test_run_sends_what_the_log_says(fly, tmp_path):
     assert [line["kind"] for line in (lines[0], end)] == ["start", "end"]
     assert len(queries) == end["queries"] == PLACES
     assert all(line["accepted"] for line in queries)
-    assert seen["bad_bytes"] == seen["lost_packets"] == seen["fixes_denied"] == 0
-    assert seen["companion"] == "1/197"
+    assert seen.bad_bytes == seen.lost_packets == seen.fixes_denied == 0
+    assert seen.companion == "1/197"
     for name in ("COMMAND_INT", "NAMED_VALUE_INT", "NAMED_VALUE_FLOAT", "ONBOARD_COMPUTER_STATUS"):
         # What was sent before the flight controller listened is gone, and nothing else.
-        assert 0 < seen["messages"][name] <= end["mavlink"]["sent"][name]
+        assert 0 < seen.messages[name] <= end["mavlink"]["sent"][name]
     mapped = {(round(50.0 + number * STEP_DEG, 7), 8.0) for number in range(PLACES)}
     assert {(fix["lat_deg"], fix["lon_deg"]) for line in queries if (fix := line["fix"])["sent"]} <= mapped
-    assert seen["fixes_accepted"] == end["mavlink"]["acks"]["ACCEPTED"] == seen["messages"]["COMMAND_INT"]
+    assert seen.fixes_accepted == end["mavlink"]["acks"]["ACCEPTED"] == seen.messages["COMMAND_INT"]
     # A line that says so was right, and so was the next; what waited for longer is told by the line of its answer.
     told = {line["query"] for line in queries if line["fix"]["sent"]}
     answered = [line for line in of_kind(lines, "answer") if line["sent"]]
-    assert [line["result"] for line in answered] == ["ACCEPTED"] * seen["fixes_accepted"]
+    assert [line["result"] for line in answered] == ["ACCEPTED"] * seen.fixes_accepted
     assert told <= {line["query"] for line in answered}
     assert len(answered) == len({line["query"] for line in answered})
-    assert f"{seen['fixes_accepted']} taken" in said
+    assert f"{seen.fixes_accepted} taken" in said
     # The board draws between the queries too, and the process does more than its queries' stages.
     totals, slack = queries[-1]["totals"], 1 + 1e-4
     assert totals["used_mah"] * slack > sum(line["costs"]["used_mah"] for line in queries)
@@ -74,9 +74,9 @@ def test_dry_run_sends_all_but_fixes(fly, tmp_path):
     with simulated_autopilot() as (link, asked):
         said = fly("--link", link, "--rate-hz", "20", "--dry-run").communicate(timeout=120)[1]
         seen = asked()
-    assert "COMMAND_INT" not in seen["messages"]
+    assert "COMMAND_INT" not in seen.messages
     for name in ("HEARTBEAT", "NAMED_VALUE_INT", "NAMED_VALUE_FLOAT", "ONBOARD_COMPUTER_STATUS"):
-        assert seen["messages"][name] > 0
+        assert seen.messages[name] > 0
     lines = list(read_log(tmp_path / "flight.jsonl"))
     queries, start_line = of_kind(lines, "query"), lines[0]
     assert all(line["accepted"] for line in queries)
