@@ -155,21 +155,27 @@ class Lap:
         self.sent: list[tuple[float, float, float, float]] = []
         self._receive, self.controller.receive = self.controller.receive, self._note
 
-    def pose(self) -> CameraPose:
-        """Return where the camera is now, and keep it."""
+    def _keep(self) -> TrueState:
+        """Keep where the plane is now, and return it."""
         state = self.controller.brain.truth
+        self.truth.append((time.monotonic(), *to_metres(state.lat_deg, state.lon_deg)))
+        return state
+
+    def pose(self) -> CameraPose:
+        """Return where the camera is now."""
+        state = self._keep()
         east_m, north_m = to_metres(state.lat_deg, state.lon_deg)
-        self.truth.append((time.monotonic(), east_m, north_m))
         angles = {"heading_deg": state.heading_deg, "roll_deg": state.roll_deg}
         return CameraPose(east_m=east_m, north_m=north_m, height_m=HEIGHT_M, **angles)
 
     def off_m(self, t_s: float, lat_deg: float, lon_deg: float) -> float:
         """Return how far a position is from where the plane was at `t_s`."""
-        known = np.array(self.truth)
+        known = np.array(sorted(self.truth))
         true_m = [np.interp(t_s, known[:, 0], known[:, axis]) for axis in (1, 2)]
         return math.dist(true_m, to_metres(lat_deg, lon_deg))
 
     def _note(self, message: object) -> list:
+        self._keep()  # a camera that is gone asks for no pose
         if message.get_type() == "COMMAND_INT" and message.command == POSITION_FIX:
             at = time.monotonic() - message.param2, message.x / 1e7, message.y / 1e7, message.param3
             self.sent.append(at)
