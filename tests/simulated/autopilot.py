@@ -2,6 +2,7 @@
 port and to the clock. Used by tests, and by people: `python tests/simulated/autopilot.py --help`. A *companion* is an
 onboard computer, such as the one that runs edgevpr."""
 
+import json
 import logging
 import math
 import select
@@ -175,7 +176,7 @@ def command_line() -> ArgumentParser:
 
 
 def main() -> None:
-    """Simulate an autopilot by the command line, and print what it received."""
+    """Simulate an autopilot by the command line, and print what it received, as JSON."""
     parser = command_line()
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -187,8 +188,7 @@ def main() -> None:
         summary = run_autopilot(args.link, track=track, vehicle=args.vehicle, gps=gps, parameters=parameters)
     except EdgevprError as error:
         parser.error(str(error))
-    for name, value in asdict(summary).items():
-        print(f"{name:15} {value}")
+    print(json.dumps(asdict(summary), indent=2))
 
 
 if __name__ == "__main__":
