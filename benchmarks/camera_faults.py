@@ -26,7 +26,7 @@ import base
 import cv2
 import numpy as np
 import psutil
-from rtsp_camera import free_port
+from loopback import free_port
 from simulated.autopilot import serve
 from simulated.controller import FlightController
 from simulated.motion import AlongTrack, TrueState

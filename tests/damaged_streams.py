@@ -18,8 +18,9 @@ from pathlib import Path
 import cv2
 import imageio_ffmpeg
 import numpy as np
-from numbered_pictures import numbers_in, picture
-from rtsp_camera import RtspCamera, free_port
+from loopback import free_port
+from numbered_pictures import HEIGHT, WIDTH, numbers_in, picture
+from rtsp_camera import RtspCamera
 
 from edgevpr.frames.decoding import Fetched, WholePictures
 from edgevpr.frames.shot import Condition
@@ -51,28 +52,25 @@ _LOSSY = (
 )
 RATE_HZ = 40.0
 OLD_S = 1.0
-_WHOLE_AT_FIRST = 80
+_WHOLE_AT_FIRST = 80  # pictures that every camera sends, so that the viewer gets to know the stream
 _TOO_SLOW = ("MJPEG over HTTP, whole", "H.264 in MPEG-TS, 0% lost", "H.264 in RTSP, 0% lost")
 _SLOWER, _LONGER = 2.0, 3  # than the stream: the work for a picture; and than the others: how long it is borne
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Film:
-    """What a camera sees: `count` pictures by their numbers, each uint8 (H, W, 3) BGR. The first `whole_at_first` are
-    sent whole by every camera, so that the viewer gets to know the stream."""
+    """What a camera sees: `count` pictures by their numbers, each uint8 (H, W, 3) BGR."""
 
-    picture: Callable[[int], np.ndarray]
     count: int
     rate_hz: float
-    whole_at_first: int
 
     def play(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yield number and picture when each is due."""
         start_s = time.monotonic()
         for number in range(self.count):
-            picture = self.picture(number)
+            shown = picture(number)
             time.sleep(max(0.0, start_s + number / self.rate_hz - time.monotonic()))
-            yield number, picture
+            yield number, shown
 
 
 class Camera:
@@ -118,9 +116,9 @@ class MjpegCamera(Camera):
             viewer.recv(4096)
             viewer.sendall(b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=part\r\n\r\n")
             self._rolls.wait()
-            for number, picture in self._film.play():
-                jpeg = cv2.imencode(".jpg", picture)[1].tobytes()
-                if number >= self._film.whole_at_first:
+            for number, shown in self._film.play():
+                jpeg = cv2.imencode(".jpg", shown)[1].tobytes()
+                if number >= _WHOLE_AT_FIRST:
                     jpeg = self._damage(jpeg)
                 head = f"--part\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
                 self.sent_s[number] = time.monotonic()
@@ -171,11 +169,11 @@ class LossyCamera(Camera):
 
     def _feed(self) -> None:
         with self._encoder.stdin as pipe:
-            pipe.write(self._film.picture(0).tobytes())  # the encoder says what it sends only when it has seen one
+            pipe.write(picture(0).tobytes())  # the encoder says what it sends only when it has seen one
             pipe.flush()
             self._rolls.wait()
-            for _, picture in self._film.play():
-                pipe.write(picture.tobytes())
+            for _, shown in self._film.play():
+                pipe.write(shown.tobytes())
                 pipe.flush()
         self._encoder.wait()
         self._filmed.set()
@@ -194,7 +192,7 @@ class LossyCamera(Camera):
                     number += 1
                     if number >= 0:
                         self.sent_s[number] = time.monotonic()
-                if len(self.sent_s) <= self._film.whole_at_first or self._random.random() >= self._lost:
+                if len(self.sent_s) <= _WHOLE_AT_FIRST or self._random.random() >= self._lost:
                     out.sendto(datagram, self._viewer)
         self.done.set()
 
@@ -210,8 +208,7 @@ class LossyCamera(Camera):
 
 
 def _encoder(film: Film, codec: tuple[str, ...], target: list[str]) -> subprocess.Popen:
-    height, width = film.picture(0).shape[:2]
-    source = ["-f", "rawvideo", "-pix_fmt", "bgr24", "-s", f"{width}x{height}", "-r", f"{film.rate_hz:g}", "-i", "-"]
+    source = ["-f", "rawvideo", "-pix_fmt", "bgr24", "-s", f"{WIDTH}x{HEIGHT}", "-r", f"{film.rate_hz:g}", "-i", "-"]
     return subprocess.Popen(
         [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *source, *codec, *target],
         stdin=subprocess.PIPE,
@@ -272,7 +269,7 @@ def run(
 ) -> list[Row]:
     """Send `count` pictures over every stream whose name is wanted, and judge what is delivered; then over some once
     more, with a decoder that is too slow for them."""
-    film = Film(picture=picture, count=count, rate_hz=rate_hz, whole_at_first=_WHOLE_AT_FIRST)
+    film = Film(count=count, rate_hz=rate_hz)
     cameras = streams(seed)
     rows = [_judge(name, make(film)) for name, make in cameras.items() if only(name)]
     for name in _TOO_SLOW:

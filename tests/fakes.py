@@ -64,11 +64,11 @@ class FakeClock:
         while self._events and self._events[0][0] <= self.now_s + 1e-9:
             self._events.pop(0)[1]()
 
-    def work(self, wall_s: float, cores: float = 1.0, kept_waiting: float = 0.0) -> None:
-        """Let so many cores be busy for a while, the asking thread among them but for the share it is kept waiting."""
+    def work(self, wall_s: float, cores: float = 1.0) -> None:
+        """Let so many cores be busy for a while, the asking thread among them."""
         self.now_s += wall_s
         self.cpu_s += wall_s * cores
-        self.thread_cpu_s += wall_s * min(cores, 1.0) * (1 - kept_waiting)
+        self.thread_cpu_s += wall_s * min(cores, 1.0)
 
 
 class FakeSource:

@@ -17,16 +17,6 @@ def film(path: Path, *coding: str) -> Path:
     return path
 
 
-def film_of(path: Path, pictures: list[np.ndarray], rate_hz: float, *coding: str) -> Path:
-    """Film pictures, uint8 (H, W, 3) BGR, without losses unless `coding` says otherwise."""
-    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the video is made with ffmpeg (pip install imageio-ffmpeg)")
-    height, width = pictures[0].shape[:2]
-    given = ["-f", "rawvideo", "-pix_fmt", "bgr24", "-s", f"{width}x{height}", "-r", f"{rate_hz}", "-i", "-"]
-    command = [ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *given, *(coding or ("-c:v", "ffv1", "-pix_fmt", "bgr0"))]
-    subprocess.run([*command, str(path)], input=b"".join(each.tobytes() for each in pictures), check=True)
-    return path
-
-
 def overwrite_in_the_middle(path: Path, count: int = 300) -> None:
     data = bytearray(path.read_bytes())
     middle = len(data) // 2

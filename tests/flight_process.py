@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-from mavlink_peers import AutopilotThread, free_port
+from loopback import free_port
+from mavlink_peers import AutopilotThread
 from pictures import textured
 
 from edgevpr.runtime.flight.flightlog import read_log

@@ -6,13 +6,6 @@ import socket
 import threading
 
 
-def free_port() -> int:
-    """A port that was free a moment ago for TCP, UDP and, two further, for RTP with its reports."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 class RtspCamera:
     def __init__(self, sdp: str, rtp_port: int, port: int):
         self.uri = f"rtsp://127.0.0.1:{port}/camera"

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import seen_from_above, textured
 
 import edgevpr
 from edgevpr.cli.main import main
@@ -24,9 +24,7 @@ PLACES = 6
 
 def seen(place, turned_deg=0.0):
     """The ground at a place, seen from straight above."""
-    ground = textured(place, 800, 800)
-    turn = cv2.getRotationMatrix2D((400, 400), turned_deg, 1.0)
-    return cv2.warpAffine(ground, turn, (800, 800))[240:560, 240:560]
+    return seen_from_above(textured(place, 800, 800), 320, turned_deg)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,8 @@ import time
 from pathlib import Path
 
 import imageio_ffmpeg
-from rtsp_camera import RtspCamera, free_port
+from loopback import free_port
+from rtsp_camera import RtspCamera
 
 WIDTH, HEIGHT = 160, 120
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 from fakes import FakeClock
-from live_sources import PATIENCE_S
+from loopback import PATIENCE_S
 
 from edgevpr.frames import streams
 from edgevpr.frames.decoding import Fetched

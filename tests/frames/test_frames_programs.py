@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from live_sources import wait_for
+from loopback import wait_until
 
 from edgevpr.core.errors import SourceError
 from edgevpr.frames import programs
@@ -49,7 +49,7 @@ def running(program="fake_rpicam.py"):
 
 
 def check_three_frames(source, shape):
-    frames = [wait_for(lambda: source.read(1.0)) for _ in range(3)]
+    frames = [wait_until(lambda: source.read(1.0)) for _ in range(3)]
     assert {frame.image.shape for frame in frames} == {shape}
     assert frames[0].t_mono_s <= frames[1].t_mono_s <= frames[2].t_mono_s <= time.monotonic()
     assert source.condition is Condition.RUNNING
@@ -61,23 +61,23 @@ def test_ribbon_camera_gives_whole_pictures_and_the_program_ends_with_the_source
     check_three_frames(source, (960, 1280, 3))
     assert running() - before
     source.close()
-    wait_for(lambda: not running() - before)
+    wait_until(lambda: not running() - before)
 
 
 def test_ribbon_camera_that_hangs_is_started_anew(rpicam, monkeypatch):
     monkeypatch.setenv("FAKE_RPICAM", "hangs")
     source = rpicam()
-    wait_for(lambda: source.read(1.0))
-    wait_for(lambda: source.condition is Condition.LOST)
-    wait_for(lambda: source.read(1.0))
+    wait_until(lambda: source.read(1.0))
+    wait_until(lambda: source.condition is Condition.LOST)
+    wait_until(lambda: source.read(1.0))
 
 
 def test_ribbon_camera_that_starts_slowly_is_waited_for(rpicam, monkeypatch):
     monkeypatch.setenv("FAKE_RPICAM", "slow")
     before = running()
     source = rpicam()
-    (process,) = wait_for(lambda: running() - before)
-    assert wait_for(lambda: source.read(1.0))
+    (process,) = wait_until(lambda: running() - before)
+    assert wait_until(lambda: source.read(1.0))
     assert running() - before == {process}, "it was not started anew"
 
 
@@ -85,7 +85,7 @@ def test_program_that_gives_no_picture_for_long_is_ended(rpicam, monkeypatch):
     monkeypatch.setattr(programs, "_FIRST_PICTURE_S", 1.0)
     monkeypatch.setenv("FAKE_RPICAM", "slow")
     source = rpicam()
-    wait_for(lambda: source.state.startswith("no picture from rpicam-vid in 1 s, reopening in "))
+    wait_until(lambda: source.state.startswith("no picture from rpicam-vid in 1 s, reopening in "))
 
 
 @pytest.mark.parametrize(
@@ -101,20 +101,20 @@ def test_error_lines_explain_the_exit_of_a_program(text, explanation):
     process = subprocess.Popen(["sh", "-c", 'printf %b "$0" >&2', text], stderr=subprocess.PIPE)
     errors = programs.ErrorLines(process)
     process.wait()
-    assert wait_for(lambda: not errors._thread.is_alive())
+    assert wait_until(lambda: not errors._thread.is_alive())
     assert errors.explain_exit() == explanation
 
 
 def test_ribbon_camera_that_is_not_there_is_reported_and_tried_again(rpicam, monkeypatch, caplog):
     monkeypatch.setenv("FAKE_RPICAM", "absent")
     source = rpicam()
-    wait_for(lambda: source.condition is Condition.LOST)
+    wait_until(lambda: source.condition is Condition.LOST)
     assert source.state.startswith(
         "rpicam-vid has ended with code 1: ERROR: *** no cameras available ***, reopening in"
     )
     assert "--list-cameras" in caplog.text
     monkeypatch.delenv("FAKE_RPICAM")
-    wait_for(lambda: source.read(1.0))
+    wait_until(lambda: source.read(1.0))
 
 
 @pytest.mark.parametrize(
@@ -140,9 +140,9 @@ def test_pipeline_gives_pictures_and_ends_with_the_source(opened, end):
     before = running("gst-launch-1.0 -q videotestsrc")
     source = opened(GST + end)
     check_three_frames(source, (240, 320, 3))
-    wait_for(lambda: source.read(1.0) and source.latency_s < 1)
+    wait_until(lambda: source.read(1.0) and source.latency_s < 1)
     source.close()
-    wait_for(lambda: not running("gst-launch-1.0 -q videotestsrc") - before)
+    wait_until(lambda: not running("gst-launch-1.0 -q videotestsrc") - before)
 
 
 @needs_gstreamer
@@ -150,11 +150,11 @@ def test_a_pipeline_that_ends_or_hangs_is_started_anew(opened):
     before = running("gst-launch-1.0 -q videotestsrc")
     source = opened(GST)
     for how in (signal.SIGKILL, signal.SIGSTOP):
-        wait_for(lambda: source.condition is Condition.RUNNING)
+        wait_until(lambda: source.condition is Condition.RUNNING)
         (process,) = running("gst-launch-1.0 -q videotestsrc") - before
         os.kill(process, how)
-        wait_for(lambda: source.condition is Condition.LOST)
-    wait_for(lambda: source.condition is Condition.RUNNING)
+        wait_until(lambda: source.condition is Condition.LOST)
+    wait_until(lambda: source.condition is Condition.RUNNING)
 
 
 @needs_gstreamer
@@ -164,7 +164,7 @@ def test_no_pipeline_outlives_a_program_that_is_killed(tmp_path):
         f"from edgevpr.frames.source import open_source; s = open_source({GST!r}, live=True)\nwhile True: s.read(1)"
     )
     program = subprocess.Popen([sys.executable, "-c", reading])
-    wait_for(lambda: running("gst-launch-1.0 -q videotestsrc") - before)
+    wait_until(lambda: running("gst-launch-1.0 -q videotestsrc") - before)
     program.kill()
     program.wait()
-    wait_for(lambda: not running("gst-launch-1.0 -q videotestsrc") - before)
+    wait_until(lambda: not running("gst-launch-1.0 -q videotestsrc") - before)

@@ -22,8 +22,7 @@ from answering_cameras import (
     send_rtp,
     send_rtp_jpeg,
 )
-from live_sources import PATIENCE_S, wait_for
-from rtsp_camera import free_port
+from loopback import PATIENCE_S, free_port, wait_until
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import SourceError
@@ -144,7 +143,7 @@ def test_open_device_names_the_cause(path, cause):
 
 
 def first_frame(source):
-    frame = wait_for(lambda: source.read(0.05))
+    frame = wait_until(lambda: source.read(0.05))
     assert frame.image.shape == (HEIGHT, WIDTH, 3)
     assert frame.image.std() > 5
     return frame
@@ -262,9 +261,9 @@ def test_snapshots_that_are_cut_are_damaged_and_those_that_fail_are_lost(opened,
     pictures = iter([encoded(0), encoded(1), encoded(2)[:900], b""])
     server = Server(http("200 OK", "image/jpeg", lambda number: next(pictures)))
     source = opened(f"http://{server.address}/snapshot.jpg")
-    wait_for(lambda: source.refused["damaged"] >= 1)
+    wait_until(lambda: source.refused["damaged"] >= 1)
     server.close()
-    wait_for(lambda: source.condition is Condition.LOST)
+    wait_until(lambda: source.condition is Condition.LOST)
 
 
 def test_snapshots_take_a_password(serve):

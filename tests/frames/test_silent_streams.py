@@ -9,7 +9,7 @@ import av
 import numpy as np
 import pytest
 from answering_cameras import Server
-from live_sources import wait_for
+from loopback import wait_until
 
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
@@ -94,8 +94,8 @@ def test_stream_whose_pictures_end_is_lost_and_opened_again(first, later):
             (later if len(viewers) > 1 else first)(connection)
 
     with closing(Server(answer)) as server, closing(open_source(f"tcp://{server.address}", live=True)) as source:
-        wait_for(lambda: source.read(0.1))
-        wait_for(lambda: source.read(0.1) is None and source.condition in (Condition.LOST, Condition.DAMAGED))
+        wait_until(lambda: source.read(0.1))
+        wait_until(lambda: source.read(0.1) is None and source.condition in (Condition.LOST, Condition.DAMAGED))
         assert source.latency_s > 2.0, "the age of the newest picture grows"
-        wait_for(lambda: len(viewers) >= 2 and source.read(0.1))
+        wait_until(lambda: len(viewers) >= 2 and source.read(0.1))
         assert source.condition is Condition.RUNNING

@@ -1,11 +1,9 @@
-"""An autopilot that answers questions, over UDP or a serial cable, in a thread of its own; it notes what it is told."""
+"""An autopilot that answers questions over UDP, in a thread of its own; it notes what it is told."""
 
 import math
 import select
-import struct
 import threading
 import time
-from pathlib import Path
 
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.ports import open_port
@@ -15,32 +13,27 @@ BEAT_S = 0.05  # twenty times as fast as a real one, so that nothing is waited f
 
 
 class AnsweringAutopilot:
-    """Speaks to the UDP port `to`, or over the serial device of that path.
+    """A quadrotor with ArduPilot, which speaks to the UDP port `to`.
 
     `messages` are those it can be asked for, `parameters` those it has. It `loses` so many of the first questions of
     each kind; `is_mute` answers nothing at all; `says_unknown` answers for a parameter that it has not (else it is
-    silent, as older firmware is). With `wants_signed` it takes only what pymavlink finds signed with its `key`.
+    silent, as older firmware is). It signs with its `key`.
     """
 
     def __init__(
-        self, to: int | Path, *, parameters=None, messages=(), firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
-        vehicle=mavlink.MAV_TYPE_QUADROTOR, system_id=1, loses=0, is_mute=False, says_unknown=True, key=None,
-        version_1=False, noise=b"", wants_signed=False,
+        self, to: int, *, parameters=None, messages=(), system_id=1, loses=0, is_mute=False, says_unknown=True,
+        key=None, version_1=False, noise=b"",
     ) -> None:  # fmt: skip
         self.heard = []
         self._parameters, self._loses, self._noise = parameters or {}, loses, noise
         self._messages = {message.get_msgId(): message for message in messages}
-        self._firmware, self._vehicle, self._is_mute = firmware, vehicle, is_mute
-        self._says_unknown, self._version_1 = says_unknown, version_1
+        self._is_mute, self._says_unknown, self._version_1 = is_mute, says_unknown, version_1
         self._packer = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=1)
         if key:
             self._packer.signing.secret_key, self._packer.signing.sign_outgoing = key, True
             self._packer.signing.timestamp = int((time.time() - 1_420_070_400) * 1e5)
-        self._receiver = PacketReader(lambda message: not wants_signed or message.get_signed())
-        if wants_signed:
-            self._receiver._parser_of(None).signing.secret_key = key
-        is_udp = isinstance(to, int)
-        self._port = open_port(parse_link(f"udpout:127.0.0.1:{to}" if is_udp else f"serial:{to}:57600"))
+        self._receiver = PacketReader()
+        self._port = open_port(parse_link(f"udpout:127.0.0.1:{to}"))
         self._lost = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -63,7 +56,7 @@ class AnsweringAutopilot:
         while not self._stop.is_set():
             if time.monotonic() >= beat_s:
                 beat_s = time.monotonic() + BEAT_S
-                self._send(mavlink.MAVLink_heartbeat_message(self._vehicle, self._firmware, 1, 0, 4, 3))
+                self._send(mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3))
                 if self._noise:
                     self._port.write(self._noise)
             is_readable = select.select([self._port], [], [], BEAT_S)[0]
@@ -94,11 +87,8 @@ class AnsweringAutopilot:
             if self._says_unknown:
                 self._send(mavlink.MAVLink_param_error_message(1, 197, name.encode(), -1, 1))
             return
-        value, kind = self._parameters[name], mavlink.MAV_PARAM_TYPE_REAL32
-        if isinstance(value, int):
-            kind = mavlink.MAV_PARAM_TYPE_INT32
-            if self._firmware == mavlink.MAV_AUTOPILOT_PX4:
-                value = struct.unpack("<f", struct.pack("<i", value))[0]
+        value = self._parameters[name]
+        kind = mavlink.MAV_PARAM_TYPE_INT32 if isinstance(value, int) else mavlink.MAV_PARAM_TYPE_REAL32
         self._send(mavlink.MAVLink_param_value_message(name.encode(), value, kind, len(self._parameters), 0))
 
     def _send(self, message) -> None:
@@ -106,12 +96,11 @@ class AnsweringAutopilot:
         self._packer.seq = (self._packer.seq + 1) % 256
 
 
-def healthy_messages(version=(4, 7, 0), capabilities=0):
-    """What an ArduPilot with GPS, on the ground and ready, can be asked for."""
-    packed = version[0] << 24 | version[1] << 16 | version[2] << 8 | 255
-    eight = [0] * 8
+def healthy_messages():
+    """What an ArduPilot 4.7.0 with GPS, on the ground and ready, can be asked for."""
+    packed, eight = 4 << 24 | 7 << 16 | 255, [0] * 8
     return (
-        mavlink.MAVLink_autopilot_version_message(capabilities, packed, 0, 0, 0, eight, eight, eight, 0, 0, 0),
+        mavlink.MAVLink_autopilot_version_message(0, packed, 0, 0, 0, eight, eight, eight, 0, 0, 0),
         mavlink.MAVLink_ekf_status_report_message(0x33F, 0, 0, 0, 0, 0),
         mavlink.MAVLink_gps_raw_int_message(0, 3, 500_000_000, 140_000_000, 0, 80, 120, 0, 0, 14),
         mavlink.MAVLink_gps_global_origin_message(500_000_000, 140_000_000, 0),

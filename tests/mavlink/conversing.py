@@ -134,8 +134,8 @@ class Autopilot:
     def filter(self, flags):
         self.say(mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.1, 0.1, 0.1, 0.1))
 
-    def px4_filter(self, accuracy_m, flags=ABS, vel_ratio=0):
-        self.say(mavlink.MAVLink_estimator_status_message(0, flags, vel_ratio, 0, 0, 0, 0, 0, accuracy_m, 1.0))
+    def px4_filter(self, accuracy_m, flags=ABS):
+        self.say(mavlink.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, accuracy_m, 1.0))
 
     def put_fix(self, accuracy_m=12.0, **sender):
         """Let a fix be sent where one may be; it leaves at once."""
@@ -147,12 +147,10 @@ class Autopilot:
     def answer(self, result, command=43003, to=197):
         self.say(mavlink.MAVLink_command_ack_message(command, result, target_system=7, target_component=to))
 
-    def take_fix(self, result, accuracy_m=12.0, after_s=0.0):
-        """Let a fix be sent, and answer it; give what became of it."""
-        sending = self.put_fix(accuracy_m)
-        self.wait(after_s)
+    def take_fix(self, result, accuracy_m=12.0):
+        """Let a fix be sent, and answer it."""
+        self.put_fix(accuracy_m)
         self.answer(result)
-        return sending.outcome
 
     def wait(self, seconds):
         self.clock.now_s += seconds

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from mavlink_peers import PATIENCE_S, wait_until
+from loopback import PATIENCE_S, wait_until
 
 from edgevpr.mavlink.wire import PacketReader
 

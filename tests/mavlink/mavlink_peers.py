@@ -5,12 +5,12 @@ import pty
 import select
 import socket
 import threading
-import time
 import tty
 from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
 
+from loopback import PATIENCE_S, wait_until
 from simulated.autopilot import AutopilotSummary, run_autopilot
 
 from edgevpr.mavlink.address import parse_link
@@ -18,28 +18,10 @@ from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
-PATIENCE_S = 60.0  # a machine that does much else is slow, and not wrong
-
-
-def wait_until(condition, what: str = "the condition", every_s: float = 0.005):
-    """Wait for something that happens at once on a quiet machine; returns what `condition` gave."""
-    give_up_s = time.monotonic() + PATIENCE_S
-    while time.monotonic() < give_up_s:
-        if result := condition():
-            return result
-        time.sleep(every_s)
-    raise AssertionError(f"{what} did not come true in {PATIENCE_S:.0f} s")
-
 
 def link_to(url: str, **settings) -> Link:
     """Make a link by its address as a user writes it, and its settings."""
     return Link(parse_link(url), LinkSettings(**settings))
-
-
-def free_port(kind: int = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as sock:
-        sock.bind(("127.0.0.1", 0))
-        return sock.getsockname()[1]
 
 
 class Peer:

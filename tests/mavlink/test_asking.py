@@ -2,7 +2,8 @@
 
 import pytest
 from answering_autopilot import AnsweringAutopilot, healthy_messages
-from mavlink_peers import SerialCable, free_port
+from loopback import free_port
+from mavlink_peers import SerialCable
 
 from edgevpr.core.errors import LinkError
 from edgevpr.mavlink import asking as module

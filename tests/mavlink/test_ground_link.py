@@ -3,7 +3,8 @@
 from contextlib import closing
 
 import pytest
-from mavlink_peers import Peer, UdpPort, free_port, link_to, wait_until
+from loopback import free_port, wait_until
+from mavlink_peers import Peer, UdpPort, link_to
 
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.groundlink import GroundLink

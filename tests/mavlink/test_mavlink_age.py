@@ -10,7 +10,8 @@ from contextlib import closing
 
 import pytest
 import serial
-from mavlink_peers import AutopilotThread, Peer, SerialCable, TcpServer, free_port, link_to, wait_until
+from loopback import free_port, wait_until
+from mavlink_peers import AutopilotThread, Peer, SerialCable, TcpServer, link_to
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.address import parse_link
@@ -27,7 +28,7 @@ THROWN_AWAY = Reason(ReasonCode.LINK_LOST)
 @pytest.fixture
 def narrow_server():
     """A TCP server that takes few bytes unless it reads."""
-    server = TcpServer(free_port(socket.SOCK_STREAM))
+    server = TcpServer(free_port())
     server._listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
     with closing(server):
         yield server

@@ -1,12 +1,12 @@
 """One link, real sockets, and an autopilot worked by hand at the other end."""
 
 import math
-import socket
 import threading
 from contextlib import closing
 
 import pytest
-from mavlink_peers import Peer, TcpServer, UdpPort, free_port, link_to, wait_until
+from loopback import free_port, wait_until
+from mavlink_peers import Peer, TcpServer, UdpPort, link_to
 
 from edgevpr.mavlink.conversation import MESSAGES_MAX
 from edgevpr.mavlink.link import Link
@@ -96,7 +96,7 @@ def test_a_sending_link_hears_nobody_but_its_peer(clock):
 
 
 def test_a_tcp_server_that_dies_and_comes_back_is_found_again_and_old_fixes_are_not_sent(clock):
-    number = free_port(socket.SOCK_STREAM)
+    number = free_port()
     server = TcpServer(number)
     with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         peer = Peer(server.accept())
@@ -123,7 +123,7 @@ def test_a_tcp_server_that_dies_and_comes_back_is_found_again_and_old_fixes_are_
 
 
 def test_an_absent_tcp_server_is_no_error_and_the_newest_messages_wait_for_it(clock):
-    number = free_port(socket.SOCK_STREAM)
+    number = free_port()
     with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         assert not link.stats().connected
         assert link.stats().trouble == "Connection refused"
@@ -138,7 +138,7 @@ def test_an_absent_tcp_server_is_no_error_and_the_newest_messages_wait_for_it(cl
 
 
 def test_a_peer_that_does_not_read_never_blocks_the_sender(clock):
-    number = free_port(socket.SOCK_STREAM)
+    number = free_port()
     server = TcpServer(number)
     with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         server.accept()

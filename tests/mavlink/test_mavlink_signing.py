@@ -8,7 +8,8 @@ from contextlib import ExitStack, closing, suppress
 
 import pytest
 from conversing import Autopilot
-from mavlink_peers import free_port, link_to, wait_until
+from loopback import free_port, wait_until
+from mavlink_peers import link_to
 
 from edgevpr.core.errors import ConfigError
 from edgevpr.mavlink.messages import Fix

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 from fakes import FakeClock
-from mavlink_peers import wait_until
+from loopback import wait_until
 
 from edgevpr.core.errors import ConfigError
 from edgevpr.mavlink.signing import OLD, TICKS_S, TimeStamps

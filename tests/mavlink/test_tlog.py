@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 from full_disk import no_file_larger_than
-from mavlink_peers import Peer, UdpPort, link_to, wait_until
+from loopback import wait_until
+from mavlink_peers import Peer, UdpPort, link_to
 
 from edgevpr.core.appending import numbered
 from edgevpr.core.errors import EdgevprError

@@ -53,6 +53,10 @@ def learn(place_map, growing, numbers, quality=lambda number: 1.0):
         growing.add(place_id, position, made.coarse)
 
 
+def grow(place_map, budget_bytes=10**6, room=2000):
+    return GrowingIndex(place_map=place_map, technique=Signs(), budget_bytes=budget_bytes, room=room)
+
+
 @pytest.fixture
 def empty_map(tmp_path):
     with PlaceMap.create(tmp_path / "m.gpkg", Signs.spec) as place_map:
@@ -71,7 +75,7 @@ def assert_packed_alike(index, parts):
 
 
 def test_an_index_that_began_empty_is_what_a_fresh_load_gives_whenever_it_has_doubled(empty_map):
-    growing = GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=1000)
+    growing = grow(empty_map)
     assert len(growing.index) == 0
     learn(empty_map, growing, range(127))
     fresh = load_index(empty_map, Signs(), 10**6)
@@ -88,10 +92,10 @@ def test_an_index_that_began_empty_is_what_a_fresh_load_gives_whenever_it_has_do
 
 @pytest.mark.slow
 def test_the_budget_holds_at_every_moment_of_growing(empty_map):
-    technique, places = Signs(), 2048  # all are packed anew at the last of them
-    each = bytes_per_place(technique.spec)
+    places = 2048  # all are packed anew at the last of them
+    each = bytes_per_place(Signs.spec)
     tracemalloc.start()
-    growing = GrowingIndex(place_map=empty_map, technique=technique, budget_bytes=places * each, room=10**6)
+    growing = grow(empty_map, places * each, room=10**6)
     empty_map.db.execute("PRAGMA synchronous = OFF")  # two thousand syncs would only take time
     learn(empty_map, growing, range(places - 1))
     tracemalloc.reset_peak()
@@ -106,10 +110,8 @@ def test_the_budget_holds_at_every_moment_of_growing(empty_map):
 
 
 def test_a_map_larger_than_the_budget_begins_with_its_best_places_and_keeps_them(empty_map):
-    learn(empty_map, GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=100), range(60))
-    growing = GrowingIndex(
-        place_map=empty_map, technique=Signs(), budget_bytes=20 * bytes_per_place(Signs.spec), room=100
-    )
+    learn(empty_map, grow(empty_map), range(60))
+    growing = grow(empty_map, 20 * bytes_per_place(Signs.spec), room=100)
     fresh = load_index(empty_map, Signs(), 20 * bytes_per_place(Signs.spec))
     assert_same(growing.index, fresh)
     learn(empty_map, growing, range(60, 130))  # its mean is that of 120 places by then
@@ -119,7 +121,7 @@ def test_a_map_larger_than_the_budget_begins_with_its_best_places_and_keeps_them
 
 
 def test_a_file_that_fails_while_all_is_packed_anew_leaves_rows_of_one_mean(empty_map, monkeypatch):
-    growing = GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=2000)
+    growing = grow(empty_map)
     empty_map.db.execute("PRAGMA synchronous = OFF")
     learn(empty_map, growing, range(1023))
     parts = {place_id: part for place_id, *_, part in empty_map.coarse_parts()}
@@ -141,7 +143,7 @@ def test_a_file_that_fails_while_all_is_packed_anew_leaves_rows_of_one_mean(empt
 
 
 def test_a_place_damaged_since_it_was_read_is_left_out_when_all_is_packed_anew(empty_map):
-    growing = GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=100)
+    growing = grow(empty_map)
     learn(empty_map, growing, range(15))
     parts = {place_id: part for place_id, *_, part in empty_map.coarse_parts()}
     parts[16] = descriptor(15).coarse
@@ -152,7 +154,7 @@ def test_a_place_damaged_since_it_was_read_is_left_out_when_all_is_packed_anew(e
     assert growing.index.place_ids.tolist() == [1, 2, *range(4, 17)]
     assert_packed_alike(growing.index, parts)
     assert growing.index.lat_deg[2] == pytest.approx(50.0003), "what stays has its own position"
-    again = GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=100)
+    again = grow(empty_map)
     assert_same(again.index, growing.index)
     learn(empty_map, again, [16])
     assert again.index.place_ids.tolist() == [1, 2, *range(4, 18)]
@@ -189,7 +191,7 @@ def test_places_without_positions_are_thinned_along_their_order(capacity):
 
 
 def test_nearest_m_measures_over_the_date_line_and_passes_over_places_left_out(empty_map):
-    growing = GrowingIndex(place_map=empty_map, technique=Signs(), budget_bytes=10**6, room=10)
+    growing = grow(empty_map)
     assert growing.nearest_m(Position(0.0, 0.0)) == np.inf
     for place_id, lon_deg in enumerate((179.99999, 170.0), start=1):
         frame = Frame(image=np.zeros((1, 1)), name="a", t_mono_s=0.0, position=Position(0.0, lon_deg))

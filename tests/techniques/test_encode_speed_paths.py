@@ -1,4 +1,4 @@
-"""The short cuts of encoding give what the long way gives: octants for angles, bounds for whole maps."""
+"""The short cuts of encoding give what the long way gives: bounds for whole maps, strips for whole images."""
 
 import cv2
 import numpy as np
@@ -47,17 +47,6 @@ def test_good_blocks_are_those_of_the_whole_map(name, cell_px):
     for threshold in (0.0, 0.4, 0.5, 1.0, *own.tolist(), *(own + 3e-4).tolist()):
         good = entropy.good_blocks(grey, "shannon", cell_px, threshold)
         np.testing.assert_array_equal(good, means >= threshold, err_msg=f"threshold {threshold}")
-
-
-def test_octants_vote_like_angles_in_every_direction():
-    turn = np.concatenate([np.linspace(0, 2 * np.pi, 4001), np.arange(16) * np.pi / 8])
-    strength = np.array([[1e-3], [0.7], [1.4]])
-    dx, dy = ((strength * function(turn)).astype(np.float32).ravel()[None] for function in (np.cos, np.sin))
-    votes = gradients._vote_by_octant(dx.copy(), dy.copy(), 1, 8, True)
-    expected = gradients._vote_by_angle(dx, dy, 1, 8, True)
-    error = np.abs(votes - expected).max(axis=2) / np.hypot(dx, dy)
-    assert error.max() < 5e-6
-    assert votes.min() >= 0
 
 
 @pytest.mark.parametrize(("bins", "signed"), [(8, True), (9, False)])

@@ -1,9 +1,8 @@
 """Layouts of places: how they move with the picture, what of them is stored, and that a place is found however seen."""
 
-import cv2
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import seen_from_above, textured
 
 from edgevpr.techniques import layout
 from edgevpr.techniques.cohog import CoHog
@@ -16,12 +15,8 @@ NOTHING = 0x88
 
 
 def view(seed, turned_deg=0.0, right_px=0, down_px=0):
-    """The ground of a place, from above, under a camera that has turned clockwise and moved."""
-    ground = textured(seed, 3 * SIDE_PX, 3 * SIDE_PX)
-    middle = np.array([1.5 * SIDE_PX - 0.5 + right_px, 1.5 * SIDE_PX - 0.5 + down_px])
-    moved = cv2.getRotationMatrix2D(middle.tolist(), turned_deg, 1)
-    moved[:, 2] += (SIDE_PX - 1) / 2 - middle
-    return cv2.warpAffine(ground, moved, (SIDE_PX, SIDE_PX))
+    """The ground of a place."""
+    return seen_from_above(textured(seed, 3 * SIDE_PX, 3 * SIDE_PX), SIDE_PX, turned_deg, right_px, down_px)
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+from pictures import seen_from_above
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.techniques import overlay
@@ -22,12 +23,8 @@ def ground_of(seed):
     return cv2.resize(coarse, (2 * SIDE_PX, 2 * SIDE_PX), interpolation=cv2.INTER_CUBIC).clip(0, 255)
 
 
-def view(ground, turned_deg=0.0, right_px=0.0, down_px=0.0, height=1.0):
-    """What a camera sees that has turned clockwise, moved and risen."""
-    middle = np.array([SIDE_PX - 0.5 + right_px, SIDE_PX - 0.5 + down_px])
-    moved = cv2.getRotationMatrix2D(middle.tolist(), turned_deg, 1 / height)
-    moved[:, 2] += (SIDE_PX - 1) / 2 - middle
-    return cv2.warpAffine(ground, moved, (SIDE_PX, SIDE_PX))
+def view(ground, *moved):
+    return seen_from_above(ground, SIDE_PX, *moved)
 
 
 def patterns(seed):

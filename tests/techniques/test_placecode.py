@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from pictures import seen_from_above
 
 from edgevpr.techniques import placecode
 from edgevpr.techniques.gradients import normalise_blocks, orient_cells
@@ -23,17 +24,11 @@ def _blocks(image: np.ndarray) -> np.ndarray:
     return normalise_blocks(orient_cells(np.ascontiguousarray(image), 16, 8, signed=True))
 
 
-def _view(ground: np.ndarray, right_px: int = 0, down_px: int = 0) -> np.ndarray:
-    """512x512 of the ground, `right_px` and `down_px` from its middle."""
-    top, left = (ground.shape[0] // 2 - 256 + step for step in (down_px, right_px))
-    return ground[top : top + 512, left : left + 512]
-
-
 @pytest.fixture(scope="module")
 def town() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """Twelve grounds, the mean of their grids, and their codes."""
     grounds = [_picture(seed) for seed in range(12)]
-    grids = np.stack([placecode.grid(_blocks(_view(ground)), ALL, ALL)[0] for ground in grounds])
+    grids = np.stack([placecode.grid(_blocks(seen_from_above(ground, 512)), ALL, ALL)[0] for ground in grounds])
     mean = grids.mean(axis=0)
     return grounds, mean, placecode.pack(grids, mean)
 
@@ -50,7 +45,7 @@ def _best_shift(asked: np.ndarray, code: np.ndarray) -> list[int]:
 @pytest.mark.parametrize(("right", "down"), [(0, 0), (2, 0), (0, -3), (-2, 1), (1, 3)])
 def test_a_moved_camera_finds_the_place_and_how_far_it_moved(town, right, down):
     grounds, mean, codes = town
-    asked = _ask(_view(grounds[5], round(_CELL_PX * right), round(_CELL_PX * down)), mean)
+    asked = _ask(seen_from_above(grounds[5], 512, 0.0, round(_CELL_PX * right), round(_CELL_PX * down)), mean)
     assert placecode.scan(asked, codes).argmax() == 5
     # A camera that moved right sees the place to its left: its picture moves right to lie on the place.
     assert _best_shift(asked, codes[5]) == [right, down]
@@ -58,7 +53,7 @@ def test_a_moved_camera_finds_the_place_and_how_far_it_moved(town, right, down):
 
 def test_what_a_mask_hides_says_nothing(town):
     grounds, mean, codes = town
-    image = _view(grounds[2]).copy()
+    image = seen_from_above(grounds[2], 512)
     image[:, 256:] = 0  # part of the aircraft
     seen = np.zeros((31, 31), bool)
     seen[:, :15] = True
@@ -73,7 +68,7 @@ def test_the_scan_is_the_product_spelt_out(town):
     _, mean, _ = town
     rng = np.random.default_rng(1)
     codes = rng.integers(0, 256, (600, 144), dtype=np.uint8)  # a whole block of places and a part
-    asked = _ask(_view(_picture(22)), mean)
+    asked = _ask(seen_from_above(_picture(22), 512), mean)
     signs = np.unpackbits(codes, axis=1) * 2.0 - 1
     np.testing.assert_allclose(placecode.scan(asked, codes), (signs @ asked.T).max(axis=1) / 1152, atol=1e-6)
 
@@ -82,7 +77,7 @@ def test_the_scan_is_the_product_spelt_out(town):
 def test_of_many_places_the_best_are_looked_at_under_every_shift(town, right, down):
     grounds, mean, codes = town
     many = np.concatenate([np.random.default_rng(3).integers(0, 256, (5000, 144), dtype=np.uint8), codes])
-    asked = _ask(_view(grounds[5], round(_CELL_PX * right), round(_CELL_PX * down)), mean)
+    asked = _ask(seen_from_above(grounds[5], 512, 0.0, round(_CELL_PX * right), round(_CELL_PX * down)), mean)
     full, ahead = placecode.scan(asked, many), placecode.scan_ahead(asked, many)
     assert ahead.shape == full.shape
     assert ahead.argmax() == full.argmax() == 5005

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from pictures import seen_from_above
 
 from edgevpr.core.contract import nearest_height
 from edgevpr.techniques import create
@@ -22,10 +23,7 @@ def ground(seed):
 
 
 def seen(seed, height_ratio=1.0, turned_deg=0.0, right_px=0.0):
-    """The ground under a camera that is so many times as high as the map's, and has turned clockwise."""
-    view = cv2.getRotationMatrix2D((549.5 + right_px, 549.5), turned_deg, 1 / height_ratio)
-    view[:, 2] += (SIDE_PX - 1) / 2 - np.array([549.5 + right_px, 549.5])
-    return cv2.warpAffine(ground(seed), view, (SIDE_PX, SIDE_PX))
+    return seen_from_above(ground(seed), SIDE_PX, turned_deg, right_px, height=height_ratio)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from freeflight import Piloted
-from mavlink_peers import PATIENCE_S
+from loopback import PATIENCE_S
 
 from edgevpr.core.geodesy import distance_m
 from edgevpr.lab.simulate.generated import ORIGIN

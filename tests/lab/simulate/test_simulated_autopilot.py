@@ -7,7 +7,8 @@ import sys
 import time
 
 import pytest
-from mavlink_peers import AutopilotThread, Peer, UdpPort, free_port, link_to, wait_until
+from loopback import free_port, wait_until
+from mavlink_peers import AutopilotThread, Peer, UdpPort, link_to
 from simulated import autopilot
 from simulated.controller import FlightController
 from simulated.motion import AlongTrack, TrueState, interpolate_track, read_track

@@ -13,7 +13,8 @@ import pytest
 from flight_process import start
 from flights import of_kind
 from ground_stations import mavproxy_with
-from mavlink_peers import AutopilotThread, Peer, SerialCable, UdpPort, free_port, wait_until
+from loopback import free_port, wait_until
+from mavlink_peers import AutopilotThread, Peer, SerialCable, UdpPort
 
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.flight.flightlog import read_log

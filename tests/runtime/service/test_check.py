@@ -10,7 +10,7 @@ import cv2
 import pytest
 import yaml
 from answering_autopilot import AnsweringAutopilot
-from mavlink_peers import free_port
+from loopback import free_port
 from pictures import textured
 
 from edgevpr import techniques
@@ -209,7 +209,7 @@ def test_check_finds_another_autopilot_than_the_configured(settings, config_file
 
 
 def test_check_finds_a_camera_that_does_not_deliver(settings, config_file):
-    settings["source"]["uri"] = f"rtsp://127.0.0.1:{free_port(socket.SOCK_STREAM)}/camera"
+    settings["source"]["uri"] = f"rtsp://127.0.0.1:{free_port()}/camera"
     settings["mavlink"]["link"] = None
     (finding,) = wrong_online(config_file, settings)
     assert finding.what == "source"

@@ -8,7 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 from answering_autopilot import AnsweringAutopilot, healthy_messages
-from mavlink_peers import AutopilotThread, free_port
+from loopback import free_port
+from mavlink_peers import AutopilotThread
 
 from edgevpr.cli.main import main
 from edgevpr.mavlink import asking as module

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 from flight_process import start, wait_for
-from mavlink_peers import Peer, UdpPort, wait_until
+from loopback import wait_until
+from mavlink_peers import Peer, UdpPort
 
 from edgevpr.mavlink.wire import mavlink
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-from mavlink_peers import Peer, UdpPort, wait_until
+from loopback import wait_until
+from mavlink_peers import Peer, UdpPort
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import ConfigError

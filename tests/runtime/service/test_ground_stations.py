@@ -6,7 +6,8 @@ from contextlib import ExitStack
 import pytest
 from flight_process import start
 from ground_stations import Router, mavsdk_example
-from mavlink_peers import AutopilotThread, free_port
+from loopback import free_port
+from mavlink_peers import AutopilotThread
 
 pytestmark = pytest.mark.process
 

@@ -14,7 +14,7 @@ import psutil
 import pytest
 from flight_process import start
 from flights import of_kind
-from live_sources import PATIENCE_S, wait_for
+from loopback import PATIENCE_S, wait_until
 
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.status import read_status
@@ -39,7 +39,7 @@ def hanging(recording, tmp_path):
             list(map(str, command)), stderr=subprocess.PIPE, text=True, env={**os.environ, **environment}
         )
         flights.append(flight)
-        wait_for((tmp_path / "mark").exists)
+        wait_until((tmp_path / "mark").exists)
         return flight
 
     yield started
@@ -52,7 +52,7 @@ def hanging(recording, tmp_path):
 @pytest.mark.parametrize("step", ["read", "pixels", "release"])
 def test_run_reports_a_hanging_camera_and_ends(hanging, step, tmp_path):
     flight = hanging(step)
-    status = wait_for(
+    status = wait_until(
         lambda: (found := read_status(tmp_path / "status.json")) and "lost" in found[0]["source"] and found
     )
     assert status[0]["health"] == "CRITICAL"
@@ -66,7 +66,7 @@ def test_run_reports_a_hanging_camera_and_ends(hanging, step, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_run_ends_while_a_camera_hangs_in_opening(hanging, number, tmp_path):
     flight = hanging("open")
-    wait_for(lambda: read_status(tmp_path / "status.json"))
+    wait_until(lambda: read_status(tmp_path / "status.json"))
     flight.send_signal(number)
     assert flight.wait(END_S) == 0
     assert list(read_log(tmp_path / "f.jsonl"))[-1]["kind"] == "end"
@@ -96,12 +96,12 @@ def test_run_ends_the_program_of_a_camera(recording, tmp_path):
     path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
     flight = start(recording / "cohog.gpkg", "gst: v4l2src", tmp_path / "f.jsonl", PATH=path)
     try:
-        (child,) = wait_for(
+        (child,) = wait_until(
             lambda: [each for each in psutil.Process(flight.pid).children() if "600.25" in each.cmdline()]
         )
         flight.terminate()
         assert flight.wait(END_S) == 0
-        wait_for(lambda: not child.is_running())
+        wait_until(lambda: not child.is_running())
         assert list(read_log(tmp_path / "f.jsonl"))[-1]["kind"] == "end"
     finally:
         flight.kill()
