@@ -29,7 +29,6 @@ LONGEST = (
     "test_ground_stations",
     "test_memory",
     "test_demo",
-    "test_hostile_pictures",
     "test_profile_command",
     "test_golden",
 )

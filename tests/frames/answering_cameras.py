@@ -17,7 +17,7 @@ RATE_HZ = 10
 _NOISE = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
 _SDP = (
     "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=camera\r\nc=IN IP4 127.0.0.1\r\nt=0 0\r\n"
-    "m=video 0 RTP/AVP 96\r\na=rtpmap:96 {codec}/90000\r\na=control:track0\r\n"
+    "m=video 0 RTP/AVP 96\r\na=rtpmap:96 H264/90000\r\na=control:track0\r\n"
 )
 
 
@@ -95,7 +95,7 @@ def multipart(kind="image/jpeg", extension=".jpg", has_length=True, *, connectio
     return answer
 
 
-def rtsp(status="200 OK", *, refuses="DESCRIBE", header="X: 1", over_tcp="461", codec="H264", authorization=None):
+def rtsp(status="200 OK", *, refuses="DESCRIBE", header="X: 1", over_tcp="461", authorization=None):
     """A camera that answers the method `refuses` with `status`. It sends by UDP only: a request for TCP gets a 461, or
     an "offer" of UDP. `authorization`: what it must be sent for DESCRIBE."""
 
@@ -107,15 +107,14 @@ def rtsp(status="200 OK", *, refuses="DESCRIBE", header="X: 1", over_tcp="461", 
                 first, headers = read_request(asked)
                 method, code, body, more = first.split()[0], "200 OK", "", "Public: DESCRIBE, SETUP, PLAY"
                 if method == "DESCRIBE":
-                    more, body = "Content-Type: application/sdp", _SDP.format(codec=codec)
+                    more, body = "Content-Type: application/sdp", _SDP
                 if method == "SETUP":
                     _, _, wanted = headers["transport"].partition("client_port=")
                     port = int(wanted.split("-")[0]) if wanted else None
                     more = f"Transport: RTP/AVP;unicast;client_port={wanted or '5000-5001'};server_port=7000-7001"
                     code = "461 Unsupported Transport" if not wanted and over_tcp == "461" else code
                 if method == refuses and (authorization is None or headers.get("authorization") != authorization):
-                    code, more, body = status, header, body if status == "200 OK" else ""
-                    more = more if status != "200 OK" else "Content-Type: application/sdp"
+                    code, more, body = status, header, ""
                 head = f"RTSP/1.0 {code}\r\nCSeq: {headers['cseq']}\r\nSession: 1\r\n{more}\r\n"
                 connection.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n{body}".encode())
                 if method == "PLAY":

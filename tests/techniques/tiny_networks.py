@@ -56,8 +56,6 @@ def _network(fault: str | None):
         weights[1, 0, 2, 2] = np.nan
     if fault == "zeros":
         weights[:], bias[:] = 0, -1
-    if fault == "no bias":
-        bias[:] = 0
     if fault == "below zero in the dark":
         bias[:] = -0.2
     size: list = [1, 1, HEIGHT, WIDTH]
