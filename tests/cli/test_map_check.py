@@ -104,20 +104,6 @@ def test_map_repair_leaves_a_map_of_which_nothing_can_be_read(valley, capsys):
     assert [entry.name for entry in valley.parent.iterdir()] == [valley.name]
 
 
-def test_map_repair_of_damaged_pages(valley, capsys):
-    data = bytearray(valley.read_bytes())
-    with contextlib.closing(sqlite3.connect(valley)) as db:
-        (fine,) = db.execute("SELECT fine FROM places WHERE place_id = 3").fetchone()
-    at = data.find(fine[-64:]) // 4096 * 4096
-    data[at : at + 4096] = b"\xff" * 4096
-    valley.write_bytes(data)
-    assert main(["map", "check", str(valley)]) == 1
-    capsys.readouterr()
-    assert main(["map", "repair", str(valley)]) == 0
-    assert "1 dropped" in capsys.readouterr().out
-    assert main(["map", "check", str(valley)]) == 0
-
-
 def run_full(arguments, bytes_at_most):
     """Run a command on a disk that takes files of so many bytes at most."""
     with no_file_larger_than(bytes_at_most):

@@ -33,27 +33,8 @@ def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):
     lines = [("query", query(name)) for name in ("a", "b", "c", "d")]
     refused, superseded = ({"code": code, "parameters": {}} for code in ("WRONG_FORM", "SUPERSEDED"))
     answers = [
-        ("answer", {"query": "a", "sent": True, "result": "ACCEPTED", "why": None, "latency_ms": 12.5}),
-        (
-            "answer",
-            {
-                "query": "b",
-                "sent": True,
-                "result": "DENIED",
-                "why": refused,
-                "latency_ms": 3.0,
-            },
-        ),
-        (
-            "answer",
-            {
-                "query": "c",
-                "sent": False,
-                "result": None,
-                "why": superseded,
-                "latency_ms": None,
-            },
-        ),
+        ("answer", {"query": query, "sent": result is not None, "result": result, "why": why, "latency_ms": 3.0})
+        for query, result, why in (("a", "ACCEPTED", None), ("b", "DENIED", refused), ("c", None, superseded))
     ]
     flight = read_flight(write_log(tmp_path / "log", *lines, *answers))
     assert outcomes(flight) == [FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.KEPT, FixOutcome.UNANSWERED]

@@ -95,12 +95,6 @@ def test_timesync_is_answered(pilot):
 
 
 @plane
-def test_fix_fails_while_there_is_gps(pilot):
-    assert pilot.fix(*pilot.true_place) == FAILED
-    assert pilot.error_m < 5
-
-
-@plane
 def test_fix_of_the_wrong_form_is_denied(pilot):
     assert pilot.fix(*pilot.true_place, frame=3) == DENIED, "relative to home"
     assert pilot.fix(*pilot.true_place, frame=6) == DENIED

@@ -194,17 +194,15 @@ def test_the_password_of_a_camera_stands_in_no_line(path):
     assert next(read_log(path))["config"]["source"]["uri"].startswith("rtsp://pilot:***@")
 
 
-def test_a_pipe_is_no_log_and_is_not_waited_for(path):
-    os.mkfifo(path)
-    with pytest.raises(EdgevprError, match="pipe"):
-        FlightLog(path)
-
-
-@pytest.mark.parametrize("name", ["", "absent/flight.jsonl", "file/flight.jsonl"])
-def test_a_path_that_cannot_be_opened_is_one_sentence(tmp_path, name):
+@pytest.mark.parametrize(
+    ("name", "said"), [("", "cannot"), ("absent/flight.jsonl", "cannot"), ("file/x.jsonl", "cannot"), ("pipe", "pipe")]
+)
+def test_a_path_that_is_no_log_is_one_sentence_and_not_waited_for(tmp_path, name, said):
     (tmp_path / "file").touch()
-    with pytest.raises(EdgevprError, match=r"^The flight log .* cannot"):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(EdgevprError, match=said) as refused:
         FlightLog(tmp_path / name)
+    assert "\n" not in str(refused.value)
 
 
 PART_MB = 0.004  # four of them are the limit of the tests below

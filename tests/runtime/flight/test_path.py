@@ -11,32 +11,6 @@ from edgevpr.runtime.flight.path import KEPT_S, Path, to_ground_acceleration
 HOME = Position(47.0, 8.0)
 
 
-def circled(t_s):
-    """Position and velocity on a circle of 100 m at 10 m/s."""
-    turn = t_s / 10
-    return 100 * np.array([math.sin(turn), 1 - math.cos(turn)]), 10 * np.array([math.cos(turn), math.sin(turn)])
-
-
-def test_velocities_add_up_to_the_way_that_was_flown():
-    path = Path(HOME, 0.0, circled(0.0)[1])
-    for step in range(1, 301):
-        assert path.fly(step / 10, circled(step / 10)[1]) == pytest.approx(0.1)
-    at_m, velocity_m_s = circled(30.0)
-    assert np.allclose(path.now.at_m, at_m, atol=0.05)
-    assert np.allclose(path.now.velocity_m_s, velocity_m_s)
-    between = path.at(27.34)
-    assert np.allclose(between.at_m, circled(27.34)[0], atol=0.05)
-    assert np.allclose(between.velocity_m_s, circled(27.34)[1], atol=0.05)
-
-
-def test_accelerations_add_up_to_velocity_and_way():
-    path = Path(HOME, 0.0, (3.0, 0.0))
-    for step in range(1, 101):
-        path.accelerate(step / 50, (0.0, 2.0))
-    assert np.allclose(path.now.velocity_m_s, (3.0, 4.0))
-    assert np.allclose(path.now.at_m, (6.0, 4.0))
-
-
 def test_only_the_last_seconds_are_kept_and_beyond_the_end_the_velocity_goes_on():
     path = Path(HOME, 0.0, (1.0, 0.0))
     for step in range(1, 2001):

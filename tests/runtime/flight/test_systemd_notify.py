@@ -34,14 +34,16 @@ def test_an_abstract_socket_is_reached(monkeypatch):
         assert receiver.recv(4096) == b"WATCHDOG=1"
 
 
-def test_a_line_break_in_a_value_cannot_become_an_assignment(manager):
-    notify(STATUS="no camera\nSTOPPING=1\r\n")
-    assert manager.recv(4096) == b"STATUS=no camera STOPPING=1"
-
-
-def test_neither_a_password_nor_an_escape_gets_into_the_status(manager):
-    notify(STATUS="rtsp://pilot:secret@cam \x1b[31m lost")
-    assert manager.recv(4096) == b"STATUS=rtsp://pilot:***@cam \\x1b[31m lost"
+@pytest.mark.parametrize(
+    ("status", "sent"),
+    [
+        ("no camera\nSTOPPING=1\r\n", b"STATUS=no camera STOPPING=1"),
+        ("rtsp://pilot:secret@cam \x1b[31m lost", b"STATUS=rtsp://pilot:***@cam \\x1b[31m lost"),
+    ],
+)
+def test_no_value_of_a_status_is_an_assignment_a_password_or_an_escape(manager, status, sent):
+    notify(STATUS=status)
+    assert manager.recv(4096) == sent
 
 
 @pytest.mark.parametrize("address", ["/nowhere/notify", "vsock:2:1234", "/" + "x" * 200, "@" + "x" * 200])

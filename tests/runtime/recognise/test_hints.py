@@ -20,35 +20,22 @@ def north(metres):
     return Position(50.0 + metres * A_METRE_DEG, 8.0)
 
 
+def index_of(north_m, heading_deg):
+    """Places so far to the north (NaN: without a position) with these headings."""
+    lat_deg = np.array([north(metres).lat_deg for metres in north_m])
+    return PlaceIndex(
+        place_ids=np.arange(1, len(lat_deg) + 1),
+        lat_deg=lat_deg,
+        lon_deg=np.where(np.isnan(lat_deg), np.nan, 8.0),
+        heading_deg=np.array(heading_deg, np.float16),
+        rows=np.zeros((len(lat_deg), 1)),
+        mean=None,
+    )
+
+
 @pytest.fixture
 def index():
-    """Places every 100 m to the north, the last without a position; headings 0, 10, 20, unknown, 40."""
-    lat_deg = np.array([north(metres).lat_deg for metres in (0, 100, 200, 300)] + [np.nan])
-    lon_deg = np.where(np.isnan(lat_deg), np.nan, 8.0)
-    heading_deg = np.array([0, 10, 20, np.nan, 350], np.float16)
-    return PlaceIndex(
-        place_ids=np.arange(1, 6),
-        lat_deg=lat_deg,
-        lon_deg=lon_deg,
-        heading_deg=heading_deg,
-        rows=np.zeros((5, 1)),
-        mean=None,
-    )
-
-
-@pytest.fixture
-def long_index():
-    """Forty places every 100 m to the north."""
-    lat_deg = np.array([north(100 * place).lat_deg for place in range(40)])
-    none = np.full(40, np.nan, np.float16)
-    return PlaceIndex(
-        place_ids=np.arange(1, 41),
-        lat_deg=lat_deg,
-        lon_deg=np.full(40, 8.0),
-        heading_deg=none,
-        rows=np.zeros((40, 1)),
-        mean=None,
-    )
+    return index_of([0, 100, 200, 300, np.nan], [0, 10, 20, np.nan, 350])
 
 
 def vehicle(position, t_heard_s, has_gps=True):
@@ -155,7 +142,8 @@ def test_a_compass_that_is_wrong_leaves_the_area_believed_and_a_false_position_l
     assert seen == [both, area, None, area, area, heading, None, both, None, both]
 
 
-def test_a_flight_that_is_sure_where_it_is_narrows_the_search_for_a_minute(long_index):
+def test_a_flight_that_is_sure_where_it_is_narrows_the_search_for_a_minute():
+    long_index = index_of(100 * np.arange(40), [np.nan] * 40)
     prior, frame = Prior(None, None, is_live=True), Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=10.0)
     there = Located(position=north(2000), covariance_m2=(9.0, 0.0, 16.0))
     prior.update_area(there, 0.98, 10.0)

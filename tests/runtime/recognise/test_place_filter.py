@@ -271,12 +271,3 @@ def test_of_twins_none_becomes_sure_however_often_the_same_one_looks_best(posed_
     for place in range(20, 60, STRIDE):
         followed = flight.look(place, 0.9999, others=[place + 60], lead=0.15, rival=75, moved_m=STEP_M)
         assert followed.confidence < 0.9
-
-
-def test_the_flight_knows_which_of_two_twins_it_is_over(posed_map):
-    flight = Flight(posed_map, IN_METRES)
-    flight.over([17, 20], 0.9999, moved_m=STEP_M)
-    for place in range(20 + STRIDE, 32, STRIDE):
-        followed = flight.look(place + 60, 0.9999, others=[place], lead=0.15, rival=75, moved_m=STEP_M)
-        assert followed.slot == place
-        assert followed.confidence > 0.98
