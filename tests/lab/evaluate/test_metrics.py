@@ -51,12 +51,6 @@ def test_compute_both_counts_queries_off_the_map():
     assert without.ep == pytest.approx((1 + 2 / 3) / 2)
 
 
-def test_compute_both_of_a_query_off_the_map_that_scores_best():
-    found = figures_of((0.9, NEVER, False), (0.8, 0), (0.7, 0))
-    assert (found.ep, found.recall_at_100_precision_vpr_bench, found.roc_auc) == (0, 0, 0)
-    assert (found.with_match.ep, found.with_match.roc_auc) == (1, None)
-
-
 @pytest.mark.parametrize("score", [0.3, -math.inf])
 def test_compute_both_where_no_query_has_a_match(score):
     found = figures_of((score, NEVER, False), (score, NEVER, False))

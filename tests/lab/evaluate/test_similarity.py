@@ -75,15 +75,6 @@ def test_measure_counts_queries_off_the_map_and_takes_the_first_of_equal_scores(
     assert (found["with_match"]["queries"], found["with_match"]["recall_at_1"]) == (2, 0.5)
 
 
-def test_measure_of_an_empty_map_finds_nothing(tmp_path, truth, capsys):
-    truth.write_text("query_file,ref_files\nq1,\nq2,\n")
-    np.save(tmp_path / "a.npy", np.empty((2, 0)))
-    assert main(["eval", "--similarity", str(tmp_path / "a.npy"), "--ground-truth", str(truth), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["similarities"]["a"]
-    assert (found["queries"], found["queries_off_map"], found["references"]) == (2, 2, 0)
-    assert (found["recall_at_1"], found["auc_from_zero"], found["with_match"]) == (0, 0, None)
-
-
 def test_measure_takes_all_images_of_the_folders(tmp_path, truth, capsys):
     for folder, names in (("query", ["q1", "q2", "q3", "q4"]), ("ref", ["r1", "r2", "r10", "r11"])):
         (tmp_path / folder).mkdir()

@@ -62,17 +62,6 @@ def test_run_writes_its_status_and_opens_no_port(fly, tmp_path, capsys):
     assert not path.exists()
 
 
-def test_run_writes_no_status_outside_a_service(fly, tmp_path):
-    (tmp_path / "run").mkdir()
-    run = fly(file=None, RUNTIME_DIRECTORY=str(tmp_path / "run"))
-    assert status_of(tmp_path / "run" / "status.json")
-    run.terminate()
-    run.communicate(timeout=PATIENCE_S)
-    run = fly(file=None, number=1)
-    wait_for("query", tmp_path / "1.jsonl", run)
-    assert not list(tmp_path.rglob("status.json*"))
-
-
 def test_service_flies_where_no_status_can_be_written(fly, tmp_path):
     refused = fly(file=tmp_path / "nowhere" / "s")
     said = refused.communicate(timeout=PATIENCE_S)[1]
