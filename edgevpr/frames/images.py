@@ -107,11 +107,6 @@ def decoded(jpeg: bytes) -> Image:
     return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_ANYCOLOR)  # type: ignore[return-value]  # uint8
 
 
-def write_png(path: Path, image: Image) -> None:
-    """Write a picture, uint8 (H, W, 3) BGR or (H, W) grey, as PNG. Raises OSError."""
-    path.write_bytes(_encoded(".png", image))
-
-
 def as_jpeg(image: Image) -> bytes:
     """Encode a picture, uint8 (H, W, 3) BGR or (H, W) grey, as a JPEG of the quality used in recordings of flights."""
     return _encoded(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _TAPE_QUALITY))

@@ -26,7 +26,6 @@ from edgevpr.frames.shot import OpeningError, Refusal, Shot
 from edgevpr.frames.streams import StreamCapture, open_raw
 
 _RIBBON, _PIPELINE = "rpicam-vid", "gst-launch-1.0"
-_OLDER = {_RIBBON: "libcamera-vid"}  # names on older systems
 _PACKAGES = {
     _RIBBON: "rpicam-apps-lite",
     _PIPELINE: "gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-good",
@@ -56,7 +55,7 @@ def require_program(uri: str) -> str:
     name = _name_program(uri)
     if name == _PIPELINE:
         _split_pipeline(uri)
-    path = shutil.which(name) or shutil.which(_OLDER.get(name, name))
+    path = shutil.which(name)
     if path is None:
         raise SourceError(f"{name}, which reads this camera, is not here: run `sudo apt install {_PACKAGES[name]}`.")
     return path

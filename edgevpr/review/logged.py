@@ -2,7 +2,6 @@
 or of another type, becomes None."""
 
 import logging
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -85,7 +84,7 @@ class LoggedFlight:
     `learnt` the positions of places learnt in flight, `between` the lines of fixes sent between matches. Times are
     seconds after its start; it is `span_s` long."""
 
-    path: Path = Path()
+    path: Path
     start: dict[str, Any] = field(default_factory=dict)
     end: dict[str, Any] = field(default_factory=dict)
     queries: list[LoggedQuery] = field(default_factory=list)
@@ -97,19 +96,11 @@ class LoggedFlight:
 
 
 def read_flight(path: str | Path) -> LoggedFlight:
-    """Read the last flight of the log `path`, and warn if files of it are missing. Raises UsageError if there is no
-    such file, and EdgevprError if it has no line of a flight (see `flightlog.select_last_flight`)."""
+    """Read the last flight of the log `path`, and warn if files of it are missing. The first time in it counts as its
+    start. Raises UsageError if there is no such file, and EdgevprError if it has no line of a flight (see
+    `flightlog.select_last_flight`)."""
     lines = select_last_flight(path)
-    flight = read_lines(lines, Path(path))
-    if lines.missing:
-        _log.warning("%s", lines.missing)
-        flight.remarks.insert(0, (0.0, "missing", lines.missing))
-    return flight
-
-
-def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
-    """Read a flight from the lines of its log, in their order. The first time in it counts as the start."""
-    flight, queries, start_s = LoggedFlight(path=path), dict[str, LoggedQuery](), None
+    flight, queries, start_s = LoggedFlight(path=Path(path)), dict[str, LoggedQuery](), None
     for line in lines:
         t_mono_s, t_s = number(line, "t_mono_s"), flight.span_s
         if t_mono_s is not None:
@@ -137,6 +128,9 @@ def read_lines(lines: Iterable[dict[str, Any]], path: Path) -> LoggedFlight:
                 flight.between += [line] if point(line) else []
             case _:
                 flight.remarks.append((t_s, str(kind), _text_of(line)))
+    if lines.missing:
+        _log.warning("%s", lines.missing)
+        flight.remarks.insert(0, (0.0, "missing", lines.missing))
     return flight
 
 

@@ -63,7 +63,7 @@ def make_flight_page(
     head = {
         "title": f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time",
         "known": [f"{clock(flight.span_s)} long", *start, str(flight.path)],
-        "figures": _matches(flight) | _flown(flight),
+        "figures": _figures(flight),
         "warnings": _notes(flight, bool(ground), no_ground),
         "span_s": flight.span_s,
     }
@@ -166,27 +166,21 @@ def _lens(start: Mapping[str, Any]) -> "Lens | None":
     return Lens(fov_deg, up_deg or 0.0, mount=Mount(ahead_deg or 0.0, right_deg or 0.0))
 
 
-def _matches(flight: LoggedFlight) -> dict[str, str]:
-    """Return the figures of the matches, by their names."""
+def _figures(flight: LoggedFlight) -> dict[str, str]:
+    """Return the figures of a flight, by their names."""
     queries, accepted = flight.queries, [query for query in flight.queries if query.accepted]
     share = f" ({len(accepted) / len(queries):.0%})" if queries else ""
     off_m = [query.off_m for query in accepted if query.off_m is not None]
     accuracies_m = [query.accuracy_m for query in accepted if query.accuracy_m is not None]
+    outcomes = Counter(query.fix.outcome for query in queries if query.fix)
+    between = f" and {len(flight.between)} between matches" if flight.between else ""
+    ends_s = [0.0, *(query.t_s for query in accepted), flight.span_s]
     return {
         "queries": str(len(queries)),
         "accepted": f"{len(accepted)}{share}",
         "accuracy, median": figure(median(accuracies_m) if accuracies_m else None, "m"),
         "from GPS, median": figure(median(off_m) if off_m else None, "m"),
         "from GPS, most": figure(max(off_m, default=None), "m"),
-    }
-
-
-def _flown(flight: LoggedFlight) -> dict[str, str]:
-    """Return the figures that only a flight has, by their names."""
-    outcomes = Counter(query.fix.outcome for query in flight.queries if query.fix)
-    between = f" and {len(flight.between)} between matches" if flight.between else ""
-    ends_s = [0.0, *(query.t_s for query in flight.queries if query.accepted), flight.span_s]
-    return {
         "frames not usable": str(flight.unusable) if flight.unusable else UNKNOWN,
         "longest without a match": figure(max(after_s - t_s for t_s, after_s in pairwise(ends_s)), "s"),
         "fixes sent": f"{sum(outcomes[outcome] for outcome in SENT)}{between}",

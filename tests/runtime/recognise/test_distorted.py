@@ -3,6 +3,7 @@
 import logging
 import math
 
+import cv2
 import pytest
 from distorted_cameras import DistortedCamera, fisheye, wide
 from pictures import rough_ground
@@ -12,7 +13,6 @@ from edgevpr.core.config import load_config
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Frame, Position
-from edgevpr.frames.images import write_png
 from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.mapmaking.making import FlownPictures, MapOrder, make_map
 from edgevpr.power.boards import load_board
@@ -52,7 +52,7 @@ def maps(ground, lenses, tmp_path_factory):
         folder, tags = tmp_path_factory.mktemp(name), {}
         for number, north_m in enumerate((100.0, 200.0, 300.0)):
             image = camera.photograph(ground, M_PER_PX, east_m=250.0, north_m=north_m, **STRAIGHT)
-            write_png(folder / f"{number}.png", image)
+            cv2.imwrite(str(folder / f"{number}.png"), image)
             tags[f"{number}.png"] = GeoTag(position=Position(*moved(*ORIGIN, 250.0, north_m)), **STRAIGHT)
         write_positions(folder / "positions.csv", tags)
         made[name] = str(folder / "map.gpkg")

@@ -4,13 +4,13 @@ import os
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from distorted_cameras import wide
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import ImageError
-from edgevpr.frames.images import write_png
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source
 from edgevpr.runtime.service import camera
@@ -81,10 +81,10 @@ def test_frame_seen_compares_the_frame_with_the_lens(tmp_path):
     folder = tmp_path / "images"
     folder.mkdir()
     grey = np.zeros((480, 640), np.uint8)
-    write_png(folder / "1.png", grey)
+    cv2.imwrite(str(folder / "1.png"), grey)
     source = load_config(None, {"source.uri": str(folder), "source.lens": lens}).source
     assert frame_seen(source).endswith(f"640 x 480 pixels, of which {lens} shows 99 degrees")
-    write_png(folder / "1.png", grey[60:420])
+    cv2.imwrite(str(folder / "1.png"), grey[60:420])
     with pytest.raises(ImageError, match="640x360"):
         frame_seen(source)
 
