@@ -13,7 +13,7 @@ import pytest
 from loopback import wait_until
 
 from edgevpr.core.errors import SourceError
-from edgevpr.frames import programs
+from edgevpr.frames import programs, streams
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import is_live, open_source
 
@@ -73,6 +73,7 @@ def test_ribbon_camera_that_hangs_is_started_anew(rpicam, monkeypatch):
 
 
 def test_ribbon_camera_that_starts_slowly_is_waited_for(rpicam, monkeypatch):
+    monkeypatch.setattr(streams, "OPEN_TIMEOUT_S", 0.5)
     monkeypatch.setenv("FAKE_RPICAM", "slow")
     before = running()
     source = rpicam()

@@ -218,14 +218,8 @@ def test_video_leaves_out_frames_predicted_from_one_that_is_missing(tmp_path):
 @pytest.mark.process
 @pytest.mark.parametrize("name", ["flight.mkv", "flight.avi", "flight.mp4"])
 def test_video_that_is_cut_short_is_reported(name, tmp_path):
-    path = film(
-        tmp_path / name,
-        "-c:v",
-        "mpeg4",
-        "-qscale:v",
-        "3",
-        *(["-movflags", "+faststart"] if name.endswith("mp4") else []),
-    )
+    index_first = ["-movflags", "+faststart"] if name.endswith("mp4") else []
+    path = film(tmp_path / name, "-c:v", "mpeg4", "-qscale:v", "3", *index_first)
     cut_in_half(path)
     frames, complaints, _, missing = frames_and_complaints(path)
     assert 10 < len(frames) < 60

@@ -200,10 +200,7 @@ def test_between_matches_a_fix_is_sent_where_none_has_been_for_half_a_second():
     autopilot.beat()
     autopilot.conversation.send_fix(Fix(50.0, 8.0, 9.0, autopilot.clock.now_s))
     assert [each.x for each in sent(autopilot, "COMMAND_INT", 0.4)] == [500_000_000], "a match has just been sent"
-
-
-def test_an_autopilot_whose_velocity_follows_a_fix_gets_none_between_matches():
     autopilot, ear = interviewed(PX4, EKF2_AGP0_CTRL=0)
     ear.between = Fix(47.0, 8.0, 9.0, 0.0)
     autopilot.beat()
-    assert sent(autopilot, "COMMAND_INT", 4.0) == []
+    assert sent(autopilot, "COMMAND_INT", 4.0) == [], "its velocity follows a fix"

@@ -231,14 +231,11 @@ def test_a_key_that_others_may_open_is_refused_also_behind_a_link(key_file, mode
             read_key(str(path))
 
 
-@pytest.mark.parametrize("content", [b"", KEY[:31], KEY + b"\n"])
-def test_a_key_of_another_length_is_refused(key_file, content):
-    key_file.write_bytes(content)
-    with pytest.raises(ConfigError, match="32 bytes"):
-        read_key(str(key_file))
-
-
-def test_a_key_that_is_no_file_is_refused(tmp_path):
+def test_a_key_of_another_length_or_that_is_no_file_is_refused(key_file, tmp_path):
+    for content in (b"", KEY[:31], KEY + b"\n"):
+        key_file.write_bytes(content)
+        with pytest.raises(ConfigError, match="32 bytes"):
+            read_key(str(key_file))
     os.mkfifo(tmp_path / "pipe", 0o600)
     for name in ("missing", "pipe", "."):
         with pytest.raises(ConfigError, match="urandom"):

@@ -75,16 +75,13 @@ def test_it_never_goes_back_over_kill_9(path):
 
 
 @pytest.mark.parametrize("content", [b"", b"soon\n", b"-5\n", b"9" * 20, b"\xff\x00", b"1" * 100, "²".encode()])
-def test_a_file_that_holds_no_time_is_refused_with_a_sentence(path, content):
+def test_a_file_that_holds_no_time_or_cannot_be_written_is_refused_with_a_sentence(path, content):
     path.write_bytes(content)
     with pytest.raises(ConfigError, match="time"):
         stamps_at(path)
     assert path.read_bytes() == content
-
-
-def test_a_place_that_cannot_be_written_is_refused_with_a_sentence(tmp_path):
     with pytest.raises(ConfigError, match="signing_state"):
-        stamps_at(tmp_path / "no-folder" / "time")
+        stamps_at(path.parent / "no-folder" / "time")
 
 
 def test_a_disk_that_becomes_full_in_flight_ends_nothing(path, monkeypatch, caplog):

@@ -334,7 +334,7 @@ def test_of_a_place_that_both_compared_the_better_match_counts():
     assert both.unread.tolist() == [3]
 
 
-def test_two_looks_have_tried_the_rotations_of_both():
+def test_together_has_tried_the_rotations_of_both():
     known, all_of_them = (dataclasses.replace(ranking({1: 0.2}), tried=tried) for tried in (0.125, 1.0))
     assert together(known, known).tried == 0.25
     assert together(known, all_of_them).tried == 1.0
