@@ -109,17 +109,6 @@ def test_map_build_appends_to_an_unfinished_map(capsys, flight, tmp_path):
     assert (built["added"], built["already_here"], built["places"]) == (6, 0, 12)
 
 
-@pytest.mark.parametrize("flags", [["--technique", "hog"], ["--technique", "cohog", "--matching", "thesis"]])
-def test_match_accepts_no_low_score_for_want_of_another_place(capsys, flight, tmp_path, flags):
-    small = tmp_path / "small"
-    small.mkdir()
-    shutil.copy(flight / "ref" / "0.png", small)
-    path = tmp_path / "m.gpkg"
-    run_json(capsys, "map", "build", path, "--images", small, *flags[:2], "--json")
-    found = run_json(capsys, "match", path, "--images", flight / "query", *flags[2:], "--json")
-    assert not any(each["accepted"] for each in found)
-
-
 def test_map_build_warns_of_a_map_without_positions(capsys, flight, tmp_path):
     path, bare = tmp_path / "m.gpkg", tmp_path / "bare"
     shutil.copytree(flight / "ref", bare)

@@ -38,9 +38,9 @@ def ties_of(position, log, seed=0, wrong=0.0, within=0.6):
     return Ties(query=query, place=place, step=step, turn=turn, step_sd=step_sd, turn_sd=turn_sd), lies
 
 
-def recorded_of(position, seed=0, sd_m=RECORDED_SD_M):
+def recorded_of(position, seed=0):
     rng = np.random.default_rng((seed, 2))
-    return position + sd_m * (rng.normal(size=len(position)) + 1j * rng.normal(size=len(position)))
+    return position + RECORDED_SD_M * (rng.normal(size=len(position)) + 1j * rng.normal(size=len(position)))
 
 
 def rms(values):
@@ -81,28 +81,6 @@ def test_covariances_are_those_of_the_errors():
         one_axis = np.concatenate([np.real(each).ravel(), np.imag(each).ravel()])
         assert np.mean(abs(one_axis) < 1) == pytest.approx(0.68, abs=0.08)
         assert np.mean(abs(one_axis) < 2) == pytest.approx(0.95, abs=0.03)
-
-
-def test_a_glitch_of_the_receiver_contradicts_the_pictures():
-    position, log = flight()
-    ties, _ = ties_of(position, log)
-    recorded = recorded_of(position, sd_m=2.0)
-    recorded[17] += 300
-    recorded[40] -= 150j
-    solved = solve(recorded, ties)
-    assert np.flatnonzero(~solved.recorded_counts).tolist() == [17, 40]
-    assert rms(off(solved, position, log)[0]) < 2
-
-
-def test_places_without_ties_stay_where_they_were_recorded():
-    position, log = flight(legs=2, a_leg=6)
-    apart = np.concatenate([position, position + 5000])
-    ties, _ = ties_of(position, log)
-    recorded = recorded_of(apart)
-    solved = solve(recorded, ties)
-    np.testing.assert_allclose(solved.position[len(position) :], recorded[len(position) :], atol=0.01)
-    assert (solved.log_var[len(position) :] > 1).all()
-    assert len(np.unique(solved.component)) == 1 + len(position)
 
 
 def test_variances_are_those_of_the_whole_inverse_also_where_entries_cancel():

@@ -39,12 +39,6 @@ def said_states(air, from_s=0.0):
     return [(t_s, state) for t_s, state in air.states if state and t_s >= from_s]
 
 
-def test_with_gps_none_is_sent():
-    air = Air(Navigator(1.0, 1.0)).fly(30)
-    assert len(air.advices) > 25
-    assert {advice.why.code for _, advice in air.advices} == {ReasonCode.HAS_GPS}
-
-
 @pytest.mark.parametrize("begins_anew", [False, True])
 def test_fixes_that_err_otherwise_from_now_on_are_believed_where_it_begins_anew(begins_anew):
     air = Air(Navigator(1.0, 1.0))

@@ -69,11 +69,6 @@ def test_a_detector_that_cannot_be_used_is_refused_in_one_sentence(opened, raw, 
     assert "\n" not in str(refused.value)
 
 
-def test_the_card_of_another_network_is_no_detector(monkeypatch):
-    with pytest.raises(ModelError, match="detector"):
-        Detector(load_card("calc"))
-
-
 RNG = np.random.default_rng(3)
 
 

@@ -32,6 +32,7 @@ def judged(scores=(0.2, 0.1), rule=RULE, matches=None, **more):
 def test_a_technique_without_a_confidence_is_judged_by_its_limits():
     assert judged().accepted
     assert judged((0.05, 0.0)).reason.code is ReasonCode.LOW_SCORE
+    assert judged((0.05,)).reason.code is ReasonCode.LOW_SCORE, "no place elsewhere makes it sure"
     assert judged((0.2, 0.19)).reason.code is ReasonCode.LOW_LEAD
 
 

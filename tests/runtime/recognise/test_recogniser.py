@@ -60,12 +60,6 @@ def test_the_event_of_a_place_that_is_recognised_says_everything(walk):
     assert event.descriptor.fine is not None
 
 
-def test_what_is_not_accepted_carries_no_position(walk):
-    event = walk.step(Frame(image=textured(99), name="elsewhere", t_mono_s=0.0))
-    assert (event.accepted, event.failed, event.position, event.accuracy_m) == (False, False, None, None)
-    assert event.best is not None
-
-
 def test_every_step_is_metered(walk, clock):
     encode, scan, match = walk.technique.encode, walk.technique.coarse_scores, walk.technique.match
     walk.technique.encode = lambda *asked: (clock.work(0.010), encode(*asked))[1]
@@ -125,14 +119,6 @@ def test_a_place_learnt_a_moment_ago_moves_nothing(walk):
     far = walk.step(Frame(image=textured(99), name="elsewhere", t_mono_s=129.9))
     assert far.reason.code is not ReasonCode.JUST_LEARNT, "what is not like it has its own reason"
     assert walk.step(frame(3, 130.1)).accepted
-
-
-def test_a_map_without_a_place_refuses_and_does_not_fail(walk):
-    nothing = type(walk.index)(**{name: array[:0] for name, array in walk.index.arrays.items()}, mean=walk.index.mean)
-    walk.change(matcher=Matcher(nothing, walk.rule))
-    event = walk.step(frame(3))
-    assert (event.failed, event.accepted, event.best) == (False, False, None)
-    assert event.reason.code is ReasonCode.EMPTY_MAP
 
 
 def test_a_frame_that_could_not_be_read_is_an_event_too(walk):

@@ -327,17 +327,3 @@ def test_doctor_checks_the_machine_where_no_autopilot_is(where, link, capsys):
     assert not found["link"][0]
     assert "memory" in found
     assert "channel" not in found
-
-
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (["--link", "udp:127.0.0.1"], "udp:127.0.0.1"),
-        (["--link", "serial:/dev/null:fast"], "baud"),
-        ([], "--link"),
-        (["--config", "/absent.yaml"], "/absent.yaml"),
-    ],
-)
-def test_doctor_exits_with_2_for_a_wrong_request(arguments, named, capsys):
-    assert main(["doctor", *arguments]) == 2
-    assert named in capsys.readouterr().err
