@@ -2,12 +2,12 @@
 
 import os
 import re
+import subprocess
 
 import cv2
 import numpy as np
 import photographs
 import pytest
-from films import cut_in_half, film, overwrite_in_the_middle
 
 from edgevpr.core.errors import SourceError, UsageError
 from edgevpr.core.types import Position
@@ -171,6 +171,14 @@ def test_only_the_frames_that_are_asked_for_are_read(folder, video):
     assert all_frames(open_source(str(folder), live=False, only=[])) == []
 
 
+def film(path, *coding):
+    """Film three seconds of a test picture at 25 Hz, with a key frame every second."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the video is made with ffmpeg (pip install imageio-ffmpeg)")
+    picture = ["-f", "lavfi", "-i", "testsrc2=size=320x240:rate=25:duration=3"]
+    subprocess.run([ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *picture, "-g", "25", *coding, str(path)], check=True)
+    return path
+
+
 def frames_and_complaints(path):
     source, errors = open_source(str(path), live=False), []
     frames = list(filter(None, read_to_end(source, errors.append)))
@@ -186,7 +194,10 @@ def test_video_leaves_out_damaged_frames_and_those_built_on_them(tmp_path):
     path = film(tmp_path / "flight.mkv", "-c:v", "libx264", "-bf", "0", "-sc_threshold", "0")
     whole, complaints, *_ = frames_and_complaints(path)
     assert (len(whole), complaints) == (75, [])
-    overwrite_in_the_middle(path)
+    damaged_file = bytearray(path.read_bytes())
+    middle = len(damaged_file) // 2
+    damaged_file[middle : middle + 300] = np.random.default_rng(1).bytes(300)
+    path.write_bytes(damaged_file)
     frames, complaints, damaged, missing = frames_and_complaints(path)
     images = {time_of(frame): frame.image for frame in whole}
     assert all((images[time_of(frame)] == frame.image).all() for frame in frames)
@@ -220,7 +231,7 @@ def test_video_leaves_out_frames_predicted_from_one_that_is_missing(tmp_path):
 def test_video_that_is_cut_short_is_reported(name, tmp_path):
     index_first = ["-movflags", "+faststart"] if name.endswith("mp4") else []
     path = film(tmp_path / name, "-c:v", "mpeg4", "-qscale:v", "3", *index_first)
-    cut_in_half(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     frames, complaints, _, missing = frames_and_complaints(path)
     assert 10 < len(frames) < 60
     assert len(frames) + missing == pytest.approx(75, abs=1)

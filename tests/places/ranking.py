@@ -3,6 +3,7 @@
 import numpy as np
 
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
+from edgevpr.places.index import PlaceIndex, empty_index
 from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, scan
 
 
@@ -30,3 +31,10 @@ def rank(technique, query, place_map, index, candidates=None, apart_m=0.0, in_re
     expected = Expectation(in_reach, turned_deg)
     asked = Query(technique=technique, descriptor=query, place_map=place_map, index=index, expected=expected)
     return compare(asked, scan(asked), candidates, apart_m)
+
+
+def index_of(place_ids) -> PlaceIndex:
+    """An index of these places, somewhere."""
+    index = empty_index(Ruler.spec, len(place_ids), None)
+    index.place_ids[:] = place_ids
+    return index

@@ -5,10 +5,9 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from map_writer import SPEC
+from ranking import index_of
 
 from edgevpr.core.contract import FineMatch
-from edgevpr.places.index import PlaceIndex, empty_index
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import SequenceSearch, bytes_beside_place
 
@@ -31,12 +30,6 @@ def literal(scores, length, velocities=FOLLOWED):
                         total += float(scores[newest - age][place])
                 found[newest, end] = max(found[newest, end], total / frames)
     return found
-
-
-def index_of(place_ids):
-    index = empty_index(SPEC, len(place_ids), None)
-    index.place_ids[:] = place_ids
-    return index
 
 
 def ranked(scores, slots=None):
@@ -144,7 +137,7 @@ def test_an_index_that_gave_up_places_begins_a_new_sequence(scores, changed):
 @pytest.mark.slow
 def test_memory_is_what_the_budget_is_told_and_no_more_is_kept():
     places, length = 50_000, 10
-    index: PlaceIndex = index_of(range(places))
+    index = index_of(range(places))
     scores = np.random.default_rng(2).random(places, dtype=np.float32)
     few = ranked(scores, np.argsort(-scores)[:40])
     sequence = SequenceSearch(length)
