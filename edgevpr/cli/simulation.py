@@ -23,7 +23,7 @@ def add(commands: Any) -> None:
     flight = command(simulations, "flight", simulate_flight, text)
     flight.add_argument("out", metavar="DIR")
     flight.add_argument(
-        "--which", choices=("map", "query"), help="mapping: the mapping flight (default); query: a later flight"
+        "--which", choices=("map", "query"), help="map: the mapping flight (default); query: a later flight"
     )
     flight.add_argument(
         "--seed", type=_seed, default=1, metavar="N", help="random seed of landscape and motion (default: 1)"
