@@ -235,7 +235,8 @@ class Decider:
             tilt = self._measure_tilt(best, query)
             found = replace(
                 found,
-                tilt=tilt,
+                # A recorded tilt is not refused for what a few regions show; the claim counts a contradiction.
+                tilt=None if query.view.is_tilt_known else tilt,
                 where=allow_for_tilt(found.where, tilt, query.view) if found.where else None,
                 at_rest_elsewhere=self._share_at_rest_elsewhere(best, ranking, query),
                 ahead_of_turned=None if is_heading_known else self._lead_over_turned(best, found.evidence, query),
@@ -297,12 +298,13 @@ class Decider:
             fine, _ = self.place_map.fine_part(best.place.place_id)
             found = self.technique.measure_perspective(query.descriptor, fine, best.match)
             tilt = convert_to_tilt(found, query.view.focal)
-            if tilt.is_level or query.view.is_tilt_known:
+            if tilt.is_level:
                 return tilt
             focal = query.view.focal or TYPICAL_FOCAL
-            if agrees_better_tilted(query.picture, focal, self.technique, fine, best.match):
-                return SUPPOSED_TILT
-            return tilt
+            is_better = agrees_better_tilted(query.picture, focal, self.technique, fine, best.match)
+            if query.view.is_tilt_known:  # a few regions alone do not contradict what is recorded
+                return tilt if is_better else ShownTilt(0.0, tilt.sd)
+            return SUPPOSED_TILT if is_better else tilt
 
     def _share_at_rest_elsewhere(self, candidate: Candidate, ranking: Ranking, encoded: EncodedFrame) -> float:
         """Return the share of a few places elsewhere that agree with the query at rest, as the best one (0: it is not

@@ -29,6 +29,7 @@ _MAX_FIX_AGE_S = 60.0
 _ALL_TRUSTED = (True, True)
 _SAME_SCALE = 1.08  # the ratio of two heights from which on it is no error of a match
 _MIN_SCALE = 0.5
+_HEIGHTS_SURE = 3  # matches that agree on a small error of the recorded heights
 _HEIGHTS_KEPT = 5  # matches whose heights are compared with the recorded ones
 # The flight so far narrows the search where it is so sure of its position. The area then has places enough to compare
 # the best one with: it is as large as that of recorded queries, and reaches over so many places.
@@ -107,7 +108,7 @@ class RecordedPrior:
             recorded_m = frame.height_m if frame.height_m and frame.height_m > 0 else None
             ratio = recorded_m and self._height_error * recorded_m / self._map_height_m
         self._expects_height = "height" in self._known and ratio is not None
-        self.looks_again = not (self._expects_height and self._height_errors)
+        self.looks_again = not (self._expects_height and len(self._height_errors) >= _HEIGHTS_SURE)
         self.height_ratio = ratio if self._expects_height and ratio else self.scale(())
         uses_heading = "heading" in self._known and self._heading_within_deg is not None
         reach = Reach(frame.position, RECORDED_REACH_M) if "reach" in self._known and frame.position else None
@@ -117,7 +118,9 @@ class RecordedPrior:
     def _height_error(self) -> float:
         """The heights by the last matches over those recorded, median; 1.0 if they are about the same."""
         error = statistics.median(self._height_errors) if self._height_errors else 1.0
-        return error if abs(math.log(error)) > math.log(_SAME_SCALE) else 1.0
+        # The height of one match may be wrong by 8 %: few of them correct what is clearly wrong only.
+        same = _SAME_SCALE if len(self._height_errors) >= _HEIGHTS_SURE else _SAME_SCALE**2
+        return error if abs(math.log(error)) > math.log(same) else 1.0
 
     def scale(self, height_ratios: Sequence[float]) -> float:
         """Return how much more ground a picture shows than its recorded height says."""

@@ -8,7 +8,7 @@ import pytest
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
-from edgevpr.runtime.recognise.hints import Hints, Prior, Reach, to_expectation
+from edgevpr.runtime.recognise.hints import Hints, Prior, Reach, RecordedPrior, to_expectation
 from edgevpr.runtime.recognise.locate import Located
 
 HOME = Position(50.0, 8.0)
@@ -183,3 +183,17 @@ def test_over_unmapped_ground_every_second_query_is_looked_for_from_all_heights(
         again.append(prior.looks_again)
         prior.update(found(), accepted, 0.0)
     assert again == [True, False, True, False, True, True, False]
+
+
+@pytest.mark.parametrize(("ratio", "matches"), [(0.9, 3), (1.25, 1), (0.95, 0)])
+def test_recorded_prior_corrects_a_small_error_of_the_height_by_three_matches_only(index, ratio, matches):
+    prior = RecordedPrior(("height",))
+    frame = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0)
+    best = Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5, height_ratio=ratio))
+    found = []
+    for _ in range(4):
+        prior.hints(frame, None, index, 0.0)
+        found.append(prior.height_ratio)
+        prior.update(best, True, 0.0, 1.0, 60.0)
+    uncorrected = matches or 4
+    assert found == [1.0] * uncorrected + [pytest.approx(ratio)] * (4 - uncorrected)
