@@ -43,7 +43,6 @@ class ClosedLoop:
     def __init__(self, vehicle, *, edgevpr=True, matches=True, velocity_m_s=0j, **parameters):
         self.motion = Hover(Position(ORIGIN.lat_deg, ORIGIN.lon_deg, ORIGIN.alt_m), HEIGHT_M, velocity_m_s)
         self.controller = FlightController(vehicle, self.motion, gps=True)
-        self.controller.brain.is_armed = True
         for name, value in parameters.items():
             self.controller.set(name, value)
         self.sees_motion = True

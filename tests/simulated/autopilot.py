@@ -4,7 +4,6 @@ onboard computer, such as the one that runs edgevpr."""
 
 import json
 import logging
-import math
 import select
 import signal
 import sys
@@ -17,7 +16,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from edgevpr.cli.shared import parse_parameters
 from edgevpr.core.errors import EdgevprError, LinkError
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.messages import AUTOPILOT
@@ -56,22 +54,20 @@ def run_autopilot(
     track: FlownTrack | None = None,
     vehicle: str = "arduplane",
     gps: bool = False,
-    gps_until_s: float = math.inf,
-    parameters: Mapping[str, str] = MappingProxyType({}),
+    parameters: Mapping[str, float] = MappingProxyType({}),
 ) -> AutopilotSummary:
     """Simulate an autopilot at `link_url` until `stop` is set, Ctrl-C comes, or the link is lost; return what it
     received. Its UTC is that of this machine.
 
     With a `track` the vehicle flies along it from the first message of a companion that does more than ask for
     information, and stays at its end. Without one, its position is unknown and never reported. With `gps` it has GPS,
-    and accepts no fix, until `gps_until_s` seconds of the track (see `FlightController`). `parameters`
-    (name to value as text) are set before the start. Raises LinkError if the link cannot be opened, UsageError for an
-    unknown parameter, and for a wrong value.
+    and accepts no fix. `parameters` are set before the start. Raises LinkError if the link cannot be opened, KeyError
+    for an unknown parameter.
     """
     motion = AlongTrack(track) if track else Motion()
-    controller = FlightController(vehicle, motion, gps=gps, gps_until_s=gps_until_s, start_utc_s=time.time())
-    for name, text in parameters.items():
-        controller.brain.parameters.set_text(name, text)
+    controller = FlightController(vehicle, motion, gps=gps, start_utc_s=time.time())
+    for name, value in parameters.items():
+        controller.set(name, value)
     return serve(controller, link_url, stop or threading.Event())
 
 
@@ -171,8 +167,13 @@ def command_line() -> ArgumentParser:
     parser.add_argument("--track", metavar="CSV", help="positions.csv to fly along once a flight is heard")
     parser.add_argument("--vehicle", choices=VEHICLES, default="arduplane")
     parser.add_argument("--no-gps", action="store_true", help="start without GPS, as always without --track")
-    parser.add_argument("--param", action="append", default=[], metavar="KEY=VALUE", help="set its parameter KEY")
+    parser.add_argument("--param", action="append", default=[], type=_parse, metavar="KEY=VALUE")
     return parser
+
+
+def _parse(pair: str) -> tuple[str, float]:
+    name, _, value = pair.partition("=")
+    return name, float(value)
 
 
 def main() -> None:
@@ -183,11 +184,12 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: it prints what it received
     try:
         track = read_track(args.track) if args.track else None
-        parameters = parse_parameters(args.param)
         gps = track is not None and not args.no_gps
-        summary = run_autopilot(args.link, track=track, vehicle=args.vehicle, gps=gps, parameters=parameters)
+        summary = run_autopilot(args.link, track=track, vehicle=args.vehicle, gps=gps, parameters=dict(args.param))
     except EdgevprError as error:
         parser.error(str(error))
+    except KeyError as error:
+        parser.error(f"the vehicle has no parameter {error}")
     print(json.dumps(asdict(summary), indent=2))
 
 

@@ -93,7 +93,7 @@ class FlightController:
                 result, answers = self._obey(message)
                 sender = {"target_system": message.get_srcSystem(), "target_component": message.get_srcComponent()}
                 return [mavlink.MAVLink_command_ack_message(message.command, result, **sender), *answers]
-            case "PARAM_REQUEST_READ" | "PARAM_REQUEST_LIST" | "PARAM_SET":
+            case "PARAM_REQUEST_READ" | "PARAM_SET":
                 return brain.parameters.answer(message)
             case "TIMESYNC" if message.tc1 == 0:
                 return [mavlink.MAVLink_timesync_message(round(brain.now_s * 1e9) + 1, message.ts1)]

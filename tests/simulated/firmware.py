@@ -1,7 +1,6 @@
 """The common part of the simulated firmwares, ArduPilot and PX4: parameters and a position estimator. The error of the
 estimate grows by a simple model. A point is (latitude, longitude) in degrees, a vector east + 1j * north."""
 
-import cmath
 import math
 import struct
 from abc import ABC, abstractmethod
@@ -9,7 +8,6 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from edgevpr.core.arrays import LatLon
-from edgevpr.core.errors import UsageError
 from edgevpr.mavlink.wire import Message, mavlink, parameter_value
 from simulated.estimator import Estimator
 from simulated.motion import Motion, displace, displacement_m
@@ -31,8 +29,6 @@ _VELOCITY_NOISE_M_S = 0.3
 _GYRO_ERROR_RAD_S = math.radians(0.02)
 _INERTIAL_M_S2 = 0.05 + 0j  # error of the acceleration from which a copter dead-reckons
 _WIND_LEARNT_IN_S = 5.0
-_NAME_BYTES = 16
-_MAX_VALUE = 2**31 - 1
 _TYPES = {"copter": mavlink.MAV_TYPE_QUADROTOR, "plane": mavlink.MAV_TYPE_FIXED_WING}
 
 Origin = tuple[float, float, float]  # latitude, longitude, altitude above sea level
@@ -56,7 +52,6 @@ class Firmware(ABC):
         self.receivers = Receivers(self.parameters)
         self.estimator = Estimator(_GYRO_ERROR_RAD_S if motion.obeys_estimate else 0.0)
         self.origin: Origin | None = None
-        self.is_armed = motion.is_flying
         self.test_ratio = 0.0
         self.start_utc_s = 0.0
         self.now_s, self.truth = 0.0, motion.step(0.0, 0.0)
@@ -68,8 +63,7 @@ class Firmware(ABC):
         self.motion.steer(self.estimator.error_m, self.estimator.velocity_error_m_s, self.tilt)
         self.truth = self.motion.step(self.now_s, dt_s)
         self.receivers.step(self.truth, self.now_s)
-        from_deg = self.parameters["SIM_WIND_DIR"]
-        self._estimate(-cmath.rect(self.parameters["SIM_WIND_SPD"], math.radians(90 - from_deg)), dt_s)
+        self._estimate(1j * self.parameters["SIM_WIND_SPD"], dt_s)
 
     @abstractmethod
     def lose_gps(self) -> None:
@@ -153,9 +147,6 @@ class Firmware(ABC):
     def _drift(self, wind_m_s: complex, dt_s: float, unnoticed_share: float) -> None:
         """Increase the velocity error of the dead reckoning: of a plane by `unnoticed_share` of the change of wind
         since the filter learnt it, of a copter by the error of its accelerometers."""
-        if not self.motion.is_flying:
-            self.estimator.velocity_error_m_s = 0j
-            return
         self.estimator.expect_drift(_DRIFT_SD_M_S[self.kind])
         if self.kind == "plane":
             self.estimator.velocity_error_m_s = unnoticed_share * (self._wind_m_s - wind_m_s)
@@ -175,38 +166,19 @@ class Parameters(dict[str, float]):
         """Set the value of an existing parameter."""
         self[name] = type(self[name])(value)
 
-    def set_text(self, name: str, text: str) -> None:
-        """Set a parameter from the user's text. Raises UsageError for an unknown name, and for an invalid value."""
-        if name not in self:
-            raise UsageError(f"The vehicle has no parameter {name}: it has {', '.join(sorted(self))}.")
-        try:
-            value = type(self[name])(text)
-        except ValueError:
-            value = math.nan
-        if not -_MAX_VALUE <= value <= _MAX_VALUE:  # false for NaN
-            wanted = "a whole number" if isinstance(self[name], int) else "a number"
-            raise UsageError(f"{name}={text}: its value is {wanted}, e.g. {self[name]}.")
-        self[name] = value
-
     def answer(self, message: Message) -> list[Message]:
-        """Return the replies to a PARAM_REQUEST_READ, PARAM_REQUEST_LIST or PARAM_SET; none for an unknown name."""
-        kind, names = message.get_type(), list(self)
-        if kind == "PARAM_REQUEST_LIST":
-            return [self._message(name, index) for index, name in enumerate(names)]
-        by_index = kind == "PARAM_REQUEST_READ" and 0 <= message.param_index < len(names)
-        name = names[message.param_index] if by_index else message.param_id
+        """Return the reply to a PARAM_REQUEST_READ by name or a PARAM_SET; none for an unknown name."""
+        name = message.param_id
         if name not in self:
             return []
-        if kind == "PARAM_SET":
+        if message.get_type() == "PARAM_SET":
             self.set(name, parameter_value(message, self._bytewise) or 0.0)
-        return [self._message(name, names.index(name))]
-
-    def _message(self, name: str, index: int) -> Message:
         value, is_whole = self[name], isinstance(self[name], int)
         kind = mavlink.MAV_PARAM_TYPE_INT32 if is_whole else mavlink.MAV_PARAM_TYPE_REAL32
         if is_whole and self._bytewise:
             value = struct.unpack("<f", struct.pack("<i", value))[0]
-        return mavlink.MAVLink_param_value_message(name.encode()[:_NAME_BYTES], float(value), kind, len(self), index)
+        index = list(self).index(name)
+        return [mavlink.MAVLink_param_value_message(name.encode(), float(value), kind, len(self), index)]
 
 
 # Parameters of the simulation, named as in ArduPilot's own simulator, so that one test can drive both.
@@ -215,10 +187,7 @@ SIMULATOR = {
     "SIM_GPS1_TYPE": 1,  # 1: u-blox, whose fix is RTK; 5: NMEA, whose fix is a plain 3D one
     "SIM_GPS1_NUMSATS": 10,
     "SIM_GPS_SPOOF": 0,  # 1: the receiver says that it is spoofed; not a parameter of ArduPilot's simulator
-    "SIM_GPS1_GLTCH_X": 0.0,  # degrees of latitude
-    "SIM_GPS1_GLTCH_Y": 0.0,  # degrees of longitude
-    "SIM_WIND_SPD": 0.0,
-    "SIM_WIND_DIR": 180.0,  # degrees: where the wind comes from
+    "SIM_WIND_SPD": 0.0,  # of a wind from the south
 }
 _SERIAL = {f"SERIAL{number}_{name}": value for number in (1, 2) for name, value in (("BAUD", 57), ("PROTOCOL", 2))}
 # The source of each quantity in the first source set, and in the second and third.
@@ -251,7 +220,7 @@ ARDUPILOT = {
     "VISO_SCALE": 1.0,
     "VISO_TYPE": 0,
 }
-ARDUPILOT_PLANE = {"ARSPD_TYPE": 2, "ARSPD_USE": 1, "TKOFF_ALT": 50.0}
+ARDUPILOT_PLANE = {"ARSPD_TYPE": 2, "ARSPD_USE": 1}
 
 PX4 = {
     "EKF2_AGP0_ID": 1,

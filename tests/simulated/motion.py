@@ -51,10 +51,9 @@ FlownTrack = Sequence[TrueState]  # the path of a vehicle, in the order of time
 
 
 class Motion:
-    """A vehicle at an unknown place that obeys no command. `is_flying`: it is between take-off and landing; `is_known`:
-    its position is known, and reported; `obeys_estimate`: the errors of its autopilot's estimate move it."""
+    """A vehicle at an unknown place that obeys no command. `is_known`: its position is known, and reported;
+    `obeys_estimate`: the errors of its autopilot's estimate move it."""
 
-    is_flying = True
     is_known = False
     obeys_estimate = False
 

@@ -2,7 +2,7 @@
 flags of a real one in its own simulator. Used by `controller`. They are from EKF2.cpp, ekf.cpp
 (resetGlobalPosToExternalObservation), ekf_helper.cpp (updateHorizontalDeadReckoningstatus, get_ekf_soln_status),
 gps_control.cpp, gnss_checks.cpp, aux_global_position.cpp and ev_pos_control.cpp. A 1.17.0 and a 1.18-beta1 were
-compared with it (test_px4_contract).
+compared with it.
 
 GPS and our positions are fused side by side, each within its gate. One that contradicts the estimate resets it only
 where the other is not active: a GPS that comes back while ours is active is refused.
@@ -81,7 +81,7 @@ class Px4(Firmware):
         is_aided = self.now_s - max(self._gps.fused_s, self._ours.fused_s) < _AIDING_GONE_S
         if not is_aided:
             self._drift(wind_m_s, dt_s, 1.0)
-        if is_aided or self.kind == "plane" or not self.motion.is_flying:
+        if is_aided or self.kind == "plane":
             self._aided_s = self.now_s
 
     def _take_gps(self, measured: PositionMeasurement) -> bool:
@@ -147,8 +147,6 @@ class Px4(Firmware):
             flags |= mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
         if self._gps.is_active or (self._ours.is_active and not self._is_vision):
             flags |= mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
-        if not self.motion.is_flying:  # at rest, whatever it knows
-            flags |= mavlink.ESTIMATOR_CONST_POS_MODE
         return flags | (mavlink.ESTIMATOR_GPS_GLITCH if self.test_ratio > 1 else 0)
 
     def take_fix(self, command: Message) -> int:

@@ -20,13 +20,12 @@ _CAPABILITIES = (
 
 
 def _heartbeat(brain: Firmware) -> Message:
-    armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if brain.is_armed else 0
     return mavlink.MAVLink_heartbeat_message(
         type=brain.vehicle_type,
         autopilot=brain.number,
-        base_mode=mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
+        base_mode=mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFETY_ARMED,
         custom_mode=0,
-        system_status=mavlink.MAV_STATE_ACTIVE if brain.is_armed else mavlink.MAV_STATE_STANDBY,
+        system_status=mavlink.MAV_STATE_ACTIVE,
         mavlink_version=3,
     )
 

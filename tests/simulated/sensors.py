@@ -44,8 +44,8 @@ NOTHING = PositionMeasurement()  # of a receiver that is silent
 
 
 class Receivers:
-    """The last `reports` of two GPS receivers. One measures the true position plus the glitch that the parameters set,
-    while enabled; one of type 14 is fed by GPS_INPUT. `primary` is the measurement in use: of the receiver that
+    """The last `reports` of two GPS receivers. One measures the true position while enabled; one of
+    type 14 is fed by GPS_INPUT. `primary` is the measurement in use: of the receiver that
     `AP_GPS::update_primary` chooses, or a blend of both."""
 
     def __init__(self, parameters: Mapping[str, float]) -> None:
@@ -93,7 +93,7 @@ class Receivers:
     def _measure(self, truth: TrueState, before: PositionMeasurement, now_s: float) -> PositionMeasurement:
         parameters = self._parameters
         report = PositionMeasurement(
-            point=(truth.lat_deg + parameters["SIM_GPS1_GLTCH_X"], truth.lon_deg + parameters["SIM_GPS1_GLTCH_Y"]),
+            point=truth.point,
             alt_m=truth.alt_m,
             sd_m=_SIMULATED_SD_M,
             t_s=now_s,

@@ -9,15 +9,15 @@ import time
 import pytest
 from loopback import free_port, wait_until
 from mavlink_peers import AutopilotThread, Peer, UdpPort, link_to
-from simulated import autopilot
-from simulated.controller import FlightController
-from simulated.motion import AlongTrack, TrueState, interpolate_track, read_track
 
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.asking import Inquiry, read_autopilot
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
+from simulated import autopilot
+from simulated.controller import FlightController
+from simulated.motion import AlongTrack, TrueState, interpolate_track, read_track
 
 pytestmark = pytest.mark.network
 
@@ -80,14 +80,14 @@ def test_track_starts_with_a_flight_and_not_with_questions(monkeypatch):
         autopilot.finish()
 
 
-def test_truth_at_has_the_velocity_along_the_track():
+def test_interpolate_track_has_the_velocity_along_it():
     points = (0.0, 50.0, 8.0), (10.0, 50.001, 8.0), (20.0, 50.001, 8.001)
     track = [TrueState(t_s=t_s, lat_deg=lat_deg, lon_deg=lon_deg, alt_m=0.0) for t_s, lat_deg, lon_deg in points]
     velocities = [interpolate_track(track, t_s).velocity_m_s for t_s in (0.0, 5.0, 15.0, 30.0)]
     assert velocities == pytest.approx([11.12j, 11.12j, 7.15 + 0j, 0j], abs=0.01), "north first"
 
 
-def test_truth_at_turns_the_shorter_way_and_keeps_what_is_unknown():
+def test_interpolate_track_turns_the_shorter_way_and_keeps_what_is_unknown():
     one = TrueState(lat_deg=50, lon_deg=8, alt_m=0, roll_deg=2, heading_deg=350, height_m=80)
     other = TrueState(lat_deg=50, lon_deg=8, alt_m=0, roll_deg=-2, heading_deg=20, height_m=90, t_s=2)
     here = interpolate_track([one, other], 1.0)
@@ -110,28 +110,14 @@ def test_gps_until_s_ends_gps_in_an_unknown_wind():
     assert controller.receive(a_fix())[0].result == mavlink.MAV_RESULT_ACCEPTED
 
 
-@pytest.mark.parametrize(
-    ("rows", "attitude_deg", "height_mm", "heading_cdeg"),
-    [
-        (
-            ["roll_deg,pitch_deg,yaw_deg,rel_alt,time,lat,lon,alt", "-12,7,300,80.5,0,50,8,100"],
-            (-12, 7, -60),
-            80_500,
-            30_000,
-        ),
-        (["roll_deg,time,lat,lon", ",10,50.0,8.001", ",0,50.0,8.0"], (0, 0, 90), 0, 9000),
-    ],
-    ids=["known", "level along its way"],
-)
-def test_attitude_is_that_of_the_track_else_level(tmp_path, rows, attitude_deg, height_mm, heading_cdeg):
-    csv = tmp_path / "positions.csv"
-    csv.write_text("\n".join([f"file,{rows[0]}", *(f"{number}.jpg,{row}" for number, row in enumerate(rows[1:]))]))
-    controller = FlightController("px4-copter", AlongTrack(read_track(csv)), gps=True)
-    said = {message.get_type(): message for message in controller.advance(1.0)}
-    attitude, position = said["ATTITUDE"], said["GLOBAL_POSITION_INT"]
-    degrees = [math.degrees(angle) for angle in (attitude.roll, attitude.pitch, attitude.yaw)]
-    assert degrees == pytest.approx(attitude_deg, abs=1e-3)
-    assert (position.relative_alt, position.hdg) == (height_mm, pytest.approx(heading_cdeg, abs=1))
+def test_read_track_takes_attitude_and_course_where_they_are_known(tmp_path):
+    known, unknown = tmp_path / "known.csv", tmp_path / "unknown.csv"
+    known.write_text("file,roll_deg,pitch_deg,yaw_deg,rel_alt,time,lat,lon,alt\n0.jpg,-12,7,300,80.5,0,50,8,100")
+    unknown.write_text("file,time,lat,lon\n0.jpg,10,50.0,8.001\n1.jpg,0,50.0,8.0")
+    (state,) = read_track(known)
+    assert (state.roll_deg, state.pitch_deg, state.heading_deg, state.height_m) == (-12, 7, 300, 80.5)
+    level = [(state.roll_deg, state.pitch_deg, round(state.heading_deg), state.t_s) for state in read_track(unknown)]
+    assert level == [(0, 0, 90, 0), (0, 0, 90, 10)], "in the order of time, along its way"
 
 
 @pytest.mark.process
