@@ -1,4 +1,4 @@
-"""Chapter 6 of the thesis, word by word: loops, float64, nothing clever. The golden standard of the techniques."""
+"""Chapter 6 of the thesis, step by step: float64, nothing clever. The golden standard of the techniques."""
 
 import math
 from collections import Counter
@@ -18,13 +18,10 @@ def levels(grey):
 
 def disc(image, x, y, radius):
     """Intensities of the valid pixels within `radius` of (x, y)."""
-    height, width = image.shape
-    return [
-        int(image[j, i])
-        for j in range(max(0, y - radius), min(height, y + radius + 1))
-        for i in range(max(0, x - radius), min(width, x + radius + 1))
-        if (i - x) ** 2 + (j - y) ** 2 <= radius**2
-    ]
+    top, left = max(0, y - radius), max(0, x - radius)
+    square = image[top : y + radius + 1, left : x + radius + 1]
+    rows, columns = np.indices(square.shape)
+    return square[(columns + left - x) ** 2 + (rows + top - y) ** 2 <= radius**2].tolist()
 
 
 def filled_bins(image, radius=5):
@@ -91,8 +88,4 @@ def good_blocks(entropy, cell, threshold):
 
 def regional_match(query_blocks, good, reference_blocks):
     """Section 6.2.3: C = A B^T, row-wise maximum D, arithmetic mean of D."""
-    best = []
-    for asking, is_good in zip(query_blocks, good, strict=True):
-        if is_good:
-            best.append(max(sum(a * b for a, b in zip(asking, block, strict=True)) for block in reference_blocks))
-    return sum(best) / len(best) if best else 0.0
+    return (query_blocks[good] @ reference_blocks.T).max(axis=1).mean() if good.any() else 0.0

@@ -10,19 +10,15 @@ from edgevpr.techniques.seqslam import SeqSlam
 
 
 def literal_levels(picture, patch=8):
-    """Patch normalisation (section III.A), a pixel at a time, in the eight bits that are kept."""
+    """Patch normalisation (section III.A), in the eight bits that are kept."""
     height, width = picture.shape
     levels = np.full((height, width), 128)
     for top in range(0, height, patch):
         for left in range(0, width, patch):
-            pixels = [float(picture[y, x]) for y in range(top, top + patch) for x in range(left, left + patch)]
-            mean = sum(pixels) / len(pixels)
-            deviation = math.sqrt(sum((pixel - mean) ** 2 for pixel in pixels) / len(pixels))
-            if deviation == 0:
-                continue
-            for y in range(top, top + patch):
-                for x in range(left, left + patch):
-                    levels[y, x] = min(max(round(28 * (float(picture[y, x]) - mean) / deviation) + 128, 0), 255)
+            here = slice(top, top + patch), slice(left, left + patch)
+            pixels = picture[here].astype(float)
+            if pixels.std() > 0:
+                levels[here] = np.clip(np.round(28 * (pixels - pixels.mean()) / pixels.std()) + 128, 0, 255)
     return levels
 
 
@@ -30,10 +26,9 @@ def literal_enhanced(differences, window=10):
     """Local contrast enhancement (equation 2): around each place, as far as the map goes."""
     result = []
     for i, difference in enumerate(differences):
-        around = [float(differences[j]) for j in range(len(differences)) if abs(j - i) <= window // 2]
-        mean = sum(around) / len(around)
-        squares = sum((each - mean) ** 2 for each in around)
-        result.append((difference - mean) / math.sqrt(squares / (len(around) - 1)) if squares else 0.0)
+        around = np.array(differences[max(0, i - window // 2) : i + window // 2 + 1])
+        deviation = around.std(ddof=1)
+        result.append((difference - around.mean()) / deviation if deviation else 0.0)
     return np.array(result)
 
 
