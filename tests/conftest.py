@@ -30,7 +30,8 @@ LONGEST = (
     "test_memory",
     "test_demo",
     "test_profile_command",
-    "test_golden",
+    "test_interface",
+    "test_views",
 )
 
 

@@ -49,8 +49,10 @@ def test_turned_blocks_are_those_of_the_turned_picture():
         np.testing.assert_allclose(rotate_blocks(blocks, quarters), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("turned_deg", [0, 130])
-@pytest.mark.parametrize("height_ratio", [0.5, 0.6, 0.7, 0.84, 1.0, 1.19, 1.42, 1.7, 2.0])
+@pytest.mark.parametrize(
+    ("height_ratio", "turned_deg"),
+    list(zip([0.5, 0.6, 0.7, 0.84, 1.0, 1.0, 1.19, 1.42, 1.7, 2.0], [0, 130] * 5, strict=True)),
+)
 def test_a_query_from_another_height_is_found_with_its_height_rotation_and_shift(town, height_ratio, turned_deg):
     technique, places, rows = town
     query = technique.encode(seen(3, height_ratio, turned_deg, right_px=24))
