@@ -21,7 +21,7 @@ test-fast: $(VENV)/installed
 
 # What of benchmarks/ needs neither an emulator nor a simulator; not part of `make test`.
 test-benchmarks: $(VENV)/installed
-	$(BIN)/python -m pytest -n 2 -o pythonpath="benchmarks tests" benchmarks/tests
+	$(BIN)/python -m pytest -n 2 -o pythonpath="benchmarks tests tests/mavlink" benchmarks/tests
 
 # The documents as a site, in site/: every link must lead somewhere.
 docs: $(VENV)/installed

@@ -21,7 +21,7 @@ from edgevpr.lab.evaluate import provenance
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 # The tests' tools (cameras on loopback, large maps, flights as processes), and the writing of networks.
-sys.path += [str(REPOSITORY / "tests"), str(REPOSITORY / "models" / "recipes")]
+sys.path += [str(REPOSITORY / name) for name in ("tests", "tests/mavlink", "tests/runtime", "models/recipes")]
 RESULTS = REPOSITORY / "benchmarks" / "results"
 DATA = Path(os.environ.get("EDGEVPR_DATA") or REPOSITORY.parent / "shared" / "data")
 TUNED_ON = ("corridor", "aerial_caliterra", "aerial_garfield28", "sat_marash")

@@ -7,11 +7,6 @@ the factor of the accuracy that ArduPilot is told is swept: the smallest one tha
 """
 
 import itertools
-import sys
-from pathlib import Path
-
-sys.path += [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1] / "tests")]
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "runtime"))
 
 import base
 import closed_loop
