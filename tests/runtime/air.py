@@ -90,7 +90,7 @@ class Air:
         self.every_steps, self.late_steps = round(every_s / _STEP_S), round(late_s / _STEP_S)
         self.stride_steps = stride_s and round(stride_s / _STEP_S)
         self.step, self.at_m, self.gps_off_m, self.has_gps = 0, np.zeros(2), np.zeros(2), True
-        self.has_receiver, self.spoofed_m_s = True, np.zeros(2)  # the speed that it has made up
+        self.has_receiver = True
         self.off_m = np.zeros(2)  # by how much the autopilot is wrong
         self.known = GPS_SD_M, 0.0  # how well it knew its position, and when
         self.way, self.waiting, self.vehicle = [self.at_m], deque(), None
@@ -220,7 +220,7 @@ class Air:
         here = moved(*HOME, *(self.at_m + self.off_m))
         measured_m = self.way[max(0, self.step - round(RECEIVER_LAG_S / _STEP_S))]
         there = moved(*HOME, *(measured_m + self.gps_off_m))
-        wrong = self.spoofed_m_s if self.has_gps else self.rng.normal(0, self.velocity_sd, 2) - self.wind
+        wrong = 0.0 if self.has_gps else self.rng.normal(0, self.velocity_sd, 2) - self.wind
         if self.has_gps:
             self.known = GPS_SD_M, self.t_s
         sd_m = math.hypot(self.known[0], _DRIFT_M_S * (self.t_s - self.known[1]))

@@ -34,8 +34,7 @@ STEP_DEG = 0.001  # of latitude: 111 m
 class Flight:
     """A flight with a map, ready to be flown: `fly` does so and gives the lines of its log but the last, the `end`.
 
-    `settings` are keys of the configuration; with `learns` the flight makes places; `navigator` is the listener of a
-    real link.
+    `settings` are keys of the configuration; with `learns` the flight makes places.
     """
 
     def __init__(
@@ -45,12 +44,11 @@ class Flight:
         clock: FakeClock,
         link: FakeLink | None = None,
         learns: bool = False,
-        navigator: Navigator | None = None,
         **settings,
     ) -> None:
         self.config = load_config(None, {"map": str(place_map), "source.uri": "/dev/video0"} | settings)
         self.board = load_board(self.config.board)
-        self.log, self.clock, self.link, self.navigator = log, clock, link, navigator
+        self.log, self.clock, self.link = log, clock, link
         growing = None
         if learns:
             self.recogniser, growing = open_learning(self.config, self.board, self.config.technique)
@@ -82,9 +80,7 @@ class Flight:
                 flight_log.write("start", **start)
             notifier, autopilot = Notifier(flight_log, self.link), None
             if self.link:
-                navigator = self.navigator
-                if navigator is None:  # of a real link it is the listener from the start
-                    navigator = self.link.listener = Navigator(settings.min_accuracy_m, 1.0)
+                navigator = self.link.listener = Navigator(settings.min_accuracy_m, 1.0)
                 autopilot = ToAutopilot(
                     self.link, navigator, notifier, settings=settings, cores=self.board.cores, clock=clock
                 )

@@ -30,8 +30,8 @@ class Watched(Air):
     """A flight whose every match is told to the autopilot and to the watch over GPS, as the loop does; `news` are the
     watch's lines of the flight log."""
 
-    def __init__(self, flight_log, clock, navigator=None, **how):
-        super().__init__(navigator or Navigator(MAP_SD_M, 1.0), **{"fix_sd_m": 2.0, "late_s": 0.0} | how)
+    def __init__(self, flight_log, clock, **how):
+        super().__init__(Navigator(MAP_SD_M, 1.0), **{"fix_sd_m": 2.0, "late_s": 0.0} | how)
         self.clock = clock
         self.link = FakeLink(self.clock)
         self.autopilot = to_autopilot(self.link, self.navigator, self.clock, flight_log)

@@ -30,13 +30,13 @@ def match_at(position, t_s, fix_sd_m, lean=None, **frame):
 
 class Flown:
     """A flight in a wide circle whose autopilot has GPS until `loss_s`, then reckons with a wind that it does not know;
-    fixes of a standard deviation of `fix_sd_m` come once a second and are `late_s` late."""
+    fixes of a standard deviation of `fix_sd_m` come once a second and are 0.4 s late."""
 
-    def __init__(self, drift, *, wind=(0.0, 0.0), bias=(0.0, 0.0), fix_sd_m=2.0, late_s=0.4):
+    def __init__(self, drift, *, wind=(0.0, 0.0), fix_sd_m=2.0):
         self.navigation = Navigation(drift, 1.0)
         self.rng = np.random.default_rng(7)
-        self.wind, self.bias = map(np.array, (wind, bias))
-        self.fix_sd_m, self.late_steps = fix_sd_m, round(late_s / STEP_S)
+        self.wind = np.array(wind)
+        self.fix_sd_m, self.late_steps = fix_sd_m, round(0.4 / STEP_S)
         self.at_m, self.reckoned_m, self.step = np.zeros(2), np.zeros(2), 0
         self.way = [self.at_m]
         self.is_inertial = drift is INERTIAL
@@ -58,7 +58,7 @@ class Flown:
             self.way.append(self.at_m)
             self.reckoned_m = self.at_m if has_gps else self.reckoned_m + STEP_S * (velocity - self.wind)
             if self.is_inertial:
-                felt = (velocity - before) / STEP_S + self.bias + self.rng.normal(0, 0.2, 2)
+                felt = (velocity - before) / STEP_S + self.rng.normal(0, 0.2, 2)
                 self.navigation.add_acceleration(self.t_s, felt)
             if self.step % 5 == 0:
                 said = {"has_gps": has_gps, "position_sd_m": 0.5 if has_gps else 20.0}

@@ -21,10 +21,10 @@ WIND = 6.0, 0.0
 LIKE_ONE = math.sqrt(50)  # by so much more a continuous position says that it is wrong
 
 
-def lost(navigator=None, gps_s=30.0, **how):
+def lost(navigator=None, **how):
     """A flight that has just lost GPS."""
     air = Air(navigator or Navigator(1.0, how.get("every_s", 1.0)), **how)
-    air.fly(gps_s)
+    air.fly(30)
     air.lose_gps()
     air.errors_m.clear()
     return air

@@ -57,8 +57,6 @@ class Bench:
         t_fix_s=-math.inf,
         quality=0.9,
         position=None,
-        failed=False,
-        view=UNKNOWN_VIEW,
         followed=None,
     ):
         """Show a frame, at a place that the autopilot or the frame itself tells; `t_fix_s` is when a fix was sent or
@@ -73,9 +71,8 @@ class Bench:
         event = Recognition(
             frame=frame,
             vehicle=vehicle,
-            picture=Levelled(frame.image, None, view),
+            picture=Levelled(frame.image, None, UNKNOWN_VIEW),
             descriptor=Descriptor(coarse=part, quality=quality),
-            failed=failed,
             followed=followed,
         )
         return self.learner.learn(event)
