@@ -18,7 +18,6 @@ from simulated.firmware import (
     OK,
     POSITION_NOISE_M,
     Firmware,
-    Origin,
 )
 from simulated.motion import Motion, displace
 from simulated.sensors import FIX_3D, PositionMeasurement
@@ -111,10 +110,6 @@ class ArduPilot(Firmware):
             sd_m = min(_MOST_NOISE_M, max(_LEAST_NOISE_M, sd_m))
             self._odometry = complex(message.y, message.x), sd_m, self.now_s
 
-    def set_origin(self, origin: Origin) -> bool:
-        """Set the origin, unless there is one. Returns True if it was set."""
-        return self.origin is None and super().set_origin(origin)
-
     def use_source_set(self, number: float) -> int:
         if number not in (1, 2, 3):
             return DENIED
@@ -156,6 +151,6 @@ class ArduPilot(Firmware):
 
     def _start_aiding(self, point: LatLon, alt_m: float, passed_s: float) -> None:
         self._is_aiding, self._passed_s, self._aligned_after_s = True, passed_s, _REALIGNED_AFTER_S
-        self.set_origin((*point, alt_m))
+        self.origin = self.origin or (*point, alt_m)
         self._reset_to(point, POSITION_NOISE_M)
         self.estimator.velocity_error_m_s = 0j

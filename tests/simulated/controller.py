@@ -103,11 +103,6 @@ class FlightController:
                 brain.take_odometry(message)
             case "GLOBAL_POSITION_SENSOR":
                 brain.take_global_position(message)
-            case "SET_GPS_GLOBAL_ORIGIN":
-                origin = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
-                is_place = abs(origin[0]) <= 90 and abs(origin[1]) <= 180 and origin[:2] != (0, 0)
-                is_set = is_place and brain.set_origin(origin)
-                return self._make(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN) if is_set else []
         return []
 
     def _obey(self, command: Message) -> tuple[int, list[Message]]:

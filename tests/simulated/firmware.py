@@ -88,11 +88,6 @@ class Firmware(ABC):
     def take_global_position(self, message: Message) -> None:  # noqa: B027
         """Process a GLOBAL_POSITION_SENSOR (296), if the firmware knows it."""
 
-    def set_origin(self, origin: Origin) -> bool:
-        """Set the origin; the vehicle does not move. Returns True if it was set."""
-        self.origin = origin
-        return True
-
     def use_source_set(self, number: float) -> int:
         """Execute MAV_CMD_SET_EKF_SOURCE_SET (42007), if the firmware has source sets. Returns a MAV_RESULT."""
         return UNSUPPORTED

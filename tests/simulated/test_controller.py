@@ -244,13 +244,6 @@ def test_copter_flies_by_odometry_of_the_right_frame_and_quality():
     assert flown.wait(10, odometry()).flags & mavlink.EKF_POS_HORIZ_ABS
 
 
-def test_origin_of_an_ardupilot_is_set_once():
-    controller = FlightController("arducopter", Hover(ORIGIN, 60.0), gps=True)
-    message = mavlink.MAVLink_set_gps_global_origin_message(1, *(round(angle * 1e7) for angle in HOME), 584_000)
-    assert [each.get_type() for each in controller.receive(message)] == ["GPS_GLOBAL_ORIGIN"]
-    assert controller.receive(message) == []
-
-
 USES_OURS = {"GPS2_TYPE": 14, "GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}
 
 
