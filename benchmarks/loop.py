@@ -111,12 +111,8 @@ def main() -> None:
         row = {"set_up": "ODOMETRY (ArduPilot)", "changed": f"30 minutes beside good GPS, {words}", **beside_gps(every)}
         rows.append(row)
         print(row, flush=True)
-    factors = [
-        {"set_up": name, "factor": factor, "worst_m": with_factor(name, factor)}
-        for name in SET_UPS
-        if "ardu" in SET_UPS[name][0]
-        for factor in FACTORS
-    ]
+    swept = itertools.product([name for name, (vehicle, _) in SET_UPS.items() if "ardu" in vehicle], FACTORS)
+    factors = [{"set_up": name, "factor": each, "worst_m": with_factor(name, each)} for name, each in swept]
     result = {**base.made_by(), "rows": rows, "factors": factors}
     base.write("loop", result, f"{page(rows, factors)}\n{base.made_line(result, 'python benchmarks/loop.py')}")
 

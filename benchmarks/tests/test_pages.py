@@ -1,6 +1,8 @@
-"""Every script can be loaded, and every page is what its results say."""
+"""Every script can be loaded, every page is what its results say, and so is what travels with edgevpr."""
 
 import importlib
+import json
+import math
 import re
 from pathlib import Path
 
@@ -10,6 +12,9 @@ import pytest
 import sets_page
 import thesis_page
 import thesis_values
+from arm64 import counted
+
+from edgevpr.runtime.preflight.scale import COUNTED_PATH
 
 BENCHMARKS = Path(base.__file__).parent
 PAGES = {
@@ -72,3 +77,19 @@ def test_a_table_has_a_dash_for_what_a_row_lacks():
 
 def test_numbers_are_kept_to_six_digits():
     assert base.rounded({"a": [1.23456789, 1e-9 / 3, 7, "x", True]}) == {"a": [1.23457, 3.33333e-10, 7, "x", True]}
+
+
+def test_the_counts_that_travel_are_those_of_the_benchmark():
+    parts = {row["part"]: row["instructions"] for row in base.read("arm64")["parts"]}
+    assert counted.figures(parts) == json.loads(COUNTED_PATH.read_text())
+
+
+def test_printed_digits_bound_what_they_were_rounded_from():
+    value, least, most = thesis_values.corners(lambda a, b: a * b, ["0.50", "20"])
+    assert (value, least, most) == pytest.approx((10, 0.495 * 19.5, 0.505 * 20.5))
+
+
+def test_pcu_of_a_table_row_is_that_of_its_printed_numbers():
+    assert thesis_values.printed_pcu("CoHOG")[0] == pytest.approx(0.84 * math.log10(0.83 / 0.02 + 9))
+    assert thesis_values.printed_pcu("AMOSNet")[2] is None  # it was trained on that set
+    assert thesis_values.printed_pcu("Cross-Region-BoW")[1] == pytest.approx(0.81)  # the slowest: its precision
