@@ -17,7 +17,8 @@ import base
 import from_space
 from base import Row
 
-FOV_DEG, TILTS_DEG = 28.0, (0.0, 20.0, 45.0, 60.0)
+FOV_DEG = 28.0
+TILTS_DEG = (0.0, 20.0, 45.0, 60.0)
 _COLUMNS = {
     "tilt": "{tilt:.0f}",
     "told": "{told}",

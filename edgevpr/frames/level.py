@@ -27,7 +27,8 @@ MAX_TILT_UNLEVELLED_DEG = 20.0
 # horizon and the sky.
 _LEAST_DOWN = 0.1
 # Standard deviations of a tilt, as tangents: of one that is reported, and of one that only the camera's mount tells.
-_REPORTED_TILT_SD, _MOUNT_TILT_SD = math.tan(math.radians(1.0)), math.tan(math.radians(3.0))
+_REPORTED_TILT_SD = math.tan(math.radians(1.0))
+_MOUNT_TILT_SD = math.tan(math.radians(3.0))
 # Of a height, as a share: the ground that a tilted camera shows is higher or lower than that below (tilt_ariel).
 _HEIGHT_SD = 0.13
 _LEAST_TILT_DEG, _LEAST_TURN_DEG, _LEAST_ZOOM = 1.0, 1.0, 0.03  # smaller corrections do not affect matches

@@ -17,8 +17,10 @@ from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.techniques import create
 
 AHEAD = create("cohog")
-HEIGHT_PX, WIDTH_PX = 240, 320
-FIRST, SECOND = 1, 5  # numbers of the places with a door of one kind
+HEIGHT_PX = 240
+WIDTH_PX = 320
+FIRST = 1  # numbers of the places with a door of one kind
+SECOND = 5
 SPOT_PX = 120  # how far to the right the second door was pictured from
 
 

@@ -14,12 +14,18 @@ from simulated.controller import FlightController
 from simulated.motion import GRAVITY_M_S2, AlongTrack, Hover, Motion, TrueState, displace, tilt_for
 
 ACCEPTED, DENIED, FAILED = (getattr(mavlink, f"MAV_RESULT_{name}") for name in ("ACCEPTED", "DENIED", "FAILED"))
-NOT_NOW, UNSUPPORTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED, mavlink.MAV_RESULT_UNSUPPORTED
+NOT_NOW = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+UNSUPPORTED = mavlink.MAV_RESULT_UNSUPPORTED
 HAS_POSITION = mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_HORIZ_ABS
-FUSES, FUSES_ANY = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS, mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
+FUSES = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+FUSES_ANY = mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
 HOME = ORIGIN.lat_deg, ORIGIN.lon_deg
-SPEED_M_S, FLIGHT_S = {"plane": 22.0, "copter": 0.0}, 1000.0
-ATTITUDE, IMU, VERSION, NO_MESSAGE = 30, 26, 148, 60_000
+SPEED_M_S = {"plane": 22.0, "copter": 0.0}
+FLIGHT_S = 1000.0
+ATTITUDE = 30
+IMU = 26
+VERSION = 148
+NO_MESSAGE = 60_000
 SECOND = {"SIM_GPS1_TYPE": 5, "GPS2_TYPE": 14}  # the receiver's fix is a plain 3D one, as ours is
 
 

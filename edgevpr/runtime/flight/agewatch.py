@@ -29,20 +29,29 @@ _MAX_MATCHES = 20
 _LEAST_MATCHES = 4  # that say anything of a delay
 # What the usual delay counts against another one, as chi-square: at most this, since a delay of seconds is possible;
 # pictures that are newer than they claim are so many times less usual than older ones, without this limit.
-_MOST_AGAINST, _NEWER = 30.0, 4.0
+_MOST_AGAINST = 30.0
+_NEWER = 4.0
 # By how much reported motion and matches may differ, beside the accuracy that a match says of itself: velocity by an
 # unknown wind (m/s), which changes (m/s in one second), or with GPS; direction by compass and mounting, which wanders.
 _ANYWHERE_M = 1e3
-_WIND_SD_M_S, _GUST_SD_M_S = 8.0, 0.5
-_GPS_SD_M_S, _GPS_WANDER_M_S = 0.2, 0.05
+_WIND_SD_M_S = 8.0
+_GUST_SD_M_S = 0.5
+_GPS_SD_M_S = 0.2
+_GPS_WANDER_M_S = 0.05
 _MATCH_SD_M = 1.5
-_COMPASS_WANDER_DEG, _DIRECTION_SD_DEG, _COMPASS_GAIN = 0.3, 2.0, 0.25
+_COMPASS_WANDER_DEG = 0.3
+_DIRECTION_SD_DEG = 2.0
+_COMPASS_GAIN = 0.25
 _ANY_COMPASS = 0.0, 30.0
 # A match contradicts the delay so far if that explains it badly, and another one far better; it agrees with it if that
 # explains it, and another one does not: chi-square with three degrees of freedom. From one opening of a stream to the
 # next a delay may change by so much; one that differs by 1.5 s is another one.
-_CONTRADICTS, _EXPLAINS, _AGREES, _AGREES_BETTER = 14.0, 10.0, 9.0, 6.0
-_MAY_CHANGE_S, _OF_ANOTHER_AGE_S = 0.5, 1.5
+_CONTRADICTS = 14.0
+_EXPLAINS = 10.0
+_AGREES = 9.0
+_AGREES_BETTER = 6.0
+_MAY_CHANGE_S = 0.5
+_OF_ANOTHER_AGE_S = 1.5
 _COMPARED = 12  # matches
 _DETERMINED_S = 0.3  # standard deviation of a delay that is known
 _MOST_COST = 3.0  # chi-square of each match, of those that have one delay

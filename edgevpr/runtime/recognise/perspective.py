@@ -21,7 +21,8 @@ _POINT_SD, _SHEAR_SD = 2.5 / 640, 0.01  # of a landmark, as a share of the longe
 TYPICAL_FOCAL = 0.77  # 66 degrees across
 _LEVEL_TILT = math.tan(math.radians(8.0))
 _UNKNOWN_TILT_SD = math.tan(math.radians(20.0))  # where too little agrees to show a tilt
-_CLEAR_SD, _CLEAR_TILT = 3.0, math.tan(math.radians(5.0))  # of a tilt beyond the reported one
+_CLEAR_SD = 3.0  # of a tilt beyond the reported one
+_CLEAR_TILT = math.tan(math.radians(5.0))
 # Relief moves neighbouring landmarks alike: so many of them count as one. The place's own picture is tilted too.
 _ALIKE, _PLACE_SD = 5.0, math.tan(math.radians(0.5))
 

@@ -21,7 +21,9 @@ pytestmark = pytest.mark.slow
 
 _STEP_S = 0.02
 _PICTURE = np.zeros((8, 8), np.uint8)
-CIRCLE, TIGHT_CIRCLE, STRAIGHT = {"turn_s": 20.0}, {"turn_s": 7.5}, {"turn_s": math.inf}
+CIRCLE = {"turn_s": 20.0}
+TIGHT_CIRCLE = {"turn_s": 7.5}
+STRAIGHT = {"turn_s": math.inf}
 HOVER = {"turn_s": math.inf, "speed_m_s": 0.0}
 
 
