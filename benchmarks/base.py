@@ -24,7 +24,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 sys.path += [str(REPOSITORY / name) for name in ("tests", "tests/mavlink", "tests/runtime", "models/recipes")]
 RESULTS = REPOSITORY / "benchmarks" / "results"
 DATA = Path(os.environ.get("EDGEVPR_DATA") or REPOSITORY.parent / "shared" / "data")
-TUNED_ON = ("corridor", "aerial_caliterra", "aerial_garfield28", "sat_marash")
+TUNED_ON = ("corridor", "aerial_caliterra", "aerial_garfield28", "sat_marash", "thumbs_essex")
 FROM_THE_AIR = ("aerial_", "kite_", "sat_")  # how the names of such sets begin
 Row = dict[str, Any]
 
