@@ -298,7 +298,7 @@ class Decider:
             fine, _ = self.place_map.fine_part(best.place.place_id)
             found = self.technique.measure_perspective(query.descriptor, fine, best.match)
             tilt = convert_to_tilt(found, query.view.focal)
-            if tilt.is_level:
+            if tilt.is_level or (query.view.is_tilt_known and not tilt.is_clear):
                 return tilt
             focal = query.view.focal or TYPICAL_FOCAL
             is_better = agrees_better_tilted(query.picture, focal, self.technique, fine, best.match)

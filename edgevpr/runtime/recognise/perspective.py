@@ -60,11 +60,15 @@ class ShownTilt:
         """True if there is no tilt, but for a few degrees."""
         return math.hypot(self.tangent, _CLEAR_SD * self.sd) < _LEVEL_TILT
 
+    @property
+    def is_clear(self) -> bool:
+        """True if there clearly is a tilt."""
+        return self.tangent > max(_CLEAR_SD * self.sd, _CLEAR_TILT)
+
     def get_sd(self, is_reported: bool) -> float:
         """Return what it says of the error of a tilt, as a tangent. One that `is_reported` is taken to be right unless
         the pictures clearly contradict it."""
-        is_clear = self.tangent > max(_CLEAR_SD * self.sd, _CLEAR_TILT)
-        return math.hypot(self.tangent, self.sd) if is_clear or not is_reported else 0.0
+        return math.hypot(self.tangent, self.sd) if self.is_clear or not is_reported else 0.0
 
 
 def convert_to_tilt(found: Perspective | None, focal: float | None) -> ShownTilt:
