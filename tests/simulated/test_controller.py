@@ -13,7 +13,9 @@ from edgevpr.runtime.flight.path import to_ground_acceleration
 from simulated.controller import FlightController
 from simulated.motion import GRAVITY_M_S2, AlongTrack, Hover, Motion, TrueState, displace, tilt_for
 
-ACCEPTED, DENIED, FAILED = (getattr(mavlink, f"MAV_RESULT_{name}") for name in ("ACCEPTED", "DENIED", "FAILED"))
+ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
+DENIED = mavlink.MAV_RESULT_DENIED
+FAILED = mavlink.MAV_RESULT_FAILED
 NOT_NOW = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
 UNSUPPORTED = mavlink.MAV_RESULT_UNSUPPORTED
 HAS_POSITION = mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_HORIZ_ABS
