@@ -46,3 +46,17 @@ def is_valid(command: str) -> bool:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_of_a_page_can_be_typed(page):
     assert [command for command in read_commands(page) if not is_valid(command)] == []
+
+
+def test_architecture_names_files_and_functions_that_exist():
+    text = " ".join((ROOT / "ARCHITECTURE.md").read_text("utf-8").split())
+    paths = re.findall(r"`((?:[a-z_]+/)+(?:[a-z_]+\.[a-z]+)?)`", text)
+    assert len(paths) > 80
+    assert [path for path in paths if not ((ROOT / "edgevpr" / path).exists() or (ROOT / path).exists())] == []
+    named = re.findall(r"`(?:[A-Za-z]+\.)?(\w+)` (?:\(|in )`([a-z_/]+\.py)`", text)
+    assert len(named) > 35
+    assert [
+        (name, path)
+        for name, path in named
+        if not re.search(rf"(?:def|class) {name}\b", (ROOT / "edgevpr" / path).read_text("utf-8"))
+    ] == []
