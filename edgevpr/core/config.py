@@ -8,12 +8,11 @@ import re
 import types
 import typing
 from collections.abc import Iterator
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from edgevpr.core.errors import ConfigError
-from edgevpr.core.files import shipped
 from edgevpr.core.text import meant
 
 if TYPE_CHECKING:
@@ -53,9 +52,9 @@ class Key:
     kind: type = str
 
 
-def key(flag: str = "", text: str = "", *, default: Any = MISSING, **rules: Any) -> Any:
-    """Make the dataclass field of a `Key` with the fields `rules`. `flag` has its flags and their placeholder, such as
-    "--rate-hz HZ"."""
+def key(default: Any = MISSING, flag: str = "", text: str = "", **rules: Any) -> Any:
+    """Make the dataclass field of a `Key` with the fields `rules`. `default` MISSING: a value must be given. `flag` has
+    its flags and their placeholder, such as "--rate-hz HZ"."""
     words = flag.split()
     flags = tuple(word for word in words if word.startswith("-"))
     metavar = words[-1] if len(words) > len(flags) else None
@@ -64,7 +63,7 @@ def key(flag: str = "", text: str = "", *, default: Any = MISSING, **rules: Any)
 
 def bounded(low: float, high: float, default: Any = MISSING) -> Any:
     """Make a `key` whose value must be None or within low..high."""
-    return key(within=(low, high), default=default)
+    return key(default, within=(low, high))
 
 
 _ANY = Key()
@@ -72,59 +71,64 @@ _ANY = Key()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceConfig:
-    uri: str | None = key("--images --source SOURCE", SOURCES)
+    uri: str | None = key(None, "--images --source SOURCE", SOURCES)
     camera: str | None = key(
+        None,
         "--camera",
         "nadir: camera looks straight down; forward: ahead (default: as in the map; forward for a new map)",
         choices=("nadir", "forward"),
     )
     rate_hz: float | None = key(
-        "--rate-hz HZ", "queries per second (default: the board's)", within=(LOWEST_RATE_HZ, HIGHEST_RATE_HZ)
+        None, "--rate-hz HZ", "queries per second (default: the board's)", within=(LOWEST_RATE_HZ, HIGHEST_RATE_HZ)
     )
-    mask: str | None = key("--mask PNG", "mask image, black where frames show an overlay instead of the ground")
-    lens: str | None = key("--lens FILE", "camera calibration (OpenCV, ROS or Kalibr YAML), to undistort images")
+    mask: str | None = key(None, "--mask PNG", "mask image, black where frames show an overlay instead of the ground")
+    lens: str | None = key(None, "--lens FILE", "camera calibration (OpenCV, ROS or Kalibr YAML), to undistort images")
     fov_deg: float | None = key(
-        "--fov-deg DEG", "field of view across the longest side of the image, in degrees", within=(5, 150)
+        None, "--fov-deg DEG", "field of view across the longest side of the image, in degrees", within=(5, 150)
     )
     up_deg: float = key(
+        0.0,
         "--up-deg DEG",
         "direction of the top of the image when the aircraft heads north, in degrees (default: 0)",
         within=(0, 360),
     )
-    mount_ahead_deg: float = bounded(-45, 45)
-    mount_right_deg: float = bounded(-45, 45)
-    gimbal: bool
+    mount_ahead_deg: float = bounded(-45, 45, default=0.0)
+    mount_right_deg: float = bounded(-45, 45, default=0.0)
+    gimbal: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchConfig:
     matching: str | None = key(
-        "--matching", "scoring method of cohog (default: displacement)", choices=("displacement", "thesis")
+        None, "--matching", "scoring method of cohog (default: displacement)", choices=("displacement", "thesis")
     )
     form: str | None = key(
+        None,
         "--form",
         "storage of vectors in RAM: half precision, one byte or one bit per number (default: float)",
         choices=FORMS,
     )
     candidates: int | None = key(
-        "--candidates N", "number of places compared in full (default: the technique's)", within=(1, 1_000_000)
+        None, "--candidates N", "number of places compared in full (default: the technique's)", within=(1, 1_000_000)
     )
-    follow: bool
+    follow: bool = True
     sequence: int | None = key(
-        "--sequence N", "number of queries matched as a sequence (default: the technique's)", within=(1, 100)
+        None, "--sequence N", "number of queries matched as a sequence (default: the technique's)", within=(1, 100)
     )
     accept_precision: float = key(
+        0.999,
         "--accept-precision P",
         "required share of right matches among those accepted (default: 0.999)",
         within=(0.5, 0.999999),
     )
-    min_score: float | None = key("--min-score S", "minimum score to accept", within=(0, 1))
+    min_score: float | None = key(None, "--min-score S", "minimum score to accept", within=(0, 1))
     min_margin: float | None = key(
-        "--min-margin M", "minimum lead over the best place elsewhere to accept", within=(0, 1)
+        None, "--min-margin M", "minimum lead over the best place elsewhere to accept", within=(0, 1)
     )
-    verify: bool
-    neighbour_m: float = bounded(0, 10_000)
+    verify: bool = True
+    neighbour_m: float = bounded(0, 10_000, default=50.0)
     reach_m_s: float | None = key(
+        None,
         "--reach-m-s V",
         "search only the area that can be reached at this speed (default: the whole map)",
         within=(0.1, 100),
@@ -134,91 +138,93 @@ class MatchConfig:
 @dataclass(frozen=True, slots=True)
 class MemoryConfig:
     budget_mb: float | None = key(
-        "--budget-mb MB", "memory limit of the index in MB (default: the board's)", within=BUDGET_MB
+        None, "--budget-mb MB", "memory limit of the index in MB (default: the board's)", within=BUDGET_MB
     )
 
 
 @dataclass(frozen=True, slots=True)
 class MappingConfig:
     learn: bool = key(
-        "--learn", "add unknown places to the map, at the autopilot's position; make the map if it does not exist"
+        False,
+        "--learn",
+        "add unknown places to the map, at the autopilot's position; make the map if it does not exist",
     )
-    spacing_m: float = bounded(1, 1000)
+    spacing_m: float = bounded(1, 1000, default=10.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SalienceConfig:
-    use: bool = key("--salience", "store and match only memorable images")
-    memorability: float = bounded(0, 1)
-    staticity: float = bounded(0, 1)
-    entropy: float = bounded(0, 1)
-    network: str | None
-    detector: str | None
-    detect_every: int = bounded(1, 1000)
-    footprint_m: float | None = bounded(1, 10_000)
-    gap_frames: int = bounded(1, 10_000)
-    gap_m: float = bounded(1, 100_000)
+    use: bool = key(False, "--salience", "store and match only memorable images")
+    memorability: float = bounded(0, 1, default=0.3)
+    staticity: float = bounded(0, 1, default=0.6)
+    entropy: float = bounded(0, 1, default=0.4)
+    network: str | None = "matchability"
+    detector: str | None = None
+    detect_every: int = bounded(1, 1000, default=1)
+    footprint_m: float | None = bounded(1, 10_000, default=None)
+    gap_frames: int = bounded(1, 10_000, default=20)
+    gap_m: float = bounded(1, 100_000, default=100.0)
 
 
 @dataclass(frozen=True, slots=True)
 class SourceSetsConfig:
-    gps: int | None = bounded(1, 3)
-    no_gps: int | None = bounded(1, 3)
+    gps: int | None = bounded(1, 3, default=None)
+    no_gps: int | None = bounded(1, 3, default=None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MavlinkConfig:
-    link: str | None = key("--link URL", "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, serial:DEV:BAUD")
-    component_id: int = bounded(1, 255)
-    system_id: int | None = bounded(1, 255)
+    link: str | None = key(None, "--link URL", "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, serial:DEV:BAUD")
+    component_id: int = bounded(1, 255, default=197)
+    system_id: int | None = bounded(1, 255, default=None)
     send_fixes: bool = key(
-        "--dry-run", "send no position; decide, log and announce everything else as in a flight", sets=False
+        True, "--dry-run", "send no position; decide, log and announce everything else as in a flight", sets=False
     )
-    max_fix_age_s: float = bounded(0.1, 5)
-    min_accuracy_m: float = bounded(1, 10_000)
-    source_sets: SourceSetsConfig
-    set_origin: bool
-    ground: str | None
-    signing_key: str | None
-    signing_state: str | None
+    max_fix_age_s: float = bounded(0.1, 5, default=1.0)
+    min_accuracy_m: float = bounded(1, 10_000, default=5.0)
+    source_sets: SourceSetsConfig = SourceSetsConfig()
+    set_origin: bool = False
+    ground: str | None = None
+    signing_key: str | None = None
+    signing_state: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogConfig:
-    path: str | None = key("--log FILE", "flight log to write (JSON lines)")
-    tlog: str | None = key("--tlog FILE", "telemetry log to write, for mavlogdump and ground stations")
-    max_mb: float | None = bounded(1, 1_000_000)
-    record: str | None = key("--record FOLDER", "folder for a recording, for `edgevpr replay`")
-    record_mb: float = bounded(10, 1_000_000)
+    path: str | None = key("edgevpr-flight.jsonl", "--log FILE", "flight log to write (JSON lines)")
+    tlog: str | None = key(None, "--tlog FILE", "telemetry log to write, for mavlogdump and ground stations")
+    max_mb: float | None = bounded(1, 1_000_000, default=200.0)
+    record: str | None = key(None, "--record FOLDER", "folder for a recording, for `edgevpr replay`")
+    record_mb: float = bounded(10, 1_000_000, default=8000.0)
 
 
 @dataclass(frozen=True, slots=True)
 class StatusConfig:
-    file: str | None
+    file: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class BatteryConfig:
-    pack: str = key("--battery PACK", "cells and capacity of the battery, for example 4S5200")
-    regulator_efficiency: float = bounded(0.1, 1)
+    pack: str = key("4S5200", "--battery PACK", "cells and capacity of the battery, for example 4S5200")
+    regulator_efficiency: float = bounded(0.1, 1, default=0.85)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
-    """The whole configuration; `deploy/config.yaml` documents every key and holds every default."""
+    """The whole configuration. A key has its type, default, limits and flag here; `deploy/config.yaml` explains it."""
 
-    board: str = key("--board NAME", "hardware profile (default: this computer)")
-    map: str | None = key("--map MAP", "map file")
-    technique: str | None = key("--technique NAME", "use this technique")
-    source: SourceConfig
-    match: MatchConfig
-    memory: MemoryConfig
-    mapping: MappingConfig
-    salience: SalienceConfig
-    mavlink: MavlinkConfig
-    log: LogConfig
-    status: StatusConfig
-    battery: BatteryConfig
+    board: str = key("this", "--board NAME", "hardware profile (default: this computer)")
+    map: str | None = key(None, "--map MAP", "map file")
+    technique: str | None = key(None, "--technique NAME", "use this technique")
+    source: SourceConfig = SourceConfig()
+    match: MatchConfig = MatchConfig()
+    memory: MemoryConfig = MemoryConfig()
+    mapping: MappingConfig = MappingConfig()
+    salience: SalienceConfig = SalienceConfig()
+    mavlink: MavlinkConfig = MavlinkConfig()
+    log: LogConfig = LogConfig()
+    status: StatusConfig = StatusConfig()
+    battery: BatteryConfig = BatteryConfig()
 
 
 def list_keys(cls: type = Config, prefix: str = "") -> Iterator[Key]:
@@ -234,21 +240,20 @@ def list_keys(cls: type = Config, prefix: str = "") -> Iterator[Key]:
 
 
 def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None) -> Config:
-    """Load the shipped defaults, replace values by those of the file `path` (None: no file), then by `overrides`
-    ({"source.rate_hz": 2.0}; None values are ignored). Raises ConfigError, which names the file, the key and what to
-    do."""
+    """Load the file `path` (None: no file, all defaults), and replace values by `overrides` ({"source.rate_hz": 2.0};
+    None values are ignored). Raises ConfigError, which names the file, the key and what to do."""
     from edgevpr.core.yamlfile import read_yaml  # loads PyYAML, which the list of flags does not need
 
-    defaults_path = shipped("deploy") / "config.yaml"
-    merged = _overlaid(read_yaml(defaults_path), read_yaml(path) if path is not None else {})
+    config = Config() if path is None else build(Config, read_yaml(path), str(path))
+    mapping = asdict(config)
     for dotted, value in (overrides or {}).items():
         if value is not None:
-            *sections, key = dotted.split(".")
-            target = merged
+            *sections, name = dotted.split(".")
+            target = mapping
             for section in sections:
                 target = target[section]
-            target[key] = value
-    return build(Config, merged, str(path or "the command line"))
+            target[name] = value
+    return build(Config, mapping, "the command line")
 
 
 def place_logs_in(config: Config, folder: str) -> Config:
@@ -278,15 +283,6 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
         elif spec.default is MISSING and spec.default_factory is MISSING:
             raise ConfigError(f"{where}: the key `{prefix}{name}` is missing: add it.")
     return cls(**values)
-
-
-def _overlaid(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Return `base` with the values of `over` in place of its own; sections are overlaid key by key."""
-    merged = base | over
-    for key in base.keys() & over.keys():
-        if isinstance(base[key], dict) and isinstance(over[key], dict):
-            merged[key] = _overlaid(base[key], over[key])
-    return merged
 
 
 def _convert(value: Any, hint: Any, rules: Key, where: str, name: str) -> Any:

@@ -74,7 +74,7 @@ class Card:
     source: str
     input: InputRule
     outputs: Outputs
-    similarity: str = key(choices=("cosine", "l1"), default="cosine")
+    similarity: str = key("cosine", choices=("cosine", "l1"))
     detector: DetectorRule | None = None
 
     @property
