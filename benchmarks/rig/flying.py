@@ -122,7 +122,7 @@ class Run:
             "map": str(place_map),
             "source": {"uri": uri, "camera": "nadir", "rate_hz": 1.0, "fov_deg": ground.FOV_DEG},
             "mavlink": {"link": link, "min_accuracy_m": 1.0},
-            "log": {"path": str(self._folder / "flight.jsonl"), "tlog": str(self._folder / "flight.tlog")},
+            "log": {"path": str(self._folder / "flight.jsonl")},
         }
         if self._scenario.learns:
             config |= {"technique": "cohog", "mapping": {"learn": True}}

@@ -192,7 +192,6 @@ class MavlinkConfig:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogConfig:
     path: str | None = key("edgevpr-flight.jsonl", "--log FILE", "flight log to write (JSON lines)")
-    tlog: str | None = key(None, "--tlog FILE", "telemetry log to write, for mavlogdump and ground stations")
     max_mb: float | None = bounded(1, 1_000_000, default=200.0)
     record: str | None = key(None, "--record FOLDER", "folder for a recording, for `edgevpr replay`")
     record_mb: float = bounded(10, 1_000_000, default=8000.0)
@@ -259,7 +258,7 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
 def place_logs_in(config: Config, folder: str) -> Config:
     """Return a copy of `config` in which the paths of logs and recordings of a flight, where relative, are relative to
     `folder`."""
-    given = ((name, getattr(config.log, name)) for name in ("path", "tlog", "record"))
+    given = ((name, getattr(config.log, name)) for name in ("path", "record"))
     paths: dict[str, Any] = {name: path and os.path.join(folder, path) for name, path in given}
     return replace(config, log=replace(config.log, **paths))
 

@@ -20,7 +20,7 @@ from edgevpr.mavlink.ground import FOR_PEOPLE, Requests, Texts
 from edgevpr.mavlink.messages import AUTOPILOT, Fix, Health, Severity
 from edgevpr.mavlink.peer import Autopilot, Listener
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
-from edgevpr.mavlink.wire import Message, PacketReader, Tap, mavlink, untapped
+from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 MESSAGES_MAX = 64
 HEARTBEAT_S = 1.0
@@ -36,15 +36,14 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSettings:
     """The settings of a link. `system_id`: that of the autopilot (None: of the first one heard). A fix that has waited
-    for `max_fix_age_s` is never sent. `clock`: the monotonic clock of all stamps. `tap` gets each packet written or
-    received. `origin` is sent to an autopilot that takes ODOMETRY and has none (None: never)."""
+    for `max_fix_age_s` is never sent. `clock`: the monotonic clock of all stamps. `origin` is sent to an autopilot that
+    takes ODOMETRY and has none (None: never)."""
 
     component_id: int = 197
     system_id: int | None = None
     max_fix_age_s: float = MAX_FIX_WAIT_S
     clock: Callable[[], float] = time.monotonic
     listener: Listener = field(default_factory=Listener)
-    tap: Tap = untapped
     signing: Signing = NOT_SIGNING
     origin: Position | None = None
 
@@ -57,7 +56,7 @@ class Conversation:
         self.autopilot = Autopilot(settings.component_id, settings.system_id, settings.listener, self._report)
         self.fixes = Fixes(settings.max_fix_age_s, self._report)
         self.texts, self.requests = Texts(), Requests()
-        self.reader = PacketReader(settings.signing.admits, tap=settings.tap)
+        self.reader = PacketReader(settings.signing.admits)
         self.between: deque[Sending] = deque(maxlen=MESSAGES_MAX)
         self.sent: Counter[str] = Counter()
         self.dropped_queue_full = 0

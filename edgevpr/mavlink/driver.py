@@ -92,7 +92,7 @@ class PortDriver:
             self._thread.join(2 * FLUSH_S)
 
     def _opened(self) -> Line:
-        return Line(open_port(self._address), self._settings.clock, self._settings.tap)
+        return Line(open_port(self._address), self._settings.clock)
 
     # The methods below run in the driver's own thread.
 

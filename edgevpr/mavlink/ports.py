@@ -17,7 +17,6 @@ from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.address import LinkAddress, Sender
 from edgevpr.mavlink.fixes import Sending
-from edgevpr.mavlink.wire import Tap, untapped
 
 CONNECT_TIMEOUT_S = 1.0
 TCP_GIVE_UP_MS = 1000  # if the other end has not confirmed bytes by then, the connection is closed and they are lost
@@ -207,12 +206,12 @@ def open_port(address: LinkAddress) -> Port:
 class Line:
     """Writes packets to a port, one after another. A fix counts as sent when all its bytes have left the operating
     system (over TCP: when they are confirmed). If that has not happened by its `due_s`, `departed` raises
-    ConnectionError; closing the port then throws the bytes away. `tap` is called with each packet that the port has
-    accepted in full; `unsent` are the bytes of the last packet that it has not accepted yet."""
+    ConnectionError; closing the port then throws the bytes away. `unsent` are the bytes of the last packet that the
+    port has not accepted yet."""
 
-    def __init__(self, port: Port, clock: Callable[[], float], tap: Tap = untapped) -> None:
-        self.port, self._clock, self._tap = port, clock, tap
-        self._packet = self.unsent = b""
+    def __init__(self, port: Port, clock: Callable[[], float]) -> None:
+        self.port, self._clock = port, clock
+        self.unsent = b""
         self._taken = 0  # number of bytes that the port has accepted so far
         self.leaving: deque[tuple[int, Sending]] = deque()  # fixes not sent yet; `_taken` at their last byte
         self._blocked_since_s: float | None = None
@@ -224,7 +223,7 @@ class Line:
 
     def put(self, packet: bytes, sending: Sending | None) -> None:
         """Set the next packet and the fix in it, if any, once the port has accepted the previous packet in full."""
-        self._packet = self.unsent = packet
+        self.unsent = packet
         if sending:
             self.leaving.append((self._taken + len(packet), sending))
 
@@ -235,8 +234,6 @@ class Line:
         taken = self.port.write(self.unsent)
         self.unsent = self.unsent[taken:]
         self._taken += taken
-        if not self.unsent:
-            self._tap(self._packet)
         if taken:
             self._blocked_since_s = None
         elif self._blocked_since_s is None:

@@ -13,24 +13,19 @@ from typing import Any, TypeAlias
 from pymavlink import quaternion, rotmat
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-__all__ = ["Message", "PacketReader", "Tap", "mavlink", "parameter_value", "quaternion", "rotmat", "untapped"]
+__all__ = ["Message", "PacketReader", "mavlink", "parameter_value", "quaternion", "rotmat"]
 
 Message: TypeAlias = Any  # a mavlink.MAVLink_message; each kind has its own fields
-Tap = Callable[[bytes], object]  # gets the bytes of every whole packet, sent or received: the tlog
 
 _SENDERS_MAX = 8  # senders whose incomplete messages are kept; a flood from invented addresses must not fill the memory
 
 
-def untapped(packet: bytes) -> None:
-    """Do nothing with a packet: the tap of a link without a tlog."""
-
-
 class PacketReader:
     """Parses received bytes, separately for each sender, so that an incomplete message of one does not swallow the
-    bytes of another. `admits` decides which messages are yielded; `tap` gets each packet."""
+    bytes of another. `admits` decides which messages are yielded."""
 
-    def __init__(self, admits: Callable[[Message], bool] = lambda message: True, *, tap: Tap = untapped) -> None:
-        self._admits, self._tap = admits, tap
+    def __init__(self, admits: Callable[[Message], bool] = lambda message: True) -> None:
+        self._admits = admits
         self.received: Counter[str] = Counter()  # messages by name
         self.bad_bytes = 0
         self.parsers: dict[Hashable, mavlink.MAVLink] = {}  # by sender, the latest at the end
@@ -48,8 +43,6 @@ class PacketReader:
             if message.get_type() == "BAD_DATA":
                 self.bad_bytes += len(message.data)
                 continue
-            if message.get_msgId() != mavlink.MAVLINK_MSG_ID_SETUP_SIGNING:  # which holds a key
-                self._tap(message.get_msgbuf())
             if isinstance(message, mavlink.MAVLink_unknown):
                 self.received["UNKNOWN"] += 1  # one name for all: there are 16 million message numbers
             elif self._admits(message):

@@ -16,7 +16,6 @@ from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.text import waiting
 from edgevpr.frames.images import read_image
 from edgevpr.mavlink.signing import NOT_SIGNING
-from edgevpr.mavlink.wire import untapped
 from edgevpr.power.boards import Board
 from edgevpr.review.compare import Line, Packets
 from edgevpr.review.tape import (
@@ -77,7 +76,6 @@ def replay(log: str | Path, place_map: str | None = None) -> Replayed:
             turns=TapedTurns(Clock().mono_s, playback),
             drive=partial(ReplayedDriver, playback),
             signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
-            tap=untapped,
             stop=TapedStop(playback),
             status=None,
             recording=header["recording"],

@@ -330,7 +330,6 @@ def open_links(
         system_id=settings.system_id,
         max_fix_age_s=settings.max_fix_age_s,
         listener=navigator,
-        tap=io.tap,
         origin=origin,
         signing=io.signing,
     )

@@ -21,9 +21,7 @@ from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.driver import DriverMaker, PortDriver
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.signing import Signing, open_signing
-from edgevpr.mavlink.tlog import Tlog
 from edgevpr.mavlink.turns import Turns
-from edgevpr.mavlink.wire import Tap, untapped
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.autopilot import ToAutopilot
@@ -62,8 +60,8 @@ _END_S = 4.0  # from a signal to the end of the process, if it does not end by i
 class FlightIO:
     """Inputs and outputs of a flight: `place_map`, the path of its map; settings of its `log`; `open_source`, given the
     seconds between two frames; the `turns` of the links, what makes their drivers (`drive`), `signing` of their
-    packets, and `tap`, called with each packet; the `status` file; and the folder of the `recording`. None: there is
-    none. All that comes in passes here; where it is recorded or played back, `boundary` does so."""
+    packets; the `status` file; and the folder of the `recording`. None: there is none. All that comes in passes here;
+    where it is recorded or played back, `boundary` does so."""
 
     board: Board
     place_map: str | None
@@ -74,7 +72,6 @@ class FlightIO:
     turns: Turns
     drive: DriverMaker
     signing: Signing
-    tap: Tap
     stop: Stop
     status: StatusFile | None
     recording: str | None
@@ -116,8 +113,6 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
         folder = str(recording.path.resolve()) if recording else None
         status_path = config.status.file or default_path()
         status = _open_optional(lambda: stack.enter_context(StatusFile(status_path))) if status_path else None
-        tlog_path = config.log.tlog if config.mavlink.link else None
-        tlog = _open_optional(lambda: stack.enter_context(Tlog(tlog_path))) if tlog_path else None
 
         def open_own(step_s: float) -> Source:
             source = open_source(uri, step_s=step_s, positions=positions, live=True, steps_s=steps_s)
@@ -137,7 +132,6 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
             turns=Turns(Clock().mono_s),
             drive=PortDriver,
             signing=open_signing(config.mavlink.signing_key, config.mavlink.signing_state),
-            tap=tlog.record if tlog else untapped,
             stop=Stop(),
             status=status,
             recording=folder,

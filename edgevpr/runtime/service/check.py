@@ -29,7 +29,7 @@ from edgevpr.runtime.recognise.levelling import load_calibrated_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.service.camera import FRAME_WAIT_S, frame_seen
 from edgevpr.runtime.service.doctor import explain_silence
-from edgevpr.runtime.service.finding import Finding, check_logs, fine, run_check, wrong
+from edgevpr.runtime.service.finding import Finding, check_log, fine, run_check, wrong
 
 
 def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
@@ -53,7 +53,7 @@ def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
     waiting("waiting for the flight controller")
     findings.append(run_check("link", lambda: _check_link(config.mavlink, offline)))
     waiting("")
-    return [*findings, *check_logs(config.log, has_link=config.mavlink.link is not None)]
+    return [*findings, check_log(config.log)]
 
 
 def _check_battery(battery: BatteryConfig) -> str:

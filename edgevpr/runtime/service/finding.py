@@ -13,7 +13,6 @@ from pathlib import Path
 from edgevpr.core.config import Config, LogConfig
 from edgevpr.core.errors import EdgevprError
 from edgevpr.mavlink.address import LinkAddress
-from edgevpr.mavlink.tlog import SPARED_BYTES
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 
@@ -72,7 +71,7 @@ def check_machine(config: Config, address: LinkAddress | None, root: Path = Path
     yield _check_memory(load_board(config.board).memory_max_mb, root)
     if address and address.kind == "serial":
         yield check_device("serial", address.where, root)
-    yield from check_logs(config.log, has_link=config.mavlink.link is not None)
+    yield check_log(config.log)
 
 
 def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
@@ -104,28 +103,23 @@ def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
     return wrong(what, f"{mode}: user {os.getuid()} has no access.", change)
 
 
-def check_logs(log: LogConfig, has_link: bool) -> Iterator[Finding]:
-    """Check that the flight log can be written and, if there is a link, the tlog (the log of all MAVLink packets)."""
+def check_log(log: LogConfig) -> Finding:
+    """Check that the flight log can be written."""
     if path := log.path:
-        yield run_check("log", lambda: _require_room(path, "path", LOG_ROOM_MB))
-    else:
-        yield fine("log", "none, so nothing of the flight is kept")
-    if (tlog := log.tlog) and has_link:
-        yield run_check("tlog", lambda: _require_room(tlog, "tlog", SPARED_BYTES / 1e6 + LOG_ROOM_MB))
-    elif tlog:
-        yield fine("tlog", "none, since there is no link")
+        return run_check("log", lambda: _require_room(path))
+    return fine("log", "none, so nothing of the flight is kept")
 
 
-def _require_room(file: str, key: str, needed_mb: float) -> str:
+def _require_room(file: str) -> str:
     # A log is not opened for the check: if root checked, it would leave a file that the service may not write.
     path = Path(file).absolute()
     if path.is_dir() or not path.parent.is_dir():
-        raise EdgevprError(f"{path} is not a file in an existing folder: correct `log: {{{key}: ...}}`.")
+        raise EdgevprError(f"{path} is not a file in an existing folder: correct `log: {{path: ...}}`.")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise EdgevprError(f"{path} may not be written by this user: change its permissions or `log: {{{key}: ...}}`.")
+        raise EdgevprError(f"{path} may not be written by this user: change its permissions or `log: {{path: ...}}`.")
     free_mb = shutil.disk_usage(path.parent).free / 1e6
-    if free_mb < needed_mb:
-        raise EdgevprError(f"{path}: only {free_mb:.1f} MB are free there, {needed_mb:g} are needed: make room.")
+    if free_mb < LOG_ROOM_MB:
+        raise EdgevprError(f"{path}: only {free_mb:.1f} MB are free there, {LOG_ROOM_MB} are needed: make room.")
     return str(path)
 
 

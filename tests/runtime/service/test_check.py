@@ -62,7 +62,7 @@ def wrong(config_file: Path, settings: dict) -> list[Finding]:
     """What `check` finds wrong without an autopilot and without waiting for a frame."""
     config_file.write_text(yaml.safe_dump(settings))
     findings = check(config_file, offline=True)
-    assert [finding.what for finding in findings if finding.what != "tlog"] == ITEMS
+    assert [finding.what for finding in findings] == ITEMS
     return [finding for finding in findings if not finding.ok]
 
 
@@ -93,7 +93,6 @@ def test_check_opens_the_ground_link_and_the_signing_key(settings, config_file, 
 
 
 def test_check_leaves_nothing_behind(settings, config_file, tmp_path, flight_folder):
-    settings["log"]["tlog"] = str(tmp_path / "flight.tlog")
     assert wrong(config_file, settings) == []
     assert list(tmp_path.iterdir()) == [config_file]
     assert sorted(path.name for path in flight_folder.iterdir()) == ["images", "valley.gpkg"]
@@ -111,7 +110,7 @@ def test_check_stops_at_a_configuration_that_cannot_be_read(config_file, text):
 @pytest.mark.parametrize(
     ("changes", "wrong_things"),
     [
-        ({"mavlink": {"link": None}, "log": {"path": None, "tlog": "/absent/x.tlog"}}, []),
+        ({"mavlink": {"link": None}, "log": {"path": None}}, []),
         ({"source": {"uri": "rtsp://127.0.0.1:9/camera"}}, []),  # it may deliver later
         ({"map": None, "source": {"uri": None}}, ["map", "source"]),
         ({"battery": {"pack": "4x5200"}}, ["map", "battery"]),
@@ -126,7 +125,7 @@ def test_check_stops_at_a_configuration_that_cannot_be_read(config_file, text):
         ({"mavlink": {"link": "serial:/dev/ttyACM99:921600"}}, ["link"]),
         ({"mavlink": {"link": "tcp:127.0.0.1:9"}}, ["link"]),
         ({"log": {"path": "/"}}, ["log"]),
-        ({"log": {"path": "/absent/flight.jsonl", "tlog": "/absent/flight.tlog"}}, ["log", "tlog"]),
+        ({"log": {"path": "/absent/flight.jsonl"}}, ["log"]),
     ],
 )
 def test_check_finds_what_is_wrong_offline(settings, config_file, changes, wrong_things):

@@ -15,14 +15,13 @@ from edgevpr.mavlink.driver import PortDriver
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.signing import NOT_SIGNING, open_signing
 from edgevpr.mavlink.turns import Turns
-from edgevpr.mavlink.wire import untapped
 from edgevpr.runtime.flight.flight import open_links
 from edgevpr.runtime.flight.navigator import Navigator
 
 
 def opened(config, port, signing, stack):
     settings = replace(config.mavlink, link=f"udpout:127.0.0.1:{port.number}")
-    world = SimpleNamespace(turns=Turns(time.monotonic), drive=PortDriver, signing=signing, tap=untapped)
+    world = SimpleNamespace(turns=Turns(time.monotonic), drive=PortDriver, signing=signing)
     return open_links(settings, world, Navigator(5.0, 1.0), None, stack)[0]
 
 
