@@ -16,8 +16,7 @@ from edgevpr.mavlink.asking import Inquiry, read_autopilot
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
 from simulated import autopilot
-from simulated.controller import FlightController
-from simulated.motion import AlongTrack, TrueState, interpolate_track, read_track
+from simulated.motion import TrueState, interpolate_track, read_track
 
 pytestmark = pytest.mark.network
 
@@ -94,20 +93,6 @@ def test_interpolate_track_turns_the_shorter_way_and_keeps_what_is_unknown():
     assert (here.roll_deg, here.heading_deg % 360, here.height_m) == pytest.approx((0, 5, 85))
     assert math.isnan(here.pitch_deg)
     assert interpolate_track([one, TrueState(lat_deg=50, lon_deg=8, alt_m=0, t_s=2)], 1.0).height_m == 80
-
-
-def test_gps_until_s_ends_gps_in_an_unknown_wind():
-    ends = (0.0, 50.0), (60.0, 50.01)
-    track = [TrueState(t_s=t_s, lat_deg=lat_deg, lon_deg=8.0, alt_m=0.0) for t_s, lat_deg in ends]
-    controller = FlightController("arduplane", AlongTrack(track), gps=True, gps_until_s=20)
-    controller.brain.motion.begin(0.0)
-    controller.advance(19.5)
-    assert (controller.brain.receivers.reports[0].fix_type, round(controller.error_m, 1)) == (6, 0)
-    controller.advance(22.0)
-    assert controller.brain.receivers.reports[0].fix_type == 1
-    controller.advance(40.0)
-    assert 60 < controller.error_m < 6 * 20
-    assert controller.receive(a_fix())[0].result == mavlink.MAV_RESULT_ACCEPTED
 
 
 def test_read_track_takes_attitude_and_course_where_they_are_known(tmp_path):

@@ -26,8 +26,6 @@ SPEED_M_S = {"plane": 22.0, "copter": 0.0}
 FLIGHT_S = 1000.0
 ATTITUDE = 30
 IMU = 26
-VERSION = 148
-NO_MESSAGE = 60_000
 SECOND = {"SIM_GPS1_TYPE": 5, "GPS2_TYPE": 14}  # the receiver's fix is a plain 3D one, as ours is
 
 
@@ -123,38 +121,6 @@ def odometry(frame: int = mavlink.MAV_FRAME_LOCAL_FRD, quality: int = 50):
     )
 
 
-@pytest.mark.parametrize(("vehicle", "autopilot", "version"), [("arduplane", 3, (4, 7)), ("px4-plane", 12, (1, 18))])
-def test_heartbeat_and_version_name_the_firmware(vehicle, autopilot, version):
-    controller = Flown(vehicle).controller
-    heartbeat = controller.reports[0](controller.brain)
-    assert (heartbeat.autopilot, heartbeat.type) == (autopilot, mavlink.MAV_TYPE_FIXED_WING)
-    request = mavlink.MAVLink_command_long_message(1, 1, 512, 0, VERSION, 0, 0, 0, 0, 0, 0)
-    result, answer = controller.receive(request)
-    assert result.result == ACCEPTED
-    assert (answer.flight_sw_version >> 24, answer.flight_sw_version >> 16 & 255) == version
-
-
-def test_message_interval_sets_the_rate_of_a_message():
-    flown = Flown("arduplane")
-    for interval_s, count in ((0.2, 5), (0.1, 10), (-1e-6, 0)):
-        assert flown.command(511, ATTITUDE, interval_s * 1e6) == ACCEPTED
-        flown.now_s += 1
-        said = flown.controller.advance(flown.now_s)
-        names = [message.get_type() for message in said]
-        assert names.count("ATTITUDE") == pytest.approx(count, abs=1)
-        assert set(names) <= {"ATTITUDE", "HEARTBEAT"}, "nothing comes that was not asked for"
-    assert flown.command(511, NO_MESSAGE, 100_000) == DENIED
-    assert flown.command(512, NO_MESSAGE) == FAILED
-
-
-def test_parameters_are_read_and_set():
-    controller = Flown("arduplane").controller
-    controller.receive(mavlink.MAVLink_param_set_message(1, 1, b"GPS2_TYPE", 14.0, 6))
-    (answer,) = controller.receive(mavlink.MAVLink_param_request_read_message(1, 1, b"GPS2_TYPE", -1))
-    assert (answer.param_id, answer.param_value) == ("GPS2_TYPE", 14)
-    assert controller.receive(mavlink.MAVLink_param_request_read_message(1, 1, b"NO_SUCH_NAME", -1)) == []
-
-
 def test_fix_fails_with_gps_and_for_a_second_after_its_loss_and_is_denied_in_a_wrong_form():
     flown = Flown("arduplane")
     assert flown.fix() == FAILED
@@ -219,12 +185,6 @@ def test_primary_receiver_is_that_with_more_satellites(switch, satellites, secon
     receivers._switched_s = flown.now_s
     flown.set(SIM_GPS1_NUMSATS=satellites).wait(seconds + 1.5, gps_input())
     assert (receivers.primary is receivers.reports[1]) == is_ours
-
-
-def test_primary_receiver_with_better_fix_wins_at_once():
-    flown = Flown("arducopter", **SECOND).wait(1, gps_input(fix_type=4))
-    assert flown.brain.receivers.primary.fix_type == 4
-    assert flown.wait(5).brain.receivers.primary.fix_type == 3, "ours is silent"
 
 
 @pytest.mark.parametrize(
