@@ -197,7 +197,7 @@ class FakeLink:
         return self._vehicle()
 
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        vehicle = self._vehicle()
+        vehicle = self.vehicle()
         if vehicle is None:
             return None
         vehicle = replace(vehicle, t_fix_s=self._waiting.t_fix_s)

@@ -1,13 +1,18 @@
 """One recorded flight for all tests of flights: thirty places, 111 m apart on a line to the north, and maps of them."""
 
 import csv
+from functools import partial
 
 import cv2
 import pytest
-from flights import PLACES, STEP_DEG
+from fakes import FakeClock, FakeLink
+from flights import PLACES, STEP_DEG, flight_over
 from pictures import textured
 
 from edgevpr.cli.main import main
+from edgevpr.runtime.flight import systemd
+from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.notifier import Notifier
 
 # Small and quick: what flights are tested on here is not how well a technique recognises.
 TECHNIQUES = {"cohog": ("w1=208",), "hog": ("w1=64",), "seqslam": ()}
@@ -33,3 +38,34 @@ def recording(tmp_path_factory):
         built = ["map", "build", folder / f"{technique}.gpkg", "--images", folder / "seen" / "images"]
         assert main([*map(str, built), "--technique", technique, "--no-calibrate", *flags]) == 0
     return folder
+
+
+@pytest.fixture
+def clock():
+    return FakeClock()
+
+
+@pytest.fixture
+def link(clock):
+    return FakeLink(clock)
+
+
+@pytest.fixture
+def make_flight(recording, tmp_path, link, clock):
+    """Make a flight with `link` by `clock`, a query a second: `make_flight("cohog", **settings)`."""
+    return partial(flight_over, recording, tmp_path, link, clock)
+
+
+@pytest.fixture
+def statuses(monkeypatch):
+    """The statuses that systemd is sent."""
+    sent = []
+    monkeypatch.setattr(systemd, "notify", lambda STATUS="", **_: sent.append(STATUS) if STATUS else None)
+    return sent
+
+
+@pytest.fixture
+def notifier(tmp_path, link, clock):
+    """A notifier whose log is `tmp_path`/log."""
+    with FlightLog(tmp_path / "log", clock=clock) as log:
+        yield Notifier(log, link)

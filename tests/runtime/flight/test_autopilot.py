@@ -3,11 +3,10 @@ things."""
 
 import numpy as np
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource
+from fakes import FakeSource
 from flights import flight_over, of_kind, pictures
 
 from edgevpr.mavlink.messages import Health
-from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.watching import NOTHING_IN_A_ROW
 
 
@@ -16,25 +15,18 @@ def fixes(lines):
     return [fix and (fix["sent"], fix["why"]) for fix in (line["fix"] for line in of_kind(lines, "query"))]
 
 
-def test_a_query_says_whether_its_fix_was_sent_and_what_was_answered_to_the_last(recording, tmp_path):
-    clock = FakeClock()
-    link = FakeLink(clock)
-    flown = flight_over(recording, tmp_path, link, clock)
-    lines = flown.fly(FakeSource(pictures(3), clock))
-    queries = of_kind(lines, "query")
+def test_a_query_says_whether_its_fix_was_sent_and_what_was_answered_to_the_last(make_flight, clock, link):
+    lines = make_flight().fly(FakeSource(pictures(3), clock))
     assert fixes(lines) == [(True, None)] * 3
-    first = queries[0]["fix"]
+    first = of_kind(lines, "query")[0]["fix"]
     assert (first["query"], first["lat_deg"], first["lon_deg"]) == ("frame 000000", 50.0, 8.0)
     assert [line["result"] for line in of_kind(lines, "answer")] == ["ACCEPTED"] * 3
     assert link.stats().fixes_sent == 3
 
 
-def test_every_answer_has_its_own_line_before_the_next_query(recording, tmp_path, monkeypatch):
-    clock, statuses = FakeClock(), []
-    monkeypatch.setattr(systemd, "notify", lambda STATUS="", **_: statuses.append(STATUS) if STATUS else None)
-    lines = flight_over(recording, tmp_path, FakeLink(clock, answer="FAILED"), clock).fly(
-        FakeSource(pictures(4), clock)
-    )
+def test_every_answer_has_its_own_line_before_the_next_query(make_flight, clock, link, statuses):
+    link.answer = "FAILED"
+    lines = make_flight().fly(FakeSource(pictures(4), clock))
     assert [line["kind"] for line in lines if line["kind"] in ("query", "answer")] == ["query", "answer"] * 4
     queries, answers = of_kind(lines, "query"), of_kind(lines, "answer")
     assert [line["query"] for line in answers] == [line["query"] for line in queries]
@@ -42,23 +34,16 @@ def test_every_answer_has_its_own_line_before_the_next_query(recording, tmp_path
     assert "3 fixes sent, 0 taken, 3 refused (GPS in use)" in statuses[-1]
 
 
-@pytest.mark.parametrize("settings", [{"mavlink.send_fixes": False}, {}])
-def test_what_was_never_sent_waits_for_no_answer(recording, tmp_path, settings):
-    clock = FakeClock()
-    lines = flight_over(recording, tmp_path, FakeLink(clock) if settings else None, clock, **settings).fly(
-        FakeSource(pictures(3), clock)
-    )
+def test_what_was_never_sent_waits_for_no_answer(make_flight, clock):
+    lines = make_flight(**{"mavlink.send_fixes": False}).fly(FakeSource(pictures(3), clock))
     assert len(of_kind(lines, "query")) == 3
     assert not of_kind(lines, "answer")
 
 
 def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and_the_status(
-    recording, tmp_path, monkeypatch
+    make_flight, clock, link, statuses
 ):
-    clock, statuses = FakeClock(), []
-    monkeypatch.setattr(systemd, "notify", lambda STATUS="", **_: statuses.append(STATUS) if STATUS else None)
-    link = FakeLink(clock)
-    flown = flight_over(recording, tmp_path, link, clock)
+    flown = make_flight()
     encode = flown.recogniser.technique.encode
     flown.recogniser.technique.encode = lambda *seen: (clock.work(6.2), encode(*seen))[1]
     lines = flown.fly(FakeSource(pictures(3), clock))
@@ -68,24 +53,20 @@ def test_a_match_that_takes_longer_than_a_fix_may_be_old_says_so_in_its_line_and
     assert "2 too late" in statuses[-1]
 
 
-def test_without_a_link_the_line_says_so(recording, tmp_path):
-    clock = FakeClock()
+def test_without_a_link_the_line_says_so(recording, tmp_path, clock):
     lines = flight_over(recording, tmp_path, None, clock).fly(FakeSource(pictures(1), clock))
     assert fixes(lines) == [(False, {"code": "NO_LINK", "parameters": {}})]
+    assert not of_kind(lines, "answer")
 
 
-def test_what_is_not_accepted_has_no_fix_to_speak_of(recording, tmp_path):
-    clock = FakeClock()
-    link = FakeLink(clock)
-    lines = flight_over(recording, tmp_path, link, clock).fly(FakeSource(pictures(2, first=100), clock))
+def test_what_is_not_accepted_has_no_fix_to_speak_of(make_flight, clock, link):
+    lines = make_flight().fly(FakeSource(pictures(2, first=100), clock))
     assert fixes(lines) == [None, None]
     assert link.stats().fixes_sent == 0
 
 
-def test_the_cost_of_every_query_is_told(recording, tmp_path):
-    clock = FakeClock()
-    link = FakeLink(clock)
-    flown = flight_over(recording, tmp_path, link, clock, board="rpi-4b")
+def test_the_cost_of_every_query_is_told(make_flight, clock, link):
+    flown = make_flight(board="rpi-4b")
     encode = flown.recogniser.technique.encode
     flown.recogniser.technique.encode = lambda *seen: (clock.work(0.1, 2.0), encode(*seen))[1]
     flown.fly(FakeSource(pictures(1, first=100), clock))
@@ -95,11 +76,8 @@ def test_the_cost_of_every_query_is_told(recording, tmp_path):
 
 
 @pytest.mark.parametrize("technique", ["cohog", "hog"])
-def test_how_sure_an_accepted_match_is_is_told_where_it_is_known(recording, tmp_path, technique):
-    clock = FakeClock()
-    link = FakeLink(clock)
-    flown = flight_over(recording, tmp_path, link, clock, technique)
-    lines = flown.fly(FakeSource(pictures(2) + pictures(1, first=100), clock))
+def test_how_sure_an_accepted_match_is_is_told_where_it_is_known(make_flight, clock, link, technique):
+    lines = make_flight(technique).fly(FakeSource(pictures(2) + pictures(1, first=100), clock))
     queries = of_kind(lines, "query")
     assert [line["accepted"] for line in queries] == [True, True, False]
     told = [each.value for each in link.sent if getattr(each, "name", "") == "vpr_conf"]
@@ -113,41 +91,34 @@ def test_how_sure_an_accepted_match_is_is_told_where_it_is_known(recording, tmp_
 
 
 @pytest.mark.slow
-def test_a_camera_that_is_lost_is_told_and_is_critical_until_it_is_back(recording, tmp_path):
-    clock = FakeClock()
-    link, health = FakeLink(clock), []
+def test_a_camera_that_is_lost_is_told_and_is_critical_until_it_is_back(make_flight, clock, link):
+    health = []
     source = FakeSource(pictures(5), clock, work=lambda: (health.append(link.health.name), turn())[0])
 
     def turn():
         source.is_lost = len(health) in (2, 3)
 
-    lines = flight_over(recording, tmp_path, link, clock).fly(source)
+    lines = make_flight().fly(source)
     assert health == ["ACTIVE", "ACTIVE", "CRITICAL", "CRITICAL", "ACTIVE"]
     assert link.texts() == [(4, "edgevpr: camera lost"), (6, "edgevpr: camera is back")]
     assert [line["condition"] for line in of_kind(lines, "source")] == ["LOST", "RUNNING"]
 
 
-def test_a_listener_that_fails_does_not_end_the_flight(recording, tmp_path, caplog):
-    clock = FakeClock()
-    link = FakeLink(clock)
+def test_a_listener_that_fails_does_not_end_the_flight(make_flight, clock, link, caplog):
     link.send_fix = lambda fix: 1 / 0
-    lines = flight_over(recording, tmp_path, link, clock).fly(FakeSource(pictures(2), clock))
+    lines = make_flight().fly(FakeSource(pictures(2), clock))
     assert len(of_kind(lines, "query")) == 2
     assert sum("could not be informed" in record.message for record in caplog.records) == 2
 
 
-def test_ten_pictures_of_nothing_are_reported_once_and_so_is_the_ground_after_them(recording, tmp_path, caplog):
-    clock, health = FakeClock(), []
-    link, ground = FakeLink(clock), pictures(1, first=1)
-    source = FakeSource(
-        [*ground, *[np.zeros((240, 320), np.uint8)] * 15, *ground * 3], clock, work=lambda: health.append(link.health)
-    )
-    lines = flight_over(recording, tmp_path, link, clock).fly(source)
-    queries, reported = of_kind(lines, "query"), ["camera shows nothing", "camera shows ground again"]
+def test_ten_pictures_of_nothing_are_reported_once_and_so_is_the_ground_after_them(make_flight, clock, link):
+    health, ground = [], pictures(1, first=1)
+    seen = [*ground, *[np.zeros((240, 320), np.uint8)] * 15, *ground * 3]
+    lines = make_flight().fly(FakeSource(seen, clock, work=lambda: health.append(link.health)))
+    queries = of_kind(lines, "query")
     assert [line["accepted"] for line in queries] == [True, *[False] * 15, *[True] * 3]
     assert all(line["reason"]["code"] == "LOW_TEXTURE" for line in queries[1:16])
     assert queries[1]["fix"] is queries[1]["place"] is None
-    assert link.texts() == [(4, f"edgevpr: {reported[0]}"), (6, f"edgevpr: {reported[1]}")]
+    assert [severity for severity, _ in link.texts()] == [4, 6]
     assert [line["note"]["code"] for line in of_kind(lines, "camera")] == ["NOTHING_SHOWN", "GROUND_SHOWN"]
     assert [health[number] for number in (NOTHING_IN_A_ROW, 15, -1)] == [Health.ACTIVE, Health.CRITICAL, Health.ACTIVE]
-    assert len([record for record in caplog.records if "shows nothing" in record.message]) == 1

@@ -3,24 +3,19 @@
 import shutil
 
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
+from fakes import FakeLink, FakeSource, vehicle_at
 from flights import Flight, flight_over, of_kind, pictures
 
 from edgevpr.mavlink.ground import Wish
 from edgevpr.runtime.flight import systemd
 
 
-@pytest.fixture
-def clock():
-    return FakeClock()
-
-
 def queries(lines):
     return [line["query"] for line in of_kind(lines, "query")]
 
 
-def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_picture(recording, tmp_path, clock):
-    link, answers, health = FakeLink(clock), [], []
+def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_picture(make_flight, clock, link):
+    answers, health = [], []
     wishes = {2: Wish.PAUSE, 5: Wish.RESUME}
 
     def work():
@@ -28,7 +23,7 @@ def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_pict
         if wish := wishes.get(len(health)):
             answers.append(link.wish(wish))
 
-    lines = flight_over(recording, tmp_path, link, clock).fly(FakeSource(pictures(7), clock, work=work))
+    lines = make_flight().fly(FakeSource(pictures(7), clock, work=work))
     assert answers == ["ACCEPTED", "ACCEPTED"]
     assert queries(lines) == ["frame 000000", "frame 000001", "frame 000005", "frame 000006"]
     assert health == ["ACTIVE", "ACTIVE", "STANDBY", "STANDBY", "STANDBY", "ACTIVE", "ACTIVE"]
@@ -40,9 +35,8 @@ def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_pict
     assert link.texts() == [(6, "edgevpr: paused by command"), (6, "edgevpr: goes on by command")]
 
 
-def test_a_recording_waits_while_paused(recording, tmp_path, clock):
-    link = FakeLink(clock)
-    flown = flight_over(recording, tmp_path, link, clock)
+def test_a_recording_waits_while_paused(make_flight, clock, link):
+    flown = make_flight()
     source = FakeSource(pictures(3), clock, is_live=False, work=lambda: link.wish(Wish.PAUSE))
     clock.at(30.0, lambda: link.wish(Wish.RESUME))
     clock.at(60.0, flown.stop)
@@ -84,15 +78,14 @@ def test_a_flight_that_does_not_learn_cannot_be_told_to(recording, tmp_path, clo
     assert not of_kind(lines, "command")
 
 
-def test_while_paused_the_watchdog_is_fed_and_the_status_says_so(recording, tmp_path, clock, monkeypatch):
+def test_while_paused_the_watchdog_is_fed_and_the_status_says_so(make_flight, clock, link, monkeypatch):
     told = []
     monkeypatch.setenv("WATCHDOG_USEC", "2000000")
     monkeypatch.delenv("WATCHDOG_PID", raising=False)
     assert systemd.watchdog_interval_s() == 1.0
     monkeypatch.setattr(systemd, "notify", lambda **said: told.append(said))
-    link = FakeLink(clock)
     source = FakeSource(pictures(9), clock, work=lambda: link.wish(Wish.PAUSE))
-    lines = flight_over(recording, tmp_path, link, clock).fly(source)
+    lines = make_flight().fly(source)
     assert queries(lines) == ["frame 000000"]
     assert sum("WATCHDOG" in each for each in told) == 9
     assert "1 queries" in told[-2]["STATUS"]

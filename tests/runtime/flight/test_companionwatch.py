@@ -4,8 +4,8 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource
-from flights import Flight, flight_meter, of_kind
+from fakes import FakeSource
+from flights import flight_meter, of_kind
 from pictures import textured
 
 from edgevpr.cli.top import lines_of
@@ -65,12 +65,11 @@ def test_take_reports_nothing_of_a_value_that_is_unknown():
     assert [severity for _, severity, _ in watched([LOW] * 5 + [UNKNOWN] * 100)] == [Severity.WARNING]
 
 
-def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(recording, tmp_path, caplog):
+def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(make_flight, clock, link, tmp_path, caplog):
     firmware = tmp_path / "sys/devices/platform/soc/soc:firmware/get_throttled"
     firmware.parent.mkdir(parents=True)
     firmware.write_text("0\n")
-    clock, statuses = FakeClock(), []
-    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, FakeLink(clock), **{"source.rate_hz": 1.0})
+    flight, statuses = make_flight("hog"), []
 
     class Status:
         def write(self, status):
@@ -84,7 +83,7 @@ def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(record
     signs = "under-voltage, throttled now"
     assert notes[:2] == [("UNDER_VOLTAGE", signs), ("THROTTLED", signs)]
     assert {code for code, _ in notes[2:]} == {"SUPPLY_FINE", "FULL_SPEED"}
-    texts = flight.link.texts()
+    texts = link.texts()
     assert (4, f"edgevpr: {begun}") in texts
     assert (6, "edgevpr: companion supply is fine again") in texts
     assert [record.levelname for record in caplog.records if record.message == begun] == ["WARNING"]

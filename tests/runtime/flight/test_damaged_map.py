@@ -8,12 +8,11 @@ import shutil
 import sqlite3
 
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource
+from fakes import FakeSource
 from flights import PLACES, STEP_DEG, Flight, fly_acts, nothing, of_kind
 from pictures import textured
 
 from edgevpr.mavlink.messages import Health
-from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW
 
 DAMAGE = (None, b"", b"\xff", b"\x00" * 7, "text", 10**18, -1.5, float("inf"), b"\xa5" * 40_000)
@@ -97,21 +96,17 @@ def test_whatever_stands_in_a_column_the_flight_goes_on_and_sends_nothing_that_i
 
 
 def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
-    place_map, tmp_path, monkeypatch, caplog
+    place_map, tmp_path, clock, link, caplog
 ):
-    health, statuses = [], []
-    monkeypatch.setattr(systemd, "notify", lambda STATUS="", **_: statuses.append(STATUS) if STATUS else None)
-    whole = place_map.read_bytes()
+    health, whole = [], place_map.read_bytes()
 
     def damage():
         damaged(place_map, "UPDATE places SET fine = x'00'")
 
     def look():
-        health.append(flight_link.health)
+        health.append(link.health)
 
-    clock = FakeClock()
-    flight_link = FakeLink(clock)
-    flight = Flight(place_map, tmp_path / "log", clock, flight_link, **{"source.rate_hz": 1.0})
+    flight = Flight(place_map, tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
     calls = iter([nothing, damage, *[look] * FAILURES_IN_A_ROW, lambda: place_map.write_bytes(whole), look, look, look])
     count = FAILURES_IN_A_ROW + 6
     lines = flight.fly(FakeSource([textured(1, 240, 320)] * count, clock, work=lambda: next(calls)()))
@@ -120,7 +115,7 @@ def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
     assert health[-4] is Health.CRITICAL
     assert health[0] is health[-1] is Health.ACTIVE
     assert [line["note"]["code"] for line in of_kind(lines, "failing")] == ["FAILING", "NOT_FAILING"]
-    assert flight_link.texts() == [
+    assert link.texts() == [
         (4, "edgevpr: its map cannot be read, see its log"),
         (4, "edgevpr: 10 frames in a row have failed"),
         (6, "edgevpr: its map is read again"),

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
-from flights import Flight, of_kind
+from fakes import FakeSource, vehicle_at
+from flights import of_kind
 from frozen_cameras import DOWN, Flown, at_constant_bitrate, compressed, make_ground, with_clock
 from pictures import textured
 
@@ -181,8 +181,8 @@ def test_impossible_reports_end_nothing(ground, harm):
     assert flown.see(np.zeros((3, 4), np.uint8)) is None
 
 
-def test_a_flight_refuses_frozen_pictures_and_says_so(recording, tmp_path):
-    clock, health, seen = FakeClock(), [], []
+def test_a_flight_refuses_frozen_pictures_and_says_so(make_flight, clock, link):
+    health, seen = [], []
 
     def vehicle():
         heading_deg = 10.0 * (clock.now_s - 1000.0) % 360
@@ -196,8 +196,7 @@ def test_a_flight_refuses_frozen_pictures_and_says_so(recording, tmp_path):
         def write(self, status) -> None:
             seen.append(status["source"])
 
-    link = FakeLink(clock, vehicle=vehicle)
-    flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
+    link.vehicle, flight = vehicle, make_flight()
     noise = np.random.default_rng(2)
     shown = [0, 1, *[2] * 12, 3, 4, 5, 6]
     pictures = [textured(number, 240, 320) + noise.integers(0, 4, (240, 320), np.uint8) for number in shown]

@@ -5,7 +5,6 @@ from fakes import FakeClock, FakeLink, FakeSource
 from flights import Flight, flight_meter, of_kind
 from pictures import textured
 
-from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.metering import FlightMeter, LoadReading
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
@@ -37,9 +36,7 @@ def governed(place_map, log, readings, count, fewer_candidates=(), **settings):
     return of_kind(lines, "governor"), lines, flight.link.texts(), flight
 
 
-def test_a_change_is_logged_and_announced_once_and_taken_back(recording, tmp_path, monkeypatch, caplog):
-    statuses = []
-    monkeypatch.setattr(systemd, "notify", lambda STATUS="", **_: statuses.append(STATUS) if STATUS else None)
+def test_a_change_is_logged_and_announced_once_and_taken_back(recording, tmp_path, statuses, caplog):
     script = [BUSY] * 2 + [CALM] * 3
     changes, _, texts, _ = governed(recording / "cohog.gpkg", tmp_path / "log", script, 8, **{"source.rate_hz": 60.0})
     down, back = changes

@@ -3,21 +3,17 @@
 from types import SimpleNamespace
 
 import pytest
-from fakes import FakeClock, FakeLink
 
 from edgevpr.core.types import Vehicle
 from edgevpr.frames.level import View
-from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.heightwatch import HeightWatch
 from edgevpr.runtime.flight.measurements import measure_frame
-from edgevpr.runtime.flight.notifier import Notifier
 
 
 class Watch:
-    def __init__(self, folder) -> None:
-        self.clock, self.log = FakeClock(), folder / "log"
-        self.link = FakeLink(self.clock)
-        self.watch = HeightWatch(Notifier(FlightLog(self.log, clock=self.clock), self.link))
+    def __init__(self, notifier, clock, link) -> None:
+        self.clock, self.link, self.watch = clock, link, HeightWatch(notifier)
 
     def see(self, *heights_m, reported_m=100.0, accepted=True, ratio=1.0, every_s=1.0, age_s=0.0):
         """Let matches of these heights be seen; return the texts so far."""
@@ -39,11 +35,11 @@ class Watch:
 
 
 @pytest.fixture
-def watch(tmp_path):
-    return Watch(tmp_path)
+def watch(notifier, clock, link):
+    return Watch(notifier, clock, link)
 
 
-def test_heightwatch_reports_a_contradiction_once_and_its_end(watch):
+def test_heightwatch_reports_a_contradiction_once_and_its_end(watch, tmp_path):
     assert watch.see(150, 160, 158, 162) == []
     assert watch.watch.ratio == 1.0
     assert watch.see(155) == ["height: autopilot 100 m, pictures 158 m"]
@@ -52,7 +48,7 @@ def test_heightwatch_reports_a_contradiction_once_and_its_end(watch):
     assert len(watch.link.texts()) == 1
     assert watch.see(100)[1:] == ["height agrees with pictures again"]
     assert watch.watch.ratio == 1.0
-    assert [(line["kind"], line["note"]) for line in read_log(watch.log)] == [
+    assert [(line["kind"], line["note"]) for line in read_log(tmp_path / "log")] == [
         ("height", {"code": "HEIGHT_DIFFERS", "parameters": {"by_autopilot_m": 100.0, "by_pictures_m": 158.0}}),
         ("height", {"code": "HEIGHT_AGREES", "parameters": {}}),
     ]

@@ -1,8 +1,10 @@
 """The loop: it ends when told to, at once where it must, keeps its pace, and goes on whatever a frame brings."""
 
+from functools import partial
+
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource
-from flights import Flight, of_kind
+from fakes import FakeSource
+from flights import of_kind
 from pictures import textured
 
 from edgevpr.core.config import load_config
@@ -16,18 +18,12 @@ PICTURE = textured(1, 240, 320)
 
 
 @pytest.fixture
-def clock():
-    return FakeClock()
+def flight(make_flight):
+    return partial(make_flight, "hog", **{"source.rate_hz": 0.5})
 
 
-def flight(recording, tmp_path, clock, **settings):
-    return Flight(
-        recording / "hog.gpkg", tmp_path / "log", clock, FakeLink(clock), **{"source.rate_hz": 0.5} | settings
-    )
-
-
-def test_a_stop_between_frames_ends_the_flight_within_a_turn(recording, tmp_path, clock):
-    flown = flight(recording, tmp_path, clock)
+def test_a_stop_between_frames_ends_the_flight_within_a_turn(flight, clock):
+    flown = flight()
     slept = []
 
     def sleep(seconds):
@@ -41,8 +37,8 @@ def test_a_stop_between_frames_ends_the_flight_within_a_turn(recording, tmp_path
     assert slept == [pytest.approx(0.2)]
 
 
-def test_a_stop_while_a_frame_is_recognised_breaks_it_off(recording, tmp_path, clock):
-    flown = flight(recording, tmp_path, clock)
+def test_a_stop_while_a_frame_is_recognised_breaks_it_off(flight, clock):
+    flown = flight()
 
     def long(image, mask):
         flown.stop()  # a signal comes
@@ -54,8 +50,8 @@ def test_a_stop_while_a_frame_is_recognised_breaks_it_off(recording, tmp_path, c
     flown.stop()  # and a second signal finds nothing to break off
 
 
-def test_a_stop_while_others_are_told_lets_them_finish(recording, tmp_path, clock):
-    flown = flight(recording, tmp_path, clock)
+def test_a_stop_while_others_are_told_lets_them_finish(flight, clock):
+    flown = flight()
     send = flown.link.send
     flown.link.send = lambda *messages: (flown.stop(), send(*messages))
     lines = flown.fly(FakeSource([PICTURE] * 9, clock))
@@ -75,8 +71,8 @@ def test_a_stop_before_the_flight_begins_ends_it_at_once():
     stop()  # nothing is left to break off
 
 
-def test_a_frame_that_cannot_be_read_is_logged_and_the_next_is_recognised(recording, tmp_path, clock):
-    flown = flight(recording, tmp_path, clock)
+def test_a_frame_that_cannot_be_read_is_logged_and_the_next_is_recognised(flight, clock):
+    flown = flight()
     pictures = [PICTURE, ImageError("1.png is cut short: copy it again."), PICTURE]
     lines = flown.fly(FakeSource(pictures, clock, is_live=False))
     assert [line["reason"]["parameters"]["problem"] for line in of_kind(lines, "unusable")] == [
@@ -127,14 +123,14 @@ def test_frames_of_a_recording_come_by_its_steps_and_slower_as_the_rate_is_lower
     assert pace.wait_s() == pytest.approx(0.5)
 
 
-def test_a_flight_over_pictures_with_times_takes_them_at_their_times(recording, tmp_path, clock):
+def test_a_flight_over_pictures_with_times_takes_them_at_their_times(flight, clock):
     class Timed(FakeSource):
         def read(self, timeout_s):
             self.step_s = next(steps, None)
             return super().read(timeout_s)
 
     steps = iter((0.5, 0.0, 7.0))
-    lines = flight(recording, tmp_path, clock).fly(Timed([PICTURE] * 4, clock, is_live=False))
+    lines = flight().fly(Timed([PICTURE] * 4, clock, is_live=False))
     taken = [line["t_frame_s"] for line in of_kind(lines, "query")]
     assert [each - taken[0] for each in taken] == pytest.approx([0.0, 0.5, 0.5, 7.5])
 
@@ -146,29 +142,27 @@ def test_the_rate_of_a_timed_flight_is_that_at_which_most_pictures_come():
     assert apply_recorded_rate(config, []) is config
 
 
-def test_on_a_terminal_a_flight_says_once_a_minute_how_it_goes(recording, tmp_path, clock, monkeypatch, caplog):
+def test_on_a_terminal_a_flight_says_once_a_minute_how_it_goes(flight, clock, monkeypatch, caplog):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     with caplog.at_level("INFO"):
-        flight(recording, tmp_path, clock).fly(FakeSource([PICTURE] * 62, clock))
+        flight().fly(FakeSource([PICTURE] * 62, clock))
     said = [each for each in caplog.messages if " min: " in each]
     assert [each.partition(" queries")[0] for each in said] == ["1 min: streaming; 31", "2 min: streaming; 61"]
     caplog.clear()
     monkeypatch.setattr("sys.stderr.isatty", lambda: False, raising=False)
-    flight(recording, tmp_path, clock).fly(FakeSource([PICTURE] * 62, clock))
+    flight().fly(FakeSource([PICTURE] * 62, clock))
     assert not [each for each in caplog.messages if " min: " in each]
 
 
 @pytest.mark.parametrize(
     ("trouble", "fed_s"), [(None, 45), ("is_lost", 100), ("is_frozen", 100), ("is_opening", 100), ("recording", 100)]
 )
-def test_the_watchdog_is_fed_while_it_is_known_why_no_query_comes(
-    recording, tmp_path, clock, monkeypatch, trouble, fed_s
-):
+def test_the_watchdog_is_fed_while_it_is_known_why_no_query_comes(flight, clock, monkeypatch, trouble, fed_s):
     monkeypatch.setenv("WATCHDOG_USEC", "2000000")
     monkeypatch.delenv("WATCHDOG_PID", raising=False)
     fed = []
     monkeypatch.setattr(systemd, "notify", lambda **said: "WATCHDOG" in said and fed.append(clock.now_s))
-    flown = flight(recording, tmp_path, clock, **{"source.rate_hz": 2.0})
+    flown = flight(**{"source.rate_hz": 2.0})
 
     class Silent(FakeSource):
         def read(self, timeout_s):

@@ -4,8 +4,8 @@ import random
 from dataclasses import asdict
 
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource
-from flights import Flight, flight_meter, of_kind
+from fakes import FakeSource
+from flights import flight_meter, of_kind
 from pictures import textured
 
 from edgevpr.power.thermal import ThermalState
@@ -16,18 +16,16 @@ pytestmark = pytest.mark.slow
 PICTURE = textured(1, 240, 320)
 
 
-def test_a_flights_charge_is_the_closed_form(recording, tmp_path):
+def test_a_flights_charge_is_the_closed_form(make_flight, clock):
     """Five minutes on a Pi 4B (2.29 W idle, 4.53 W more at full load, four cores) with stages of all lengths."""
-    script = random.Random(5)
-    spent, clock = [], FakeClock()
+    script, spent = random.Random(5), []
 
     def work():
         wall_s, cores = script.uniform(0.001, 0.6), script.uniform(0, 2)
         spent.append(wall_s * cores)
         clock.work(wall_s, cores)
 
-    settings = {"board": "rpi-4b", "source.rate_hz": 0.5, "match.candidates": 1}
-    flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, **settings)
+    flight = make_flight(**{"board": "rpi-4b", "source.rate_hz": 0.5, "match.candidates": 1})
     technique = flight.recogniser.technique
     encode, scan = technique.encode, technique.coarse_scores
     technique.encode = lambda *seen: (work(), encode(*seen))[1]
@@ -66,16 +64,15 @@ class Watch:
         pass
 
 
-def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(recording, tmp_path):
+def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(make_flight, clock, link):
     cool = ThermalState(temperature_c=61.0, frequency_mhz=1800.0, throttled=False, why="")
     hot = ThermalState(temperature_c=84.0, frequency_mhz=600.0, throttled=True, why="throttled now", under_voltage=True)
-    clock = FakeClock()
-    flight = Flight(recording / "hog.gpkg", tmp_path / "log", clock, FakeLink(clock), **{"source.rate_hz": 1.0})
+    flight = make_flight("hog")
     meter = flight_meter(flight, machine=Machine(flight.board, Watch([cool] * 3 + [hot])))
     lines = flight.fly(FakeSource([PICTURE] * 6, clock), meter)
     boards = [line["board"] for line in of_kind(lines, "query")]
     assert (boards[0], boards[-1]) == (asdict(cool), asdict(hot))
-    told = [each.temperature_core[0] for each in flight.link.sent if each.get_type() == "ONBOARD_COMPUTER_STATUS"]
+    told = [each.temperature_core[0] for each in link.sent if each.get_type() == "ONBOARD_COMPUTER_STATUS"]
     throttled = [board["throttled"] for board in boards]
     assert flight.end["queries_throttled"] == sum(throttled) > 0
     assert told[0] == 61

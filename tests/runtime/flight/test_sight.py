@@ -4,26 +4,22 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource
-from flights import Flight, of_kind
-from pictures import textured
+from fakes import FakeSource
+from flights import of_kind, pictures
 
 from edgevpr.core.config import load_config
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.frames.level import View
 from edgevpr.runtime.flight.camerawatch import TurnWatch
-from edgevpr.runtime.flight.flightlog import FlightLog, read_log
-from edgevpr.runtime.flight.notifier import Notifier
+from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.watching import Sight
 
 
 class Seen:
     """A sight with its listeners; `look` shows it pictures, one a second."""
 
-    def __init__(self, folder):
-        self.clock, self.log = FakeClock(), folder / "log"
-        self.link = FakeLink(self.clock)
-        self.sight = Sight(Notifier(FlightLog(self.log, clock=self.clock), self.link))
+    def __init__(self, notifier, clock, link):
+        self.clock, self.link, self.sight = clock, link, Sight(notifier)
 
     def look(self, outcomes: str, every_s: float = 1.0):
         """`+` accepted, `-` not, `L` not and lost, `0` shows nothing, `x` failed, `t` tilted, `n` not worth a search,
@@ -46,34 +42,34 @@ class Seen:
 
 
 @pytest.fixture
-def seen(tmp_path):
-    return Seen(tmp_path)
+def seen(notifier, clock, link):
+    return Seen(notifier, clock, link)
 
 
-def test_the_map_is_left_after_thirty_queries_without_a_match_and_found_with_two(seen):
+def test_the_map_is_left_after_thirty_queries_without_a_match_and_found_with_two(seen, tmp_path):
     assert seen.look("+++" + "-" * 29) == []
     assert seen.look("-") == ["map left"]
     assert seen.look("-" * 50) == ["map left"]
     assert seen.look("+--") == ["map left"]
     assert seen.look("+") == ["map left", "map found again"]
-    assert [(line["kind"], line["note"]["code"]) for line in read_log(seen.log)] == [
+    assert [(line["kind"], line["note"]["code"]) for line in read_log(tmp_path / "log")] == [
         ("sight", "MAP_LEFT"),
         ("sight", "MAP_FOUND"),
     ]
     assert [severity for severity, _ in seen.link.texts()] == [4, 6]
 
 
-def test_a_flight_that_knows_to_be_lost_needs_ten(seen):
-    assert seen.look("+++" + "L" * 9) == []
-    assert seen.look("L") == ["map left"]
-
-
-def test_a_map_that_was_hardly_ever_recognised_cannot_be_left(seen):
-    assert seen.look("-" * 100 + "++" + "-" * 100) == []
-
-
-def test_matches_far_apart_do_not_make_a_left_map_found(seen):
-    assert seen.look("+++" + "-" * 30 + ("+" + "-" * 10) * 5) == ["map left"]
+@pytest.mark.parametrize(
+    ("outcomes", "texts"),
+    [
+        ("+++" + "L" * 9, []),
+        ("+++" + "L" * 10, ["map left"]),  # the flight knows to be lost
+        ("-" * 100 + "++" + "-" * 100, []),  # it was hardly ever recognised
+        ("+++" + "-" * 30 + ("+" + "-" * 10) * 5, ["map left"]),  # matches far apart
+    ],
+)
+def test_the_map_is_left_and_found_by_several_queries_only(seen, outcomes, texts):
+    assert seen.look(outcomes) == texts
 
 
 @pytest.mark.parametrize("outcome", "0xtnu")
@@ -82,22 +78,17 @@ def test_what_says_nothing_of_the_map_does_not_count(seen, outcome):
     assert seen.look("-")[-1] == "map left"
 
 
-def test_a_tilt_is_told_when_it_lasts_five_seconds_and_when_it_is_over_for_as_long(seen):
+def test_a_tilt_is_told_when_it_lasts_five_seconds_and_when_it_is_over_for_as_long(seen, tmp_path):
     assert seen.look("-" + "t" * 5) == []
     assert seen.look("t") == ["tilt too large"]
     assert seen.look("-----") == ["tilt too large"]
     assert seen.look("-") == ["tilt too large", "tilt is fine again"]
-    assert [line["kind"] for line in read_log(seen.log)] == ["tilt", "tilt"]
+    assert [line["kind"] for line in read_log(tmp_path / "log")] == ["tilt", "tilt"]
 
 
 @pytest.mark.slow
-def test_a_flight_that_leaves_its_map_and_comes_back_says_so(recording, tmp_path):
-    clock = FakeClock()
-    link = FakeLink(clock)
-    flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
-    over_map, elsewhere = range(8), range(100, 140)
-    pictures = [textured(number, 240, 320) for number in [*over_map, *elsewhere, *over_map]]
-    lines = flight.fly(FakeSource(pictures, clock))
+def test_a_flight_that_leaves_its_map_and_comes_back_says_so(make_flight, clock, link):
+    lines = make_flight().fly(FakeSource([*pictures(8), *pictures(40, first=100), *pictures(8)], clock))
     assert link.texts() == [(4, "edgevpr: map left"), (6, "edgevpr: map found again")]
     assert [line["note"]["code"] for line in of_kind(lines, "sight")] == ["MAP_LEFT", "MAP_FOUND"]
 
@@ -113,11 +104,9 @@ def test_a_flight_that_leaves_its_map_and_comes_back_says_so(recording, tmp_path
         ([20, 80], []),
     ],
 )
-def test_pictures_that_are_turned_against_the_heading_are_said_once(tmp_path, turned_deg, said):
-    clock = FakeClock()
-    link = FakeLink(clock)
+def test_pictures_that_are_turned_against_the_heading_are_said_once(notifier, link, turned_deg, said):
     source = load_config(None, {"source.up_deg": 300.0}).source
-    watch = TurnWatch(Notifier(FlightLog(tmp_path / "log", clock=clock), link), source)
+    watch = TurnWatch(notifier, source)
     view = SimpleNamespace(up_deg=350.0, reason=None)
     events = [SimpleNamespace(located=SimpleNamespace(heading_deg=350.0 + turn), view=view) for turn in turned_deg]
     missed = SimpleNamespace(located=None, view=view)
@@ -130,21 +119,15 @@ def test_pictures_that_are_turned_against_the_heading_are_said_once(tmp_path, tu
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_mirrored_pictures_are_reported_once_and_only_where_none_matches(recording, tmp_path, axis):
-    clock = FakeClock()
-    link = FakeLink(clock)
-    flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
-    pictures = [np.flip(textured(number % 8, 240, 320), axis).copy() for number in range(20)]
-    lines = flight.fly(FakeSource(pictures, clock))
+def test_mirrored_pictures_are_reported_once_and_only_where_none_matches(make_flight, clock, link, axis):
+    mirrored = [np.flip(picture, axis).copy() for picture in pictures(8)]
+    lines = make_flight().fly(FakeSource([*mirrored, *mirrored, *mirrored[:4]], clock))
     assert not any(line["accepted"] for line in of_kind(lines, "query"))
     assert link.texts() == [(4, "edgevpr: pictures are mirrored")]
     (line,) = of_kind(lines, "camera")
     assert line["note"]["code"] == "PICTURES_MIRRORED"
 
 
-def test_pictures_of_other_ground_are_not_reported_as_mirrored(recording, tmp_path):
-    clock = FakeClock()
-    link = FakeLink(clock)
-    flight = Flight(recording / "cohog.gpkg", tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
-    flight.fly(FakeSource([textured(number, 240, 320) for number in range(100, 135)], clock))
+def test_pictures_of_other_ground_are_not_reported_as_mirrored(make_flight, clock, link):
+    make_flight().fly(FakeSource(pictures(35, first=100), clock))
     assert link.texts() == []
