@@ -147,7 +147,8 @@ def test_signed_packets_and_the_link_to_the_ground_are_the_same_but_for_the_sign
     key.chmod(0o600)
     config = tmp_path / "c.yaml"
     ground, flight_port = UdpPort(), UdpPort()
-    settings = {"signing_key": str(key), "ground": f"udpout:127.0.0.1:{ground.number}"}
+    settings = {"signing_key": str(key), "signing_state": str(tmp_path / "time")}
+    settings["ground"] = f"udpout:127.0.0.1:{ground.number}"
     config.write_text(yaml.safe_dump({"mavlink": settings | {"link": f"udpout:127.0.0.1:{flight_port.number}"}}))
     flight = fly("--config", str(config), "--rate-hz", "5")
     station = Peer(ground)
@@ -159,6 +160,7 @@ def test_signed_packets_and_the_link_to_the_ground_are_the_same_but_for_the_sign
     ground.close()
     flight_port.close()
     again, _ = is_the_same(tmp_path / "flight.jsonl")
+    assert (tmp_path / "time").exists()
     assert again.packets.alike > 0
     assert again.lines[-1]["mavlink"]["refused_signatures"] == {"unsigned": 1}
     tape = (recordings(tmp_path / "recorded")[-1] / TAPE).read_text()
