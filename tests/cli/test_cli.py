@@ -56,14 +56,6 @@ def refused(capsys, *argv):
     return code, said[-1]
 
 
-def test_map_info_counts_places(capsys, valley):
-    info = run_json(capsys, "map", "info", valley, "--json")
-    assert info["places"] == info["with_position"] == 6
-    assert info["spec"]["name"] == "cohog"
-    assert main(["map", "info", str(valley)]) == 0
-    assert " 6 places, 6 with a position\n" in capsys.readouterr().out
-
-
 @pytest.mark.slow
 def test_match_finds_every_place_with_its_cost(capsys, flight, valley):
     found = run_json(capsys, "match", valley, "--images", flight / "query", "--json")
@@ -83,16 +75,6 @@ def test_match_finds_every_place_with_its_cost(capsys, flight, valley):
     assert found[2]["from_gps_tag_m"] == 0
     assert main(["match", str(valley), "--images", str(flight / "query")]) == 0
     assert "6 queries, 6 accepted" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_map_build_picks_a_technique_and_logs_why(capsys, caplog, flight, tmp_path):
-    with caplog.at_level("INFO"):
-        built = run_json(capsys, "map", "build", tmp_path / "m.gpkg", "--images", flight / "ref", "--json")
-    assert built["technique"] == "cohog"
-    (said,) = (message for message in caplog.messages if message.startswith("technique cohog: recall@1 "))
-    assert "accepted, 0 wrong" in said
-    assert "6 places take" in said
 
 
 def test_map_build_appends_to_an_unfinished_map(capsys, flight, tmp_path):

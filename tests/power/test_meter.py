@@ -8,12 +8,8 @@ from fakes import FakeClock
 
 from edgevpr.core.types import NO_COST, StageCost
 from edgevpr.power.boards import load_board
-from edgevpr.power.equations import Pack, parse_pack
-from edgevpr.power.meter import OwnLoad, QueryMeter, query_cost, stage
-
-
-def clock(*readings):
-    return iter(readings).__next__
+from edgevpr.power.equations import parse_pack
+from edgevpr.power.meter import OwnLoad, QueryMeter, stage
 
 
 def test_stage_counts_the_cpu_time_of_other_threads():
@@ -30,23 +26,6 @@ def test_stage_counts_the_cpu_time_of_other_threads():
         thread.join()
     assert metered.cost.cpu_s >= own_s[0]
     assert metered.cost.wall_s > 0
-
-
-def test_query_cost_follows_the_closed_form():
-    # Pi 4B, 2.29 W idle, 6.82 W full, 4 cores: one busy core for 0.4 s, then two for 1.5 s.
-    with stage(clock(0.0, 0.4), clock(0.0, 0.4)) as encoding:
-        assert encoding.cost == NO_COST
-    with stage(clock(0.4, 1.9), clock(0.4, 3.4)) as matching:
-        pass
-    cost = query_cost(encoding.cost, matching.cost, load_board("rpi-4b"), Pack(4, 5200), 0.85, rss_mb=80.0)
-    assert (cost.u_encode, cost.u_match) == pytest.approx((0.25, 0.5), abs=1e-9)
-    assert (cost.t_encode_s, cost.t_match_s, cost.cpu_s) == pytest.approx((0.4, 1.5, 3.4), abs=1e-9)
-    volt_hours = 14.8 * 0.85 * 3600
-    total_j = (2.29 + 4.53 * 0.25) * 0.4 + (2.29 + 4.53 * 0.5) * 1.5
-    marginal_j = 4.53 * 0.25 * 0.4 + 4.53 * 0.5 * 1.5
-    assert cost.used_mah == pytest.approx(1000 * total_j / volt_hours, abs=1e-9)
-    assert cost.marginal_mah == pytest.approx(1000 * marginal_j / volt_hours, abs=1e-9)
-    assert cost.rss_mb == 80.0
 
 
 def test_step_does_not_mask_an_exception_before_its_cost_is_set():
