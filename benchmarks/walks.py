@@ -26,7 +26,6 @@ from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, AcceptRule, accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
-from edgevpr.runtime.recognise.opening import make_meter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.techniques import create
@@ -44,7 +43,7 @@ def config(**keys: object) -> Config:
 
 
 def meter() -> QueryMeter:
-    return make_meter(config(), load_board("this"))
+    return QueryMeter(load_board("this"))
 
 
 def frames_of(folder: Path) -> Iterator[Frame]:

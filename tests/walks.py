@@ -13,7 +13,6 @@ from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.boards import load_board
-from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
@@ -26,7 +25,7 @@ USUAL = WalkSettings(candidates=50)
 def query_meter(clock: FakeClock | None = None) -> QueryMeter:
     """A meter by a clock that moves when told to."""
     clock = clock or FakeClock()
-    return QueryMeter(load_board("rpi-4b"), Pack(4, 5200), 0.85, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
+    return QueryMeter(load_board("rpi-4b"), wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
 
 
 def map_of(path: Path, technique: Technique, frames: Iterable[Frame], **encoder) -> Path:

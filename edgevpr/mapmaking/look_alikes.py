@@ -12,7 +12,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Bools, Image
 from edgevpr.core.arrays import Mask as Shown
-from edgevpr.core.config import load_config
+from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame
@@ -37,7 +37,7 @@ from edgevpr.runtime.recognise.evidence import (
     log_share,
 )
 from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
-from edgevpr.runtime.recognise.opening import create_technique, make_meter
+from edgevpr.runtime.recognise.opening import create_technique
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -164,12 +164,12 @@ def find_look_alikes(
     places elsewhere, and yield what looks like it (None: nothing does). Yields nothing for a picture that the place was
     not made of, for a place without a position, or for a technique without a confidence. Raises MapError for a map that
     cannot be read."""
-    technique, config = create_technique(place_map), load_config(None, {})
+    technique = create_technique(place_map)
     if not list_evidence_kinds(technique.spec):
         return
     index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-    rule = accept_rule(technique, config.match, 1, read_calibration_for(place_map))
-    search = MapSearch(technique, place_map, index, rule, meter=make_meter(config, load_board("this")))
+    rule = accept_rule(technique, MatchConfig(), 1, read_calibration_for(place_map))
+    search = MapSearch(technique, place_map, index, rule, meter=QueryMeter(load_board("this")))
     for place_id, image, mask in pictures:
         slot = search.slots.get(place_id)
         if slot is None or np.isnan(index.lat_deg[slot]):

@@ -24,6 +24,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove
 from edgevpr.places.mapinfo import describe_map
 from edgevpr.power.boards import load_board
+from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.preflight.pick import camera_setting, pick_technique
 from edgevpr.runtime.recognise.calibration import MapCalibration
 from edgevpr.runtime.recognise.encoder import FrameEncoder
@@ -32,7 +33,6 @@ from edgevpr.runtime.recognise.levelling import lens_of, make_levelling, read_mo
 from edgevpr.runtime.recognise.opening import (
     create_technique,
     made_for,
-    make_meter,
     open_salience_gate,
     warn_of_other_pictures,
 )
@@ -283,7 +283,7 @@ def calibrate_map(
         encoder_of(config, pictures, technique),
         place_map,
         config.match,
-        make_meter(config, load_board("this")),
+        QueryMeter(load_board("this")),
         frames,
         lambda asked, total: shown(asked, total, "calibrating"),
     )

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import psutil
 
+from edgevpr.core.config import BatteryConfig
 from edgevpr.core.types import NO_COST, QueryCost, StageCost, Steps
 from edgevpr.power import machine
 from edgevpr.power.boards import Board
-from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, stage_energy_j
+from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, parse_pack, stage_energy_j
 
 Clock = Callable[[], float]
 _KEPT_WAITING = 0.15  # of busy time; a thread off the CPU for more was kept waiting by other programs
@@ -41,21 +42,22 @@ def stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process
 
 
 class QueryMeter:
-    """Measures the steps of one query after another, and the charge that each query draws from the pack of a board.
-    `wall_clock` and `cpu_clock` (all threads) return seconds, `memory_mb` the resident memory of this process."""
+    """Measures the steps of one query after another, and the charge that each draws from the `battery` (None: any,
+    where only seconds count). `wall_clock` and `cpu_clock` (all threads) return seconds, `memory_mb` the resident
+    memory of this process."""
 
     def __init__(
         self,
         board: Board,
-        pack: Pack,
-        regulator_efficiency: float,
+        battery: BatteryConfig | None = None,
         *,
         wall_clock: Clock = time.perf_counter,
         cpu_clock: Clock = time.process_time,
         memory_mb: Callable[[], float] = machine.rss_mb,
     ) -> None:
         self.board = board
-        self._pack, self._regulator_efficiency = pack, regulator_efficiency
+        battery = battery or BatteryConfig()
+        self._pack, self._regulator_efficiency = parse_pack(battery.pack), battery.regulator_efficiency
         self._wall_clock, self._cpu_clock = wall_clock, cpu_clock
         self._memory_mb = memory_mb
         self._taken: dict[str, StageCost] = {}

@@ -8,7 +8,6 @@ from fakes import FakeClock
 
 from edgevpr.core.types import NO_COST, StageCost
 from edgevpr.power.boards import load_board
-from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import OwnLoad, QueryMeter, stage
 
 
@@ -42,7 +41,7 @@ def test_step_does_not_mask_an_exception_before_its_cost_is_set():
             raise Ended
         return 0.0
 
-    meter = QueryMeter(load_board("generic-x86"), parse_pack("4S5200"), 0.85, wall_clock=counted)
+    meter = QueryMeter(load_board("generic-x86"), wall_clock=counted)
     meter.begin()
     with pytest.raises(Ended), meter.step("encode"):
         pass

@@ -11,7 +11,6 @@ from pictures import textured
 from edgevpr.core.arrays import Image
 from edgevpr.core.config import Config, load_config
 from edgevpr.power.boards import load_board
-from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.flight import flight as flight_module
 from edgevpr.runtime.flight.autopilot import ToAutopilot
@@ -114,8 +113,8 @@ def pictures(count: int, first: int = 0) -> list[Image]:
 
 def metered(config: Config, recogniser: Recogniser, clock: FakeClock) -> QueryMeter:
     """The meter of queries by the flight's own clock."""
-    pack, efficiency = parse_pack(config.battery.pack), config.battery.regulator_efficiency
-    return QueryMeter(recogniser.meter.board, pack, efficiency, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
+    board = recogniser.meter.board
+    return QueryMeter(board, config.battery, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
 
 
 def flight_meter(flight: Flight, kind: type[FlightMeter] = FlightMeter, **more) -> FlightMeter:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.core.config import bounded, load_config
+from edgevpr.core.config import BatteryConfig, Config, MatchConfig, bounded
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.core.types import NO_COST, Frame, StageCost
@@ -32,14 +32,13 @@ from edgevpr.places.retrieve import elsewhere
 from edgevpr.places.sequence import make_sequence_search, sequence_length
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack, queries_ah
-from edgevpr.power.meter import query_cost
+from edgevpr.power.meter import QueryMeter, query_cost
 from edgevpr.runtime.preflight.probe import disk_bytes, ram_bytes
 from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.hints import RecordedPrior, explain_useless, parse_known_fields
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.opening import make_meter
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -127,10 +126,10 @@ def answer_queries(
     spec = technique.spec
     prior, tags = read_known(options.known, dataset, spec, options.sequence)
     together = sequence_length(spec, options.sequence)
-    source, meter = open_source(str(dataset.ref_dir), live=False), make_meter(load_config(None), load_board("this"))
+    source, meter = open_source(str(dataset.ref_dir), live=False), QueryMeter(load_board("this"))
     frames = progress(read_frames(source), source.total, f"{spec.name}: references")
     with mapped(frames, technique, dataset.ref_dir, progress) as (place_map, index, not_done):
-        rule = accept_rule(technique, load_config(None).match, together, read_calibration_for(place_map))
+        rule = accept_rule(technique, MatchConfig(), together, read_calibration_for(place_map))
         follows = options.follow and together == 1 and rule.sure is not None
 
         def open_recogniser(length: int, follows: bool) -> Recogniser:
@@ -179,7 +178,7 @@ def mapped(
         with PlaceMap.create(path, technique.spec) as place_map:
             build_map(frames, FrameEncoder(technique=technique), place_map)
             pictures = FlownPictures(source=str(images)) if images else None
-            finished = finish_map(place_map, technique, load_config(None), pictures, show)
+            finished = finish_map(place_map, technique, Config(), pictures, show)
         with PlaceMap.open(path) as place_map:
             index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
             # The folder is gone when the sentences are read, and another one in the next run.
@@ -197,13 +196,13 @@ def summarise(
     `options` on a map to which something could not be done."""
     queries, references = len(answers), len(dataset.references)
     sequence = sequence_length(technique.spec, options.sequence)
-    config, board = load_config(None), load_board("this")
-    efficiency = config.battery.regulator_efficiency
+    battery, board = BatteryConfig(), load_board("this")
+    efficiency = battery.regulator_efficiency
     encoding, matching = (
         sum(costs, start=NO_COST) * (1 / queries)
         for costs in ([answer.encoding for answer in answers], [answer.matching for answer in answers])
     )
-    cost = query_cost(encoding, matching, board, parse_pack(config.battery.pack), efficiency, rss_mb=0.0)
+    cost = query_cost(encoding, matching, board, parse_pack(battery.pack), efficiency, rss_mb=0.0)
     return metrics.TechniqueResult(
         technique=labelled(technique.spec.name, technique.spec.form),
         weights=find_weights(technique.spec),
@@ -230,7 +229,7 @@ def summarise(
         known=options.known and ",".join(parse_known_fields(options.known)),
         ah_assumes=(
             f"{board.title}, {board.idle_w:g} W idle and {board.full_w:g} W at full load ({board.source}), "
-            f"pack {config.battery.pack}, regulator efficiency {efficiency:g}"
+            f"pack {battery.pack}, regulator efficiency {efficiency:g}"
         ),
     )
 

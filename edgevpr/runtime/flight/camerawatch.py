@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from edgevpr.core.config import Config, SourceConfig
+from edgevpr.core.config import SourceConfig
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
+from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
-from edgevpr.runtime.recognise.opening import make_meter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -54,9 +54,9 @@ class MirrorWatch:
     """Reports once if pictures are mirrored, as by a setting of the camera: they never match. Where many queries in a
     row have no match, and none had one before, a picture is tried flipped left to right, and top to bottom."""
 
-    def __init__(self, notifier: Notifier, recogniser: Recogniser, config: Config) -> None:
+    def __init__(self, notifier: Notifier, recogniser: Recogniser) -> None:
         self._notifier, self._recogniser = notifier, recogniser
-        self._meter = make_meter(config, recogniser.meter.board)  # its own: that of the flight may be recorded
+        self._meter = QueryMeter(recogniser.meter.board)  # its own: that of the flight may be recorded
         self._misses = self._tries = self._matches = 0
         self._next_try = _MISSES_TO_TRY
 

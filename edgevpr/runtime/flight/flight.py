@@ -85,7 +85,7 @@ class Flight:
             self._map_watch.update,
             Sight(notifier).update,
             TurnWatch(notifier, config.source).update,
-            MirrorWatch(notifier, parts.recogniser, config).update,
+            MirrorWatch(notifier, parts.recogniser).update,
             HeightWatch(notifier, parts.autopilot).update,
             gps.update,
             self._surveyor.update,

@@ -20,7 +20,6 @@ from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import MapIdentity, read_identity
-from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.flight.flightio import FlightIO
 from edgevpr.runtime.preflight.pick import explain_technique
@@ -63,8 +62,7 @@ def _make_query_meter(config: Config, io: FlightIO) -> QueryMeter:
     """Make the meter of the queries of a flight, by its clock."""
     return QueryMeter(
         io.board,
-        parse_pack(config.battery.pack),
-        config.battery.regulator_efficiency,
+        config.battery,
         wall_clock=io.clock.wall_s,
         cpu_clock=io.clock.process_cpu_s,
         memory_mb=io.machine.rss_mb,

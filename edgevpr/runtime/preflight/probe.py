@@ -22,7 +22,6 @@ from edgevpr.places.rows import MOST_LANDMARK_BYTES
 from edgevpr.places.sequence import bytes_beside_place, make_sequence_search, sequence_length
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
-from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder, explain_failure
@@ -36,7 +35,6 @@ _TRIES = 5  # of each picture, at most
 _STEPS = ("encode", "scan", "compare", "verify")
 _SCANNED = 4096
 _SCANNED_BYTES = 8 << 20  # at most: a small board has no more to spare before the map is loaded
-_ANY_PACK = Pack(cells=1, capacity_mah=1)  # only seconds count here, not charge
 _LINK_MB = 12.0  # what importing pymavlink adds to the resident memory (measured on x86-64)
 
 
@@ -96,7 +94,7 @@ def probe(technique: Technique, *, tried_s: float = 0.0, meter: QueryMeter | Non
     Each picture is tried again for about `tried_s` seconds per map, and the least CPU time counts, since the time of
     other programs is no cost of the technique. Raises ModelError for a technique that fails on a picture.
     """
-    bench = _Bench(technique, meter or QueryMeter(load_board("this"), _ANY_PACK, 1.0), tried_s)
+    bench = _Bench(technique, meter or QueryMeter(load_board("this")), tried_s)
     spec, candidates = technique.spec, technique.candidates
     with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", spec) as trial_map:
         peak_is_new = machine.forget_peak()

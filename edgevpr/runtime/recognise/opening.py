@@ -15,7 +15,6 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove, require_regular
 from edgevpr.places.sequence import bytes_beside_place, make_sequence_search, sequence_length
 from edgevpr.power.boards import Board
-from edgevpr.power.equations import parse_pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
@@ -64,7 +63,7 @@ def open_recogniser(
         prior = RecordedPrior(known, technique.spec.heading_within_deg)
         if narrowed:
             prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
-        meter = meter or make_meter(config, board)
+        meter = meter or QueryMeter(board, config.battery)
         recogniser = _recogniser(config, technique, place_map, index, meter, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser
@@ -89,7 +88,7 @@ def open_learning(
         budget_bytes, beside_bytes = _ram(config, board, technique)
         growing = GrowingIndex(place_map, technique, budget_bytes=budget_bytes, room=_ROOM, beside_bytes=beside_bytes)
         prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
-        meter, follows = meter or make_meter(config, board), config.match.follow
+        meter, follows = meter or QueryMeter(board, config.battery), config.match.follow
         recogniser = _recogniser(config, technique, place_map, growing.index, meter, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser, growing
@@ -129,11 +128,6 @@ def open_salience_gate(config: SalienceConfig, threads: int = 1) -> Gate | None:
     if not (memorability or detector or config.entropy > 0):
         raise ConfigError("`salience.use` is true, and every criterion is off: raise a threshold, or use no salience.")
     return Gate(config, memorability, detector)
-
-
-def make_meter(config: Config, board: Board) -> QueryMeter:
-    """Make the meter of time and battery charge of queries, on a board fed by the configured battery pack."""
-    return QueryMeter(board, parse_pack(config.battery.pack), config.battery.regulator_efficiency)
 
 
 def made_for(threads: int | None, name: str, settings: Settings | None = None) -> Technique:

@@ -14,7 +14,6 @@ from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.core.errors import ModelError
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
-from edgevpr.power.equations import Pack
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.preflight import choose as choosing
 from edgevpr.runtime.preflight import pick
@@ -107,7 +106,7 @@ def test_probe_does_not_count_what_other_programs_take():
 
     technique.encode = encode_slowly
     clocks = {"wall_clock": lambda: now["wall"], "cpu_clock": lambda: now["cpu"]}
-    costs = probe(technique, tried_s=0.2, meter=QueryMeter(board(), Pack(1, 1), 1.0, **clocks))
+    costs = probe(technique, tried_s=0.2, meter=QueryMeter(board(), **clocks))
     assert costs.encode == StageCost(pytest.approx(0.1), pytest.approx(0.1))
 
 

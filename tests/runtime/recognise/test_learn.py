@@ -14,12 +14,12 @@ from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.places.index import GrowingIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
+from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.learn import Learner, check_positions
 from edgevpr.runtime.recognise.locate import at_place
-from edgevpr.runtime.recognise.opening import make_meter
 from edgevpr.runtime.recognise.place_filter import Followed
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -42,7 +42,7 @@ class Bench:
             FrameEncoder(technique=TECHNIQUE),
             self.map,
             Matcher(self.growing.index, AcceptRule(min_score=0.0, min_margin=0.0, neighbour_m=50.0)),
-            make_meter(load_config(None), load_board("this")),
+            QueryMeter(load_board("this")),
             settings=WalkSettings(),
         )
         self.learner = Learner(
