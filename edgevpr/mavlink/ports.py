@@ -11,7 +11,7 @@ import struct
 import termios
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -71,12 +71,20 @@ class Port:
         self._sock.close()
 
 
+def _open_udp(attach: Callable[[socket.socket, tuple[str, int]], None], host: str, port: int) -> socket.socket:
+    """Return a UDP socket, attached to an address by `bind` or `connect`; one that cannot be is closed."""
+    with ExitStack() as closes:
+        sock = closes.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        attach(sock, (host, port))
+        closes.pop_all()
+    return sock
+
+
 class UdpOutPort(Port):
     """A UDP socket that is connected to one address: the operating system drops packets from any other."""
 
     def __init__(self, host: str, port: int) -> None:
-        super().__init__(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        self._sock.connect((host, port))
+        super().__init__(_open_udp(socket.socket.connect, host, port))
 
     # A datagram that no program received makes the next call fail, once; so `write` tries twice.
 
@@ -97,8 +105,7 @@ class UdpInPort(Port):
 
     def __init__(self, host: str, port: int) -> None:
         # No SO_REUSEADDR: with it, a second program on the port would silently take the first one's datagrams.
-        super().__init__(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        self._sock.bind((host, port))
+        super().__init__(_open_udp(socket.socket.bind, host, port))
         self._peer: Sender | None = None
         self.connected = False
 

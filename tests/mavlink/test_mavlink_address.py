@@ -1,3 +1,4 @@
+import os
 import re
 import socket
 
@@ -64,17 +65,21 @@ def test_a_link_to_the_ground_alone_is_refused():
     ],
 )
 def test_a_wrong_link_is_a_wrong_request_which_a_service_must_not_repeat(link):
+    before = os.listdir("/proc/self/fd")
     with pytest.raises(LinkAddressError) as caught:
         open_port(parse_link(link))
     assert caught.value.exit_code == 2
+    assert os.listdir("/proc/self/fd") == before, "it is closed"
 
 
 def test_what_may_end_by_itself_is_no_wrong_request():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
+        before = os.listdir("/proc/self/fd")
         with pytest.raises(LinkError) as caught:
             open_port(parse_link(f"udpin:127.0.0.1:{other.getsockname()[1]}"))
         assert caught.value.exit_code == 1
+        assert os.listdir("/proc/self/fd") == before, "it is closed"
     with pytest.raises(LinkError) as caught:
         open_port(parse_link("tcp:no-such-drone.local:5760"))
     assert caught.value.exit_code == 1, "a host that announces itself may not be up yet"
