@@ -5,7 +5,6 @@ Every picture carries its number in every band of its rows, so that what is deli
 
 import random
 import socket
-import subprocess
 import tempfile
 import threading
 import time
@@ -16,8 +15,8 @@ from functools import partial
 from pathlib import Path
 
 import cv2
-import imageio_ffmpeg
 import numpy as np
+from encoders import Encoder, describe_rtp
 from loopback import free_port
 from numbered_pictures import HEIGHT, WIDTH, numbers_in, picture
 from rtsp_camera import RtspCamera
@@ -26,15 +25,16 @@ from edgevpr.frames.decoding import Fetched, WholePictures
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
 
-_X264 = ("-c:v", "libx264", "-preset", "ultrafast", "-tune", "zerolatency", "-pix_fmt", "yuv420p", "-g", "30")
-_ENCODERS = {
-    "H.264": _X264,
-    "H.264, refreshed bit by bit": (*_X264, "-x264-params", "intra-refresh=1"),
-    "H.265": ("-c:v", "libx265", "-preset", "ultrafast", "-tune", "zerolatency", "-pix_fmt", "yuv420p", "-g", "30",
-              "-x265-params", "log-level=none"),
-    "MPEG-2": ("-c:v", "mpeg2video", "-g", "15", "-b:v", "2M"),
-    "MJPEG": ("-c:v", "mjpeg", "-pix_fmt", "yuvj420p", "-huffman", "0", "-q:v", "4"),
-}  # fmt: skip
+_X264 = {"preset": "ultrafast", "tune": "zerolatency", "g": "30"}
+_ENCODERS = {  # by FFmpeg's names of codecs and of their options
+    "H.264": ("libx264", _X264),
+    "H.264, refreshed bit by bit": ("libx264", _X264 | {"x264-params": "intra-refresh=1"}),
+    "H.265": ("libx265", _X264 | {"x265-params": "log-level=none"}),
+    "MPEG-2": ("mpeg2video", {"g": "15", "b": "2M"}),
+    "MJPEG": ("mjpeg", {"huffman": "default", "threads": "1", "qmin": "4", "qmax": "4"}),
+}
+_TS_BYTES = 7 * 188  # of a datagram of MPEG-TS
+_RTCP = 200  # second byte of a packet that is no part of a picture
 _MJPEG = ("whole", "cut to 15 %", "bytes corrupted", "truncated")
 _LOSSY = (
     ("H.264", "MPEG-TS", (0.0, 0.1, 0.3, 0.5)),
@@ -133,33 +133,23 @@ class LossyCamera(Camera):
     """An encoder of which a share of the datagrams is lost: MPEG-TS over UDP, RTP described by an .sdp file, or an RTSP
     server behind such a lossy radio, which itself loses nothing."""
 
-    def __init__(self, film: Film, encoder: tuple[str, ...], transport: str, lost: float, seed: int) -> None:
+    def __init__(self, film: Film, encoder: tuple[str, dict[str, str]], transport: str, lost: float, seed: int) -> None:
         super().__init__(film)
-        self._lost, self._random, self._filmed = lost, random.Random(seed), threading.Event()
-        self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._in.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 21)
-        self._in.bind(("127.0.0.1", 0))
-        self._in.settimeout(0.2)
-        inner, outer = self._in.getsockname()[1], free_port()
-        self._viewer = "127.0.0.1", outer
-        self._count_begun, self._stamp = (self._in_ts if transport == "MPEG-TS" else self._in_rtp), b""
+        (self._codec, self._options), self._lost, self._random = encoder, lost, random.Random(seed)
+        self._form = "mpegts" if transport == "MPEG-TS" else "rtp"
+        self._viewer = "127.0.0.1", free_port()
+        self.uri = f"udp://127.0.0.1:{self._viewer[1]}"
         self._folder = tempfile.TemporaryDirectory()
-        sdp = Path(self._folder.name) / "camera.sdp"
-        target = ["-f", "rtp", "-sdp_file", str(sdp), f"rtp://127.0.0.1:{inner}?pkt_size=1200"]
-        if transport == "MPEG-TS":
-            target = ["-f", "mpegts", f"udp://127.0.0.1:{inner}?pkt_size=1316"]
-        self._encoder = _encoder(film, encoder, target)
-        self._start(self._feed, self._hand_on)
         self._server: RtspCamera | None = None
-        self.uri = f"udp://127.0.0.1:{outer}"
-        if transport != "MPEG-TS":
-            while not (sdp.exists() and f"m=video {inner} " in sdp.read_text() and sdp.read_text().endswith("\n")):
-                time.sleep(0.02)
-            sdp.write_text(sdp.read_text().replace(f"m=video {inner} ", f"m=video {outer} "))
-            self.uri = str(sdp)
+        sdp = describe_rtp(self._codec, self._viewer[1])
+        if transport == "RTP":
+            path = Path(self._folder.name) / "camera.sdp"
+            path.write_text(sdp)
+            self.uri = str(path)
         if transport == "RTSP":
-            self._server = RtspCamera(sdp.read_text(), outer, free_port())
+            self._server = RtspCamera(sdp, self._viewer[1], free_port())
             self.uri = self._server.uri
+        self._start(self._send)
 
     def close(self) -> None:
         super().close()
@@ -167,53 +157,23 @@ class LossyCamera(Camera):
             self._server.switch_off()
         self._folder.cleanup()
 
-    def _feed(self) -> None:
-        with self._encoder.stdin as pipe:
-            pipe.write(picture(0).tobytes())  # the encoder says what it sends only when it has seen one
-            pipe.flush()
+    def _send(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            give = partial(self._hand_on, out)
+            encoder = Encoder(give, self._form, self._codec, self._film.rate_hz, (WIDTH, HEIGHT), self._options)
             self._rolls.wait()
-            for _, shown in self._film.play():
-                pipe.write(shown.tobytes())
-                pipe.flush()
-        self._encoder.wait()
-        self._filmed.set()
-
-    def _hand_on(self) -> None:
-        number = -2  # the first picture is shown twice
-        with self._in, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            while True:
-                try:
-                    datagram = self._in.recv(65536)
-                except TimeoutError:
-                    if self._filmed.is_set():
-                        break
-                    continue
-                for _ in range(self._count_begun(datagram)):
-                    number += 1
-                    if number >= 0:
-                        self.sent_s[number] = time.monotonic()
-                if len(self.sent_s) <= _WHOLE_AT_FIRST or self._random.random() >= self._lost:
-                    out.sendto(datagram, self._viewer)
+            for number, shown in self._film.play():
+                self.sent_s[number] = time.monotonic()
+                encoder.write(number, shown)
+            encoder.close()
         self.done.set()
 
-    def _in_ts(self, datagram: bytes) -> int:
-        """Count the pictures that begin in a datagram of MPEG-TS packets: the units of FFmpeg's first stream."""
-        packets = (datagram[start : start + 188] for start in range(0, len(datagram), 188))
-        return sum(packet[1] == 0x41 and packet[2] == 0 for packet in packets)
-
-    def _in_rtp(self, datagram: bytes) -> int:
-        """Count the pictures that begin in an RTP datagram, one at most: each has a time stamp of its own."""
-        before, self._stamp = self._stamp, datagram[4:8]
-        return before != self._stamp
-
-
-def _encoder(film: Film, codec: tuple[str, ...], target: list[str]) -> subprocess.Popen:
-    source = ["-f", "rawvideo", "-pix_fmt", "bgr24", "-s", f"{WIDTH}x{HEIGHT}", "-r", f"{film.rate_hz:g}", "-i", "-"]
-    return subprocess.Popen(
-        [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *source, *codec, *target],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-    )
+    def _hand_on(self, out: socket.socket, data: bytes) -> None:
+        size = _TS_BYTES if self._form == "mpegts" else len(data)
+        for datagram in (data[start : start + size] for start in range(0, len(data), size)):
+            is_rtcp = self._form == "rtp" and datagram[1] == _RTCP
+            if not is_rtcp and (len(self.sent_s) <= _WHOLE_AT_FIRST or self._random.random() >= self._lost):
+                out.sendto(datagram, self._viewer)
 
 
 def streams(seed: int) -> dict[str, Callable[[Film], Camera]]:

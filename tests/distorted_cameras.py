@@ -40,31 +40,6 @@ class DistortedCamera:
         spots = cv2.perspectiveTransform(self.rays, ground_from_ray).astype(np.float32)
         return cv2.remap(ground, spots, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
 
-    def photograph_board(self, turn, middle):
-        """What it takes of a board of 10x7 squares, turned by a rotation vector, its middle at a point right of, below
-        and before the camera; in squares."""
-        columns, rows, px = 10, 7, 40
-        board = np.full(((rows + 2) * px, (columns + 2) * px), 255, np.uint8)  # with a white rim
-        for row, column in np.ndindex(rows, columns):
-            if (row + column) % 2 == 0:
-                board[(row + 1) * px : (row + 2) * px, (column + 1) * px : (column + 2) * px] = 20
-        axes = cv2.Rodrigues(np.array(turn, float))[0]
-        board_from_ray = np.linalg.inv(np.column_stack([axes[:, 0], axes[:, 1], middle]))
-        pixel_from_board = np.array(
-            [[px, 0, (columns / 2 + 1) * px - 0.5], [0, px, (rows / 2 + 1) * px - 0.5], [0, 0, 1]]
-        )
-        spots = cv2.perspectiveTransform(self.rays, pixel_from_board @ board_from_ray).astype(np.float32)
-        seen = cv2.remap(board, spots, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=120)
-        return cv2.GaussianBlur(seen, (3, 3), 0.7)
-
-    def photographs_of_board(self, number, seed=0):
-        """Pictures of the board in various places and attitudes, of which some show only a part of it."""
-        rng, (height, width) = np.random.default_rng(seed), self.rays.shape[:2]
-        for _ in range(number):
-            row, column = (round(rng.uniform(0.15, 0.85) * side) for side in (height, width))
-            turn, away = rng.uniform(-0.5, 0.5, 3), rng.uniform(6, 14) * self.matrix[0, 0] / 352
-            yield self.photograph_board(turn, np.array([*self.rays[row, column], 1]) * away)
-
     def write(self, path):
         """Write its calibration, as OpenCV's program does, and return the path."""
         storage = cv2.FileStorage(str(path), cv2.FileStorage_WRITE)

@@ -2,23 +2,19 @@
 
 import itertools
 import socket
-import struct
 import threading
 import time
 from contextlib import suppress
 
-import av
 import cv2
 import numpy as np
+from encoders import Encoder, describe_rtp
 
 WIDTH = 320
 HEIGHT = 240
 RATE_HZ = 10
 _NOISE = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
-_SDP = (
-    "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=camera\r\nc=IN IP4 127.0.0.1\r\nt=0 0\r\n"
-    "m=video 0 RTP/AVP 96\r\na=rtpmap:96 H264/90000\r\na=control:track0\r\n"
-)
+_SDP = describe_rtp("libx264", 0) + "a=control:track0\r\n"
 
 
 def picture(number):
@@ -32,8 +28,8 @@ def encoded(number, extension=".jpg"):
 class Server:
     """Calls `answer` with each connection, a file of what it says and nothing else, in a thread of its own."""
 
-    def __init__(self, answer):
-        self._answer, self._listener = answer, socket.create_server(("127.0.0.1", 0))
+    def __init__(self, answer, port=0):
+        self._answer, self._listener = answer, socket.create_server(("127.0.0.1", port))
         self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
         threading.Thread(target=self._serve, daemon=True).start()
 
@@ -48,6 +44,8 @@ class Server:
             self._answer(connection, asked)
 
     def close(self):
+        with suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)  # else it listens until `accept` returns
         self._listener.close()
 
 
@@ -127,36 +125,15 @@ def rtsp(status="200 OK", *, refuses="DESCRIBE", header="X: 1", over_tcp="461", 
 
 def send_rtp(port, is_on, codec="libx264"):
     """Send RTP to a port of this machine until `is_on` is cleared."""
-    box = av.open(f"rtp://127.0.0.1:{port}?pkt_size=1200", "w", format="rtp")
-    stream = box.add_stream(codec, rate=RATE_HZ, options={"preset": "ultrafast", "tune": "zerolatency"})
-    stream.width, stream.height, stream.pix_fmt, stream.codec_context.gop_size = WIDTH, HEIGHT, "yuv420p", RATE_HZ // 2
-    number = 0
-    while is_on.is_set():
-        frame = av.VideoFrame.from_ndarray(picture(number), "bgr24").reformat(format="yuv420p")
-        frame.pts = number
-        for packet in stream.encode(frame):
-            box.mux(packet)
-        number += 1
+    options = (
+        {"preset": "ultrafast", "tune": "zerolatency"}
+        if codec.startswith("libx")
+        else {"huffman": "default", "threads": "1"}
+    )
+    encoder = Encoder(f"rtp://127.0.0.1:{port}", "rtp", codec, RATE_HZ, (WIDTH, HEIGHT), options | {"g": "5"})
+    for number in itertools.count():
+        if not is_on.is_set():
+            break
+        encoder.write(number, picture(number))
         time.sleep(1 / RATE_HZ)
-    box.close()
-
-
-def send_rtp_jpeg(port, is_on):
-    """The same with JPEG (RFC 2435), which FFmpeg sends without its end."""
-    sequence = 0
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for number in range(10_000):
-            jpeg = encoded(number)
-            tables = b"".join(part[3:67] for part in jpeg.split(b"\xff\xdb")[1:3])
-            scan_at = jpeg.index(b"\xff\xda")
-            scan = jpeg[scan_at + 2 + int.from_bytes(jpeg[scan_at + 2 : scan_at + 4], "big") : -2]
-            for at in range(0, len(scan), 1200):
-                last = 0x80 * (at + 1200 >= len(scan))
-                head = struct.pack(">BBHII", 0x80, 26 | last, sequence & 0xFFFF, number * 90_000 // RATE_HZ, 7)
-                head += struct.pack(">IBBBB", at, 1, 255, WIDTH // 8, HEIGHT // 8)
-                head += b"" if at else struct.pack(">BBH", 0, 0, len(tables)) + tables
-                sender.sendto(head + scan[at : at + 1200], ("127.0.0.1", port))
-                sequence += 1
-            if not is_on.wait(0) and number:
-                return
-            time.sleep(1 / RATE_HZ)
+    encoder.close()

@@ -3,15 +3,12 @@ is `python benchmarks/hostile.py --parts streams`."""
 
 from concurrent.futures import ThreadPoolExecutor
 
-import pytest
-
-pytest.importorskip("imageio_ffmpeg", reason="the cameras need ffmpeg (pip install imageio-ffmpeg)")
-
 import damaged_streams
+import pytest
 
 from edgevpr.frames import streams
 
-pytestmark = [pytest.mark.network, pytest.mark.process, pytest.mark.slow]
+pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 PICTURES, RATE_HZ = 200, 80.0
 WHOLE = ("MJPEG over HTTP, whole", "H.264 in MPEG-TS, 0% lost", "H.264 in RTSP, 0% lost")

@@ -9,8 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from answering_cameras import Server, read_request
+from encoders import Encoder, describe_rtp
 from fakes import FakeClock
-from loopback import PATIENCE_S, wait_until
+from loopback import PATIENCE_S, free_port, wait_until
+from numbered_pictures import HEIGHT, WIDTH, picture
+from rtsp_camera import RtspCamera
 
 from edgevpr.core.errors import SourceError
 from edgevpr.frames import live as live_module
@@ -21,14 +25,6 @@ from edgevpr.frames.shot import Condition, OpeningError, Refusal, Shot
 from edgevpr.frames.source import open_source
 
 
-@pytest.fixture
-def cameras():
-    pytest.importorskip("imageio_ffmpeg", reason="the test cameras need ffmpeg (pip install imageio-ffmpeg)")
-    import live_cameras
-
-    return live_cameras
-
-
 def next_frame(source):
     return wait_until(lambda: source.read(0.05))
 
@@ -37,31 +33,83 @@ def number(frame):
     return int(frame.name.split()[1])
 
 
+CODEC = "mpeg2video"
+
+
+@pytest.fixture
+def film():
+    """A function that sends moving ground by FFmpeg, until the test ends or what it returns is called."""
+    stops = []
+
+    def start(target, form, codec=CODEC):
+        is_over = threading.Event()
+
+        def send():
+            encoder = Encoder(target, form, codec, 60, (WIDTH, HEIGHT), {"g": "5", "b": "2M"})
+            for number in itertools.count():
+                if is_over.wait(1 / 60):
+                    break
+                encoder.write(number, picture(number))
+
+        thread = threading.Thread(target=send, daemon=True)
+        thread.start()
+        stops.append(lambda: (is_over.set(), thread.join()))
+        return stops[-1]
+
+    yield start
+    for stop in stops:
+        stop()
+
+
+def film_to_viewers(film, port):
+    """Serve MJPEG as FFmpeg does over HTTP; return what ends it."""
+    stops = []
+
+    def answer(connection, asked):
+        read_request(asked)
+        connection.sendall(b"HTTP/1.0 200 OK\r\nContent-Type: application/octet-stream\r\n\r\n")
+        ended = threading.Event()
+        stops.extend((film(connection.sendall, "mpjpeg", "mjpeg"), ended.set))
+        ended.wait(PATIENCE_S)
+
+    server = Server(answer, port)
+    return lambda: [stop() for stop in (server.close, *stops)]
+
+
+def camera_of(kind, film, tmp_path):
+    """The address of a camera, and a function that switches it on and returns the one that switches it off."""
+    port, inner = free_port(), free_port()
+    if kind == "http":
+        return f"http://127.0.0.1:{port}/", lambda: film_to_viewers(film, port)
+    if kind == "rtsp":
+        film(f"rtp://127.0.0.1:{inner}", "rtp")
+        sdp = describe_rtp(CODEC, inner)
+        return f"rtsp://127.0.0.1:{port}/camera", lambda: RtspCamera(sdp, inner, port).switch_off
+    if kind == "sdp":
+        (tmp_path / "camera.sdp").write_text(describe_rtp(CODEC, port))
+        return str(tmp_path / "camera.sdp"), lambda: film(f"rtp://127.0.0.1:{port}", "rtp")
+    return f"udp://127.0.0.1:{port}", lambda: film(f"udp://127.0.0.1:{port}?pkt_size=1316", "mpegts")
+
+
 @pytest.mark.network
-@pytest.mark.process
-@pytest.mark.parametrize("kind", ["udp", "tcp", "http", "rtsp", "sdp"])
-def test_stream_that_is_lost_is_reported_and_opened_again(kind, cameras, opened, tmp_path):
-    over_rtp = {"rtsp": cameras.RtspOverRtp, "sdp": cameras.RtpCamera}
-    camera = over_rtp[kind](tmp_path) if kind in over_rtp else cameras.FfmpegCamera(kind)
-    camera.switch_on()
-    try:
-        source = opened(camera.uri)
-        frame = next_frame(source)
-        assert frame.image.shape == (cameras.HEIGHT, cameras.WIDTH, 3)
-        assert frame.image.std() > 20  # the test picture, not a grey area
-        assert (source.state, source.ended) == ("streaming", False)
-        camera.switch_off()
-        wait_until(lambda: source.read(0.02) is None and source.condition is Condition.LOST)
-        assert ", reopening in " in source.state
-        camera.switch_on()
-        wait_until(lambda: source.read(0.05) and source.state == "streaming")
-        again = next_frame(source)
-        assert number(again) > number(frame)
-        assert again.t_mono_s > frame.t_mono_s
-    finally:
-        camera.switch_off()
-        if kind == "rtsp":
-            camera.scrap()
+@pytest.mark.parametrize("kind", ["udp", "http", "rtsp", "sdp"])
+def test_stream_that_is_lost_is_reported_and_opened_again(kind, film, opened, tmp_path):
+    uri, switch_on = camera_of(kind, film, tmp_path)
+    switch_off = switch_on()
+    source = opened(uri)
+    frame = next_frame(source)
+    assert frame.image.shape == (HEIGHT, WIDTH, 3)
+    assert frame.image.std() > 20  # the test picture, not a grey area
+    assert (source.state, source.ended) == ("streaming", False)
+    switch_off()
+    wait_until(lambda: source.read(0.02) is None and source.condition is Condition.LOST)
+    assert ", reopening in " in source.state
+    switch_off = switch_on()
+    wait_until(lambda: source.read(0.05) and source.state == "streaming")
+    again = next_frame(source)
+    assert number(again) > number(frame)
+    assert again.t_mono_s > frame.t_mono_s
+    switch_off()
 
 
 @pytest.mark.network

@@ -2,12 +2,13 @@
 
 import os
 import re
-import subprocess
 
 import cv2
 import numpy as np
 import photographs
 import pytest
+from encoders import Encoder
+from numbered_pictures import HEIGHT, WIDTH, picture
 
 from edgevpr.core.errors import SourceError, UsageError
 from edgevpr.core.types import Position
@@ -15,6 +16,7 @@ from edgevpr.frames.source import open_source, read_to_end, recorded_intervals
 
 RATE_HZ = 10
 SHADES = range(0, 250, 10)  # of the frames of the test video: 2.5 s
+IN_ORDER = {"bf": "0", "sc_threshold": "0"}  # each frame is predicted from the one before
 
 
 @pytest.fixture
@@ -171,11 +173,12 @@ def test_only_the_frames_that_are_asked_for_are_read(folder, video):
     assert all_frames(open_source(str(folder), live=False, only=[])) == []
 
 
-def film(path, *coding):
-    """Film three seconds of a test picture at 25 Hz, with a key frame every second."""
-    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the video is made with ffmpeg (pip install imageio-ffmpeg)")
-    picture = ["-f", "lavfi", "-i", "testsrc2=size=320x240:rate=25:duration=3"]
-    subprocess.run([ffmpeg.get_ffmpeg_exe(), "-v", "quiet", *picture, "-g", "25", *coding, str(path)], check=True)
+def film(path, codec, options, **container):
+    """Film three seconds at 25 Hz, with a key frame every second."""
+    encoder = Encoder(str(path), None, codec, 25, (WIDTH, HEIGHT), {"g": "25", **options}, **container)
+    for number in range(75):
+        encoder.write(number, picture(number))
+    encoder.close()
     return path
 
 
@@ -189,9 +192,8 @@ def time_of(frame):
     return frame.name.split("t=")[1]
 
 
-@pytest.mark.process
 def test_video_leaves_out_damaged_frames_and_those_built_on_them(tmp_path):
-    path = film(tmp_path / "flight.mkv", "-c:v", "libx264", "-bf", "0", "-sc_threshold", "0")
+    path = film(tmp_path / "flight.mkv", "libx264", IN_ORDER)
     whole, complaints, *_ = frames_and_complaints(path)
     assert (len(whole), complaints) == (75, [])
     damaged_file = bytearray(path.read_bytes())
@@ -209,11 +211,10 @@ def test_video_leaves_out_damaged_frames_and_those_built_on_them(tmp_path):
     assert "being damaged or built on damage: copy the video again." in complaint
 
 
-@pytest.mark.process
 def test_video_leaves_out_frames_predicted_from_one_that_is_missing(tmp_path):
     """Of an MPEG transport stream, recorded from a radio link that lost the packets of a whole frame: no decoder finds
     anything wrong with the frames after it."""
-    path = film(tmp_path / "flight.ts", "-c:v", "libx264", "-bf", "0", "-sc_threshold", "0")
+    path = film(tmp_path / "flight.ts", "libx264", IN_ORDER)
     images = {time_of(frame): frame.image for frame in frames_and_complaints(path)[0]}
     packets = [path.read_bytes()[start : start + 188] for start in range(0, path.stat().st_size, 188)]
     video = [index for index, packet in enumerate(packets) if packet[1] & 0x1F == 1 and packet[2] == 0]
@@ -226,11 +227,10 @@ def test_video_leaves_out_frames_predicted_from_one_that_is_missing(tmp_path):
     assert (len(complaints), len(frames) + damaged) == (1, 74)
 
 
-@pytest.mark.process
 @pytest.mark.parametrize("name", ["flight.mkv", "flight.avi", "flight.mp4"])
 def test_video_that_is_cut_short_is_reported(name, tmp_path):
-    index_first = ["-movflags", "+faststart"] if name.endswith("mp4") else []
-    path = film(tmp_path / name, "-c:v", "mpeg4", "-qscale:v", "3", *index_first)
+    index_first = {"movflags": "faststart"} if name.endswith("mp4") else {}
+    path = film(tmp_path / name, "mpeg4", {"qmin": "3", "qmax": "3"}, **index_first)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     frames, complaints, _, missing = frames_and_complaints(path)
     assert 10 < len(frames) < 60

@@ -20,7 +20,6 @@ from answering_cameras import (
     read_request,
     rtsp,
     send_rtp,
-    send_rtp_jpeg,
 )
 from loopback import PATIENCE_S, free_port, wait_until
 
@@ -165,7 +164,7 @@ def test_rtsp_of_a_camera_that_sends_by_udp_only(over_tcp, opened, serve):
         ("udp", send_rtp, "h264"),
         ("rtp", send_rtp, "h264"),
         ("udp", lambda *where: send_rtp(*where, "libx265"), "hevc"),
-        ("udp", send_rtp_jpeg, "mjpeg"),
+        ("udp", lambda *where: send_rtp(*where, "mjpeg"), "mjpeg"),
     ],
 )
 def test_rtp_at_a_udp_port_is_read_without_a_description(scheme, send, codec, opened, sending):

@@ -1,14 +1,13 @@
 """Streams of which no new picture comes, though they stay connected: sound goes on, or the codec changes."""
 
-import io
 import time
 from contextlib import closing, suppress
-from fractions import Fraction
 
 import av
 import numpy as np
 import pytest
 from answering_cameras import Server
+from encoders import Encoder
 from loopback import wait_until
 
 from edgevpr.frames.shot import Condition
@@ -17,70 +16,44 @@ from edgevpr.frames.source import open_source
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 SIZE_PX = 160, 120
+RATE_HZ = 20
 
 
 def picture(number):
     return np.random.default_rng(number).integers(0, 255, (*SIZE_PX[::-1], 3), np.uint8)
 
 
-class Out(io.RawIOBase):
-    """What a muxer writes goes to the viewer at once."""
-
-    def __init__(self, connection):
-        self._connection = connection
-
-    def writable(self):
-        return True
-
-    def write(self, data):
-        self._connection.sendall(bytes(data))
-        return len(data)
-
-
 def transport_stream(connection, codec="mpeg2video", **options):
-    """A muxer of MPEG-TS to a viewer, and its stream of pictures."""
-    at_once = {"max_interleave_delta": "1", "flush_packets": "1"}
-    box = av.open(Out(connection), "w", format="mpegts", container_options=at_once)
-    stream = box.add_stream(codec, rate=Fraction(20), options=options)
-    stream.width, stream.height, stream.pix_fmt = *SIZE_PX, "yuv420p"
-    stream.codec_context.gop_size = 5
-    return box, stream
-
-
-def send(box, stream, number):
-    frame = av.VideoFrame.from_ndarray(picture(number), "bgr24").reformat(format="yuv420p")
-    frame.pts = number
-    for packet in stream.encode(frame):
-        box.mux(packet)
+    """An encoder of MPEG-TS for a viewer."""
+    return Encoder(connection.sendall, "mpegts", codec, RATE_HZ, SIZE_PX, {"g": "5", **options})
 
 
 def pictures_then_sound(connection):
-    box, stream = transport_stream(connection)
-    sound = box.add_stream("mp2", rate=16000)
+    encoder = transport_stream(connection)
+    sound = encoder.box.add_stream("mp2", rate=16000)
     sound.layout = "mono"
     for number in range(10**6):
         if number < 60:
-            send(box, stream, number)
+            encoder.write(number, picture(number))
         samples = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), "s16", "mono")
         samples.sample_rate, samples.pts = 16000, number * 800
-        for packet in sound.encode(samples):
-            box.mux(packet)
-        time.sleep(0.05)
+        encoder.box.mux(sound.encode(samples))
+        time.sleep(1 / RATE_HZ)
 
 
 def one_codec(connection):
-    box, stream = transport_stream(connection, "libx264", tune="zerolatency")
+    encoder = transport_stream(connection, "libx264", tune="zerolatency")
     for number in range(10**6):
-        send(box, stream, number)
-        time.sleep(0.05)
+        encoder.write(number, picture(number))
+        time.sleep(1 / RATE_HZ)
 
 
 def two_codecs(connection):
     """The codec changes: from then on no packet is of the stream that the viewer has opened."""
-    box, stream = transport_stream(connection)
+    encoder = transport_stream(connection)
     for number in range(60):
-        send(box, stream, number)
-        time.sleep(0.05)
+        encoder.write(number, picture(number))
+        time.sleep(1 / RATE_HZ)
     one_codec(connection)
 
 
