@@ -14,6 +14,7 @@ WIDTH = 320
 HEIGHT = 240
 RATE_HZ = 10
 _NOISE = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+_RTCP = 200  # second byte of a packet that is no part of a picture
 _SDP = describe_rtp("libx264", 0) + "a=control:track0\r\n"
 
 
@@ -50,8 +51,11 @@ class Server:
 
 
 def read_request(asked):
-    """The first line of a request, and its headers by names in small letters; ValueError at the end."""
-    first, headers = asked.readline().decode(), {}
+    """The first line of a request, and its headers by names in small letters; ValueError at the end. Skips what an RTSP
+    viewer reports of the packets received."""
+    while (begin := asked.read(1)) == b"$":
+        asked.read(int.from_bytes(asked.read(3)[1:], "big"))
+    first, headers = (begin + asked.readline()).decode(), {}
     if not first:
         raise ValueError
     while line := asked.readline().decode().strip():
@@ -93,9 +97,11 @@ def multipart(kind="image/jpeg", extension=".jpg", has_length=True, *, connectio
     return answer
 
 
-def rtsp(status="200 OK", *, refuses="DESCRIBE", header="X: 1", over_tcp="461", authorization=None):
-    """A camera that answers the method `refuses` with `status`. It sends by UDP only: a request for TCP gets a 461, or
-    an "offer" of UDP. `authorization`: what it must be sent for DESCRIBE."""
+def rtsp(
+    status="200 OK", *, refuses="DESCRIBE", header="X: 1", over_tcp="461", authorization=None, sdp=_SDP, play=None
+):
+    """A camera that answers the method `refuses` with `status`. A request for TCP gets a 461, or an "offer" of UDP, or
+    "200": then `play` is called with the connection of each viewer. `authorization`: what it must be sent."""
 
     def answer(connection, asked):
         port, is_on = None, threading.Event()
@@ -105,22 +111,47 @@ def rtsp(status="200 OK", *, refuses="DESCRIBE", header="X: 1", over_tcp="461", 
                 first, headers = read_request(asked)
                 method, code, body, more = first.split()[0], "200 OK", "", "Public: DESCRIBE, SETUP, PLAY"
                 if method == "DESCRIBE":
-                    more, body = "Content-Type: application/sdp", _SDP
+                    more, body = "Content-Type: application/sdp", sdp
                 if method == "SETUP":
                     _, _, wanted = headers["transport"].partition("client_port=")
                     port = int(wanted.split("-")[0]) if wanted else None
                     more = f"Transport: RTP/AVP;unicast;client_port={wanted or '5000-5001'};server_port=7000-7001"
+                    if over_tcp == "200":
+                        more = "Transport: RTP/AVP/TCP;unicast;interleaved=0-1"
                     code = "461 Unsupported Transport" if not wanted and over_tcp == "461" else code
                 if method == refuses and (authorization is None or headers.get("authorization") != authorization):
                     code, more, body = status, header, ""
                 head = f"RTSP/1.0 {code}\r\nCSeq: {headers['cseq']}\r\nSession: 1\r\n{more}\r\n"
                 connection.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n{body}".encode())
-                if method == "PLAY":
+                if method == "PLAY" and play:
+                    play(connection)
+                elif method == "PLAY":
                     threading.Thread(target=send_rtp, args=(port, is_on), daemon=True).start()
         finally:
             is_on.clear()
 
     return answer
+
+
+class RtspCamera(Server):
+    """A camera at `uri` that hands the packets given to `send` to its viewers, by TCP (RFC 2326, section 10.12)."""
+
+    def __init__(self, sdp, port=0):
+        self._viewers = []
+        answer = rtsp(refuses="", over_tcp="200", sdp=f"{sdp}a=control:track0\r\n", play=self._viewers.append)
+        super().__init__(answer, port)
+        self.uri = f"rtsp://{self.address}/camera"
+
+    def send(self, packet):
+        for viewer in self._viewers:
+            with suppress(OSError):  # it has gone
+                viewer.sendall(bytes((0x24, packet[1] == _RTCP)) + len(packet).to_bytes(2, "big") + packet)
+
+    def close(self):
+        super().close()
+        for viewer in self._viewers:
+            with suppress(OSError):
+                viewer.shutdown(socket.SHUT_RDWR)
 
 
 def send_rtp(port, is_on, codec="libx264"):

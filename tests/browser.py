@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -23,21 +24,15 @@ def driven() -> Iterator[Any]:
         browser.close()
 
 
-class Opened:
-    """A page that is open, for `with`; at its end nothing may have been asked for, and nothing complained of."""
-
-    def __init__(self, browser, path, width_px=390):
-        self._browser, self._path, self._width_px = browser, path, width_px
-
-    def __enter__(self):
-        self._context = self._browser.new_context(viewport={"width": self._width_px, "height": 800})
-        page, self._said = self._context.new_page(), []
-        page.on("console", lambda message: self._said.append(message.text))
-        page.on("pageerror", lambda error: self._said.append(str(error)))
-        page.on("request", lambda asked: self._said.append(asked.url) if asked.url.startswith("http") else None)
-        page.goto(self._path.as_uri())
-        return page
-
-    def __exit__(self, *_):
-        self._context.close()
-        assert not self._said
+@contextmanager
+def opened(browser: Any, path: Path, width_px: int = 390) -> Iterator[Any]:
+    """A page that is open; at its end nothing may have been asked for, and nothing complained of."""
+    context = browser.new_context(viewport={"width": width_px, "height": 800})
+    page, said = context.new_page(), []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda asked: said.append(asked.url) if asked.url.startswith("http") else None)
+    page.goto(path.as_uri())
+    yield page
+    context.close()
+    assert not said

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from answering_cameras import RtspCamera
 from encoders import Encoder, describe_rtp
 from loopback import free_port
 from numbered_pictures import HEIGHT, WIDTH, numbers_in, picture
-from rtsp_camera import RtspCamera
 
 from edgevpr.frames.decoding import Fetched, WholePictures
 from edgevpr.frames.shot import Condition
@@ -147,14 +147,14 @@ class LossyCamera(Camera):
             path.write_text(sdp)
             self.uri = str(path)
         if transport == "RTSP":
-            self._server = RtspCamera(sdp, self._viewer[1], free_port())
+            self._server = RtspCamera(sdp)
             self.uri = self._server.uri
         self._start(self._send)
 
     def close(self) -> None:
         super().close()
         if self._server:
-            self._server.switch_off()
+            self._server.close()
         self._folder.cleanup()
 
     def _send(self) -> None:
@@ -172,7 +172,11 @@ class LossyCamera(Camera):
         size = _TS_BYTES if self._form == "mpegts" else len(data)
         for datagram in (data[start : start + size] for start in range(0, len(data), size)):
             is_rtcp = self._form == "rtp" and datagram[1] == _RTCP
-            if not is_rtcp and (len(self.sent_s) <= _WHOLE_AT_FIRST or self._random.random() >= self._lost):
+            if is_rtcp or (len(self.sent_s) > _WHOLE_AT_FIRST and self._random.random() < self._lost):
+                continue
+            if self._server:
+                self._server.send(datagram)
+            else:
                 out.sendto(datagram, self._viewer)
 
 

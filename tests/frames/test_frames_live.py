@@ -9,12 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from answering_cameras import Server, read_request
+from answering_cameras import RtspCamera, Server, read_request
 from encoders import Encoder, describe_rtp
 from fakes import FakeClock
 from loopback import PATIENCE_S, free_port, wait_until
 from numbered_pictures import HEIGHT, WIDTH, picture
-from rtsp_camera import RtspCamera
 
 from edgevpr.core.errors import SourceError
 from edgevpr.frames import live as live_module
@@ -76,15 +75,19 @@ def film_to_viewers(film, port):
     return lambda: [stop() for stop in (server.close, *stops)]
 
 
+def film_by_rtsp(film, port):
+    camera = RtspCamera(describe_rtp(CODEC, 0), port)
+    stop = film(camera.send, "rtp")
+    return lambda: (stop(), camera.close())
+
+
 def camera_of(kind, film, tmp_path):
     """The address of a camera, and a function that switches it on and returns the one that switches it off."""
-    port, inner = free_port(), free_port()
+    port = free_port()
     if kind == "http":
         return f"http://127.0.0.1:{port}/", lambda: film_to_viewers(film, port)
     if kind == "rtsp":
-        film(f"rtp://127.0.0.1:{inner}", "rtp")
-        sdp = describe_rtp(CODEC, inner)
-        return f"rtsp://127.0.0.1:{port}/camera", lambda: RtspCamera(sdp, inner, port).switch_off
+        return f"rtsp://127.0.0.1:{port}/camera", lambda: film_by_rtsp(film, port)
     if kind == "sdp":
         (tmp_path / "camera.sdp").write_text(describe_rtp(CODEC, port))
         return str(tmp_path / "camera.sdp"), lambda: film(f"rtp://127.0.0.1:{port}", "rtp")

@@ -192,22 +192,6 @@ def test_levelled_takes_from_the_vehicle_what_the_frame_does_not_know(ground):
     assert np.array_equal(by_frame.image, by_vehicle.image)
 
 
-@pytest.mark.parametrize("below", [False, True])
-def test_levelled_masks_a_display_where_it_goes(ground, below):
-    frame = taken(ground, heading_deg=90, roll_deg=15)
-    image = frame.image.copy()
-    image[:120, :200] = 255
-    overlay = np.ones(image.shape[:2], bool)
-    overlay[:122, :202] = False
-    found = levelled(replace(frame, image=image), None, LENS, FOOTPRINT_M, overlay=overlay, below=below)
-    clean = levelled(frame, None, LENS, FOOTPRINT_M, below=below)
-    assert np.array_equal(found.image[found.mask], clean.image[found.mask]), "nothing of it is left"
-    assert found.mask.sum() < clean.mask.sum()
-    assert not (found.mask & ~clean.mask).any()
-    still = levelled(replace(frame, heading_deg=None, roll_deg=0.0), None, LENS, FOOTPRINT_M, overlay=overlay)
-    assert still.mask is overlay
-
-
 def test_levelled_makes_a_large_picture_smaller_without_leaving_pixels_out():
     """Rows of one pixel, black and white in turns, become grey; a warp alone would make stripes of them."""
     stripes = np.zeros((3000, 4000), np.uint8)

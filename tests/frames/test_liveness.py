@@ -42,39 +42,37 @@ def test_source_is_lost_after_three_seconds_or_what_its_rate_allows(interval_s, 
     assert begins_s(watched, must_reopen, 7 * interval_s) == lost_s
 
 
-def test_first_picture_and_second_of_a_slow_camera_are_waited_for():
-    assert begins_s(liveness(), is_(Condition.LOST)) == 12.0
-    assert begins_s(liveness(1.0), is_(Condition.LOST), 1.0) == 12.0
-    assert liveness(0.0, 5.0).fault(10.0) is None
+LOST, DAMAGED, LATE = is_(Condition.LOST), is_(Condition.DAMAGED), is_(Condition.LATE)
 
 
-def test_source_opened_anew_is_given_time_for_a_key_frame_and_keeps_its_rate():
+@pytest.mark.parametrize(
+    ("new_s", "opened_s", "refusal", "wanted", "after_s"),
+    [
+        ((), None, None, LOST, 12.0),  # the first picture is waited for
+        ((1.0,), None, None, LOST, 12.0),  # and the second, of a slow camera
+        ((0.0, 0.1, 0.2, 60.0, 60.1), None, None, LOST, 3.0),  # one long pause does not make it slow
+        ((0.0, 0.1, 0.2), 20.0, None, LOST, 12.0),  # opened anew, it may wait for a key frame
+        ((0.0, 0.1), None, Refusal.DAMAGED, DAMAGED, 3.0),
+        ((0.0, 0.1), None, Refusal.DAMAGED, must_reopen, 5.0),
+        ((), None, Refusal.DAMAGED, must_reopen, 12.0),  # a key frame may be ten seconds away
+        ((0.0, 0.1), None, Refusal.LATE, LATE, 3.0),
+        ((0.0, 0.1), None, Refusal.LATE, must_reopen, 30.0),
+        ((), None, Refusal.LATE, LATE, 12.0),
+    ],
+)
+def test_source_without_a_usable_picture_has_a_fault_in_time(new_s, opened_s, refusal, wanted, after_s):
+    watched = liveness(*new_s)
+    if opened_s is not None:
+        watched.open(opened_s)
+    assert begins_s(watched, wanted, opened_s or max(new_s, default=0.0), refusal) == after_s
+
+
+def test_source_opened_anew_keeps_its_rate():
     watched = liveness(0.0, 0.1, 0.2)
     watched.open(20.0)
-    assert begins_s(watched, is_(Condition.LOST), 20.0) == 12.0
     watched.take(25.0)
     assert begins_s(watched, is_(Condition.LOST), 25.0) == 3.0
-
-
-def test_one_long_pause_does_not_make_a_source_slow():
-    watched = liveness(0.0, 0.1, 0.2, 60.0, 60.1)
-    assert begins_s(watched, is_(Condition.LOST), 60.1) == 3.0
-
-
-def test_source_of_which_no_picture_is_whole_is_damaged_and_opened_anew():
-    watched = liveness(0.0, 0.1)
-    assert begins_s(watched, is_(Condition.DAMAGED), 0.1, Refusal.DAMAGED) == 3.0
-    assert begins_s(watched, must_reopen, 0.1, Refusal.DAMAGED) == 5.0
-    assert begins_s(liveness(), must_reopen, 0.0, Refusal.DAMAGED) == 12.0, "a key frame may be ten seconds away"
-
-
-def test_source_of_unknown_age_is_late_and_opened_anew_after_half_a_minute():
-    watched = liveness(0.0, 0.1)
-    assert begins_s(watched, is_(Condition.LATE), 0.1, Refusal.LATE) == 3.0
-    assert "the age of its pictures is unknown" in watched.fault(4.0).text
-    assert begins_s(watched, must_reopen, 0.1, Refusal.LATE) == 30.0
-    first = liveness()
-    assert begins_s(first, is_(Condition.LATE), 0.0, Refusal.LATE) == 12.0, "it may wait for a key frame"
+    assert liveness(0.0, 5.0).fault(10.0) is None
 
 
 @pytest.mark.parametrize(

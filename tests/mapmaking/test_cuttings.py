@@ -16,7 +16,6 @@ from edgevpr.mapmaking.cuttings import SIDE_PX, OrthophotoSource, make_lattice
 from edgevpr.mapmaking.making import Cuttings
 from edgevpr.mapmaking.missions import Area, Waypoint
 from edgevpr.mapmaking.orthophoto import Orthophoto
-from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
 
@@ -151,30 +150,6 @@ def test_an_area_takes_places_of_the_same_grid_under_the_same_names(tmp_path):
         assert (frame.position.lat_deg, frame.position.lon_deg) == pytest.approx(
             (there.lat_deg, there.lon_deg), abs=1e-8
         )
-
-
-def test_only_the_places_that_are_asked_for_are_cut(tmp_path):
-    path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=400)
-    whole = frames_of(source_of(path, 80.0, 40.0))
-    asked = [whole[4], whole[2]]
-    cut = frames_of(source_of(path, 80.0, 40.0, only=[each.name for each in asked]))
-    assert [each.name for each in cut] == sorted(each.name for each in asked)
-    assert np.array_equal(cut[0].image, whole[2].image)
-
-
-def test_begin_reports_pixels_along_a_picture_and_too_few_are_refused(tmp_path, caplog):
-    path, technique = textured_raster(tmp_path / "o.tif", pixel_m=0.5), create("cohog", {"camera": "nadir"})
-    for footprint_m, expected in (
-        (80.0, ", 160 pixels along a picture"),
-        (40.0, ", 80 pixels along a picture, too few"),
-    ):
-        caplog.clear()
-        with caplog.at_level("INFO"):
-            Cuttings(orthophoto=str(path), footprint_m=footprint_m, spacing_m=20.0).open().begin(20.0, technique, iter)
-        assert expected in caplog.text
-        assert ("too few" in caplog.text) == (footprint_m == 40)
-    with pytest.raises(UsageError, match="has 30 pixels along a picture of 15 m"):
-        Cuttings(orthophoto=str(path), footprint_m=15.0, spacing_m=20.0).open()
 
 
 def test_places_under_cloud_are_counted(tmp_path):

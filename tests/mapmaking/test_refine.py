@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from edgevpr.cli.main import main
-from edgevpr.core.geodesy import distance_m, moved, offset_m
+from edgevpr.core.geodesy import distance_m, moved
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.images import read_image
 from edgevpr.lab.simulate.camera import Camera, lit, photograph
@@ -136,41 +136,6 @@ def test_refining_again_begins_with_what_was_recorded(map_path, capsys):
     said = capsys.readouterr().out
     assert "28 of 28 places refined" in said
     assert "place 10 (009.jpg): recorded 2" in said
-
-
-def test_a_fix_is_finer_than_the_places(flown, map_path, tmp_path, capsys):
-    """Pictures between the places: half a step beside each, turned and a little higher."""
-    folder, poses = flown
-    shot_of, _ = photographer(8)
-    (tmp_path / "asked").mkdir()
-    asked = [
-        dataclasses.replace(
-            pose, east_m=pose.east_m + 9, north_m=pose.north_m + 6, heading_deg=pose.heading_deg + 25, height_m=86.0,
-            roll_deg=0.0, pitch_deg=0.0,
-        )
-        for pose in poses[2:12:2]
-    ]  # fmt: skip
-    for number, pose in enumerate(asked):
-        cv2.imwrite(str(tmp_path / "asked" / f"{number}.jpg"), shot_of(pose))
-    main(["map", "refine", str(map_path), "--images", str(folder / "images")])
-    with PlaceMap.open(map_path) as place_map:
-        offsets = []
-        for place, pose in zip(place_map.places(), poses, strict=True):
-            true = to_position(pose)
-            offsets.append(offset_m(true.lat_deg, true.lon_deg, place.position.lat_deg, place.position.lon_deg))
-    common = np.mean(offsets, axis=0)  # what is left of the noise of all positions together
-    capsys.readouterr()
-    assert main(["match", str(map_path), "--images", str(tmp_path / "asked"), "--json"]) == 0
-    events = json.loads(capsys.readouterr().out)
-    for event, pose in zip(events, asked, strict=True):
-        assert event["accepted"], event["reason"]
-        where = event["position"]
-        true = to_position(pose)
-        off_m = np.subtract(offset_m(true.lat_deg, true.lon_deg, where["lat_deg"], where["lon_deg"]), common)
-        assert np.hypot(*off_m) < 4
-        assert abs((where["heading_deg"] - pose.heading_deg + 180) % 360 - 180) < 8
-        assert where["height_ratio"] == pytest.approx(86 / 80, abs=0.08)
-        assert where["accuracy_m"] < 12, event
 
 
 def some_of(built, path, numbers, position=lambda number, place: place.position):

@@ -55,14 +55,6 @@ def test_words_make_the_technique_work(kind, technique, folder, own_models, caps
     assert np.linalg.norm(vector) == pytest.approx(1, abs=1e-3)
 
 
-@pytest.mark.slow
-def test_the_same_pictures_give_the_same_file(folder, own_models, tmp_path):
-    for out in (own_models, tmp_path / "again"):
-        train(folder, out, "--kind", "vlad", "--count", "8")
-    first, again = ((out / "mine_vlad8.npz").read_bytes() for out in (own_models, tmp_path / "again"))
-    assert first == again
-
-
 def test_more_words_than_descriptors_allow_are_refused(folder, own_models):
     with pytest.raises(UsageError, match=r"at most \d+ words"):
         train(folder, own_models, "--kind", "vlad", "--count", "5000")

@@ -6,7 +6,7 @@ from dataclasses import replace
 from shutil import copyfile
 
 import pytest
-from browser import Opened
+from browser import opened
 from ground import STEP_M, places_in, position, write_positions
 
 from edgevpr.cli.main import main
@@ -46,7 +46,7 @@ def test_the_page_of_a_map_shows_its_places_and_what_is_amiss_with_them(browser,
     assert "looks like place 13: " in alike["Place 6: 05.png"]
     assert "looks like place 6: " in alike[f"Place 13: {TWIN}"]
     assert all("place 13: " in said for title, said in alike.items() if TWIN not in title), "they overlap with its twin"
-    with Opened(browser, out) as page:
+    with opened(browser, out) as page:
         assert page.locator("image").count() == 12
         page.focus("#step")
         for _ in range(5):

@@ -88,37 +88,6 @@ def test_names_in_the_log_are_text_and_nothing_else(tmp_path):
     assert not {"\x1b", "\u202e"} & set(content)
 
 
-@pytest.mark.parametrize(
-    ("lines", "end", "said"),
-    [
-        ([], True, "No picture became a query"),
-        (
-            [("unusable", {"reason": {"code": "UNUSABLE", "parameters": {"problem": "cut short"}}})],
-            True,
-            "No picture became a query",
-        ),
-        ([("query", query("a", located=None, position=None, fix=None))], True, "No place has a position"),
-        ([("query", query("a"))], False, "has no last line: it was cut off"),
-        ([("query", query("a"))], True, "no report of the autopilot"),
-    ],
-)
-def test_a_page_says_what_is_missing(tmp_path, lines, end, said):
-    data = data_of(page(write_log(tmp_path / "log", *lines, end=end)))
-    assert any(said in warning for warning in data["warnings"])
-    assert bool(data["ground"]) == any(fields.get("position") for _, fields in lines)
-
-
-def test_matches_far_from_gps_can_be_chosen(tmp_path):
-    off_deg = {"near": 1e-5, "far": 1e-3}
-    at = {"t_frame_s": 1001.0, "vehicle": {"gps": {"lat_deg": 50.0, "lon_deg": 8.0, "t_s": 1001.0}}}
-    lines = [
-        ("query", query(name, **at, located={"lat_deg": 50.0 + off, "lon_deg": 8.0})) for name, off in off_deg.items()
-    ]
-    data = data_of(page(write_log(tmp_path / "log", *lines)))
-    assert ["match over 15 m from GPS", "refused", 1] in data["groups"]
-    assert "111 m from GPS" in data["steps"][1]["said"][1]
-
-
 def test_positions_that_cross_the_date_line_stay_together(tmp_path):
     at = [{"position": None, "fix": None, "located": {"lat_deg": 0.0, "lon_deg": lon}} for lon in (179.999, -179.999)]
     data = data_of(page(write_log(tmp_path / "log", *(("query", query("a", **each)) for each in at))))

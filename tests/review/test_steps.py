@@ -4,7 +4,7 @@ import json
 import re
 
 import pytest
-from browser import Opened
+from browser import opened
 from ground import flown_over, places_in
 from logs import query, write_log
 
@@ -36,7 +36,7 @@ def made(tmp_path_factory):
 @pytest.fixture
 def page(browser, made):
     """The page on a phone, which must ask for nothing and complain of nothing."""
-    with Opened(browser, made) as there:
+    with opened(browser, made) as there:
         yield there
 
 
@@ -80,6 +80,6 @@ def test_damaged_log_still_has_its_steps(browser, tmp_path):
     broken = query("a", confidence="high", evidence=[], position={"lat_deg": 1e99}, located=None, fix=7, vehicle="?")
     log = write_log(tmp_path / "log", ("query", broken), ("query", {"query": None, "place": 1e14}))
     (tmp_path / "page.html").write_text(page_from(log), "utf-8")
-    with Opened(browser, tmp_path / "page.html") as page:
+    with opened(browser, tmp_path / "page.html") as page:
         assert page.inner_text("#which") == "1 of 2"
         assert page.locator(".view").count() == 0

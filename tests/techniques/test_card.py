@@ -6,24 +6,12 @@ from pictures import textured
 from tiny_networks import CARD, write_card, write_network
 
 from edgevpr import techniques
-from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.core.errors import EdgevprError, ModelError, UsageError
 from edgevpr.core.files import model_folders, shipped
-from edgevpr.techniques.card import card_names, find_weights, load_card, read_card
+from edgevpr.techniques.card import load_card, read_card
 from edgevpr.techniques.session import open_backbone
 
 SHA256 = "0" * 64
-
-
-def test_a_card_says_what_the_network_is(models):
-    write_network(models)
-    card = load_card("tiny")
-    assert (card.name, card.title, card.licence) == ("tiny", "A tiny network", "MIT")
-    assert card.file_path == models / "tiny.onnx"
-    assert (card.input.height, card.input.width, card.input.colour) == (24, 32, "grey")
-    assert card.outputs.features == "features"
-    assert card.is_technique
-    assert "tiny" in card_names()
 
 
 def test_the_users_card_of_a_name_comes_before_the_shipped_one(tmp_path, monkeypatch):
@@ -86,17 +74,6 @@ def test_a_missing_key_and_a_missing_card_are_said(models):
         load_card("tinny")
     with pytest.raises(ModelError, match=r"`\.\./tiny`"):
         load_card("../tiny")
-
-
-def test_the_weights_of_a_result_are_named(models):
-    write_network(models)
-    part = PartSpec((1,), "<f2")
-    assert find_weights(TechniqueSpec(name="hog", parameters={}, coarse=part)) is None
-    said = "tiny: A tiny network (MIT; made by a test)"
-    assert find_weights(TechniqueSpec(name="tiny", parameters={}, coarse=part, model_sha256=SHA256)) == said
-    assert (
-        find_weights(TechniqueSpec(name="calc", parameters={"model": "tiny"}, coarse=part, model_sha256=SHA256)) == said
-    )
 
 
 def test_a_card_makes_a_technique_of_its_name(models):

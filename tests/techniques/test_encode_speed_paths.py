@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.techniques import entropy, gradients
+from edgevpr.techniques import entropy
 
 
 def _wall(seed: int) -> np.ndarray:
@@ -47,14 +47,3 @@ def test_good_blocks_are_those_of_the_whole_map(name, cell_px):
     for threshold in (0.0, 0.4, 0.5, 1.0, *own.tolist(), *(own + 3e-4).tolist()):
         good = entropy.good_blocks(grey, "shannon", cell_px, threshold)
         np.testing.assert_array_equal(good, means >= threshold, err_msg=f"threshold {threshold}")
-
-
-@pytest.mark.parametrize(("bins", "signed"), [(8, True), (9, False)])
-def test_only_allowed_pixels_vote_in_every_strip(bins, signed):
-    grey = textured(11, 192, 64)
-    allowed = np.random.default_rng(12).random(grey.shape) < 0.5
-    some, others, all_of_them = (
-        gradients.orient_cells(grey, 16, bins, signed, allowed=mask) for mask in (allowed, ~allowed, None)
-    )
-    np.testing.assert_allclose(some + others, all_of_them, atol=1e-4)
-    assert (some[..., 0] < all_of_them[..., 0]).any()

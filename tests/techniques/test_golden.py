@@ -8,7 +8,7 @@ import pytest
 from pictures import textured
 
 from edgevpr.techniques import create, entropy
-from edgevpr.techniques.gradients import normalise_blocks, orient_cells, slow_patterns, waves
+from edgevpr.techniques.gradients import normalise_blocks, orient_cells
 
 pytestmark = pytest.mark.slow
 
@@ -81,18 +81,3 @@ def test_hog_is_the_cosine_of_whole_image_histograms():
     scores, _ = technique.coarse_scores(query, np.stack([query.coarse, other.coarse]))
     np.testing.assert_allclose(query.coarse, vectors[0], atol=2e-4)  # half precision
     np.testing.assert_allclose(scores, [1.0, vectors[0] @ vectors[1]], atol=1e-3)
-
-
-@pytest.mark.parametrize("bins", [2, 3, 5, 8, 9, 64])
-def test_waves_have_length_one_and_are_those_of_the_discrete_fourier_transform(bins):
-    np.testing.assert_allclose(waves(bins) @ waves(bins).T, np.eye(bins), atol=1e-5)
-    power = abs(np.fft.rfft(waves(bins), axis=1)) ** 2
-    assert power.argmax(axis=1).tolist() == [(number + 1) // 2 for number in range(bins)]
-    assert np.sort(power, axis=1)[:, :-1].max() < 1e-9 * bins
-
-
-@pytest.mark.parametrize("bins", [2, 3, 5, 8, 9, 64])
-def test_patterns_have_length_one_and_stand_at_right_angles(bins):
-    patterns = slow_patterns(bins).astype(float)
-    assert patterns.shape[0] == 4 * bins
-    np.testing.assert_allclose(patterns.T @ patterns, np.eye(patterns.shape[1]), atol=1e-6)

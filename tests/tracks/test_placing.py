@@ -12,7 +12,7 @@ from recordings import START_S, write_dataflash, write_gpx
 
 from edgevpr.cli.main import main
 from edgevpr.core.geodesy import moved
-from edgevpr.frames.positions import find_track, read_positions, read_track
+from edgevpr.frames.positions import read_positions
 from edgevpr.tracks.clock import clock_offset_s
 from edgevpr.tracks.record import read_record
 
@@ -139,35 +139,3 @@ def test_a_clock_that_is_off_by_seconds_is_set_by_how_the_pictures_move(capsys, 
     paths = [folder / f"{number}.jpg" for number in range(len(pictures))]
     times = [START_S + 2 * number for number in range(len(pictures))]
     assert clock_offset_s(read_record(straight).track, times, paths) is None, "another flight sets no clock"
-
-
-@pytest.fixture
-def film(tmp_path):
-    import av
-
-    path = tmp_path / "DJI_0001.MP4"
-    with av.open(str(path), "w", format="mp4") as out:
-        stream = out.add_stream("mpeg4", rate=5)
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        out.metadata["creation_time"] = datetime.fromtimestamp(START_S + 3600, timezone.utc).isoformat()
-        for number in range(25):
-            picture = np.repeat(textured(number, 48, 64)[:, :, None], 3, axis=2)
-            out.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        out.mux(stream.encode())
-    return path
-
-
-def test_subtitles_place_their_video_and_the_table_is_found_beside_it(capsys, caplog, film, folder, tmp_path):
-    lines = [f"{t}\n00:00:0{t},000 --> 00:00:0{t + 1},000\n[latitude: 50.00{t}] [longitude: 8.0]\n\n" for t in range(6)]
-    (tmp_path / "DJI_0001.SRT").write_text("".join(lines))
-    map_file = tmp_path / "m.gpkg"
-    build = ("map", "build", map_file, "--images", film, "--technique", "hog", "--rate-hz", 1, "--no-calibrate")
-    run(capsys, *build)
-    assert "DJI_0001.SRT --images" in caplog.text, "the subtitles are there, and nobody has read them"
-    map_file.unlink()
-    run(capsys, "positions", tmp_path / "DJI_0001.SRT", "--images", film)
-    assert find_track(film) == tmp_path / "DJI_0001.csv"
-    assert read_track(tmp_path / "DJI_0001.csv").interpolate_tag(1.5).position.lat_deg == pytest.approx(50.0015)
-    built = json.loads(run(capsys, *build, "--json").out)
-    assert (built["places"], built["without_position"]) == (5, 0)
-    assert "video" in refused(capsys, "positions", tmp_path / "DJI_0001.SRT", "--images", folder)

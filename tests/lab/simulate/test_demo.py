@@ -6,7 +6,6 @@ from functools import partial
 import cv2
 import pytest
 
-from edgevpr.core.errors import EdgevprError
 from edgevpr.lab.simulate import demo
 from edgevpr.lab.simulate.generated import later_flight, mapping_flight
 from edgevpr.lab.simulate.landscape import make_scene
@@ -31,10 +30,3 @@ def test_run_demo_maps_flies_and_draws(small, tmp_path):
     assert picture.shape == (1050, 2580, 3)
     assert picture.std() > 20
     assert "recall@1" in said
-
-
-def test_run_demo_names_a_command_that_fails(small, tmp_path, monkeypatch):
-    command = demo._command
-    monkeypatch.setattr(demo, "_command", lambda *words: command(*words, *(["--often"] if words[0] == "run" else [])))
-    with pytest.raises(EdgevprError, match=r"`edgevpr run.* 2"):
-        demo.run_demo(tmp_path / "out")
