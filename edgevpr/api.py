@@ -29,7 +29,7 @@ from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.reasons import Reason
 from edgevpr.core.types import Frame, Place, Position
 from edgevpr.mapmaking.making import Cuttings, FlownPictures, MadeMap, MapOrder, make_map
-from edgevpr.power.boards import load_board
+from edgevpr.power.boards import load_board, resolve_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -100,7 +100,8 @@ class Map:
         settings = load_config(config, wanted)
         source = settings.source
         known = ("heading", "height", "reach") if source.fov_deg or source.lens else ("heading", "reach")
-        self._recogniser = open_recogniser(settings, load_board(settings.board), known=known, follows=follow)
+        board = resolve_board(load_board(settings.board), source, settings.memory)
+        self._recogniser = open_recogniser(settings, board, known=known, follows=follow)
         is_nadir = self._recogniser.technique.spec.looks_down
         self._needs_height = source.fov_deg is not None or (source.lens is not None and is_nadir)
         self._is_open, self._threads = True, ThreadpoolController()

@@ -74,7 +74,7 @@ def run_match(args: Namespace) -> int:
     """Run `match`: find the places of a recording's images in a map, and print a line for each image."""
     from edgevpr.cli.matched import format_match, format_matches
     from edgevpr.frames.source import open_source, read_to_end
-    from edgevpr.power.boards import load_board
+    from edgevpr.power.boards import load_board, resolve_board
     from edgevpr.runtime.recognise.calibration import not_calibrated
     from edgevpr.runtime.recognise.evidence import list_evidence_kinds
     from edgevpr.runtime.recognise.hints import parse_known_fields
@@ -82,7 +82,8 @@ def run_match(args: Namespace) -> int:
     from edgevpr.techniques.card import find_weights
 
     config, known = load_command_config(args, args.config, map=args.map), parse_known_fields(args.known)
-    recogniser = open_recogniser(config, load_board(config.board), known=known, follows=args.follow)
+    board = resolve_board(load_board(config.board), config.source, config.memory)
+    recogniser = open_recogniser(config, board, known=known, follows=args.follow)
     found = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=path_of(args.positions), live=False)

@@ -4,6 +4,7 @@ from argparse import Namespace
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import add_json, add_keys, command, count, load_command_config, positive, show
+from edgevpr.core.config import Config
 from edgevpr.core.text import progress
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def add(commands: Any) -> None:
 
 def profile(args: Namespace) -> int:
     """Run `profile`: estimate what techniques cost in a flight, or list the boards that have a profile."""
-    from edgevpr.power.boards import board_names, load_board
+    from edgevpr.power.boards import board_names, load_board, resolve_board
     from edgevpr.runtime.preflight.choose import list_preferred
     from edgevpr.runtime.preflight.estimate import estimate
     from edgevpr.runtime.preflight.presentation import format_table
@@ -45,16 +46,17 @@ def profile(args: Namespace) -> int:
         for name in ("this", *board_names()):
             print(f"{name:<20} {load_board(name).title}")
         return 0
-    board = load_board(args.board)
+    config = load_command_config(args)
+    board = resolve_board(load_board(args.board), config.source, config.memory)
     list_preferred(board)  # raises if the profile names a technique that is not there
-    plan, wanted = _plan(args, board)
+    plan, wanted = _plan(args, config, board)
     trials = progress(try_each(wanted, board.threads), len(wanted), "trying techniques")
     found = estimate(board, compare_speed(board), trials, plan)
     show(found, args.json, format_table(found))
     return 0
 
 
-def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ...]]":
+def _plan(args: Namespace, config: Config, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ...]]":
     """Make two things from the flags: the plan of the flight, and the techniques to try in all their forms: that of
     --map, else every one."""
     from edgevpr import techniques
@@ -63,9 +65,7 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ..
     from edgevpr.runtime.preflight.estimate import FlightPlan
     from edgevpr.runtime.preflight.pick import camera_setting
     from edgevpr.runtime.preflight.trial import offers
-    from edgevpr.runtime.recognise.opening import budget_mb
 
-    config = load_command_config(args)
     places, camera = args.places, config.source.camera
     if args.map:
         with PlaceMap.open(args.map) as place_map:
@@ -76,11 +76,11 @@ def _plan(args: Namespace, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ..
         wanted = offers(techniques.names(), settings={n: camera_setting(n, camera) for n in techniques.names()})
     plan = FlightPlan(
         places=places,
-        rate_hz=config.source.rate_hz or board.rate_hz,
+        rate_hz=board.rate_hz,
         flight_min=args.flight_min,
         pack=parse_pack(config.battery.pack),
         regulator_efficiency=config.battery.regulator_efficiency,
-        budget_mb=budget_mb(config, board),
+        budget_mb=board.budget_mb,
         camera=camera,
     )
     return plan, wanted

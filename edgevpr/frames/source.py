@@ -214,8 +214,10 @@ def read_to_end(source: Source, left_out: Callable[[ImageError], None]) -> Itera
     source.close()
 
 
-def is_live(uri: str) -> bool:
-    """Return True if `uri` names a camera or a stream; anything else is a recording."""
+def is_live(uri: str | None) -> bool:
+    """Return True if `uri` names a camera or a stream; anything else is a recording (None: there is no source)."""
+    if uri is None:
+        return False
     is_device = uri.startswith("/dev/") and not Path(uri).is_file()  # /dev/shm holds plain files
     return "://" in uri or is_device or uri.lower().endswith(".sdp") or is_by_program(uri)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from edgevpr.core.config import MavlinkConfig
 from edgevpr.core.errors import LinkAddressError
 
 FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
@@ -38,8 +39,9 @@ def parse_link(url: str) -> LinkAddress:
     return LinkAddress(kind, where, int(number))
 
 
-def parse_links(flight: str | None, ground: str | None) -> tuple[LinkAddress | None, LinkAddress | None]:
+def parse_links(settings: MavlinkConfig) -> tuple[LinkAddress | None, LinkAddress | None]:
     """Parse the links to flight controller and ground station (None: no link). Raises LinkAddressError."""
+    flight, ground = settings.link, settings.ground
     if flight is None and ground is not None:
         raise LinkAddressError("`mavlink.ground` is a second link: name the flight controller's as `mavlink.link`.")
     return (None if flight is None else parse_link(flight)), (None if ground is None else parse_link(ground))

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from threading import Lock, Thread
 
+from edgevpr.core.config import MavlinkConfig
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.files import open_file, read_file, write_whole
 from edgevpr.mavlink.wire import Message, mavlink
@@ -173,12 +174,12 @@ class Signing:
 NOT_SIGNING = Signing()
 
 
-def open_signing(key_path: str | None, state_path: str | None, to_ask: bool = False) -> Signing:
-    """Open the signing with the key of a file (None: no signing). `state_path` is the file of the kept time (None:
-    beside the key); with `to_ask` (questions before the flight) it is only read. Raises ConfigError."""
-    if key_path is None:
+def open_signing(settings: MavlinkConfig, to_ask: bool = False) -> Signing:
+    """Open the signing with the configured key, if there is one. With `to_ask` (questions before the flight) the file
+    of the kept time is only read. Raises ConfigError."""
+    if settings.signing_key is None:
         return NOT_SIGNING
-    key, state = read_key(key_path), Path(state_path or f"{key_path}.time")
+    key, state = read_key(settings.signing_key), Path(settings.signing_state or f"{settings.signing_key}.time")
     return Signing(key, TimeStamps(state, is_kept=not to_ask), TO_ASK if to_ask else TO_AUTOPILOT)
 
 

@@ -7,7 +7,15 @@ module also detects the machine that it runs on. The flight, `edgevpr profile` a
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from edgevpr.core.config import BUDGET_MB, HIGHEST_RATE_HZ, LOWEST_RATE_HZ, bounded, build
+from edgevpr.core.config import (
+    BUDGET_MB,
+    HIGHEST_RATE_HZ,
+    LOWEST_RATE_HZ,
+    MemoryConfig,
+    SourceConfig,
+    bounded,
+    build,
+)
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.files import shipped
 from edgevpr.core.text import meant
@@ -88,6 +96,11 @@ def load_board(name: str, root: Path = Path("/")) -> Board:
     names = ["this", *board_names()]
     hint = meant(name, names, f"use {', '.join(names)}, or the path of a YAML file.")
     raise ConfigError(f"There is no board `{name}`: {hint}")
+
+
+def resolve_board(board: Board, source: SourceConfig, memory: MemoryConfig) -> Board:
+    """Return a board with the configured rate of queries and memory of the index in place of its own."""
+    return replace(board, rate_hz=source.rate_hz or board.rate_hz, budget_mb=memory.budget_mb or board.budget_mb)
 
 
 def _matches(board: Board, root: Path) -> bool:

@@ -16,7 +16,7 @@ from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.text import waiting
 from edgevpr.frames.images import read_image
 from edgevpr.mavlink.signing import NOT_SIGNING
-from edgevpr.power.boards import Board
+from edgevpr.power.boards import Board, resolve_board
 from edgevpr.review.compare import Line, Packets
 from edgevpr.review.tape import (
     Playback,
@@ -62,7 +62,8 @@ def replay(log: str | Path, place_map: str | None = None) -> Replayed:
     header = note[1]
     config = build(Config, header["config"], str(folder))
     playback = Playback(notes)
-    board = build(Board, header["board"], "the board of the flight")
+    recorded = build(Board, header["board"], "the board of the flight")
+    board = resolve_board(recorded, config.source, config.memory)
     why_ended = None
     with TemporaryDirectory(prefix="edgevpr-replay-") as temporary:
         again_log = f"{temporary}/flight.jsonl" if config.log.path else None

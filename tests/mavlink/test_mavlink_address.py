@@ -4,6 +4,7 @@ import socket
 
 import pytest
 
+from edgevpr.core.config import MavlinkConfig
 from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.mavlink.address import LinkAddress, parse_link, parse_links
 from edgevpr.mavlink.ports import open_port
@@ -51,7 +52,7 @@ def test_a_malformed_link_gets_one_sentence(url, says):
 
 def test_a_link_to_the_ground_alone_is_refused():
     with pytest.raises(LinkAddressError, match="second"):
-        parse_links(None, "udpout:127.0.0.1:14550")
+        parse_links(MavlinkConfig(ground="udpout:127.0.0.1:14550"))
 
 
 @pytest.mark.parametrize(

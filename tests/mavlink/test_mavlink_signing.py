@@ -11,6 +11,7 @@ from conversing import Autopilot
 from loopback import free_port, wait_until
 from mavlink_peers import link_to
 
+from edgevpr.core.config import MavlinkConfig
 from edgevpr.core.errors import ConfigError
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.signing import (
@@ -143,7 +144,7 @@ def test_a_link_and_pymavlink_understand_each_other_by_key(key_file, monkeypatch
     from pymavlink import mavutil
 
     number = free_port()
-    signing = open_signing(str(key_file), None)
+    signing = open_signing(MavlinkConfig(signing_key=str(key_file)))
     with link_to(f"udpin:127.0.0.1:{number}", signing=signing) as link:
         other = mavutil.mavlink_connection(
             f"udpout:127.0.0.1:{number}", dialect="all", source_system=7, source_component=1
@@ -169,7 +170,8 @@ def test_a_link_and_pymavlink_understand_each_other_by_key(key_file, monkeypatch
 def test_an_autopilot_whose_clock_is_old_learns_the_time_though_another_has_called_before(key_file):
     """As after a flat battery of its clock: it takes ours from the first message that it gets, so it must get one."""
     number, day = free_port(), 86_400 * TICKS_S
-    with link_to(f"udpin:127.0.0.1:{number}", signing=open_signing(str(key_file), None)) as link, ExitStack() as stack:
+    signing = open_signing(MavlinkConfig(signing_key=str(key_file)))
+    with link_to(f"udpin:127.0.0.1:{number}", signing=signing) as link, ExitStack() as stack:
         stray, own, replaying = (stack.enter_context(closing(calling(number))) for _ in range(3))
         stray.send(unsigned())
         wait_until(lambda: link.stats().refused_signatures, "the stray packet")
@@ -212,7 +214,7 @@ def test_no_fix_goes_to_who_has_not_the_key(signing):
 
 
 def test_without_a_key_everything_is_admitted_and_nothing_signed():
-    assert open_signing(None, None) is NOT_SIGNING
+    assert open_signing(MavlinkConfig()) is NOT_SIGNING
     packer = mavlink.MAVLink(None)
     NOT_SIGNING.stamp(packer)
     assert not packer.signing.sign_outgoing

@@ -10,7 +10,7 @@ from pictures import textured
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.config import Config, load_config
-from edgevpr.power.boards import load_board
+from edgevpr.power.boards import load_board, resolve_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.flight import flight as flight_module
 from edgevpr.runtime.flight.autopilot import ToAutopilot
@@ -46,7 +46,7 @@ class Flight:
         **settings,
     ) -> None:
         self.config = load_config(None, {"map": str(place_map), "source.uri": "/dev/video0"} | settings)
-        self.board = load_board(self.config.board)
+        self.board = resolve_board(load_board(self.config.board), self.config.source, self.config.memory)
         self.log, self.clock, self.link = log, clock, link
         growing = None
         if learns:
@@ -92,7 +92,9 @@ class Flight:
                 flight_log=flight_log,
                 notifier=notifier,
                 meter=meter or FlightMeter(self.config.battery, self.board, clock),
-                io=SimpleNamespace(clock=clock, machine=Machine(self.board), stop=self.stop, status=status),
+                io=SimpleNamespace(
+                    board=self.board, clock=clock, machine=Machine(self.board), stop=self.stop, status=status
+                ),
             )
             patch = opened.enter_context(pytest.MonkeyPatch.context())
             patch.setattr(flight_module, "limit_candidates", lambda technique: fewer_candidates)

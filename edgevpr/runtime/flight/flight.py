@@ -33,7 +33,6 @@ from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.notifier import Commands, Notifier
 from edgevpr.runtime.flight.startup import (
     apply_recorded_rate,
-    choose_rate_hz,
     find_origin,
     log_start,
     open_map,
@@ -69,7 +68,7 @@ class Flight:
     def __init__(self, config: Config, parts: FlightParts) -> None:
         self._config, self._parts, self._opened = config, parts, ExitStack()
         notifier, self._map_watch, self._tally = parts.notifier, MapWatch(parts.notifier), Tally()
-        self._pace = Pace(choose_rate_hz(config, parts.recogniser), parts.io.clock)
+        self._pace = Pace(parts.io.board.rate_hz, parts.io.clock)
         fewer_candidates = () if config.match.candidates else limit_candidates(parts.recogniser.technique)
         self._governing = GovernorActuator(parts, self._pace, fewer_candidates)
         self._commands = Commands(parts.link, notifier, parts.learner)
@@ -104,7 +103,7 @@ class Flight:
                 stack.callback(recogniser.place_map.close)
                 flight_log = stack.enter_context(_open_log(io))
             flight_log.write("start", **log_start(config, io, recogniser))
-            step_s, settings = 1 / choose_rate_hz(config, recogniser), config.mavlink
+            step_s, settings = 1 / io.board.rate_hz, config.mavlink
             navigator = Navigator(settings.min_accuracy_m, step_s, not settings.send_fixes, config.source.gimbal)
             origin = find_origin(recogniser.place_map, config.source) if settings.set_origin else None
             link, ground = open_links(settings, io, navigator, origin, stack)
@@ -322,7 +321,7 @@ def open_links(
     settings: MavlinkConfig, io: FlightIO, navigator: Navigator, origin: Position | None, stack: ExitStack
 ) -> tuple[Link | None, Link | None]:
     """Open the links to flight controller and ground station (None: not configured), which `stack` closes."""
-    address, ground_address = parse_links(settings.link, settings.ground)
+    address, ground_address = parse_links(settings)
     if address is None:
         return None, None
     link_settings = LinkSettings(

@@ -22,7 +22,7 @@ from edgevpr.mavlink.driver import DriverMaker, PortDriver
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.signing import Signing, open_signing
 from edgevpr.mavlink.turns import Turns
-from edgevpr.power.boards import Board, load_board
+from edgevpr.power.boards import Board, load_board, resolve_board
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.boundary import (
@@ -101,10 +101,10 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
     uri = config.source.uri
     if uri is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
-    parse_links(config.mavlink.link, config.mavlink.ground)
+    parse_links(config.mavlink)
     if config.mapping.learn:
         check_positions(config)
-    board = load_board(config.board)
+    board = resolve_board(load_board(config.board), config.source, config.memory)
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # musl has none
         for parameter, value in _MALLOC.items():
             mallopt(parameter, value)
@@ -131,7 +131,7 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
             open_source=open_own,
             turns=Turns(Clock().mono_s),
             drive=PortDriver,
-            signing=open_signing(config.mavlink.signing_key, config.mavlink.signing_state),
+            signing=open_signing(config.mavlink),
             stop=Stop(),
             status=status,
             recording=folder,

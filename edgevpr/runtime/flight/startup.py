@@ -69,11 +69,6 @@ def _make_query_meter(config: Config, io: FlightIO) -> QueryMeter:
     )
 
 
-def choose_rate_hz(config: Config, recogniser: Recogniser) -> float:
-    """Return the queries per second: the configured rate, or else that of the board's profile."""
-    return config.source.rate_hz or recogniser.meter.board.rate_hz
-
-
 def apply_recorded_rate(config: Config, steps_s: Sequence[float]) -> Config:
     """Return the configuration with the rate at which most pictures of a recording come, `steps_s` apart (empty: as it
     is configured)."""
@@ -114,7 +109,7 @@ def log_start(config: Config, io: FlightIO, recogniser: Recogniser) -> dict[str,
         "candidates": recogniser.candidates,
         "sequence": recogniser.sequence,
         "accuracy_m": recogniser.accuracy_m,
-        "rate_hz": choose_rate_hz(config, recogniser),
+        "rate_hz": board.rate_hz,
         "idle_w": board.idle_w,
         "full_w": board.full_w,
         "power_verified": board.verified,

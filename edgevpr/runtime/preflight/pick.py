@@ -4,7 +4,6 @@ import logging
 from dataclasses import replace
 
 from edgevpr import techniques
-from edgevpr.core.config import Config
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import ModelError
 from edgevpr.power.boards import Board, load_board
@@ -21,7 +20,7 @@ from edgevpr.runtime.preflight.choose import (
 )
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe, ram_bytes
 from edgevpr.runtime.preflight.scale import compare_speed, count_work, on_board
-from edgevpr.runtime.recognise.opening import budget_mb, made_for
+from edgevpr.runtime.recognise.opening import made_for
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import find_weights
 
@@ -68,8 +67,8 @@ def explain_technique(recogniser: Recogniser, is_named: bool) -> str:
     return f"technique {_label(spec)}: {'; '.join(parts)}"
 
 
-def measure_flight(recogniser: Recogniser, config: Config) -> tuple[float, str]:
-    """Measure what a flight costs the board. Returns the seconds that a query takes, and accuracy and cost as text.
+def measure_flight(recogniser: Recogniser) -> tuple[float, str]:
+    """Measure what a flight costs its board. Returns the seconds that a query takes, and accuracy and cost as text.
     Raises EdgevprError, and OSError if there is no room for a small temporary map."""
     board, spec = recogniser.meter.board, recogniser.technique.spec
     costs = _measure_costs(recogniser.technique, board)
@@ -80,8 +79,8 @@ def measure_flight(recogniser: Recogniser, config: Config) -> tuple[float, str]:
     )
     demand = Demand(
         places=len(recogniser.index),
-        rate_hz=config.source.rate_hz or board.rate_hz,
-        budget_mb=budget_mb(config, board),
+        rate_hz=board.rate_hz,
+        budget_mb=board.budget_mb,
         camera=_camera(spec),
     )
     option = make_option(board, _label(spec), spec.name, costs, demand)

@@ -113,7 +113,7 @@ def make_levelling(
         _log.info("no correction for tilt, height or heading: set source.fov_deg (--fov-deg)")
         if config.gimbal and mount == STRAIGHT_DOWN:
             return None
-    return Levelling(lens, below=below, on_gimbal=config.gimbal, is_live=is_now(config), mount=mount)
+    return Levelling(lens, below=below, on_gimbal=config.gimbal, is_live=is_live(config.uri), mount=mount)
 
 
 def lens_of(config: SourceConfig) -> Lens | None:
@@ -140,11 +140,6 @@ def load_calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
             "out, or name the calibration of this camera."
         )
     return lens
-
-
-def is_now(config: SourceConfig) -> bool:
-    """Return True if frames are taken now, so that the autopilot's reports hold for them."""
-    return config.uri is not None and is_live(config.uri)
 
 
 def with_picture_heading(frame: Frame, view: View) -> Frame:

@@ -10,6 +10,7 @@ from edgevpr.core.config import Config, SalienceConfig, SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ConfigError, MapError, UsageError
 from edgevpr.frames.mask import Mask, load_mask
+from edgevpr.frames.source import is_live
 from edgevpr.places.index import GrowingIndex, PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove, require_regular
@@ -23,7 +24,7 @@ from edgevpr.runtime.recognise.evidence import list_evidence_kinds
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
 from edgevpr.runtime.recognise.hints import Prior, RecordedPrior
 from edgevpr.runtime.recognise.judge import accept_rule
-from edgevpr.runtime.recognise.levelling import Levelling, is_now, make_levelling
+from edgevpr.runtime.recognise.levelling import Levelling, make_levelling
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate
@@ -45,7 +46,7 @@ def open_recogniser(
     follows: bool = False,
     meter: QueryMeter | None = None,
 ) -> Recogniser:
-    """Open the map, make its technique for the board, and load the index.
+    """Open the map, make its technique for the board (see `resolve_board`), and load the index.
 
     With `narrowed`, for a flight, hints narrow each query (see `hints`); otherwise every query searches the whole map,
     but for what is `known` of recorded ones (see `RecordedPrior`). With `follows`, the queries are those of one flight,
@@ -58,11 +59,12 @@ def open_recogniser(
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
         technique = create_technique(place_map, config.technique, _wanted(config), board)
-        budget_bytes, beside_bytes = _ram(config, board, technique)
+        length = sequence_length(technique.spec, config.match.sequence)
+        budget_bytes, beside_bytes = int(board.budget_mb * 1e6), bytes_beside_place(length)
         index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
         prior = RecordedPrior(known, technique.spec.heading_within_deg)
         if narrowed:
-            prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
+            prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_live(config.source.uri))
         meter = meter or QueryMeter(board, config.battery)
         recogniser = _recogniser(config, technique, place_map, index, meter, prior=prior, follows=follows)
         on_error.pop_all()
@@ -85,9 +87,10 @@ def open_learning(
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
         technique = create_technique(place_map, config.technique, _wanted(config), board)
-        budget_bytes, beside_bytes = _ram(config, board, technique)
+        beside_bytes = bytes_beside_place(sequence_length(technique.spec, config.match.sequence))
+        budget_bytes = int(board.budget_mb * 1e6)
         growing = GrowingIndex(place_map, technique, budget_bytes=budget_bytes, room=_ROOM, beside_bytes=beside_bytes)
-        prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_now(config.source))
+        prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_live(config.source.uri))
         meter, follows = meter or QueryMeter(board, config.battery), config.match.follow
         recogniser = _recogniser(config, technique, place_map, growing.index, meter, prior=prior, follows=follows)
         on_error.pop_all()
@@ -97,11 +100,6 @@ def open_learning(
 def has_map(path: Path) -> bool:
     """Return True if there is a file at `path` that is not empty."""
     return path.exists() and path.stat().st_size > 0
-
-
-def budget_mb(config: Config, board: Board) -> float:
-    """Return the RAM that the index may take, MB: the configuration's value, else the board's."""
-    return config.memory.budget_mb or board.budget_mb
 
 
 def open_salience_gate(config: SalienceConfig, threads: int = 1) -> Gate | None:
@@ -200,7 +198,7 @@ def _recogniser(
     place_filter = None
     # Only matches that have a confidence can be followed, and only where no sequence is asked for.
     if follows and match.sequence is None and list_evidence_kinds(technique.spec):
-        place_filter = PlaceFilter(place_map, max_speed_m_s=match.reach_m_s, is_live=is_now(source))
+        place_filter = PlaceFilter(place_map, max_speed_m_s=match.reach_m_s, is_live=is_live(source.uri))
     levelling, gate = make_levelling(source, technique), open_salience_gate(config.salience, meter.board.threads)
     knows_scale = isinstance(levelling, Levelling) and levelling.lens is not None
     recogniser = Recogniser(
@@ -238,9 +236,3 @@ def _wanted(config: Config) -> dict[str, str]:
     """Return the parameters of the technique that the configuration sets, by name."""
     wanted = {"camera": config.source.camera, "matching": config.match.matching, "form": config.match.form}
     return {key: value for key, value in wanted.items() if value}
-
-
-def _ram(config: Config, board: Board, technique: Technique) -> tuple[int, int]:
-    """Return the bytes of RAM that an index may take, and that a sequence of queries takes for each place."""
-    beside_bytes = bytes_beside_place(sequence_length(technique.spec, config.match.sequence))
-    return int(budget_mb(config, board) * 1e6), beside_bytes

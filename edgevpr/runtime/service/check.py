@@ -17,7 +17,7 @@ from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.signing import open_signing
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path
-from edgevpr.power.boards import Board, load_board
+from edgevpr.power.boards import Board, load_board, resolve_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.flight.startup import apply_recorded_rate
@@ -42,7 +42,7 @@ def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
     config = apply_recorded_rate(config, recorded_intervals(config.source.uri))
     findings = [fine("configuration", str(config_path))]
     try:
-        board = load_board(config.board)
+        board = resolve_board(load_board(config.board), config.source, config.memory)
         findings.append(fine("board", f"{board.title}, up to {board.memory_max_mb:.0f} MB for edgevpr"))
         findings.append(run_check("map", lambda: _check_map(config, board)))
     except ConfigError as error:  # then nothing is known of what the map would take
@@ -74,7 +74,7 @@ def _check_map(config: Config, board: Board) -> str:
                 return f"{path}, empty so far"
     recogniser = open_recogniser(config, board, narrowed=True)
     with closing(recogniser.place_map) as place_map:
-        t_query_s, cost = measure_flight(recogniser, config)
+        t_query_s, cost = measure_flight(recogniser)
         reason = f"{explain_technique(recogniser, is_named=config.technique is not None)}; {cost}"
         confidence = ""
         if recogniser.rule.sure:
@@ -107,10 +107,10 @@ def _check_source(config: Config, offline: bool) -> str:
 
 
 def _check_link(settings: MavlinkConfig, offline: bool) -> str:
-    address, ground = parse_links(settings.link, settings.ground)
+    address, ground = parse_links(settings)
     if address is None:
         return "none: results go into the log only"
-    signing = open_signing(settings.signing_key, settings.signing_state, to_ask=True)
+    signing = open_signing(settings, to_ask=True)
     parts = [str(address)]
     with Inquiry(address, settings.component_id, settings.system_id, signing) as inquiry:
         if not offline:

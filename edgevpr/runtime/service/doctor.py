@@ -31,7 +31,7 @@ def doctor(config: Config, address: LinkAddress) -> tuple[list[Finding], Autopil
     read from the autopilot (None: nothing could be read). Raises ConfigError for a board that is unknown or a signing
     key that cannot be used."""
     settings = config.mavlink
-    signing = open_signing(settings.signing_key, settings.signing_state, to_ask=True)
+    signing = open_signing(settings, to_ask=True)
     of_machine = list(check_machine(config, address))
     if (uri := config.source.uri) and is_live(uri):
         of_camera = list(check_camera(uri))

@@ -20,13 +20,13 @@ def measure_at(recording, monkeypatch):
     def found(rate_hz, costs=COSTS, **settings):
         monkeypatch.setattr(pick, "probe", lambda technique: costs)
         monkeypatch.setattr(pick, "on_board", lambda costs, *_: costs)
-        config = load_config(None, {"map": str(recording / "cohog.gpkg"), "source.rate_hz": rate_hz, **settings})
-        board = replace(load_board("this"), cores=4, cpu_share=0.5)
+        config = load_config(None, {"map": str(recording / "cohog.gpkg"), **settings})
+        board = replace(load_board("this"), cores=4, cpu_share=0.5, rate_hz=rate_hz)
         recogniser = open_recogniser(config, board)
         # A flight over more places than candidates: this map has few.
         monkeypatch.setattr(type(recogniser.index), "__len__", lambda index: 1000)
         with recogniser.place_map:
-            return measure_flight(recogniser, config)
+            return measure_flight(recogniser)
 
     return found
 
