@@ -27,6 +27,7 @@ from edgevpr.runtime.flight.flightio import FlightIO, FlightParts, open_real_io
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.frozenwatch import FrozenWatch, read_optics
 from edgevpr.runtime.flight.governor import GovernorActuator
+from edgevpr.runtime.flight.gpswatch import GpsWatch
 from edgevpr.runtime.flight.heightwatch import HeightWatch
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
@@ -39,7 +40,7 @@ from edgevpr.runtime.flight.startup import (
 )
 from edgevpr.runtime.flight.stop import StopNow
 from edgevpr.runtime.flight.vitals import Vitals
-from edgevpr.runtime.flight.watching import GpsWatch, MapWatch, Sight, Surveyor, Tally
+from edgevpr.runtime.flight.watching import MapWatch, Sight, Surveyor, Tally
 from edgevpr.runtime.preflight.pick import limit_candidates
 from edgevpr.runtime.recognise.recognition import Recognition, fields_of
 

@@ -1,23 +1,16 @@
 """Observers of the events of a flight (each the `Recognition` of a frame): they count them, and report when something
-goes wrong and when it is right again. The loop of `flight` calls `tell` of each class with every event; an exception in
+goes wrong and when it is right again. The loop of `flight` calls `update` of each class with every event; an exception in
 it ends no flight."""
 
 import logging
-import math
 from collections.abc import Callable
 
-import numpy as np
-
-from edgevpr.core.arrays import Doubles
 from edgevpr.core.config import SourceConfig
-from edgevpr.core.geodesy import offset_m
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.text import beside
 from edgevpr.frames.level import Mount
 from edgevpr.mavlink.messages import Severity
-from edgevpr.mavlink.receivers import extrapolate
-from edgevpr.runtime.flight.autopilot import ToAutopilot
-from edgevpr.runtime.flight.measurements import PositionedMatch, measure_for_gps, worst_sd
+from edgevpr.runtime.flight.gpswatch import GpsWatch
 from edgevpr.runtime.flight.notifier import Notifier, Trouble
 from edgevpr.runtime.flight.survey import Measure, Sightings, Surveyed
 from edgevpr.runtime.recognise.levelling import read_mount
@@ -31,20 +24,6 @@ _LEFT_AFTER = 30  # queries in a row that are not accepted; over poor ground ten
 _LOST, _LOST_AFTER = 0.9, 10  # probability of being lost, in so many queries in a row that are not accepted
 _FOUND_WITH, _FORGOTTEN_AFTER = 2, 10  # accepted matches that find the map again, with fewer misses between two of them
 _TILT_LASTS_S = 5.0  # longer than a gust, and than the change from one turn to the next
-
-# In standard deviations of match and receiver together. Errors of map and receiver last for minutes, so that averaging
-# does not reduce them: they are so large in one flight of 3000. With a standard deviation of 5 m for the map, the limit
-# is 23 m for good matches and a good receiver.
-_GPS_CONTRADICTS = 4.0
-_GPS_LEAST_M = 15.0  # less is no danger, and may be a few bad seconds of the receiver
-# Beside the offset that matches and receiver had so far, in which the errors that last cancel out.
-_GPS_MOVED, _GPS_MOVED_M = 3.5, 7.0  # standard deviations, and the least that counts
-_USUAL_OF, _USUAL_OVER = 10, 60  # matches before it is known, and in its mean
-_GPS_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; at 1 a second it costs 3 s
-_GPS_WITHIN_S = 30.0  # the matches in a row must be no older
-_GPS_IN_TURN, _GPS_IN_TURN_S = 5, 20.0  # so many, with others between them that agree
-_GPS_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
-_REPORTED_AGAIN = 2.0  # times the distance that was last reported
 _SURVEYED_EVERY = 6  # sightings from one look at the survey to the next
 _MOUNT = "ahead_deg", "right_deg"
 _ANEW = 3.0  # times the least that counts: a result is reported anew when it has changed by more
@@ -148,94 +127,6 @@ class Sight:
             self._map.update(True)
 
 
-class GpsWatch:
-    """Compares GPS with the matches. It reports when they contradict each other, whenever the distance has doubled, and
-    when they agree again. Every comparison is sent to the autopilot, and navigation does not use a GPS that is wrong.
-
-    GPS `is_wrong` after three matches in a row that contradict it, of different places and with about the same offset
-    from GPS; it is right again after three matches in a row that agree with it. A match contradicts GPS that is far
-    from it, or that has moved away from where GPS was beside the matches before. Where the aircraft hovers, the same
-    place counts again if it agreed with GPS before. A jammer that comes and goes is found by five matches within
-    twenty seconds, whatever lies between, and GPS is not right again before there are fewer. `map_sd_m` is the standard
-    deviation of the error that all matches share."""
-
-    def __init__(self, map_sd_m: float, notifier: Notifier, autopilot: ToAutopilot | None) -> None:
-        self._map_sd_m, self._notifier, self._autopilot = map_sd_m, notifier, autopilot
-        self._against: list[tuple[PositionedMatch, Doubles]] = []  # matches with their offset (2,) from GPS
-        self._doubts: list[PositionedMatch] = []  # the last matches that contradicted it
-        self._agreeing = 0
-        self._usual_m, self._usual_of = np.zeros(2), 0  # the mean offset of matches that agreed, and their number
-        self._agreed: set[int] = set()  # places of the last match that agreed
-        self._reported_m = 0.0  # the distance that was last reported
-        self._have_agreed = False  # GPS and map, in this flight
-        self.is_wrong = False
-
-    def begin_anew(self) -> None:
-        """Forget the offsets from GPS so far, since matches err otherwise from now on."""
-        self._against.clear()
-        self._doubts.clear()
-        self._usual_m, self._usual_of = np.zeros(2), 0
-
-    def update(self, event: Recognition) -> None:
-        """Compare GPS with the match of an event, if that has a position."""
-        vehicle = event.vehicle
-        if event.frame is None or event.view.reason or vehicle is None or vehicle.gps is None:
-            return
-        seen = measure_for_gps(event, vehicle)
-        if seen is None or not vehicle.is_fresh_at(seen.t_s):
-            return
-        gps_deg = extrapolate(vehicle.gps, seen.t_s, vehicle.velocity_m_s or (0.0, 0.0))
-        off_m = np.array(offset_m(*gps_deg, seen.position.lat_deg, seen.position.lon_deg))
-        was_wrong, tilted_m = self.is_wrong, (vehicle.height_m or 0.0) * _attitude_error_shown(seen)
-        sd_m = math.hypot(worst_sd(seen.covariance_m2), vehicle.gps.sd_m, seen.frame.sd_m, tilted_m)
-        self._weigh(seen, off_m, sd_m)
-        away_m = math.hypot(*off_m)
-        if self._autopilot:
-            self._autopilot.compare_gps(away_m, self.is_wrong, self._have_agreed)
-        has_grown = self.is_wrong and away_m > _REPORTED_AGAIN * self._reported_m
-        if self.is_wrong != was_wrong or has_grown:
-            self._reported_m = away_m
-            severity = Severity.WARNING if self.is_wrong else Severity.INFO
-            note = Reason(ReasonCode.GPS_AGREES)
-            if self.is_wrong:
-                note = Reason(ReasonCode.GPS_DIFFERS, {"off_m": away_m})
-            self._notifier.report("gps", severity, note, off_m=round(away_m, 1), is_wrong=self.is_wrong)
-
-    def _weigh(self, seen: PositionedMatch, off_m: Doubles, sd_m: float) -> None:
-        """Judge GPS anew by a match that is `off_m` (2,) metres from it, with a standard deviation of `sd_m` but for
-        the error that all matches share."""
-        is_far = _is_beyond(off_m, _GPS_LEAST_M, _GPS_CONTRADICTS * math.hypot(sd_m, self._map_sd_m))
-        has_moved = self._usual_of >= _USUAL_OF and _is_beyond(off_m - self._usual_m, _GPS_MOVED_M, _GPS_MOVED * sd_m)
-        self._doubts = [other for other in self._doubts if seen.t_s - other.t_s <= _GPS_IN_TURN_S]
-        if not is_far and not has_moved:
-            self._against.clear()
-            self._agreeing += 1
-            self._usual_of = min(self._usual_of + 1, _USUAL_OVER)
-            self._usual_m = self._usual_m + (off_m - self._usual_m) / self._usual_of
-            self._agreed = set(seen.places)
-            if self._agreeing >= _GPS_IN_A_ROW and len(self._doubts) < _GPS_IN_TURN:
-                self.is_wrong, self._have_agreed = False, True
-            return
-        places, has_agreed = set(seen.places), bool(self._agreed & set(seen.places))
-
-        def is_news_beside(other: PositionedMatch) -> bool:
-            return has_agreed or not set(other.places) >= places
-
-        if all(map(is_news_beside, self._doubts)):
-            self._doubts.append(seen)
-        self._agreeing = 0
-        self._against = [
-            (other, other_m)
-            for other, other_m in self._against
-            if seen.t_s - other.t_s <= _GPS_WITHIN_S
-            and math.hypot(*(off_m - other_m)) <= 2 * math.hypot(2 * sd_m, _GPS_LED_AWAY_M_S * (seen.t_s - other.t_s))
-            and is_news_beside(other)
-        ]
-        self._against.append((seen, off_m))
-        is_proven = len(self._against) >= _GPS_IN_A_ROW or len(self._doubts) >= _GPS_IN_TURN
-        self.is_wrong = self.is_wrong or is_proven
-
-
 class Surveyor:
     """Reports what `survey` finds of map and camera: each once it is known and not as it should be, again when it has
     clearly changed, and all of it at the end. What was reported of the map is taken back where `gps` contradicts it.
@@ -311,13 +202,3 @@ def _surveyed(name: str, found: Measure) -> tuple[str, str]:
     side, key = sides[first > 0], f"source.mount_{name}"
     looks = f"looks {abs(first):.1f} degrees {side}"
     return f"the camera {looks} of straight down, +-{found.sd:.1f}: set {key}: {first:.1f}", f"camera {looks}"
-
-
-def _attitude_error_shown(seen: PositionedMatch) -> float:
-    """Return the tangent of the least error of the reported attitude that the picture of a match shows: a match is off
-    GPS by as much of the height."""
-    return max(0.0, math.hypot(*seen.lean.over_height) - seen.lean.sd) if seen.lean else 0.0
-
-
-def _is_beyond(off_m: Doubles, *limits_m: float) -> bool:
-    return math.hypot(*off_m) > max(limits_m)

@@ -15,9 +15,9 @@ from edgevpr.core.types import FRAME_TIME_SD_S, Position
 from edgevpr.frames.level import View
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.gpswatch import GpsWatch
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 from edgevpr.runtime.flight.notifier import Notifier
-from edgevpr.runtime.flight.watching import GpsWatch
 from edgevpr.runtime.recognise.perspective import AttitudeError
 
 pytestmark = pytest.mark.slow

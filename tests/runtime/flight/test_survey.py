@@ -14,9 +14,10 @@ from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Position
 from edgevpr.frames.level import STRAIGHT_DOWN, View
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
+from edgevpr.runtime.flight.gpswatch import GpsWatch
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.flight.survey import Sightings
-from edgevpr.runtime.flight.watching import GpsWatch, Surveyor
+from edgevpr.runtime.flight.watching import Surveyor
 from edgevpr.runtime.recognise.levelling import read_mount
 
 OFF_M, SCALE, AHEAD_DEG, RIGHT_DEG = np.array([5.0, -3.0]), 0.01, 9.0, -3.0
