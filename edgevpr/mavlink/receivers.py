@@ -16,9 +16,8 @@ GPS_GONE_AFTER_S = 2.5  # reports come at least once a second, and one may be lo
 GPS_SD_M = 5.0  # of a receiver that does not report its accuracy
 PLAUSIBLE_SD_M = 15.0  # one that is worse is no reason to do without our own positions
 # From the moment that a receiver measures to the arrival of its report: next to nothing in PX4's simulator, 0.1 s and
-# up to 0.2 s until the next report in ArduPilot's. What is left of it is the error of its time.
+# up to 0.2 s until the next report in ArduPilot's.
 RECEIVER_LAG_S = 0.1
-RECEIVER_LAG_SD_S = 0.1
 _ACCURACY_UNKNOWN = (0, 2**32 - 1)  # of h_acc: not sent, and not known
 _SPEED_UNKNOWN = 2**16 - 1
 _MAX_STEP_M = 8.0  # from one report to the next, beside what its own velocity explains: more is a jump

@@ -61,8 +61,7 @@ class Consistency:
     that repeats itself can say the same twice, and where pictures are suddenly turned against the compass."""
 
     def __init__(self) -> None:
-        self._held: ComparedFix | None = None
-        self._joined, self._against_s = 0, -math.inf  # how many say what the held one says; time of the last of all
+        self._agreeing: list[ComparedFix] = []  # fixes held back: one, and those after it that say the same
         self._turn_deg: float | None = None  # of the last fix believed: that of the compass, if it is wrong
         self._row: list[ComparedFix] = []  # fixes held back, of different places, that can have been flown through
 
@@ -70,7 +69,7 @@ class Consistency:
         """Return True while the last fix contradicts what is expected, and another one may still agree with it. Where
         the path `is_followed` from frame to frame, one that was right would be followed by another soon."""
         good_for_s = _JOINED_WITHIN_S if is_followed else _GOOD_FOR_S
-        return self._held is not None and now_s - self._against_s <= good_for_s
+        return bool(self._agreeing) and now_s - self._agreeing[-1].seen.t_s <= good_for_s
 
     def judge(self, fix: ComparedFix, has_gps: bool, is_followed: bool) -> GateResult:
         """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed; `is_followed`: the path
@@ -81,7 +80,7 @@ class Consistency:
         off_m, good_to_m = math.hypot(*step_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
         turned = Reason(ReasonCode.HELD_TURNED, {"turn_deg": fix.seen.turn_deg or 0.0})
         if has_gps:
-            self._held, self._row = None, []
+            self._agreeing, self._row = [], []
             return GateResult(turned if is_turned else Reason(ReasonCode.HELD_OFF_GPS, {"off_m": off_m}))
         self._row = [each for each in self._row if _could_follow(each, fix)]
         if all(fix.seen.is_of_other_places(each.seen) for each in self._row):  # neighbours share places
@@ -91,17 +90,17 @@ class Consistency:
         if is_turned:
             return GateResult(turned)
         drift_m_s = _FOLLOWED_DRIFT_M_S if is_followed else _DRIFT_M_S
-        self._against_s = fix.seen.t_s
-        if self._held is None or _differ(self._held, fix, drift_m_s) > _AGREES:
-            self._held, self._joined = fix, 1
-        else:
-            self._joined += 1
-            if _is_independent(self._held, fix, drift_m_s) and self._joined >= (_IN_A_ROW if is_followed else 2):
+        if self._agreeing and _differ(self._agreeing[0], fix, drift_m_s) <= _AGREES:
+            self._agreeing.append(fix)
+            is_enough = not is_followed or len(self._agreeing) >= _IN_A_ROW
+            if is_enough and _is_independent(self._agreeing[0], fix, drift_m_s):
                 return self._believed(fix, GateResult(is_against=True))
+        else:
+            self._agreeing = [fix]
         return GateResult(Reason(ReasonCode.HELD_OFF_PATH, {"off_m": off_m, "accuracy_m": good_to_m}))
 
     def _believed(self, fix: ComparedFix, verdict: GateResult) -> GateResult:
-        self._held, self._row = None, []
+        self._agreeing, self._row = [], []
         if fix.seen.turn_deg is not None:
             self._turn_deg = fix.seen.turn_deg
         return verdict

@@ -9,7 +9,6 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.types import FRAME_TIME_SD_S, Position, Vehicle
-from edgevpr.mavlink.receivers import RECEIVER_LAG_SD_S
 from edgevpr.runtime.flight.drift import GRAVITY_M_S2
 from edgevpr.runtime.recognise.locate import covariance_matrix
 from edgevpr.runtime.recognise.perspective import AttitudeError
@@ -21,6 +20,7 @@ from edgevpr.runtime.recognise.stride import Stride
 # more.
 ATTITUDE_SD = math.tan(math.radians(0.5))
 CAUTIOUS_ATTITUDE_SD = math.tan(math.radians(1.0))
+RECEIVER_LAG_SD_S = 0.1  # of a receiver's time, beside `receivers.RECEIVER_LAG_S`
 _UNKNOWN_ATTITUDE_SD = math.tan(math.radians(15.0))  # without a reported attitude: a turning aircraft banks
 _UNKNOWN_SPEED_M_S = 15.0  # of an aircraft that reports none
 _MAX_HEIGHT_RATIO = 2.0  # beyond it, motion between pictures is not corrected but left out

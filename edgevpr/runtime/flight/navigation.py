@@ -8,10 +8,10 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import moved
 from edgevpr.core.types import Position, Receiver, Vehicle
-from edgevpr.mavlink.receivers import RECEIVER_LAG_S, RECEIVER_LAG_SD_S, extrapolate
+from edgevpr.mavlink.receivers import RECEIVER_LAG_S, extrapolate
 from edgevpr.runtime.flight.consistency import BELIEVED, ComparedFix, GateResult
 from edgevpr.runtime.flight.drift import Drift, DriftFilter, OdometryMeasurement
-from edgevpr.runtime.flight.measurements import FrameMeasurement, PositionedMatch, worst_sd
+from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurement, PositionedMatch, worst_sd
 from edgevpr.runtime.flight.output import PROOF_S
 from edgevpr.runtime.flight.path import Path, Point
 from edgevpr.runtime.recognise.locate import in_sd

@@ -1,6 +1,6 @@
 """Observers of the events of a flight (each the `Recognition` of a frame): they count them, and report when something
-goes wrong and when it is right again. The loop of `flight` calls `update` of each class with every event; an exception in
-it ends no flight."""
+goes wrong and when it is right again. The loop of `flight` calls `update` of each class with every event; an exception
+in it ends no flight."""
 
 import logging
 from collections.abc import Callable

@@ -1,5 +1,6 @@
 """A fix that contradicts the autopilot's own position is held back until a second, independent one says the same."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from flights import STEP_DEG, Flight, of_kind
 from pictures import textured
 
 from edgevpr.core.geodesy import distance_m, moved
-from edgevpr.core.reasons import ReasonCode
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Position
 from edgevpr.frames.level import View
 from edgevpr.runtime.flight.consistency import ComparedFix, Consistency
@@ -87,12 +88,6 @@ def test_consistency_holds_back_until_an_independent_fix_agrees(fixes, held):
     assert Aircraft().held(*fixes) == [each == "h" for each in held]
 
 
-def test_consistency_forgets_what_agreed_long_ago():
-    near, late = Aircraft(speed_m_s=1.0), Aircraft(speed_m_s=1.0)
-    assert near.held(((900, 0), 1, (1,)), ((900, 0), 28, (2,))) == [True, False]
-    assert late.held(((900, 0), 1, (1,)), ((900, 0), 33, (2,))) == [True, True]
-
-
 def test_one_that_contradicts_is_held_back_and_says_by_how_much():
     advice = Aircraft().report((300, -400), 1.0)
     assert advice.fix is None
@@ -135,15 +130,6 @@ def test_a_compass_that_was_wrong_from_the_start_is_none_of_its_business():
     aircraft = Aircraft()
     told = [aircraft.report((0, 0), t_s, places=(t_s,), turned_deg=140.0).is_held for t_s in range(1, 6)]
     assert told == [False] * 5
-
-
-def test_matches_win_over_a_path_that_parts_from_them_faster_than_it_drifts():
-    aircraft = Aircraft()
-    told = [aircraft.report((200 + 20 * t_s, 0), t_s, places=(t_s,), fix_sd_m=1.0) for t_s in range(1, 5)]
-    assert [advice.is_held for advice in told] == [True, True, True, False]
-    aircraft = Aircraft()
-    told = [aircraft.report((200 + 60 * t_s, 0), t_s, places=(t_s,), fix_sd_m=1.0) for t_s in range(1, 9)]
-    assert all(advice.is_held for advice in told), "no aircraft of ours flies through these"
 
 
 def test_against_gps_no_fix_is_believed():
@@ -206,18 +192,72 @@ def test_in_flight_a_fix_held_back_is_in_the_log_and_the_ground_is_told_once(rec
     assert sum(each.name == "vpr_place" for each in link.sent if each.get_type() == "NAMED_VALUE_INT") == 5
 
 
-def test_while_match_after_match_contradicts_a_path_that_is_followed_it_is_in_doubt():
-    judge, here = Consistency(), np.zeros(2)
+def compared(off_m, t_s, place=1, *, path_m=0.0, expected_m=0.0, turn_deg=None):
+    """A fix off to the east, whose covariance is 5.5 m2 and that of its prediction 30.5 m2: together 6 m."""
+    frame = FrameMeasurement(t_s=float(t_s), sd_m=0.0)
+    said = {"position": Position(*HOME), "accuracy_m": 1.0, "places": (place,), "turn_deg": turn_deg}
+    path, off, expected = (np.array([each, 0.0]) for each in (path_m, off_m, expected_m))
+    seen = PositionedMatch(frame=frame, covariance_m2=5.5 * np.eye(2), **said)
+    return ComparedFix(seen=seen, path_m=path, off_m=off, expected_m=expected, covariance_m2=30.5 * np.eye(2))
+
+
+VERDICTS = {"believed": (False, False), "against": (True, False), "lost": (True, True)}
+
+
+@pytest.mark.parametrize(
+    ("fixes", "is_followed", "last"),
+    [
+        ([(24.0, 0)], False, "believed"),
+        ([(24.1, 0)], False, None),
+        # Two that agree: after 2 s they differ by 6 m, with the drift that is allowed for.
+        ([(100, 0, 1), (112.0, 2, 2)], False, "against"),
+        ([(100, 0, 1), (112.1, 2, 2)], False, None),
+        ([(100, 0, 1), (100, 30.0, 2)], False, "against"),
+        ([(100, 0, 1), (100, 30.1, 2)], False, None),
+        # Where the camera has followed the path it takes four, after 24 s within 2 * 12.45 m.
+        ([(100, 8 * number, number) for number in range(3)], True, None),
+        ([(100, 0, 0), (100, 8, 1), (100, 16, 2), (124.8, 24, 3)], True, "against"),
+        ([(100, 0, 0), (100, 8, 1), (100, 16, 2), (125.0, 24, 3)], True, None),
+        # The same place is another one if the aircraft has flown on by more than 24 m.
+        ([(100, 0), (100, 2, 1, {"path_m": 24.0})], False, None),
+        ([(100, 0), (100, 2, 1, {"path_m": 24.1})], False, "against"),
+        ([(100, 0, 1, {"expected_m": 3.0}), (110, 2, 1, {"path_m": 13.9, "expected_m": 13.1})], False, None),
+        ([(100, 0, 1, {"expected_m": 3.0}), (110, 2, 1, {"path_m": 14.1, "expected_m": 13.1})], False, "against"),
+        # Four of different places that an aircraft of 30 m/s can have flown through within 10 s: the path is lost.
+        ([(100, 0, 1), (190, 3, 2), (280, 6, 3), (400.0, 10.0, 4)], False, "lost"),
+        ([(100, 0, 1), (190, 3, 2), (280, 6, 3), (400.1, 10.0, 4)], False, None),
+        ([(100, 0, 1), (190, 3, 2), (280, 6, 3), (400.0, 10.1, 4)], False, None),
+        ([(100, 0, 1), (190, 3, 2), (280, 6, 3), (400.0, 10.0, 3)], False, None),
+        ([(100, 0, 1), (100, 0, 2), (190, 3, 3), (280, 6, 4)], True, None),
+    ],
+)
+def test_consistency_believes_what_others_prove_within_limits(fixes, is_followed, last):
+    judge = Consistency()
+    *before, verdict = [
+        judge.judge(compared(*each[:3], **dict(*each[3:])), has_gps=False, is_followed=is_followed) for each in fixes
+    ]
+    assert all(other.why for other in before)
+    assert (verdict.why is None) is (last is not None)
+    assert (verdict.is_against, verdict.is_lost) == VERDICTS.get(last, (False, False))
+
+
+@pytest.mark.parametrize(("is_followed", "good_for_s"), [(True, 2.5), (False, 30.0)])
+def test_consistency_is_in_doubt_until_another_should_have_agreed(is_followed, good_for_s):
+    judge = Consistency()
+    assert not judge.is_contradicted(0.0, is_followed)
     for t_s in range(8):
-        frame = FrameMeasurement(t_s=float(t_s), sd_m=0.5)
-        how = {"position": Position(*HOME), "accuracy_m": 1.0, "covariance_m2": np.eye(2), "places": (1,)}
-        fix = ComparedFix(
-            seen=PositionedMatch(frame=frame, **how),
-            path_m=here,
-            off_m=np.array([20.0, 0.0]),
-            expected_m=here,
-            covariance_m2=np.eye(2),
-        )
-        assert judge.judge(fix, has_gps=False, is_followed=True).why, "of one place they are one"
-    assert judge.is_contradicted(8.0, is_followed=True)
-    assert not judge.is_contradicted(11.0, is_followed=True), "no other has agreed"
+        why = judge.judge(compared(-100, t_s), has_gps=False, is_followed=is_followed).why
+        assert why == Reason(ReasonCode.HELD_OFF_PATH, {"off_m": 100.0, "accuracy_m": math.sqrt(30.5)})
+    assert judge.is_contradicted(7 + good_for_s, is_followed)
+    assert not judge.is_contradicted(7.1 + good_for_s, is_followed), "no other has agreed"
+    assert judge.judge(compared(0.0, 9), has_gps=False, is_followed=is_followed).why is None
+    assert not judge.is_contradicted(9.0, is_followed)
+
+
+@pytest.mark.parametrize(("before_deg", "turn_deg"), [(100.0, 0.0), (0.0, 100.0)])
+def test_consistency_reports_by_how_much_a_picture_is_turned(before_deg, turn_deg):
+    judge = Consistency()
+    judge.judge(compared(0.0, 0, turn_deg=before_deg), has_gps=True, is_followed=False)
+    for has_gps in (True, False):
+        why = judge.judge(compared(0.0, 1, turn_deg=turn_deg), has_gps=has_gps, is_followed=False).why
+        assert why == Reason(ReasonCode.HELD_TURNED, {"turn_deg": turn_deg})
