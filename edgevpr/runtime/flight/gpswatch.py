@@ -60,7 +60,7 @@ class GpsWatch:
     def update(self, event: Recognition) -> None:
         """Compare GPS with the match of an event, if that has a position."""
         vehicle = event.vehicle
-        if event.frame is None or event.view.reason or vehicle is None or vehicle.gps is None:
+        if event.view.reason or vehicle is None or vehicle.gps is None:
             return
         seen = measure_for_gps(event, vehicle)
         if seen is None or not vehicle.is_fresh_at(seen.t_s):
