@@ -91,22 +91,6 @@ def test_map_build_appends_to_an_unfinished_map(capsys, flight, tmp_path):
     assert (built["added"], built["already_here"], built["places"]) == (6, 0, 12)
 
 
-def test_map_build_warns_of_a_map_without_positions(capsys, flight, tmp_path):
-    path, bare = tmp_path / "m.gpkg", tmp_path / "bare"
-    shutil.copytree(flight / "ref", bare)
-    build = ["map", "build", str(path), "--technique", "cohog", "--images"]
-    assert main([*build, str(bare)]) == 0
-    said = capsys.readouterr().out.splitlines()
-    assert said[-1].startswith(f"{path}: no place has a position, and a map without positions sends no fixes")
-    assert "positions.csv" in said[-1]
-    for file in bare.iterdir():  # other names, so that they are no pictures of the map
-        file.rename(bare / f"again_{file.name}")
-    rows = (flight / "positions.csv").read_text().splitlines()
-    (bare / "positions.csv").write_text("\n".join([rows[0], *(f"again_{row}" for row in rows[1:])]))
-    assert main([*build, str(bare), "--append"]) == 0
-    assert "no fixes" not in capsys.readouterr().out
-
-
 def test_map_build_names_unusable_images_and_maps_the_others(capsys, flight, tmp_path):
     folder = tmp_path / "mixed"
     shutil.copytree(flight / "ref", folder)

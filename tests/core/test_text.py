@@ -6,7 +6,7 @@ import os
 import pytest
 from fakes import FakeClock
 
-from edgevpr.core.text import format_probability, progress, waiting
+from edgevpr.core.text import format_probability, progress
 
 
 def test_a_file_gets_a_line_for_every_tenth():
@@ -28,19 +28,6 @@ def test_a_terminal_sees_one_line_redrawn():
     os.close(reader)
     assert drawn.split("\r")[:4] == ["map  1/4  25 %", "map  2/4  50 %", "map  3/4  75 %", "map  4/4  100 %"]
     assert drawn.count("\n") == 1
-
-
-def test_a_terminal_sees_what_is_waited_for_until_it_is_over():
-    reader, writer = os.openpty()
-    with os.fdopen(writer, "w") as terminal:
-        for each in ("waiting for the source", "for the link", ""):
-            waiting(each, terminal)
-        drawn = ""
-        while drawn.count("\r") < 3:
-            drawn += os.read(reader, 4096).decode()
-    os.close(reader)
-    assert [line.rstrip() for line in drawn.split("\r")] == ["waiting for the source", "for the link", "", ""]
-    assert {len(line) for line in drawn.split("\r")[:3]} == {79}
 
 
 def test_the_time_that_is_left_is_told_once_it_can_be_known():

@@ -72,13 +72,6 @@ def test_load_board_recognises_this_machine_by_its_device_tree(tree):
     assert board.cores == os.cpu_count()
 
 
-def test_load_board_takes_a_machine_without_a_device_tree_as_any_x86(tree):
-    board = load_board("this", machine(tree))
-    assert (board.name, board.verified) == ("generic-x86", False)
-    score = board.benchmark_score
-    assert (score.single, score.products, score.verified) == (1.0, 1.0, False)
-
-
 def test_load_board_obeys_control_groups(tree):
     root = machine(tree, "Raspberry Pi 4 Model B", memory_max="400000000\n", cpu_max="20000 100000\n")
     board = load_board("this", root)

@@ -42,10 +42,6 @@ def test_look_reads_temperature_frequency_and_throttling(tree, files, expected):
     assert ThermalWatch(tree(PI | files)).look() == expected
 
 
-def test_look_knows_nothing_of_a_machine_without_sensors(tmp_path):
-    assert ThermalWatch(tmp_path).look() == state(None, None, None)
-
-
 @pytest.mark.parametrize("nonsense", ["hot\n", "999999999\n", "-300000\n", "\udcff"])
 def test_look_takes_nonsense_as_unknown(tree, nonsense):
     root = tree(PI)

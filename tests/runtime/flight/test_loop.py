@@ -142,18 +142,6 @@ def test_the_rate_of_a_timed_flight_is_that_at_which_most_pictures_come():
     assert apply_recorded_rate(config, []) is config
 
 
-def test_on_a_terminal_a_flight_says_once_a_minute_how_it_goes(flight, clock, monkeypatch, caplog):
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    with caplog.at_level("INFO"):
-        flight().fly(FakeSource([PICTURE] * 62, clock))
-    said = [each for each in caplog.messages if " min: " in each]
-    assert [each.partition(" queries")[0] for each in said] == ["1 min: streaming; 31", "2 min: streaming; 61"]
-    caplog.clear()
-    monkeypatch.setattr("sys.stderr.isatty", lambda: False, raising=False)
-    flight().fly(FakeSource([PICTURE] * 62, clock))
-    assert not [each for each in caplog.messages if " min: " in each]
-
-
 @pytest.mark.parametrize(
     ("trouble", "fed_s"), [(None, 45), ("is_lost", 100), ("is_frozen", 100), ("is_opening", 100), ("recording", 100)]
 )

@@ -83,11 +83,6 @@ def test_estimate_notes_how_far_figures_can_be_trusted(board, ratio, times, note
     assert all(part in note for part, note in zip(notes, estimated.notes, strict=True))
 
 
-def test_estimate_scales_the_times_of_another_board():
-    assert estimate(COSTS, ratio=SLOWER).techniques[0].query.t_encode_s == pytest.approx(0.1 / SLOWER.passes)
-    assert estimate(COSTS, ratio=None).techniques[0].query.t_encode_s == 0.1
-
-
 def test_estimate_recommends_the_most_accurate_that_fits_and_says_why():
     forms = {"cohog": COSTS["regions"], "hog": COSTS["vector"], "hog 1bit": COSTS["vector"]}
     estimated = estimate(forms, board=replace(PI, technique=None))

@@ -33,12 +33,6 @@ def test_on_board_scales_products_and_passes_apart_and_no_memory():
     assert (scaled.ram_bytes_per_place, scaled.process_mb) == (1_000, 90.0)
 
 
-def test_on_board_takes_networks_as_products_and_scans_of_vectors_as_passes():
-    assert on_board(replace(VECTOR, is_network=True), PI, SLOWER).encode.wall_s == pytest.approx(0.05 / 0.05)
-    assert on_board(VECTOR, PI, SLOWER).encode.wall_s == pytest.approx(0.05 / 0.2)
-    assert on_board(VECTOR, PI, SLOWER).match_per_place.wall_s == pytest.approx(0.001 / 0.2)
-
-
 def test_compare_speed_of_an_arm_board_follows_from_the_counted_instructions():
     assert compare_speed(PI).products == PI.benchmark_score.products
     passes_hz = 1e6 * PI.benchmark_score.arm64_mips / counted_parts()["micro-benchmark: a round of passes"]

@@ -22,7 +22,6 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.calibration import (
     MapCalibration,
     calibration_text,
-    not_calibrated,
     of_several,
     read_calibration,
     read_calibration_for,
@@ -124,16 +123,6 @@ def test_a_row_of_another_form_ends_no_flight(path, value):
     with contextlib.closing(sqlite3.connect(path)) as db, db:
         db.execute("INSERT OR REPLACE INTO edgevpr_map (key, value) VALUES ('calibration', ?)", (value,))
     assert flown(path) == SHIPPED
-
-
-def test_what_to_expect_is_said_in_words_and_figures():
-    figures = FOUND.figures()
-    assert (figures["asked"], figures["places_asked"], figures["hardly_recognisable"]) == (120, 4, 0.25)
-    assert figures["made_of"] == [OWN.made_of]
-    alike = replace(FOUND, recognisable={1: 0.1, 2: 0.49, 3: 0.9})
-    assert (FOUND.looks_alike, alike.looks_alike, replace(FOUND, recognisable={}).looks_alike) == (False, True, False)
-    assert ("alike" in FOUND.described(), "alike" in alike.described()) == (False, True)
-    assert ("12" in not_calibrated(12), "12" in not_calibrated(30)) == (True, False)
 
 
 @pytest.mark.parametrize("kind", OF_MAP)

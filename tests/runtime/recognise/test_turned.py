@@ -1,5 +1,7 @@
 """A picture of unknown heading that fits a place in two ways: which of them is right is not known."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from pictures import textured
@@ -8,9 +10,10 @@ from walks import map_of, walk_over
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.hints import RecordedPrior
+from edgevpr.runtime.recognise.hints import Prior, RecordedPrior
 from edgevpr.techniques import create
 
+WITHIN_DEG = 20.0
 LIKE_A_BRIDGE = 2  # the place that looks the same from its other end
 
 
@@ -24,10 +27,15 @@ def frame(place, shift_px=0, heading_deg=None):
 
 
 @pytest.fixture(scope="module")
-def walk(tmp_path_factory):
+def turned_walk(tmp_path_factory):
     technique, frames = create("cohog", {"camera": "nadir"}), (frame(place, heading_deg=0.0) for place in range(4))
     with PlaceMap.open(map_of(tmp_path_factory.mktemp("turned") / "m.gpkg", technique, frames)) as place_map:
-        yield walk_over(place_map, technique, prior=RecordedPrior(("heading",), technique.spec.heading_within_deg))
+        yield partial(walk_over, place_map, technique)
+
+
+@pytest.fixture
+def walk(turned_walk):
+    return turned_walk(prior=RecordedPrior(("heading",), WITHIN_DEG))
 
 
 def test_a_place_that_looks_the_same_from_the_other_side_is_accepted_with_a_heading_only(walk):
@@ -40,3 +48,12 @@ def test_a_place_that_looks_the_same_from_the_other_side_is_accepted_with_a_head
 def test_any_other_place_is_accepted_without(walk):
     event = walk.step(frame(1, 40))
     assert event.accepted, event.reason
+
+
+def test_a_wrong_compass_costs_one_query_and_not_the_flight(turned_walk):
+    """The next finds its place without the heading, as do the others until a place is found that agrees with it."""
+    walk = turned_walk(prior=Prior(None, WITHIN_DEG, is_live=False))
+    headings_deg = {0: 0.0, 1: 150.0, 3: 150.0}
+    events = [walk.step(frame(place, 40, heading_deg)) for place, heading_deg in headings_deg.items()]
+    assert [event.accepted for event in events] == [True, False, True]
+    assert [event.hints is not None for event in events] == [True, True, False]
