@@ -91,18 +91,6 @@ def test_figures_of_a_flight(tmp_path):
     assert (found["sent"], found["accepted"], found["texts"]) == (13, "1 of 2", ["map left"])
 
 
-def test_figures_of_one_that_never_takes_off(tmp_path):
-    lines = [f"{t},600,450,600,{450 + error},{error},4,0" for t, error in ((1, 9e6), (2, 0.1), (3, 40.0))]
-    (tmp_path / "track.csv").write_text(
-        "\n".join(["t_s,east_m,north_m,est_east_m,est_north_m,error_m,mode,height_m", *lines])
-    )
-    (tmp_path / "sent.csv").write_text("t_s,kind,age_s,east_m,north_m,accuracy_m,true_east_m,true_north_m\n")
-    run = {"commit": "abc", "cannot": "never ready", "warnings": [], "texts": [], "marks_s": {"started": 1.0}}
-    (tmp_path / "run.json").write_text(json.dumps(run))
-    found = verdicts.figures_of(tmp_path, Flight("gps_primary", "quiet", "none"))
-    assert (found["error_m"], found["sent"], found["accepted"]) == (40.0, 0, "0 of 0")
-
-
 def test_distance_from_a_path():
     path_m = [(0, 0), (10, 0), (10, 10)]
     assert verdicts.distances(np.array([(5.0, 3.0), (12.0, 5.0), (-3.0, 4.0)]), path_m) == pytest.approx([3, 2, 5])

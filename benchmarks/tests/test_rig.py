@@ -1,8 +1,6 @@
 """The rig: what needs no simulator."""
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,23 +15,10 @@ sys.path.append(str(Path(__file__).parents[1] / "rig"))
 import figures
 import truth
 
-RIG = Path(figures.__file__).parent
-
 
 def degrees(east_m: float, north_m: float) -> tuple[float, float]:
     at = to_position(CameraPose(east_m=east_m, north_m=north_m, height_m=0.0, heading_deg=0.0))
     return at.lat_deg, at.lon_deg
-
-
-def test_without_a_simulator_a_sentence_says_what_to_do():
-    done = subprocess.run(
-        [sys.executable, str(RIG / "rig.py"), "plane_wind"],
-        env={name: value for name, value in os.environ.items() if name != "EDGEVPR_ARDUPILOT"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 1
-    assert done.stderr == "rig: build ArduPilot's simulator, and name its folder in EDGEVPR_ARDUPILOT.\n"
 
 
 def test_the_truth_of_a_turn_between_two_states():

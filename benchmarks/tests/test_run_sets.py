@@ -1,6 +1,5 @@
 """`make results` on a folder with one small set."""
 
-import base
 import cv2
 import pytest
 import run_sets
@@ -62,11 +61,3 @@ def test_a_set_of_sites_gets_positions_and_what_is_known_is_measured_where_there
     assert distance_m(*at[0], *at[1]) == pytest.approx(120, abs=0.1)
     assert distance_m(*at[0], *at[2]) > 10_000
     assert tags[0].heading_deg == 0
-
-
-def test_a_row_or_a_set_that_is_not_there_gets_a_sentence(tmp_path):
-    make_set(tmp_path / "data" / "meadow")
-    with pytest.raises(base.UsageError, match="cohogg"):
-        measure(tmp_path / "data", tmp_path / "out", "--variants", "cohogg")
-    with pytest.raises(base.UsageError, match="EDGEVPR_DATA"):
-        measure(tmp_path, tmp_path / "out")

@@ -1,7 +1,9 @@
 """One recorded flight for all tests of flights: thirty places, 111 m apart on a line to the north, and maps of them."""
 
 import csv
+import shutil
 from functools import partial
+from pathlib import Path
 
 import cv2
 import pytest
@@ -38,6 +40,12 @@ def recording(tmp_path_factory):
         built = ["map", "build", folder / f"{technique}.gpkg", "--images", folder / "seen" / "images"]
         assert main([*map(str, built), "--technique", technique, "--no-calibrate", *flags]) == 0
     return folder
+
+
+@pytest.fixture
+def place_map(recording, tmp_path):
+    """A copy of the map of cohog, to be harmed."""
+    return Path(shutil.copy(recording / "cohog.gpkg", tmp_path / "m.gpkg"))
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """The simulated flight controller: strict, and honest about what it saw."""
 
 import json
-import math
 import subprocess
 import sys
 import time
@@ -84,15 +83,6 @@ def test_interpolate_track_has_the_velocity_along_it():
     track = [TrueState(t_s=t_s, lat_deg=lat_deg, lon_deg=lon_deg, alt_m=0.0) for t_s, lat_deg, lon_deg in points]
     velocities = [interpolate_track(track, t_s).velocity_m_s for t_s in (0.0, 5.0, 15.0, 30.0)]
     assert velocities == pytest.approx([11.12j, 11.12j, 7.15 + 0j, 0j], abs=0.01), "north first"
-
-
-def test_interpolate_track_turns_the_shorter_way_and_keeps_what_is_unknown():
-    one = TrueState(lat_deg=50, lon_deg=8, alt_m=0, roll_deg=2, heading_deg=350, height_m=80)
-    other = TrueState(lat_deg=50, lon_deg=8, alt_m=0, roll_deg=-2, heading_deg=20, height_m=90, t_s=2)
-    here = interpolate_track([one, other], 1.0)
-    assert (here.roll_deg, here.heading_deg % 360, here.height_m) == pytest.approx((0, 5, 85))
-    assert math.isnan(here.pitch_deg)
-    assert interpolate_track([one, TrueState(lat_deg=50, lon_deg=8, alt_m=0, t_s=2)], 1.0).height_m == 80
 
 
 def test_read_track_takes_attitude_and_course_where_they_are_known(tmp_path):

@@ -10,59 +10,48 @@ from pictures import textured
 
 from edgevpr.cli.top import lines_of
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.mavlink.messages import TEXT_BYTES, Severity
+from edgevpr.mavlink.messages import Severity
 from edgevpr.power.thermal import ThermalState, ThermalWatch
 from edgevpr.runtime.flight.companionwatch import CompanionWatch
 from edgevpr.runtime.flight.machine import Machine
-from edgevpr.runtime.flight.notifier import Notifier
 
 FINE = ThermalState(temperature_c=60.0, frequency_mhz=1800.0, throttled=False, why="", under_voltage=False, hot=False)
 LOW = replace(FINE, why="under-voltage now", under_voltage=True)
 UNKNOWN = ThermalState(temperature_c=None, frequency_mhz=None, throttled=None, why="")
 
 
-class Log:
-    """Flight log and link in one, that keep what they are given."""
+@pytest.fixture
+def watch(notifier, link):
+    """Let states be read each second; return (second, severity, text) of all that is sent to the ground station."""
 
-    def __init__(self):
-        self.lines, self.texts = [], []
+    def watched(states):
+        companion, found = CompanionWatch(notifier), []
+        for second, state in enumerate(states):
+            companion.take(float(second), state)
+            found += [(second, *text) for text in link.texts()[len(found) :]]
+        return found
 
-    def write(self, kind, **fields):
-        self.lines.append((kind, fields))
-
-    def announce(self, severity, text, topic):
-        assert len(f"edgevpr: {text}") <= TEXT_BYTES
-        self.texts.append((severity, text))
-
-
-def watched(states, every_s=1.0):
-    """(severity, text) of all that is sent to the ground station for a reading each second, and when."""
-    log, found = Log(), []
-    watch = CompanionWatch(Notifier(log, log))
-    for number, state in enumerate(states):
-        watch.take(every_s * number, state)
-        found += [(number, *text) for text in log.texts[len(found) :]]
-    return found
+    return watched
 
 
-def test_take_reports_a_problem_when_it_begins_and_when_it_is_over():
-    assert watched([FINE] * 5 + [LOW] * 100 + [FINE] * 100) == [
-        (5, Severity.WARNING, "companion under-voltage: check 5 V supply"),
-        (134, Severity.INFO, "companion supply is fine again"),
+def test_take_reports_a_problem_when_it_begins_and_when_it_is_over(watch):
+    assert watch([FINE] * 5 + [LOW] * 100 + [FINE] * 100) == [
+        (5, Severity.WARNING, "edgevpr: companion under-voltage: check 5 V supply"),
+        (134, Severity.INFO, "edgevpr: companion supply is fine again"),
     ]
 
 
 @pytest.mark.parametrize("apart", [2, 7, 29, 31, 45])
-def test_take_reports_a_problem_that_blinks_at_most_once_in_30_seconds(apart):
-    found = watched(([LOW] + [FINE] * (apart - 1)) * (600 // apart))
+def test_take_reports_a_problem_that_blinks_at_most_once_in_30_seconds(watch, apart):
+    found = watch(([LOW] + [FINE] * (apart - 1)) * (600 // apart))
     times = [time for time, *_ in found]
     assert all(later - earlier >= 30 for earlier, later in pairwise(times))
     assert len(found) == 1 or apart > 30
 
 
-def test_take_reports_nothing_of_a_value_that_is_unknown():
-    assert watched([UNKNOWN] * 100) == []
-    assert [severity for _, severity, _ in watched([LOW] * 5 + [UNKNOWN] * 100)] == [Severity.WARNING]
+def test_take_reports_nothing_of_a_value_that_is_unknown(watch):
+    assert watch([UNKNOWN] * 100) == []
+    assert [severity for _, severity, _ in watch([LOW] * 5 + [UNKNOWN] * 100)] == [Severity.WARNING]
 
 
 def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(make_flight, clock, link, tmp_path, caplog):

@@ -4,7 +4,6 @@ What is damaged may be compared or not; what must not be is an end of the flight
 have.
 """
 
-import shutil
 import sqlite3
 
 import pytest
@@ -17,12 +16,6 @@ from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW
 
 DAMAGE = (None, b"", b"\xff", b"\x00" * 7, "text", 10**18, -1.5, float("inf"), b"\xa5" * 40_000)
 COLUMNS = ("geom", "time", "alt_m", "heading_deg", "source_image", "quality", "coarse", "fine")
-
-
-@pytest.fixture
-def place_map(recording, tmp_path):
-    shutil.copy(recording / "cohog.gpkg", tmp_path / "m.gpkg")
-    return tmp_path / "m.gpkg"
 
 
 def damaged(path, statement, *values):

@@ -16,12 +16,6 @@ from edgevpr.places.mapfile import PlaceMap
 SAID = [(4, "edgevpr: its map cannot be read, see its log"), (6, "edgevpr: its map is read again")]
 
 
-@pytest.fixture
-def place_map(recording, tmp_path):
-    shutil.copy(recording / "cohog.gpkg", tmp_path / "m.gpkg")
-    return tmp_path / "m.gpkg"
-
-
 class Locked:
     """Another program that holds the file for itself alone."""
 

@@ -5,7 +5,6 @@ import shutil
 
 import numpy as np
 import pytest
-from fakes import FakeClock
 from pictures import textured
 from walks import map_of, walk_over
 
@@ -25,11 +24,6 @@ RULE = AcceptRule(min_score=0.07, min_margin=0.06, neighbour_m=50.0)
 def frame(number, t_mono_s=0.0):
     position = Position(50 + number * 0.001, 8.0)
     return Frame(image=textured(number), name=f"{number}.png", t_mono_s=t_mono_s, position=position)
-
-
-@pytest.fixture
-def clock():
-    return FakeClock()
 
 
 @pytest.fixture(scope="module")
