@@ -69,16 +69,6 @@ def test_a_page_names_pictures_that_are_there():
             assert (base.RESULTS / picture).is_file(), (page.name, picture)
 
 
-def test_a_table_has_a_dash_for_what_a_row_lacks():
-    rows = [{"a": 1.25, "b": {"c": None}}, {"a": None}]
-    said = base.table(rows, {"one": "{a:.1f}", "two": "{b[c]}"})
-    assert said.splitlines()[2:] == ["| 1.2 | - |", "| - | - |"]
-
-
-def test_numbers_are_kept_to_six_digits():
-    assert base.rounded({"a": [1.23456789, 1e-9 / 3, 7, "x", True]}) == {"a": [1.23457, 3.33333e-10, 7, "x", True]}
-
-
 def test_the_counts_that_travel_are_those_of_the_benchmark():
     parts = {row["part"]: row["instructions"] for row in base.read("arm64")["parts"]}
     assert counted.figures(parts) == json.loads(COUNTED_PATH.read_text())

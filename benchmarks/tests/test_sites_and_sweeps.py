@@ -5,15 +5,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
-import walks
 from foreign_places import GENERATED, MIRRORED, foreign
 from sites import chosen, covering
-from sweep_changes import OF_CAMERA, SWEEPS, view
-from sweeps import Shown
+from sweep_changes import view
 
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
-from edgevpr.runtime.recognise.encoder import FrameEncoder
 
 SIZE = (320, 240)
 MIDDLE = (np.array(SIZE) - 1) / 2
@@ -55,14 +51,6 @@ def test_foreign_places_looking_down_are_mirrored_then_generated(tmp_path):
     assert cut.shape[0] >= 120
 
 
-@pytest.mark.parametrize("camera", ["nadir", "forward"])
-@pytest.mark.parametrize("sweep", OF_CAMERA)
-def test_a_sweep_of_the_camera_starts_from_none(camera, sweep):
-    none = 1.0 if sweep == "height" else 0.0
-    assert none in SWEEPS[sweep].of(camera)
-    assert np.allclose(view(camera, sweep, none, SIZE, rng()), np.eye(3), atol=1e-9)
-
-
 def test_the_camera_moves_as_is_said():
     aside_px = np.array((40, 9))
     assert np.allclose(seen_at(view("nadir", "height", 2.0, SIZE, rng()), MIDDLE + 40), MIDDLE + 20)
@@ -73,11 +61,3 @@ def test_the_camera_moves_as_is_said():
     assert np.allclose(np.abs(looking_up), (0, 160))  # half of 66 degrees: half of the width
     aside = seen_at(view("forward", "yaw", 33.0, SIZE, rng()), MIDDLE) - MIDDLE
     assert np.allclose(np.abs(aside), (160, 0))
-
-
-def test_what_a_sweep_shows_is_asked_as_it_is_with_its_mask():
-    image, shown = picture(), Shown()
-    shown.mask = np.zeros(image.shape[:2], bool)
-    levelled = FrameEncoder(technique=None, levelling=shown).prepare(walks.frame(image))
-    assert levelled.image is image
-    assert levelled.mask is shown.mask

@@ -76,15 +76,6 @@ def test_map_build_makes_a_map_that_it_cannot_calibrate(flight, tmp_path, capsys
     assert "SciPy" in made["not_done"][0]
 
 
-@pytest.mark.slow
-def test_map_calibrate_stores_and_reports_the_calibration(bare, flight, capsys):
-    assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
-    found = calibration_in(bare)
-    assert found.described() in capsys.readouterr().out
-    assert main(["map", "info", str(bare), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["calibration"] == found.figures()
-
-
 @pytest.mark.parametrize(
     ("flags", "code", "said"),
     [

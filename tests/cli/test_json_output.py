@@ -6,9 +6,8 @@ import json
 import jsonschema
 import pytest
 from documented import require_documented, schema
-from statuses import STATUS
 
-from edgevpr.cli.main import command_line, main
+from edgevpr.cli.main import command_line
 
 
 def commands_with_json(parser=None):
@@ -32,10 +31,3 @@ def test_require_documented_refuses_other_fields():
     for other in (whole | {"kept": "3"}, whole | {"more": 1}, {"map": "m.gpkg", "kept": 3}):
         with pytest.raises(jsonschema.ValidationError):
             require_documented("edgevpr map shrink", json.dumps(other))
-
-
-def test_top_prints_a_status_as_json(tmp_path, capsys):
-    path = tmp_path / "status.json"
-    path.write_text(json.dumps(STATUS))
-    assert main(["top", "--file", str(path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == STATUS

@@ -1,8 +1,6 @@
 """`edgevpr map build --orthophoto` and `edgevpr simulate flight --orthophoto`: a map and a flight without flying."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -112,20 +110,6 @@ def test_simulate_flight_refuses_a_wrong_request(tmp_path, ground, track, capsys
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_map_build_names_rasterio_where_it_is_missing(tmp_path, ground):
-    script = (
-        "import sys; sys.modules['rasterio'] = None\n"
-        "from edgevpr.cli.main import main\n"
-        f"sys.exit(main(['map', 'build', {str(tmp_path / 'm.gpkg')!r}, '--orthophoto', {ground!r}, "
-        "'--footprint-m', '80', '--spacing-m', '20']))"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "pip install rasterio" in done.stderr
-    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.slow

@@ -7,6 +7,8 @@ import termios
 import time
 import tty
 from contextlib import closing
+from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import serial
@@ -87,7 +89,7 @@ def test_a_fix_that_the_system_still_holds_when_it_is_due_is_thrown_away_with_th
 def test_a_serial_line_that_is_held_up_gives_no_old_fix_when_it_goes_on():
     master, slave = pty.openpty()
     tty.setraw(slave)
-    peer = Peer(_Terminal(master), 7)
+    peer = Peer(SimpleNamespace(recv=partial(os.read, master), send=partial(os.write, master)), 7)
     with link_to(f"serial:{os.ttyname(slave)}:57600", max_fix_age_s=0.2) as link:
         peer.heartbeat()
         peer.synchronise(link)
@@ -103,19 +105,6 @@ def test_a_serial_line_that_is_held_up_gives_no_old_fix_when_it_goes_on():
         assert link.stats().fixes_sent == 0
     os.close(master)
     os.close(slave)
-
-
-class _Terminal:
-    """A terminal with a socket's names."""
-
-    def __init__(self, number: int) -> None:
-        self._number = number
-
-    def recv(self, size: int) -> bytes:
-        return os.read(self._number, size)
-
-    def send(self, data: bytes) -> int:
-        return os.write(self._number, data)
 
 
 BEAT = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 1, 0, 4, 3)

@@ -13,7 +13,7 @@ from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import FRAME_TIME_SD_S, Candidate, Frame, Place, Position, QueryCost, Steps, Vehicle
 from edgevpr.frames.level import Levelled, View
 from edgevpr.mavlink.conversation import BETWEEN_S
-from edgevpr.mavlink.messages import Fix, MotionState
+from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.navigator import Advice, Navigator
@@ -140,7 +140,6 @@ class Air:
                     self._report(velocity)
             if self.step % _STATE_STEPS == 0:
                 self.states.append((self.t_s, self.navigator.state_at(self.t_s)))
-                self.hear_state(self.states[-1][1])
             if self.step % self.every_steps == 0 and self.sees:
                 self.waiting.append((self.step, self.vehicle))
             if self.stride_steps and not self.has_gps and self.step % self.stride_steps == 0 and not self.waiting:
@@ -178,10 +177,10 @@ class Air:
     def tell(self, event: Recognition) -> Advice:
         return self.navigator.advise(event, self.t_s)
 
-    def match(self, step, vehicle, off_m=(0.0, 0.0), view=None, lean=None) -> Advice:
+    def match(self, step, vehicle, off_m=(0.0, 0.0), view=None) -> Advice:
         seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2) + off_m
         where = Position(*moved(*HOME, *seen_m))
-        event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, self.places(step), view, lean)
+        event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, self.places(step), view)
         frame = replace(event.frame, t_sd_s=self.t_sd_s)
         event = replace(event, frame=frame, stride=self._stride(step))
         if self.shows_turn:
@@ -201,9 +200,6 @@ class Air:
         if self.takes_fixes:
             self.off_m = self.off(fix.lat_deg, fix.lon_deg, fix.t_frame_s)
             self.known = fix.accuracy_m, self.t_s
-
-    def hear_state(self, state: MotionState | None) -> None:
-        """Do as the autopilot does that is sent a position on a continuous channel: here nothing."""
 
     def places(self, step: int) -> tuple[int, ...]:
         """The places that a match of that step is of."""

@@ -20,12 +20,14 @@ from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import PacketReader, mavlink
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.recognise.perspective import AttitudeError
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.stride import Stride
 
 HEIGHT_M = 60.0
 _FRAME_S = 1.0  # from frame to frame
 _MATCH_SD_M, _STRIDE_SD_M = 1.0, 0.2
+_SHOWN_SD = math.tan(math.radians(1.0))
 _VIEW = View(up_deg=0.0, footprint_m=60.0, aside=(0.0, 0.0))
 _PICTURE = np.zeros((8, 8), np.uint8)
 
@@ -36,11 +38,12 @@ class ClosedLoop:
     While it `matches`, each `match_every`-th frame is recognised `late_s` later, `map_off_m` (east + 1j * north) beside
     the truth. While it `sees_motion`, each frame has a stride. `stride_scale` is by what strides are too long,
     `time_error_s` by how much frames carry too late a time, and `mount_tilt_deg` by how much the camera looks east of
-    straight down. `away_m` and `error_m` are, step by step,
+    straight down. Gyros have the noise `gyro_sd` (radians, a root second); matches show the error of the attitude where
+    they `show_tilt`. `away_m` and `error_m` are, step by step,
     the true distance from the target, and that of the autopilot's estimate from the truth; `sent` is all that edgevpr
     sends, with the times."""
 
-    def __init__(self, vehicle, *, edgevpr=True, matches=True, velocity_m_s=0j, **parameters):
+    def __init__(self, vehicle, *, edgevpr=True, matches=True, velocity_m_s=0j, min_accuracy_m=1.0, **parameters):
         self.motion = Hover(Position(ORIGIN.lat_deg, ORIGIN.lon_deg, ORIGIN.alt_m), HEIGHT_M, velocity_m_s)
         self.controller = FlightController(vehicle, self.motion, gps=True)
         for name, value in parameters.items():
@@ -48,9 +51,10 @@ class ClosedLoop:
         self.sees_motion = True
         self.matches, self.match_every, self.map_off_m, self.stride_scale = matches, 1, 0j, 1.0
         self.late_s, self.time_error_s, self.mount_tilt_deg = 0.5, 0.0, 0.0
+        self.gyro_sd, self.show_tilt = 0.0, False
         self.away_m, self.error_m, self.sent = [], [], []
         self._clock, self._rng, self._steps = FakeClock(), np.random.default_rng(5), 0
-        self.navigator = Navigator(1.0, _FRAME_S)
+        self.navigator = Navigator(min_accuracy_m, _FRAME_S)
         settings = LinkSettings(clock=self._clock, listener=self.navigator)
         self.conversation = Conversation(settings, self._clock) if edgevpr else None
         if self.conversation:
@@ -75,6 +79,8 @@ class ClosedLoop:
         for _ in range(round(seconds / STEP_S)):
             self._steps += 1
             self._clock.now_s = 1000.0 + self.now_s
+            if self.gyro_sd:
+                self.brain.estimator.disturb(self._noise(self.gyro_sd * math.sqrt(STEP_S)))
             said = self.controller.advance(self.now_s + STEP_S / 2)
             self.away_m.append(self.motion.away_m)
             self.error_m.append(self.controller.error_m)
@@ -142,9 +148,11 @@ class ClosedLoop:
         if self.matches and frames % self.match_every == 0:
             # A camera that is levelled by an attitude that is wrong puts the place beside the true one.
             off_m = self.map_off_m + HEIGHT_M * math.tan(math.radians(self.mount_tilt_deg))
-            off_m += HEIGHT_M * self.brain.tilt + complex(*self._rng.normal(0, _MATCH_SD_M, 2))
+            off_m += HEIGHT_M * self.brain.tilt + self._noise(_MATCH_SD_M)
             place = Position(*moved(truth.lat_deg, truth.lon_deg, off_m.real, off_m.imag))
-            event = match_at(place, t_s, vehicle, _MATCH_SD_M, (self._steps,), _VIEW)
+            shown = self.show_tilt and self._noise(_SHOWN_SD) - self.brain.tilt
+            error = AttitudeError((shown.real, shown.imag), _SHOWN_SD) if self.show_tilt else None
+            event = match_at(place, t_s, vehicle, _MATCH_SD_M, (self._steps,), _VIEW, error)
         else:
             frame = Frame(image=_PICTURE, name="", t_mono_s=t_s)
             event = Recognition(frame=frame, vehicle=vehicle, picture=Levelled(_PICTURE, None, _VIEW))
@@ -156,8 +164,11 @@ class ClosedLoop:
             return None
         was, from_s, tilt = before
         moved_m = self.stride_scale * displacement_m(was.point, truth.point)
-        moved_m += HEIGHT_M * (self.brain.tilt - tilt) + complex(*self._rng.normal(0, _STRIDE_SD_M, 2))
+        moved_m += HEIGHT_M * (self.brain.tilt - tilt) + self._noise(_STRIDE_SD_M)
         return Stride(from_s=from_s, to_s=t_s, moved_m=(moved_m.real, moved_m.imag), sd_m=_STRIDE_SD_M, inliers=100)
+
+    def _noise(self, sd):
+        return complex(*self._rng.normal(0, sd, 2))
 
     def _recognise(self, event):
         if not event.accepted:

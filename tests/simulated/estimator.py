@@ -64,6 +64,10 @@ class Estimator:
         self._state[2] += self._gyro_error_rad_s * step_s
         self._covariance = move @ self._covariance @ move.T + step_s * _NOISE
 
+    def disturb(self, tilt: complex) -> None:
+        """Let the attitude be wrong by this much more, as by the noise of gyros."""
+        self._state[2] += tilt
+
     def expect_drift(self, sd_m_s: float) -> None:
         """Let the filter know that its velocity may be wrong by this standard deviation: it dead-reckons."""
         self._covariance[1, 1] = max(self._covariance[1, 1], sd_m_s**2)

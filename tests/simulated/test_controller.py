@@ -248,12 +248,6 @@ def test_px4_takes_a_fix_at_any_time_and_names_no_frame():
     assert flown.fix(x=1_000_000_000) == FAILED
 
 
-def test_px4_copter_without_any_aid_has_no_position_after_five_seconds():
-    flown = lose_gps("px4-copter").wait(4)
-    assert flown.flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
-    assert not flown.wait(3).flags & mavlink.ESTIMATOR_POS_HORIZ_ABS
-
-
 def test_px4_fuses_message_296_of_its_slot_and_flags_it():
     flown = Flown("px4-copter", EKF2_GPS_CTRL=0).wait(8)
     assert flown.brain.receivers.primary.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX

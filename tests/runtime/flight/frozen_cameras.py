@@ -2,6 +2,7 @@
 harms them: a sensor that hangs behind an encoder, and a clock."""
 
 import io
+from unittest.mock import Mock
 
 import av
 import cv2
@@ -11,9 +12,7 @@ from fakes import vehicle_at
 from edgevpr.core.types import Frame
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
 from edgevpr.lab.simulate.landscape import make_scene
-from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.frozenwatch import FrozenWatch, Optics
-from edgevpr.runtime.flight.notifier import Notifier
 
 HEIGHT_M = 80.0
 METRES_PER_PIXEL = 0.4
@@ -26,33 +25,18 @@ def make_ground() -> np.ndarray:
     return lit(make_scene(3, 400, 240, metres_per_pixel=METRES_PER_PIXEL), LIGHT, 3)
 
 
-class Notes(Notifier):
-    """Keeps what is reported."""
-
-    def __init__(self) -> None:
-        super().__init__(FlightLog(None), None)
-        self.texts = []
-
-    def report(self, kind, severity, note, **fields) -> None:
-        self.texts.append(str(note))
-
-
-class Autopilot:
-    """Counts how often navigation begins anew."""
-
-    begun_anew = 0
-
-    def begin_anew(self) -> None:
-        self.begun_anew += 1
-
-
 class Flown:
     """A flight with a picture every `every_s`, whose reports are wrong by `attitude_sd` degrees. `refused`: of each."""
 
     def __init__(self, ground, optics=DOWN, every_s=1.0, attitude_sd=0.5):
-        self.notes, self.autopilot, self.rng = Notes(), Autopilot(), np.random.default_rng(1)
-        self.watch = FrozenWatch(self.notes, optics, self.autopilot)
+        self.notifier, self.autopilot, self.rng = Mock(), Mock(), np.random.default_rng(1)
+        self.watch = FrozenWatch(self.notifier, optics, self.autopilot)
         self.refused, self._ground, self._every_s, self._sd, self.t_s = [], ground, every_s, attitude_sd, 100.0
+
+    @property
+    def notes(self):
+        """What is reported."""
+        return [str(call.args[2]) for call in self.notifier.report.call_args_list]
 
     def photograph(self, east_m=200.0, north_m=120.0, height_m=HEIGHT_M, heading_deg=90.0, roll_deg=0.0, pitch_deg=0.0):
         place = {"east_m": east_m, "north_m": north_m, "height_m": height_m}

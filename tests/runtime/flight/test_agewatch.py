@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from air import HOME, Air, match_at
-from fakes import FakeClock, FakeLink, to_autopilot
+from fakes import to_autopilot
 
 from edgevpr.core.geodesy import moved
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -129,9 +129,8 @@ def test_a_frozen_picture_is_of_unknown_age(path):
     assert len(air.refused) >= 8, "a delay of one second may be usual"
 
 
-def test_check_age_reports_once_and_leaves_out_the_match(tmp_path):
-    clock = FakeClock()
-    link, log = FakeLink(clock), FlightLog(tmp_path / "log", clock=clock)
+def test_check_age_reports_once_and_leaves_out_the_match(tmp_path, clock, link):
+    log = FlightLog(tmp_path / "log", clock=clock)
     ages = [(False, 0.0), (True, 0.0), (True, 0.0), (False, 0.6)]
     navigator, events, summaries = Navigator(1.0, 1.0), [], []
     autopilot = to_autopilot(link, navigator, clock, log)

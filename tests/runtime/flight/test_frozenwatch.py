@@ -45,10 +45,10 @@ def test_pictures_that_stay_while_the_aircraft_flies_on_are_refused_until_they_m
     for picture in harm(last, flown.rng, 16):
         flown.see(picture, velocity_m_s=(speed_m_s, 0.0))
     assert flown.refused == [None] * (5 + within_s) + [STAY] * (17 - within_s)
-    assert flown.autopilot.begun_anew == 1
+    flown.autopilot.begin_anew.assert_called_once()
     flown.fly_on(6, speed_m_s, start_m=180.0)
     assert flown.refused[-4:] == [None] * 4
-    assert flown.notes.texts == [str(STAY), str(MOVE)]
+    assert flown.notes == [str(STAY), str(MOVE)]
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_pictures_that_stay_while_the_aircraft_turns_are_refused(ground, optics,
         flown.see(compressed(still, flown.rng), **turn(number))
     assert flown.refused[:5] == [None] * 5
     assert all(flown.refused[11:])
-    assert flown.notes.texts == [str(STAY)]
+    assert flown.notes == [str(STAY)]
 
 
 @pytest.mark.parametrize("is_in_order", [True, False])
@@ -81,7 +81,7 @@ def test_a_clip_that_is_played_again_in_flight_is_refused(ground, is_in_order):
         flown.see(compressed(shown, flown.rng), velocity_m_s=(5.0, 0.0))
     assert flown.refused[:20] == [None] * 20
     assert all(flown.refused[30:])
-    assert flown.notes.texts == [str(Reason(ReasonCode.PICTURES_REPEAT))]
+    assert flown.notes == [str(Reason(ReasonCode.PICTURES_REPEAT))]
 
 
 def test_a_clip_whose_turns_the_aircraft_does_not_fly_is_refused(ground):
@@ -114,14 +114,6 @@ def test_a_camera_on_the_ground_is_not_frozen_when_the_autopilot_finds_its_headi
     for number in range(60):
         heading_deg = 0.0 if number < 20 else 137.0
         flown.see(compressed(still, flown.rng), heading_deg=heading_deg, height_m=0.2, velocity_m_s=(1.5, 0.0))
-    assert flown.refused == [None] * 60
-
-
-def test_a_slow_drift_is_not_frozen(ground):
-    flown = Flown(ground)
-    for number in range(60):
-        picture = flown.photograph(east_m=180.0 + 0.3 * number)
-        flown.see(picture, velocity_m_s=(0.3, 0.0))
     assert flown.refused == [None] * 60
 
 

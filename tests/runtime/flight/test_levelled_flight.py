@@ -5,13 +5,11 @@ import pytest
 from fakes import FakeClock, FakeLink, FakeSource, receiver_at, vehicle_at
 from flights import STEP_DEG, Flight, of_kind
 from pictures import textured
+from walks import map_of
 
 from edgevpr.core.types import Frame, Position
-from edgevpr.mapmaking.mapping import build_map
-from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight import watching
 from edgevpr.runtime.flight.survey import Measure, Sightings, Surveyed
-from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -23,7 +21,6 @@ FAR_APART = {"source.fov_deg": 66.0, "source.rate_hz": 0.1}
 @pytest.fixture(scope="module")
 def place_map(tmp_path_factory):
     technique = create("cohog", {"camera": "nadir"})
-    path = tmp_path_factory.mktemp("level") / "m.gpkg"
     frames = (
         Frame(
             image=textured(place + 20, 256, 256),
@@ -34,9 +31,7 @@ def place_map(tmp_path_factory):
         )
         for place in range(PLACES)
     )
-    with PlaceMap.create(path, technique.spec) as made:
-        build_map(frames, FrameEncoder(technique=technique), made)
-    return path
+    return map_of(tmp_path_factory.mktemp("level") / "m.gpkg", technique, frames)
 
 
 class TimedLink(FakeLink):

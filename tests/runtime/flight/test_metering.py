@@ -2,6 +2,8 @@
 
 import random
 from dataclasses import asdict
+from itertools import chain, repeat
+from types import SimpleNamespace
 
 import pytest
 from fakes import FakeSource
@@ -51,24 +53,12 @@ def test_a_flights_charge_is_the_closed_form(make_flight, clock):
     assert queries[-1]["totals"]["used_mah"] == pytest.approx(totals["used_mah"], rel=1e-6)
 
 
-class Watch:
-    """A board whose heat is what stands in a script, the last state for ever."""
-
-    def __init__(self, states):
-        self._states = list(states)
-
-    def look(self):
-        return self._states.pop(0) if len(self._states) > 1 else self._states[0]
-
-    def close(self):
-        pass
-
-
 def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(make_flight, clock, link):
     cool = ThermalState(temperature_c=61.0, frequency_mhz=1800.0, throttled=False, why="")
     hot = ThermalState(temperature_c=84.0, frequency_mhz=600.0, throttled=True, why="throttled now", under_voltage=True)
     flight = make_flight("hog")
-    meter = flight_meter(flight, machine=Machine(flight.board, Watch([cool] * 3 + [hot])))
+    watch = SimpleNamespace(look=chain([cool] * 3, repeat(hot)).__next__, close=lambda: None)
+    meter = flight_meter(flight, machine=Machine(flight.board, watch))
     lines = flight.fly(FakeSource([PICTURE] * 6, clock), meter)
     boards = [line["board"] for line in of_kind(lines, "query")]
     assert (boards[0], boards[-1]) == (asdict(cool), asdict(hot))

@@ -2,12 +2,12 @@
 
 import logging
 import os
-import time
 
 import numpy as np
 import pytest
 from fakes import FakeClock, FakeSource
 from full_disk import no_file_larger_than
+from loopback import wait_until
 from pictures import textured
 
 from edgevpr.core.errors import ImageError
@@ -16,11 +16,6 @@ from edgevpr.review.tape import Playback, ReplayedSource, read_tape
 from edgevpr.runtime.flight import recording as module
 from edgevpr.runtime.flight.boundary import RecordedSource
 from edgevpr.runtime.flight.recording import FRAMES, TAPE, Recording, frame_path, recordings
-
-
-def until(condition):
-    while not condition():
-        time.sleep(0.01)
 
 
 def notes(folder):
@@ -72,7 +67,7 @@ def test_each_flight_has_a_folder_and_the_oldest_make_room(tmp_path):
             tape.note("x")
         assert tape.path.name == f"flight-{number + 1:04d}"
     with Recording(tmp_path, 10):  # the half of 10 MB is to be free
-        until(lambda: len(recordings(tmp_path)) < 5)
+        wait_until(lambda: len(recordings(tmp_path)) < 5)
     assert [each.name for each in recordings(tmp_path)] == ["flight-0003", "flight-0004", "flight-0005"]
 
 
@@ -82,8 +77,8 @@ def test_one_that_is_as_large_as_it_may_be_ends_and_says_so(tmp_path, caplog):
         for _ in range(4):
             tape.keep(bytes(1_500_000))
             tape.note("frame")
-            until(lambda: not tape._waiting)
-        until(lambda: tape.state)
+            wait_until(lambda: not tape._waiting)
+        wait_until(lambda: tape.state)
         tape.keep(b"no more")
         tape.note("no more")
     assert "log.record_mb" in tape.state
@@ -96,11 +91,11 @@ def test_one_that_is_as_large_as_it_may_be_ends_and_says_so(tmp_path, caplog):
 def test_a_full_disk_ends_it_and_nothing_else(tmp_path):
     with Recording(tmp_path, 100) as tape:
         tape.note("x")
-        until(lambda: not tape._waiting)
+        wait_until(lambda: not tape._waiting)
         with no_file_larger_than(5000):
             tape.keep(bytes(9000))
             tape.note("frame")
-            until(lambda: tape.state)
+            wait_until(lambda: tape.state)
         tape.note("later")
     assert "too large" in tape.state
     assert notes(tape.path) == [["x"]]
@@ -112,5 +107,5 @@ def test_the_last_of_the_disk_is_left_to_logs_and_map(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "SPARED_BYTES", disk.f_bavail * disk.f_frsize + 10**12)
     with Recording(tmp_path, 100) as tape:
         tape.note("x")
-        until(lambda: tape.state)
+        wait_until(lambda: tape.state)
     assert "are left" in tape.state

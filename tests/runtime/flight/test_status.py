@@ -1,13 +1,18 @@
 """The status file: whole at every moment, for its user and group, and nobody else."""
 
+import json
 import os
 
 import pytest
-from statuses import STATUS
+from fakes import FakeSource
+from flights import pictures
 
+from edgevpr import __version__
 from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError
 from edgevpr.runtime.flight.status import StatusFile, default_path, read_status
+
+STATUS = {"version": __version__, "queries": 7}
 
 
 @pytest.fixture
@@ -53,11 +58,13 @@ def test_what_is_no_status_is_refused_by_name(path, text):
         read_status(path)
 
 
-def test_once_takes_no_status_of_a_flight_that_is_gone(path, capsys):
+def test_top_shows_the_status_of_a_flight_and_none_of_one_that_is_gone(make_flight, clock, path, capsys):
     assert main(["top", "--file", str(path), "--once"]) == 1
     assert "--file" in capsys.readouterr().err
     with StatusFile(path) as told:
-        told.write(STATUS)
+        make_flight().fly(FakeSource(pictures(3), clock), status=told)
+        assert main(["top", "--file", str(path), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == read_status(path)[0]
         assert main(["top", "--file", str(path), "--once"]) == 0
         os.utime(path, (0, 0))
         assert main(["top", "--file", str(path), "--once"]) == 1

@@ -89,10 +89,3 @@ def test_estimate_recommends_the_most_accurate_that_fits_and_says_why():
     assert estimated.recommended == "cohog"
     assert estimated.reason.startswith("cohog: nothing that fits finds more: recall@1 0.90 on 2 image sets")
     assert estimate({"netvlad": VECTOR}).recommended is None
-
-
-def test_estimate_lists_what_cannot_be_used():
-    broken = Trial(label="calc", name="calc", settings={}, problem="There is no model `calc`.")
-    estimated = estimate_of(PI, SAME_MACHINE, [*trials({"cohog": COSTS["regions"]}), broken], PLAN)
-    assert estimated.unusable == {"calc": "There is no model `calc`."}
-    assert [row.option.label for row in estimated.techniques] == ["cohog"]

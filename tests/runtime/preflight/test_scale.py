@@ -85,7 +85,3 @@ def test_on_board_takes_longer_with_fewer_cores():
     network = replace(VECTOR, encode=StageCost(0.1, 0.8), is_network=True)
     two = on_board(network, replace(PI, cores=4, threads=2), Speed(0.4, 0.4)).encode
     assert two == StageCost(pytest.approx(0.8 / 0.4 / 2), pytest.approx(0.8 / 0.4)), "as many as the board gives it"
-
-
-def test_on_board_leaves_times_unchanged_where_a_speed_is_unknown_or_the_same():
-    assert on_board(REGIONS, PI, None) == on_board(REGIONS, PI, SAME_MACHINE) == REGIONS

@@ -3,7 +3,6 @@
 import os
 import signal
 
-import numpy as np
 import pytest
 
 from edgevpr.runtime.preflight import trial
@@ -13,17 +12,6 @@ from edgevpr.runtime.preflight.trial import offers, try_each
 @pytest.fixture(autouse=True)
 def no_models(monkeypatch, tmp_path):
     monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path / "models"))
-
-
-@pytest.mark.slow
-def test_try_each_measures_in_a_process_of_its_own():
-    ballast = np.ones(300_000_000, np.uint8)  # which is ours, and not the technique's
-    (found,) = try_each(offers(["seqslam"]), threads=1)
-    assert (found.label, found.problem, found.weights) == ("seqslam", None, None)
-    assert found.parameters
-    assert 30 < found.costs.process_mb < 250
-    assert found.costs.encode.wall_s > 0
-    assert ballast.size
 
 
 def die_of_hog(trials, threads):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from edgevpr.runtime.recognise.gate_networks import Detector, fastestdet, yolox
+from edgevpr.runtime.recognise.gate_networks import Detector, fastestdet
 from edgevpr.techniques.card import load_card
 
 pytest.importorskip("onnx", reason="the test networks are written with onnx (pip install onnx)")
@@ -70,30 +70,6 @@ RNG = np.random.default_rng(3)
 
 def sigmoid(x):
     return 1 / (1 + math.exp(-x))
-
-
-def test_yolox_cell_by_cell():
-    height, width, classes = 64, 96, 4
-    strides = (8, 16, 32)
-    count = sum((height // stride) * (width // stride) for stride in strides)
-    raw = RNG.normal(0, 1, (1, count, 5 + classes)).astype(np.float32)
-    boxes, scores = yolox([raw], (height, width))
-    at = 0
-    for stride in strides:
-        for row in range(height // stride):
-            for column in range(width // stride):
-                x, y, w, h, thing, *named = raw[0, at]
-                middle = ((x + column) * stride, (y + row) * stride)
-                half = (math.exp(w) * stride / 2, math.exp(h) * stride / 2)
-                wanted = [
-                    (middle[0] - half[0]) / width,
-                    (middle[1] - half[1]) / height,
-                    (middle[0] + half[0]) / width,
-                    (middle[1] + half[1]) / height,
-                ]
-                assert boxes[at] == pytest.approx(wanted, rel=1e-4, abs=1e-5)
-                assert scores[at] == pytest.approx([thing * each for each in named], rel=1e-4)
-                at += 1
 
 
 def test_fastestdet_cell_by_cell():

@@ -18,7 +18,6 @@ from edgevpr.runtime.recognise.salience_gate import (
     Worth,
     compute_memorability,
     compute_scores,
-    select_best,
 )
 from edgevpr.techniques.entropy import filled_bins
 
@@ -121,12 +120,6 @@ def test_the_detector_looks_at_every_kth_frame_only():
     assert detector.looks == 4
 
 
-def test_lowering_the_thresholds_step_by_step_lets_the_best_pass():
-    assert select_best([0.05, 0.031, 0.2, 0.059]) == [True, True, False, True]  # two steps of 0.03
-    assert select_best([0.03]) == [True]
-    assert select_best([0.5, 0.02, 0.03, 0.031]) == [False, True, True, False]
-
-
 NORTH_M = 1 / 111_195  # degrees
 
 
@@ -145,10 +138,6 @@ def event(number, short_by=0.0, north_m=None):
 def kept(gaps, events):
     found = [pair for each in events for pair in gaps.take(each)]
     return [(int(each.frame.name), salience.is_low) for each, salience in [*found, *gaps.end()]]
-
-
-def test_what_passes_is_kept_at_once_and_what_does_not_is_left_out():
-    assert kept(Gaps(20), [event(0), event(1, 0.1), event(2), event(3, 0.1)]) == [(0, False), (2, False)]
 
 
 @pytest.mark.parametrize("seed", range(5))
