@@ -1,4 +1,4 @@
-"""Cards of two object detectors, for tests and benchmarks. Their files are no part of edgevpr: they are looked for in
+"""Cards of two object detectors. Their files are no part of edgevpr: they are looked for in
 $EDGEVPR_DETECTORS, by default ../shared/models beside the project.
 """
 
