@@ -2,10 +2,10 @@
 $EDGEVPR_DETECTORS, by default ../shared/models beside the project.
 """
 
+import json
 import os
 from pathlib import Path
 
-from edgevpr.runtime.preflight.networks import card_text
 from edgevpr.techniques.session import file_sha256
 
 FILES = Path(os.environ.get("EDGEVPR_DETECTORS") or Path(__file__).resolve().parents[2] / "shared" / "models")
@@ -49,4 +49,4 @@ def write_card(name: str, folder: Path) -> None:
         "source": "an ONNX file beside the project",
         **_SAID[name],
     }
-    (folder / f"{name}.yaml").write_text(card_text(card))
+    (folder / f"{name}.yaml").write_text(json.dumps(card))

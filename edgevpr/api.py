@@ -28,7 +28,8 @@ from edgevpr.core.config import load_config
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.reasons import Reason
 from edgevpr.core.types import Frame, Place, Position
-from edgevpr.mapmaking.making import Cuttings, FlownPictures, MadeMap, MapOrder, make_map
+from edgevpr.mapmaking.making import MadeMap, MapOrder, make_map
+from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
 from edgevpr.power.boards import load_board, resolve_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -205,7 +206,8 @@ def build(
 
     `images`: a folder of pictures or a video; `FlownPictures` say more of them, and `Cuttings` take an orthophoto.
     `camera`: "nadir" or "forward". `technique`: None chooses it. `config`: a configuration of the flight (None: the
-    shipped one). Pictures that cannot be used are left out with a warning. Raises EdgevprError.
+    shipped one). Pictures that cannot be used are left out with a warning, and one says what could not be done to the
+    map. Raises EdgevprError.
     """
     pictures = images if isinstance(images, FlownPictures | Cuttings) else FlownPictures(source=_path_of(images))
     order = MapOrder(
@@ -214,7 +216,10 @@ def build(
     settings = load_config(config, {"source.camera": camera})
     shown = text.progress if progress is None else _reported_to(progress)
     with ThreadpoolController().limit(limits=1, user_api="blas"):
-        return make_map(order, settings, lambda error: _log.warning("%s", error), shown)
+        made = make_map(order, settings, lambda error: _log.warning("%s", error), shown)
+    for sentence in made.not_done:
+        _log.warning("%s", sentence)
+    return made
 
 
 def _reported_to(progress: Progress) -> Any:

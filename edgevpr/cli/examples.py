@@ -28,15 +28,8 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "map merge": (("two flights as one map", "all.gpkg monday.gpkg tuesday.gpkg"),),
     "map shrink": (("the 500 best places, spread over the map", "valley.gpkg small.gpkg --places 500"),),
     "map subset": (
-        ("of a fleet's maps what a mission needs", "valley/ --mission plan.waypoints --out flight.gpkg"),
+        ("of a folder of maps what a mission needs", "valley/ --mission plan.waypoints --out flight.gpkg"),
         ("in a file of 50 MB at most", "valley/ --mission plan.plan --margin-m 300 --mb 50 --out flight.gpkg"),
-    ),
-    "fleet build": (
-        ("the photographs of many flights", "valley/ --images monday/ tuesday/ --camera nadir"),
-        (
-            "a large orthophoto, by the computers of a network",
-            "state/ --orthophoto state.vrt --footprint-m 120 --spacing-m 30 --scheduler tcp://10.0.0.1:8786",
-        ),
     ),
     "salience": (("what of a picture is worth remembering", "photos/0042.jpg"),),
     "match": (
@@ -67,8 +60,7 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
         ("a mission over this year's ground", "later --orthophoto now.tif --track mission.plan --height-m 120"),
     ),
     "demo": (("the whole job in a minute", "--out demo_out"),),
-    "models list": (("which networks there are", ""),),
-    "models add": (("a network of yours", "net.onnx --card net.yaml"),),
+    "models list": (("which networks there are, and whether they work", ""),),
 }
 
 

@@ -9,7 +9,7 @@ import threading
 from functools import cache
 
 from edgevpr import __version__
-from edgevpr.cli import evaluation, fleet, flying, maps, networks, positions, profile, review, simulation, top
+from edgevpr.cli import evaluation, flying, maps, networks, positions, profile, review, simulation, top
 from edgevpr.cli.screen import LineFormatter, guard_output
 from edgevpr.cli.shared import Parser
 from edgevpr.core.errors import EdgevprError
@@ -24,7 +24,7 @@ EXIT_CODES = {
     "was begun, and trying again does not help: systemd starts the service no more. `check` ends so where `run` does.",
     130: "Stopped by Ctrl-C. What is ended so (`run`, `top`) ends with 0 or 1.",
 }
-_GROUPS = (positions, maps, fleet, flying, top, review, profile, evaluation, simulation, networks)
+_GROUPS = (positions, maps, flying, top, review, profile, evaluation, simulation, networks)
 
 
 def program() -> None:

@@ -32,7 +32,7 @@ from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import progress
 
 if TYPE_CHECKING:
-    from edgevpr.mapmaking.making import Cuttings, FlownPictures
+    from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
 
 _OF_AN_ORTHOPHOTO = ("footprint_m", "spacing_m", "area", "attribution")
 _OF_A_RECORDING = ("positions", "rate_hz")
@@ -100,11 +100,6 @@ def _add_build(build: ArgumentParser) -> None:
 def _add_pictures(parser: ArgumentParser) -> None:
     """Add the flags for the pictures to make a map of: those of a recording, and those of an orthophoto."""
     add_recording(parser, required=False)
-    add_orthophoto(parser)
-
-
-def add_orthophoto(parser: ArgumentParser) -> None:
-    """Add the flags for an orthophoto, and for the pictures that are cut from it."""
     flags = parser.add_argument_group("from an orthophoto, instead of --images")
     flags.add_argument(
         "--orthophoto",
@@ -141,7 +136,7 @@ def _lengths(text: str) -> tuple[float, ...]:
 
 def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
     """Return the pictures that the flags name: those of a recording or of an orthophoto. Raises UsageError."""
-    from edgevpr.mapmaking.making import FlownPictures
+    from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
 
     if (args.source is None) == (args.orthophoto is None):
         raise UsageError("Give either --images (pictures of a flight) or --orthophoto: a map is made of one of them.")
@@ -152,13 +147,6 @@ def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
     if args.source is not None:
         rate_hz = getattr(args, "rate_hz", None)
         return FlownPictures(source=args.source, positions=path_of(args.positions), rate_hz=rate_hz)
-    return parse_cuttings(args)
-
-
-def parse_cuttings(args: Namespace) -> "Cuttings":
-    """Return the pictures that the flags of an orthophoto name. Raises UsageError."""
-    from edgevpr.mapmaking.making import Cuttings
-
     if args.footprint_m is None or args.spacing_m is None:
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
     about: dict[str, Any] = {name: getattr(args, name, None) for name in _OF_AN_ORTHOPHOTO}
@@ -193,7 +181,7 @@ def map_build(args: Namespace) -> int:
 
 def map_refine(args: Namespace) -> int:
     """Run `map refine`: correct the positions of a map's pictures by comparing them, and print the result."""
-    from edgevpr.mapmaking.making import refine_map
+    from edgevpr.mapmaking.finishing import refine_map
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.runtime.recognise.opening import create_technique
 
@@ -216,7 +204,7 @@ def map_move(args: Namespace) -> int:
 
 def map_calibrate(args: Namespace) -> int:
     """Run `map calibrate`: calibrate the confidence of matches in a map, and print what to expect of the map."""
-    from edgevpr.mapmaking.making import calibrate_map
+    from edgevpr.mapmaking.finishing import calibrate_map
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.runtime.recognise.opening import create_technique
 

@@ -1,4 +1,4 @@
-"""`edgevpr map subset`: the part of a map, or of a fleet's maps, that one flight needs."""
+"""`edgevpr map subset`: the part of a map, or of a folder of maps, that one flight needs."""
 
 from argparse import Namespace
 from collections.abc import Callable
@@ -14,9 +14,7 @@ _MARGIN_M = 500.0
 
 def add(of_map: Callable[..., Any]) -> None:
     """Add the command and its flags. `of_map` adds a command that begins with a map."""
-    parser = of_map(
-        "subset", map_subset, "cut out the part that a mission needs", "map, or folder made by `fleet build`"
-    )
+    parser = of_map("subset", map_subset, "cut out the part that a mission needs", "map, or folder of maps")
     parser.add_argument(
         "--mission",
         metavar="FILE",

@@ -6,7 +6,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from edgevpr.core.arrays import Array, Bools, Degrees, Doubles, Floats, LatLon
+from edgevpr.core.arrays import Array, Degrees, Doubles, Floats, LatLon
 
 Extent = tuple[float, float, float, float]  # south, west, north, east in degrees
 D = TypeVar("D", float, Doubles, Floats)
@@ -62,22 +62,6 @@ def compute_extent(points: Iterable[LatLon]) -> Extent:
     if max(lons_deg) - min(lons_deg) > 180:
         lons_deg = tuple(lon_deg % 360 for lon_deg in lons_deg)
     return min(lats_deg), min(lons_deg), max(lats_deg), max(lons_deg)
-
-
-def widen_extent(extent_deg: Extent, margin_m: float) -> Extent:
-    """Return the bounding box of what lies in `extent_deg` or within `margin_m` metres of it; east is above 180 degrees
-    if it crosses the antimeridian."""
-    south, west, north, east = extent_deg
-    (south, west), (north, east) = moved(south, west, -margin_m, -margin_m), moved(north, east, margin_m, margin_m)
-    return south, west, north, west + (east - west) % 360
-
-
-def is_in_extent(extent_deg: Extent, lat_deg: Doubles, lon_deg: Doubles) -> Bools:
-    """Return bool (N,), True for the positions in degrees, (N,) each, that lie in a bounding box: not for those on its
-    northern and eastern edge, which are its neighbours'."""
-    south, west, north, east = extent_deg
-    is_between = [(lon_deg + turn_deg >= west) & (lon_deg + turn_deg < east) for turn_deg in (-360, 0, 360)]
-    return np.asarray((lat_deg >= south) & (lat_deg < north) & np.any(is_between, axis=0))
 
 
 def axes_of(up_deg: float) -> Doubles:

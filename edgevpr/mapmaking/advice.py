@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import closing, suppress
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -29,13 +28,11 @@ from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.mask import Mask
 from edgevpr.frames.positions import find_positions, find_track, read_positions, read_track
 from edgevpr.frames.source import Source, open_source, read_to_end
+from edgevpr.mapmaking.pictures import FlownPictures
 from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, measure_tilt
 from edgevpr.runtime.recognise.agreement import PROVEN, agreement
 from edgevpr.runtime.recognise.calibration import FEWEST_PLACES
 from edgevpr.runtime.recognise.landmarks import describe
-
-if TYPE_CHECKING:
-    from edgevpr.mapmaking.making import FlownPictures
 
 _log = logging.getLogger(__name__)
 _RUNS = 6  # of neighbouring pictures that are compared, spread over the folder
@@ -69,7 +66,7 @@ _MIN_DISPLAY_SHARE = 0.006
 _MAX_STILL_EDGES = 0.5  # share of all edges: with more the camera itself stood still
 
 
-def warn_of_gaps(pictures: "FlownPictures", total: int, places: int | None) -> None:
+def warn_of_gaps(pictures: FlownPictures, total: int, places: int | None) -> None:
     """Warn of what the map will lack. `total`: number of frames (0: unknown). `places`: number of places in the map
     already (None: the map is not to be calibrated)."""
     uri, is_placed = pictures.source, (pictures.positions or find_track(pictures.source)) is not None
@@ -95,7 +92,7 @@ def warn_of_gaps(pictures: "FlownPictures", total: int, places: int | None) -> N
         _log.warning(text, total + places, FEWEST_PLACES)
 
 
-def suggest_lens(pictures: "FlownPictures", config: SourceConfig, technique: Technique) -> None:
+def suggest_lens(pictures: FlownPictures, config: SourceConfig, technique: Technique) -> None:
     """Log the field of view of the lens by the EXIF data of a picture, if it is not configured: without it pictures of
     a camera that looks down are neither untilted nor scaled."""
     is_needed = technique.spec.parameters.get("camera") == "nadir" and config.fov_deg is None and config.lens is None
@@ -109,7 +106,7 @@ def suggest_lens(pictures: "FlownPictures", config: SourceConfig, technique: Tec
 
 
 @at_work("looking where the camera looks")
-def require_ahead(pictures: "FlownPictures", mask: Mask | None) -> None:
+def require_ahead(pictures: FlownPictures, mask: Mask | None) -> None:
     """Log that the camera is taken to look ahead, and why. Raises UsageError if the pictures clearly look straight
     down: the user must say then what is meant."""
     tilt_deg = _gimbal_tilt_deg(pictures.folder) if pictures.folder else None
@@ -125,7 +122,7 @@ def require_ahead(pictures: "FlownPictures", mask: Mask | None) -> None:
 
 
 @at_work("measuring the tilt of the camera")
-def require_level(pictures: "FlownPictures", fov_deg: float | None) -> None:
+def require_level(pictures: FlownPictures, fov_deg: float | None) -> None:
     """Raise UsageError if neighbouring pictures show that a camera that is to look straight down is tilted, and its
     angles are not recorded: then nothing could level them."""
     if pictures.folder:
@@ -148,7 +145,7 @@ def require_level(pictures: "FlownPictures", fov_deg: float | None) -> None:
         )
 
 
-def _compare_neighbours(pictures: "FlownPictures", mask: Mask | None) -> tuple[bool, str]:
+def _compare_neighbours(pictures: FlownPictures, mask: Mask | None) -> tuple[bool, str]:
     """Compare neighbouring pictures. Returns whether they clearly look down, and what was found, as text."""
     folder = pictures.folder
     runs = map(_read_usable, _runs(folder)) if folder else [_read_film(pictures.source, _FILM_PICTURES)]
@@ -170,7 +167,7 @@ def _compare_neighbours(pictures: "FlownPictures", mask: Mask | None) -> tuple[b
 
 
 @at_work("looking for a display")
-def warn_of_display(pictures: "FlownPictures", mask: Mask | None) -> None:
+def warn_of_display(pictures: FlownPictures, mask: Mask | None) -> None:
     """Warn if something stands still in the pictures where `mask` shows ground (None: everywhere)."""
     if pictures.folder:
         paths = list_images(pictures.folder)

@@ -5,8 +5,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
@@ -15,7 +14,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, Image, Ints
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.geodesy import Extent, is_in_extent, widen_extent
+from edgevpr.core.geodesy import Extent
 from edgevpr.core.text import decode_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.shot import Refusal
@@ -26,7 +25,7 @@ from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.mapmaking.tiles import ground_of
 
 if TYPE_CHECKING:
-    from edgevpr.mapmaking.making import Cuttings
+    from edgevpr.mapmaking.pictures import Cuttings
 
 _log = logging.getLogger(__name__)
 
@@ -43,10 +42,6 @@ _BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainl
 _MOST_PLACES = 1_000_000
 _EDGE_MARGIN = 0.01  # of the sides of a box
 _MOST_POINTS = 20 * _MOST_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
-
-
-class NoPlaceError(UsageError):
-    """No place of the grid lies where the user wants one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,18 +138,6 @@ class OrthophotoSource(RecordingSource):
         """Yield each place as its lattice and its number there."""
         return ((lattice, at) for lattice in self._lattices for at in range(len(lattice)))
 
-    def ground(self, spacing_m: float) -> Iterator[bytes]:
-        """Yield what the pictures are cut from: the numbers of the places, and all that the file shows around them, in
-        windows that overlap."""
-        photo = self._orthophoto
-        together = max(1, int(SIDE_PX * photo.resolution_m / spacing_m))  # places a window, along each side
-        for lattice in self._lattices:
-            side_px = math.ceil((2 * together * spacing_m + lattice.footprint_m) / photo.resolution_m)
-            numbers = np.column_stack((lattice.rows, lattice.columns))
-            yield numbers.tobytes()
-            for at in np.unique(numbers // together, axis=0, return_index=True)[1].tolist():
-                yield photo.as_it_is(lattice.position_of(at), side_px)[0].tobytes()
-
     def close(self) -> None:
         """Close the orthophoto."""
         self._orthophoto.close()
@@ -169,43 +152,16 @@ def _white(image: Image) -> float:
 
 def open_cuttings(cuttings: "Cuttings", only: Collection[str] | None) -> OrthophotoSource:
     """Open an orthophoto and choose the places, see `Cuttings.open`."""
-    tile_deg, footprints_m = cuttings.tile_deg, _footprints_m(cuttings)
+    footprints_m = [float(footprint_m) for footprint_m in np.unique(cuttings.footprint_m)]
     area = read_area(cuttings.area) if cuttings.area else None
-    if area is None and tile_deg:
-        area = _make_area_around(widen_extent(tile_deg, cuttings.margin_m))
-    orthophoto = _open_orthophoto(cuttings, area)
+    orthophoto = Orthophoto(cuttings.orthophoto, ground_of(area.points, footprints_m[-1]) if area else None)
     lattices = [make_lattice(orthophoto, footprint_m, cuttings.spacing_m, area) for footprint_m in footprints_m]
     if (across_px := footprints_m[0] / orthophoto.resolution_m) < _LEAST_PX:
         raise UsageError(
             f"{orthophoto.name} has {across_px:.0f} pixels along a picture of {footprints_m[0]:g} m, and nothing is "
             f"found with fewer than {_LEAST_PX}: give a sharper one."
         )
-    if tile_deg:
-        lattices = [select_of_tile(lattice, tile_deg, cuttings.margin_m) for lattice in lattices]
     return OrthophotoSource(orthophoto, lattices, only=only)
-
-
-def _make_area_around(extent_deg: Extent) -> Area:
-    """Return an area a little larger than a bounding box, whose edges are curves in other projections."""
-    south, west, north, east = extent_deg
-    lat_deg, lon_deg = _EDGE_MARGIN * (north - south), _EDGE_MARGIN * (east - west)
-    south, west, north, east = south - lat_deg, west - lon_deg, north + lat_deg, east + lon_deg
-    return Area(polygons=([(south, west), (south, east), (north, east), (north, west), (south, west)],))
-
-
-def extent_of_cuttings(cuttings: "Cuttings") -> Extent:
-    """Return the bounding box of the ground that is cut, see `Cuttings.extent_deg`."""
-    area = read_area(cuttings.area) if cuttings.area else None
-    with closing(_open_orthophoto(cuttings, area)) as orthophoto:
-        return ground_of(area.points, _footprints_m(cuttings)[-1]).extent_deg if area else orthophoto.extent_deg
-
-
-def _footprints_m(cuttings: "Cuttings") -> list[float]:
-    return [float(footprint_m) for footprint_m in np.unique(cuttings.footprint_m)]
-
-
-def _open_orthophoto(cuttings: "Cuttings", area: Area | None) -> Orthophoto:
-    return Orthophoto(cuttings.orthophoto, ground_of(area.points, _footprints_m(cuttings)[-1]) if area else None)
 
 
 def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, area: Area | None = None) -> Lattice:
@@ -213,8 +169,8 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
     place is inside its bounding box. With an `area` (None: no limit), keep only the places of this grid that are in
     its polygons or within `footprint_m` of its path.
 
-    Raises UsageError if footprint or spacing do not fit the orthophoto, or there are more than a million places, and
-    NoPlaceError if there are none.
+    Raises UsageError if footprint or spacing do not fit the orthophoto, or there are more than a million places, or
+    none.
     """
     plane = local_crs(orthophoto.middle)
     outline_m = np.array(orthophoto.outline(plane))
@@ -237,7 +193,7 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
         ground = area.on_plane(lambda lat_deg, lon_deg: transform(WGS84, plane, lon_deg, lat_deg), 0.0, footprint_m)
         area_low, area_high = np.reshape(ground.bounds, (2, 2))
         if not ((area_low <= high) & (area_high >= low)).all():  # false for an empty one, whose bounds are NaN
-            raise NoPlaceError(
+            raise UsageError(
                 f"The area does not touch {orthophoto.name}: it is at {extent_words(area.extent_deg)}, the orthophoto "
                 f"at {extent_words(orthophoto.extent_deg)}."
             )
@@ -253,24 +209,13 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
     rows, columns = np.nonzero(wanted)
     _require_bounded(len(rows), _MOST_PLACES, spacing_m)
     if not len(rows):
-        raise NoPlaceError(
+        raise UsageError(
             f"No place of a grid of {spacing_m:g} m lies in the area and in {orthophoto.name}: give a smaller spacing."
         )
     lon_deg, lat_deg = map(np.array, transform(plane, WGS84, x_m[columns], y_m[rows]))
     shape = (int(count[1]), int(count[0]))
     rows, columns = rows + count[1] - end[1], columns + begin[0]
     return Lattice(footprint_m=footprint_m, rows=rows, columns=columns, lat_deg=lat_deg, lon_deg=lon_deg, shape=shape)
-
-
-def select_of_tile(lattice: Lattice, tile_deg: Extent, margin_m: float) -> Lattice:
-    """Return the places of a grid that lie in the tile with this bounding box, or within `margin_m` of it. Raises
-    NoPlaceError if none is in the tile: each place is in one tile of a zoom."""
-    there = is_in_extent(tile_deg, lattice.lat_deg, lattice.lon_deg)
-    if not there.any():
-        raise NoPlaceError(f"No place lies in the tile {extent_words(tile_deg)}.")
-    there |= is_in_extent(widen_extent(tile_deg, margin_m), lattice.lat_deg, lattice.lon_deg)
-    arrays = {name: getattr(lattice, name)[there] for name in ("rows", "columns", "lat_deg", "lon_deg")}
-    return replace(lattice, **arrays)
 
 
 def _require_bounded(count: int, most: int, spacing_m: float) -> None:

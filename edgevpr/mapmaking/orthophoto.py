@@ -137,13 +137,6 @@ class Orthophoto:
             picture[~seen] = picture[seen].mean(axis=0)
         return picture, seen
 
-    def as_it_is(self, at: Position, side_px: int) -> tuple[Image, Bools]:
-        """Return the pixels of the file around `at`, neither turned nor scaled: up to `side_px` rows and columns, fewer
-        at the edges of the file. Returns and raises as `cut` does."""
-        middle, size = self._pixels(at, np.zeros((1, 2)))[0], np.array([self._raster.width, self._raster.height])
-        low, high = (np.clip(middle + side, 0, size).astype(int).tolist() for side in (-side_px / 2, side_px / 2))
-        return self._raster.read(tuple(low), tuple(high), 1)
-
     def close(self) -> None:
         """Close the file."""
         self._raster.close()

@@ -1,5 +1,5 @@
 """Refinement of a map whose camera looks straight down: its pictures are matched with each other to correct the
-recorded positions. `mapmaking.making` calls it.
+recorded positions. `mapmaking.finishing` calls it.
 
 Each place gets a pose: the direction and the footprint of its picture, and a position with a covariance. Headings, lens
 and mounting of the camera need not be known. A place with ties (see `graph`) to too few others keeps its recorded

@@ -7,12 +7,11 @@ from pathlib import Path
 
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import MapError, UsageError
-from edgevpr.core.geodesy import Extent, offset_m, widen_extent
+from edgevpr.core.geodesy import offset_m
 from edgevpr.mapmaking.missions import Area, shapely
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import Watch, merge, positions_in, select, shrink
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapinfo import read_extent
 from edgevpr.runtime.recognise.calibration import (
     MapCalibration,
     calibration_text,
@@ -35,7 +34,7 @@ class Subset:
 
 
 def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: float | None, watch: Watch) -> Subset:
-    """Make the map `out` of the places of `source`, a map or a folder of tiles, that are within `margin_m` metres of an
+    """Make the map `out` of the places of `source`, a map or a folder of maps, that are within `margin_m` metres of an
     area: as many as fit into `most_bytes` (None: all), the best, spread over the ground. Raises UsageError if there are
     none or none fits, and MapError for a map that cannot be read."""
     south, west, north, east = area.extent_deg
@@ -44,24 +43,21 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
         return offset_m((south + north) / 2, (west + east) / 2, lat_deg, lon_deg)
 
     ground = area.on_plane(project, margin_m, margin_m)
-    paths, calibrations = (
-        _list_maps_near(source, widen_extent(area.extent_deg, margin_m)),
-        list[MapCalibration | None](),
-    )
-
-    def wanted(place_map: PlaceMap) -> list[int]:
-        place_ids, lat_deg, lon_deg = positions_in(place_map)
-        there: list[int] = place_ids[shapely.contains_xy(ground, *project(lat_deg, lon_deg))].tolist()
-        if there:
-            calibrations.append(read_calibration_for(place_map))
-        return there
-
+    ids_near: dict[Path, list[int]] = {}
+    calibrations: list[MapCalibration | None] = []
+    for path in _list_maps(source):
+        with PlaceMap.open(path) as place_map:
+            place_ids, lat_deg, lon_deg = positions_in(place_map)
+            if there := place_ids[shapely.contains_xy(ground, *project(lat_deg, lon_deg))].tolist():
+                ids_near[path] = there
+                calibrations.append(read_calibration_for(place_map))
+    paths = list(ids_near)
     with mapfiles.whole_or_none(out) as unfinished, tempfile.TemporaryDirectory(dir=out.parent) as scratch:
         whole, made = Path(scratch) / "near.gpkg", Path(scratch) / "small.gpkg"
         if len(paths) == 1:
-            near = select(paths[0], whole, wanted)
+            near = select(paths[0], whole, ids_near[paths[0]])
         else:  # as numbers of places copied, and of those that were there already
-            near = sum(copied for copied, _ in merge(list(map(str, paths)), whole, watch, wanted)[0]) if paths else 0
+            near = sum(copied for copied, _ in merge(paths, whole, watch, list(ids_near.values()))[0]) if paths else 0
         if not near:
             raise UsageError(
                 f"No place of {source} is within {margin_m:g} m of the mission: check both, or the margin."
@@ -82,21 +78,10 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
     return Subset(maps=len(paths), near=near, places=count, file_bytes=size, is_calibrated=is_calibrated)
 
 
-def _list_maps_near(source: Path, near_deg: Extent) -> list[Path]:
-    """Return the maps to look into: one map, or of a folder those whose bounding box touches another."""
+def _list_maps(source: Path) -> list[Path]:
+    """Return the maps to look into: one map, or those of a folder. Raises MapError if there is none."""
     if not source.is_dir():
         return [mapfiles.existing(source)]
-    paths = sorted(source.glob("*.gpkg"))
-    if not paths:
-        raise MapError(f"{source} holds no map (*.gpkg): give one that `edgevpr fleet build` has made.")
-    south, west, north, east = near_deg
-    near = []
-    for path in paths:
-        with PlaceMap.open(path) as place_map:
-            extent_deg = read_extent(place_map)
-        if extent_deg:
-            low, left, high, right = extent_deg
-            overlaps = (west - left) % 360 <= right - left or (left - west) % 360 <= east - west
-            if overlaps and low <= north and high >= south:
-                near.append(path)
-    return near
+    if not (paths := sorted(source.glob("*.gpkg"))):
+        raise MapError(f"{source} holds no map (*.gpkg): give a folder of maps, or one map.")
+    return paths

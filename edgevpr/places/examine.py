@@ -34,9 +34,6 @@ class Examined(NamedTuple):
     is_usable: bool
 
 
-Wanted = Callable[[PlaceMap], Collection[int] | None]  # the ids of the places of a map that are wanted; None: all
-
-
 def positions_in(place_map: PlaceMap) -> tuple[Ints, Doubles, Doubles]:
     """Return the ids, int (N,), and the positions, float64 (N,) each, of the readable places; NaN: unknown."""
     place_ids, lat_deg, lon_deg, _ = np.array(list(place_map.outlines())).reshape(-1, 4).T
@@ -109,10 +106,14 @@ def _rows_of(place_map: PlaceMap, place_ids: Collection[int]) -> Iterator[tuple[
 
 
 def merge(
-    paths: Sequence[str], out: Path, watch: Watch = unwatched, wanted: Wanted = lambda place_map: None
+    paths: Sequence[str | Path],
+    out: Path,
+    watch: Watch = unwatched,
+    only: Sequence[Collection[int] | None] | None = None,
 ) -> tuple[list[tuple[int, int]], bool]:
-    """Make the new map `out` of the `wanted` places of several maps; if that fails, leave no file. Returns for each map
-    (places copied, places that were there already) as numbers, and True if one was calibrated: `out` is not.
+    """Make the new map `out` of the places of several maps, or of those with the ids `only`, a collection for each map;
+    if that fails, leave no file. Returns for each map (places copied, places that were there already) as numbers, and
+    True if one was calibrated: `out` is not.
 
     A place is there already if image name and time are equal and the coarse parts nearly so (`PlaceMap.is_of`). Mask
     hash and lens are copied if all have the same; attributions are all copied. Raises MapError if the techniques differ
@@ -130,15 +131,17 @@ def merge(
                 merged.record_lens(*lenses)
             for each in maps:
                 merged.add_attribution(each.attribution)
-            return [_absorb(merged, each, watch, wanted) for each in maps], any(
-                each.calibration is not None for each in maps
-            )
+            counts = [
+                _absorb(merged, other, watch, place_ids)
+                for other, place_ids in zip(maps, only or [None] * len(maps), strict=True)
+            ]
+            return counts, any(each.calibration is not None for each in maps)
 
 
-def _absorb(place_map: PlaceMap, other: PlaceMap, watch: Watch, wanted: Wanted) -> tuple[int, int]:
-    """Copy what is new and `wanted` of `other` into `place_map`; return (copied, already there) as numbers."""
+def _absorb(place_map: PlaceMap, other: PlaceMap, watch: Watch, only: Collection[int] | None) -> tuple[int, int]:
+    """Copy what is new of `other`, or of its places with the ids `only`, into `place_map`; return (copied, already
+    there) as numbers."""
     copied = already_here = 0
-    only = wanted(other)
     with place_map.transaction():
         here = place_map.select_ids("source_image, time")
         total = len(other) if only is None else len(only)
@@ -198,10 +201,10 @@ def repair(path: str | Path, watch: Watch = unwatched) -> Path:
     return original
 
 
-def select(path: str | Path, out: Path, wanted: Wanted) -> int:
-    """Copy the `wanted` places of a map to the new file `out`, as `shrink` does; return how many there are."""
+def select(path: str | Path, out: Path, place_ids: Collection[int]) -> int:
+    """Copy places of a map to the new file `out`, as `shrink` does; return how many there are."""
     with mapfiles.whole_or_none(out) as unfinished, PlaceMap.open(path) as place_map:
-        return _copy(place_map, unfinished, examine(place_map, wanted(place_map)))
+        return _copy(place_map, unfinished, examine(place_map, place_ids))
 
 
 def shrink(path: str | Path, out: Path, count: int, watch: Watch = unwatched) -> tuple[int, int]:

@@ -65,14 +65,13 @@ class PlaceMap(MapConnection):
 
     `mask_sha256`: hash of the overlay mask that was used to make the places. `lens`: name of the calibration by which
     their pictures were straightened. `attribution`: owners of the orthophotos that places were cut from, in their own
-    words. `calibration`: the calibration of confidences (see `mapmaking.calibrate`). `inputs_sha256`: hash of all that
-    a tile of a fleet's maps was made of. None: there is none, or it is unknown."""
+    words. `calibration`: the calibration of confidences (see `mapmaking.calibrate`). None: there is none, or it is
+    unknown."""
 
     mask_sha256 = _StoredText(mapspec.MASK)
     lens = _StoredText(mapspec.LENS)
     attribution = _StoredText(mapspec.ATTRIBUTION)
     calibration = _StoredText(mapspec.CALIBRATION)
-    inputs_sha256 = _StoredText(mapspec.INPUTS)
 
     def require(self, spec: TechniqueSpec) -> None:
         """Raise MapError, naming what differs, unless the map's descriptors were made by exactly `spec`."""
@@ -130,10 +129,6 @@ class PlaceMap(MapConnection):
         if text:
             words = [*(self.attribution or text).split(_OWNERS), *text.split(_OWNERS)]
             self._record_text(mapspec.ATTRIBUTION, _OWNERS.join(dict.fromkeys(words)))
-
-    def record_inputs(self, sha256: str) -> None:
-        """Store the hash of all that the map was made of. Raises MapError."""
-        self._record_text(mapspec.INPUTS, sha256)
 
     def record_calibration(self, text: str | None) -> None:
         """Store the map's calibration of confidences, as text (None: not calibrated). Raises MapError."""

@@ -57,8 +57,8 @@ def require_regular(path: Path) -> None:
     from which a program would read for ever."""
     if path.is_dir():
         raise MapError(
-            f"{path} is a folder, and a map is one file: cut the map of a mission out of a folder that `fleet build` "
-            f"made with `edgevpr map subset {path} --mission FILE --out flight.gpkg`."
+            f"{path} is a folder, and a map is one file: cut the map of a mission out of a folder of maps with "
+            f"`edgevpr map subset {path} --mission FILE --out flight.gpkg`."
         )
     for each in (path, *beside(path)):
         if each.exists() and not each.is_file():

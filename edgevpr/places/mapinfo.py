@@ -82,7 +82,7 @@ def describe_map(place_map: PlaceMap) -> MapInfo:
         spec=place_map.spec,
         places=places,
         with_position=with_position,
-        extent=read_extent(place_map) if with_position else None,
+        extent=_read_extent(place_map) if with_position else None,
         first_time=first,
         last_time=last,
         of_low_quality=int(of_low_quality),
@@ -95,7 +95,7 @@ def describe_map(place_map: PlaceMap) -> MapInfo:
     )
 
 
-def read_extent(place_map: PlaceMap) -> Extent | None:
+def _read_extent(place_map: PlaceMap) -> Extent | None:
     """Return the bounding box that the file states for its places (None: it states none). Raises MapError."""
     with sentences(place_map.path):
         extent = place_map.db.execute(_EXTENT).fetchone()

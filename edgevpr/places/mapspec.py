@@ -21,8 +21,8 @@ _DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for s
 _MOST_PART_BYTES = 64_000_000
 _PARTS = ("coarse", "fine", "packed")
 # Keys of texts that a map may lack.
-MASK, LENS, ATTRIBUTION, CALIBRATION, INPUTS = "mask_sha256", "lens", "attribution", "calibration", "inputs_sha256"
-BESIDE = MASK, LENS, ATTRIBUTION, CALIBRATION, INPUTS
+MASK, LENS, ATTRIBUTION, CALIBRATION = "mask_sha256", "lens", "attribution", "calibration"
+BESIDE = MASK, LENS, ATTRIBUTION, CALIBRATION
 _MOST_STORED = 1000  # rows read from the table, and characters of a damaged one in a message
 
 Stored = dict[str, Any]  # the JSON values of the table, by key
@@ -53,7 +53,7 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
         raise MapError(f"{path}: this is not a place map: give a .gpkg file made by `edgevpr map build`.")
     try:
         # The others are read only when they are needed: a map can be used without them.
-        said = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?, ?, ?)", BESIDE)
+        said = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?, ?)", BESIDE)
         stored = {key: json.loads(value) for key, value in said.fetchmany(_MOST_STORED)}
         version = stored["format_version"]
         if not isinstance(version, int) or version < 1:

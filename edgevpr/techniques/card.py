@@ -135,23 +135,19 @@ def find_weights(spec: TechniqueSpec) -> str | None:
     return f"{card.name}: {card.title} ({card.licence}; {card.source})"
 
 
-def read_card(path: Path, needs_hash: bool = True) -> Card:
-    """Read one card. With `needs_hash` False, `sha256` may be missing or empty, for a card that is not filled in yet.
-    Raises ConfigError or ModelError for a card that is not valid."""
-    values = read_yaml(path)
-    if not needs_hash:
-        values = {**values, "sha256": values.get("sha256") or ""}
-    card = build(Card, {"path": path, **values}, str(path))
-    for problem in _problems(card, "[0-9a-f]{64}" if needs_hash else "([0-9a-f]{64})?"):
+def read_card(path: Path) -> Card:
+    """Read one card. Raises ConfigError or ModelError for a card that is not valid."""
+    card = build(Card, {"path": path, **read_yaml(path)}, str(path))
+    for problem in _problems(card):
         raise ModelError(f"{path}: {problem}")
     return card
 
 
-def _problems(card: Card, sha256: str) -> Iterator[str]:
+def _problems(card: Card) -> Iterator[str]:
     """Yield a sentence for each fault of a card that the checks of types and ranges cannot find, with its remedy."""
     boxes, rule, channels = card.outputs.boxes, card.detector, 1 if card.input.colour == "grey" else 3
     per_channel = f"write one number or {channels}, one a channel"
-    if not re.fullmatch(sha256, card.sha256):
+    if not re.fullmatch("[0-9a-f]{64}", card.sha256):
         yield f"`sha256` must be the 64 hexadecimal digits that `sha256sum {card.file}` prints."
     if card.input.layout != "NCHW":
         yield f"`input.layout` is `{card.input.layout:.20}`: export the network again with the axes in the order NCHW."

@@ -1,5 +1,6 @@
 """Writes a network of PyTorch as an ONNX file with its card, checked against PyTorch."""
 
+import json
 import logging
 import warnings
 from collections.abc import Sequence
@@ -13,7 +14,6 @@ import torch
 
 from edgevpr.core.arrays import Singles
 from edgevpr.core.errors import EdgevprError
-from edgevpr.runtime.preflight.networks import card_text
 from edgevpr.techniques.card import InputRule
 from edgevpr.techniques.session import file_sha256
 
@@ -59,7 +59,8 @@ def write_model(file: ModelFile, network: torch.nn.Module, samples: Sequence[Sin
         "input": {key: value for key, value in asdict(file.rule).items() if value is not None},
         "outputs": file.outputs,
     }
-    file.path.with_suffix(".yaml").write_text(card_text(values), encoding="utf-8")
+    card = "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())  # JSON is YAML
+    file.path.with_suffix(".yaml").write_text(card, encoding="utf-8")
     return largest
 
 

@@ -13,9 +13,9 @@ from rasters import HOME, grid, ground_m, marked_raster, textured_raster, write_
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved
 from edgevpr.mapmaking.cuttings import SIDE_PX, OrthophotoSource, make_lattice
-from edgevpr.mapmaking.making import Cuttings
 from edgevpr.mapmaking.missions import Area, Waypoint
 from edgevpr.mapmaking.orthophoto import Orthophoto
+from edgevpr.mapmaking.pictures import Cuttings
 
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,7 @@ import pytest
 from edgevpr.core.errors import UsageError
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph
 from edgevpr.mapmaking.advice import require_level
-from edgevpr.mapmaking.making import FlownPictures
+from edgevpr.mapmaking.pictures import FlownPictures
 from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, MIN_PAIRS, measure_tilt
 
 CAMERA = Camera(width=320, height=240, focal_px=246.5, noise_sigma=0)

@@ -24,8 +24,9 @@ from edgevpr.frames.positions import GeoTag
 from edgevpr.frames.source import Source, open_source, read_tags
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
-from edgevpr.mapmaking.making import FlownPictures, finish_map
+from edgevpr.mapmaking.finishing import finish_map
 from edgevpr.mapmaking.mapping import build_map
+from edgevpr.mapmaking.pictures import FlownPictures
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import elsewhere

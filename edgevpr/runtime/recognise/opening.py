@@ -146,8 +146,8 @@ def create_technique(
     if not techniques.is_known(built_with.name):
         raise MapError(
             f"{place_map.path} was built with `{built_with.name}`, which this edgevpr does not have: update edgevpr, "
-            "add its network with `edgevpr models add`, or build the map with one of "
-            f"{', '.join(techniques.names())}."
+            "copy its network and card to your models folder (`edgevpr models list` says where), or build the map with "
+            f"one of {', '.join(techniques.names())}."
         )
     if name in (None, built_with.name):
         try:

@@ -13,7 +13,7 @@ from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import evaluate
 from edgevpr.lab.evaluate.metrics import compare, from_json
 from edgevpr.lab.evaluate.tables import results_text
-from edgevpr.mapmaking import making
+from edgevpr.mapmaking import finishing
 from edgevpr.runtime.preflight.probe import probe
 from edgevpr.techniques import create
 
@@ -74,7 +74,7 @@ def test_evaluate_says_what_could_not_be_done_to_the_map(folder, monkeypatch):
     def lack_scipy(*_):
         raise UsageError("SciPy is missing.")
 
-    monkeypatch.setattr(making, "calibrate_map", lack_scipy)
+    monkeypatch.setattr(finishing, "calibrate_map", lack_scipy)
     result = evaluate("cohog", load(folder), COHOG)
     assert result.not_done == ("the map is not calibrated: SciPy is missing.",)
     assert result.not_done[0] in results_text(compare([result]))

@@ -13,7 +13,8 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import moved, offset_m
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.positions import GeoTag, write_positions
-from edgevpr.mapmaking.making import FlownPictures, MapOrder, make_map
+from edgevpr.mapmaking.making import MapOrder, make_map
+from edgevpr.mapmaking.pictures import FlownPictures
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 

@@ -1,0 +1,137 @@
+"""What is done to a map once it has its places: their positions are refined, and its confidence is calibrated. The
+commands `edgevpr map refine` and `map calibrate` do one of these to an existing map."""
+
+import logging
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from edgevpr.core.config import Config
+from edgevpr.core.contract import Technique
+from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.types import Frame
+from edgevpr.frames.mask import load_mask
+from edgevpr.frames.source import read_to_end
+from edgevpr.mapmaking.headings import find_headings, lacks_heading
+from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
+from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
+from edgevpr.power.meter import QueryMeter
+from edgevpr.runtime.recognise.calibration import MapCalibration
+from edgevpr.runtime.recognise.encoder import FrameEncoder
+from edgevpr.runtime.recognise.evidence import list_evidence_kinds
+from edgevpr.runtime.recognise.levelling import lens_of, make_levelling
+
+if TYPE_CHECKING:
+    from edgevpr.mapmaking.refine import Refined
+
+_log = logging.getLogger(__name__)
+
+# Called with items, their number and a label; yields the items unchanged and shows the progress.
+Shown = Callable[[Iterable[Any], int, str], Iterable[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class FinishedMap:
+    """Result of `finish_map`. `refined`, `calibration`: results of refining and calibrating (None: not done).
+    `not_done`: sentences on which of them was to be done and could not be, and why."""
+
+    refined: "Refined | None"
+    calibration: MapCalibration | None
+    not_done: tuple[str, ...]
+
+
+def finish_map(
+    place_map: PlaceMap,
+    technique: Technique,
+    config: Config,
+    pictures: FlownPictures | Cuttings | None,
+    shown: Shown,
+    refine: bool = True,
+    calibrate: bool = True,
+) -> FinishedMap:
+    """Refine and calibrate an open map as far as its technique and its `pictures` (None: not at hand, so that it is not
+    calibrated) allow it. The result says what fails: a map is of use without."""
+    refined, calibration, not_done = None, None, []
+    if refine and technique.spec.looks_down and not isinstance(pictures, Cuttings):
+        try:
+            refined = refine_map(place_map, technique, pictures.folder if pictures else None, shown)
+        except EdgevprError as error:
+            not_done.append(f"the map is not refined: {error}")
+    if calibrate and pictures and list_evidence_kinds(technique.spec):
+        try:
+            calibration = calibrate_map(place_map, technique, config, pictures, shown)
+        except EdgevprError as error:
+            not_done.append(f"the map is not calibrated: {error}")
+    return FinishedMap(refined, calibration, tuple(not_done))
+
+
+def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | None, shown: Shown) -> "Refined":
+    """Refine the positions of an open map (see `refine`). `images` is the folder of its pictures (None: not at hand).
+    Raises UsageError if the map's technique does not allow it, or SciPy is missing."""
+    if not technique.spec.looks_down:
+        raise UsageError(
+            f"{place_map.path} is of {technique.spec.name}, and not of a camera that looks straight down: only `cohog` "
+            "with `--camera nadir` can be refined."
+        )
+    with _needing_scipy():
+        from edgevpr.mapmaking.refine import refine
+    refined = refine(place_map, technique, lambda pairs, total: shown(pairs, total, "refining"), images)
+    if refined.is_mirrored:
+        _log.warning(
+            "lat and lon may be swapped, or the sign of one lost (south and west are negative): the pictures fit the "
+            "mirror image of their positions, so no place of %s is refined: check the columns, and make the map again",
+            place_map.path,
+        )
+    return refined
+
+
+def calibrate_map(
+    place_map: PlaceMap, technique: Technique, config: Config, pictures: FlownPictures | Cuttings, shown: Shown
+) -> MapCalibration:
+    """Calibrate the confidence of an open map with the pictures that it was made from, as far as they can be read (see
+    `calibrate`). Raises UsageError if the map cannot be calibrated, or SciPy is missing."""
+    with _needing_scipy():
+        from edgevpr.mapmaking.calibrate import calibrate
+
+    lens = lens_of(config.source) if technique.spec.looks_down and isinstance(pictures, FlownPictures) else None
+
+    def read(names: Collection[str] | None) -> Iterator[Frame]:
+        yield from filter(None, read_to_end(pictures.open(names), lambda error: None))
+
+    def frames(names: Collection[str]) -> Iterator[Frame]:
+        first = next(read(names), None)
+        if lens is None or first is None or not lacks_heading(first, lens):
+            yield from read(names)
+        else:  # the images between show the motion
+            yield from (frame for frame in find_headings(read(None), lens) if frame.name in names)
+
+    return calibrate(
+        make_encoder(config, pictures, technique),
+        place_map,
+        config.match,
+        QueryMeter(load_board("this")),
+        frames,
+        lambda asked, total: shown(asked, total, "calibrating"),
+    )
+
+
+def make_encoder(config: Config, pictures: FlownPictures | Cuttings, technique: Technique) -> FrameEncoder:
+    """Return the encoder of places: with mask and levelling, which pictures cut from an orthophoto do not need."""
+    if isinstance(pictures, Cuttings):
+        return FrameEncoder(technique=technique)
+    levelling = make_levelling(config.source, technique, below=True)
+    return FrameEncoder(technique=technique, mask=load_mask(config.source.mask), levelling=levelling)
+
+
+@contextmanager
+def _needing_scipy() -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"Refining and calibrating a map need SciPy ({error}): install it on the machine that builds maps, with "
+            "`pip install scipy`, and run `edgevpr map refine` and `edgevpr map calibrate`."
+        ) from error

@@ -1,0 +1,54 @@
+"""The pictures that a map is made of: those of a flight, or those cut from an orthophoto."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from edgevpr.frames.source import Source, open_source
+
+if TYPE_CHECKING:
+    from edgevpr.mapmaking.cuttings import OrthophotoSource
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlownPictures:
+    """Pictures of a flight. `source`: a folder of images or a video. `positions`: their table of positions (None: the
+    one that `open_source` finds). `rate_hz`: pictures taken per second of a video (None: every frame)."""
+
+    source: str
+    positions: Path | None = None
+    rate_hz: float | None = None
+
+    def open(self, only: Collection[str] | None = None) -> Source:
+        """Open the source. Only pictures whose names are in `only` are read (None: all)."""
+        step_s = 1 / self.rate_hz if self.rate_hz else None
+        return open_source(self.source, step_s=step_s, positions=self.positions, live=False, only=only)
+
+    @property
+    def folder(self) -> Path | None:
+        """The folder of images; None for a video."""
+        return Path(self.source) if Path(self.source).is_dir() else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cuttings:
+    """Pictures that are cut from an orthophoto, at the places of a grid.
+
+    `orthophoto`: see `Orthophoto`. `footprint_m`: ground length of a picture's side, or several, each of which gives a
+    picture of every place. `spacing_m`: distance between neighbouring places. `area`: file or circle that limits the
+    places, see `missions.read_area` (None: the whole orthophoto). `attribution`: the owner's words, which a map keeps
+    (None: none are asked for)."""
+
+    orthophoto: str
+    footprint_m: float | Sequence[float]
+    spacing_m: float
+    area: str | None = None
+    attribution: str | None = None
+
+    def open(self, only: Collection[str] | None = None) -> "OrthophotoSource":
+        """Open the orthophoto and choose the places. Only pictures whose names are in `only` are cut (None: all).
+        Raises SourceError if it cannot be opened, and UsageError if grid and area do not fit it."""
+        from edgevpr.mapmaking.cuttings import open_cuttings  # loads GDAL, or raises if it is missing
+
+        return open_cuttings(self, only)
