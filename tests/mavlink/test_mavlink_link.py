@@ -156,21 +156,6 @@ def test_a_peer_that_does_not_read_never_blocks_the_sender(clock):
     server.close()
 
 
-def test_many_threads_may_send_and_no_packet_is_lost_or_torn(link, peer):
-    def chatter(name: str) -> None:
-        for count in range(20):
-            link.send(text(f"{name}{count}"))
-
-    threads = [threading.Thread(target=chatter, args=(name,)) for name in "abc"]
-    for thread in threads:
-        thread.start()
-    texts = {peer.expect("STATUSTEXT").text for _ in range(60)}
-    for thread in threads:
-        thread.join()
-    assert texts == {f"{name}{count}" for name in "abc" for count in range(20)}
-    assert peer.receiver.bad_bytes == 0
-
-
 def test_a_closed_link_sends_nothing_more_and_can_be_closed_again(port, clock):
     link = link_to(f"udpout:127.0.0.1:{port.number}", clock=clock)
     link.start()

@@ -15,7 +15,7 @@ from edgevpr.mavlink.asking import Inquiry, read_autopilot
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
 from simulated import autopilot
-from simulated.motion import TrueState, interpolate_track, read_track
+from simulated.motion import TrueState, read_track
 
 pytestmark = pytest.mark.network
 
@@ -76,13 +76,6 @@ def test_track_starts_with_a_flight_and_not_with_questions(monkeypatch):
             wait_until(lambda: (vehicle := flight.vehicle()) and vehicle.lat_deg == 50.1, "the end of the track")
     finally:
         autopilot.finish()
-
-
-def test_interpolate_track_has_the_velocity_along_it():
-    points = (0.0, 50.0, 8.0), (10.0, 50.001, 8.0), (20.0, 50.001, 8.001)
-    track = [TrueState(t_s=t_s, lat_deg=lat_deg, lon_deg=lon_deg, alt_m=0.0) for t_s, lat_deg, lon_deg in points]
-    velocities = [interpolate_track(track, t_s).velocity_m_s for t_s in (0.0, 5.0, 15.0, 30.0)]
-    assert velocities == pytest.approx([11.12j, 11.12j, 7.15 + 0j, 0j], abs=0.01), "north first"
 
 
 def test_read_track_takes_attitude_and_course_where_they_are_known(tmp_path):
