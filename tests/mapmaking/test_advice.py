@@ -69,19 +69,6 @@ def test_a_camera_that_looks_down_must_be_said_to(folder, view, pitch_deg, code)
     assert (here / "m.gpkg").exists() == (code == 0)
 
 
-def warnings_of(caplog):
-    return [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-
-
-@pytest.mark.slow
-def test_what_a_map_will_lack_is_said_before_it_is_made(folder, caplog):
-    lines = [f"{number}.jpg,0,0" for number in range(8)]
-    assert build(folder(ahead, lines)) == 0
-    nowhere, few = warnings_of(caplog)[:2]
-    assert "no position was found" in nowhere
-    assert "8 places at most" in few
-
-
 @pytest.mark.slow
 def test_the_ground_of_a_map_is_measured(folder, capsys):
     lines = [f"{number}.jpg,{50 + 0.001 * number:.3f},{8 if number % 2 else 8.001}" for number in range(8)]

@@ -8,7 +8,6 @@ import pytest
 from pictures import textured
 
 from edgevpr.techniques import create, entropy
-from edgevpr.techniques.gradients import normalise_blocks, orient_cells
 
 pytestmark = pytest.mark.slow
 
@@ -27,15 +26,6 @@ def test_filled_bins_of_radius_5_tops_out_below_one():
 def test_shannon_is_the_entropy_of_the_disc():
     image = textured(4, 128, 128)
     np.testing.assert_allclose(entropy.shannon(image), literal.shannon(image), atol=1e-5)
-
-
-@pytest.mark.parametrize(("bins", "signed"), [(8, True), (9, False), (5, True)])
-def test_cell_histograms_and_blocks(bins, signed):
-    image = textured(5, 136, 80)  # more than two strips of rows
-    cells = orient_cells(image, 8, bins, signed)
-    expected = literal.cell_histograms(image, 8, bins, signed)
-    np.testing.assert_allclose(cells, expected, atol=1e-3, rtol=1e-4)
-    np.testing.assert_allclose(normalise_blocks(cells).reshape(-1, 4 * bins), literal.blocks(expected), atol=1e-4)
 
 
 @cache  # these loops are slow

@@ -6,7 +6,7 @@ from pictures import seen_from_above, textured
 
 from edgevpr.techniques import layout
 from edgevpr.techniques.cohog import CoHog
-from edgevpr.techniques.layout import COARSE, FINE, NBYTES
+from edgevpr.techniques.layout import NBYTES
 
 SIDE_PX = 256
 PLACES = 6
@@ -23,28 +23,6 @@ def view(seed, turned_deg=0.0, right_px=0, down_px=0):
 def town():
     technique = CoHog(camera="nadir")
     return technique, np.stack([technique.encode(view(seed)).coarse for seed in range(PLACES)])
-
-
-def unpacked(row):
-    """The fields of a stored place, in levels of -7 to 7."""
-    levels = np.stack([row & 15, row >> 4], axis=1).ravel().astype(int) - 8
-    coarse, fine = np.split(levels, [COARSE.numbers])
-    return coarse.reshape(-1, 8, 8), fine.reshape(-1, 12, 12)
-
-
-def test_a_place_is_stored_in_levels_of_its_largest_numbers():
-    patterns = np.random.default_rng(1).normal(size=(31 * 31, 20))
-    good = np.arange(31 * 31) > 300
-    row = layout.of_place(patterns, good, 31)
-    assert (row.shape, row.dtype, NBYTES) == ((1120,), np.uint8, 1120)
-    numbers = np.flatnonzero(good)
-    for grid, levels in zip((COARSE, FINE), unpacked(row), strict=True):
-        values = layout.field(grid, patterns[numbers], numbers, (31, 31))
-        step = np.percentile(np.abs(values), 99) / 7
-        kept = np.abs(values) < 7 * step
-        assert np.abs(levels * step - values)[kept].max() <= 0.5 * step * (1 + 1e-6)
-        np.testing.assert_array_equal(levels[~kept], 7 * np.sign(values[~kept]))
-    assert layout.of_place(patterns, good, 31).tobytes() == row.tobytes()
 
 
 def test_layouts_agree_on_the_shift_between_them():

@@ -48,24 +48,3 @@ def test_photograph_shows_a_point_where_it_must(marked, change, column, row):
     frame = photograph(lit(marked, NOON, 0), 0.25, pose, CAMERA, NOON, np.random.default_rng(0))
     assert frame.shape == (480, 640, 3)
     assert mark_in(frame) == pytest.approx((MIDDLE[0] + column, MIDDLE[1] + row), abs=0.6)
-
-
-def plain(width_m: float = 60, metres_per_pixel: float = 0.5) -> Scene:
-    side = round(width_m / metres_per_pixel)
-    return Scene(np.full((side, side, 3), 120, np.uint8), np.full((side, side), 300, np.uint16), metres_per_pixel)
-
-
-@pytest.mark.parametrize(
-    ("sun_azimuth_deg", "shaded", "sunny"),
-    [
-        (90, (60, 50), (60, 70)),  # sun in the east: the shadow lies west, at a lower column
-        (270, (60, 70), (60, 50)),
-        (0, (70, 60), (50, 60)),  # sun in the north: the shadow lies south, at a higher row
-        (180, (50, 60), (70, 60)),
-    ],
-)
-def test_lit_casts_the_shadow_of_a_mast_away_from_the_sun(sun_azimuth_deg, shaded, sunny):
-    scene = plain()
-    scene.height_cm[59:62, 59:62] += 1000
-    ground = lit(scene, Light(sun_azimuth_deg=sun_azimuth_deg, sun_elevation_deg=45), seed=0)
-    assert ground[shaded].max() < 0.6 * ground[sunny].max()
