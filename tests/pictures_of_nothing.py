@@ -351,16 +351,13 @@ SPOILT: dict[str, Spoil] = {
 }
 
 
-def pictures(seed: int, count: int | None = None) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield `count` pictures of nothing real (None: endlessly): the kind, and uint8 (H, W, 3) BGR. All kinds take
-    turns."""
-    number = 0
-    while count is None or number < count:
+def pictures(seed: int, count: int) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield pictures of nothing real: the kind, and uint8 (H, W, 3) BGR. All kinds take turns."""
+    for number in range(count):
         kind = list(NOTHING)[number % len(NOTHING)]
         rng = np.random.default_rng((seed, number))
         height, width = SIZES[rng.integers(len(SIZES))]
         yield kind, NOTHING[kind](rng, height, width)
-        number += 1
 
 
 def spoilt(seed: int, picture: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:

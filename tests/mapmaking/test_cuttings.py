@@ -42,10 +42,6 @@ def waypoint(east_m: float, north_m: float) -> Waypoint:
     return Waypoint(*moved(HOME.lat_deg, HOME.lon_deg, east_m, north_m))
 
 
-def ring(points_m) -> list[tuple[float, float]]:
-    return [moved(HOME.lat_deg, HOME.lon_deg, *point) for point in (*points_m, points_m[0])]
-
-
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4326", "EPSG:3857"])
 def test_places_lie_on_a_grid_of_metres_in_rows_from_the_north(tmp_path, crs):
     path = marked_raster(tmp_path / "o.tif", crs, pixel_m=0.5, side_px=400)
@@ -86,16 +82,6 @@ def test_places_without_data_are_left_out_and_counted(tmp_path):
 
     turned = source_of(marked_raster(tmp_path / "turned.tif", turned_deg=45), 40.0, 40.0)
     assert 0.3 < len(frames_of(turned)) / turned.total < 0.7
-
-
-def test_an_area_keeps_what_lies_in_its_polygons(tmp_path):
-    path = marked_raster(tmp_path / "o.tif", pixel_m=0.5, side_px=800)
-    outline = ring([(-100, -80), (100, -80), (100, 60), (-100, 60)])
-    points_m = off_m(make_lattice(Orthophoto(path), 40.0, 10.0, Area(polygons=(outline,))))
-    assert len(points_m) > 150
-    assert (points_m.min(axis=0) >= (-100.1, -80.1)).all()
-    assert (points_m.max(axis=0) <= (100.1, 60.1)).all()
-    assert np.ptp(points_m[:, 0]) > 180
 
 
 def test_an_area_keeps_what_lies_near_its_path(tmp_path):

@@ -91,27 +91,6 @@ def test_a_calibration_is_kept_in_the_map(place_map):
     assert 0 <= found.accepted <= 1
 
 
-def test_pictures_of_the_same_names_that_show_something_else_are_not_believed(place_map):
-    others = [Frame(image=textured(50 + n, 240, 320), name=f"{n}.png", t_mono_s=0.0) for n in range(PLACES)]
-    with pytest.raises(UsageError, match=f" 0 places.*{PLACES}"):
-        calibrated(place_map, at_hand(*others)[0])
-    with pytest.raises(UsageError, match=" 7 places"):
-        calibrated(place_map, at_hand(*map(frame, range(1, PLACES)))[0])
-    assert place_map.calibration is None
-
-
-def test_a_map_that_is_too_small_and_a_technique_without_confidence_are_refused(place_map, tmp_path, monkeypatch):
-    monkeypatch.setattr(calibrating, "FEWEST_PLACES", PLACES + 1)
-    with pytest.raises(UsageError, match=f"{PLACES + 1}"):
-        calibrated(place_map, at_hand()[0])
-    hog = create("hog")
-    with (
-        PlaceMap.create(tmp_path / "hog.gpkg", hog.spec) as other,
-        pytest.raises(UsageError, match="margin"),
-    ):
-        calibrated(other, at_hand()[0], hog)
-
-
 def test_a_place_that_cannot_be_read_is_not_asked_for(place_map):
     with place_map.transaction():
         place_map.db.execute("UPDATE places SET coarse = x'00' WHERE place_id = 3")

@@ -12,7 +12,6 @@ import sys
 import map_writer
 import numpy as np
 import pytest
-from full_disk import no_file_larger_than
 from map_writer import SPEC, descriptor, frame, make_map, write_sql
 
 from edgevpr.core.errors import MapError, UsageError
@@ -178,12 +177,6 @@ def test_two_programs_never_add_to_one_map_at_once(map_path):
             assert len(reader) == len(place_map) == PLACES
     with PlaceMap.open_for_adding(map_path) as again:
         again.add(frame(41), descriptor(41))
-
-
-def test_a_map_that_could_not_be_made_leaves_no_file(tmp_path):
-    with no_file_larger_than(10_000), pytest.raises(MapError):
-        PlaceMap.create(tmp_path / "m.gpkg", SPEC)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("part", ["geom", "coarse", "fine"])

@@ -110,23 +110,6 @@ def test_a_map_from_before_the_release_is_read_and_one_of_another_format_refused
             PlaceMap.open(map_path).close()
 
 
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        (b"", "not a place map"),
-        (b"this is no database, but it is long enough to look like one" * 40, "not a place map"),
-        (b"SQLite format 3\0" + bytes(5000), "place map|damaged"),
-    ],
-)
-def test_a_file_that_is_no_map_is_named(tmp_path, content, says):
-    path = tmp_path / "other.gpkg"
-    with pytest.raises(MapError, match="map build"):
-        PlaceMap.open(path)
-    path.write_bytes(content)
-    with pytest.raises(MapError, match=says):
-        PlaceMap.open(path)
-
-
 def test_an_existing_map_is_never_overwritten(map_path):
     before = map_path.read_bytes()
     with pytest.raises(MapError, match="there already"):

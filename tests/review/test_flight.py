@@ -2,7 +2,6 @@
 
 import json
 
-import pytest
 from logs import query, write_log
 
 from edgevpr.core.appending import numbered
@@ -13,20 +12,6 @@ from edgevpr.runtime.flight.flightlog import FlightLog
 
 def outcomes(flight):
     return [each.fix.outcome for each in flight.queries]
-
-
-def test_a_real_flight_is_read(flown):
-    flight = read_flight(flown / "flight.jsonl")
-    assert [each.name for each in flight.queries] == [f"{number:02d}.png" for number in range(10)]
-    assert [each.accepted for each in flight.queries] == [True] * 8 + [False] * 2
-    assert flight.start["map"] == str(flown / "map.gpkg")
-    first = flight.queries[0]
-    assert first.at == pytest.approx((50.0, 8.0), abs=1e-5)
-    assert first.autopilot_at == pytest.approx((50.0, 8.0), abs=1e-5)
-    assert first.off_m == pytest.approx(90, abs=2), "the receiver is beside the map"
-    assert first.has_link
-    assert first.fix.outcome is FixOutcome.TAKEN
-    assert flight.end
 
 
 def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):

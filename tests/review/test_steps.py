@@ -60,21 +60,6 @@ def test_slider_moves_texts_pictures_and_marks_by_keyboard(page, made):
     assert page.inner_text(".ruler") == "20 m"
 
 
-def test_only_chosen_reasons_stay_on_ground_lanes_and_slider(page):
-    label = page.locator("label:has([data-group])", has_text="not similar enough")
-    count = int(label.locator("b").inner_text())
-    assert 0 < count < COUNT
-    label.locator("input").check()
-    assert page.inner_text("#which").endswith(f"of {count}")
-    marks = "all => all.map(each => (each.getAttribute('d').match(/M/g) || []).length)"
-    lane = page.get_attribute("label:has([data-group]:checked) input", "data-group")
-    assert page.eval_on_selector_all(f"[data-lane='{lane}']", marks) == [count]
-    assert page.eval_on_selector_all(".mark.accepted", marks) == [0]
-    assert page.eval_on_selector_all(".dots.layer-accepted", marks) == [0]
-    label.locator("input").uncheck()
-    assert page.inner_text("#which").endswith(f"of {COUNT}")
-
-
 def test_damaged_log_still_has_its_steps(browser, tmp_path):
     """Figures that are none, and no position at all."""
     broken = query("a", confidence="high", evidence=[], position={"lat_deg": 1e99}, located=None, fix=7, vehicle="?")
