@@ -27,7 +27,7 @@ LOSSY = (
 def rows():
     """What was delivered of each stream, by its name; read side by side, as it takes seconds, mostly of waiting."""
     names = (*WHOLE, *CUT, CORRUPTED, *LOSSY)
-    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(4) as pool:
+    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(3) as pool:
         patch.setattr(streams, "READ_TIMEOUT_S", 1.5)
         found = pool.map(lambda name: damaged_streams.run(PICTURES, 1, only=name.__eq__, rate_hz=RATE_HZ), names)
         return {row.stream: row for (row,) in found}
