@@ -7,8 +7,7 @@ from pictures import seen_from_above
 
 from edgevpr.core.contract import nearest_height
 from edgevpr.techniques import create
-from edgevpr.techniques.gradients import normalise_blocks, orient_cells
-from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, hypothesis, rotate_blocks
+from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, hypothesis
 
 pytestmark = pytest.mark.slow
 
@@ -38,15 +37,6 @@ def test_a_hypothesis_is_a_height_and_a_rotation():
     assert hypothesis(2 * ROTATIONS + 7) == (1.0, 7)
     nearest = [nearest_height(HEIGHT_RATIOS, ratio) for ratio in (0.1, 0.58, 0.6, 0.9, 1.3, 5)]
     assert nearest == [0.5, 0.5, 0.7, 1.0, 1.42, 2.0]
-
-
-def test_turned_blocks_are_those_of_the_turned_picture():
-    image = seen(4)
-    blocks = normalise_blocks(orient_cells(image, 16, 8, signed=True))
-    for quarters in range(-3, 5):
-        turned = np.ascontiguousarray(np.rot90(image, quarters))
-        expected = normalise_blocks(orient_cells(turned, 16, 8, signed=True))
-        np.testing.assert_allclose(rotate_blocks(blocks, quarters), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(
