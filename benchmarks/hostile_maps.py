@@ -24,7 +24,7 @@ from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
+from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
 
@@ -118,7 +118,7 @@ def _tried(path: Path, whole: Path) -> Row:
     """Return tracebacks, wrong positions and places lost of one damaged map."""
     config, tracebacks, wrong, lost = load_config(None, {"map": str(path)}), 0, 0, 0
     damaged = path.read_bytes()
-    tries = (lambda: _in_flight(config, path, whole, damaged), lambda: _at_take_off(config), lambda: _learning(config))
+    tries = (lambda: _in_flight(config, path, whole, damaged), lambda: _at_take_off(config))
     for each in tries:
         path.write_bytes(damaged)
         try:
@@ -155,16 +155,6 @@ def _at_take_off(config: Config) -> int:
     recogniser = open_recogniser(config, _BOARD, narrowed=True)
     with recogniser.place_map:
         return _asked(recogniser)
-
-
-def _learning(config: Config) -> int:
-    recogniser, growing = open_learning(config, _BOARD, None)
-    with recogniser.place_map as place_map:
-        wrong = _asked(recogniser)
-        frame = _frame(_PLACES)
-        descriptor = recogniser.technique.encode(frame.image)
-        growing.add(place_map.add(frame, descriptor), frame.position, descriptor.coarse)
-    return wrong
 
 
 def _in_flight(config: Config, path: Path, whole: Path, damaged: bytes) -> int:

@@ -20,7 +20,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # Files that take longest, most of them for a few tests that wait or start programs. They begin first: a process that
 # ended alone with one of them would leave the others idle.
 LONGEST = (
-    "test_learning_flight",
     "test_frames_damage",
     "test_flight_process",
     "test_gate",

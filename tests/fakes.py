@@ -155,7 +155,7 @@ class FakeLink:
         self._waiting = Fixes()
         self._fixes: list[Fix] = []
         self._acks: Counter[str] = Counter()
-        self._offered, self._wishes = (), []
+        self._is_under_way, self._wish = False, None
 
     def turn(self, what: str) -> AbstractContextManager[None]:
         return nullcontext()
@@ -171,20 +171,20 @@ class FakeLink:
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
         self.send(status_text(severity, f"edgevpr: {text}"))
 
-    def offer(self, wishes) -> None:
-        self._offered = wishes
+    def accept_wishes(self) -> None:
+        self._is_under_way = True
 
     def take_between(self):
         return []
 
-    def take_wishes(self) -> tuple[Wished, ...]:
-        wishes, self._wishes = tuple(self._wishes), []
-        return wishes
+    def take_wish(self) -> Wished | None:
+        wish, self._wish = self._wish, None
+        return wish
 
     def wish(self, wish: Wish) -> str:
-        if wish not in self._offered:
+        if not self._is_under_way:
             return "TEMPORARILY_REJECTED"
-        self._wishes.append(Wished(wish, "255/190"))
+        self._wish = Wished(wish, "255/190")
         return "ACCEPTED"
 
     def set_health(self, health: Health) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.lab.simulate.camera import Camera, CameraPose, ground_to_pixel
 from edgevpr.lab.simulate.generated import to_metres
 from edgevpr.runtime.flight.flightlog import read_log
 
@@ -16,7 +15,6 @@ AFTER_S = (10, 30, 60, 120, 180, 240, 300)
 _TAKEN_WITHIN_S = 0.05  # a query belongs to the picture of its time
 _ALARMS = ("failsafe", "variance", "stopped aiding", "crash", "emergency")
 
-_POSE = ("east_m", "north_m", "height_m", "heading_deg", "roll_deg", "pitch_deg")
 
 Row = dict[str, Any]
 
@@ -59,7 +57,6 @@ def figures_of(folder: Path) -> Row:
         found["accepted"] = sum(line["accepted"] for line in queries)
         ages_s = np.array([line["t_mono_s"] - line["t_frame_s"] for line in queries])
         found["query_ms"] = [round(1e3 * float(each)) for each in np.quantile(ages_s, (0.5, 0.99))] if queries else None
-        found["learnt"] = _learnt(pictures, log, loss_s)
         found["gap"] = _longest_gap(sent, pictures, [q["t_frame_s"] for q in queries if q["accepted"]], loss_s)
         found["gps_alarms_s"] = [
             round(line["t_mono_s"] - loss_s, 1) for line in log if line["kind"] == "gps" and line["is_wrong"]
@@ -168,29 +165,3 @@ def _wire_ms(sent: np.ndarray, queries: list[Row]) -> list[float] | None:
         for each in sent_s[(sent_s > line["t_frame_s"]) & (sent_s <= line["t_mono_s"])]
     ]
     return [round(float(each), 1) for each in np.quantile(took_ms, (0.5, 0.99))] if took_ms else None
-
-
-def _learnt(pictures: np.ndarray, log: list[Row], loss_s: float) -> Row | None:
-    """Return the errors of the places learnt in flight, against the ground in the middle of their pictures, and how
-    many were learnt after the loss."""
-    taken_s = {line["query"]: line["t_frame_s"] for line in log if line["kind"] == "query"}
-    places = [line for line in log if line["kind"] == "learnt" and line["query"] in taken_s]
-    if not places:
-        return None
-    errors_m, after = [], 0
-    for line in places:
-        at_s = taken_s[line["query"]]
-        seen_m = _looked_at(pictures[np.argmin(abs(pictures["t_s"] - at_s))])
-        east_m, north_m = to_metres(line["position"]["lat_deg"], line["position"]["lon_deg"])
-        errors_m.append(math.dist((east_m, north_m), seen_m))
-        after += at_s > loss_s
-    return {"error": spread(np.array(errors_m)), "after_the_loss": after}
-
-
-def _looked_at(picture: np.void) -> np.ndarray:
-    """Return the point of the ground, east and north, in the middle of a picture."""
-    camera = Camera()
-    pose = CameraPose(**{name: float(picture[name]) for name in _POSE})
-    middle = (camera.width - 1) / 2, (camera.height - 1) / 2, 1.0
-    east, north, scale = np.linalg.solve(ground_to_pixel(pose, camera), middle)
-    return np.array((east, north)) / scale

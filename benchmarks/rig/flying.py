@@ -85,8 +85,7 @@ class Run:
             seed = ground.SEED + scenario_of(folder.name)[1]
             self._camera = stack.enter_context(Camera(self._truth, lit, folder / "pictures.csv", seed, scenario))
             self._relay = stack.enter_context(simulator.relay(self._truth, folder / "sent.csv", home_m))
-            place_map = folder / "learnt.gpkg" if scenario.learns else self._place_map()
-            config = self._config(place_map, self._camera.uri, self._relay.uri)
+            config = self._config(self._place_map(), self._camera.uri, self._relay.uri)
             (folder / "config.yaml").write_text(json.dumps(config, indent=1))  # JSON is YAML
         stack.callback(self._end_edgevpr)
 
@@ -124,8 +123,6 @@ class Run:
             "mavlink": {"link": link, "min_accuracy_m": 1.0},
             "log": {"path": str(self._folder / "flight.jsonl")},
         }
-        if self._scenario.learns:
-            config |= {"technique": "cohog", "mapping": {"learn": True}}
         for room, keys in self._scenario.config.items():
             config[room] = {**config.get(room, {}), **keys}
         return config

@@ -179,13 +179,6 @@ def _remarks(found: dict[str, dict[str, Row]]) -> str:
         name, which, told = run["name"], run["which"], []
         if run["alarms"]:
             told.append("; ".join(f"{text} ({t_s} s)" for t_s, text in run["alarms"][:4]))
-        if run.get("learnt"):
-            learnt = run["learnt"]
-            error = learnt["error"]
-            told.append(
-                f"{error['n']} places learnt, {error['median']} m off, at most {error['max']} m; "
-                f"{learnt['after_the_loss']} of them without GPS"
-            )
         if (gap := run.get("gap")) and gap["s"] > 30 and gap["off_m"] is not None:
             told.append(
                 f"{gap['s']:.0f} s and {gap['way_m']} m without a match; what was sent {gap['told_s']:.0f} s after the "

@@ -46,7 +46,6 @@ class Scenario:
     config: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     starts_early: bool = False
     mapped_m: float | None = None
-    learns: bool = False
     home_m: tuple[float, float] | None = None
     map_east_m: float = 0.0
     is_blind: bool = False
@@ -129,5 +128,4 @@ SCENARIOS = {
         is_compared=False,
     ),
     "px4_copter_vision": Scenario(is_px4=True, vehicle="copter", with_edgevpr={"EKF2_EV_CTRL": 1}, is_compared=False),
-    "learn": Scenario(gps_s=220.0, off_s=60.0, learns=True, is_compared=False),
 }

@@ -16,7 +16,7 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
             "town.gpkg --orthophoto town.tif --footprint-m 120 --spacing-m 30",
         ),
     ),
-    "map refine": (("after learning in flight", "valley.gpkg --images photos/"),),
+    "map refine": (("after a merge", "valley.gpkg --images photos/"),),
     "map move": (("to where GPS has it, after a flight with it", "valley.gpkg --by flight.jsonl"),),
     "map calibrate": (("after a merge", "valley.gpkg --images photos/"),),
     "map info": (

@@ -15,8 +15,8 @@ def add(commands: Any) -> None:
         "record",
         metavar="RECORD",
         help=(
-            "ArduPilot .bin, .tlog, PX4 .ulg, DJI .SRT, .gpx, or a table from exiftool, Pix4D, Metashape or "
-            "OpenDroneMap"
+            "ArduPilot .bin, .tlog, PX4 .ulg, DJI .SRT, .gpx, the flight log (.jsonl) of a recorded flight, or a "
+            "table from exiftool, Pix4D, Metashape or OpenDroneMap"
         ),
     )
     parser.add_argument("--images", required=True, metavar="SOURCE", help="folder of images, or video file")

@@ -142,16 +142,6 @@ class MemoryConfig:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class MappingConfig:
-    learn: bool = key(
-        False,
-        "--learn",
-        "add unknown places to the map, at the autopilot's position; make the map if it does not exist",
-    )
-    spacing_m: float = bounded(1, 1000, default=10.0)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SalienceConfig:
     use: bool = key(False, "--salience", "store and match only memorable images")
@@ -218,7 +208,6 @@ class Config:
     source: SourceConfig = SourceConfig()
     match: MatchConfig = MatchConfig()
     memory: MemoryConfig = MemoryConfig()
-    mapping: MappingConfig = MappingConfig()
     salience: SalienceConfig = SalienceConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
     log: LogConfig = LogConfig()

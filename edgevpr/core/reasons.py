@@ -45,7 +45,6 @@ class ReasonCode(Enum):
         "{summary}: it shows {shown:.0%} of the ground under it at a tilt of {tilt_deg:.0f} degrees",
     )
     NOT_MEMORABLE = "not memorable", "{summary}: {measure} {score:.2f}, {needed:.2f} needed"
-    EMPTY_MAP = "the map has no place yet"
     UNUSABLE = "unusable", "{problem}"
     MAP_UNREADABLE = "the map cannot be read", "{problem}"
     PLACE_UNREADABLE = "a place cannot be read", "{problem}"
@@ -72,7 +71,6 @@ class ReasonCode(Enum):
         "{summary}: by about {tilt_deg:.0f} degrees; set `source.mount_ahead_deg`, or record roll and pitch",
     )
     POSITIONS_DISAGREE = "places of the same ground disagree on the position", "{summary} by {apart_m:.0f} m"
-    JUST_LEARNT = "place was learnt just now", "{summary}, within {limit_s:g} s: it repeats the autopilot's position"
     SEQUENCE_INCOMPLETE = "the sequence is not complete yet", "{summary}: {queries:.0f} queries of {needed:.0f}"
     NEWEST_DISAGREES = "other places resemble the newest query more than this one does"
     NEWEST_LEFT = "the newest queries no longer see what those before them saw"
@@ -171,11 +169,8 @@ class ReasonCode(Enum):
     GPS_DIFFERS = "GPS is far from the map", "GPS is {off_m:.0f} m from the map's position"
     GPS_AGREES = "GPS agrees with the map again"
     SURVEY_WITHDRAWN = "the map's place is unknown again", "{summary}: GPS contradicts what was reported"
-    LEARNING_STOPPED = "nothing more is learnt, see its log", "nothing more is learnt: {problem}"
     PAUSED_BY_COMMAND = "paused by command"
     RESUMED_BY_COMMAND = "goes on by command"
-    LEARNING_ON = "learning on by command"
-    LEARNING_OFF = "learning off by command"
     UNDER_VOLTAGE = "companion under-voltage: check 5 V supply"
     SUPPLY_FINE = "companion supply is fine again"
     THROTTLED = "companion throttled", "{summary}", " at {temperature_c:.0f} C", ": runs slower"

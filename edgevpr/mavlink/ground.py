@@ -3,7 +3,7 @@ request that only the flight itself can fulfil, such as a pause. Used by `conver
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -22,8 +22,6 @@ class Wish(IntEnum):
 
     PAUSE = 1
     RESUME = 2
-    LEARN = 3
-    LEARN_NOTHING = 4
 
 
 class Wished(NamedTuple):
@@ -34,21 +32,21 @@ class Wished(NamedTuple):
 
 
 class Requests:
-    """Answers the requests of all links, and keeps the wishes until the main loop of the flight takes them. `offered`
-    are those that it can fulfil, none at first. `results` counts commands by the name of their result, `ignored` the
+    """Answers the requests of all links, and keeps the newest wish until the main loop of the flight takes it. Wishes
+    are rejected until the flight `is_under_way`. `results` counts commands by the name of their result, `ignored` the
     other messages to us, of an unknown kind or too many a second. While it `is_paused`, no fix may be sent."""
 
     def __init__(self) -> None:
-        self.offered: Collection[Wish] = ()
+        self.is_under_way = False
         self.results: Counter[str] = Counter()
         self.ignored = 0
         self.is_paused = False
-        self._waiting: dict[bool, Wished] = {}  # the newest about learning (True), and about pausing (False)
+        self._waiting: Wished | None = None
         self._second_s, self._answered = 0.0, 0
 
-    def take(self) -> tuple[Wished, ...]:
-        """Return the wishes that have arrived since the last call; of two on the same subject only the newer one."""
-        waiting, self._waiting = tuple(self._waiting.values()), {}
+    def take(self) -> Wished | None:
+        """Return the newest wish that has arrived since the last call (None: none has)."""
+        waiting, self._waiting = self._waiting, None
         return waiting
 
     def hear(self, message: Message, us: tuple[int, int], now_s: float) -> tuple[Message, ...]:
@@ -69,16 +67,14 @@ class Requests:
         return (mavlink.MAVLink_command_ack_message(message.command, result, **to),)
 
     def _take_wish(self, wanted: float, sender: tuple[int, int]) -> int:
-        """Keep a wish, in place of a waiting one on the same subject. Returns a MAV_RESULT."""
+        """Keep a wish, in place of a waiting one. Returns a MAV_RESULT."""
         if wanted not in tuple(Wish):  # a whole float equals its integer, and NaN equals none
             return int(mavlink.MAV_RESULT_DENIED)
-        wish = Wish(int(wanted))
-        if wish not in self.offered:
+        if not self.is_under_way:
             return int(mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
-        is_about_learning = wish in (Wish.LEARN, Wish.LEARN_NOTHING)
-        if not is_about_learning:
-            self.is_paused = wish is Wish.PAUSE
-        self._waiting[is_about_learning] = Wished(wish, f"{sender[0]}/{sender[1]}")
+        wish = Wish(int(wanted))
+        self.is_paused = wish is Wish.PAUSE
+        self._waiting = Wished(wish, f"{sender[0]}/{sender[1]}")
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _may_answer(self, now_s: float) -> bool:

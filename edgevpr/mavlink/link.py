@@ -1,6 +1,6 @@
 """The link to the flight controller: any thread may call it, and its driver alone touches the port."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 
@@ -10,7 +10,7 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.driver import DriverMaker, PortDriver
 from edgevpr.mavlink.fixes import Sending
-from edgevpr.mavlink.ground import Wish, Wished
+from edgevpr.mavlink.ground import Wished
 from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Message
@@ -102,15 +102,15 @@ class Link:
         with self._sending("announce"):
             self.conversation.announce(severity, text, topic)
 
-    def offer(self, wishes: Collection[Wish]) -> None:
-        with self.turn("offer"):
-            self.conversation.requests.offered = wishes
+    def accept_wishes(self) -> None:
+        with self.turn("offer"):  # so called on the tapes of recorded flights, as the turn of `take_wish`
+            self.conversation.requests.is_under_way = True
 
     def take_between(self) -> list[Sending]:
         with self.turn("take_between"):
             return self.conversation.take_between()
 
-    def take_wishes(self) -> tuple[Wished, ...]:
+    def take_wish(self) -> Wished | None:
         with self.turn("take_wishes"):
             return self.conversation.requests.take()
 

@@ -1,7 +1,6 @@
 """The index: the part of a map that is held in RAM, in arrays that are allocated once, within a memory budget.
 
-`load_index` makes the index of a map that does not change. A `GrowingIndex` takes new places while it is in use, until
-its arrays are full. `retrieve` searches an index.
+`load_index` makes it, and `retrieve` searches it.
 """
 
 import logging
@@ -88,11 +87,8 @@ def bytes_per_place(spec: TechniqueSpec) -> int:
     return spec.row.nbytes + _BYTES_BESIDE_ROW
 
 
-def load_index(
-    place_map: PlaceMap, technique: Technique, budget_bytes: int, into: PlaceIndex | None = None, beside_bytes: int = 0
-) -> PlaceIndex:
-    """Load the coarse parts of a map, packed by the technique, into the arrays of `into` (None: into new ones). Return
-    the index of the places that were loaded.
+def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int, beside_bytes: int = 0) -> PlaceIndex:
+    """Load the coarse parts of a map, packed by the technique. Return the index of the places that were loaded.
 
     If `budget_bytes` is too small for all, only the `best_places` are loaded. Per place, `beside_bytes` of the budget
     stay free for other arrays that grow with the index (see `sequence`). Places that cannot be read are noted in
@@ -102,9 +98,12 @@ def load_index(
     places, each = len(place_map), bytes_per_place(spec) + beside_bytes
     if not places:
         raise MapError(f"{place_map.path} holds no place yet: add some with `edgevpr map build --append`.")
-    capacity = _capacity(place_map, each, budget_bytes, places)
-    if into is None:
-        into = empty_index(spec, capacity, place_map.mean_coarse() if spec.packed else None)
+    if budget_bytes < each:
+        raise MapError(
+            f"{place_map.path}: a place takes {each} bytes in RAM and the budget is {budget_bytes}: raise --budget-mb."
+        )
+    capacity = min(places, budget_bytes // each)
+    index = empty_index(spec, capacity, place_map.mean_coarse() if spec.packed else None)
     # Another program may have added places since they were counted: those are left out until the next load.
     parts: Iterator[CoarsePart] = islice(place_map.coarse_parts(), places)
     if capacity < places:
@@ -116,7 +115,7 @@ def load_index(
         seen = np.fromiter(islice(place_map.outlines(), places), _OUTLINE)
         kept = seen["id"][best_places(seen["lat_deg"], seen["lon_deg"], seen["quality"], capacity)]
         parts = _only(parts, kept)
-    loaded = max(fill(into, parts, technique), default=0)
+    loaded = _fill(index, parts, technique)
     if not loaded:
         raise MapError(f"{place_map.path}: none of its {places} places can be read: restore a copy, or build it again.")
     if place_map.left_out:
@@ -125,7 +124,7 @@ def load_index(
             place_map.path,
             len(place_map.left_out),
         )
-    return into.first(loaded)
+    return index.first(loaded)
 
 
 def empty_index(spec: TechniqueSpec, capacity: int, mean: Singles | None) -> PlaceIndex:
@@ -141,9 +140,9 @@ def empty_index(spec: TechniqueSpec, capacity: int, mean: Singles | None) -> Pla
     )
 
 
-def fill(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -> Iterator[int]:
+def _fill(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -> int:
     """Write coarse parts (as `PlaceMap.coarse_parts` yields them), packed by the technique, to the slots of `index` in
-    blocks, until parts or slots run out. After each block, yield how many slots are completely written so far."""
+    blocks, until parts or slots run out. Return how many slots are written."""
     spec = technique.spec
     waiting = np.empty((_PACKED_AT_ONCE, *spec.coarse.shape), spec.coarse.dtype)
     filled = 0
@@ -157,18 +156,7 @@ def fill(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -
             index.lat_deg[at], index.lon_deg[at] = point or (np.nan, np.nan)
             index.heading_deg[at] = np.nan if heading_deg is None else heading_deg
         filled += len(block)
-        yield filled
-
-
-def _capacity(place_map: PlaceMap, place_bytes: int, budget_bytes: int, wanted: int) -> int:
-    """Return how many places that take `place_bytes` each fit into the budget, at most `wanted`. Raises MapError if not
-    even one fits."""
-    if budget_bytes < place_bytes:
-        raise MapError(
-            f"{place_map.path}: a place takes {place_bytes} bytes in RAM and the budget is {budget_bytes}: "
-            "raise --budget-mb."
-        )
-    return min(wanted, budget_bytes // place_bytes)
+    return filled
 
 
 def _only(parts: Iterator[CoarsePart], ascending: Ints) -> Iterator[CoarsePart]:
@@ -224,66 +212,3 @@ def best_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: int
         for touched in {block, *(end // _BLOCK for end in ends)}:
             least[touched] = blocks[touched].min()
     return np.flatnonzero(kept)[:capacity]
-
-
-class GrowingIndex:
-    """The index of an open map, with free slots for more places. `index` is a PlaceIndex of the present places; its
-    arrays are views, valid until the next `add`. A place without a free slot is in the map file only."""
-
-    def __init__(
-        self, place_map: PlaceMap, technique: Technique, *, budget_bytes: int, room: int, beside_bytes: int = 0
-    ) -> None:
-        """Load the map, which may be empty, and allocate slots for `room` more places as far as the budget allows.
-        `beside_bytes`: see `load_index`. Raises MapError if the budget is too small for one place."""
-        each = bytes_per_place(technique.spec) + beside_bytes
-        self._in_file = len(place_map)
-        capacity = _capacity(place_map, each, budget_bytes, self._in_file + room)
-        self.place_map, self._technique = place_map, technique
-        self._mean = place_map.mean_coarse() if technique.spec.packed else None
-        self._mean_of = self._in_file  # number of places that this mean was computed from
-        self._slots = empty_index(technique.spec, capacity, self._mean)
-        self._taken = 0
-        self._outlines = np.fromiter(place_map.outlines(), _OUTLINE)  # of all places in the file
-        if self._in_file:
-            free = self._slots.first(min(self._in_file, capacity))
-            loaded = load_index(place_map, technique, len(free) * each, into=free, beside_bytes=beside_bytes)
-            self._taken = len(loaded)
-
-    @property
-    def index(self) -> PlaceIndex:
-        return replace(self._slots.first(self._taken), mean=self._mean)
-
-    def add(self, place_id: int, position: Position | None, coarse: Array, heading_deg: float | None = None) -> None:
-        """Add a place that is already in the map file, with an id larger than all in the index (position and heading
-        None: unknown). If all places must be packed again with a new mean, they are read from the file, and damaged
-        ones are left out. Raises MapError if the file cannot be read: the index may then have fewer places, all packed
-        with one mean."""
-        point = (position.lat_deg, position.lon_deg) if position else None
-        free = replace(self._slots.only(slice(self._taken, self._taken + 1)), mean=self._mean)
-        self._taken += max(fill(free, iter([(place_id, point, heading_deg, coarse)]), self._technique), default=0)
-        self._in_file += 1
-        self._outlines = np.append(self._outlines, np.array([(place_id, *(point or (np.nan, np.nan)), 1)], _OUTLINE))
-        # Rows are packed as differences from the mean, and the first few places are a poor estimate of the mean.
-        if self._mean is not None and self._in_file >= 2 * self._mean_of:
-            self._repack()
-
-    def nearest_m(self, position: Position) -> float:
-        """Return the distance in metres from `position` to the nearest readable place of the file, whether or not it is
-        in the index; infinity if there is none."""
-        lat_deg, lon_deg = self._outlines["lat_deg"], self._outlines["lon_deg"]
-        away_m = distance_m(position.lat_deg, position.lon_deg, lat_deg, lon_deg)
-        is_known = ~np.isnan(away_m) & ~np.isin(self._outlines["id"], list(self.place_map.left_out))
-        return float(np.min(away_m, initial=np.inf, where=is_known))
-
-    def _repack(self) -> None:
-        """Pack all places again with the new mean. A place that can no longer be read is dropped, since its row is
-        packed with the old mean."""
-        mean = self.place_map.mean_coarse()
-        packed = 0
-        held = _only(self.place_map.coarse_parts(), self.index.place_ids.copy())
-        try:
-            for written in fill(replace(self.index, mean=mean), held, self._technique):
-                packed = written
-        finally:
-            if packed:  # rows packed with the old mean and with the new one must not be mixed
-                self._mean, self._mean_of, self._taken = mean, self._in_file, packed

@@ -81,7 +81,7 @@ class LoggedQuery:
 class LoggedFlight:
     """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `remarks` are the
     lines with a text for people: time, kind and text. `unusable` is the number of frames that never became queries,
-    `learnt` the positions of places learnt in flight, `between` the lines of fixes sent between matches. Times are
+    `between` the lines of fixes sent between matches. Times are
     seconds after its start; it is `span_s` long."""
 
     path: Path
@@ -90,7 +90,6 @@ class LoggedFlight:
     queries: list[LoggedQuery] = field(default_factory=list)
     remarks: list[tuple[float, str, str]] = field(default_factory=list)
     unusable: int = 0
-    learnt: list[Point] = field(default_factory=list)
     between: list[dict[str, Any]] = field(default_factory=list)
     span_s: float = 0.0
 
@@ -122,8 +121,6 @@ def read_flight(path: str | Path) -> LoggedFlight:
                     _apply_answer(answered.fix, line)
             case "unusable":
                 flight.unusable += 1
-            case "learnt":
-                flight.learnt += filter(None, [point(line, "position")])
             case "between":
                 flight.between += [line] if point(line) else []
             case _:

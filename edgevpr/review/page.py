@@ -85,7 +85,6 @@ def _layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]
     return [
         Layer("places of the map", "places", [[at_of(place) for place in ground]]),
         make_layer(steps, "places found", "found"),
-        Layer("places learnt", "learnt", [flight.learnt]),
         Layer("fixes between matches", "between", [list(filter(None, map(point, flight.between)))]),
         make_layer(steps, "GPS", "gps", "line"),
         make_layer(steps, "autopilot", "autopilot", "line"),

@@ -2,16 +2,16 @@
 recording in place of the real ones."""
 
 import logging
-import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from edgevpr.core.arrays import Image
-from edgevpr.core.config import Config, build
+from edgevpr.core.config import Config, build, list_keys
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.text import waiting
 from edgevpr.frames.images import read_image
@@ -30,9 +30,9 @@ from edgevpr.runtime.flight.boundary import TapedStop, TapedTurns, tape_clock, t
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flight import Flight
 from edgevpr.runtime.flight.flightio import FlightIO
-from edgevpr.runtime.flight.flightlog import read_log, select_last_flight
+from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.machine import Machine
-from edgevpr.runtime.flight.recording import MAP, TAPE, frame_path, open_recording
+from edgevpr.runtime.flight.recording import TAPE, frame_path, read_recorded
 
 _log = logging.getLogger(__name__)
 
@@ -54,13 +54,16 @@ def replay(log: str | Path, place_map: str | None = None) -> Replayed:
     """Fly the last flight of `log` again. Its recording is in the folder that the log names, or in one of that name
     beside the log. `place_map` is the path of its map (None: the path that it had). Raises UsageError if there is no
     recording, and EdgevprError if it or the map cannot be opened."""
-    flown, folder = _recorded(log)
+    flown, folder = read_recorded(log)
     notes = read_tape(folder / TAPE)
     note = next(notes, None)
     if not (note and note[0] == "flight" and isinstance(note[1], dict)):
         raise EdgevprError(f"{folder / TAPE} is no tape of a flight, or was cut in its first line: nothing to replay.")
     header = note[1]
-    config = build(Config, header["config"], str(folder))
+    config = build(Config, _keep_known(header["config"]), str(folder))
+    place_map = place_map or config.map
+    if place_map and not Path(place_map).exists():
+        raise UsageError(f"{place_map}, the map of the flight, is not there: give it with --map.")
     playback = Playback(notes)
     recorded = build(Board, header["board"], "the board of the flight")
     board = resolve_board(recorded, config.source, config.memory)
@@ -69,7 +72,7 @@ def replay(log: str | Path, place_map: str | None = None) -> Replayed:
         again_log = f"{temporary}/flight.jsonl" if config.log.path else None
         io = FlightIO(
             board=board,
-            place_map=_map_of(folder, Path(temporary), config, place_map or config.map),
+            place_map=place_map,
             log=replace(config.log, path=again_log, max_mb=None),
             clock=tape_clock(Clock(sleep=playback.sleep), playback),
             machine=tape_machine(Machine(board), playback),
@@ -96,21 +99,6 @@ def replay(log: str | Path, place_map: str | None = None) -> Replayed:
         )
 
 
-def _recorded(log: str | Path) -> tuple[list[Line], Path]:
-    """Return the lines of the last flight of `log`, and the folder of its recording."""
-    whole = select_last_flight(log)
-    if whole.missing:
-        _log.warning("%s", whole.missing)
-    lines = list(whole)
-    where = lines[0].get("recording") if lines else None
-    if not where:
-        raise UsageError(f"{log}: its last flight was not recorded: fly with `log: {{record: FOLDER}}`.")
-    folder = open_recording(where, log)
-    if folder is None:
-        raise UsageError(f"{log}: its recording is neither at {where} nor beside the log: bring it there.")
-    return lines, folder
-
-
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Context manager: of the messages of the replayed flight, which has printed them once, let errors through only;
@@ -131,14 +119,15 @@ def _picture(folder: Path, number: int) -> Image:
         raise TapeEnded(str(error)) from None
 
 
-def _map_of(folder: Path, temporary: Path, config: Config, map_path: str | None) -> str | None:
-    """Return the path of the map to fly with (None: the flight had none). For a flight that learnt, it is that of a
-    copy, in `temporary`, of the map as it was at the start."""
-    if config.mapping.learn:
-        copy = temporary / MAP
-        if (folder / MAP).is_file():
-            shutil.copyfile(folder / MAP, copy)
-        return str(copy)
-    if map_path and not Path(map_path).exists():
-        raise UsageError(f"{map_path}, the map of the flight, is not there: give it with --map.")
-    return map_path
+def _keep_known(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the settings of a recorded flight without those that this edgevpr no longer has, with a warning."""
+    kept, known = {}, {key.name for key in list_keys()}
+    for name, value in config.items():
+        dotted = f"{prefix}{name}"
+        if dotted in known:
+            kept[name] = value
+        elif isinstance(value, dict):
+            kept |= {name: section} if (section := _keep_known(value, f"{dotted}.")) else {}
+        elif value not in (None, False):
+            _log.warning("the flight had the setting `%s`, which this edgevpr does not know", dotted)
+    return kept

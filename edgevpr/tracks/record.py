@@ -32,9 +32,9 @@ class Record:
 
 
 def read_record(path: Path) -> Record:
-    """Read a recording; its name says which it is: .bin and .log, .tlog, .ulg, .srt and .gpx, and any other is a
+    """Read a recording; its name says which it is: .bin and .log, .tlog, .ulg, .srt, .gpx, .jsonl, and any other is a
     table. Raises UsageError for a file that cannot be read, or that has no position."""
-    from edgevpr.tracks import gpx, logs, srt, tables
+    from edgevpr.tracks import flown, gpx, logs, srt, tables
 
     if not path.is_file():
         raise UsageError(f"There is no file {path}: name a log, a track, subtitles or a table.")
@@ -45,6 +45,7 @@ def read_record(path: Path) -> Record:
         ".ulg": logs.read_px4,
         ".srt": srt.read_subtitles,
         ".gpx": gpx.read_gpx,
+        ".jsonl": flown.read_flight,
     }
     record = readers.get(path.suffix.lower(), tables.read_table)(path)
     if not (record.track or record.shots or record.named):

@@ -164,7 +164,6 @@ def test_main_exits_with_documented_codes_and_check_as_run_does(capsys, flight, 
         (2, {"battery": {"pack": "lots"}}),
         (2, {"mavlink": {"link": "udp:1"}}),
         (2, {"mavlink": {"link": "udpin:127.0.0.1:0", "signing_key": str(tmp_path / "no.key")}}),
-        (2, {"mapping": {"learn": True}, "map": str(tmp_path / "new.gpkg"), "source": {"uri": "/dev/video0"}}),
         (2, {"mach": {}}),
     ]
     path = tmp_path / "c.yaml"

@@ -22,7 +22,6 @@ def parse_package():
     ("code", "parameters", "sentence"),
     [
         ("LOW_SCORE", {"score": 0.05, "needed": 0.1}, "not similar enough to any place: score 0.050, 0.100 needed"),
-        ("EMPTY_MAP", {}, "the map has no place yet"),
         ("UNUSABLE", {"problem": "1.png is cut short."}, "1.png is cut short."),
         (
             "LOW_CONFIDENCE",

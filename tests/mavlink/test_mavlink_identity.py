@@ -2,7 +2,6 @@
 
 import pytest
 
-from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.peer import Identity, Speaker
 from edgevpr.mavlink.wire import mavlink
@@ -57,7 +56,7 @@ def test_a_configured_system_is_never_given_up_but_may_come_from_elsewhere(caplo
 
 
 def test_second_sender_with_our_autopilots_number_is_neither_believed_nor_obeyed(autopilot, caplog):
-    autopilot.conversation.requests.offered = tuple(Wish)
+    autopilot.conversation.requests.is_under_way = True
     autopilot.put_fix()
     for _ in range(40):
         autopilot.wait(1.0)
@@ -69,7 +68,7 @@ def test_second_sender_with_our_autopilots_number_is_neither_believed_nor_obeyed
         autopilot.beat()
     assert autopilot.put_fix().sent
     assert autopilot.conversation.autopilot.acks == {}
-    assert autopilot.conversation.requests.take() == ()
+    assert autopilot.conversation.requests.take() is None
     assert autopilot.conversation.autopilot.identity.foreign_messages == 120
     assert caplog.text.count("another autopilot, system 7") == 1
 

@@ -41,7 +41,7 @@ def answered(autopilot, message):
 
 @pytest.fixture
 def requests(autopilot):
-    autopilot.conversation.requests.offered = tuple(Wish)
+    autopilot.conversation.requests.is_under_way = True
     return autopilot.conversation.requests
 
 
@@ -56,24 +56,22 @@ def test_a_request_for_the_time_is_answered_by_the_clock_that_stamps_the_message
 @pytest.mark.parametrize("wish", list(Wish))
 def test_a_wish_that_can_be_fulfilled_is_accepted_and_handed_on(autopilot, requests, form, wish):
     assert answered(autopilot, form(31010, wish)) == "ACCEPTED"
-    (wished,) = requests.take()
-    assert (wished.wish, wished.sender) == (wish, "255/190")
-    assert requests.take() == ()
+    assert requests.take() == (wish, "255/190")
+    assert requests.take() is None
     assert requests.results == {"ACCEPTED": 1}
 
 
-def test_a_wish_is_rejected_for_the_time_being_where_nobody_flies_or_learns(autopilot):
+def test_a_wish_is_rejected_for_the_time_being_where_nobody_flies(autopilot):
     assert answered(autopilot, command_long(31010, 1)) == "TEMPORARILY_REJECTED"
-    autopilot.conversation.requests.offered = (Wish.PAUSE, Wish.RESUME)
-    assert answered(autopilot, command_long(31010, 3)) == "TEMPORARILY_REJECTED"
+    assert autopilot.conversation.requests.take() is None
+    autopilot.conversation.requests.is_under_way = True
     assert answered(autopilot, command_long(31010, 2)) == "ACCEPTED"
-    assert [each.wish for each in autopilot.conversation.requests.take()] == [Wish.RESUME]
 
 
-def test_of_wishes_that_contradict_each_other_the_newest_is_left_and_others_stay(autopilot, requests):
-    for wish in (Wish.LEARN_NOTHING, Wish.PAUSE, Wish.RESUME, Wish.PAUSE):
+def test_of_wishes_that_contradict_each_other_the_newest_is_left(autopilot, requests):
+    for wish in (Wish.PAUSE, Wish.RESUME, Wish.PAUSE):
         assert answered(autopilot, command_long(31010, wish)) == "ACCEPTED"
-    assert {each.wish for each in requests.take()} == {Wish.LEARN_NOTHING, Wish.PAUSE}
+    assert requests.take().wish is Wish.PAUSE
 
 
 def test_no_fix_leaves_once_a_pause_is_acknowledged(autopilot, requests):
@@ -88,7 +86,7 @@ def test_no_fix_leaves_once_a_pause_is_acknowledged(autopilot, requests):
 def test_what_is_not_addressed_to_exactly_this_companion_is_not_obeyed(autopilot, requests, to):
     commands = command_long(31010, 1, to=to), command_int(31010, 1, to=to), command_long(400, 1, to=to)
     assert replies(autopilot, *commands) == []
-    assert requests.take() == ()
+    assert requests.take() is None
     assert requests.results == {}
 
 
@@ -107,9 +105,9 @@ def test_a_flood_of_requests_is_answered_in_part_and_does_not_push_out_what_we_s
 
 
 def react(message, sender=STATION):
-    """The replies to a message, the requests that it has met, and the wishes."""
+    """The replies to a message, the requests that it has met, and the wish."""
     requests = Requests()
-    requests.offered = tuple(Wish)
+    requests.is_under_way = True
     message._header.srcSystem, message._header.srcComponent = sender
     return requests.hear(message, US, 5.0), requests, requests.take()
 
@@ -117,13 +115,13 @@ def react(message, sender=STATION):
 def test_whatever_a_command_holds_it_has_one_answer_that_can_be_sent():
     packer = mavlink.MAVLink(None, *US)
     for command, p1, p2, sender in itertools.product((31010, 511, 512), ODD, ODD, (STATION, (1, 1), (255, 0))):
-        (ack,), _, wishes = react(command_long(command, p1, p2), sender)
+        (ack,), _, wished = react(command_long(command, p1, p2), sender)
         assert ack.pack(packer)
         assert (ack.get_type(), ack.command) == ("COMMAND_ACK", command)
         assert (ack.target_system, ack.target_component) == sender
-        assert bool(wishes) == (command == 31010 and p1 in (1, 2, 3, 4))
+        assert bool(wished) == (command == 31010 and p1 in (1, 2))
         refusal = mavlink.MAV_RESULT_DENIED if command == 31010 else mavlink.MAV_RESULT_UNSUPPORTED
-        assert ack.result == (mavlink.MAV_RESULT_ACCEPTED if wishes else refusal)
+        assert ack.result == (mavlink.MAV_RESULT_ACCEPTED if wished else refusal)
 
 
 WARNING = Severity.WARNING

@@ -16,7 +16,6 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import Levelled, View
 from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
-from edgevpr.mavlink.ground import Wish
 from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import PacketReader, mavlink
 from edgevpr.runtime.flight.navigator import Navigator
@@ -59,7 +58,7 @@ class ClosedLoop:
         self.conversation = Conversation(settings, self._clock) if edgevpr else None
         if self.conversation:
             self.conversation.want_position()
-            self.conversation.requests.offered = tuple(Wish)
+            self.conversation.requests.is_under_way = True
         self._packer, self._reader = mavlink.MAVLink(None, 1, 1), PacketReader()
         self._waiting, self._last_frame = [], None
 

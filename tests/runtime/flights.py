@@ -22,8 +22,7 @@ from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.flight.stop import Stop
-from edgevpr.runtime.recognise.learn import Learner
-from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
+from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
 PLACES = 30
@@ -33,33 +32,15 @@ STEP_DEG = 0.001  # of latitude: 111 m
 class Flight:
     """A flight with a map, ready to be flown: `fly` does so and gives the lines of its log but the last, the `end`.
 
-    `settings` are keys of the configuration; with `learns` the flight makes places.
+    `settings` are keys of the configuration.
     """
 
-    def __init__(
-        self,
-        place_map: Path,
-        log: Path,
-        clock: FakeClock,
-        link: FakeLink | None = None,
-        learns: bool = False,
-        **settings,
-    ) -> None:
+    def __init__(self, place_map: Path, log: Path, clock: FakeClock, link: FakeLink | None = None, **settings) -> None:
         self.config = load_config(None, {"map": str(place_map), "source.uri": "/dev/video0"} | settings)
         self.board = resolve_board(load_board(self.config.board), self.config.source, self.config.memory)
         self.log, self.clock, self.link = log, clock, link
-        growing = None
-        if learns:
-            self.recogniser, growing = open_learning(self.config, self.board, self.config.technique)
-        else:
-            self.recogniser = open_recogniser(self.config, self.board, narrowed=True)
+        self.recogniser = open_recogniser(self.config, self.board, narrowed=True)
         self.recogniser.meter = metered(self.config, self.recogniser, clock)
-        spacing_m = self.config.mapping.spacing_m
-        self.learner = (
-            Learner(self.recogniser, growing, spacing_m=spacing_m, gap_m=100.0, utc_clock=clock.utc_s)
-            if learns
-            else None
-        )
         self.stop = Stop()
         self.end: dict = {}
 
@@ -85,7 +66,6 @@ class Flight:
                 )
             parts = FlightParts(
                 recogniser=self.recogniser,
-                learner=self.learner,
                 source=source,
                 link=self.link,
                 autopilot=autopilot,

@@ -74,8 +74,6 @@ _QUESTIONS: dict[str, tuple[str, type[Any] | None]] = {
     "measure_heat": ("heat", ThermalState),
     "measure_load": ("load", MachineLoad),
     "rss_mb": ("rss_mb", None),
-    "pick_technique": ("picked", None),
-    "try_map": ("cannot_learn", None),
     "is_written": ("log is written", None),
 }
 

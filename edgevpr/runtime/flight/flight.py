@@ -1,10 +1,10 @@
 """A flight from start to end. Each pass of the loop takes the newest frame, recognises it, and reports the event, the
-`Recognition` of this frame, to the autopilot and to observers: functions that count, watch, log and learn."""
+`Recognition` of this frame, to the autopilot and to observers: functions that count, watch and log."""
 
 import logging
 from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +72,7 @@ class Flight:
         self._pace = Pace(parts.io.board.rate_hz, parts.io.clock)
         fewer_candidates = () if config.match.candidates else limit_candidates(parts.recogniser.technique)
         self._governing = GovernorActuator(parts, self._pace, fewer_candidates)
-        self._commands = Commands(parts.link, notifier, parts.learner)
+        self._commands = Commands(parts.link, notifier)
         self._frozen = FrozenWatch(notifier, read_optics(config.source, parts.recogniser), parts.autopilot)
         self._vitals = Vitals(
             parts, self._frozen, tally=self._tally, pace=self._pace, commands=self._commands, remarks=self._remarks
@@ -90,7 +90,6 @@ class Flight:
             gps.update,
             self._surveyor.update,
             self._log_event,
-            self._learn,
         )
 
     @classmethod
@@ -100,7 +99,7 @@ class Flight:
         systemd.notify(EXTEND_TIMEOUT_USEC=systemd.LONGEST_START_US)
         with ExitStack() as stack:
             with io.stop.beginning():
-                recogniser, learner, cannot_learn = open_map(config, io)
+                recogniser = open_map(config, io)
                 stack.callback(recogniser.place_map.close)
                 flight_log = stack.enter_context(_open_log(io))
             flight_log.write("start", **log_start(config, io, recogniser))
@@ -110,9 +109,8 @@ class Flight:
             link, ground = open_links(settings, io, navigator, origin, stack)
             source = io.open_source(step_s)
             stack.callback(source.close)
-            if link and not source.is_live and (learner or settings.send_fixes):
-                text = "%s is a recording: its fixes, and what it learns, do not say where you are"
-                _log.warning(text, config.source.uri)
+            if link and not source.is_live and settings.send_fixes:
+                _log.warning("%s is a recording: its fixes do not say where you are", config.source.uri)
             notifier = Notifier(flight_log, link)
             autopilot = None
             if link:
@@ -120,12 +118,9 @@ class Flight:
                 autopilot = ToAutopilot(link, navigator, notifier, settings=settings, cores=cores, clock=io.clock)
             if not settings.send_fixes:
                 notifier.announce(Severity.WARNING, str(DRY_RUN))
-            if cannot_learn:
-                _report_learning_stopped(notifier, cannot_learn)
             notifier.announce(Severity.INFO, f"started, {len(recogniser.place_map)} places", topic="start")
             parts = FlightParts(
                 recogniser=recogniser,
-                learner=learner,
                 source=source,
                 link=link,
                 ground=ground,
@@ -167,10 +162,9 @@ class Flight:
 
     def _remarks(self) -> tuple[str | None, ...]:
         """Return what people should know beside the counts, each a few words (None: nothing)."""
-        learnt = self._parts.learner.summary if self._parts.learner else None
         held = self._governing.governor.held
         age = self._parts.autopilot.age_summary if self._parts.autopilot else None
-        return self._commands.summary, age, held, learnt, self._map_watch.summary, self._parts.flight_log.state
+        return self._commands.summary, age, held, self._map_watch.summary, self._parts.flight_log.state
 
     def _run_pass(self) -> None:
         """Run one pass of the loop, with one frame at most."""
@@ -271,22 +265,6 @@ class Flight:
         if self._parts.autopilot:
             self._parts.autopilot.begin_anew()
 
-    def _learn(self, event: Recognition) -> None:
-        learner = self._parts.learner
-        if learner is None:
-            return
-        was_well = learner.trouble is None
-        if place := learner.learn(event):
-            self._parts.flight_log.write(
-                "learnt",
-                place=place.place_id,
-                query=event.name,
-                position=place.position and asdict(place.position),
-                quality=place.quality,
-            )
-        if was_well and learner.trouble:
-            _report_learning_stopped(self._parts.notifier, learner.trouble)
-
     def _end(self) -> None:
         parts, totals = self._parts, self.totals()
         systemd.notify(STOPPING=1)
@@ -304,13 +282,10 @@ class Flight:
             **totals,
             mavlink=parts.link.stats() if parts.link else None,
             **({"ground": parts.ground.stats()} if parts.ground else {}),
-            **({"learnt": parts.learner.totals} if parts.learner else {}),
         )
         fixes = f", {parts.autopilot.summary}" if parts.autopilot else ""
         counts = f"{self._tally.queries} queries, {self._tally.accepted} accepted{fixes}"
         _log.info("%s, %.3f mAh (%.3f of them for recognising)", counts, totals["used_mah"], totals["marginal_mah"])
-        if parts.learner:
-            _log.info("%s, %d in %s", parts.learner.summary, len(parts.recogniser.place_map), self._config.map)
 
 
 def _open_log(io: FlightIO) -> FlightLog:
@@ -336,8 +311,3 @@ def open_links(
     link = stack.enter_context(Link(address, link_settings, io.turns, drive=io.drive))
     link.want_position()
     return link, stack.enter_context(GroundLink(ground_address, link, io.drive)) if ground_address else None
-
-
-def _report_learning_stopped(notifier: Notifier, problem: str) -> None:
-    note = Reason(ReasonCode.LEARNING_STOPPED, {"problem": problem})
-    notifier.report("learning stopped", Severity.WARNING, note, topic="learning")

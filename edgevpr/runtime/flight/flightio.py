@@ -41,8 +41,6 @@ from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.flight.recording import Recording
 from edgevpr.runtime.flight.status import StatusFile, default_path
 from edgevpr.runtime.flight.stop import Stop
-from edgevpr.runtime.recognise.learn import Learner, check_positions
-from edgevpr.runtime.recognise.opening import has_map
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
 T = TypeVar("T")
@@ -82,7 +80,6 @@ class FlightParts:
     """All opened parts of a flight (None: it has no such part)."""
 
     recogniser: Recogniser
-    learner: Learner | None = None
     source: Source
     link: Link | None = None
     ground: Link | None = None
@@ -102,8 +99,6 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
     if uri is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
     parse_links(config.mavlink)
-    if config.mapping.learn:
-        check_positions(config)
     board = resolve_board(load_board(config.board), config.source, config.memory)
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # musl has none
         for parameter, value in _MALLOC.items():
@@ -162,10 +157,7 @@ def _open_recording(config: Config, stack: ExitStack) -> Recording | None:
     """Begin the recording, which `stack` closes; return None if none is configured."""
     if config.log.record is None:
         return None
-    recording = stack.enter_context(Recording(config.log.record, config.log.record_mb))
-    if config.mapping.learn and config.map and has_map(Path(config.map)):
-        recording.keep_map(Path(config.map))
-    return recording
+    return stack.enter_context(Recording(config.log.record, config.log.record_mb))
 
 
 def _open_optional(opened: Callable[[], T]) -> T | None:

@@ -9,13 +9,10 @@ from edgevpr.mavlink.ground import Wish, Wished
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import TEXT_BYTES, Severity
 from edgevpr.runtime.flight.flightlog import FlightLog
-from edgevpr.runtime.recognise.learn import Learner
 
 _NOTES = {
-    Wish.PAUSE: (ReasonCode.PAUSED_BY_COMMAND, "pause"),
-    Wish.RESUME: (ReasonCode.RESUMED_BY_COMMAND, "pause"),
-    Wish.LEARN: (ReasonCode.LEARNING_ON, "learning"),
-    Wish.LEARN_NOTHING: (ReasonCode.LEARNING_OFF, "learning"),
+    Wish.PAUSE: ReasonCode.PAUSED_BY_COMMAND,
+    Wish.RESUME: ReasonCode.RESUMED_BY_COMMAND,
 }
 _SHORT_BYTES = TEXT_BYTES - len("edgevpr: ")  # of a text for the ground station
 
@@ -77,37 +74,30 @@ class Trouble:
 
 class Commands:
     """Carries out the requests (`Wish`) of ground stations. While the flight `is_paused`, nothing is recognised and no
-    fix is sent. Learning can be switched only if there is a learner and it works."""
+    fix is sent."""
 
-    def __init__(self, link: Link | None, notifier: Notifier, learner: Learner | None) -> None:
+    def __init__(self, link: Link | None, notifier: Notifier) -> None:
         self.is_paused = False
-        self._link, self._notifier, self._learner = link, notifier, learner
+        self._link, self._notifier = link, notifier
 
     @property
     def summary(self) -> str | None:
-        """Features that a ground station has switched off, in a few words; None if there are none."""
-        off = ("paused" if self.is_paused else "", "learning off" if self._learner and self._learner.is_off else "")
-        return ", ".join(filter(None, off)) or None
+        """The word "paused" while the flight is paused, else None."""
+        return "paused" if self.is_paused else None
 
     def obey(self) -> None:
-        """Carry out the requests received since the last call, and tell the link which ones to accept from now on."""
+        """Carry out the request received since the last call, and let the link accept requests from now on."""
         if self._link is None:
             return
-        for wished in self._link.take_wishes():
+        if wished := self._link.take_wish():
             self._fulfil(wished)
-        can_learn = self._learner is not None and self._learner.trouble is None
-        self._link.offer(tuple(Wish) if can_learn else (Wish.PAUSE, Wish.RESUME))
+        self._link.accept_wishes()
 
     def _fulfil(self, wished: Wished) -> None:
-        before = self.summary
-        match wished.wish:
-            case Wish.PAUSE | Wish.RESUME:
-                self.is_paused = wished.wish is Wish.PAUSE
-            case Wish.LEARN | Wish.LEARN_NOTHING if self._learner:
-                self._learner.is_off = wished.wish is Wish.LEARN_NOTHING
-        is_new = before != self.summary
-        code, topic = _NOTES[wished.wish]
+        is_new = self.is_paused != (wished.wish is Wish.PAUSE)
+        self.is_paused = wished.wish is Wish.PAUSE
+        code = _NOTES[wished.wish]
         self._notifier.log("command", wish=wished.wish.name, sender=wished.sender, note=Reason(code), is_new=is_new)
         if is_new:  # a command repeated because its answer was lost changes nothing
             text = code.summary
-            self._notifier.announce(Severity.INFO, f"{text}, as {wished.sender} wishes", ground=text, topic=topic)
+            self._notifier.announce(Severity.INFO, f"{text}, as {wished.sender} wishes", ground=text, topic="pause")

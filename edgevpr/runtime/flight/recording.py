@@ -1,5 +1,5 @@
 """The recording of a flight, with which `review` can fly it again: a folder with `tape.jsonl`, one line for each input,
-`frames/`, the pictures as JPEG, and if the flight learns `map.gpkg`, the map as it was at the start.
+and `frames/`, the pictures as JPEG.
 
 A thread of its own writes, so that a slow disk delays nobody. A recording is of no use after a gap: if the disk is too
 slow or full, or the recording too large, it ends and the flight goes on.
@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from edgevpr.core.appending import append, open_appending, sync
-from edgevpr.core.errors import EdgevprError
+from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.text import redact_passwords
 from edgevpr.runtime.flight.boundary import Tape
+from edgevpr.runtime.flight.flightlog import Line, select_last_flight
 
-TAPE, FRAMES, MAP = "tape.jsonl", "frames", "map.gpkg"
+TAPE, FRAMES = "tape.jsonl", "frames"
 SPARED_BYTES = 100_000_000  # free bytes of the disk that are left to logs and map
 WAITING_BYTES = 32_000_000  # most bytes of pictures that may wait for a slow disk: minutes of a small camera
 WAITING_NOTES = 100_000
@@ -89,16 +90,6 @@ class Recording(Tape):
             self._bytes_put += len(jpeg)
             self._waiting.append((self._frames, jpeg))
         return self._frames
-
-    def keep_map(self, path: Path) -> None:
-        """Copy the map, as it is before the flight, into the recording. Raises EdgevprError."""
-        try:
-            shutil.copyfile(path, self.path / MAP)
-        except OSError as error:
-            raise EdgevprError(
-                f"{path} cannot be copied into {self.path} ({error.strerror}): a flight that learns is recorded with "
-                "its map; make room, or leave `log.record` out."
-            ) from error
 
     def close(self) -> None:
         """Write what still waits, and close the tape. Gives up after 1.5 seconds, with a warning."""
@@ -175,6 +166,22 @@ def open_recording(said: str | None, log: str | Path) -> Path | None:
     here = Path(said)
     beside = Path(log).resolve().parent / here.parent.name / here.name
     return next((each for each in (here, beside) if (each / TAPE).is_file()), None)
+
+
+def read_recorded(log: str | Path) -> tuple[list[Line], Path]:
+    """Return the lines of the last flight of `log`, and the folder of its recording (see `open_recording`). Raises
+    UsageError if there is none, and EdgevprError if the file holds no flight."""
+    flight = select_last_flight(log)
+    if flight.missing:
+        _log.warning("%s", flight.missing)
+    lines = list(flight)
+    said = lines[0].get("recording") if lines else None
+    if not said:
+        raise UsageError(f"{log}: its last flight was not recorded: fly with `log: {{record: FOLDER}}`.")
+    folder = open_recording(said, log)
+    if folder is None:
+        raise UsageError(f"{log}: its recording is neither at {said} nor beside the log: bring it there.")
+    return lines, folder
 
 
 def frames_of(folder: Path) -> dict[str, Path]:

@@ -1,4 +1,4 @@
-"""The start of a flight: opening of map, recogniser and learner, and the first line of the flight log."""
+"""The start of a flight: opening of the recogniser, and the first line of the flight log."""
 
 import logging
 import math
@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
-from functools import cache
 from itertools import islice
 from pathlib import Path
 from statistics import median
@@ -23,9 +22,8 @@ from edgevpr.places.mapinfo import MapIdentity, read_identity
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.flight.flightio import FlightIO
 from edgevpr.runtime.preflight.pick import explain_technique
-from edgevpr.runtime.recognise.learn import Learner
 from edgevpr.runtime.recognise.levelling import lens_of
-from edgevpr.runtime.recognise.opening import open_learning, open_recogniser
+from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
 _ORIGIN_PLACES = 15  # the first places of the map, by which the altitude of the ground is found
@@ -34,39 +32,17 @@ _LIBRARIES = ("numpy", "cv2", "onnxruntime")
 _log = logging.getLogger(__name__)
 
 
-def open_map(config: Config, io: FlightIO) -> tuple[Recogniser, Learner | None, str | None]:
-    """Open the recogniser of a flight. Returns it, its learner (None: no places are learnt), and why it cannot learn
-    (None: it can, or is not asked to), as on a memory card that has become read-only. Raises EdgevprError."""
-    here, meter = replace(config, map=io.place_map), _make_query_meter(config, io)
-    name = io.machine.pick_technique(config)
-
-    @cache
-    def learning() -> tuple[Recogniser, Learner]:
-        recogniser, growing = open_learning(here, io.board, name, meter)
-        spacing_m, gap_m = config.mapping.spacing_m, config.salience.gap_m
-        return recogniser, Learner(recogniser, growing, spacing_m=spacing_m, gap_m=gap_m, utc_clock=io.clock.utc_s)
-
-    cannot_learn = io.machine.try_map(learning) if config.mapping.learn else None
-    if config.mapping.learn and not cannot_learn:
-        return *learning(), None
-    try:
-        recogniser = open_recogniser(here, io.board, narrowed=True, follows=config.match.follow, meter=meter)
-    except MapError:
-        if cannot_learn:
-            raise MapError(cannot_learn) from None
-        raise
-    return recogniser, None, cannot_learn
-
-
-def _make_query_meter(config: Config, io: FlightIO) -> QueryMeter:
-    """Make the meter of the queries of a flight, by its clock."""
-    return QueryMeter(
+def open_map(config: Config, io: FlightIO) -> Recogniser:
+    """Open the recogniser of a flight, metered by the clock of the flight. Raises EdgevprError."""
+    meter = QueryMeter(
         io.board,
         config.battery,
         wall_clock=io.clock.wall_s,
         cpu_clock=io.clock.process_cpu_s,
         memory_mb=io.machine.rss_mb,
     )
+    config = replace(config, map=io.place_map)
+    return open_recogniser(config, io.board, narrowed=True, follows=config.match.follow, meter=meter)
 
 
 def apply_recorded_rate(config: Config, steps_s: Sequence[float]) -> Config:
@@ -138,10 +114,9 @@ def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map
 
 
 def _identity(place_map: PlaceMap) -> MapIdentity | None:
-    """Return the identity of a map; None if it has no places yet, or cannot be identified."""
+    """Return the identity of a map; None if it cannot be identified."""
     try:
-        found = read_identity(place_map)
-        return found if found.places else None
+        return read_identity(place_map)
     except MapError as error:  # the flight uses the places that can be read
         _log.warning("the log does not say which map it is: %s", error)
         return None

@@ -1,8 +1,7 @@
 """The later stages of recognition: verify the best place of a ranking by landmarks, which had no part in finding it,
 locate the aircraft by it, and decide."""
 
-import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -49,7 +48,6 @@ from edgevpr.runtime.recognise.evidence import (
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.runtime.recognise.judge import (
     LIKE_AT_REST,
-    NEW_FOR_S,
     AcceptRule,
     Findings,
     Verdict,
@@ -192,8 +190,7 @@ class Decision:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decider:
-    """Decides on rankings of the places of a `matcher`. `accuracy_m` is that of a place's position as a fix, and
-    `learnt_s` has the times at which places were learnt in this flight, by their numbers."""
+    """Decides on rankings of the places of a `matcher`. `accuracy_m` is that of a place's position as a fix."""
 
     place_map: PlaceMap
     technique: Technique
@@ -201,7 +198,6 @@ class Decider:
     settings: WalkSettings
     meter: QueryMeter
     accuracy_m: float
-    learnt_s: Mapping[int, float]
 
     def make_query(self, descriptor: Descriptor, expected: Expectation) -> Query:
         """Return the query of a descriptor to the places of the matcher."""
@@ -226,8 +222,7 @@ class Decider:
             if followed.slot is not None and followed.leads_from(int(ranking.slots[0])):
                 ranking = ranking.promote(followed.slot)
                 best, found = self._examine(ranking, query, verifier)
-        age_s = query.frame.t_mono_s - self.learnt_s.get(best.place.place_id, -math.inf)
-        found = replace(found, is_new=age_s <= NEW_FOR_S, by_flight=followed.confidence if followed else None)
+        found = replace(found, by_flight=followed.confidence if followed else None)
         verdict = judge(found, index, rule, search)
         if verdict.accepted and self.technique.spec.looks_down and search is None:
             heading_deg = best.place.heading_deg

@@ -25,8 +25,6 @@ from edgevpr.runtime.recognise.evidence import Evidence, LookAlikes, list_eviden
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.perspective import ShownTilt
 
-NEW_FOR_S = 30.0  # seconds; a place learnt so recently only repeats the position that the autopilot has just reported
-
 # Trajectories at other speeds are many, so one of them scores well by chance: half the margin over them is enough. With
 # it, no wrong sequence of the corridor set was accepted from hog, seqslam or cohog, flown as it was mapped, twice as
 # fast, or the other way. At half the speed cohog accepted places three away from the right one.
@@ -134,7 +132,7 @@ ACCEPT_NOTHING = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)
 class Findings:
     """All that is known of the best place of a `ranking` when it is judged.
 
-    `is_new` is True for a place learnt within the last `NEW_FOR_S` seconds. `proof` is the agreement of the landmarks
+    `proof` is the agreement of the landmarks
     of query and place (None: not compared). `where` is the position computed from the best places (None: only that of
     the best place is known); the places it was computed from are not elsewhere. `evidence` is that of the match (None:
     the rule needs none), and `by_flight` the probability of the place by the flight so far (None: the query is judged
@@ -144,7 +142,6 @@ class Findings:
     """
 
     ranking: Ranking = field(kw_only=False)
-    is_new: bool = False
     proof: Agreement | None = None
     where: Located | None = None
     evidence: Evidence | None = None
@@ -225,8 +222,6 @@ def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: Seque
         return Verdict(False, where.objection)
     if findings.tilt and findings.tilt.least_deg > MAX_TILT_UNLEVELLED_DEG:
         return _refuse(ReasonCode.TILT_SHOWN, tilt_deg=findings.tilt.deg)
-    if findings.is_new:  # a fix would only repeat the autopilot's position, and make its errors look confirmed
-        return _refuse(ReasonCode.JUST_LEARNT, limit_s=NEW_FOR_S)
     return verdict
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from edgevpr.core.arrays import Covariance, Doubles
 from edgevpr.core.geodesy import axes_of, moved, offset_m
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.core.types import Candidate, Place, Pose, Position
+from edgevpr.core.types import Candidate, Place, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
 from edgevpr.runtime.recognise.levelling import TILT_SD_WITHOUT_ATTITUDE
@@ -161,26 +161,6 @@ def covariance_matrix(covariance: Covariance) -> Doubles:
 def in_sd(step: Doubles, covariance: Doubles) -> float:
     """Return the length of a shift (2,) in standard deviations: its Mahalanobis distance, by a covariance (2, 2)."""
     return math.sqrt(step @ np.linalg.solve(covariance, step))
-
-
-def combine_with_recorded(where: Located, recorded: Position, recorded_sd_m: float) -> tuple[Position, Pose] | None:
-    """Return position and pose of a new place. Two positions of it are combined: `recorded`, whose standard deviation
-    along one axis is `recorded_sd_m`, and `where`, computed from the places around it. None if the two contradict each
-    other, or `where` has no heading or footprint."""
-    off_m = _off_m(recorded, where.position)
-    by_places, by_record = covariance_matrix(where.covariance_m2), recorded_sd_m**2 * np.eye(2)
-    both = by_places + by_record
-    if in_sd(off_m, both) > _MAX_DIFFERENCE_SD or where.heading_deg is None or where.footprint_m is None:
-        return None
-    gain = by_record @ np.linalg.inv(both)
-    covariance = gain @ by_places
-    pose = Pose(
-        up_deg=where.heading_deg,
-        footprint_m=where.footprint_m,
-        covariance_m2=to_triple(covariance),
-        recorded=Position(recorded.lat_deg, recorded.lon_deg),
-    )
-    return Position(*moved(recorded.lat_deg, recorded.lon_deg, *(gain @ off_m).tolist()), recorded.alt_m), pose
 
 
 def _average(estimates: list[_PlaceEstimate]) -> tuple[Doubles, Doubles]:

@@ -3,17 +3,15 @@
 import logging
 from collections.abc import Collection, Mapping
 from contextlib import ExitStack
-from pathlib import Path
 
 from edgevpr import techniques
-from edgevpr.core.config import Config, SalienceConfig, SourceConfig
+from edgevpr.core.config import Config, SalienceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ConfigError, MapError, UsageError
 from edgevpr.frames.mask import Mask, load_mask
 from edgevpr.frames.source import is_live
-from edgevpr.places.index import GrowingIndex, PlaceIndex, load_index
+from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapfiles import map_path, remove, require_regular
 from edgevpr.places.sequence import bytes_beside_place, make_sequence_search, sequence_length
 from edgevpr.power.boards import Board
 from edgevpr.power.meter import QueryMeter
@@ -34,7 +32,6 @@ from edgevpr.techniques.card import load_card
 _MAX_WAIT_S = 0.05  # longest wait in flight for another program that writes to the map: a query must not be late
 _log = logging.getLogger(__name__)
 Settings = Mapping[str, int | float | str]  # parameters of a technique, by their names
-_ROOM = 20_000  # places to learn in a flight: 200 km at the usual spacing; beyond that, RAM keeps the best places
 
 
 def open_recogniser(
@@ -69,37 +66,6 @@ def open_recogniser(
         recogniser = _recogniser(config, technique, place_map, index, meter, prior=prior, follows=follows)
         on_error.pop_all()
     return recogniser
-
-
-def open_learning(
-    config: Config, board: Board, new_technique: str | None, meter: QueryMeter | None = None
-) -> tuple[Recogniser, GrowingIndex]:
-    """Open a map for adding places. Returns a recogniser for a flight, as `open_recogniser` does, and the index that
-    takes new places, up to the memory budget. If there is no map, an empty one is made for the technique
-    `new_technique` (None: a map must exist)."""
-    if config.map is None:
-        raise UsageError("There is no map to learn places into: name one with --map, or `map:` in the configuration.")
-    path = map_path(config.map)
-    require_regular(path)
-    if new_technique and not has_map(path):
-        _make_map(path, made_for(board.threads, new_technique, _wanted(config)), config.source)
-    place_map = PlaceMap.open_for_adding(path)
-    with ExitStack() as on_error:
-        on_error.callback(place_map.close)
-        technique = create_technique(place_map, config.technique, _wanted(config), board)
-        beside_bytes = bytes_beside_place(sequence_length(technique.spec, config.match.sequence))
-        budget_bytes = int(board.budget_mb * 1e6)
-        growing = GrowingIndex(place_map, technique, budget_bytes=budget_bytes, room=_ROOM, beside_bytes=beside_bytes)
-        prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_live(config.source.uri))
-        meter, follows = meter or QueryMeter(board, config.battery), config.match.follow
-        recogniser = _recogniser(config, technique, place_map, growing.index, meter, prior=prior, follows=follows)
-        on_error.pop_all()
-    return recogniser, growing
-
-
-def has_map(path: Path) -> bool:
-    """Return True if there is a file at `path` that is not empty."""
-    return path.exists() and path.stat().st_size > 0
 
 
 def open_salience_gate(config: SalienceConfig, threads: int = 1) -> Gate | None:
@@ -219,17 +185,6 @@ def _recogniser(
     if is_flight:
         place_map.wait_at_most(_MAX_WAIT_S)
     return recogniser
-
-
-def _make_map(path: Path, technique: Technique, source: SourceConfig) -> None:
-    """Make an empty map, completely or not at all, so that a service killed at power-on can start again."""
-    unfinished = path.with_name(path.name + ".new")
-    remove(unfinished)
-    with PlaceMap.create(unfinished, technique.spec) as place_map:
-        mask = load_mask(source.mask)
-        place_map.record_mask(mask.sha256 if mask else None)
-        place_map.record_lens(source.lens)
-    unfinished.replace(path)
 
 
 def _wanted(config: Config) -> dict[str, str]:

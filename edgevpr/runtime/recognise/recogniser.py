@@ -11,10 +11,8 @@ from itertools import islice
 
 from edgevpr.core.contract import Descriptor, nearest_height
 from edgevpr.core.errors import MapError, PlaceError
-from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.level import Mount, View
-from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import layers_of
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation, Ranking, compare, scan, together
@@ -22,7 +20,7 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Decider, Decision, Matcher, Verifier, WalkSettings
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, explain_failure
 from edgevpr.runtime.recognise.hints import RecordedPrior, to_expectation
-from edgevpr.runtime.recognise.judge import NEW_FOR_S, Verdict, says_nothing
+from edgevpr.runtime.recognise.judge import Verdict, says_nothing
 from edgevpr.runtime.recognise.levelling import with_picture_heading
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -57,7 +55,6 @@ class Recogniser:
         self._settings, self._strides, self._place_filter = settings, strides, place_filter
         self._prior = prior or RecordedPrior()
         self._left_out_reported = 0  # places
-        self._learnt_s: dict[int, float] = {}  # places by their numbers, and the times they were learnt
         self._layers = matcher.layers or layers_of(place_map)
         self.change(matcher=matcher)
 
@@ -80,19 +77,12 @@ class Recogniser:
                 settings=self._settings,
                 meter=self.meter,
                 accuracy_m=self.accuracy_m,
-                learnt_s=self._learnt_s,
             )
         if candidates is not None:
             self.candidates = candidates
         if mount is not None:
             self.encoder = self.encoder.with_mount(mount)
             self._strides = Strides() if self._strides else None  # no stride leads to the first frame
-
-    def add_place(self, index: PlaceIndex, place_id: int, t_mono_s: float) -> None:
-        """Use an index that has one more place, `place_id`, learnt from the frame taken at `t_mono_s`."""
-        self._learnt_s = {new: t_s for new, t_s in self._learnt_s.items() if t_mono_s - t_s <= NEW_FOR_S}
-        self._learnt_s[place_id] = t_mono_s
-        self.change(matcher=replace(self.matcher, index=index))
 
     @property
     def sequence(self) -> int:
@@ -200,8 +190,6 @@ class Recogniser:
         objection = objection or query.view.reason or (query.worth.reason if query.worth else None)
         if place_filter:
             place_filter.predict(query.frame, query.vehicle, stride)
-        if not len(self.index):
-            return Decision(verdict=Verdict(False, Reason(ReasonCode.EMPTY_MAP)))
         if objection and self.matcher.search is None:  # a sequence needs every query
             if place_filter:
                 place_filter.update_without_match(self.index)

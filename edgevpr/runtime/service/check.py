@@ -1,13 +1,12 @@
 """`edgevpr check`: checks whether a configuration is ready to fly. It opens everything that `edgevpr run` opens, and
 closes it again."""
 
-import os
 import time
 from contextlib import closing
 from pathlib import Path
 
 from edgevpr.core.config import BatteryConfig, Config, MavlinkConfig, load_config
-from edgevpr.core.errors import ConfigError, EdgevprError, LinkError, MapError, SourceError, UsageError
+from edgevpr.core.errors import ConfigError, EdgevprError, LinkError, SourceError, UsageError
 from edgevpr.core.text import waiting
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.shot import Condition
@@ -15,8 +14,6 @@ from edgevpr.frames.source import is_live, missing_cause, open_source, recorded_
 from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.signing import open_signing
-from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapfiles import map_path
 from edgevpr.power.boards import Board, load_board, resolve_board
 from edgevpr.power.equations import parse_pack
 from edgevpr.runtime.flight.autopilot import DRY_RUN
@@ -24,7 +21,6 @@ from edgevpr.runtime.flight.startup import apply_recorded_rate
 from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import explain_technique, measure_flight
 from edgevpr.runtime.recognise.calibration import not_calibrated, read_calibration_for
-from edgevpr.runtime.recognise.learn import check_positions
 from edgevpr.runtime.recognise.levelling import load_calibrated_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.service.camera import FRAME_WAIT_S, frame_seen
@@ -62,16 +58,6 @@ def _check_battery(battery: BatteryConfig) -> str:
 
 
 def _check_map(config: Config, board: Board) -> str:
-    if config.mapping.learn and config.map is not None:
-        path = map_path(config.map).absolute()
-        # Not opened for writing: root would leave a file that the service may not write.
-        if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
-            raise MapError(f"{path} or its folder cannot be written by this user: learning needs both.")
-        if not path.exists():
-            return f"{path}, which the first flight makes"
-        with PlaceMap.open(path) as place_map:
-            if not len(place_map):
-                return f"{path}, empty so far"
     recogniser = open_recogniser(config, board, narrowed=True)
     with closing(recogniser.place_map) as place_map:
         t_query_s, cost = measure_flight(recogniser)
@@ -92,8 +78,6 @@ def _check_source(config: Config, offline: bool) -> str:
     uri = config.source.uri
     if uri is None:
         raise UsageError("There is no source of frames: write `source: {uri: ...}`.")
-    if config.mapping.learn:
-        check_positions(config)
     if not offline:
         return frame_seen(config.source)
     load_calibrated_lens(config.source)

@@ -1,10 +1,8 @@
-"""A flight that is commanded from the ground: it pauses and goes on, and learns or not."""
-
-import shutil
+"""A flight that is commanded from the ground: it pauses and goes on."""
 
 import pytest
-from fakes import FakeLink, FakeSource, vehicle_at
-from flights import Flight, flight_over, of_kind, pictures
+from fakes import FakeSource
+from flights import of_kind, pictures
 
 from edgevpr.mavlink.ground import Wish
 from edgevpr.runtime.flight import systemd
@@ -44,38 +42,6 @@ def test_a_recording_waits_while_paused(make_flight, clock, link):
     lines = flown.fly(source)
     assert queries(lines) == ["frame 000000", "frame 000001"], "paused, gone on, and paused again by the second"
     assert clock.now_s - started_s == pytest.approx(60.0, abs=0.5)
-
-
-def learning_flight(recording, tmp_path, clock, link):
-    """A flight that learns wherever the autopilot is, 111 m on every second."""
-    shutil.copy(recording / "cohog.gpkg", tmp_path / "m.gpkg")
-    settings = {"source.rate_hz": 1.0, "mapping.spacing_m": 20.0, "match.follow": False}
-    return Flight(tmp_path / "m.gpkg", tmp_path / "log", clock, link, learns=True, **settings)
-
-
-@pytest.mark.slow
-def test_learning_is_switched_off_and_on(recording, tmp_path, clock):
-    link = FakeLink(clock, vehicle=lambda: vehicle_at(51.0 + clock.now_s / 1000, 8.0, clock.now_s))
-    read = []
-
-    def work():
-        read.append(1)
-        if wish := {3: Wish.LEARN_NOTHING, 6: Wish.LEARN}.get(len(read)):
-            assert link.wish(wish) == "ACCEPTED"
-
-    flown = learning_flight(recording, tmp_path, clock, link)
-    lines = flown.fly(FakeSource(pictures(8, 100), clock, work=work))
-    learnt = [line["query"] for line in of_kind(lines, "learnt")]
-    assert learnt == [f"frame {number:06d}" for number in (0, 1, 2, 6, 7)]
-    assert link.texts() == [(6, "edgevpr: learning off by command"), (6, "edgevpr: learning on by command")]
-
-
-def test_a_flight_that_does_not_learn_cannot_be_told_to(recording, tmp_path, clock):
-    link, answers = FakeLink(clock), []
-    source = FakeSource(pictures(1), clock, work=lambda: answers.extend([link.wish(Wish.LEARN), link.wish(4)]))
-    lines = flight_over(recording, tmp_path, link, clock).fly(source)
-    assert answers == ["TEMPORARILY_REJECTED"] * 2
-    assert not of_kind(lines, "command")
 
 
 def test_while_paused_the_watchdog_is_fed_and_the_status_says_so(make_flight, clock, link, monkeypatch):

@@ -6,9 +6,7 @@ import shutil
 import sqlite3
 
 import pytest
-from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
-from flights import PLACES, Flight, fly_acts, nothing, of_kind
-from pictures import textured
+from flights import PLACES, fly_acts, nothing, of_kind
 
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
@@ -109,25 +107,3 @@ def test_another_map_in_its_place_is_refused_and_said_once(recording, tmp_path, 
     assert all(line["reason"]["code"] == "MAP_UNREADABLE" for line in queries[1:])
     assert flight.link.texts() == SAID[:1]
     assert len([each for each in caplog.records if "another map" in each.message]) == 1
-
-
-def learning(place_map, tmp_path, acts):
-    """A flight that learns, where the map has nothing, from an autopilot that moves on. Each picture counts alone:
-    it is the file that decides what is learnt."""
-    clock = FakeClock()
-    link = FakeLink(clock, vehicle=lambda: vehicle_at(51.0 + clock.now_s / 1000, 8.0, clock.now_s))
-    flight = Flight(
-        place_map, tmp_path / "log", clock, link, learns=True, **{"source.rate_hz": 1.0, "match.follow": False}
-    )
-    calls = iter(acts)
-    pictures = [textured(100 + n, 240, 320) for n in range(len(acts))]
-    return flight.fly(FakeSource(pictures, clock, work=lambda: next(calls)())), flight
-
-
-@pytest.mark.slow
-def test_while_another_program_writes_nothing_is_learnt_and_afterwards_again(place_map, tmp_path):
-    other = Locked(place_map)
-    lines, flight = learning(place_map, tmp_path, [nothing, other.lock, nothing, nothing, other.unlock, nothing])
-    assert len(of_kind(lines, "learnt")) == 3
-    assert flight.learner.totals["left_out"] == {"while another program was writing": 3}
-    assert flight.learner.trouble is None

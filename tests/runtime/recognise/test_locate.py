@@ -11,7 +11,7 @@ from edgevpr.core.geodesy import metres, moved
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import View
-from edgevpr.runtime.recognise.locate import at_place, combine_with_recorded, locate
+from edgevpr.runtime.recognise.locate import at_place, locate
 
 ORIGIN = Position(50.0, 8.0, 120.0)
 CELLS, FOOTPRINT_M = 32, 64.0
@@ -135,16 +135,3 @@ def test_the_covariance_is_that_of_the_place_turned_to_the_ground():
     assert var_east > 100 > 10 > var_north > 1
     assert abs(cov) < 0.1
     assert found.accuracy_m == pytest.approx(math.sqrt(var_east), rel=1e-3)
-
-
-def test_a_new_place_lies_between_what_was_recorded_and_what_its_neighbours_say():
-    where = locate([candidate(covariance_m2=(25.0, 0.0, 25.0), turned_deg=15)], CELLS, View(aside=(0.0, 0.0)))
-    recorded = Position(*moved(ORIGIN.lat_deg, ORIGIN.lon_deg, 6.0, 0.0), 130.0)
-    position, pose = combine_with_recorded(where, recorded, 5.0)
-    east_m, _ = off_m(position)
-    assert 2.0 < east_m < 4.0
-    assert (pose.up_deg, pose.footprint_m, position.alt_m) == (pytest.approx(15.0), FOOTPRINT_M, 130.0)
-    assert (pose.recorded.lat_deg, pose.recorded.lon_deg) == (recorded.lat_deg, recorded.lon_deg)
-    assert pose.covariance_m2[0] < 25
-    far = Position(*moved(ORIGIN.lat_deg, ORIGIN.lon_deg, 60.0, 0.0))
-    assert combine_with_recorded(where, far, 5.0) is None

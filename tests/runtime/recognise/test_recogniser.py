@@ -103,18 +103,6 @@ def test_a_stop_is_no_exception_of_a_frame(walk):
         walk.step(frame(1))
 
 
-def test_a_place_learnt_a_moment_ago_moves_nothing(walk):
-    assert walk.step(frame(3, 100.0)).accepted
-    walk.add_place(walk.index, 4, 100.0)
-    event = walk.step(frame(3, 129.9))
-    assert (event.accepted, event.position, event.accuracy_m) == (False, None, None)
-    assert event.reason.code is ReasonCode.JUST_LEARNT
-    assert walk.step(frame(2, 129.9)).accepted, "another place"
-    far = walk.step(Frame(image=textured(99), name="elsewhere", t_mono_s=129.9))
-    assert far.reason.code is not ReasonCode.JUST_LEARNT, "what is not like it has its own reason"
-    assert walk.step(frame(3, 130.1)).accepted
-
-
 def test_a_frame_that_could_not_be_read_is_an_event_too(walk):
     event = walk.report_unread(ValueError("cut"))
     assert (event.frame, event.failed, event.is_query) == (None, True, False)

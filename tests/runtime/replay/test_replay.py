@@ -118,29 +118,6 @@ def test_a_flight_that_was_killed_is_replayed_to_where_its_tape_ends(fly, tmp_pa
         assert len(shorter.lines) <= len(again.lines)
 
 
-def test_a_flight_that_learns_is_replayed_in_a_copy_of_its_map(fly, recording, tmp_path):
-    place_map, part = tmp_path / "m.gpkg", tmp_path / "part"
-    shutil.copytree(recording / "seen", part)
-    for number in range(12, PLACES):
-        (part / "images" / f"{number:02d}.png").unlink()
-    built = ["map", "build", str(place_map), "--images", str(part / "images"), "--technique", "hog", "--no-calibrate"]
-    assert main([*built, "--param", "w1=64"]) == 0
-    ended(fly("--learn", *QUICK, place_map=place_map, pictures=recording / "seen" / "images"))
-    learnt = of_kind(read_log(tmp_path / "flight.jsonl"), "learnt")
-    assert learnt
-    before = place_map.read_bytes()
-    again, _ = is_the_same(tmp_path / "flight.jsonl")
-    assert [line["place"] for line in of_kind(again.lines, "learnt")] == [line["place"] for line in learnt]
-    assert place_map.read_bytes() == before, "the map itself is left alone"
-
-
-def test_a_new_map_is_learnt_again(fly, recording, tmp_path):
-    flags = "--learn", "--technique", "hog", *QUICK
-    ended(fly(*flags, place_map=tmp_path / "new.gpkg", pictures=recording / "seen" / "images"))
-    again, _ = is_the_same(tmp_path / "flight.jsonl")
-    assert len(of_kind(again.lines, "learnt")) == PLACES
-
-
 def test_signed_packets_and_the_link_to_the_ground_are_the_same_but_for_the_signature(fly, tmp_path):
     key = tmp_path / "key"
     key.write_bytes(bytes(range(32)))

@@ -115,10 +115,6 @@ def test_check_stops_at_a_configuration_that_cannot_be_read(config_file, text):
         ({"map": None, "source": {"uri": None}}, ["map", "source"]),
         ({"battery": {"pack": "4x5200"}}, ["map", "battery"]),
         ({"technique": "cohog"}, ["map"]),
-        (
-            {"mapping": {"learn": True}, "mavlink": {"link": None}, "source": {"uri": "rtsp://127.0.0.1:9/camera"}},
-            ["source"],
-        ),
         ({"source": {"uri": "/dev/video99"}}, ["source"]),
         ({"source": {"uri": "ftp://camera/x"}}, ["source"]),
         ({"mavlink": {"link": "udp:127.0.0.1"}}, ["link"]),
@@ -137,17 +133,6 @@ def test_check_of_an_unknown_board_does_not_open_the_map(settings, config_file):
     findings = {finding.what: finding.ok for finding in check(config_file, offline=True)}
     assert not findings["board"]
     assert "map" not in findings
-
-
-def test_check_of_a_flight_that_learns_needs_no_map_and_makes_none(settings, config_file, tmp_path):
-    settings |= {"mapping": {"learn": True}, "map": str(tmp_path / "new.gpkg")}
-    assert wrong(config_file, settings) == []
-    assert not (tmp_path / "new.gpkg").exists()
-    PlaceMap.create(tmp_path / "new.gpkg", techniques.create("hog").spec).close()
-    assert wrong(config_file, settings) == []
-    settings["map"] = str(tmp_path / "absent" / "new.gpkg")
-    (finding,) = wrong(config_file, settings)
-    assert finding.what == "map"
 
 
 def test_check_reports_places_beyond_the_budget(settings, config_file):

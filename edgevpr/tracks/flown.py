@@ -1,0 +1,36 @@
+"""The flight log of a recorded flight of ours: where its pictures were taken, as the autopilot reported it with GPS."""
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from edgevpr.frames.positions import GeoTag
+from edgevpr.runtime.flight.recording import frames_of, read_recorded
+from edgevpr.tracks.record import Record, tag_of
+
+_FRESH_S = 1.0
+# Seconds after a fix that the autopilot took, or perhaps took, in which its position may only repeat that fix.
+_ECHO_S = 10.0
+
+
+def read_flight(path: Path) -> Record:
+    """Read the last flight of a log, by the names of the pictures in the folder `frames` of its recording. A picture
+    has no position if the autopilot had no GPS, its report was old, or it may only have repeated a fix of ours. Raises
+    UsageError if the flight was not recorded, and EdgevprError if the file holds no flight."""
+    lines, folder = read_recorded(path)
+    files, named = frames_of(folder), dict[str, GeoTag]()
+    for line in lines:
+        if line.get("kind") == "query" and (file := files.get(str(line.get("query")))):
+            with suppress(KeyError, TypeError):  # a line that is damaged, or has no vehicle
+                if tag := _tag_of(line["vehicle"], line["t_frame_s"]):
+                    named[file.name] = tag
+    return Record(kind="flight log of edgevpr", named=named)
+
+
+def _tag_of(vehicle: dict[str, Any], t_frame_s: float) -> GeoTag | None:
+    t_fix_s = vehicle["t_fix_s"]
+    is_echo = t_fix_s is not None and t_frame_s - t_fix_s < _ECHO_S
+    if not vehicle["has_gps"] or is_echo or abs(t_frame_s - vehicle["t_heard_s"]) > _FRESH_S:
+        return None
+    attitude = vehicle["heading_deg"], vehicle["roll_deg"], vehicle["pitch_deg"]
+    return tag_of(vehicle["lat_deg"], vehicle["lon_deg"], vehicle["alt_m"], attitude, vehicle["height_m"])

@@ -1,0 +1,60 @@
+"""Where the pictures of a recorded flight of ours were taken, by its log."""
+
+import json
+
+import cv2
+import pytest
+from fakes import vehicle_at
+from pictures import textured
+
+from edgevpr.cli.main import main
+from edgevpr.core.errors import UsageError
+from edgevpr.frames.positions import read_positions
+from edgevpr.runtime.flight.flightlog import FlightLog
+from edgevpr.runtime.flight.recording import Recording
+from edgevpr.tracks.record import read_record
+
+FRAME_S = 100.0
+
+
+def vehicles():
+    """Reports at the time of each picture: one that counts, no report, an old one, no GPS, and a fix of ours just now
+    and long ago."""
+    return (
+        vehicle_at(50.1, 8.0, FRAME_S, roll_deg=3.0, height_m=80.0),
+        None,
+        vehicle_at(50.2, 8.0, FRAME_S - 1.5),
+        vehicle_at(50.3, 8.0, FRAME_S, has_gps=False),
+        vehicle_at(50.4, 8.0, FRAME_S, t_fix_s=FRAME_S - 9.0),
+        vehicle_at(50.5, 8.0, FRAME_S, t_fix_s=FRAME_S - 11.0),
+    )
+
+
+@pytest.fixture
+def flown(tmp_path):
+    """The log of a recorded flight, and the folder of its pictures."""
+    jpeg = cv2.imencode(".jpg", textured(1, 48, 64))[1].tobytes()
+    with Recording(tmp_path / "recorded", 1000) as recording, FlightLog(tmp_path / "flight.jsonl") as log:
+        log.write("start", recording=str(recording.path))
+        for number, vehicle in enumerate(vehicles()):
+            recording.note("frame", {"name": f"frame {number}", "number": recording.keep(jpeg)})
+            log.write("query", query=f"frame {number}", t_frame_s=FRAME_S, vehicle=vehicle)
+    return tmp_path / "flight.jsonl", recording.path / "frames"
+
+
+def test_positions_places_the_pictures_of_a_flight_while_the_autopilot_had_gps(flown, capsys):
+    log, frames = flown
+    assert main(["positions", str(log), "--images", str(frames), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["placed"], said["of"]) == (2, 6)
+    tags = {name: tag for name, tag in read_positions(frames / "positions.csv").items() if tag.position}
+    assert {name: tag.position.lat_deg for name, tag in tags.items()} == {"000001.jpg": 50.1, "000006.jpg": 50.5}
+    assert (tags["000001.jpg"].roll_deg, tags["000001.jpg"].height_m) == (3.0, 80.0)
+
+
+def test_a_flight_that_was_not_recorded_gets_a_sentence(tmp_path):
+    with FlightLog(tmp_path / "flight.jsonl") as log:
+        log.write("start", recording=None)
+        log.write("query", query="frame 0", t_frame_s=FRAME_S, vehicle=vehicles()[0])
+    with pytest.raises(UsageError, match="was not recorded"):
+        read_record(tmp_path / "flight.jsonl")
