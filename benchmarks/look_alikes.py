@@ -15,7 +15,6 @@ from base import DATA
 
 from edgevpr.places.retrieve import elsewhere
 from edgevpr.runtime.recognise.calibration import read_calibration_for
-from edgevpr.runtime.recognise.decide import Matcher
 from edgevpr.runtime.recognise.evidence import INLIERS_BY_CHANCE, count_beside
 
 SETS = ("thumbs_essex", "corridor", "grief_stromovka_seasons")
@@ -34,7 +33,6 @@ def measure(name: str) -> base.Row:
         walk, slots = walks.walk(place_map, index, technique), np.arange(len(index))
         with_landmarks = walks.walk(place_map, index, technique, all_evidence=True)
         for query in dataset.queries:
-            walk.change(matcher=Matcher(index, walk.rule))
             event = walk.step(walks.frame(query.path))
             if event.accepted:
                 found = event.best.place.source_image
@@ -44,8 +42,8 @@ def measure(name: str) -> base.Row:
                 row["unproven"] += is_right and landmarks <= np.log1p(INLIERS_BY_CHANCE)
             known = [slot for slot in slots if dataset.references[slot] in {*query.right, *query.ignored}]
             kept = np.all([elsewhere(index, slot, slots, 0.0, beside=beside) for slot in known], axis=0)
-            walk.change(matcher=Matcher(index.only(kept), walk.rule))
-            row["left_out"] += walk.step(walks.frame(query.path)).accepted
+            without = walks.walk(place_map, index.only(kept), technique, rule=walk.rule)
+            row["left_out"] += without.step(walks.frame(query.path)).accepted
     return row
 
 

@@ -6,7 +6,6 @@ places per query: places must be mapped in the order of the flight. At another s
 places that lag behind. So trajectories at other speeds (-2.5 to 3) are scored as well, and a place is accepted only if
 it scores higher than these *rivals* of all places elsewhere."""
 
-import zlib
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
@@ -58,7 +57,6 @@ class SequenceSearch:
         self.rivals: Singles = np.empty(0, np.float32)
         self._rows: deque[Singles] = deque(maxlen=length)  # newest first
         self._usual: deque[float] = deque(maxlen=_NEWEST_ALONE)  # score of the places not compared, by query
-        self._known = (0, 0)  # number of places of the index, and the checksum of their ids
         self._t_last_s: float | None = None
         self._interval_s = 0.0
 
@@ -72,7 +70,7 @@ class SequenceSearch:
         by the mean score of their best trajectory, with the matches of the newest query. A place that was not compared
         gets the median score of those that were (0 would score rivals too low); slots before the first place of the map
         score 0."""
-        if self._broken(index, t_mono_s):
+        if self._is_broken(t_mono_s):
             self._rows.clear()
         if self.frames == self.length:
             self._rows.pop()  # before there is one more
@@ -81,7 +79,6 @@ class SequenceSearch:
         row = np.full(len(index), usual, np.float32)
         row[ranking.slots] = ranking.scores
         self._rows.appendleft(row)
-        self._known = (len(index), zlib.crc32(index.place_ids.data))
         means = best_means(self._rows, self._trajectories)
         self.rivals = best_means(self._rows, self._other_trajectories)
         worth_naming = means > 0
@@ -103,25 +100,20 @@ class SequenceSearch:
         if not near[together.argmax()]:
             return False
         for row, usual in zip(newest[:_NEWEST_ALONE], self._usual, strict=False):
-            seen = float(row[near[: len(row)]].max(initial=0))
+            seen = float(row[near].max(initial=0))
             # The usual score, which places have that were not compared, would reach a `min_score` of 0.
             if seen <= usual or seen < min_score or np.count_nonzero(row > seen) * near.sum() > _BEST_SHARE * len(row):
                 return False
         return True
 
-    def _broken(self, index: PlaceIndex, t_mono_s: float) -> bool:
-        """Return True if this query cannot continue the sequence, because of a long pause or another index."""
+    def _is_broken(self, t_mono_s: float) -> bool:
+        """Return True if this query cannot continue the sequence, because of a long pause."""
         before_s, usual_s = self._t_last_s, self._interval_s
         self._t_last_s = t_mono_s
         if before_s is None:
             return False
         self._interval_s = t_mono_s - before_s
-        places, checksum = self._known
-        return (
-            self._interval_s > max(_GAP_S, _USUAL_INTERVALS * usual_s)
-            or len(index) < places
-            or zlib.crc32(index.place_ids[:places].data) != checksum
-        )
+        return self._interval_s > max(_GAP_S, _USUAL_INTERVALS * usual_s)
 
 
 def trajectories(length: int, velocities: Floats) -> list[list[int]]:
@@ -136,12 +128,12 @@ def trajectories(length: int, velocities: Floats) -> list[list[int]]:
 
 def best_means(rows: Sequence[Singles], trajectories: Sequence[Sequence[int]]) -> Singles:
     """Return, for each slot, the best mean score of the trajectories that end there, float32 (N,). `rows` has the
-    scores of each query, newest first: (N,), or fewer for older queries if the index has grown since."""
+    scores (N,) of each query, newest first."""
     best, total = np.zeros_like(rows[0]), np.empty_like(rows[0])
     for trajectory in trajectories:
         total[:] = 0
         for row, back in zip(rows, trajectory, strict=False):
-            first, last = max(0, -back), min(len(row), len(total) - back)
+            first, last = max(0, -back), min(len(total), len(total) - back)
             if first < last:
                 total[first + back : last + back] += row[first:last]
         np.maximum(best, total, out=best)

@@ -111,29 +111,6 @@ def test_a_gap_in_time_begins_a_new_sequence(scores):
     assert sequence.frames == 2
 
 
-def test_an_index_that_grows_keeps_the_sequence(scores):
-    sequence = SequenceSearch(6)
-    grown = [scores[at, : 20 + 2 * at] for at in range(8)]
-    padded = np.zeros((8, 34), np.float32)
-    for at, row in enumerate(grown):
-        padded[at, : len(row)] = row
-        ranking = sequence.follow(ranked(row), index_of(range(1, len(row) + 1)), float(at))
-    assert sequence.frames == 6
-    np.testing.assert_allclose(dense(ranking, 34), literal(padded, 6)[-1], rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    "changed", [range(0, 40, 2), [*range(10), *range(11, 41)], [*range(10), *range(11, 60)]], ids=str
-)
-def test_an_index_that_gave_up_places_begins_a_new_sequence(scores, changed):
-    sequence = SequenceSearch(6)
-    followed(sequence, scores[:4], index_of(range(40)))
-    row = np.resize(scores[5], len(changed))
-    ranking = sequence.follow(ranked(row), index_of(changed), 4.0)
-    assert sequence.frames == 1
-    np.testing.assert_array_equal(dense(ranking, len(row)), row)
-
-
 @pytest.mark.slow
 def test_memory_is_what_the_budget_is_told_and_no_more_is_kept():
     places, length = 50_000, 10

@@ -83,7 +83,6 @@ class MirrorWatch:
         """Search the whole map for the flipped picture, by nothing that the flight knows."""
         assert event.frame is not None
         now, settings = self._recogniser, WalkSettings(candidates=self._recogniser.candidates)
-        matcher = Matcher(now.index, now.rule, follows=False)
-        alone = Recogniser(now.encoder, now.place_map, matcher, self._meter, settings=settings)
+        alone = Recogniser(now.encoder, now.place_map, Matcher(now.index, now.rule), self._meter, settings=settings)
         frame = replace(event.frame, image=np.flip(event.frame.image, axis).copy())
         return alone.step(frame, event.vehicle).accepted

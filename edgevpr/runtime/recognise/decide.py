@@ -67,14 +67,12 @@ _MAX_SAME_GROUND = 12  # places that may show the same ground: so many overlap o
 class Matcher:
     """What encoded frames are searched in, and how: an index, the rule for accepting its matches, and the search over
     sequences of queries (None: each query is ranked alone). They belong together: another form of the vectors in RAM
-    gives other scores, and so needs other limits. `layers` are those of the index (None: those of the map).
-    `follows`: the flight is followed; not where the index is a part of the map in which the aircraft need not be."""
+    gives other scores, and so needs other limits. `layers` are those of the index (None: those of the map)."""
 
     index: PlaceIndex = field(kw_only=False)
     rule: AcceptRule = field(kw_only=False)
     search: SequenceSearch | None = field(default=None, kw_only=False)
     layers: Layers | None = None
-    follows: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -62,12 +62,12 @@ class Followed:
 
 
 class _Survey:
-    """Measures of a map of so many `places`: the `origin` of the belief's plane (None: the map has no positions), the
+    """Measures of a map: the `origin` of the belief's plane (None: the map has no positions), the
     `scale`, and `spread`, the standard deviation of the position of a place without a pose."""
 
     def __init__(self, place_map: PlaceMap, index: PlaceIndex) -> None:
         known = ~np.isnan(index.lat_deg)
-        self.places, self.origin = len(index), None
+        self.origin = None
         self.scale, self.spread = MapScale(spacing=1.0, near=_NEAR_PLACES, is_ordinal=True), 1.0
         if known.mean() > _HALF:
             first = int(np.flatnonzero(known)[0])
@@ -79,12 +79,6 @@ class _Survey:
                 spacing=max(_MIN_SPACING_M, footprint_m / 2 if footprint_m else spacing_m),
                 near=max(_MIN_SPACING_M, near_m),
             )
-
-    def is_outdated(self, index: PlaceIndex) -> bool:
-        """Return True if most places have a position now, and either they had none before, or there are twice as many:
-        the first few places do not show how far apart the others are."""
-        is_measured = self.origin is not None and len(index) < 2 * self.places
-        return not is_measured and bool((~np.isnan(index.lat_deg)).mean() > _HALF)
 
     def positions(self, slots: Ints, index: PlaceIndex) -> Doubles:
         """Return positions in the plane of the belief, float (K, 2), NaN if unknown."""
@@ -104,7 +98,7 @@ class PlaceFilter:
 
     def __init__(self, place_map: PlaceMap, *, max_speed_m_s: float | None, is_live: bool) -> None:
         self._map, self._max_speed_m_s, self._is_live = place_map, max_speed_m_s or DEFAULT_MAX_SPEED_M_S, is_live
-        self._survey: _Survey | None = None  # of the map, once it has a place
+        self._survey: _Survey | None = None
         self._belief: Belief | None = None
         self._next: Belief | None = None  # the belief after the last pass, until `commit`
         self._arrived: tuple[Doubles, float] | None = None  # position of the newest ground, first confidence
@@ -131,7 +125,7 @@ class PlaceFilter:
         """Return the result of one pass together with the flight so far; nothing is kept before `commit`. `evidence` is
         that of the best place of the `ranking`, and `sure` turns it into probabilities. `where` is the position of the
         aircraft computed from the best place (None: the position of the place itself is taken)."""
-        if self._survey is None or self._belief is None or self._survey.is_outdated(index):
+        if self._survey is None or self._belief is None:
             self._survey = _Survey(self._map, index)
             self._belief = Belief(self._survey.scale)
         survey, near = self._survey, self._survey.scale.near

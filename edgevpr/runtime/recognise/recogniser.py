@@ -56,28 +56,23 @@ class Recogniser:
         self._prior = prior or RecordedPrior()
         self._left_out_reported = 0  # places
         self._layers = matcher.layers or layers_of(place_map)
-        self.change(matcher=matcher)
+        self.matcher, self.index, self.rule = matcher, matcher.index, matcher.rule
+        # Places nearer to each other show the same ground: neither is a rival of the other.
+        self._footprint_m = max(self._layers.footprints_m, default=0.0)
+        # 1-sigma accuracy of a place's position as a fix: the aircraft may be anywhere between two places.
+        self.accuracy_m = max(settings.min_accuracy_m, matcher.index.spacing_m() or 0.0)
+        self._decider = Decider(
+            place_map=place_map,
+            technique=self.technique,
+            matcher=matcher,
+            settings=settings,
+            meter=meter,
+            accuracy_m=self.accuracy_m,
+        )
 
-    def change(
-        self, *, matcher: Matcher | None = None, candidates: int | None = None, mount: Mount | None = None
-    ) -> None:
-        """Recognise with another matcher, number of candidates or mount of the camera from the next frame on (None: it
-        stays). Call it between two frames, from the thread that recognises."""
-        if matcher is not None:
-            self.matcher, self.index, self.rule = matcher, matcher.index, matcher.rule
-            self._layers = matcher.layers or self._layers
-            # Places nearer to each other show the same ground: neither is a rival of the other.
-            self._footprint_m = max(self._layers.footprints_m, default=0.0)
-            # 1-sigma accuracy of a place's position as a fix: the aircraft may be anywhere between two places.
-            self.accuracy_m = max(self._settings.min_accuracy_m, matcher.index.spacing_m() or 0.0)
-            self._decider = Decider(
-                place_map=self.place_map,
-                technique=self.technique,
-                matcher=matcher,
-                settings=self._settings,
-                meter=self.meter,
-                accuracy_m=self.accuracy_m,
-            )
+    def change(self, *, candidates: int | None = None, mount: Mount | None = None) -> None:
+        """Recognise with another number of candidates or mount of the camera from the next frame on (None: it stays).
+        Call it between two frames, from the thread that recognises."""
         if candidates is not None:
             self.candidates = candidates
         if mount is not None:
@@ -185,7 +180,7 @@ class Recogniser:
 
     def _decide(self, query: EncodedFrame, verifier: Verifier, stride: Stride | None) -> Decision:
         """Search the map for an encoded frame, and learn from the decision what the next query needs."""
-        place_filter = self._place_filter if self.matcher.follows else None
+        place_filter = self._place_filter
         objection = says_nothing(query.descriptor, self.rule.min_quality)
         objection = objection or query.view.reason or (query.worth.reason if query.worth else None)
         if place_filter:

@@ -14,7 +14,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.decide import WalkSettings
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.techniques import create
@@ -135,12 +135,3 @@ def test_ground_that_is_not_in_the_map_is_not_accepted_for_the_flight(whole_map)
         away = [walk.see(0, image=textured(900 + look)) for look in range(10)]
     assert not any(event.accepted for event in away)
     assert all(event.followed.lost > 0.5 for event in away[5:])
-
-
-def test_an_index_that_changes_in_flight_is_followed(flight):
-    whole = flight.recogniser.index
-    for place in range(4, 28, STRIDE):
-        index = whole.first(place + 3)
-        flight.recogniser.change(matcher=Matcher(index, flight.recogniser.rule))
-        event = flight.see(place)
-    assert event.accepted

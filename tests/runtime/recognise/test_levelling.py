@@ -20,7 +20,7 @@ from edgevpr.frames.mask import Mask
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, photograph
 from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.decide import WalkSettings
 from edgevpr.runtime.recognise.hints import Prior, RecordedPrior
 from edgevpr.runtime.recognise.levelling import Levelling, make_levelling, place_at_middle
 from edgevpr.techniques import create
@@ -102,13 +102,6 @@ def test_a_query_from_another_height_heading_and_tilt_finds_its_place(walk, grou
     assert event.view.footprint_m == pytest.approx(FOOTPRINT_M)
     off_m = 45 * math.tan(math.radians(20))
     assert math.hypot(*event.view.aside) * FOOTPRINT_M == pytest.approx(off_m)
-
-
-def test_pictures_are_scaled_to_the_places_that_are_searched_now(walk, ground):
-    recogniser, other_m = walk(scaling()), 0.8 * FOOTPRINT_M
-    of_other_tile = Layers(other_m, (other_m,), np.zeros(0, int), np.zeros(0, int))
-    recogniser.change(matcher=Matcher(recogniser.index, recogniser.rule, layers=of_other_tile))
-    assert recogniser.step(frame(ground, 1, **HARD)).view.footprint_m == pytest.approx(other_m)
 
 
 @pytest.mark.slow

@@ -203,16 +203,6 @@ def test_of_two_looks_at_one_frame_only_the_last_is_kept(flight):
     assert flight.look(43) == other.look(43)
 
 
-def test_a_map_that_grows_is_measured_again(bare_map):
-    """Of one place nobody knows how far the next will be."""
-    flight = Flight(bare_map, IN_METRES)
-    for place in range(0, 40):
-        flight.index = IN_METRES.first(place + 1)
-        followed = flight.look(place, 0.95, elapsed_s=1.0, others=(0,))
-        assert off_m(followed, place) < 2 * SPACING_M
-    assert followed.estimate.sd_m > SPACING_M / 2
-
-
 def test_a_place_without_position_lends_its_confidence_to_no_other(posed_map, bare_map):
     some = index_of([None if place % 3 == 0 else at(place) for place in range(PLACES)])
     for place_map in (posed_map, bare_map):

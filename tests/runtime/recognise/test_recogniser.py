@@ -13,8 +13,9 @@ from edgevpr.core.errors import MapError, ModelError
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.decide import WalkSettings
 from edgevpr.runtime.recognise.judge import AcceptRule
+from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
 
 PLACES = 6
@@ -111,8 +112,9 @@ def test_a_frame_that_could_not_be_read_is_an_event_too(walk):
 
 def test_the_accuracy_of_a_map_is_never_below_what_is_claimed_at_least(walk):
     walk.index.lat_deg[:] = np.linspace(50.0, 50.00001, PLACES)
-    walk.change(matcher=Matcher(walk.index, walk.rule))
-    assert walk.accuracy_m == 20.0
+    settings = WalkSettings(min_accuracy_m=20.0)
+    dense = Recogniser(walk.encoder, walk.place_map, walk.matcher, walk.meter, settings=settings)
+    assert dense.accuracy_m == 20.0
     assert load_config(None).mavlink.min_accuracy_m == 5.0
 
 
