@@ -13,7 +13,7 @@ import yaml
 
 from edgevpr.lab.evaluate import metrics
 from edgevpr.power.boards import load_board
-from edgevpr.power.equations import queries_ah, rail_ah, stage_energy_j
+from edgevpr.power.equations import queries_ah, stage_energy_j
 
 THESIS = yaml.safe_load(Path(__file__).with_suffix(".yaml").with_stem("thesis").read_text(encoding="utf-8"))
 # The thesis's names, by those of the rows of the results. Its CALC is the one with the authors' weights.
@@ -92,7 +92,7 @@ def total_ah(u_encode: float, u_match: float, t_encode_s: float, t_match_s: floa
     table, board = THESIS["table_5_2"], load_board(XEON)
     energy_j = stage_energy_j(board.idle_w, board.full_w, u_encode, t_encode_s)
     energy_j += stage_energy_j(board.idle_w, board.full_w, u_match, t_match_s)
-    return queries_ah(table["queries"], rail_ah(energy_j, table["rail_v"]))
+    return queries_ah(table["queries"], energy_j / (3600 * table["rail_v"]))
 
 
 def printed_pcu(technique: str) -> list[float | None]:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 from edgevpr.core.errors import ConfigError
 
-CPU_RAIL_V = 2.5  # V in the thesis, which counts the charge drawn from the CPU's supply rail
 _CELL_V = 3.7  # nominal voltage of a lithium-polymer cell
 _S_PER_H = 3600.0
 
@@ -52,15 +51,9 @@ def marginal_energy_j(idle_w: float, full_w: float, utilisation: float, t_s: flo
     return (full_w - idle_w) * utilisation * t_s
 
 
-def rail_ah(energy_j: float, rail_v: float = CPU_RAIL_V) -> float:
-    """Return the ampere-hours drawn from the CPU's rail, as the thesis counts them (5.6): Ah_q = (P_e t_e + P_m t_m) /
-    V, with times in hours."""
-    return energy_j / (rail_v * _S_PER_H)
-
-
 def pack_ah(energy_j: float, pack: Pack, regulator_efficiency: float) -> float:
     """Return the ampere-hours drawn from the pack, equation 5.6 with the pack's voltage: Ah = P t / (V_pack x regulator
-    efficiency). The efficiency is a share, 0..1."""
+    efficiency). The thesis counts them from the CPU's rail of 2.5 V instead. The efficiency is a share, 0..1."""
     return energy_j / (pack.nominal_v * regulator_efficiency * _S_PER_H)
 
 

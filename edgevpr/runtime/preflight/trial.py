@@ -5,6 +5,7 @@ import ctypes
 import gc
 import os
 import signal
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -14,13 +15,13 @@ from multiprocessing import get_context
 from typing import Any
 
 from edgevpr import techniques
-from edgevpr.core.child import end_with_parent
 from edgevpr.core.config import FORMS
 from edgevpr.core.errors import EdgevprError
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.recognise.opening import made_for
 from edgevpr.techniques.card import find_weights
 
+_PR_SET_PDEATHSIG = 1  # prctl(2)
 _TRIED_S = 0.5  # pictures are tried again for so long; twice as long finds the same. A check has no time for that
 
 
@@ -43,17 +44,15 @@ class Trial:
     parameters: dict[str, Any] = field(default_factory=dict)
 
 
-def offers(
-    names: Iterable[str], forms: Iterable[str] = FORMS, settings: Mapping[str, Mapping[str, Any]] | None = None
-) -> tuple[Trial, ...]:
-    """Return the trials to make, not yet made: one for each technique of `names` in each of `forms`, or only one if it
-    has no forms or its settings name one. `settings` are by technique name. Raises UsageError for an unknown name,
+def offers(names: Iterable[str], settings: Mapping[str, Mapping[str, Any]] | None = None) -> tuple[Trial, ...]:
+    """Return the trials to make, not yet made: one for each technique of `names` in each of its forms, or only one if
+    it has no forms or its settings name one. `settings` are by technique name. Raises UsageError for an unknown name,
     ModelError for a card that is incomplete."""
     trials = []
     for name in names:
         own = dict((settings or {}).get(name, {}))
         is_one = "form" in own or "form" not in techniques.parameters(name)
-        for chosen in (own,) if is_one else ({**own, "form": form} for form in forms):
+        for chosen in (own,) if is_one else ({**own, "form": form} for form in FORMS):
             trials.append(Trial(label=techniques.labelled(name, chosen.get("form")), name=name, settings=chosen))
     return tuple(trials)
 
@@ -74,7 +73,11 @@ def try_each(wanted: Sequence[Trial], threads: int) -> Iterator[Trial]:
 
 
 def _begin_child(parent_pid: int) -> None:
-    end_with_parent(parent_pid)
+    """Make the kernel kill this process when its parent ends in any way, even if a library here is in an endless loop.
+    Exits at once if the parent has ended already."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent_pid:
+        sys.exit(1)
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it without a traceback of its own
     os.dup2(2, 1)  # what a library prints does not go into the answer of the program
 
