@@ -12,6 +12,7 @@ from edgevpr import techniques
 from edgevpr.cli.main import main
 from edgevpr.core.types import StageCost
 from edgevpr.power import speed
+from edgevpr.power.boards import board_names
 from edgevpr.runtime.preflight import choose, trial
 
 COSTS = replace(REGIONS, disk_bytes_per_place=31_776, candidates=40, scan_per_place=StageCost(1e-6, 1e-6))
@@ -90,6 +91,11 @@ def test_profile_recommends_first_and_lists_every_technique(capsys, tried):
     assert tried == ["cohog", "hog", "hog 8bit", "hog 1bit", "seqslam", "calc", "calc 8bit", "calc 1bit"]
     assert {"cohog", "hog 1bit", "seqslam", "calc"} <= {line.split("  ")[0] for line in said}
     assert max(map(len, said)) <= 120
+
+
+def test_profile_list_names_every_board_and_this_machine(capsys):
+    said = [line.split()[0] for line in run(capsys, "--list").out.splitlines()]
+    assert said == ["this", *board_names()]
 
 
 def test_profile_of_a_map_tries_only_its_forms(capsys, tmp_path, tried):

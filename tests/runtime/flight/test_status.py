@@ -62,7 +62,7 @@ def test_top_shows_the_status_of_a_flight_and_none_of_one_that_is_gone(make_flig
     assert main(["top", "--file", str(path), "--once"]) == 1
     assert "--file" in capsys.readouterr().err
     with StatusFile(path) as told:
-        make_flight().fly(FakeSource(pictures(3), clock), status=told)
+        make_flight().fly(FakeSource([*pictures(2), *pictures(1, first=100)], clock), status=told)
         assert main(["top", "--file", str(path), "--json"]) == 0
         assert json.loads(capsys.readouterr().out) == read_status(path)[0]
         assert main(["top", "--file", str(path), "--once"]) == 0

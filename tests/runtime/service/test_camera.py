@@ -67,6 +67,14 @@ def test_check_camera_finds_that_the_program_is_missing(root, monkeypatch, uri):
     assert "sudo apt install" in finding.message
 
 
+def test_check_camera_finds_a_program_that_has_it_open(root):
+    assert next(check_camera("/dev/video0", root)).ok
+    (root / "proc/812/fd").mkdir(parents=True)
+    (root / "proc/812/stat").write_text("812 (guvcview) S 1 812 812 0 -1 4194304")
+    (root / "proc/812/fd/7").symlink_to("/dev/null")
+    assert next(check_camera("/dev/video0", root)).changes == ("stop guvcview (process 812)",)
+
+
 def test_frame_seen_compares_the_frame_with_the_lens(tmp_path):
     camera = wide()
     lens = str(camera.write(tmp_path / "lens.yaml"))
