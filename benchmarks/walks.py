@@ -24,7 +24,7 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.judge import ACCEPT_NOTHING, AcceptRule, accept_rule
+from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -115,4 +115,4 @@ def walk_over(places: Iterable[Path], name: str, looks_down: bool) -> Iterator[R
     """Map images with a technique, and give what recognises in that map, as it flies, and accepts nothing."""
     technique = create(name, {"camera": "nadir"} if looks_down and name == "cohog" else {})
     with mapped(map(frame, places), technique) as (place_map, index, _):
-        yield walk(place_map, index, technique, rule=ACCEPT_NOTHING)
+        yield walk(place_map, index, technique, rule=AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0))

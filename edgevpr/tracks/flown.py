@@ -4,8 +4,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import GeoTag
-from edgevpr.runtime.flight.recording import frames_of, read_recorded
+from edgevpr.runtime.flight.recording import frames_of, is_of_camera, read_recorded
 from edgevpr.tracks.record import Record, tag_of
 
 _FRESH_S = 1.0
@@ -16,8 +17,13 @@ _ECHO_S = 10.0
 def read_flight(path: Path) -> Record:
     """Read the last flight of a log, by the names of the pictures in the folder `frames` of its recording. A picture
     has no position if the autopilot had no GPS, its report was old, or it may only have repeated a fix of ours. Raises
-    UsageError if the flight was not recorded, and EdgevprError if the file holds no flight."""
+    UsageError if the flight was not recorded, or not by a camera, and EdgevprError if the file holds no flight."""
     lines, folder = read_recorded(path)
+    if not is_of_camera(folder):
+        raise UsageError(
+            f"{path}: its pictures were no camera's but a folder's or a film's, and the aircraft was elsewhere: place "
+            "those pictures by what was recorded with them."
+        )
     files, named = frames_of(folder), dict[str, GeoTag]()
     for line in lines:
         if line.get("kind") == "query" and (file := files.get(str(line.get("query")))):

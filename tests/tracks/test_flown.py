@@ -30,20 +30,20 @@ def vehicles():
     )
 
 
-@pytest.fixture
-def flown(tmp_path):
-    """The log of a recorded flight, and the folder of its pictures."""
+def fly(tmp_path, is_live=True):
+    """Write the log of a recorded flight, and return it and the folder of its pictures."""
     jpeg = cv2.imencode(".jpg", textured(1, 48, 64))[1].tobytes()
     with Recording(tmp_path / "recorded", 1000) as recording, FlightLog(tmp_path / "flight.jsonl") as log:
         log.write("start", recording=str(recording.path))
+        recording.note("is_live", is_live)
         for number, vehicle in enumerate(vehicles()):
             recording.note("frame", {"name": f"frame {number}", "number": recording.keep(jpeg)})
             log.write("query", query=f"frame {number}", t_frame_s=FRAME_S, vehicle=vehicle)
     return tmp_path / "flight.jsonl", recording.path / "frames"
 
 
-def test_positions_places_the_pictures_of_a_flight_while_the_autopilot_had_gps(flown, capsys):
-    log, frames = flown
+def test_positions_places_the_pictures_of_a_flight_while_the_autopilot_had_gps(tmp_path, capsys):
+    log, frames = fly(tmp_path)
     assert main(["positions", str(log), "--images", str(frames), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["placed"], said["of"]) == (2, 6)
@@ -58,3 +58,9 @@ def test_a_flight_that_was_not_recorded_gets_a_sentence(tmp_path):
         log.write("query", query="frame 0", t_frame_s=FRAME_S, vehicle=vehicles()[0])
     with pytest.raises(UsageError, match="was not recorded"):
         read_record(tmp_path / "flight.jsonl")
+
+
+def test_a_flight_over_a_folder_of_pictures_gets_a_sentence(tmp_path):
+    log, _ = fly(tmp_path, is_live=False)
+    with pytest.raises(UsageError, match="no camera's"):
+        read_record(log)

@@ -67,7 +67,7 @@ class Flight:
     """A flight whose parts are open. `open` makes it; close it after `run`."""
 
     def __init__(self, config: Config, parts: FlightParts) -> None:
-        self._config, self._parts, self._opened = config, parts, ExitStack()
+        self._parts, self._opened = parts, ExitStack()
         notifier, self._map_watch, self._tally = parts.notifier, MapWatch(parts.notifier), Tally()
         self._pace = Pace(parts.io.board.rate_hz, parts.io.clock)
         fewer_candidates = () if config.match.candidates else limit_candidates(parts.recogniser.technique)

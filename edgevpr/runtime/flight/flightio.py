@@ -104,7 +104,8 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
         for parameter, value in _MALLOC.items():
             mallopt(parameter, value)
     with ExitStack() as stack:
-        recording = _open_optional(lambda: _open_recording(config, stack))
+        record, most_mb = config.log.record, config.log.record_mb
+        recording = _open_optional(lambda: stack.enter_context(Recording(record, most_mb))) if record else None
         folder = str(recording.path.resolve()) if recording else None
         status_path = config.status.file or default_path()
         status = _open_optional(lambda: stack.enter_context(StatusFile(status_path))) if status_path else None
@@ -151,13 +152,6 @@ def record_io(io: FlightIO, recording: Recording) -> FlightIO:
         drive=partial(RecordedDriver, turns),
         stop=TapedStop(recording),
     )
-
-
-def _open_recording(config: Config, stack: ExitStack) -> Recording | None:
-    """Begin the recording, which `stack` closes; return None if none is configured."""
-    if config.log.record is None:
-        return None
-    return stack.enter_context(Recording(config.log.record, config.log.record_mb))
 
 
 def _open_optional(opened: Callable[[], T]) -> T | None:

@@ -196,6 +196,12 @@ def frames_of(folder: Path) -> dict[str, Path]:
     return found
 
 
+def is_of_camera(folder: Path) -> bool:
+    """Return True if the pictures of the recording in `folder` came from a camera or stream as they were taken."""
+    with open(folder / TAPE, "rb") as tape:
+        return any(line.startswith(b'["is_live", true') for line in tape)
+
+
 def recordings(folder: Path) -> list[Path]:
     """List the folders of the recordings in `folder`, oldest first."""
     numbered = [(int(found[1]), each) for each in folder.iterdir() if (found := _FOLDER.fullmatch(each.name))]

@@ -125,9 +125,6 @@ class AcceptRule:
     look_alikes: LookAlikes | None = None
 
 
-ACCEPT_NOTHING = AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
     """All that is known of the best place of a `ranking` when it is judged.
