@@ -10,6 +10,7 @@ import posixpath
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 import yaml
@@ -19,9 +20,10 @@ from mkdocs.structure.pages import Page
 
 from edgevpr.cli.main import EXIT_CODES, command_line
 from edgevpr.core.config import Config, Key, list_keys
-from edgevpr.core.reasons import ReasonCode
+from edgevpr.core.reasons import Code, ReasonCode
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.interview import TABLES
+from edgevpr.runtime.service.findingcodes import FindingCode
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = "benchmarks/results"
@@ -183,15 +185,28 @@ def json_output() -> str:
 
 
 def reasons() -> str:
-    """Return the page of the reasons, made from their table."""
+    """Return the page of the reasons and findings, made from their tables."""
     lines = ["# Reasons", ""]
-    lines += ["Why a match is accepted or refused, and a fix not sent or not taken. Flight log and `--json` carry the"]
-    lines += ["code and the parameters, here in braces; sentences may change. Made from `edgevpr/core/reasons.py`.", ""]
+    lines += [
+        "Why a match is accepted or refused, and a fix not sent or not taken, and what `check` and `doctor` find."
+    ]
+    lines += [
+        "Flight log and `--json` carry the code and the parameters, here in braces; sentences may change. Made from"
+    ]
+    lines += ["`edgevpr/core/reasons.py` and `edgevpr/runtime/service/findingcodes.py`.", ""]
     lines += ["| code | in short | sentence |", "|---|---|---|"]
-    for code in ReasonCode:
-        sentence = re.sub(r"{(\w+):?[^}]*}", r"{\1}", "".join(code.parts)).replace("{summary}", code.summary)
-        lines.append(f"| `{code.name}` | {code.summary} | {sentence} |")
+    lines += [f"| `{code.name}` | {code.summary} | {sentence_of(code)} |" for code in ReasonCode]
+    lines += ["", "## Findings of `check` and `doctor`", "", "Some findings have a code of the table above.", ""]
+    lines += ["| code | sentence |", "|---|---|"]
+    lines += [f"| `{code.name}` | {sentence_of(code)} |" for code in FindingCode]
     return "\n".join(lines) + "\n"
+
+
+def sentence_of(code: Code) -> str:
+    """Return the sentence of a code, with the names of its parameters in braces."""
+    pieces = [piece for part in code.parts for piece in Formatter().parse(part)]
+    sentence = "".join(f"{text}{{{name}}}" if name else text for text, name, _, _ in pieces)
+    return sentence.replace("{summary}", code.summary)
 
 
 def fields_of(part: dict[str, Any], prefix: str) -> Iterator[tuple[str, str, str]]:

@@ -114,10 +114,9 @@ def faults(flown: Row, control: Row) -> list[str]:
 
 
 def is_refused(flown: Row) -> bool:
-    """Tell whether edgevpr sent nothing in the watched time, or the aircraft stayed on the ground, and it has warned of
-    something else than a busy computer."""
-    is_harmless = not flown.get("sent") or bool(flown["cannot"])
-    return is_harmless and any(not text.startswith("held to ") for text in flown["warnings"])
+    """Tell whether edgevpr sent nothing in the watched time, or the aircraft stayed on the ground, and it has warned: a
+    busy computer is a notice."""
+    return bool(flown["warnings"]) and (not flown.get("sent") or bool(flown["cannot"]))
 
 
 def judged(rows: Mapping[str, Row]) -> list[Row]:

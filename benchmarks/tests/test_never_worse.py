@@ -52,7 +52,6 @@ def test_controls_are_shared():
         ({"sent": 0, "warnings": ["GPS_PRIMARY=1: not sent"], "error_m": 9.0}, "refused"),
         ({"cannot": "never ready", "warnings": ["GPS_PRIMARY=1: not sent"], "sent": 0}, "refused"),
         ({"cannot": "never ready", "error_m": 40.0}, "never ready; estimate 40 m off"),
-        ({"cannot": "never ready", "warnings": ["held to 10 of 30 candidates"], "sent": 0}, "never ready"),
     ],
 )
 def test_judged_by_the_control(changed, verdict):

@@ -159,7 +159,7 @@ def _show_findings(findings: "Sequence[Finding]", as_json: bool, **others: Any) 
     """Print findings, in JSON with the fields `others`, and return the exit code."""
     from edgevpr.runtime.service.finding import format_findings
 
-    is_ok, fields = all(finding.ok for finding in findings), [asdict(finding) for finding in findings]
+    is_ok, fields = all(finding.ok for finding in findings), [finding.fields() for finding in findings]
     show({**others, "ok": is_ok, "findings": fields}, as_json, format_findings(findings))
     return max(finding.exit_code for finding in findings)
 

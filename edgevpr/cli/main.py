@@ -13,7 +13,7 @@ from edgevpr.cli import evaluation, flying, maps, networks, positions, profile, 
 from edgevpr.cli.screen import LineFormatter, guard_output
 from edgevpr.cli.shared import Parser
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.text import shown
+from edgevpr.core.text import meant, shown
 
 EXIT_CODES = {
     0: "Done, and nothing is wrong.",
@@ -51,7 +51,8 @@ def main(argv: list[str] | None = None) -> int:
 def _run(argv: list[str]) -> int:
     args, unknown = command_line().parse_known_args(argv)
     if unknown:
-        args.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+        hint = meant(unknown[0].partition("=")[0], args.parser._option_string_actions, "")
+        args.parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint and '; '}{hint}")
     # Set before NumPy is imported: matrix products are small here, and more threads only make them slower.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     handler = logging.StreamHandler(sys.stderr)

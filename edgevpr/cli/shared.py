@@ -3,12 +3,12 @@
 import json
 import re
 import sys
-from argparse import SUPPRESS, ArgumentParser, Namespace, RawDescriptionHelpFormatter
+from argparse import SUPPRESS, Action, ArgumentError, ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from textwrap import wrap
-from typing import Any, NoReturn, TextIO, TypeVar
+from typing import Any, TextIO, TypeVar
 
 from edgevpr.cli.examples import format_examples
 from edgevpr.core.config import Config, list_keys, load_config
@@ -24,20 +24,17 @@ _UNITS = {
 
 
 class Parser(ArgumentParser):
-    """Parser of a command; where a word is wrong, its error names the one that may be meant. What begins as a negative
+    """Parser of a command. The error of a wrong choice names the one that may be meant. What begins as a negative
     number, as in `--area -35.36,149.16,500`, is a value and no flag."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
-    def error(self, message: str) -> NoReturn:
-        wrong = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)|unrecognized arguments: (\S+)", message)
-        if wrong:
-            known = re.findall(r"[\w-]+", wrong[2]) if wrong[2] else list(self._option_string_actions)
-            hint = meant(wrong[1] or wrong[3].partition("=")[0], known, "")
-            message = f"{message}; {hint}" if hint else message
-        super().error(message)
+    def _check_value(self, action: Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices and (hint := meant(value, action.choices, "")):
+            raise ArgumentError(action, f"invalid choice: {value!r}; {hint}")
+        super()._check_value(action, value)
 
 
 def command(commands: Any, name: str, run: Callable[[Namespace], int], text: str) -> ArgumentParser:

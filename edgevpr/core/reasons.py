@@ -1,7 +1,7 @@
 """Why a match was accepted or refused, and a fix sent or not: codes with parameters, and the one table of sentences.
 
 Programs, tests and counts work on the code and its parameters; people read the sentence, which may change at any time.
-"""
+The table of `edgevpr check` and `doctor` is `findingcodes` in `runtime/service`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -23,9 +23,21 @@ _FIGURES = (
 )
 
 
-class ReasonCode(Enum):
-    """The codes, each with its `summary` of a few words and the parts of its sentence (none: the summary), in which
-    names in braces are parameters. A part is left out if a parameter of it is unknown."""
+class Code(Enum):
+    """A code has a `summary` of a few words and the parts of its sentence (none: the summary), in which names in braces
+    are parameters. A part is left out if a parameter of it is unknown."""
+
+    def __init__(self, summary: str, *parts: str) -> None:
+        self.summary, self.parts = summary, parts or (summary,)
+
+    @property
+    def parameters(self) -> frozenset[str]:
+        """Names of the parameters of the sentence."""
+        return frozenset(name for part in self.parts for name in _names(part))
+
+
+class ReasonCode(Code):
+    """The codes of matches and fixes, of notes of a flight, and of the channel to the autopilot."""
 
     # Of a match that was accepted
     ACCEPTED_BY_CONFIDENCE = "accepted", *_FIGURES
@@ -102,7 +114,8 @@ class ReasonCode(Enum):
         "good to {accuracy_m:.0f} m: another fix has to agree",
     )
     PAUSED = "not sent: paused by the ground station"
-    PARAMETERS_UNFIT = "not sent: parameters of the autopilot", "{problem}"
+    PARAMETER_DANGEROUS = "not sent: a parameter is dangerous", "not sent: set {changes}. {why}"
+    PARAMETERS_UNANSWERED = "not sent: parameters not answered", "not sent: no answer for {names} from the autopilot"
     FIXES_UNANSWERED = "not sent: five fixes in a row had no answer"
     ANSWERS_BEGIN_AGAIN = "not sent: the autopilot has only just begun to answer again"
     FRAME_TOO_OLD = "its frame is too old", "its frame is {age_s:.1f} s old, and {limit_s:g} s are the limit"
@@ -123,7 +136,7 @@ class ReasonCode(Enum):
     TAKEN = "taken", "it takes them"
     GPS_IN_USE = "GPS in use", "a GPS receiver of its has a fix, and while it has GPS it takes no other position"
     NOT_STARTED = "filter not started", "its position filter has not started: a plane starts it with GPS only"
-    NO_ORIGIN = "no origin", "it gives no origin when asked: it must have had GPS once, or be sent one"
+    NO_ORIGIN = "no origin", "it has no origin, so it takes no position: it must have had GPS once, or be sent one"
     NOT_ARMED = "not armed", "it is not armed: on the ground it reckons no position that a fix could correct"
     NOT_RECKONING = "nothing to reckon by", "it reckons no position, with neither GPS, airspeed, flow nor vision"
     OTHER_AID = "not dead reckoning", "it takes a fix only while it reckons its position without any aid"
@@ -178,6 +191,20 @@ class ReasonCode(Enum):
     HOT = "companion hot", "{summary}", " at {temperature_c:.0f} C", ": give it cool air"
     COOL = "companion is cool again", "{summary}", " at {temperature_c:.0f} C"
 
+    # Of the channel to the autopilot: "it" is the autopilot
+    BY_GPS_INPUT = "GPS_INPUT", "GPS_INPUT, as its {parameter} is 14"
+    BY_ODOMETRY = "ODOMETRY", "ODOMETRY, as its {parameter} is 1", "; without GPS by source set {source_set:.0f}"
+    BY_MESSAGE_296 = "message 296", "message 296, as its {parameter} fuses positions"
+    COMMAND_TO_PLANE = "command 43003, which a dead-reckoning plane accepts at any time"
+    COMMAND_NEEDS_FLOW = "command 43003", "command 43003, for a {vehicle} that optical flow carries; else set {change}"
+    COMMAND_WITHOUT_296 = "command 43003", "command 43003, as it has no {parameter} for message 296 (1.18 has)"
+    COMMAND_FOR_296 = (
+        "command 43003",
+        "command 43003, as its {parameter} fuses no positions of message 296: set it, and reboot",
+    )
+    COMMAND_TO_ANY = "command 43003, the only one that is asked of an unknown firmware"
+    PARAMETER_WEAK = "a parameter is not right", "set {changes}. {why}"
+
     # Of a change of the governor
     BOARD_HOT = "the board is too hot", "{temperature_c:.0f} degrees, and {limit_c:.0f} are the limit"
     BOARD_SLOW = "the board slows itself down"
@@ -186,21 +213,13 @@ class ReasonCode(Enum):
     MEMORY_TAKEN = "too much memory taken", "{taken_mb:.0f} MB of memory taken, and {allowed_mb:.0f} allowed"
     ROOM_AGAIN = "there is room again"
 
-    def __init__(self, summary: str, *parts: str) -> None:
-        self.summary, self.parts = summary, parts or (summary,)
-
-    @property
-    def parameters(self) -> frozenset[str]:
-        """Names of the parameters of the sentence."""
-        return frozenset(name for part in self.parts for name in _names(part))
-
 
 @dataclass(frozen=True, slots=True)
 class Reason:
     """A code with the parameters of this case, numbers or text (None or not there: unknown). As text it is the
     sentence."""
 
-    code: ReasonCode
+    code: Code
     parameters: Parameters = field(default_factory=dict)
 
     def __str__(self) -> str:

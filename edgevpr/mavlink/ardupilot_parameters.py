@@ -3,6 +3,7 @@ receivers: a real one with a fix must always come first. Each row names the file
 
 from collections.abc import Iterator
 
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.channel import Channel, Choice, Kind, Parameters, own_name, read_value
 from edgevpr.mavlink.parameters import (
     MAX_DELAY_MS,
@@ -72,17 +73,17 @@ def choose_ardupilot_channel(kind: Kind, parameters: Parameters) -> Choice:
         name = own_name(parameters, RECEIVERS[number])
         if parameters.get(name) == MAVLINK_GPS:
             delay_ms = read_value(parameters, DELAYS[number], 0)
-            reason = f"GPS_INPUT as receiver {number + 1}, as its {name} is {MAVLINK_GPS}"
-            return Choice(Channel.GPS_INPUT, reason, number, delay_ms / 1e3 if delay_ms > 0 else _GPS_LAG_S)
+            lag_s = delay_ms / 1e3 if delay_ms > 0 else _GPS_LAG_S
+            return Choice(Channel.GPS_INPUT, Reason(ReasonCode.BY_GPS_INPUT, {"parameter": name}), number, lag_s)
     if parameters.get(VISION) == _MAVLINK_VISION:
-        return Choice(Channel.ODOMETRY, f"ODOMETRY, as its {VISION} is {_MAVLINK_VISION}")
+        sets = [n for n, name in enumerate(_name_sources("POSXY"), 1) if parameters.get(name) == _FROM_VISION]
+        source_set = None if 1 in sets or not sets else sets[0]
+        reason = Reason(ReasonCode.BY_ODOMETRY, {"parameter": VISION, "source_set": source_set})
+        return Choice(Channel.ODOMETRY, reason)
     if kind is Kind.PLANE:
-        return Choice(Channel.COMMAND, "command 43003, which a dead-reckoning plane accepts at any time")
-    return Choice(
-        Channel.COMMAND,
-        f"command 43003, which a {kind.value} without GPS takes only as long as optical flow carries it: set "
-        f"{own_name(parameters, RECEIVERS[SECOND])}={MAVLINK_GPS} to give it a continuous position",
-    )
+        return Choice(Channel.COMMAND, Reason(ReasonCode.COMMAND_TO_PLANE))
+    change = f"{own_name(parameters, RECEIVERS[SECOND])}={MAVLINK_GPS}"
+    return Choice(Channel.COMMAND, Reason(ReasonCode.COMMAND_NEEDS_FLOW, {"vehicle": kind.value, "change": change}))
 
 
 def _has_other_receiver(parameters: Parameters, choice: Choice) -> bool:

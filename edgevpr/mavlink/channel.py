@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import TypeAlias
 
-from edgevpr.core.reasons import Reason, ReasonCode
+from edgevpr.core.reasons import Reason
 
 Parameters: TypeAlias = Mapping[str, float]
 
@@ -63,16 +63,14 @@ class Choice:
     receiver that we replace (0: the first), and `lag_s` the age that the autopilot assumes our positions to have."""
 
     channel: Channel
-    reason: str
+    reason: Reason
     receiver: int = 0
     lag_s: float = 0.0
 
     @property
     def why_nothing(self) -> Reason | None:
         """The reason why nothing is sent; None if something is."""
-        if self.channel is not Channel.NONE:
-            return None
-        return Reason(ReasonCode.PARAMETERS_UNFIT, {"problem": self.reason})
+        return self.reason if self.channel is Channel.NONE else None
 
 
 def kind_of(mav_type: int) -> Kind:

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.ardupilot_parameters import ARDUPILOT_TABLE
 from edgevpr.mavlink.channel import Channel, Choice, Kind, kind_of
@@ -27,7 +28,7 @@ VERSION_ASKS_MAX = 4
 TOPIC = "parameters"
 
 TABLES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUPILOT_TABLE, mavlink.MAV_AUTOPILOT_PX4: PX4_TABLE}
-_OF_ANY = Choice(Channel.COMMAND, "command 43003, the only one that is asked of an unknown firmware")
+_OF_ANY = Choice(Channel.COMMAND, Reason(ReasonCode.COMMAND_TO_ANY))
 
 log = logging.getLogger(__name__)
 
@@ -203,7 +204,7 @@ class Interview:
             elif self._reported or self._has_reported_missing:
                 self._announce(Severity.INFO, f"positions go by {choice.channel.name}", TOPIC)
         for fault in faults:
-            log.warning("%s: %s", fault.advice, fault.rule.why)
+            log.warning("%s", fault.reason)
 
     def _report_missing(self, now_s: float) -> None:
         missing = self._decision.missing

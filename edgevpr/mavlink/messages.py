@@ -41,6 +41,7 @@ class Severity(IntEnum):
     """Severity of a status text (MAV_SEVERITY)."""
 
     WARNING = mavlink.MAV_SEVERITY_WARNING
+    NOTICE = mavlink.MAV_SEVERITY_NOTICE
     INFO = mavlink.MAV_SEVERITY_INFO
 
 

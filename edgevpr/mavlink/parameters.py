@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.channel import OLD_NAMES, Channel, Choice, Kind, Parameters, own_name, read_value
 
 # ARMING_SKIPCHK takes the place of ARMING_CHECK after ArduPilot 4.6: it names the checks to leave out.
@@ -47,8 +48,10 @@ class ParameterFault:
     changes: tuple[str, ...]
 
     @property
-    def advice(self) -> str:
-        return f"set {' and '.join(self.changes)}"
+    def reason(self) -> Reason:
+        """The reason why nothing is sent, or the channel is weak, with what to change."""
+        code = ReasonCode.PARAMETER_DANGEROUS if self.rule.is_dangerous else ReasonCode.PARAMETER_WEAK
+        return Reason(code, {"changes": " and ".join(self.changes), "why": self.rule.why})
 
     @property
     def brief(self) -> str:
@@ -107,8 +110,7 @@ class ParameterTable:
             return _wait_for(missing)
         faults = self.find_faults(choice, parameters)
         if faults and faults[0].rule.is_dangerous:
-            reason = f"not sent: {faults[0].advice}. {faults[0].rule.why}"
-            choice = replace(choice, channel=Channel.NONE, reason=reason)
+            choice = replace(choice, channel=Channel.NONE, reason=faults[0].reason)
         return Decision(choice, (), faults)
 
     def _join(self, rules: Iterable[ParameterRule]) -> tuple[str, ...]:
@@ -116,8 +118,7 @@ class ParameterTable:
 
 
 def _wait_for(missing: tuple[str, ...]) -> Decision:
-    more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-    reason = f"not sent: the autopilot has not answered for {', '.join(missing[:3])}{more}"
+    reason = Reason(ReasonCode.PARAMETERS_UNANSWERED, {"names": ", ".join(missing)})
     return Decision(Choice(Channel.NONE, reason), missing)
 
 

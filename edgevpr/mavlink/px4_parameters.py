@@ -1,6 +1,7 @@
 """PX4's channel and the table of its parameters (see `parameters`). Each row names the file of PX4 1.18.0-beta1 that
 decides, or says that it was flown in its own simulator."""
 
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.channel import Channel, Choice, Kind, Parameters
 from edgevpr.mavlink.messages import SENSOR_ID
 from edgevpr.mavlink.parameters import (
@@ -37,12 +38,13 @@ def choose_px4_channel(_kind: Kind, parameters: Parameters) -> Choice:
     command 43003."""
     fuses_ours = has_bit(parameters.get(CONTROL, 0), FUSES_POSITION)
     if parameters.get(VISION_CONTROL) == FUSES_POSITION and not fuses_ours:
-        return Choice(Channel.VISION, f"ODOMETRY, as its {VISION_CONTROL} is {FUSES_POSITION}")
+        reason = Reason(ReasonCode.BY_ODOMETRY, {"parameter": VISION_CONTROL, "source_set": None})
+        return Choice(Channel.VISION, reason)
     if CONTROL not in parameters:
-        return Choice(Channel.COMMAND, f"command 43003, as it has no {CONTROL} for message 296 (1.18 has)")
+        return Choice(Channel.COMMAND, Reason(ReasonCode.COMMAND_WITHOUT_296, {"parameter": CONTROL}))
     if fuses_ours:
-        return Choice(Channel.SENSOR, f"message 296, as its {CONTROL} fuses positions")
-    return Choice(Channel.COMMAND, f"command 43003, as its {CONTROL} fuses no positions of message 296")
+        return Choice(Channel.SENSOR, Reason(ReasonCode.BY_MESSAGE_296, {"parameter": CONTROL}))
+    return Choice(Channel.COMMAND, Reason(ReasonCode.COMMAND_FOR_296, {"parameter": CONTROL}))
 
 
 # fmt: off

@@ -7,14 +7,17 @@ import pytest
 
 import edgevpr
 from edgevpr.core.reasons import Reason, ReasonCode, read_reason
+from edgevpr.runtime.service.findingcodes import FindingCode
 
 PACKAGE = Path(edgevpr.__file__).parent
+TABLES = {"ReasonCode": ReasonCode, "FindingCode": FindingCode}
+CODES = [*ReasonCode, *FindingCode]
 
 
 def parse_package():
-    """The syntax trees of all modules but the table's own."""
+    """The syntax trees of all modules but those of the tables."""
     for path in sorted(PACKAGE.rglob("*.py")):
-        if path != PACKAGE / "core/reasons.py":
+        if path not in (PACKAGE / "core/reasons.py", PACKAGE / "runtime/service/findingcodes.py"):
             yield path, ast.parse(path.read_text("utf-8"))
 
 
@@ -37,15 +40,23 @@ def parse_package():
             "the runner-up (25%), 7 landmarks agree",
         ),
         ("LOW_SCORE", {"score": "damaged", "needed": 0.1}, "not similar enough to any place"),
+        ("FILTER_READY", {"flags": 0x33F}, "has attitude and position (flags 0x33f)"),
+        ("LOG_NOT_A_FILE", {"path": "/"}, "/ is not a file in an existing folder: correct `log: {path: ...}`"),
+        (
+            "LINK_OPENED_DRY",
+            {"address": "tcp:10.0.0.2:5760", "system": 1, "ground": None, "key": None},
+            "tcp:10.0.0.2:5760, autopilot of system 1, dry run: no fix is sent",
+        ),
     ],
 )
 def test_reason_is_a_sentence_without_what_is_unknown(code, parameters, sentence):
-    reason = Reason(ReasonCode[code], parameters)
-    assert str(reason) == sentence
+    codes = {each.name: each for each in CODES}
+    assert str(Reason(codes[code], parameters)) == sentence
 
 
-def test_reason_codes_are_all_different():
-    assert len(ReasonCode.__members__) == len(list(ReasonCode)), "members with equal texts would be one"
+def test_codes_are_all_different():
+    names = [name for table in TABLES.values() for name in table.__members__]
+    assert len(set(names)) == len(names) == len(CODES), "members with equal texts would be one"
 
 
 def test_read_reason_gives_what_was_written_and_nothing_else():
@@ -58,24 +69,31 @@ def test_read_reason_gives_what_was_written_and_nothing_else():
 
 
 def test_reasons_are_given_the_parameters_of_their_sentences():
-    wrong = []
+    wrong, used = [], set()
     for path, tree in parse_package():
         for node in ast.walk(tree):
             match node:
-                case ast.Call(
-                    func=ast.Name(id="Reason"), args=[ast.Attribute(value=ast.Name(id="ReasonCode"), attr=code), *given]
-                ):
+                case ast.Call(func=ast.Name(id="Reason"), args=[code, *given]):
                     keys = given[0].keys if given and isinstance(given[0], ast.Dict) else []
-                case ast.Call(func=ast.Name(id="_refuse"), args=[ast.Attribute(attr=code)], keywords=keywords):
-                    given, keys = [], [ast.Constant(keyword.arg) for keyword in keywords]
+                    is_whole = None not in keys and not (given and not isinstance(given[0], ast.Dict))
+                case (
+                    ast.Call(func=ast.Name(id="_refuse"), args=[code, *_], keywords=keywords)
+                    | ast.Call(func=ast.Name(id="fine" | "wrong"), args=[_, code, *_], keywords=keywords)
+                ):
+                    keys = [keyword.arg and ast.Constant(keyword.arg) for keyword in keywords]
+                    is_whole = None not in keys
+                case ast.Attribute(value=ast.Name(id="ReasonCode" | "FindingCode"), attr=name):
+                    used.add(name)
+                    continue
                 case _:
                     continue
-            names = {key.value for key in keys if key}
-            is_whole = None not in keys and not (given and not isinstance(given[0], ast.Dict))
-            expected = ReasonCode[code].parameters
-            if not names <= expected or (is_whole and names != expected):
-                wrong.append((path.name, node.lineno, code, names))
+            match code:
+                case ast.Attribute(value=ast.Name(id=table), attr=name) if table in TABLES:
+                    names, expected = {key.value for key in keys if key}, TABLES[table][name].parameters
+                    if not names <= expected or (is_whole and names != expected):
+                        wrong.append((path.name, node.lineno, name, names))
     assert wrong == []
+    assert {code.name for code in CODES} - used == {"NOT_SEARCHED"}, "which `reasons` itself uses"
 
 
 def test_no_module_takes_a_sentence_apart():
@@ -102,7 +120,7 @@ def _is_reason(node):
     """Tell whether an expression is a reason, or its sentence, by its name."""
     match node:
         case ast.Name(id=name) | ast.Attribute(attr=name) | ast.Subscript(slice=ast.Constant(value=name)):
-            return name in ("reason", "why", "objection")
+            return name in ("reason", "why", "objection", "problem", "note", "texts", "warnings")
         case ast.Call(func=ast.Name(id="str"), args=[inner]):
             return _is_reason(inner)
     return False

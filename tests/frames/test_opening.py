@@ -31,7 +31,8 @@ from edgevpr.frames.shot import Condition, OpeningError, Shot
 from edgevpr.frames.source import open_source
 from edgevpr.frames.streams import open_address
 from edgevpr.runtime.service import camera
-from edgevpr.runtime.service.camera import frame_seen
+from edgevpr.runtime.service.camera import check_frame
+from edgevpr.runtime.service.findingcodes import FindingCode
 
 pytestmark = pytest.mark.network
 PASSWORD = "geh%23heim"
@@ -280,14 +281,14 @@ def test_snapshots_take_a_password(serve):
 
 
 def seen(uri):
-    return frame_seen(load_config(None, {"source.uri": uri}).source)
+    finding = check_frame("source", load_config(None, {"source.uri": uri}).source)
+    return finding.reason.code, finding.reason.parameters
 
 
-def test_frame_seen_shows_the_facts_of_the_first_picture_and_that_a_flight_accepts_it(serve, monkeypatch):
+def test_check_frame_has_the_facts_of_the_first_picture_and_refuses_an_old_one(serve, monkeypatch):
     uri = f"http://{serve(multipart('image/jpg', '.jpg'))}/video"
-    shown = f"{uri}, streaming, {WIDTH} x {HEIGHT} pixels, mjpeg, 8 bits a channel, square pixels, "
-    assert seen(uri).startswith(shown)
-    assert seen(uri).endswith(" s old: a flight accepts it")
+    code, found = seen(uri)
+    assert (code, found["width"], found["height"]) == (FindingCode.FRAME_RECEIVED, WIDTH, HEIGHT)
+    assert found["facts"] == "mjpeg, 8 bits a channel, square pixels"
     monkeypatch.setattr(camera, "FIX_MAX_AGE_S", -1.0)
-    with pytest.raises(SourceError, match="no fix of a picture older than -1 s is sent"):
-        seen(uri)
+    assert seen(uri)[0] is FindingCode.FRAMES_LATE

@@ -9,6 +9,7 @@ from simulated.firmware import ARDUPILOT as ARDUPILOT_PARAMETERS
 from simulated.firmware import PX4 as PX4_PARAMETERS
 
 from edgevpr.core.geodesy import offset_m
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Position
 from edgevpr.mavlink.ardupilot_parameters import choose_ardupilot_channel
 from edgevpr.mavlink.channel import Channel, Kind
@@ -22,7 +23,8 @@ ARDUPILOT, PX4 = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4
 def test_the_receiver_is_the_one_that_is_ours_and_as_late_as_it_is_taken_to_be():
     second = choose_ardupilot_channel(Kind.COPTER, {"GPS1_TYPE": 1, "GPS2_TYPE": 14, "GPS2_DELAY_MS": 0})
     assert (second.receiver, second.lag_s) == (1, 0.2)
-    assert "GPS2_TYPE=14" in choose_ardupilot_channel(Kind.COPTER, {"GPS1_TYPE": 1}).reason, "what to set up"
+    needed = choose_ardupilot_channel(Kind.COPTER, {"GPS1_TYPE": 1}).reason
+    assert (needed.code, needed.parameters["change"]) == (ReasonCode.COMMAND_NEEDS_FLOW, "GPS2_TYPE=14")
     first = choose_ardupilot_channel(Kind.COPTER, {"GPS_TYPE": 14, "GPS_TYPE2": 1, "GPS_DELAY_MS": 60})
     assert (first.receiver, first.lag_s) == (0, 0.06)
 

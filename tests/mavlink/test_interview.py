@@ -112,7 +112,7 @@ def test_a_parameter_whose_answers_are_lost_is_not_absent(share):
         autopilot = Asked(COPTER | {"GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}, is_lost=loses(share, seed))
         autopilot.answer_for(40)
         assert autopilot.conversation.channel is Channel.NONE
-        assert "GPS_PRIMARY=0" in autopilot.interview.choice.reason
+        assert autopilot.interview.choice.reason.parameters["changes"] == "GPS_PRIMARY=0"
         assert not [message for message in autopilot.sent if message.get_type() == "GPS_INPUT"]
 
 
@@ -124,8 +124,8 @@ def test_missing_answers_are_reported_once_and_withhold_fixes():
     assert [text for _, text in autopilot.sentences()] == ["edgevpr: no answer for GPS2_TYPE and 1 more"]
     sending = autopilot.conversation.send_fix(Fix(50.0, 8.0, 9.0, autopilot.clock.now_s))
     autopilot.answer_for(1)
-    assert (sending.sent, sending.why.code) == (False, ReasonCode.PARAMETERS_UNFIT)
-    assert "GPS2_TYPE, VISO_TYPE" in sending.why.parameters["problem"]
+    assert (sending.sent, sending.why.code) == (False, ReasonCode.PARAMETERS_UNANSWERED)
+    assert sending.why.parameters["names"] == "GPS2_TYPE, VISO_TYPE"
     autopilot.link = {}
     autopilot.answer_for(60, Channel.GPS_INPUT)
     autopilot.answer_for(10)

@@ -3,6 +3,7 @@
 import pytest
 from simulated.firmware import ARDUPILOT, PX4
 
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.mavlink.channel import OLD_NAMES, Channel, Kind
 from edgevpr.mavlink.interview import TABLES
 from edgevpr.mavlink.wire import mavlink
@@ -80,7 +81,8 @@ DANGEROUS = [
 def test_decide_stops_the_channel_for_what_is_dangerous(parameters, wrong, advice):
     decision = decide(parameters | wrong)
     assert decision.choice.channel is Channel.NONE
-    assert f"set {advice}." in decision.choice.why_nothing.parameters["problem"]
+    why = decision.choice.why_nothing
+    assert (why.code, why.parameters["changes"]) == (ReasonCode.PARAMETER_DANGEROUS, advice)
 
 
 WEAK = [
@@ -109,7 +111,8 @@ WEAK = [
 def test_decide_reports_what_makes_us_useless_and_keeps_the_channel(parameters, wrong, advice):
     decision = decide(parameters | wrong)
     assert decision.choice.channel is decide(parameters).choice.channel
-    assert [fault.advice for fault in decision.faults] == [f"set {advice}"]
+    (why,) = (fault.reason for fault in decision.faults)
+    assert (why.code, why.parameters["changes"]) == (ReasonCode.PARAMETER_WEAK, advice)
 
 
 @pytest.mark.parametrize(

@@ -195,10 +195,10 @@ class GovernorActuator:
         if change is None:
             return
         text = ground = self.governor.held or "back to what was asked"
+        severity = Severity.INFO if change.back else Severity.NOTICE
         if change.before == change.after:
             text = "over a limit of the board, and nothing is left to lower"
-            ground = "over a limit of its board, see its log"
-        severity = Severity.INFO if change.back else Severity.WARNING
+            ground, severity = "over a limit of its board, see its log", Severity.WARNING
         fields = {"from": asdict(change.before), "to": asdict(change.after), "why": change.why}
         parts.notifier.log("governor", **fields)
         parts.notifier.announce(severity, f"{text}: {change.why}", ground=ground, topic="limits")

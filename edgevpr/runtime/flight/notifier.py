@@ -32,7 +32,7 @@ class Notifier:
     def announce(self, severity: Severity, text: str, *, ground: str | None = None, topic: str | None = None) -> None:
         """Write a text to the journal, and queue it for the ground station (the shorter text `ground` instead, if
         given). A text that still waits is replaced by a newer one of the same `topic`."""
-        _log.log(logging.WARNING if severity is Severity.WARNING else logging.INFO, "%s", text)
+        _log.log(logging.INFO if severity is Severity.INFO else logging.WARNING, "%s", text)
         if self._link:
             self._link.announce(severity, ground or text, topic)
 

@@ -9,13 +9,14 @@ from contextlib import closing
 from pathlib import Path
 
 from edgevpr.core.config import SourceConfig
-from edgevpr.core.errors import ImageError, SourceError
+from edgevpr.core.errors import ImageError
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.lens import line_of_sight
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source, is_by_program, open_source
 from edgevpr.runtime.recognise.levelling import load_calibrated_lens
 from edgevpr.runtime.service.finding import Finding, check_device, fine, run_check, wrong
+from edgevpr.runtime.service.findingcodes import FindingCode
 
 FRAME_WAIT_S = 65.0  # longer than any source takes to report that it is lost; a pipeline that starts slowly takes most
 _WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED, Condition.LATE)
@@ -30,60 +31,55 @@ def check_camera(uri: str, root: Path = Path("/")) -> Iterator[Finding]:
     if uri.startswith("/dev/"):
         yield check_device("camera", uri, root)
     elif is_by_program(uri):
-        from edgevpr.frames.programs import require_program  # loads FFmpeg
-
-        finding = run_check("camera", lambda: require_program(uri))
-        if finding.ok and not uri.startswith("gst:"):
-            finding = _check_ribbon(uri, finding.message, root)
-        yield finding
+        yield run_check("camera", lambda what: _check_program(what, uri, root))
 
 
-def _check_ribbon(uri: str, program: str, root: Path) -> Finding:
-    """Check the devices of a camera on a Raspberry Pi's ribbon, and whether `program` lists it."""
+def _check_program(what: str, uri: str, root: Path) -> Finding:
+    """Check that the program that reads a camera is installed; for one on a Raspberry Pi's ribbon, check its devices,
+    and that the program lists it."""
+    from edgevpr.frames.programs import require_program  # loads FFmpeg
+
+    program = require_program(uri)
+    if uri.startswith("gst:"):
+        return fine(what, FindingCode.FILE_USABLE, path=program)
     for pattern in _LIBCAMERA_DEVICES:
         for file in sorted((root / "dev").glob(pattern)):
-            device = check_device("camera", f"/{file.relative_to(root)}", root)
+            device = check_device(what, f"/{file.relative_to(root)}", root)
             if not device.ok:
                 return device
     try:
         listing = subprocess.run([program, "--list-cameras"], capture_output=True, text=True, timeout=_LIST_S)
     except subprocess.TimeoutExpired:
-        return wrong("camera", f"{program} --list-cameras does not end: restart the board.")
+        return wrong(what, FindingCode.CAMERA_LIST_HANGS, program=program)
     cameras = dict(_LISTED.findall(listing.stdout + listing.stderr))
     if name := cameras.get(uri.partition(":")[2] or "0"):
-        return fine("camera", f"{uri}: {name}, read by {program}")
-    return wrong(
-        "camera",
-        f"{uri} is not found: {program} --list-cameras lists {', '.join(cameras) or 'none'}.",
-        "with the power off, push in both ends of the ribbon, the right way round",
-        "camera_auto_detect=1, or the dtoverlay= of the sensor, in /boot/firmware/config.txt, and reboot",
-    )
+        return fine(what, FindingCode.CAMERA_LISTED, uri=uri, camera=name, program=program)
+    listed = ", ".join(cameras) or "none"
+    return wrong(what, FindingCode.CAMERA_NOT_LISTED, uri=uri, program=program, cameras=listed)
 
 
-def frame_seen(config: SourceConfig) -> str:
-    """Open the source, wait for a frame, and return a text about both. Raises SourceError if no frame comes in 65 s, or
-    if it is too old for a flight, ImageError if it does not fit the lens, and ConfigError for a calibration that cannot
-    be used."""
+def check_frame(what: str, config: SourceConfig) -> Finding:
+    """Open the source, wait for a frame, 65 s at most, and check its age. Raises ImageError if it does not fit the
+    lens, SourceError if the source cannot be opened, and ConfigError for a calibration that cannot be used."""
     assert config.uri is not None
-    lens = load_calibrated_lens(config)
+    lens, begin_s = load_calibrated_lens(config), time.monotonic()
     with closing(open_source(config.uri, live=True)) as source:
-        (width, height), state = _read_size(source, config.uri), source.state
+        size, state = _read_size(source), source.state
         facts, age_s = source.facts, source.latency_s
-    parts = [config.uri, state, f"{width} x {height} pixels"]
-    if lens is not None:
-        parts.append(f"of which {lens.path} shows {line_of_sight(lens, (width, height)).fov_deg:.0f} degrees")
+    if size is None:
+        waited_s = time.monotonic() - begin_s
+        return wrong(what, FindingCode.NO_FRAME, uri=config.uri, state=state, waited_s=waited_s)
     if age_s is not None and age_s > FIX_MAX_AGE_S:
-        raise SourceError(
-            f"{', '.join(parts)}, {age_s:.1f} s old: no fix of a picture older than {FIX_MAX_AGE_S:g} s is sent: "
-            "shorten the buffers of the camera."
-        )
-    if age_s is not None:
-        parts += [*([str(facts)] if facts else []), f"{age_s:.1f} s old: a flight accepts it"]
-    return ", ".join(parts)
+        return wrong(what, FindingCode.FRAMES_LATE, uri=config.uri, age_s=age_s, limit_s=FIX_MAX_AGE_S)
+    found: dict[str, float | str | None] = {"width": size[0], "height": size[1], "age_s": age_s}
+    found["facts"] = str(facts) if facts else None
+    found["lens"] = lens.path if lens else None
+    found["fov_deg"] = line_of_sight(lens, size).fov_deg if lens else None
+    return fine(what, FindingCode.FRAME_RECEIVED, uri=config.uri, state=state, **found)
 
 
-def _read_size(source: Source, uri: str) -> tuple[int, int]:
-    """Wait for a frame, 65 s at most; return its width and height in pixels."""
+def _read_size(source: Source) -> tuple[int, int] | None:
+    """Wait for a frame, 65 s at most; return its width and height in pixels (None: no frame came)."""
     begin_s = time.monotonic()
     is_hopeless = False
     while not (is_hopeless or source.ended) and time.monotonic() < begin_s + FRAME_WAIT_S:
@@ -97,8 +93,4 @@ def _read_size(source: Source, uri: str) -> tuple[int, int]:
         if frame:
             height, width = frame.image.shape[:2]
             return width, height
-    waited_s = time.monotonic() - begin_s
-    raise SourceError(
-        f"{uri}: no frame came in {waited_s:.0f} s ({source.state}): start the camera or the stream, or "
-        "correct `source: {uri: ...}`; `edgevpr check --offline` waits for none."
-    )
+    return None

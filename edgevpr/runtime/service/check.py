@@ -3,10 +3,12 @@ closes it again."""
 
 import time
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
-from edgevpr.core.config import BatteryConfig, Config, MavlinkConfig, load_config
-from edgevpr.core.errors import ConfigError, EdgevprError, LinkError, SourceError, UsageError
+from edgevpr.core.config import Config, MavlinkConfig, load_config
+from edgevpr.core.errors import ConfigError, EdgevprError, UsageError
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.text import waiting
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.shot import Condition
@@ -15,17 +17,15 @@ from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.signing import open_signing
 from edgevpr.power.boards import Board, load_board, resolve_board
-from edgevpr.power.equations import parse_pack
-from edgevpr.runtime.flight.autopilot import DRY_RUN
 from edgevpr.runtime.flight.startup import apply_recorded_rate
-from edgevpr.runtime.preflight.choose import too_late
 from edgevpr.runtime.preflight.pick import explain_technique, measure_flight
 from edgevpr.runtime.recognise.calibration import not_calibrated, read_calibration_for
 from edgevpr.runtime.recognise.levelling import load_calibrated_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
-from edgevpr.runtime.service.camera import FRAME_WAIT_S, frame_seen
+from edgevpr.runtime.service.camera import FRAME_WAIT_S, check_frame
 from edgevpr.runtime.service.doctor import explain_silence
-from edgevpr.runtime.service.finding import Finding, check_log, fine, run_check, wrong
+from edgevpr.runtime.service.finding import Finding, check_log, fine, refuse, run_check, wrong
+from edgevpr.runtime.service.findingcodes import FindingCode
 
 
 def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
@@ -34,76 +34,66 @@ def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
     try:
         config = load_config(config_path)
     except EdgevprError as error:
-        return [wrong("configuration", str(error), exit_code=error.exit_code)]
+        return [refuse("configuration", error)]
     config = apply_recorded_rate(config, recorded_intervals(config.source.uri))
-    findings = [fine("configuration", str(config_path))]
+    findings = [fine("configuration", FindingCode.FILE_USABLE, path=str(config_path))]
     try:
         board = resolve_board(load_board(config.board), config.source, config.memory)
-        findings.append(fine("board", f"{board.title}, up to {board.memory_max_mb:.0f} MB for edgevpr"))
-        findings.append(run_check("map", lambda: _check_map(config, board)))
+        known = FindingCode.BOARD_KNOWN
+        findings.append(fine("board", known, board=board.title, memory_mb=board.memory_max_mb))
+        findings.append(run_check("map", lambda what: _check_map(what, config, board)))
     except ConfigError as error:  # then nothing is known of what the map would take
-        findings.append(wrong("board", str(error), exit_code=error.exit_code))
-    findings.append(run_check("battery", lambda: _check_battery(config.battery)))
+        findings.append(refuse("board", error))
     waiting("opening the source" if offline else f"waiting for a frame of the source, {FRAME_WAIT_S:g} s at most")
-    findings.append(run_check("source", lambda: _check_source(config, offline)))
+    findings.append(run_check("source", lambda what: _check_source(what, config, offline)))
     waiting("waiting for the flight controller")
-    findings.append(run_check("link", lambda: _check_link(config.mavlink, offline)))
+    findings.append(run_check("link", lambda what: _check_link(what, config.mavlink, offline)))
     waiting("")
     return [*findings, check_log(config.log)]
 
 
-def _check_battery(battery: BatteryConfig) -> str:
-    pack = parse_pack(battery.pack)
-    return f"{pack.cells} cells in series, {pack.capacity_mah} mAh"
-
-
-def _check_map(config: Config, board: Board) -> str:
+def _check_map(what: str, config: Config, board: Board) -> Finding:
     recogniser = open_recogniser(config, board, narrowed=True)
     with closing(recogniser.place_map) as place_map:
         t_query_s, cost = measure_flight(recogniser)
-        reason = f"{explain_technique(recogniser, is_named=config.technique is not None)}; {cost}"
-        confidence = ""
+        technique, confidence = explain_technique(recogniser, is_named=config.technique is not None), None
         if recogniser.rule.sure:
             calibration = read_calibration_for(place_map)
-            confidence = f"; {calibration.described() if calibration else not_calibrated(len(place_map))}"
+            confidence = calibration.described() if calibration else not_calibrated(len(place_map))
     if config.mavlink.link and config.mavlink.send_fixes and t_query_s > FIX_MAX_AGE_S:
-        raise EdgevprError(
-            f"No fix would ever be sent ({too_late(t_query_s)}): use a faster board, fewer places or candidates, "
-            f"or a technique that costs less; {reason}."
-        )
-    return f"{config.map}, {reason}{confidence}"
+        return wrong(what, FindingCode.QUERY_TOO_SLOW, t_query_s=t_query_s, limit_s=FIX_MAX_AGE_S)
+    found = {"technique": technique, "cost": cost, "confidence": confidence}
+    return fine(what, FindingCode.MAP_READY, path=config.map, t_query_s=t_query_s, **found)
 
 
-def _check_source(config: Config, offline: bool) -> str:
+def _check_source(what: str, config: Config, offline: bool) -> Finding:
     uri = config.source.uri
     if uri is None:
-        raise UsageError("There is no source of frames: write `source: {uri: ...}`.")
+        return replace(wrong(what, FindingCode.NO_SOURCE), exit_code=UsageError.exit_code)
     if not offline:
-        return frame_seen(config.source)
+        return check_frame(what, config.source)
     load_calibrated_lens(config.source)
     if is_live(uri) and (cause := missing_cause(uri)):
-        raise SourceError(f"The camera is not there ({cause}): connect it, or correct `source: {{uri: ...}}`.")
+        return wrong(what, FindingCode.CAMERA_ABSENT, problem=cause)
     with closing(open_source(uri, live=True)) as source:
         # Wait until FFmpeg has given up (10 s at most): a capture that returns while Python ends aborts the process.
         while source.condition is Condition.OPENING:
             time.sleep(0.05)
-        return f"{uri}, {source.state}"
+        return fine(what, FindingCode.SOURCE_OPENED, uri=uri, state=source.state)
 
 
-def _check_link(settings: MavlinkConfig, offline: bool) -> str:
+def _check_link(what: str, settings: MavlinkConfig, offline: bool) -> Finding:
     address, ground = parse_links(settings)
     if address is None:
-        return "none: results go into the log only"
+        return fine(what, ReasonCode.NO_LINK)
     signing = open_signing(settings, to_ask=True)
-    parts = [str(address)]
     with Inquiry(address, settings.component_id, settings.system_id, signing) as inquiry:
-        if not offline:
-            if inquiry.heartbeat() is None:
-                raise LinkError(explain_silence(address, inquiry).message)
-            parts.append(f"autopilot of system {inquiry.system_id}")
+        if not offline and inquiry.heartbeat() is None:
+            return explain_silence(address, inquiry)
     if ground:
         with Inquiry(ground, settings.component_id, settings.system_id):
-            parts.append(f"ground station at {ground}")
-    if settings.signing_key is not None:
-        parts.append("signed")
-    return ", ".join(parts if settings.send_fixes else [*parts, str(DRY_RUN)])
+            pass  # it can be opened
+    code = FindingCode.LINK_OPENED if settings.send_fixes else FindingCode.LINK_OPENED_DRY
+    system = None if offline else inquiry.system_id
+    others = {"ground": str(ground) if ground else None, "key": settings.signing_key}
+    return fine(what, code, address=str(address), system=system, **others)

@@ -7,14 +7,18 @@ import shutil
 import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from edgevpr.core.config import Config, LogConfig
 from edgevpr.core.errors import EdgevprError
+from edgevpr.core.files import shipped
+from edgevpr.core.reasons import Code, Reason, ReasonCode
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
+from edgevpr.runtime.service.findingcodes import FindingCode
 
 LOG_ROOM_MB = 10  # some hours of queries
 _SYSTEM_GROUPS = ("root", "tty")  # no user is to join them: a login shell holds the device, or a udev rule is missing
@@ -22,46 +26,51 @@ _SYSTEM_GROUPS = ("root", "tty")  # no user is to join them: a login shell holds
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """Result of one check. `what`: name of what was checked. `message`: a description of it or, if it is not `ok`, one
-    sentence that says what is wrong. `changes`: the exact changes that put it right, such as `GPS2_TYPE=14`.
-    `exit_code`: that of a command with such a result, and of a flight that would end by it."""
+    """Result of one check. `what`: name of what was checked. `reason`: what was found, by a code with parameters.
+    `changes`: the exact changes that put it right if it is not `ok`, such as `GPS2_TYPE=14`. `exit_code`: that of a
+    command with such a result, and of a flight that would end by it."""
 
     what: str
     ok: bool
-    message: str
+    reason: Reason
     changes: tuple[str, ...] = ()
     exit_code: int = 0
 
+    def fields(self) -> dict[str, Any]:
+        """Return the finding as fields of JSON."""
+        found = {"what": self.what, "level": "ok" if self.ok else "wrong", **self.reason.fields()}
+        return {**found, "changes": self.changes, "exit_code": self.exit_code}
 
-def fine(what: str, message: str) -> Finding:
+
+def fine(what: str, code: Code, **parameters: float | str | None) -> Finding:
     """Return a finding with nothing to change."""
-    return Finding(what=what, ok=True, message=message)
+    return Finding(what=what, ok=True, reason=Reason(code, parameters))
 
 
-def wrong(what: str, message: str, *changes: str, exit_code: int = 1) -> Finding:
+def wrong(what: str, code: Code, *changes: str, **parameters: float | str | None) -> Finding:
     """Return a finding with something wrong, which `changes` put right."""
-    return Finding(what=what, ok=False, message=message, changes=changes, exit_code=exit_code)
+    return Finding(what=what, ok=False, reason=Reason(code, parameters), changes=changes, exit_code=1)
 
 
-def judge(what: str, ok: bool, good: str, bad: str, *changes: str) -> Finding:
-    """Return a fine finding with the text `good` if `ok`, else a wrong one with the text `bad` and the `changes`."""
-    return fine(what, good) if ok else wrong(what, bad, *changes)
+def refuse(what: str, error: EdgevprError) -> Finding:
+    """Return the finding of an error that would end a flight."""
+    return replace(wrong(what, ReasonCode.UNUSABLE, problem=str(error)), exit_code=error.exit_code)
 
 
-def run_check(what: str, check: Callable[[], str]) -> Finding:
-    """Return a finding: fine with the text that `check` returns, or wrong with the error that it raises."""
+def run_check(what: str, check: Callable[[str], Finding]) -> Finding:
+    """Return the finding of a `check`, which takes the name of what it checks, or that of the error that it raises."""
     try:
-        return fine(what, check())
+        return check(what)
     except EdgevprError as error:
-        return wrong(what, str(error), exit_code=error.exit_code)
+        return refuse(what, error)
     except OSError as error:
-        return wrong(what, f"{error.filename}: {error.strerror}: check the path and its permissions.")
+        return wrong(what, FindingCode.FILE_UNUSABLE, path=str(error.filename), problem=error.strerror)
 
 
 def format_findings(findings: Iterable[Finding]) -> Iterator[str]:
     """Yield the findings as lines of text: one for each finding, then one for each of its changes."""
     for finding in findings:
-        yield f"{'ok   ' if finding.ok else 'WRONG'}  {finding.what:<14} {finding.message}"
+        yield f"{'ok   ' if finding.ok else 'WRONG'}  {finding.what:<14} {finding.reason}"
         yield from (f"{'':<22}change: {change}" for change in finding.changes)
 
 
@@ -81,59 +90,58 @@ def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
     try:
         status, port = file.stat(), file.resolve()
     except OSError as error:
-        return wrong(what, f"{path}: {error.strerror}: connect it, or correct the name.")
+        return wrong(what, FindingCode.DEVICE_ABSENT, path=path, problem=error.strerror)
     if not stat.S_ISCHR(status.st_mode):
-        return wrong(what, f"{path} is not a device: correct the name.")
+        return wrong(what, FindingCode.NOT_A_DEVICE, path=path)
     is_serial, no_login = what == "serial", f"sudo systemctl disable --now serial-getty@{port.name}"
     if is_serial and (console := _find_console(port, root)):
-        no_console = f"remove console={console} from the kernel's command line (cmdline.txt), and reboot"
-        return wrong(what, f"{path} is the console of the kernel, which writes into the link.", no_console, no_login)
+        return wrong(what, FindingCode.PORT_IS_CONSOLE, no_login, path=path, console=console)
     program, is_login = _find_program(port, root)
     if program:
-        return wrong(what, f"{path} is in use by {program}.", no_login if is_login else f"stop {program}")
+        return wrong(what, FindingCode.DEVICE_IN_USE, *([no_login] if is_login else []), path=path, program=program)
     group = str(status.st_gid)
     with suppress(KeyError):
         group = grp.getgrgid(status.st_gid).gr_name
-    mode = f"{path}, group {group}, mode {stat.S_IMODE(status.st_mode):04o}"
+    access = {"path": path, "group": group, "mode": f"{stat.S_IMODE(status.st_mode):04o}"}
     if os.access(file, os.R_OK | os.W_OK):
-        return fine(what, mode)
-    change = f"sudo usermod --append --groups {group} USER, and log in; in a container --group-add {status.st_gid}"
+        return fine(what, FindingCode.DEVICE_READY, **access)
+    changes = [f"sudo usermod --append --groups {group} USER", f"docker run --group-add {status.st_gid}"]
     if group in _SYSTEM_GROUPS:
-        change = no_login if is_serial else "install the udev rules 99-edgevpr.rules of edgevpr"
-    return wrong(what, f"{mode}: user {os.getuid()} has no access.", change)
+        rules = shipped("deploy") / "99-edgevpr.rules"
+        changes = [no_login if is_serial else f"sudo install -D -m 644 -t /etc/udev/rules.d {rules}"]
+    return wrong(what, FindingCode.DEVICE_DENIED, *changes, user=os.getuid(), **access)
 
 
 def check_log(log: LogConfig) -> Finding:
     """Check that the flight log can be written."""
     if path := log.path:
-        return run_check("log", lambda: _require_room(path))
-    return fine("log", "none, so nothing of the flight is kept")
+        return run_check("log", lambda what: _check_log(what, path))
+    return fine("log", FindingCode.NO_LOG)
 
 
-def _require_room(file: str) -> str:
+def _check_log(what: str, file: str) -> Finding:
     # A log is not opened for the check: if root checked, it would leave a file that the service may not write.
     path = Path(file).absolute()
     if path.is_dir() or not path.parent.is_dir():
-        raise EdgevprError(f"{path} is not a file in an existing folder: correct `log: {{path: ...}}`.")
+        return wrong(what, FindingCode.LOG_NOT_A_FILE, path=str(path))
     if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise EdgevprError(f"{path} may not be written by this user: change its permissions or `log: {{path: ...}}`.")
+        return wrong(what, FindingCode.LOG_NOT_WRITABLE, path=str(path))
     free_mb = shutil.disk_usage(path.parent).free / 1e6
     if free_mb < LOG_ROOM_MB:
-        raise EdgevprError(f"{path}: only {free_mb:.1f} MB are free there, {LOG_ROOM_MB} are needed: make room.")
-    return str(path)
+        return wrong(what, FindingCode.DISK_FULL, path=str(path), free_mb=free_mb, needed_mb=LOG_ROOM_MB)
+    return fine(what, FindingCode.FILE_USABLE, path=str(path))
 
 
 def _check_memory(needed_mb: float, root: Path) -> Finding:
-    limit_mb = machine.ram_limit_mb(root)
-    limit = f"{limit_mb:.0f} of {machine.ram_mb(root):.0f} MB for this process"
+    limit_mb, ram_mb = machine.ram_limit_mb(root), machine.ram_mb(root)
     controllers = machine.text(root / "sys/fs/cgroup/cgroup.controllers")
     if controllers is not None and "memory" not in controllers.split():
-        without = f"{limit}; the kernel runs without the memory controller, so no limit of the service is kept."
-        return wrong("memory", without, "cgroup_enable=memory in /boot/firmware/cmdline.txt, and reboot")
+        return wrong("memory", FindingCode.MEMORY_LIMIT_IGNORED)
     if limit_mb < needed_mb:
-        less = f"{limit}: less than what the profile of the board spares for edgevpr."
-        return wrong("memory", less, f"MemoryMax={1e6 * needed_mb:.0f}")
-    return fine("memory", limit)
+        change = f"MemoryMax={1e6 * needed_mb:.0f}"
+        low = FindingCode.MEMORY_LIMIT_LOW
+        return wrong("memory", low, change, limit_mb=limit_mb, ram_mb=ram_mb, needed_mb=needed_mb)
+    return fine("memory", FindingCode.MEMORY_LIMIT, limit_mb=limit_mb, ram_mb=ram_mb)
 
 
 def _find_console(port: Path, root: Path) -> str | None:

@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from edgevpr.core.config import load_config
+from edgevpr.core.files import shipped
 from edgevpr.mavlink.address import parse_link
 from edgevpr.runtime.service.finding import check_device, check_machine
+from edgevpr.runtime.service.findingcodes import FindingCode
 
 
 @pytest.fixture
@@ -41,23 +43,22 @@ def test_check_machine_finds_nothing_wrong_and_writes_nothing(root, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("file", "text", "change"),
+    ("file", "text", "code", "changes"),
     [
-        ("sys/fs/cgroup/user.slice/memory.max", "128000000\n", "MemoryMax=256000000"),
-        ("sys/fs/cgroup/cgroup.controllers", "cpu io", "cgroup_enable=memory in "),
+        ("user.slice/memory.max", "128000000\n", FindingCode.MEMORY_LIMIT_LOW, ("MemoryMax=256000000",)),
+        ("cgroup.controllers", "cpu io", FindingCode.MEMORY_LIMIT_IGNORED, ()),
     ],
 )
-def test_check_machine_finds_limits_of_memory(root, file, text, change):
-    (root / file).write_text(text)
+def test_check_machine_finds_limits_of_memory(root, file, text, code, changes):
+    (root / "sys/fs/cgroup" / file).write_text(text)
     memory = find(root)["memory"]
-    assert not memory.ok
-    assert memory.changes[0].startswith(change)
+    assert (memory.ok, memory.reason.code, memory.changes) == (False, code, changes)
 
 
 def test_check_machine_finds_a_full_disk(root, monkeypatch):
     usage = type(shutil.disk_usage("/"))
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(8_000_000_000, 7_995_000_000, 5_000_000))
-    assert not find(root)["log"].ok
+    assert find(root)["log"].reason.code is FindingCode.DISK_FULL
 
 
 def test_check_device_accepts_a_serial_port_that_is_free():
@@ -68,19 +69,19 @@ def test_check_device_accepts_a_serial_port_that_is_free():
 
 
 def test_check_device_refuses_what_is_not_a_device(root):
-    assert not find(root, "serial:/dev/ttyACM99:57600")["serial"].ok
+    assert find(root, "serial:/dev/ttyACM99:57600")["serial"].reason.code is FindingCode.DEVICE_ABSENT
     (root / "dev/ttyS0").touch()
-    assert not check_device("serial", "/dev/ttyS0", root).ok
+    assert check_device("serial", "/dev/ttyS0", root).reason.code is FindingCode.NOT_A_DEVICE
 
 
 @pytest.mark.parametrize(
     ("gid", "what", "change"),
     [
-        (0, "serial", "sudo systemctl disable --now serial-getty@"),
-        (grp.getgrnam("tty").gr_gid, "serial", "sudo systemctl disable --now serial-getty@"),
-        (0, "camera", "install the udev rules"),
-        (5000, "serial", "sudo usermod --append --groups 5000 "),
-        (5000, "camera", "sudo usermod --append --groups 5000 "),
+        (0, "serial", "sudo systemctl disable --now serial-getty@null"),
+        (grp.getgrnam("tty").gr_gid, "serial", "sudo systemctl disable --now serial-getty@null"),
+        (0, "camera", f"sudo install -D -m 644 -t /etc/udev/rules.d {shipped('deploy')}/99-edgevpr.rules"),
+        (5000, "serial", "sudo usermod --append --groups 5000 USER"),
+        (5000, "camera", "sudo usermod --append --groups 5000 USER"),
     ],
 )
 def test_check_device_without_access_advises_a_group_unless_it_is_of_the_system(root, monkeypatch, gid, what, change):
@@ -89,8 +90,7 @@ def test_check_device_without_access_advises_a_group_unless_it_is_of_the_system(
     monkeypatch.setattr(os, "access", lambda *_: False)
     monkeypatch.setattr(Path, "stat", lambda path, **how: owned if path.name == "ttyAMA0" else status(path, **how))
     finding = check_device(what, "/dev/ttyAMA0", root)
-    assert not finding.ok
-    assert finding.changes[0].startswith(change)
+    assert (finding.ok, finding.reason.code, finding.changes[0]) == (False, FindingCode.DEVICE_DENIED, change)
 
 
 def test_check_device_names_the_program_that_has_it_open(root):
@@ -99,7 +99,7 @@ def test_check_device_names_the_program_that_has_it_open(root):
         (root / f"proc/{number}/stat").write_text(f"{number} (a getty) S 1 {number} {number} 0 -1 4194304")
     assert check_device("serial", "/dev/ttyAMA0", root).ok
     (root / "proc/99/fd/7").symlink_to("/dev/null")
-    assert check_device("serial", "/dev/ttyAMA0", root).changes == ("stop a getty (process 99)",)
+    assert check_device("serial", "/dev/ttyAMA0", root).reason.parameters["program"] == "a getty (process 99)"
     (root / "proc/99/stat").write_text("99 (ag) S 1 99 99 259 99 4194304")  # 259: major number 1, minor number 3
     assert check_device("serial", "/dev/ttyAMA0", root).changes == ("sudo systemctl disable --now serial-getty@null",)
 
@@ -108,4 +108,4 @@ def test_check_device_names_the_program_that_has_it_open(root):
 def test_check_device_finds_the_console_of_the_kernel(root, file):
     (root / file).parent.mkdir(parents=True, exist_ok=True)
     (root / file).write_text("console=ttyAMA0,115200 console=tty1")
-    assert "console=ttyAMA0" in check_device("serial", "/dev/ttyAMA0", root).changes[0]
+    assert check_device("serial", "/dev/ttyAMA0", root).reason.parameters["console"] == "ttyAMA0"

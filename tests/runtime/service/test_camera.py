@@ -11,10 +11,12 @@ from distorted_cameras import wide
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import ImageError
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source
 from edgevpr.runtime.service import camera
-from edgevpr.runtime.service.camera import check_camera, frame_seen
+from edgevpr.runtime.service.camera import check_camera, check_frame
+from edgevpr.runtime.service.findingcodes import FindingCode
 
 FAKE = Path(__file__).parents[2] / "frames/fake_rpicam.py"
 
@@ -42,12 +44,11 @@ def rpicam(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("rpicam")
 def test_check_camera_lists_the_cameras_on_the_ribbon(root, monkeypatch):
     (finding,) = check_camera("rpicam", root)
-    assert finding.ok
-    assert "imx219" in finding.message
-    assert not next(check_camera("rpicam:1", root)).ok
+    assert (finding.ok, finding.reason.parameters["camera"]) == (True, "imx219")
+    assert next(check_camera("rpicam:1", root)).reason.parameters["cameras"] == "0"
     monkeypatch.setenv("FAKE_RPICAM", "absent")
     (finding,) = check_camera("rpicam", root)
-    assert (finding.ok, len(finding.changes)) == (False, 2)
+    assert (finding.ok, finding.reason.code) == (False, FindingCode.CAMERA_NOT_LISTED)
 
 
 @pytest.mark.usefixtures("rpicam")
@@ -55,16 +56,14 @@ def test_check_camera_finds_a_device_of_the_ribbon_without_access(root, monkeypa
     access = os.access
     monkeypatch.setattr(os, "access", lambda path, mode: "dma_heap" not in str(path) and access(path, mode))
     (finding,) = check_camera("rpicam", root)
-    assert not finding.ok
-    assert finding.message.startswith("/dev/dma_heap/linux,cma")
+    assert (finding.ok, finding.reason.parameters["path"]) == (False, "/dev/dma_heap/linux,cma")
 
 
 @pytest.mark.parametrize("uri", ["rpicam", "gst: v4l2src ! appsink"])
 def test_check_camera_finds_that_the_program_is_missing(root, monkeypatch, uri):
     monkeypatch.setenv("PATH", str(root))
     (finding,) = check_camera(uri, root)
-    assert not finding.ok
-    assert "sudo apt install" in finding.message
+    assert (finding.ok, finding.reason.code) == (False, ReasonCode.UNUSABLE)
 
 
 def test_check_camera_finds_a_program_that_has_it_open(root):
@@ -72,10 +71,10 @@ def test_check_camera_finds_a_program_that_has_it_open(root):
     (root / "proc/812/fd").mkdir(parents=True)
     (root / "proc/812/stat").write_text("812 (guvcview) S 1 812 812 0 -1 4194304")
     (root / "proc/812/fd/7").symlink_to("/dev/null")
-    assert next(check_camera("/dev/video0", root)).changes == ("stop guvcview (process 812)",)
+    assert next(check_camera("/dev/video0", root)).reason.parameters["program"] == "guvcview (process 812)"
 
 
-def test_frame_seen_compares_the_frame_with_the_lens(tmp_path):
+def test_check_frame_compares_the_frame_with_the_lens(tmp_path):
     camera = wide()
     lens = str(camera.write(tmp_path / "lens.yaml"))
     folder = tmp_path / "images"
@@ -83,13 +82,14 @@ def test_frame_seen_compares_the_frame_with_the_lens(tmp_path):
     grey = np.zeros((480, 640), np.uint8)
     cv2.imwrite(str(folder / "1.png"), grey)
     source = load_config(None, {"source.uri": str(folder), "source.lens": lens}).source
-    assert frame_seen(source).endswith(f"640 x 480 pixels, of which {lens} shows 99 degrees")
+    found = check_frame("source", source).reason.parameters
+    assert (found["width"], found["height"], found["lens"], round(found["fov_deg"])) == (640, 480, lens, 99)
     cv2.imwrite(str(folder / "1.png"), grey[60:420])
     with pytest.raises(ImageError, match="640x360"):
-        frame_seen(source)
+        check_frame("source", source)
 
 
-def test_frame_seen_refuses_both_pictures_of_a_stereo_pair(monkeypatch):
+def test_check_frame_refuses_both_pictures_of_a_stereo_pair(monkeypatch):
     """Of a live source the first picture decides: the flight would refuse those after it, too."""
 
     class Stereo(Source):
@@ -100,4 +100,4 @@ def test_frame_seen_refuses_both_pictures_of_a_stereo_pair(monkeypatch):
 
     monkeypatch.setattr(camera, "open_source", lambda *_, **__: Stereo())
     with pytest.raises(ImageError, match="both halves"):
-        frame_seen(load_config(None, {"source.uri": "tcp://127.0.0.1:1"}).source)
+        check_frame("source", load_config(None, {"source.uri": "tcp://127.0.0.1:1"}).source)
