@@ -140,29 +140,6 @@ def test_against_gps_no_fix_is_believed():
     assert advices[0].why.parameters["off_m"] == pytest.approx(500.0, abs=0.5)
 
 
-def test_where_the_autopilot_says_nothing_of_its_position_a_fix_is_sent_as_it_is():
-    aircraft = Aircraft()
-    assert not aircraft.report((500, 0), 2.5, heard=False).is_held, "its last report is too old"
-    knows_nothing = Navigator(1.0, 1.0)
-    aircraft.navigator = knows_nothing
-    assert aircraft.report((500, 0), 3.0, heard=False).fix
-
-
-def test_an_autopilot_that_has_only_just_appeared_is_sent_nothing_until_it_had_time_to_say_where_it_is():
-    aircraft = Aircraft()
-    aircraft.navigator.hear_autopilot(START_S + 1.0)
-    too_early = aircraft.report((500, 0), 5.9, heard=False)
-    assert (too_early.fix, too_early.why.code) == (None, ReasonCode.NO_TELEMETRY)
-    assert aircraft.report((500, 0), 6.1, heard=False).fix, "it has none"
-
-
-def test_an_autopilot_whose_reports_fail_for_seconds_is_sent_nothing():
-    aircraft = Aircraft(has_gps=True)
-    assert not aircraft.report((0, 0), 2.0, heard=False).fix, "its GPS is still there"
-    assert not aircraft.report((0, 0), 4.9, heard=False).fix
-    assert aircraft.report((0, 0), 5.1, heard=False).fix
-
-
 def fly(recording, tmp_path, pictures, off_deg=0.05, has_gps=False, **settings):
     """A flight past the places, one a second, with an autopilot that is `off_deg` of longitude off; its lines, link."""
     clock = FakeClock()

@@ -9,7 +9,6 @@ from air import Air, lengths
 
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.core.types import FRAME_TIME_SD_S
 from edgevpr.frames.level import View
 from edgevpr.mavlink.channel import Channel
 from edgevpr.runtime.flight import navigator
@@ -37,20 +36,6 @@ def inertial(navigator):
 
 def said_states(air, from_s=0.0):
     return [(t_s, state) for t_s, state in air.states if state and t_s >= from_s]
-
-
-@pytest.mark.parametrize("begins_anew", [False, True])
-def test_fixes_that_err_otherwise_from_now_on_are_believed_where_it_begins_anew(begins_anew):
-    air = Air(Navigator(1.0, 1.0))
-    air.map_off = air.map_off + np.array((16.0, 0.0))
-    air.fly(120)
-    air.map_off = air.map_off - np.array((16.0, 0.0))
-    if begins_anew:
-        air.navigator.begin_anew()
-    air.advices.clear()
-    held = [advice.is_held for _, advice in air.fly(30).advices]
-    assert len(held) > 25
-    assert any(held) == (not begins_anew)
 
 
 def test_one_is_sent_when_the_autopilot_is_better_off_and_else_it_says_by_how_little():
@@ -102,23 +87,6 @@ def test_what_is_claimed_is_met(how):
     assert (abs(known[:, :2]) < known[:, 2:]).mean() == pytest.approx(0.68, abs=0.1)
 
 
-@pytest.mark.parametrize("channel", [Channel.SENSOR, Channel.VISION])
-def test_a_px4_is_sent_positions_while_it_has_no_gps_and_none_while_it_has(channel):
-    navigator = Navigator(1.0, 1.0)
-    navigator.hear_channel(channel)
-    air = Air(navigator, wind=WIND).fly(30)
-    assert not said_states(air)
-    air.lose_gps()
-    air.fly(150)
-    said = said_states(air, from_s=32.0)
-    assert len(said) > 0.99 * 10 * 148
-    off_m = np.array([air.off(state.lat_deg, state.lon_deg, t_s) for t_s, state in said])
-    claimed_m = np.array([state.accuracy_m for _, state in said])
-    assert lengths(off_m).max() < 10.0, "of matches that are 3 m off"
-    assert (abs(off_m) < claimed_m[:, None]).mean() > 0.58
-    assert (abs(off_m) < 2 * claimed_m[:, None]).mean() > 0.92
-
-
 def test_a_picture_that_cannot_be_levelled_is_withheld_and_says_why():
     air = lost(wind=WIND).fly(10)
     before = air.navigator.knows_position(air.t_s)
@@ -135,21 +103,6 @@ def test_where_the_attitude_is_unknown_a_fix_says_less():
     told, less = (air.fly(20).sent[-1][1].accuracy_m for air in (level, untold))
     assert told < 5
     assert less > 10
-
-
-@pytest.mark.parametrize("channel", [Channel.COMMAND, Channel.GPS_INPUT, Channel.SENSOR, Channel.VISION])
-def test_accuracy_contains_the_error_of_a_frames_time(channel):
-    """At 15 m/s, 0.3 s are 4.5 m; frames err alike by it, so that many of them say no more than one."""
-    claims_m = []
-    for t_sd_s in (FRAME_TIME_SD_S, 0.3):
-        navigator = Navigator(1.0, 1.0)
-        navigator.hear_channel(channel)
-        air = lost(navigator, wind=WIND, fix_sd_m=1.0, t_sd_s=t_sd_s).fly(40)
-        claims_m.append(navigator.accuracy_m(air.t_s))
-    assert claims_m[0] < 2.5
-    assert claims_m[1] > 4.5
-    if channel is Channel.COMMAND:
-        assert air.sent[-1][1].accuracy_m > 4.5
 
 
 def test_fix_for_an_autopilot_that_reports_no_velocity_contains_the_error_of_time():
@@ -224,47 +177,6 @@ def test_a_continuous_position_holds_and_says_how_good_it_is():
     assert last.velocity_m_s[:2] == pytest.approx(tuple(air.velocity(air.t_s)), abs=1.5)
 
 
-def test_continuous_position_by_accelerations_alone_ends_after_ten_seconds():
-    air = lost(inertial(Navigator(1.0, 1.0))).fly(60)
-    air.sees = False
-    seen_s = air.events[-1].frame.t_mono_s
-    air.fly(90)
-    last_s, last = said_states(air)[-1]
-    assert last_s <= seen_s + 11.1, "one more was on its way"
-    assert last.accuracy_m <= 20 * LIKE_ONE
-    assert air.states[-1][1] is None
-    assert not air.navigator.knows_position(air.t_s)
-    air.sees = True
-    air.fly(40)
-    assert air.states[-1][1]
-
-
-def test_blind_camera_gets_no_continuous_position_sent_for_long_after_gps():
-    air = Air(inertial(Navigator(1.0, 1.0)))
-    air.sees = False
-    air.fly(30)
-    air.lose_gps()
-    lost_s = air.t_s
-    air.fly(20)
-    assert lost_s + 1.5 < said_states(air)[-1][0] <= lost_s + 3.1
-
-
-def test_a_continuous_position_ends_when_it_is_worse_than_fifty_metres(monkeypatch):
-    monkeypatch.setattr(navigator, "_BLIND_S", math.inf)
-    air = lost(inertial(Navigator(1.0, 1.0))).fly(10)
-    air.sees = False
-    air.fly(120)
-    last = said_states(air)[-1][1]
-    assert air.states[-1][1] is None
-    assert last.accuracy_m / LIKE_ONE == pytest.approx(50.0, abs=1.0)
-
-
-def test_muted_it_hears_and_gives_no_state():
-    flown = Air(inertial(Navigator(1.0, 1.0, is_muted=True))).fly(10)
-    assert flown.navigator.knows_position(flown.t_s)
-    assert flown.navigator.state_at(flown.t_s) is None
-
-
 class OnlyAtMatches(Navigator):
     """A navigator as it would be without fixes between matches."""
 
@@ -287,23 +199,3 @@ def test_what_is_claimed_between_matches_is_met():
     assert len(sigmas) > 300
     assert 0.58 <= (abs(sigmas) < 1).mean() <= 0.85
     assert (abs(sigmas) < 2).mean() >= 0.9
-
-
-def test_between_matches_nothing_is_sent_where_it_would_not_help_or_is_in_doubt():
-    assert not Air(Navigator(1.0, 1.0)).fly(60).between, "the autopilot has GPS"
-    assert not lost(Navigator(1.0, 1.0, is_muted=True), wind=WIND).fly(60).between
-    assert not lost(inertial(Navigator(1.0, 1.0)), wind=WIND).fly(60).between
-    air = lost(wind=WIND).fly(60)
-    air.sees = False
-    air.fly(1)
-    air.match_now(off_m=(300.0, 0.0))
-    air.between.clear()
-    assert not air.fly(10).between, "a match has contradicted what is known"
-    air.sees = True
-    air.fly(5)
-    air.sees = False
-    assert air.fly(6).between, "others have shown it wrong"
-    unseen = lost(wind=WIND)
-    unseen.sees = False
-    unseen.waiting.clear()
-    assert not unseen.fly(20).between, "no match has shown the wind"

@@ -1,0 +1,349 @@
+"""The gates of the navigator: when the position is known, and what is sent of it, on both sides of every limit."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from air import HOME, match_at
+from fakes import receiver_at, vehicle_at
+
+from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.reasons import Reason, ReasonCode
+from edgevpr.core.types import FRAME_TIME_SD_S, Position
+from edgevpr.frames.level import Levelled, View
+from edgevpr.mavlink.channel import Channel
+from edgevpr.mavlink.vehicle import Attitude
+from edgevpr.runtime.flight.consistency import ComparedFix
+from edgevpr.runtime.flight.navigation import NavState
+from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.flight.output import Output
+from edgevpr.runtime.recognise.perspective import AttitudeError
+
+NOW_S = 1000.0
+NEVER_S = math.inf
+LIKE_ONE = math.sqrt(50)
+
+
+class Known:
+    """What navigation says of the position: `off_m` (2,) from HOME, so many metres and seconds ago."""
+
+    def __init__(self, *, off_m=(0.0, 0.0), accuracy_m=2.0, shown_ago_s=0.0, gps_ago_s=NEVER_S, drift_m_s=(0.0, 0.0)):
+        self.off_m, self.accuracy_m, self.drift_m_s = off_m, accuracy_m, drift_m_s
+        self.shown_s = self.fixed_s = NOW_S - shown_ago_s
+        self.gps_s, self.has_gps, self.is_in_doubt, self.path_velocity_m_s = NOW_S - gps_ago_s, False, False, None
+        self.reports, self.frames, self.begun, self.contradicts_m = [], [], [], 0.0
+        self.add_acceleration = self.correct_by_fix = lambda *_: None
+
+    def state_at(self, t_s):
+        if self.accuracy_m is None:
+            return None
+        where = Position(*moved(*HOME, *self.off_m))
+        return NavState(
+            t_s=t_s, position=where, velocity_m_s=(3.0, 4.0), accuracy_m=self.accuracy_m, speed_accuracy_m_s=0.5
+        )
+
+    def add_report(self, vehicle, *how):
+        self.reports.append(how)
+
+    def add_frame(self, frame, is_query):
+        self.frames.append((frame, is_query))
+
+    def compare(self, seen):
+        if self.contradicts_m is None:
+            return None
+        here, off_m = np.zeros(2), np.array([self.contradicts_m, 0.0])
+        return ComparedFix(seen=seen, path_m=here, off_m=off_m, expected_m=here, covariance_m2=np.eye(2))
+
+    def begin(self, *how):
+        self.begun.append(how)
+
+    def is_followed_at(self, t_s):
+        return False
+
+    def path_drift_m_s(self):
+        return self.drift_m_s
+
+
+def navigate(channel=Channel.COMMAND, *, reports=None, is_heard=True, map_sd_m=1.0, every_s=1.0, how=None, **known):
+    """A navigator that knows its position, beside an autopilot without GPS that `reports`."""
+    navigator = Navigator(map_sd_m, every_s, **how or {})
+    navigator.hear_channel(channel)
+    navigator._navigation = Known(**known)
+    if is_heard:
+        said = {"has_gps": False, "velocity_m_s": (0.0, 0.0)} | (reports or {})
+        navigator.hear_vehicle(vehicle_at(*HOME, said.pop("t_heard_s", NOW_S), **said))
+    return navigator
+
+
+def matched(**changes):
+    return replace(match_at(Position(*HOME), NOW_S, None, 1.5, (1,)), **changes)
+
+
+GPS = {"has_gps": True}
+
+
+@pytest.mark.parametrize(
+    ("channel", "known", "is_known"),
+    [
+        (Channel.COMMAND, {"accuracy_m": 50.0}, True),
+        (Channel.COMMAND, {"accuracy_m": 50.1}, False),
+        (Channel.COMMAND, {"accuracy_m": None}, False),
+        (Channel.COMMAND, {"shown_ago_s": 60.0}, True),
+        (Channel.COMMAND, {"shown_ago_s": 60.1}, False),
+        (Channel.COMMAND, {"shown_ago_s": NEVER_S, "gps_ago_s": 60.0}, True),
+        (Channel.COMMAND, {"shown_ago_s": NEVER_S, "gps_ago_s": 60.1}, False),
+        (Channel.GPS_INPUT, {"shown_ago_s": 10.0}, True),
+        (Channel.GPS_INPUT, {"shown_ago_s": 10.1}, False),
+        (Channel.GPS_INPUT, {"shown_ago_s": NEVER_S, "gps_ago_s": 3.0}, True),
+        (Channel.GPS_INPUT, {"shown_ago_s": NEVER_S, "gps_ago_s": 3.1}, False),
+        (Channel.SENSOR, {"shown_ago_s": 5.0}, True),
+        (Channel.SENSOR, {"shown_ago_s": 5.1}, False),
+        (Channel.VISION, {"shown_ago_s": 5.1}, False),
+        (Channel.SENSOR, {"shown_ago_s": NEVER_S, "gps_ago_s": 0.0}, False),
+    ],
+)
+def test_position_is_known_well_enough_within_limits(channel, known, is_known):
+    assert navigate(channel, **known).knows_position(NOW_S) is is_known
+
+
+@pytest.mark.parametrize(("accuracy_m", "claimed_m"), [(0.5, 1.0), (2.0, 2.0), (None, None)])
+def test_accuracy_is_never_better_than_the_error_that_all_fixes_share(accuracy_m, claimed_m):
+    assert navigate(accuracy_m=accuracy_m).accuracy_m(NOW_S) == claimed_m
+
+
+def receiver(sd_m=1.0, **said):
+    return {"has_gps": True, "gps": receiver_at(HOME, sd_m, NOW_S, **said)}
+
+
+@pytest.mark.parametrize(
+    ("channel", "reports", "before", "output"),
+    [
+        (Channel.SENSOR, receiver(), Output.STARTING, Output.GPS_IN_USE),
+        (Channel.SENSOR, {}, Output.STARTING, Output.SENDING),
+        (Channel.ODOMETRY, receiver(), Output.STARTING, Output.BESIDE_GPS),
+        (Channel.GPS_INPUT, receiver(), Output.STARTING, Output.RESERVE),
+        (Channel.GPS_INPUT, receiver() | {"has_gps": False}, Output.STARTING, Output.SENDING),
+        (Channel.GPS_INPUT, receiver(15.0), Output.STARTING, Output.RESERVE),
+        (Channel.GPS_INPUT, receiver(15.1), Output.STARTING, Output.SENDING),
+        (Channel.GPS_INPUT, receiver(steady_for_s=0.5), Output.RESERVE, Output.RESERVE),
+        (Channel.GPS_INPUT, receiver(steady_for_s=0.9), Output.SENDING, Output.SENDING),
+        (Channel.GPS_INPUT, receiver(steady_for_s=1.0), Output.SENDING, Output.GPS_BACK),
+        (Channel.GPS_INPUT, receiver(steady_for_s=2.9), Output.GPS_BACK, Output.GPS_BACK),
+        (Channel.GPS_INPUT, receiver(steady_for_s=3.0), Output.GPS_BACK, Output.RESERVE),
+    ],
+)
+def test_output_is_chosen_by_channel_and_receiver(channel, reports, before, output):
+    navigator = navigate(channel, reports=reports)
+    navigator.output = before
+    assert (navigator.state_at(NOW_S) is not None) is output.is_sent
+    assert navigator.output is output
+
+
+def test_no_position_is_sent_that_is_unknown_contradicted_or_withdrawn():
+    unheard, unknown = navigate(Channel.GPS_INPUT, is_heard=False), navigate(Channel.GPS_INPUT, accuracy_m=None)
+    for navigator in (unheard, unknown):
+        assert (navigator.state_at(NOW_S), navigator.output) == (None, Output.STARTING)
+    unknown.output = Output.SENDING
+    assert (unknown.state_at(NOW_S), unknown.output) == (None, Output.UNKNOWN)
+    in_doubt, doubted, withdrawn = (navigate(Channel.GPS_INPUT) for _ in range(3))
+    in_doubt._navigation.is_in_doubt = True
+    doubted.doubt_map(True)
+    withdrawn._watch.withdrawn = Output.REFUSED
+    for navigator in (in_doubt, doubted):
+        assert (navigator.state_at(NOW_S), navigator.output) == (None, Output.CONTRADICTS_GPS)
+    assert (withdrawn.state_at(NOW_S), withdrawn.output) == (None, Output.REFUSED)
+    assert navigate(Channel.GPS_INPUT, how={"is_muted": True}).state_at(NOW_S) is None
+
+
+def test_continuous_position_claims_accuracy_and_lag_for_fifty_like_it():
+    navigator = navigate(Channel.GPS_INPUT, reports={"sink_m_s": 0.7}, map_sd_m=1.0)
+    navigator.hear_force(NOW_S, (0.0, 0.0, -9.8), Attitude(NOW_S, 90.0, -45.0, 180.0))
+    state = navigator.state_at(NOW_S)
+    assert (state.t_mono_s, state.alt_m, state.alt_accuracy_m, state.is_reserve) == (NOW_S, 300.0, 3.0, False)
+    assert (state.lat_deg, state.lon_deg) == pytest.approx(HOME)
+    assert state.velocity_m_s == (3.0, 4.0, 0.7)
+    assert state.attitude == pytest.approx((math.pi / 2, -math.pi / 4, math.pi))
+    assert (state.accuracy_m, state.speed_accuracy_m_s) == pytest.approx((2.0 * LIKE_ONE, 0.5 * LIKE_ONE))
+    navigator._navigation.off_m = (3.0 + 10.0, 4.0)  # as far as it has flown, and 10 m of which 2 m are made up
+    assert navigator.state_at(NOW_S + 1.0).accuracy_m == pytest.approx(math.hypot(2.0, 8.0) * LIKE_ONE, rel=1e-4)
+    bare = navigate(Channel.GPS_INPUT).state_at(NOW_S)
+    assert (bare.attitude, bare.velocity_m_s[2]) == (None, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("sd_m", "alt_m", "expected_m"), [(1.0, 250.0, 250.0), (1.0, None, 300.0), (20.0, 250.0, 300.0)]
+)
+def test_altitude_of_a_reserve_is_that_of_the_receiver(sd_m, alt_m, expected_m):
+    state = navigate(Channel.GPS_INPUT, reports=receiver(sd_m, alt_m=alt_m)).state_at(NOW_S)
+    assert (state.alt_m, state.is_reserve) == (expected_m, sd_m == 1.0)
+
+
+@pytest.mark.parametrize(
+    ("channel", "how", "shown_ago_s", "factor"),
+    [
+        (Channel.SENSOR, {}, None, LIKE_ONE),
+        (Channel.SENSOR, {"is_level": True}, None, 1.5),
+        (Channel.GPS_INPUT, {"is_level": True}, None, LIKE_ONE),
+        (Channel.SENSOR, {}, 5.0, 1.5),
+        (Channel.SENSOR, {}, 5.1, LIKE_ONE),
+    ],
+)
+def test_px4_is_told_plain_errors_while_pictures_show_its_attitude(channel, how, shown_ago_s, factor):
+    navigator = navigate(channel, how=how)
+    if shown_ago_s:
+        lean = AttitudeError((0.01, 0.0), 0.01)
+        navigator.advise(match_at(Position(*HOME), NOW_S - shown_ago_s, None, 1.5, (1,), lean=lean), NOW_S)
+    assert navigator.state_at(NOW_S).accuracy_m == pytest.approx(2.0 * factor)
+
+
+@pytest.mark.parametrize(
+    ("after_s", "reports", "is_ours"), [(10.0, GPS, True), (10.1, GPS, False), (10.1, {"has_gps": False}, True)]
+)
+def test_estimate_may_be_ours_for_ten_seconds(after_s, reports, is_ours):
+    navigator = navigate(Channel.GPS_INPUT)
+    assert navigator._navigation.reports == [(True, False)]
+    navigator.state_at(NOW_S)
+    navigator.believe_gps(False)
+    navigator.hear_vehicle(vehicle_at(*HOME, NOW_S + after_s, velocity_m_s=(0.0, 0.0), **reports))
+    assert navigator._navigation.reports[1:] == [(False, is_ours)]
+
+
+@pytest.mark.parametrize(
+    ("channel", "has_gps", "rests"),
+    [(Channel.COMMAND, True, True), (Channel.COMMAND, False, False), (Channel.GPS_INPUT, True, False)],
+)
+def test_age_of_pictures_is_found_by_the_path(channel, has_gps, rests):
+    navigator, motions = navigate(channel), []
+    navigator.age = SimpleNamespace(add_motion=lambda *motion: motions.append(motion))
+    vehicle = vehicle_at(*HOME, NOW_S, velocity_m_s=(0.0, 0.0))
+    navigator.hear_vehicle(vehicle)
+    navigator._navigation.has_gps, navigator._navigation.path_velocity_m_s = has_gps, (1.0, 2.0)
+    navigator.hear_vehicle(vehicle)
+    assert motions == [(NOW_S, (1.0, 2.0), None, rests)]
+
+
+def test_frame_claims_an_error_of_the_height_that_pictures_show():
+    navigator = navigate()
+    navigator.hear_frame(matched())
+    navigator.correct_height(1.2)
+    navigator.hear_frame(matched(), is_query=False)
+    navigator.correct_height(1.0, 0.3)
+    navigator.hear_frame(matched())
+    navigator.hear_frame(matched(frame=None))
+    frames = navigator._navigation.frames
+    assert [frame.scale_sd for frame, _ in frames] == pytest.approx([0.0, 0.2, 0.3])
+    assert [is_query for _, is_query in frames] == [True, False, True]
+
+
+CONTINUOUS = Channel.GPS_INPUT
+TILTED = Levelled(np.zeros((8, 8), np.uint8), None, View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 40.0})))
+
+
+@pytest.mark.parametrize(
+    ("channel", "reports", "event", "contradicts_m", "code"),
+    [
+        (Channel.COMMAND, {}, {"located": None}, 0.0, ReasonCode.PLACE_WITHOUT_POSITION),
+        (Channel.COMMAND, {}, {"frame": None}, 0.0, ReasonCode.PLACE_WITHOUT_POSITION),
+        (Channel.COMMAND, {}, {"picture": TILTED}, 0.0, ReasonCode.NOT_BELOW_AIRCRAFT),
+        (CONTINUOUS, {"t_heard_s": NOW_S - 1.1}, {}, 0.0, ReasonCode.NO_TELEMETRY),
+        (CONTINUOUS, {"velocity_m_s": None}, {}, 0.0, ReasonCode.NO_TELEMETRY),
+        (Channel.COMMAND, {"velocity_m_s": None}, {}, 0.0, None),
+        (CONTINUOUS, {}, {}, None, ReasonCode.CONTINUOUS),
+        (Channel.COMMAND, {}, {}, None, None),
+        (Channel.COMMAND, {}, {}, 500.0, ReasonCode.HELD_OFF_PATH),
+        (Channel.COMMAND, {}, {}, 0.0, ReasonCode.NOT_BETTER),
+        (CONTINUOUS, {}, {}, 0.0, ReasonCode.CONTINUOUS),
+    ],
+)
+def test_match_is_sent_only_where_it_may_be(channel, reports, event, contradicts_m, code):
+    navigator = navigate(channel, reports=reports)
+    navigator._navigation.contradicts_m = contradicts_m
+    advice = navigator.advise(matched(**event), NOW_S)
+    assert (advice.why and advice.why.code) is code
+    assert advice.is_held is (code is ReasonCode.HELD_OFF_PATH)
+    assert len(navigator._navigation.begun) == (contradicts_m is None)
+    if code is None:
+        assert (advice.fix.accuracy_m, advice.fix.t_frame_s) == (1.5, NOW_S)
+
+
+def test_accuracy_of_a_fix_contains_the_error_of_its_time():
+    navigator = navigate(reports={"velocity_m_s": (30.0, 40.0)})
+    late = replace(matched().frame, t_sd_s=math.hypot(FRAME_TIME_SD_S, 0.1))
+    navigator.advise(matched(frame=late), NOW_S)
+    assert navigator.accuracy_m(NOW_S) == pytest.approx(math.hypot(1.0, 5.0))
+    unheard = navigate(is_heard=False).advise(matched(frame=late), NOW_S)
+    assert unheard.fix.accuracy_m == pytest.approx(1.5 * math.sqrt(2)), "an unknown speed is 15 m/s"
+
+
+@pytest.mark.parametrize("is_heard", [True, False])
+def test_autopilot_that_has_just_been_heard_is_sent_nothing_for_five_seconds(is_heard):
+    navigator = navigate(is_heard=is_heard, reports={"t_heard_s": NOW_S - 5.0})
+    if not is_heard:
+        navigator.hear_autopilot(NOW_S - 5.0)
+    assert navigator.advise(matched(), NOW_S).why.code is ReasonCode.NO_TELEMETRY
+    assert navigator.advise(matched(), NOW_S + 0.1).fix
+
+
+def test_fix_is_sent_where_it_improves_the_position_of_the_autopilot():
+    reports = {"velocity_m_s": (10.0, -4.0), "t_heard_s": NOW_S - 0.5}
+    same = navigate(reports=reports, off_m=(5.0, -2.0)).advise(matched(), NOW_S)
+    assert same.why.code is ReasonCode.NOT_BETTER
+    assert same.why.parameters == pytest.approx({"off_m": 0.0, "accuracy_m": 2.0}, abs=0.01)
+    assert navigate(off_m=(2.82, 0.0)).advise(matched(), NOW_S).fix is None
+    assert navigate(off_m=(2.84, 0.0)).advise(matched(), NOW_S).fix
+    for every_s, ahead_m in ((1.0, (2.0, -1.5)), (0.2, (0.8, -0.6))):
+        fix = navigate(every_s=every_s, off_m=(10.0, 0.0), drift_m_s=(8.0, -6.0)).advise(matched(), NOW_S).fix
+        assert offset_m(*HOME, fix.lat_deg, fix.lon_deg) == pytest.approx((10.0 + ahead_m[0], ahead_m[1]), abs=0.01)
+        assert fix.accuracy_m == pytest.approx(math.hypot(2.0, math.hypot(*ahead_m) / math.sqrt(2)))
+        assert fix.t_frame_s == NOW_S
+
+
+def test_no_fix_is_sent_beside_gps_or_where_the_map_contradicts_it():
+    beside, doubted, unknown = (navigate(off_m=(10.0, 0.0), reports=said) for said in (GPS, {}, {}))
+    assert beside.advise(matched(), NOW_S).why.code is ReasonCode.HAS_GPS
+    beside.believe_gps(False)
+    assert beside.advise(matched(), NOW_S).why.code is ReasonCode.HAS_WRONG_GPS
+    doubted.doubt_map(True)
+    assert doubted.advise(matched(), NOW_S).why.code is ReasonCode.MAP_CONTRADICTS_GPS
+    unknown._navigation.accuracy_m = None
+    assert unknown.advise(matched(), NOW_S).why.code is ReasonCode.NO_TELEMETRY
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"how": {"is_muted": True}},
+        {"channel": Channel.GPS_INPUT},
+        {"is_heard": False},
+        {"reports": {"velocity_m_s": None}},
+        {"reports": {"t_heard_s": NOW_S - 1.1}},
+        {"reports": GPS},
+        {"shown_ago_s": 60.1},
+        {"off_m": (1.0, 0.0)},
+    ],
+    ids=str,
+)
+def test_fix_between_matches_is_sent_to_an_autopilot_that_needs_it_only(change):
+    off = {"off_m": (10.0, 0.0)}
+    assert navigate(**off).fix_between(NOW_S)
+    assert navigate(**off | change).fix_between(NOW_S) is None
+
+
+def test_no_fix_is_sent_between_matches_that_contradict_or_of_unknown_age():
+    navigator = navigate(off_m=(10.0, 0.0))
+    navigator.age.is_unknown = True
+    assert navigator.fix_between(NOW_S) is None
+    navigator.age.is_unknown, navigator._navigation.contradicts_m = False, 500.0
+    assert navigator.advise(matched(), NOW_S).is_held
+    assert navigator.fix_between(NOW_S) is None
+
+
+def test_navigation_begins_anew_where_the_path_errs_otherwise():
+    navigator, seen = Navigator(1.0, 1.0), []
+    for channel in (Channel.NONE, Channel.COMMAND, Channel.SENSOR, Channel.VISION, Channel.GPS_INPUT, Channel.ODOMETRY):
+        navigator.hear_channel(channel)
+        seen.append(navigator._navigation)
+    assert [one is other for one, other in pairwise(seen)] == [True, False, True, False, True]
