@@ -124,3 +124,20 @@ def test_memory_is_what_the_budget_is_told_and_no_more_is_kept():
     kept, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert kept < 1.02 * places * bytes_beside_place(length) == 1.02 * places * 44
+
+
+@pytest.mark.parametrize(
+    ("queries", "least", "goes_on"),
+    [
+        ([(5, 0.5), (6, 0.4), (7, 0.3)], 0.299, True),
+        ([(5, 0.5), (6, 0.4), (7, 0.3)], 0.31, False),  # too low for one query
+        ([(5, 0.9), (60, 0.1), (20, 0.1)], 0.0, False),  # the newest was not compared with the place
+    ],
+)
+def test_the_newest_query_must_still_see_the_place(queries, least, goes_on):
+    sequence, near = SequenceSearch(3), abs(np.arange(80) - 7) <= 2
+    index = index_of(range(80))
+    for query, (slot, score) in enumerate(queries):
+        slots, scores = np.array([slot, 40, 50]), np.array([score, 0.1, 0.1], np.float32)
+        sequence.follow(Ranking(slots=slots, scores=scores, compared={}), index, float(query))
+    assert sequence.goes_on(near, min_score=least) == goes_on

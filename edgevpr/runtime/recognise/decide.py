@@ -47,7 +47,6 @@ from edgevpr.runtime.recognise.evidence import (
 )
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.runtime.recognise.judge import (
-    LIKE_AT_REST,
     AcceptRule,
     Findings,
     Verdict,
@@ -61,6 +60,9 @@ from edgevpr.runtime.recognise.place_filter import Followed, PlaceFilter
 from edgevpr.runtime.recognise.tilted import SUPPOSED_TILT, agrees_better_tilted
 
 _MAX_SAME_GROUND = 12  # places that may show the same ground: so many overlap on kite_ochota, which has no positions
+# Of the votes of the best place, those that a place elsewhere has at rest: behind a display or figures nearly all have
+# 0.15 to 0.9 of them, on smooth ground some are at rest by chance with up to 0.065.
+_LIKE_AT_REST = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -308,5 +310,5 @@ class Decider:
         with self.meter.step("compare"):
             query = self.make_query(encoded.descriptor, NOTHING)
             matches = unmoved_outside_neighbourhood(query, int(ranking.slots[0]), self.accuracy_m)
-        least = LIKE_AT_REST * compute_share(best)
+        least = _LIKE_AT_REST * compute_share(best)
         return sum(is_at_rest(match) and compute_share(match) >= least for match in matches) / max(len(matches), 1)

@@ -32,10 +32,8 @@ _MARGIN_SHARE_AT_OTHER_SPEEDS = 0.5
 _MAX_INDEPENDENT = 10
 
 # Looking down, if more than this share of a few places elsewhere agree without any shift or rotation, as the best one
-# does, all share what is drawn over every frame. They count with this share of its votes or more: behind a display or
-# figures nearly all have 0.15 to 0.9 of them, on smooth ground some are at rest by chance with up to 0.065.
+# does, all share what is drawn over every frame.
 _DISPLAY_SHARE = 0.4
-LIKE_AT_REST = 0.15
 _AT_REST_CELLS = 0.75
 _AT_REST_DEG = 7.5
 _AT_REST_HEIGHT = 0.2
