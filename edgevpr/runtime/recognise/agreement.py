@@ -219,7 +219,7 @@ def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tupl
 def _variance(asked: Array, known: Array, turn_scale: complex, shift: complex) -> float:
     """Return the variance of the shift along each axis, in squares of the picture's longest side, from the inliers."""
     left = np.abs(turn_scale * asked + shift - known) ** 2
-    per_axis = max(float(left.sum()) / max(2 * len(asked) - 4, 1), (_TOLERANCE_SHARE / 10) ** 2)
+    per_axis = max(float(left.sum()) / (2 * len(asked) - 4), (_TOLERANCE_SHARE / 10) ** 2)
     middle = asked.mean()
     spread = float((np.abs(asked - middle) ** 2).mean())
     # The farther the inliers are from the picture's middle, the more a wrong rotation moves the middle.

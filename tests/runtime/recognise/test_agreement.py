@@ -71,14 +71,6 @@ def test_the_signs_are_those_of_a_match_of_cohog(landscape, right_px, down_px, t
     assert guided.shift_share == pytest.approx(found.shift_share, abs=0.005)
 
 
-def test_the_covariance_holds_what_is_off(landscape):
-    query, place = cut(landscape, 860, 560, 20), cut(landscape, 800, 600)
-    found = agreement(asked(query), kept(place))
-    var_x, _, var_y = found.covariance_share2
-    off = np.array(found.shift_share) - (60 / WIDE, -40 / WIDE)
-    assert off @ off < 9 * (var_x + var_y) < 9 * 2 * (20 / WIDE) ** 2
-
-
 def test_landmarks_that_lie_otherwise_than_expected_are_not_taken_for_what_is(landscape):
     query, place = asked(cut(landscape, 860, 560)), kept(cut(landscape, 800, 600))
     wrong = Overlay((-0.2, 0.1), 90.0)
@@ -88,13 +80,7 @@ def test_landmarks_that_lie_otherwise_than_expected_are_not_taken_for_what_is(la
     assert np.array(found.shift_share) * WIDE == pytest.approx((60, -40), abs=2)
 
 
-def test_what_stands_still_may_be_a_display(landscape):
-    place = cut(landscape, 800, 600)
-    assert agreement(asked(place), kept(place)).is_at_rest
-    assert not agreement(asked(cut(landscape, 830, 600)), kept(place)).is_at_rest
-
-
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_pictures_of_other_ground_do_not_agree(landscape, seed):
     other = textured(100 + seed, HIGH, WIDE)
     expected = Overlay((0.05 * (seed % 3), -0.05), 15.0 * seed)
