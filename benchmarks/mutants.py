@@ -13,6 +13,7 @@ import os
 import re
 import resource
 import sys
+import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
 from importlib import util
@@ -55,11 +56,11 @@ def fork(task: Callable[[], int]) -> int:
     sys.stdout.flush()
     if pid := os.fork():
         return pid
-    code = 1
     try:
-        code = task()
-    finally:
-        os._exit(code)
+        os._exit(task())
+    except BaseException:  # a forked process must not go on as this one
+        traceback.print_exc()
+        os._exit(1)
 
 
 def name_module(path: str) -> str:
@@ -125,7 +126,8 @@ def forget(name: str) -> None:
         path = getattr(module, "__file__", None) or ""
         if other in users or path.startswith(str(base.REPOSITORY / "tests")):
             parent, _, child = other.rpartition(".")
-            vars(sys.modules.get(parent)).pop(child, None) if parent else None
+            if parent in sys.modules:
+                vars(sys.modules[parent]).pop(child, None)
             del sys.modules[other]
 
 
