@@ -204,13 +204,14 @@ def map_move(args: Namespace) -> int:
 
 def map_calibrate(args: Namespace) -> int:
     """Run `map calibrate`: calibrate the confidence of matches in a map, and print what to expect of the map."""
-    from edgevpr.mapmaking.finishing import calibrate_map
+    from edgevpr.mapmaking.finishing import calibrate_map, make_encoder
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.runtime.recognise.opening import create_technique
 
     config, pictures = load_command_config(args, args.config), _pictures(args)
     with PlaceMap.open_for_adding(args.map) as place_map:
-        found = calibrate_map(place_map, create_technique(place_map), config, pictures, progress)
+        encoder = make_encoder(config.source, pictures, create_technique(place_map))
+        found = calibrate_map(place_map, encoder, config.match, pictures, progress)
     show({"map": args.map, "calibration": found.figures()}, args.json, [f"{args.map}: calibrated: {found.described()}"])
     return 0
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.core.config import Config
+from edgevpr.core.config import MatchConfig, SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.types import Frame
@@ -22,7 +22,7 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import MapCalibration
 from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.evidence import list_evidence_kinds
-from edgevpr.runtime.recognise.levelling import lens_of, make_levelling
+from edgevpr.runtime.recognise.levelling import Levelling, make_levelling
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.refine import Refined
@@ -45,8 +45,8 @@ class FinishedMap:
 
 def finish_map(
     place_map: PlaceMap,
-    technique: Technique,
-    config: Config,
+    encoder: FrameEncoder,
+    match: MatchConfig,
     pictures: FlownPictures | Cuttings | None,
     shown: Shown,
     refine: bool = True,
@@ -54,7 +54,7 @@ def finish_map(
 ) -> FinishedMap:
     """Refine and calibrate an open map as far as its technique and its `pictures` (None: not at hand, so that it is not
     calibrated) allow it. The result says what fails: a map is of use without."""
-    refined, calibration, not_done = None, None, []
+    technique, refined, calibration, not_done = encoder.technique, None, None, []
     if refine and technique.spec.looks_down and not isinstance(pictures, Cuttings):
         try:
             refined = refine_map(place_map, technique, pictures.folder if pictures else None, shown)
@@ -62,7 +62,7 @@ def finish_map(
             not_done.append(f"the map is not refined: {error}")
     if calibrate and pictures and list_evidence_kinds(technique.spec):
         try:
-            calibration = calibrate_map(place_map, technique, config, pictures, shown)
+            calibration = calibrate_map(place_map, encoder, match, pictures, shown)
         except EdgevprError as error:
             not_done.append(f"the map is not calibrated: {error}")
     return FinishedMap(refined, calibration, tuple(not_done))
@@ -89,14 +89,15 @@ def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | N
 
 
 def calibrate_map(
-    place_map: PlaceMap, technique: Technique, config: Config, pictures: FlownPictures | Cuttings, shown: Shown
+    place_map: PlaceMap, encoder: FrameEncoder, match: MatchConfig, pictures: FlownPictures | Cuttings, shown: Shown
 ) -> MapCalibration:
     """Calibrate the confidence of an open map with the pictures that it was made from, as far as they can be read (see
     `calibrate`). Raises UsageError if the map cannot be calibrated, or SciPy is missing."""
     with _needing_scipy():
         from edgevpr.mapmaking.calibrate import calibrate
 
-    lens = lens_of(config.source) if technique.spec.looks_down and isinstance(pictures, FlownPictures) else None
+    levelling = encoder.levelling
+    lens = levelling.lens if encoder.technique.spec.looks_down and isinstance(levelling, Levelling) else None
 
     def read(names: Collection[str] | None) -> Iterator[Frame]:
         yield from filter(None, read_to_end(pictures.open(names), lambda error: None))
@@ -109,21 +110,21 @@ def calibrate_map(
             yield from (frame for frame in find_headings(read(None), lens) if frame.name in names)
 
     return calibrate(
-        make_encoder(config, pictures, technique),
+        encoder,
         place_map,
-        config.match,
+        match,
         QueryMeter(load_board("this")),
         frames,
         lambda asked, total: shown(asked, total, "calibrating"),
     )
 
 
-def make_encoder(config: Config, pictures: FlownPictures | Cuttings, technique: Technique) -> FrameEncoder:
+def make_encoder(source: SourceConfig, pictures: FlownPictures | Cuttings | None, technique: Technique) -> FrameEncoder:
     """Return the encoder of places: with mask and levelling, which pictures cut from an orthophoto do not need."""
     if isinstance(pictures, Cuttings):
         return FrameEncoder(technique=technique)
-    levelling = make_levelling(config.source, technique, below=True)
-    return FrameEncoder(technique=technique, mask=load_mask(config.source.mask), levelling=levelling)
+    levelling = make_levelling(source, technique, below=True)
+    return FrameEncoder(technique=technique, mask=load_mask(source.mask), levelling=levelling)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from edgevpr.core.config import Config
+from edgevpr.core.config import Config, SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.text import at_work
@@ -80,16 +80,17 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     """Make the map that `order` describes, or continue it. `unusable` is called with an error for each picture that
     cannot be used. `shown` shows progress. Raises EdgevprError."""
     path, here, pictures = map_path(order.path), load_board("this"), order.pictures
+    flown, salience = config.source, config.salience
     is_new = not (order.append and path.exists())
     place_map = None if is_new else PlaceMap.open_for_adding(path)
     source: Source
     counts: dict[str, int] = {}
     if isinstance(pictures, FlownPictures):
-        mask, lens = load_mask(config.source.mask), config.source.lens
-        source, technique = _open_flown(order, pictures, config, place_map, mask)
+        mask, lens = load_mask(flown.mask), flown.lens
+        source, technique = _open_flown(order, pictures, flown, place_map, mask)
     else:
         mask, lens = None, None
-        source, technique = cuttings, _ = _open_cuttings(order, pictures, config, place_map)
+        source, technique = cuttings, _ = _open_cuttings(order, pictures, flown.camera, place_map)
         cuttings.begin(pictures.spacing_m, technique, shown)
         counts = cuttings.counts
     if place_map is None:
@@ -103,20 +104,19 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             if isinstance(pictures, FlownPictures):
                 is_calibrated = order.calibrate and list_evidence_kinds(technique.spec)
                 advice.warn_of_gaps(pictures, source.total, len(place_map) if is_calibrated else None)
-                advice.suggest_lens(pictures, config.source, technique)
+                advice.suggest_lens(pictures, flown, technique)
                 advice.warn_of_display(pictures, mask)
             else:
                 place_map.add_attribution(pictures.attribution)
             frames: Iterator[Frame] = filter(None, shown(read_to_end(source, unusable), source.total, "mapping"))
-            if technique.spec.looks_down and isinstance(pictures, FlownPictures) and (camera := lens_of(config.source)):
+            if technique.spec.looks_down and isinstance(pictures, FlownPictures) and (camera := lens_of(flown)):
                 frames = find_headings(frames, camera)
+            encoder = make_encoder(flown, pictures, technique)
             result = build_map(
                 frames,
-                replace(
-                    make_encoder(config, pictures, technique), gate=open_salience_gate(config.salience, here.threads)
-                ),
+                replace(encoder, gate=open_salience_gate(salience, here.threads)),
                 place_map,
-                Gaps(config.salience.gap_frames, config.salience.gap_m),
+                Gaps(salience.gap_frames, salience.gap_m),
                 unusable,
             )
         except EdgevprError:
@@ -126,7 +126,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
         if covered := measure_ground(place_map):
             _log.info("%s", covered.described(is_flown=isinstance(pictures, FlownPictures)))
         finished = finish_map(
-            place_map, technique, config, pictures, shown, refine=order.refine, calibrate=order.calibrate
+            place_map, encoder, config.match, pictures, shown, refine=order.refine, calibrate=order.calibrate
         )
         info = describe_map(place_map)
         if info.one_way_deg is not None:
@@ -144,12 +144,12 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
 
 
 def _open_flown(
-    order: MapOrder, pictures: FlownPictures, config: Config, place_map: PlaceMap | None, mask: Mask | None
+    order: MapOrder, pictures: FlownPictures, flown: SourceConfig, place_map: PlaceMap | None, mask: Mask | None
 ) -> tuple[Source, Technique]:
     """Open the pictures, and make the technique: the one asked for, else that of the map (`place_map` None: there is no
     map yet), else the best for the board. Raises UsageError if the camera looks down, and nobody has said so, and for
     one that is tilted by angles that are not recorded."""
-    source, settings, camera = pictures.open(), order.parameters, config.source.camera
+    source, settings, camera = pictures.open(), order.parameters, flown.camera
     name = order.technique or (place_map.spec.name if place_map is not None else None)
     asks_camera = camera is None and place_map is None and "camera" not in settings
     if asks_camera and (not name or camera_setting(name, "nadir")):
@@ -161,19 +161,19 @@ def _open_flown(
     elif camera:  # a technique that knows no camera refuses one that was asked for
         settings = settings | {"camera": camera}
     technique = _make_technique(order, place_map, name, settings)
-    if technique.spec.looks_down and not config.source.gimbal and read_mount(config.source) == STRAIGHT_DOWN:
-        advice.require_level(pictures, config.source.fov_deg)
+    if technique.spec.looks_down and not flown.gimbal and read_mount(flown) == STRAIGHT_DOWN:
+        advice.require_level(pictures, flown.fov_deg)
     return source, technique
 
 
 def _open_cuttings(
-    order: MapOrder, pictures: Cuttings, config: Config, place_map: PlaceMap | None
+    order: MapOrder, pictures: Cuttings, camera: str | None, place_map: PlaceMap | None
 ) -> tuple["OrthophotoSource", Technique]:
     """Open the orthophoto, and make the technique: the one asked for, else that of the map (`place_map` None: there is
     no map yet), else `cohog`. Raises UsageError for another camera, and for tiles whose owner is not named."""
     if "://" in str(pictures.orthophoto) and not pictures.attribution:
         raise UsageError("Tiles of an address have an owner: give --attribution TEXT, as its terms ask for.")
-    if (camera := config.source.camera) not in (None, "nadir"):
+    if camera not in (None, "nadir"):
         raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
     name = order.technique or (place_map.spec.name if place_map is not None else _OF_ORTHOPHOTOS)
     settings = order.parameters | camera_setting(name, "nadir")

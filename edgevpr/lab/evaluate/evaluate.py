@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.core.config import BatteryConfig, Config, MatchConfig, bounded
+from edgevpr.core.config import BatteryConfig, MatchConfig, SourceConfig, bounded
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.core.types import NO_COST, Frame, StageCost
@@ -24,7 +24,7 @@ from edgevpr.frames.positions import GeoTag
 from edgevpr.frames.source import Source, open_source, read_tags
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
-from edgevpr.mapmaking.finishing import finish_map
+from edgevpr.mapmaking.finishing import finish_map, make_encoder
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.mapmaking.pictures import FlownPictures
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
@@ -179,7 +179,8 @@ def mapped(
         with PlaceMap.create(path, technique.spec) as place_map:
             build_map(frames, FrameEncoder(technique=technique), place_map)
             pictures = FlownPictures(source=str(images)) if images else None
-            finished = finish_map(place_map, technique, Config(), pictures, show)
+            encoder = make_encoder(SourceConfig(), pictures, technique)
+            finished = finish_map(place_map, encoder, MatchConfig(), pictures, show)
         with PlaceMap.open(path) as place_map:
             index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
             # The folder is gone when the sentences are read, and another one in the next run.
