@@ -3,7 +3,7 @@
 import os
 from argparse import Namespace
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -131,8 +131,9 @@ def run_flight(args: Namespace) -> int:
     """Run `run`: fly with a configuration, until the flight ends."""
     from edgevpr.runtime.flight.flight import fly
 
-    config = place_logs_in(load_command_config(args, args.config), os.environ.get("LOGS_DIRECTORY", ""))
-    return fly(config, path_of(args.positions))
+    config = load_command_config(args, args.config)
+    log = place_logs_in(config.log, os.environ.get("LOGS_DIRECTORY", ""))
+    return fly(replace(config, log=log), path_of(args.positions))
 
 
 def run_check(args: Namespace) -> int:

@@ -244,12 +244,10 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
     return build(Config, mapping, "the command line")
 
 
-def place_logs_in(config: Config, folder: str) -> Config:
-    """Return a copy of `config` in which the paths of logs and recordings of a flight, where relative, are relative to
-    `folder`."""
-    given = ((name, getattr(config.log, name)) for name in ("path", "record"))
-    paths: dict[str, Any] = {name: path and os.path.join(folder, path) for name, path in given}
-    return replace(config, log=replace(config.log, **paths))
+def place_logs_in(log: LogConfig, folder: str) -> LogConfig:
+    """Return settings of logs and recordings whose paths, where relative, are relative to `folder`."""
+    path, record = (given and os.path.join(folder, given) for given in (log.path, log.record))
+    return replace(log, path=path, record=record)
 
 
 def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -> T:

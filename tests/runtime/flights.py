@@ -4,7 +4,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 
-import pytest
 from fakes import FakeClock, FakeLink, FakeSource
 from pictures import textured
 
@@ -12,7 +11,6 @@ from edgevpr.core.arrays import Image
 from edgevpr.core.config import Config, load_config
 from edgevpr.power.boards import load_board, resolve_board
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.flight import flight as flight_module
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.flight import Flight as FlightItself
 from edgevpr.runtime.flight.flightio import FlightParts
@@ -76,9 +74,8 @@ class Flight:
                     board=self.board, clock=clock, machine=Machine(self.board), stop=self.stop, status=status
                 ),
             )
-            patch = opened.enter_context(pytest.MonkeyPatch.context())
-            patch.setattr(flight_module, "limit_candidates", lambda technique: fewer_candidates)
-            FlightItself(self.config, parts).run()
+            accuracy_m = settings.min_accuracy_m
+            FlightItself(parts, self.config.source, min_accuracy_m=accuracy_m, fewer_candidates=fewer_candidates).run()
         *lines, self.end = read_log(self.log)
         return lines
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from edgevpr.core.config import Config, MavlinkConfig
+from edgevpr.core.config import Config, MavlinkConfig, SourceConfig
 from edgevpr.core.errors import ImageError
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Position
@@ -52,8 +52,9 @@ _log = logging.getLogger(__name__)
 def fly(config: Config, positions: Path | None = None) -> int:
     """Fly, and return the exit code: 1 if any frame failed, else 0. `positions` is a file with the positions of the
     frames of a recording (None: there is none). Raises EdgevprError if the flight cannot start."""
-    steps_s = recorded_intervals(config.source.uri, positions)
-    config = apply_recorded_rate(config, steps_s)
+    source = config.source
+    steps_s = recorded_intervals(source.uri, positions)
+    config = replace(config, source=apply_recorded_rate(source, steps_s))
     with open_real_io(config, positions, steps_s) as io:
         try:
             with closing(Flight.open(config, io)) as flight:
@@ -66,25 +67,31 @@ def fly(config: Config, positions: Path | None = None) -> int:
 class Flight:
     """A flight whose parts are open. `open` makes it; close it after `run`."""
 
-    def __init__(self, config: Config, parts: FlightParts) -> None:
+    def __init__(
+        self,
+        parts: FlightParts,
+        camera: SourceConfig,
+        *,
+        min_accuracy_m: float,
+        fewer_candidates: tuple[int, ...],
+    ) -> None:
         self._parts, self._opened = parts, ExitStack()
         notifier, self._map_watch, self._tally = parts.notifier, MapWatch(parts.notifier), Tally()
         self._pace = Pace(parts.io.board.rate_hz, parts.io.clock)
-        fewer_candidates = () if config.match.candidates else limit_candidates(parts.recogniser.technique)
         self._governing = GovernorActuator(parts, self._pace, fewer_candidates)
         self._commands = Commands(parts.link, notifier)
-        self._frozen = FrozenWatch(notifier, read_optics(config.source, parts.recogniser), parts.autopilot)
+        self._frozen = FrozenWatch(notifier, read_optics(camera, parts.recogniser), parts.autopilot)
         self._vitals = Vitals(
             parts, self._frozen, tally=self._tally, pace=self._pace, commands=self._commands, remarks=self._remarks
         )
-        gps = GpsWatch(config.mavlink.min_accuracy_m, notifier, parts.autopilot)
-        self._surveyor = Surveyor(notifier, gps, config.source, self._set_mount)
+        gps = GpsWatch(min_accuracy_m, notifier, parts.autopilot)
+        self._surveyor = Surveyor(notifier, gps, camera, self._set_mount)
         self._observers: tuple[Callable[[Recognition], None], ...] = (
             self._tally.update,
             self._vitals.update,
             self._map_watch.update,
             Sight(notifier).update,
-            TurnWatch(notifier, config.source).update,
+            TurnWatch(notifier, camera).update,
             MirrorWatch(notifier, parts.recogniser).update,
             HeightWatch(notifier, parts.autopilot).update,
             gps.update,
@@ -103,14 +110,14 @@ class Flight:
                 stack.callback(recogniser.place_map.close)
                 flight_log = stack.enter_context(_open_log(io))
             flight_log.write("start", **log_start(config, io, recogniser))
-            step_s, settings = 1 / io.board.rate_hz, config.mavlink
-            navigator = Navigator(settings.min_accuracy_m, step_s, not settings.send_fixes, config.source.gimbal)
-            origin = find_origin(recogniser.place_map, config.source) if settings.set_origin else None
+            step_s, settings, camera = 1 / io.board.rate_hz, config.mavlink, config.source
+            navigator = Navigator(settings.min_accuracy_m, step_s, not settings.send_fixes, camera.gimbal)
+            origin = find_origin(recogniser.place_map, camera) if settings.set_origin else None
             link, ground = open_links(settings, io, navigator, origin, stack)
             source = io.open_source(step_s)
             stack.callback(source.close)
             if link and not source.is_live and settings.send_fixes:
-                _log.warning("%s is a recording: its fixes do not say where you are", config.source.uri)
+                _log.warning("%s is a recording: its fixes do not say where you are", camera.uri)
             notifier = Notifier(flight_log, link)
             autopilot = None
             if link:
@@ -130,7 +137,8 @@ class Flight:
                 meter=FlightMeter(config.battery, io.board, io.clock, machine=io.machine),
                 io=io,
             )
-            flight = cls(config, parts)
+            fewer = () if config.match.candidates else limit_candidates(recogniser.technique)
+            flight = cls(parts, camera, min_accuracy_m=settings.min_accuracy_m, fewer_candidates=fewer)
             flight._opened = stack.pop_all()
         systemd.notify(READY=1)
         return flight

@@ -95,17 +95,17 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
     """Open the inputs and outputs of a real flight, yield and close them; meanwhile SIGTERM and SIGINT end the flight.
     Of a source that is a recording, `positions` is the file with those of its frames, and `steps_s` the seconds between
     them (empty: they come at the rate). Raises EdgevprError."""
-    uri = config.source.uri
-    if uri is None:
+    source = config.source
+    if (uri := source.uri) is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
     parse_links(config.mavlink)
-    board = resolve_board(load_board(config.board), config.source, config.memory)
+    board = resolve_board(load_board(config.board), source, config.memory)
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # musl has none
         for parameter, value in _MALLOC.items():
             mallopt(parameter, value)
     with ExitStack() as stack:
-        record, most_mb = config.log.record, config.log.record_mb
-        recording = _open_optional(lambda: stack.enter_context(Recording(record, most_mb))) if record else None
+        log, record = config.log, config.log.record
+        recording = _open_optional(lambda: stack.enter_context(Recording(record, log.record_mb))) if record else None
         folder = str(recording.path.resolve()) if recording else None
         status_path = config.status.file or default_path()
         status = _open_optional(lambda: stack.enter_context(StatusFile(status_path))) if status_path else None

@@ -45,14 +45,14 @@ def open_map(config: Config, io: FlightIO) -> Recogniser:
     return open_recogniser(config, io.board, narrowed=True, follows=config.match.follow, meter=meter)
 
 
-def apply_recorded_rate(config: Config, steps_s: Sequence[float]) -> Config:
-    """Return the configuration with the rate at which most pictures of a recording come, `steps_s` apart (empty: as it
-    is configured)."""
+def apply_recorded_rate(source: SourceConfig, steps_s: Sequence[float]) -> SourceConfig:
+    """Return the settings of a source with the rate at which most pictures of a recording come, `steps_s` apart (empty:
+    as it is configured)."""
     if not steps_s:
-        return config
+        return source
     usual_hz = 1 / median(step_s for step_s in steps_s if step_s > 0)
     usual_hz = min(max(usual_hz, LOWEST_RATE_HZ), HIGHEST_RATE_HZ)
-    return replace(config, source=replace(config.source, rate_hz=usual_hz))
+    return replace(source, rate_hz=usual_hz)
 
 
 def find_origin(place_map: PlaceMap, source: SourceConfig) -> Position | None:

@@ -10,7 +10,7 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ConfigError, MapError, UsageError
 from edgevpr.frames.mask import Mask, load_mask
 from edgevpr.frames.source import is_live
-from edgevpr.places.index import PlaceIndex, load_index
+from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import bytes_beside_place, make_sequence_search, sequence_length
 from edgevpr.power.boards import Board
@@ -52,18 +52,42 @@ def open_recogniser(
     """
     if config.map is None:
         raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
+    source, match = config.source, config.match
     place_map = PlaceMap.open(config.map)
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
-        technique = create_technique(place_map, config.technique, _wanted(config), board)
-        length = sequence_length(technique.spec, config.match.sequence)
-        budget_bytes, beside_bytes = int(board.budget_mb * 1e6), bytes_beside_place(length)
-        index = load_index(place_map, technique, budget_bytes, beside_bytes=beside_bytes)
+        wanted = {"camera": source.camera, "matching": match.matching, "form": match.form}
+        given = {name: value for name, value in wanted.items() if value}
+        technique = create_technique(place_map, config.technique, given, board)
+        length = sequence_length(technique.spec, match.sequence)
+        index = load_index(place_map, technique, int(board.budget_mb * 1e6), beside_bytes=bytes_beside_place(length))
+        mask = load_mask(source.mask)
+        warn_of_other_pictures(place_map, mask, source.lens)
+        levelling, gate = make_levelling(source, technique), open_salience_gate(config.salience, board.threads)
+        knows_scale = isinstance(levelling, Levelling) and levelling.lens is not None
         prior = RecordedPrior(known, technique.spec.heading_within_deg)
         if narrowed:
-            prior = Prior(config.match.reach_m_s, technique.spec.heading_within_deg, is_live(config.source.uri))
-        meter = meter or QueryMeter(board, config.battery)
-        recogniser = _recogniser(config, technique, place_map, index, meter, prior=prior, follows=follows)
+            prior = Prior(match.reach_m_s, technique.spec.heading_within_deg, is_live(source.uri))
+        place_filter = None
+        # Only matches that have a confidence can be followed, and only where no sequence is asked for.
+        if follows and match.sequence is None and list_evidence_kinds(technique.spec):
+            place_filter = PlaceFilter(place_map, max_speed_m_s=match.reach_m_s, is_live=is_live(source.uri))
+        rule = accept_rule(technique, match, length, read_calibration_for(place_map))
+        candidates, min_accuracy_m = match.candidates or technique.candidates, config.mavlink.min_accuracy_m
+        settings = WalkSettings(candidates=candidates, verify=match.verify, min_accuracy_m=min_accuracy_m)
+        recogniser = Recogniser(
+            FrameEncoder(technique=technique, levelling=levelling, mask=mask, gate=gate),
+            place_map,
+            Matcher(index, rule, make_sequence_search(length)),
+            meter or QueryMeter(board, config.battery),
+            settings=settings,
+            strides=Strides() if narrowed and knows_scale else None,
+            # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
+            prior=prior if length == 1 else None,
+            place_filter=place_filter,
+        )
+        if narrowed:
+            place_map.wait_at_most(_MAX_WAIT_S)
         on_error.pop_all()
     return recogniser
 
@@ -145,49 +169,3 @@ def warn_of_other_pictures(place_map: PlaceMap, mask: Mask | None, lens: str | N
             path,
             built_lens,
         )
-
-
-def _recogniser(
-    config: Config,
-    technique: Technique,
-    place_map: PlaceMap,
-    index: PlaceIndex,
-    meter: QueryMeter,
-    *,
-    prior: RecordedPrior,
-    follows: bool,
-) -> Recogniser:
-    match, source, is_flight = config.match, config.source, isinstance(prior, Prior)
-    length, mask = sequence_length(technique.spec, match.sequence), load_mask(source.mask)
-    rule = accept_rule(technique, match, length, read_calibration_for(place_map))
-    warn_of_other_pictures(place_map, mask, source.lens)
-    place_filter = None
-    # Only matches that have a confidence can be followed, and only where no sequence is asked for.
-    if follows and match.sequence is None and list_evidence_kinds(technique.spec):
-        place_filter = PlaceFilter(place_map, max_speed_m_s=match.reach_m_s, is_live=is_live(source.uri))
-    levelling, gate = make_levelling(source, technique), open_salience_gate(config.salience, meter.board.threads)
-    knows_scale = isinstance(levelling, Levelling) and levelling.lens is not None
-    recogniser = Recogniser(
-        FrameEncoder(technique=technique, levelling=levelling, mask=mask, gate=gate),
-        place_map,
-        Matcher(index, rule, make_sequence_search(length)),
-        meter,
-        settings=WalkSettings(
-            candidates=match.candidates or technique.candidates,
-            verify=match.verify,
-            min_accuracy_m=config.mavlink.min_accuracy_m,
-        ),
-        strides=Strides() if is_flight and knows_scale else None,
-        # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
-        prior=prior if length == 1 else None,
-        place_filter=place_filter,
-    )
-    if is_flight:
-        place_map.wait_at_most(_MAX_WAIT_S)
-    return recogniser
-
-
-def _wanted(config: Config) -> dict[str, str]:
-    """Return the parameters of the technique that the configuration sets, by name."""
-    wanted = {"camera": config.source.camera, "matching": config.match.matching, "form": config.match.form}
-    return {key: value for key, value in wanted.items() if value}

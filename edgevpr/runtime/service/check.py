@@ -6,7 +6,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-from edgevpr.core.config import Config, MavlinkConfig, load_config
+from edgevpr.core.config import Config, MavlinkConfig, SourceConfig, load_config
 from edgevpr.core.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.text import waiting
@@ -35,17 +35,17 @@ def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
         config = load_config(config_path)
     except EdgevprError as error:
         return [refuse("configuration", error)]
-    config = apply_recorded_rate(config, recorded_intervals(config.source.uri))
+    source = apply_recorded_rate(config.source, recorded_intervals(config.source.uri))
     findings = [fine("configuration", FindingCode.FILE_USABLE, path=str(config_path))]
     try:
-        board = resolve_board(load_board(config.board), config.source, config.memory)
+        board = resolve_board(load_board(config.board), source, config.memory)
         known = FindingCode.BOARD_KNOWN
         findings.append(fine("board", known, board=board.title, memory_mb=board.memory_max_mb))
         findings.append(run_check("map", lambda what: _check_map(what, config, board)))
     except ConfigError as error:  # then nothing is known of what the map would take
         findings.append(refuse("board", error))
     waiting("opening the source" if offline else f"waiting for a frame of the source, {FRAME_WAIT_S:g} s at most")
-    findings.append(run_check("source", lambda what: _check_source(what, config, offline)))
+    findings.append(run_check("source", lambda what: _check_source(what, source, offline)))
     waiting("waiting for the flight controller")
     findings.append(run_check("link", lambda what: _check_link(what, config.mavlink, offline)))
     waiting("")
@@ -60,19 +60,20 @@ def _check_map(what: str, config: Config, board: Board) -> Finding:
         if recogniser.rule.sure:
             calibration = read_calibration_for(place_map)
             confidence = calibration.described() if calibration else not_calibrated(len(place_map))
-    if config.mavlink.link and config.mavlink.send_fixes and t_query_s > FIX_MAX_AGE_S:
+    settings = config.mavlink
+    if settings.link and settings.send_fixes and t_query_s > FIX_MAX_AGE_S:
         return wrong(what, FindingCode.QUERY_TOO_SLOW, t_query_s=t_query_s, limit_s=FIX_MAX_AGE_S)
     found = {"technique": technique, "cost": cost, "confidence": confidence}
     return fine(what, FindingCode.MAP_READY, path=config.map, t_query_s=t_query_s, **found)
 
 
-def _check_source(what: str, config: Config, offline: bool) -> Finding:
-    uri = config.source.uri
+def _check_source(what: str, settings: SourceConfig, offline: bool) -> Finding:
+    uri = settings.uri
     if uri is None:
         return replace(wrong(what, FindingCode.NO_SOURCE), exit_code=UsageError.exit_code)
     if not offline:
-        return check_frame(what, config.source)
-    load_calibrated_lens(config.source)
+        return check_frame(what, settings)
+    load_calibrated_lens(settings)
     if is_live(uri) and (cause := missing_cause(uri)):
         return wrong(what, FindingCode.CAMERA_ABSENT, problem=cause)
     with closing(open_source(uri, live=True)) as source:

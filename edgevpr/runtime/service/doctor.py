@@ -11,6 +11,7 @@ from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.asking import HEARTBEAT_WAIT_S, AutopilotReading, Inquiry, read_autopilot
 from edgevpr.mavlink.signing import MEANING, open_signing
 from edgevpr.mavlink.wire import mavlink
+from edgevpr.power.boards import load_board
 from edgevpr.runtime.service.camera import check_camera, check_frame
 from edgevpr.runtime.service.finding import Finding, check_machine, fine, refuse, run_check, wrong
 from edgevpr.runtime.service.findingcodes import FindingCode
@@ -27,14 +28,14 @@ def doctor(config: Config, address: LinkAddress) -> tuple[list[Finding], Autopil
     """Check the autopilot at the other end of the link `address`, and this machine. Return the findings, and what was
     read from the autopilot (None: nothing could be read). Raises ConfigError for a board that is unknown or a signing
     key that cannot be used."""
-    settings = config.mavlink
+    settings, source = config.mavlink, config.source
     signing = open_signing(settings, to_ask=True)
-    of_machine = list(check_machine(config, address))
-    if (uri := config.source.uri) and is_live(uri):
+    of_machine = list(check_machine(load_board(config.board), config.log, address))
+    if (uri := source.uri) and is_live(uri):
         of_camera = list(check_camera(uri))
         if all(finding.ok for finding in of_camera):
             waiting(f"waiting for a frame of {uri}")
-            of_camera.append(run_check("frames", lambda what: check_frame(what, config.source)))
+            of_camera.append(run_check("frames", lambda what: check_frame(what, source)))
         of_machine += of_camera
     waiting(f"asking the autopilot at {address}")
     reading = None

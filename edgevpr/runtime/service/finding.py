@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from edgevpr.core.config import Config, LogConfig
+from edgevpr.core.config import LogConfig
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.files import shipped
 from edgevpr.core.reasons import Code, Reason, ReasonCode
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.power import machine
-from edgevpr.power.boards import load_board
+from edgevpr.power.boards import Board
 from edgevpr.runtime.service.findingcodes import FindingCode
 
 LOG_ROOM_MB = 10  # some hours of queries
@@ -74,13 +74,15 @@ def format_findings(findings: Iterable[Finding]) -> Iterator[str]:
         yield from (f"{'':<22}change: {change}" for change in finding.changes)
 
 
-def check_machine(config: Config, address: LinkAddress | None, root: Path = Path("/")) -> Iterator[Finding]:
-    """Check this machine for a flight with `config` over the link `address` (None: no link). `root` is the root of the
-    file system with /proc, /sys and /dev. Raises ConfigError if the board is unknown."""
-    yield _check_memory(load_board(config.board).memory_max_mb, root)
+def check_machine(
+    board: Board, log: LogConfig, address: LinkAddress | None, root: Path = Path("/")
+) -> Iterator[Finding]:
+    """Check this machine, as `board`, for a flight with a `log` over the link `address` (None: no link). `root` is the
+    root of the file system with /proc, /sys and /dev."""
+    yield _check_memory(board.memory_max_mb, root)
     if address and address.kind == "serial":
         yield check_device("serial", address.where, root)
-    yield check_log(config.log)
+    yield check_log(log)
 
 
 def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:

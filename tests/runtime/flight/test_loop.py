@@ -7,7 +7,7 @@ from fakes import FakeSource
 from flights import of_kind
 from pictures import textured
 
-from edgevpr.core.config import load_config
+from edgevpr.core.config import SourceConfig
 from edgevpr.core.errors import ImageError
 from edgevpr.runtime.flight import systemd
 from edgevpr.runtime.flight.clock import Pace
@@ -136,10 +136,10 @@ def test_a_flight_over_pictures_with_times_takes_them_at_their_times(flight, clo
 
 
 def test_the_rate_of_a_timed_flight_is_that_at_which_most_pictures_come():
-    config = load_config(None, {"source.rate_hz": 1.0})
-    assert apply_recorded_rate(config, [0.5, 0.0, 0.5, 60.0]).source.rate_hz == 2.0
-    assert apply_recorded_rate(config, [1e-6, 1e-6]).source.rate_hz == 60.0
-    assert apply_recorded_rate(config, []) is config
+    source = SourceConfig(rate_hz=1.0)
+    assert apply_recorded_rate(source, [0.5, 0.0, 0.5, 60.0]).rate_hz == 2.0
+    assert apply_recorded_rate(source, [1e-6, 1e-6]).rate_hz == 60.0
+    assert apply_recorded_rate(source, []) is source
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from edgevpr.core.config import load_config
+from edgevpr.core.config import LogConfig
 from edgevpr.core.files import shipped
 from edgevpr.mavlink.address import parse_link
+from edgevpr.power.boards import load_board
 from edgevpr.runtime.service.finding import check_device, check_machine
 from edgevpr.runtime.service.findingcodes import FindingCode
 
@@ -33,8 +34,8 @@ def root(tmp_path) -> Path:
 
 
 def find(root: Path, link: str = "udpin:127.0.0.1:14550") -> dict:
-    config = load_config(None, {"log.path": str(root.parent / "flight.jsonl"), "board": "rpi-zero-2w"})
-    return {finding.what: finding for finding in check_machine(config, parse_link(link), root)}
+    board, log = load_board("rpi-zero-2w"), LogConfig(path=str(root.parent / "flight.jsonl"))
+    return {finding.what: finding for finding in check_machine(board, log, parse_link(link), root)}
 
 
 def test_check_machine_finds_nothing_wrong_and_writes_nothing(root, tmp_path):
