@@ -17,6 +17,7 @@ from edgevpr.cli.shared import (
     load_command_config,
     parse_parameters,
     parse_value,
+    path_of,
     positive,
     report,
     show,
@@ -43,7 +44,9 @@ def add(commands: Any) -> None:
         metavar="M",
         help="distance in metres that counts as near (default: 25)",
     )
-    parser.add_argument("--out", metavar="FOLDER", help="folder for results.json, results.csv and answers.csv")
+    parser.add_argument(
+        "--out", metavar="FOLDER", help="folder for results.json and results.csv; an interrupted run resumes"
+    )
     parser.add_argument("--similarity", nargs="+", metavar="FILE", help="evaluate stored similarity matrices (.npy)")
     parser.add_argument("--form", default="float", metavar="A,B", help=f"of vectors: {', '.join(FORMS)} (float)")
     parser.add_argument("--exact", action="store_true", help="compare all places in full; too slow for a flight")
@@ -62,7 +65,7 @@ def add(commands: Any) -> None:
 
 def evaluate(args: Namespace) -> int:
     """Run `eval`: measure stored similarities, or rows on data sets, and print the results. With --out they are written
-    there."""
+    there, and rows that an earlier run measured are reused."""
     if args.similarity:
         return _measure_similarities(args)
     from edgevpr.lab.evaluate.evaluate import MatchOptions
@@ -78,7 +81,7 @@ def evaluate(args: Namespace) -> int:
         known=args.known,
     )
     plan = Plan(sets=sets, rows=rows, options=options, salience=config.salience)
-    outcome = measure(plan, progress)
+    outcome = measure(plan, path_of(args.out), progress)
     content = outcome.as_json()
     if not content["results"]:
         raise next(iter(outcome.failed.values()))
