@@ -177,7 +177,8 @@ def check_fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
     if reachable_hz < demand.rate_hz:
         shortfalls.append(f"it reaches {_round_down(reachable_hz):g} Hz of {demand.rate_hz:g}")
     if query.wall_s > FIX_MAX_AGE_S:
-        shortfalls.append(too_late(query.wall_s))
+        limit = f"no fix of a frame older than {FIX_MAX_AGE_S:g} s is ever sent"
+        shortfalls.append(f"a query takes {query.wall_s:.1f} s, and {limit}")
     return Fit(
         t_query_s=query.wall_s,
         cpu_s=query.cpu_s,
@@ -187,11 +188,6 @@ def check_fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
         reachable_hz=reachable_hz,
         misfit=f"does not fit: {' and '.join(shortfalls)}" if shortfalls else None,
     )
-
-
-def too_late(t_query_s: float) -> str:
-    """Return a text that says that queries of `t_query_s` seconds are too slow for their fixes to be sent."""
-    return f"a query takes {t_query_s:.1f} s, and no fix of a frame older than {FIX_MAX_AGE_S:g} s is ever sent"
 
 
 def list_preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:

@@ -39,8 +39,7 @@ def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
     findings = [fine("configuration", FindingCode.FILE_USABLE, path=str(config_path))]
     try:
         board = resolve_board(load_board(config.board), source, config.memory)
-        known = FindingCode.BOARD_KNOWN
-        findings.append(fine("board", known, board=board.title, memory_mb=board.memory_max_mb))
+        findings.append(fine("board", FindingCode.BOARD_KNOWN, board=board.title, memory_mb=board.memory_max_mb))
         findings.append(run_check("map", lambda what: _check_map(what, config, board)))
     except ConfigError as error:  # then nothing is known of what the map would take
         findings.append(refuse("board", error))
@@ -49,7 +48,7 @@ def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
     waiting("waiting for the flight controller")
     findings.append(run_check("link", lambda what: _check_link(what, config.mavlink, offline)))
     waiting("")
-    return [*findings, check_log(config.log)]
+    return [*findings, run_check("log", lambda what: check_log(what, config.log.path))]
 
 
 def _check_map(what: str, config: Config, board: Board) -> Finding:

@@ -82,7 +82,7 @@ def check_machine(
     yield _check_memory(board.memory_max_mb, root)
     if address and address.kind == "serial":
         yield check_device("serial", address.where, root)
-    yield check_log(log)
+    yield run_check("log", lambda what: check_log(what, log.path))
 
 
 def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
@@ -114,14 +114,10 @@ def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
     return wrong(what, FindingCode.DEVICE_DENIED, *changes, user=os.getuid(), **access)
 
 
-def check_log(log: LogConfig) -> Finding:
-    """Check that the flight log can be written."""
-    if path := log.path:
-        return run_check("log", lambda what: _check_log(what, path))
-    return fine("log", FindingCode.NO_LOG)
-
-
-def _check_log(what: str, file: str) -> Finding:
+def check_log(what: str, file: str | None) -> Finding:
+    """Check that the flight log `file` can be written, if there is one."""
+    if not file:
+        return fine(what, FindingCode.NO_LOG)
     # A log is not opened for the check: if root checked, it would leave a file that the service may not write.
     path = Path(file).absolute()
     if path.is_dir() or not path.parent.is_dir():

@@ -87,8 +87,7 @@ def _dry(choice: Choice, reading: AutopilotReading) -> Finding:
     change = "VISO_TYPE=0"
     if choice.channel is Channel.GPS_INPUT:
         change = f"{own_name(reading.parameters, RECEIVERS[choice.receiver])}={0 if choice.receiver == SECOND else 1}"
-    code = FindingCode.DRY_RUN_NOT_ARMED
-    return wrong("channel", code, change, channel=choice.channel.name, vehicle=reading.vehicle)
+    return wrong("channel", FindingCode.DRY_RUN_NOT_ARMED, change, channel=choice.channel.name, vehicle=reading.vehicle)
 
 
 def _px4_findings(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Finding]:
