@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Where this is set, each of the hundreds of processes that the tests start compiles edgevpr anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig never-worse from-space tilted sites sweeps clean
+.PHONY: demo test test-fast test-benchmarks docs package lint results bench thesis bench-arm64 hostile rig never-worse from-space tilted sites sweeps mutants clean
 
 demo: $(VENV)/installed
 	$(BIN)/edgevpr demo --out demo_out
@@ -104,6 +104,12 @@ from-space: $(VENV)/installed
 tilted: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[maps]'
 	$(BIN)/python benchmarks/tilted.py
+
+# Changes of the decisions that keep a wrong position from an aircraft, which their tests must notice, into
+# benchmarks/results/: half an hour. It goes on in mutants_work/, where those that were noticed are not made again.
+mutants: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check cosmic-ray==8.7.0
+	$(BIN)/python benchmarks/mutants.py
 
 clean:
 	rm -rf $(VENV) demo_out dist build site

@@ -7,7 +7,6 @@ notices survives. `benchmarks/mutants.yaml` names the modules, their tests, the 
 # A mutant is only in the memory of a process forked for it: no file ever holds one, also if the run is killed, and what
 # the module imports is loaded once. What was killed is kept in mutants_work/.
 
-import argparse
 import json
 import os
 import re
@@ -29,18 +28,14 @@ from cosmic_ray.plugins import get_operator
 
 PLAN = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
 WORK = base.REPOSITORY / "mutants_work"
+JOBS = int(os.environ.get("JOBS", 2))
 MAX_CPU_S = 60  # of the tests of one mutant; one that takes longer counts as killed
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("modules", nargs="*", default=list(PLAN["modules"]), help="files of edgevpr/ (default: all)")
-    parser.add_argument("--jobs", type=int, default=2, help="number of processes (default: 2)")
-    parser.add_argument("--anew", action="store_true", help="run the mutants that were killed before as well")
-    args = parser.parse_args()
     WORK.mkdir(exist_ok=True)
-    for module in args.modules:
-        if run_forked(lambda module=module: run_module(module, args.jobs, args.anew)):
+    for module in sys.argv[1:] or PLAN["modules"]:
+        if run_forked(lambda module=module: run_module(module)):
             return 1
     write_page()
     return 0
@@ -63,17 +58,13 @@ def fork(task: Callable[[], int]) -> int:
         os._exit(1)
 
 
-def name_module(path: str) -> str:
-    return path.removesuffix(".py").replace("/", ".")
-
-
 def kept_outcomes(module: str) -> Path:
     """Return the file that says of each change of a module whether it was killed."""
-    return WORK / f"{name_module(module)}.json"
+    return WORK / Path(module).with_suffix(".json").name
 
 
 def list_mutants(source: str) -> Iterator[tuple[str, str]]:
-    """Yield the mutants of a module that compile: the change of its line, and the whole source."""
+    """Yield the mutants of a module: the change of its line, and the whole source."""
     seen = Counter[str]()
     for name in PLAN["operators"]:
         operator = get_operator(f"core/{name}")()
@@ -81,34 +72,26 @@ def list_mutants(source: str) -> Iterator[tuple[str, str]]:
         for occurrence in range(positions):
             mutant = mutate_code(source, operator, occurrence)
             lines = zip(source.splitlines(), mutant.splitlines(), strict=True)
-            change = " -> ".join(line.strip() for line in next(pair for pair in lines if pair[0] != pair[1]))
-            if re.match(PLAN["unchanged"], change) or not compiles(mutant):
-                continue
-            seen[change] += 1
-            yield f"{change} ({seen[change]})", mutant
+            change = " => ".join(line.strip() for line in next(pair for pair in lines if pair[0] != pair[1]))
+            if not re.match(PLAN["unchanged"], change):
+                seen[change] += 1
+                yield f"{change} ({seen[change]})", mutant
 
 
-def compiles(source: str) -> bool:
-    try:
-        compile(source, "mutant", "exec")
-    except SyntaxError:
-        return False
-    return True
-
-
-def run_module(module: str, jobs: int, anew: bool) -> int:
+def run_module(module: str) -> int:
     """Run the tests of a module on each of its mutants, and keep which ones were killed."""
-    source, name, kept = (base.REPOSITORY / module).read_text(), name_module(module), kept_outcomes(module)
+    source, kept = (base.REPOSITORY / module).read_text(), kept_outcomes(module)
+    name = module.removesuffix(".py").replace("/", ".")
     pytest.main(["--collect-only", "-qq", "-p", "no:xdist", *PLAN["modules"][module]])  # loads all that is needed
     forget(name)
     if run_forked(lambda: run_tests(module, name, source, is_quiet=False)):
         return 1
-    before = json.loads(kept.read_text()) if kept.exists() and not anew else {}
+    before = json.loads(kept.read_text()) if kept.exists() else {}
     mutants = dict(list_mutants(source))
     killed = {change: before.get(change) for change in mutants}
     waiting, running = [change for change in mutants if not killed[change]], dict[int, str]()
     while waiting or running:
-        while waiting and len(running) < jobs:
+        while waiting and len(running) < JOBS:
             change = waiting.pop()
             running[fork(lambda source=mutants[change]: run_tests(module, name, source))] = change
         pid, status = os.wait()
@@ -152,7 +135,7 @@ def write_page() -> None:
         kept = kept_outcomes(module)
         killed = json.loads(kept.read_text()) if kept.exists() else {}
         for change in (change for change, is_killed in killed.items() if not is_killed):
-            after = change.rpartition(" (")[0].partition(" -> ")[2]
+            after = change.rpartition(" (")[0].partition(" => ")[2]
             reasons = (why for why, lines in PLAN["survivors"].items() if after in lines)
             survivors.append({"module": Path(module).name, "mutant": after, "why": next(reasons, "**a gap**")})
         rows.append({"module": module, "mutants": len(killed), "killed": sum(killed.values())})

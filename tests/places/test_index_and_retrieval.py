@@ -13,7 +13,7 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.places import retrieve
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Ranking, best_scanned, elsewhere, margin, named, together
+from edgevpr.places.retrieve import Query, elsewhere, margin, named, unmoved_outside_neighbourhood
 
 
 @pytest.fixture(scope="module")
@@ -236,6 +236,8 @@ def test_of_many_candidates_those_that_look_best_at_a_glance_are_compared_in_ful
     assert names[:3] == ["40", "36", "32"]
     assert len(names) == 8, "the others come last, as they looked"
     assert set(ranking.compared) == set(ranking.slots[:3].tolist())
+    whole = [named(ranking, index, place_map)[number].match for number in (0, -1)]
+    assert whole == [ranking.compared[ranking.slots[0]], FineMatch(float(ranking.scores[-1]))]
     assert (np.diff(ranking.scores) <= 0).all()
 
 
@@ -270,71 +272,41 @@ def test_where_the_scan_counts_it_is_part_of_the_score(ruler, candidates):
     assert [ranking.compared[slot].score for slot in ranking.slots.tolist()] == pytest.approx(expected)
 
 
-def tried(by_hypothesis, count, among=None):
-    among = np.ones(len(by_hypothesis), bool) if among is None else among
-    return dict(best_scanned(by_hypothesis.max(axis=1), by_hypothesis, among, count))
+@pytest.mark.parametrize(
+    ("usual", "candidates", "glanced", "compared"), [(20, 25, 0, 25), (25, 25, 25, 3), (20, 24, 24, 3), (20, 3, 0, 3)]
+)
+def test_nothing_is_chosen_at_a_glance_where_all_or_few_are_compared(ruler, usual, candidates, glanced, compared):
+    _, place_map, index = ruler
+    technique = Hasty()
+    technique.candidates = usual
+    rank(technique, technique.encode(41), place_map, index, candidates)
+    assert (len(technique.glanced), technique.compared) == (glanced, compared)
 
 
-def test_of_many_places_the_best_hypotheses_of_all_are_tried():
-    by_hypothesis = np.random.default_rng(1).random((500, 24), dtype=np.float32)
-    found = tried(by_hypothesis, 60)
-    assert sum(len(each) for each in found.values()) == 60
-    least = min(by_hypothesis[slot, each].min() for slot, each in found.items())
-    left = by_hypothesis.copy()
-    for slot, each in found.items():
-        left[slot, each] = 0
-    assert left.max() <= least
-    assert len(found) > 20
+def test_out_of_reach_five_are_compared_however_few_in_full(ruler):
+    _, place_map, index = ruler
+    technique = Hasty()
+    rank(technique, technique.encode(41), place_map, index, 8, in_reach=within(index, *range(0, 60, 4)))
+    assert technique.compared == 3 + 5
 
 
-@pytest.mark.parametrize(("places", "most"), [(1, 24), (2, 24), (5, 12), (19, 3), (20, 3), (60, 3)])
-def test_where_there_are_few_places_more_hypotheses_of_each_are_tried(places, most):
-    by_hypothesis = np.random.default_rng(3).random((places, 24), dtype=np.float32)
-    by_hypothesis[0] += 1
-    found = tried(by_hypothesis, 60)
-    assert len(found[0]) == most
-    assert sum(len(each) for each in found.values()) == min(60, places * most)
+@pytest.mark.parametrize(("candidates", "apart_m", "compared"), [(3, 60.0, 3 + 5), (2, 40.0, 2), (3, 40.0, 3)])
+def test_rivals_are_compared_where_no_candidate_is_one(ruler, candidates, apart_m, compared):
+    technique, place_map, index = ruler
+    rank(technique, technique.encode(41), place_map, index, candidates, apart_m)
+    assert technique.compared == compared
 
 
-def test_what_is_out_of_the_question_is_not_tried_and_nor_are_more_places_for_it():
-    by_hypothesis = np.random.default_rng(4).random((500, 24), dtype=np.float32)
-    by_hypothesis[:, 3:] = -np.inf
-    by_hypothesis[7] = 0.5  # one place of which nothing is known does not change what all take
-    found = tried(by_hypothesis, 10)
-    assert sum(len(each) for each in found.values()) == 10
-    assert {number for slot, each in found.items() for number in each if slot != 7} == {0, 1, 2}
-    by_hypothesis[:] = -np.inf
-    assert not tried(by_hypothesis, 10)
+class Unmoved(Ruler):
+    def unmoved(self, query, fine):
+        return FineMatch(float(fine[0]))
 
 
-def test_only_hypotheses_of_the_places_asked_for_are_tried():
-    by_hypothesis = np.random.default_rng(5).random((500, 24), dtype=np.float32)
-    among = np.zeros(500, bool)
-    assert not tried(by_hypothesis, 10, among)
-    among[100:103] = True
-    assert sorted(tried(by_hypothesis, 10, among)) == [100, 101, 102]
-
-
-def ranking(compared, rest=(), unread=()):
-    slots = [*compared, *(slot for slot, _ in rest)]
-    scores = [*compared.values(), *(score for _, score in rest)]
-    matches = {slot: FineMatch(score) for slot, score in compared.items()}
-    return Ranking(
-        slots=np.array(slots), scores=np.array(scores, np.float32), compared=matches, unread=np.array(unread, np.intp)
-    )
-
-
-def test_of_a_place_that_both_compared_the_better_match_counts():
-    one = ranking({4: 0.3, 7: 0.1}, rest=[(2, 0.09), (5, 0.08)])
-    other = ranking({7: 0.5, 2: 0.06}, rest=[(9, 0.05), (5, 0.04)], unread=[3])
-    both = together(one, other)
-    assert both.slots.tolist() == [7, 4, 2, 5, 9]
-    np.testing.assert_allclose(both.scores, [0.5, 0.3, 0.06, 0.06, 0.05], rtol=1e-6)
-    assert {slot: match.score for slot, match in both.compared.items()} == {4: 0.3, 7: 0.5, 2: 0.06}
-    assert both.unread.tolist() == [3]
-
-
-def test_together_has_tried_the_rotations_of_both():
-    known, all_of_them = (dataclasses.replace(ranking({1: 0.2}), tried=tried) for tried in (0.125, 1.0))
-    assert together(known, known).tried == 0.25
-    assert together(known, all_of_them).tried == 1.0
+def test_a_few_places_all_over_the_map_are_asked_unmoved(ruler):
+    _, place_map, index = ruler
+    technique = Unmoved()
+    query = Query(technique=technique, descriptor=technique.encode(0), place_map=place_map, index=index)
+    place_map.left_out[25] = "gone"
+    asked = [match.score for match in unmoved_outside_neighbourhood(query, 0, 100.0)]
+    assert asked == list(range(12, 96, 12)), "of 21 places elsewhere that can be read, every third"
+    assert unmoved_outside_neighbourhood(query, 15, 1e6)[0].score == 0.0, "only neighbours of one without a position"

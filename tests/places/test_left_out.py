@@ -129,6 +129,19 @@ def test_where_most_cannot_be_read_the_file_is_at_fault_and_all_come_back_with_i
     assert rank(technique, technique.encode(142), place_map, index).slots[0] == 14
 
 
+@pytest.mark.parametrize(
+    ("damaged", "candidates", "error"),
+    [((140, 130), 3, PlaceError), ((140, 130, 150), 5, MapError), ((140, 130, 150), 6, PlaceError)],
+)
+def test_the_file_is_at_fault_where_three_and_most_cannot_be_read(ruler, damaged, candidates, error):
+    technique, place_map, index = ruler
+    damage(place_map, "fine = x'00'", *damaged)
+    with pytest.raises(MapError) as caught:
+        rank(technique, technique.encode(142), place_map, index, candidates)
+    assert type(caught.value) is error
+    assert len(place_map.left_out) == (len(damaged) if error is PlaceError else 0)
+
+
 def test_rivals_elsewhere_are_found_among_the_places_that_can_be_read(ruler):
     technique, place_map, index = ruler
     place_map.left_out.update({16: "gone", 14: "gone"})
@@ -145,6 +158,7 @@ def test_of_one_stage_a_place_left_out_is_still_a_rival_and_never_named(short):
         named(ranking, index, place_map, 1)
     again = rank(technique, technique.encode(142), place_map, index)
     np.testing.assert_array_equal(again.scores, ranking.scores)
+    assert len(rank(technique, technique.encode(142), place_map, index, 3).slots) == 30, "rows are all there is"
     with pytest.raises(PlaceError, match="place 15"):
         named(again, index, place_map, 1)
     other = rank(technique, technique.encode(132), place_map, index)

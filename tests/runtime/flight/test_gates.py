@@ -17,6 +17,7 @@ from edgevpr.frames.level import Levelled, View
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.consistency import ComparedFix
+from edgevpr.runtime.flight.drift import INERTIAL, INERTIAL_PX4, RECKONED
 from edgevpr.runtime.flight.navigation import NavState
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.output import Output
@@ -90,7 +91,6 @@ GPS = {"has_gps": True}
     [
         (Channel.COMMAND, {"accuracy_m": 50.0}, True),
         (Channel.COMMAND, {"accuracy_m": 50.1}, False),
-        (Channel.COMMAND, {"accuracy_m": None}, False),
         (Channel.COMMAND, {"shown_ago_s": 60.0}, True),
         (Channel.COMMAND, {"shown_ago_s": 60.1}, False),
         (Channel.COMMAND, {"shown_ago_s": NEVER_S, "gps_ago_s": 60.0}, True),
@@ -100,7 +100,6 @@ GPS = {"has_gps": True}
         (Channel.GPS_INPUT, {"shown_ago_s": NEVER_S, "gps_ago_s": 3.0}, True),
         (Channel.GPS_INPUT, {"shown_ago_s": NEVER_S, "gps_ago_s": 3.1}, False),
         (Channel.SENSOR, {"shown_ago_s": 5.0}, True),
-        (Channel.SENSOR, {"shown_ago_s": 5.1}, False),
         (Channel.VISION, {"shown_ago_s": 5.1}, False),
         (Channel.SENSOR, {"shown_ago_s": NEVER_S, "gps_ago_s": 0.0}, False),
     ],
@@ -226,14 +225,15 @@ def test_age_of_pictures_is_found_by_the_path(channel, has_gps, rests):
 
 
 def test_frame_claims_an_error_of_the_height_that_pictures_show():
-    navigator = navigate()
+    navigator = navigate(reports={"velocity_m_s": (30.0, 40.0)})
     navigator.hear_frame(matched())
     navigator.correct_height(1.2)
-    navigator.hear_frame(matched(), is_query=False)
+    navigator.hear_frame(matched(vehicle=vehicle_at(*HOME, NOW_S)), is_query=False)
     navigator.correct_height(1.0, 0.3)
     navigator.hear_frame(matched())
     navigator.hear_frame(matched(frame=None))
     frames = navigator._navigation.frames
+    assert [frame.sd_m for frame, _ in frames] == pytest.approx([50 * FRAME_TIME_SD_S, 0.0, 50 * FRAME_TIME_SD_S])
     assert [frame.scale_sd for frame, _ in frames] == pytest.approx([0.0, 0.2, 0.3])
     assert [is_query for _, is_query in frames] == [True, False, True]
 
@@ -292,8 +292,8 @@ def test_fix_is_sent_where_it_improves_the_position_of_the_autopilot():
     same = navigate(reports=reports, off_m=(5.0, -2.0)).advise(matched(), NOW_S)
     assert same.why.code is ReasonCode.NOT_BETTER
     assert same.why.parameters == pytest.approx({"off_m": 0.0, "accuracy_m": 2.0}, abs=0.01)
-    assert navigate(off_m=(2.82, 0.0)).advise(matched(), NOW_S).fix is None
-    assert navigate(off_m=(2.84, 0.0)).advise(matched(), NOW_S).fix
+    assert navigate(accuracy_m=3.0, off_m=(4.23, 0.0)).advise(matched(), NOW_S).fix is None
+    assert navigate(accuracy_m=3.0, off_m=(4.25, 0.0)).advise(matched(), NOW_S).fix
     for every_s, ahead_m in ((1.0, (2.0, -1.5)), (0.2, (0.8, -0.6))):
         fix = navigate(every_s=every_s, off_m=(10.0, 0.0), drift_m_s=(8.0, -6.0)).advise(matched(), NOW_S).fix
         assert offset_m(*HOME, fix.lat_deg, fix.lon_deg) == pytest.approx((10.0 + ahead_m[0], ahead_m[1]), abs=0.01)
@@ -347,3 +347,4 @@ def test_navigation_begins_anew_where_the_path_errs_otherwise():
         navigator.hear_channel(channel)
         seen.append(navigator._navigation)
     assert [one is other for one, other in pairwise(seen)] == [True, False, True, False, True]
+    assert [each._drift for each in seen[::2]] == [RECKONED, INERTIAL_PX4, INERTIAL]

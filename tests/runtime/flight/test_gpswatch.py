@@ -10,6 +10,7 @@ from edgevpr.core.geodesy import moved
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Position
 from edgevpr.frames.level import View
+from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.gpswatch import GpsWatch
@@ -40,9 +41,6 @@ class Watched:
     def matches(self, *offsets_m, begin_s=0):
         """Watch a match a second, each of another place."""
         return [self.match(off_m, second, (second,)) for second, off_m in enumerate(offsets_m, begin_s)][-1]
-
-    def reports(self):
-        return [text for _, text in self.link.texts()]
 
     def distances_m(self):
         return [each.value for each in self.link.sent if getattr(each, "name", "") == "vpr_gps_m"]
@@ -129,8 +127,8 @@ def test_gps_is_believed_against_a_map_that_has_not_agreed_with_it(agreeing, bel
 def test_gps_is_reported_again_when_its_distance_has_doubled():
     watched = Watched()
     watched.matches(100.0, 100.0, 100.0, 199.0, 201.0, 202.0, *[0.0] * 25)
-    says = [f"edgevpr: GPS is {off_m} m from the map's position" for off_m in (100, 201)]
-    assert watched.reports() == [*says, "edgevpr: GPS agrees with the map again"]
+    says = [(Severity.WARNING, f"edgevpr: GPS is {off_m} m from the map's position") for off_m in (100, 201)]
+    assert watched.link.texts() == [*says, (Severity.INFO, "edgevpr: GPS agrees with the map again")]
     assert watched.distances_m()[:5] == pytest.approx([100.0, 100.0, 100.0, 199.0, 201.0], abs=0.01)
 
 

@@ -1,0 +1,93 @@
+"""Rankings: which hypotheses are tried, and how two rankings of a query are merged."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from ranking import index_of
+
+from edgevpr.core.contract import FineMatch
+from edgevpr.places.retrieve import Ranking, best_scanned, elsewhere, together
+
+
+def tried(by_hypothesis, count, among=None):
+    among = np.ones(len(by_hypothesis), bool) if among is None else among
+    return dict(best_scanned(by_hypothesis.max(axis=1), by_hypothesis, among, count))
+
+
+def test_of_many_places_the_best_hypotheses_of_all_are_tried():
+    by_hypothesis = np.random.default_rng(1).random((500, 24), dtype=np.float32)
+    found = tried(by_hypothesis, 60)
+    assert sum(len(each) for each in found.values()) == 60
+    least = min(by_hypothesis[slot, each].min() for slot, each in found.items())
+    left = by_hypothesis.copy()
+    for slot, each in found.items():
+        left[slot, each] = 0
+    assert left.max() <= least
+    assert len(found) > 20
+
+
+@pytest.mark.parametrize(("places", "most"), [(1, 24), (2, 24), (5, 12), (19, 3), (20, 3), (60, 3)])
+def test_where_there_are_few_places_more_hypotheses_of_each_are_tried(places, most):
+    by_hypothesis = np.random.default_rng(3).random((places, 24), dtype=np.float32)
+    by_hypothesis[0] += 1
+    found = tried(by_hypothesis, 60)
+    assert len(found[0]) == most
+    assert sum(len(each) for each in found.values()) == min(60, places * most)
+
+
+def test_what_is_out_of_the_question_is_not_tried_and_nor_are_more_places_for_it():
+    by_hypothesis = np.random.default_rng(4).random((500, 24), dtype=np.float32)
+    by_hypothesis[:, 3:] = -np.inf
+    by_hypothesis[7] = 0.5  # one place of which nothing is known does not change what all take
+    found = tried(by_hypothesis, 10)
+    assert sum(len(each) for each in found.values()) == 10
+    assert {number for slot, each in found.items() for number in each if slot != 7} == {0, 1, 2}
+    by_hypothesis[:] = -np.inf
+    assert not tried(by_hypothesis, 10)
+
+
+def test_only_hypotheses_of_the_places_asked_for_are_tried():
+    by_hypothesis = np.random.default_rng(5).random((500, 24), dtype=np.float32)
+    among = np.zeros(500, bool)
+    assert not tried(by_hypothesis, 10, among)
+    among[100:103] = True
+    assert sorted(tried(by_hypothesis, 10, among)) == [100, 101, 102]
+
+
+def ranking(compared, rest=(), unread=()):
+    slots = [*compared, *(slot for slot, _ in rest)]
+    scores = [*compared.values(), *(score for _, score in rest)]
+    matches = {slot: FineMatch(score) for slot, score in compared.items()}
+    return Ranking(
+        slots=np.array(slots), scores=np.array(scores, np.float32), compared=matches, unread=np.array(unread, np.intp)
+    )
+
+
+def test_of_a_place_that_both_compared_the_better_match_counts():
+    one = ranking({4: 0.3, 7: 0.1}, rest=[(2, 0.09), (5, 0.08)])
+    other = ranking({7: 0.5, 2: 0.06}, rest=[(9, 0.05), (5, 0.04)], unread=[3])
+    both = together(one, other)
+    assert both.slots.tolist() == [7, 4, 2, 5, 9]
+    np.testing.assert_allclose(both.scores, [0.5, 0.3, 0.06, 0.06, 0.05], rtol=1e-6)
+    assert {slot: match.score for slot, match in both.compared.items()} == {4: 0.3, 7: 0.5, 2: 0.06}
+    assert both.unread.tolist() == [3]
+
+
+def test_together_has_tried_the_rotations_of_both():
+    known, all_of_them = (dataclasses.replace(ranking({1: 0.2}), tried=tried) for tried in (0.125, 1.0))
+    assert together(known, known).tried == 0.25
+    assert together(known, all_of_them).tried == 1.0
+
+
+def test_promote_moves_a_place_to_the_front():
+    promoted = ranking({4: 0.3, 7: 0.2, 2: 0.1}).promote(2)
+    assert promoted.slots.tolist() == [2, 4, 7]
+    np.testing.assert_allclose(promoted.scores, [0.1, 0.3, 0.2], rtol=1e-6)
+
+
+def test_elsewhere_is_beyond_the_two_beside_and_not_of_the_same_places():
+    index, slots = index_of(range(10, 17)), np.arange(7)
+    assert elsewhere(index, 3, slots, 50.0).tolist() == [True, False, False, False, False, False, True]
+    assert elsewhere(index, 3, slots, 50.0, same=(10,)).tolist() == [False] * 6 + [True]
+    assert elsewhere(index, 3, slots, 50.0, beside=3).tolist() == [False] * 7
