@@ -1,5 +1,6 @@
 """The watch over our own positions: withdrawn where they cannot be right, back with proof."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,47 +11,72 @@ from edgevpr.mavlink.messages import TEXT_BYTES
 from edgevpr.runtime.flight.output import Output, OutputWatch
 
 HOME = 50.0, 8.0
-LONG_AGO_S = -100.0
+BEGIN_S = 1000.0
+AWAY = {"off_m": 15.1}
+REFUSES = {"ratio": 1.01, "has_gps": False}
 
 
-class Watched:
-    """Reports ten times a second; positions are sent all the time."""
-
-    def __init__(self):
-        self.watch, self.now_s = OutputWatch(), 0.0
-
-    def report(self, seconds, *, off_m=0.0, ratio=0.1, has_gps=True, fixed_s=LONG_AGO_S, sends=True):
-        for _ in range(round(10 * seconds)):
-            self.now_s += 0.1
-            if sends:
-                self.watch.note_sent(self.now_s)
-            gps = receiver_at(HOME, 1.0, self.now_s, steady_for_s=60.0) if has_gps else None
-            vehicle = vehicle_at(*moved(*HOME, off_m, 0.0), self.now_s, has_gps=has_gps, gps=gps)
-            self.watch.update(replace(vehicle, innovation_ratio=ratio), fixed_s, has_gps)
-        return self.watch.withdrawn
+def withdrawn(*reports):
+    """What is withdrawn after reports: so many seconds after the first, how far the estimate is from its receiver, the
+    ratio of its innovation, and how long ago a position was sent and a match was believed."""
+    watch = OutputWatch()
+    for after_s, known in reports:
+        known = {"off_m": 0.0, "ratio": 0.1, "has_gps": True, "sd_m": 1.0, "steady_s": 60.0} | known
+        t_s, has_gps = BEGIN_S + after_s, known["has_gps"]
+        watch.note_sent(t_s - known.get("sent_ago_s", 0.0))
+        receiver = receiver_at(HOME, known["sd_m"], t_s, steady_for_s=known["steady_s"]) if has_gps else None
+        vehicle = vehicle_at(*moved(*HOME, known["off_m"], 0.0), t_s, has_gps=has_gps, gps=receiver)
+        fixed_s = t_s - known.get("fixed_ago_s", math.inf)
+        watch.update(replace(vehicle, innovation_ratio=known["ratio"]), fixed_s, has_gps)
+    return watch.withdrawn
 
 
-def test_positions_are_withdrawn_when_the_estimate_leaves_a_good_receiver():
-    watched = Watched()
-    assert watched.report(10, off_m=14.0) is None
-    assert watched.report(3, off_m=30.0) is Output.LEADS_AWAY
-    assert watched.report(20, off_m=0.0, sends=False) is None, "it follows its receiver again"
+@pytest.mark.parametrize(
+    ("last_s", "known", "output"),
+    [
+        (2.0, AWAY, Output.LEADS_AWAY),
+        (1.9, AWAY, None),
+        (2.0, {"off_m": 14.9}, None),
+        (2.0, {"off_m": 20.1, "sd_m": 5.0}, Output.LEADS_AWAY),
+        (2.0, {"off_m": 19.9, "sd_m": 5.0}, None),
+        (2.0, AWAY | {"steady_s": 3.0}, Output.LEADS_AWAY),
+        (2.0, AWAY | {"steady_s": 2.9}, None),
+        (2.0, AWAY | {"sent_ago_s": 10.0}, Output.LEADS_AWAY),
+        (2.0, AWAY | {"sent_ago_s": 10.1}, None),
+        (2.0, AWAY | {"fixed_ago_s": 5.0}, None),
+        (2.0, AWAY | {"fixed_ago_s": 5.1}, Output.LEADS_AWAY),
+        (2.0, AWAY | {"has_gps": False}, None),
+        (3.0, REFUSES, Output.REFUSED),
+        (2.9, REFUSES, None),
+        (3.0, REFUSES | {"ratio": 1.0}, None),
+        (3.0, REFUSES | {"ratio": None}, None),
+        (3.0, REFUSES | {"has_gps": True}, None),
+        (3.0, REFUSES | {"sent_ago_s": 1.0}, Output.REFUSED),
+        (3.0, REFUSES | {"sent_ago_s": 1.1}, None),
+        (3.0, REFUSES | {"fixed_ago_s": 5.0}, None),
+        (3.0, REFUSES | {"fixed_ago_s": 5.1}, Output.REFUSED),
+    ],
+)
+def test_positions_are_withdrawn_that_lead_away_or_are_refused(last_s, known, output):
+    assert withdrawn((0.0, known), (1.0, known), (last_s, known)) is output
+    assert withdrawn((0.0, known), (1.0, {}), (last_s, known)) is None, "not all the time"
 
 
-def test_estimate_that_leaves_a_receiver_is_no_matter_without_positions_of_ours_or_with_a_match():
-    assert Watched().report(20, off_m=30.0, sends=False) is None
-    watched = Watched()
-    for _ in range(20):
-        assert watched.report(1, off_m=30.0, fixed_s=watched.now_s) is None
-
-
-def test_positions_are_withdrawn_when_the_autopilot_refuses_them_until_a_match_proves_them():
-    watched = Watched()
-    assert watched.report(2, ratio=1.5, has_gps=False) is None, "a glitch"
-    assert watched.report(1, ratio=0.5, has_gps=False) is None
-    assert watched.report(4, ratio=1.5, has_gps=False) is Output.REFUSED
-    assert watched.report(30, ratio=0.1, has_gps=False, sends=False) is Output.REFUSED, "silence proves nothing"
-    assert watched.report(1, ratio=0.1, has_gps=False, fixed_s=watched.now_s + 0.5) is None
+@pytest.mark.parametrize(
+    ("known", "output"),
+    [
+        ({"fixed_ago_s": 10.0}, Output.LEADS_AWAY),
+        ({"fixed_ago_s": 9.9}, None),
+        ({"has_gps": False}, Output.LEADS_AWAY),
+        ({}, Output.LEADS_AWAY),
+    ],
+)
+def test_positions_are_withdrawn_until_a_match_or_gps_proves_them(known, output):
+    led_away = (0.0, AWAY), (2.0, AWAY)
+    assert withdrawn(*led_away, (12.0, known)) is output
+    back = {"has_gps": True} | known
+    assert withdrawn(*led_away, (12.1, back)) is (None if back["has_gps"] else output)
+    assert withdrawn(*led_away, (11.5, AWAY), (12.1, AWAY)) is Output.LEADS_AWAY
 
 
 @pytest.mark.parametrize("output", Output)
