@@ -208,7 +208,18 @@ def test_a_ranking_says_how_many_rotations_were_not_ruled_out(ruler_map):
             scores, each = super().coarse_scores(query, rows, mean)
             return scores, np.where([True, False, True], each, -np.inf)
 
-    for technique, tried in ((Turned(), 1.0), (Known(), 2 / 3), (Ruler(), 1.0)):
+    class Tall(Turned):
+        """Of places with an odd number, one of two rotations at one of two heights is left."""
+
+        spec = dataclasses.replace(Ruler.spec, height_ratios=(0.8, 1.0))
+
+        def coarse_scores(self, query, rows, mean, **hints):
+            scores, _ = Ruler.coarse_scores(self, query, rows, mean)
+            is_left = np.ones((len(rows), 4), bool)
+            is_left[1::2, 1:] = False
+            return scores, np.where(is_left, scores[:, None], -np.inf)
+
+    for technique, tried in ((Turned(), 1.0), (Known(), 2 / 3), (Ruler(), 1.0), (Tall(), 0.75)):
         index = load_index(place_map, technique, 10_000)
         assert rank(technique, technique.encode(43), place_map, index, 14).tried == pytest.approx(tried)
 
@@ -290,10 +301,13 @@ def test_out_of_reach_five_are_compared_however_few_in_full(ruler):
     assert technique.compared == 3 + 5
 
 
-@pytest.mark.parametrize(("candidates", "apart_m", "compared"), [(3, 60.0, 3 + 5), (2, 40.0, 2), (3, 40.0, 3)])
-def test_rivals_are_compared_where_no_candidate_is_one(ruler, candidates, apart_m, compared):
+@pytest.mark.parametrize(
+    ("candidates", "apart_m", "reach", "compared"),
+    [(3, 60.0, None, 3 + 5), (2, 40.0, None, 2), (3, 40.0, None, 3), (3, 60.0, (80,), 1 + 5 + 2)],
+)
+def test_rivals_are_compared_where_no_candidate_is_one(ruler, candidates, apart_m, reach, compared):
     technique, place_map, index = ruler
-    rank(technique, technique.encode(41), place_map, index, candidates, apart_m)
+    rank(technique, technique.encode(41), place_map, index, candidates, apart_m, reach and within(index, *reach))
     assert technique.compared == compared
 
 
@@ -309,4 +323,6 @@ def test_a_few_places_all_over_the_map_are_asked_unmoved(ruler):
     place_map.left_out[25] = "gone"
     asked = [match.score for match in unmoved_outside_neighbourhood(query, 0, 100.0)]
     assert asked == list(range(12, 96, 12)), "of 21 places elsewhere that can be read, every third"
+    place_map.left_out[16] = "gone"
+    assert unmoved_outside_neighbourhood(query, 0, 1e6) == [], "the only one elsewhere cannot be read"
     assert unmoved_outside_neighbourhood(query, 15, 1e6)[0].score == 0.0, "only neighbours of one without a position"

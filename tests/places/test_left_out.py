@@ -107,11 +107,21 @@ def test_without_the_right_place_no_other_is_accepted(ruler):
     assert (verdict.accepted, verdict.reason.code) == (False, ReasonCode.PLACE_UNREAD)
 
 
-@pytest.mark.parametrize(("number", "may_be_right"), [(90, True), (100, True), (110, True), (120, False), (80, False)])
-def test_a_place_left_out_may_be_right_if_it_is_one_of_the_three_likeliest(ruler, number, may_be_right):
+@pytest.mark.parametrize(
+    ("shown", "number", "may_be_right"),
+    [
+        *[(101, number, True) for number in (90, 100, 110)],
+        *[(101, number, False) for number in (80, 120)],
+        (138, 70, True),  # its row is nearer to the query's than that of 140, which is the best place
+        (138, 60, False),
+    ],
+)
+def test_a_place_left_out_may_be_right_if_its_row_is_as_like_as_the_best_or_among_three(
+    ruler, shown, number, may_be_right
+):
     technique, place_map, index = ruler
     place_map.left_out[1 + number // 10] = "gone"
-    query = dataclasses.replace(technique.encode(101), coarse=np.array([101], "<f4"))
+    query = dataclasses.replace(technique.encode(shown), coarse=np.array([101], "<f4"))
     ranking = rank(technique, query, place_map, index)
     assert (number // 10 in ranking.unread) is may_be_right
 
@@ -139,6 +149,7 @@ def test_the_file_is_at_fault_where_three_and_most_cannot_be_read(ruler, damaged
     with pytest.raises(MapError) as caught:
         rank(technique, technique.encode(142), place_map, index, candidates)
     assert type(caught.value) is error
+    assert getattr(caught.value, "place_id", 14) == 14
     assert len(place_map.left_out) == (len(damaged) if error is PlaceError else 0)
 
 

@@ -82,7 +82,7 @@ def test_together_has_tried_the_rotations_of_both():
 
 def test_promote_moves_a_place_to_the_front():
     promoted = ranking({4: 0.3, 7: 0.2, 2: 0.1}).promote(2)
-    assert promoted.slots.tolist() == [2, 4, 7]
+    assert (promoted.slots.tolist(), promoted.tried) == ([2, 4, 7], 1.0)
     np.testing.assert_allclose(promoted.scores, [0.1, 0.3, 0.2], rtol=1e-6)
 
 
