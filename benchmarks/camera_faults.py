@@ -32,7 +32,7 @@ from simulated.controller import FlightController
 from simulated.motion import AlongTrack, TrueState
 
 from edgevpr.core.arrays import Image
-from edgevpr.lab.simulate.camera import Camera, CameraPose, lit, photograph
+from edgevpr.lab.simulate.camera import Camera, CameraPose, light_scene, photograph
 from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
     SCENE_WIDTH_M,
@@ -199,7 +199,7 @@ def fly(seconds: float, folder: Path) -> base.Row:
     subprocess.run(
         [*program, "map", "build", place_map, "--images", folder / "images", *look, "--no-calibrate"], check=True
     )
-    ground, lap, rng = lit(scene, flight.light, SEED), Lap(seconds + 60), np.random.default_rng(SEED)
+    ground, lap, rng = light_scene(scene, flight.light, SEED), Lap(seconds + 60), np.random.default_rng(SEED)
     camera = FaultyCamera(lambda: photograph(ground, scene.metres_per_pixel, lap.pose(), CAMERA, flight.light, rng))
     camera.start()
     stop, port = threading.Event(), free_port()

@@ -28,8 +28,8 @@ from shipped_model import FittedSite, shipped_model
 
 from edgevpr.frames.images import list_images
 from edgevpr.lab.evaluate.metrics import roc_auc
-from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, MapAnswer, adapted
-from edgevpr.runtime.recognise.calibration import FEWEST_PLACES
+from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, MapAnswer, adapt_model
+from edgevpr.runtime.recognise.calibration import MIN_PLACES
 from edgevpr.runtime.recognise.confidence import Model
 from edgevpr.runtime.recognise.evidence import (
     AHEAD,
@@ -44,7 +44,7 @@ from edgevpr.runtime.recognise.place_filter import PlaceFilter
 PRECISIONS = (0.9, 0.99, 0.999)
 KINDS = {"forward": (AHEAD, AHEAD_PROVEN), "nadir": (DOWN, DOWN_BARE)}
 FLOWN_ALONG = ("corridor", "grief_stromovka_seasons", "nordland_tiny")  # as the map was made
-_MOST_FLOWN = 250  # queries
+_MAX_FLOWN = 250  # queries
 _BINS = 10
 Rows = dict[str, list[Row]]
 Models = dict[str, Model]  # by the kind of evidence
@@ -119,11 +119,11 @@ def site(rows: Sequence[Row], kind: str, without: str | None = None) -> FittedSi
 def models_without(name: str, rows: Rows) -> Models:
     """Return the models of the map of one set, from the other sites and from what the map says of itself."""
     others = [of for of in rows if camera_of(of) == camera_of(name) and site_of(of) != site_of(name)]
-    is_adapted = len({row.query for row in rows[name] if row.kind == THERE}) >= FEWEST_PLACES
+    is_adapted = len({row.query for row in rows[name] if row.kind == THERE}) >= MIN_PLACES
     models = {}
     for kind in KINDS[camera_of(name)]:
         model = shipped_model(kind, [site(rows[of], kind, site_of(name)) for of in others], "other sites")
-        models[kind] = adapted(model, kind, site(rows[name], kind).answers, name) if is_adapted else model
+        models[kind] = adapt_model(model, kind, site(rows[name], kind).answers, name) if is_adapted else model
     return models
 
 
@@ -167,7 +167,7 @@ def followed(name: str, models: dict[str, Models]) -> base.Row:
     """Fly along the way of a map in several manners, each query by itself and followed, and count fixes."""
     dataset = walks.dataset_of(DATA / name)
     truth = {query.path.name: query for query in dataset.queries}
-    own = [path for path in list_images(DATA / name / "query") if path.name in truth][:_MOST_FLOWN]
+    own = [path for path in list_images(DATA / name / "query") if path.name in truth][:_MAX_FLOWN]
     other = "grief_michigan_monthly" if name != "nordland_tiny" else "corridor"
     foreign = list_images(DATA / other / "query")[:30]
     middle, third = len(own) // 2, len(own) // 3
@@ -230,7 +230,7 @@ of sets and both cameras.
 ## Followed from query to query
 
 Flights along the way of the map, at the default precision, each query by itself and followed; nothing is known of time
-or speed. Of nordland_tiny the first {_MOST_FLOWN} queries fly. Share of the queries accepted as the right place; in
+or speed. Of nordland_tiny the first {_MAX_FLOWN} queries fly. Share of the queries accepted as the right place; in
 brackets wrong, beside, foreign.
 
 {base.table(flown, {name: f"{{{name}}}" for name in ("set", "mode", *ways)})}

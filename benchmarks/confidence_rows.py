@@ -18,7 +18,7 @@ from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
 from edgevpr.lab.evaluate.dataset import ScoredQuery
 from edgevpr.mapmaking.calibrate import ask, query_altered_copies
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.retrieve import elsewhere
+from edgevpr.places.retrieve import outside_neighbourhood
 from edgevpr.runtime.recognise.evidence import Evidence
 from edgevpr.runtime.recognise.judge import accept_rule
 
@@ -116,7 +116,7 @@ def kind_of_match(found: str, query: ScoredQuery | None, references: Sequence[st
     if found in query.ignored:
         return "ignored"
     known = np.flatnonzero([each in query.right or each in query.ignored for each in references])
-    return "wrong" if elsewhere(index, references.index(found), known, 0.0).all() else "beside"
+    return "wrong" if outside_neighbourhood(index, references.index(found), known, 0.0).all() else "beside"
 
 
 def gather(work: Path, name: str) -> None:

@@ -14,10 +14,10 @@ import numpy as np
 import rasterio
 from mosaics import Ground, ground_of, laid, make_mosaic, write_tif
 
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light
-from edgevpr.lab.simulate.overflight import seen_from
+from edgevpr.lab.simulate.overflight import photograph_from
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 # Sets without positions, or too few of them: metres of a pixel and a place on the Earth are assumed.
@@ -75,7 +75,7 @@ class Site:
 
     def position(self, at_m: np.ndarray) -> Position:
         """Return the position of a point (2,)."""
-        return Position(*moved(*self.origin, *at_m.tolist()))
+        return Position(*offset_position(*self.origin, *at_m.tolist()))
 
     def offset(self, position: Position) -> np.ndarray:
         """Return the metres (2,) of a position."""
@@ -125,10 +125,10 @@ def _rows(of: Path, folder: Path) -> Site:
     for lane, north_m in enumerate(lanes):
         east_m = np.arange(-half_m[0], half_m[0], step_m)
         for east in east_m if lane % 2 == 0 else east_m[::-1]:
-            at = Position(*moved(photo.middle.lat_deg, photo.middle.lon_deg, float(east), float(north_m)))
+            at = Position(*offset_position(photo.middle.lat_deg, photo.middle.lon_deg, float(east), float(north_m)))
             up_deg = 90.0 if lane % 2 == 0 else 270.0
             pose = CameraPose(east_m=0, north_m=0, height_m=_height_m(_ROWS_FOOTPRINT_M), heading_deg=up_deg)
-            image = seen_from(photo, at, pose, camera, light, rng)
+            image = photograph_from(photo, at, pose, camera, light, rng)
             if image is not None:
                 file = f"{len(positions):04d}.jpg"
                 cv2.imwrite(str(folder / "images" / file), image)

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from flight_sites import Site
 
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Vehicle
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light
 from edgevpr.lab.simulate.generated import wander
-from edgevpr.lab.simulate.overflight import seen_from
+from edgevpr.lab.simulate.overflight import photograph_from
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 QUERIES = 40
@@ -187,7 +187,7 @@ def reports(track: Track, site: Site, how: str, rng: np.random.Generator) -> lis
         if how == "stops" and number > from_here:
             said.append(said[-1])
             continue
-        lat_deg, lon_deg = moved(*site.origin, *at[number].tolist())
+        lat_deg, lon_deg = offset_position(*site.origin, *at[number].tolist())
         velocity = tuple(told[number].tolist())
         if how == "not a number" and number >= from_here:
             velocity = (np.nan, np.nan)
@@ -228,5 +228,5 @@ def photographs(
             roll_deg=float(roll[number]),
             pitch_deg=float(pitch[number]),
         )
-        image = seen_from(photos[name], sites[name].position(track.seen[number]), pose, camera, light, rng)
+        image = photograph_from(photos[name], sites[name].position(track.seen[number]), pose, camera, light, rng)
         yield image if image is None else cv2.imdecode(cv2.imencode(".jpg", image, quality)[1], cv2.IMREAD_COLOR)

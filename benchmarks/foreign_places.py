@@ -14,7 +14,7 @@ import numpy as np
 
 from edgevpr.core.types import Frame
 from edgevpr.frames.images import list_images, read_image
-from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, light_scene, photograph
 from edgevpr.lab.simulate.generated import SCENE_DEPTH_M, SCENE_WIDTH_M
 from edgevpr.lab.simulate.landscape import make_scene
 
@@ -66,7 +66,7 @@ def _landscape(seed: int) -> Iterator[Frame]:
         exposure=rng.uniform(0.8, 1.2),
     )
     scene = make_scene(seed, SCENE_WIDTH_M, SCENE_DEPTH_M)
-    ground = lit(scene, light, seed)
+    ground = light_scene(scene, light, seed)
     for north_m in np.linspace(_MARGIN_M, SCENE_DEPTH_M - _MARGIN_M, _NORTH):
         for east_m in np.linspace(_MARGIN_M, SCENE_WIDTH_M - _MARGIN_M, _EAST):
             height_m, heading_deg = rng.uniform((50, 0), (80, 360))

@@ -29,12 +29,12 @@ import rasterio
 import walks
 from base import Row
 
-from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
 from edgevpr.lab.simulate.camera import Camera, Light
-from edgevpr.lab.simulate.overflight import make_poses, seen_from
+from edgevpr.lab.simulate.overflight import make_poses, photograph_from
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser
@@ -108,12 +108,12 @@ def flown(raster: Path, fov_deg: float = FOV_DEG, tilt_deg: float = 0.0) -> Iter
         for column in np.linspace(inside_m, wide_m - inside_m, _GRID[0])[:: -1 if len(shots) // _GRID[0] % 2 else 1]:
             heading_deg = float(rng.uniform(0, 360))
             back_m = -ahead_m * np.array([np.sin(np.radians(heading_deg)), np.cos(np.radians(heading_deg))])
-            at = Position(*moved(south, west, column + back_m[0], row + back_m[1]))
+            at = Position(*offset_position(south, west, column + back_m[0], row + back_m[1]))
             shots.append(GeoTag(position=at, height_m=height_m, heading_deg=heading_deg))
             if tilt_deg:
                 shots[-1] = replace(shots[-1], roll_deg=0.0, pitch_deg=tilt_deg)
     for number, (shot, pose) in enumerate(zip(shots, make_poses(shots, _SEED), strict=True)):
-        image = seen_from(photo, shot.position, pose, camera, _LIGHT, rng)
+        image = photograph_from(photo, shot.position, pose, camera, _LIGHT, rng)
         if image is None and tilt_deg:
             continue  # a tilted view reaches far
         if image is None:

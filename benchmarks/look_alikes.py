@@ -13,9 +13,9 @@ import numpy as np
 import walks
 from base import DATA
 
-from edgevpr.places.retrieve import elsewhere
+from edgevpr.places.retrieve import outside_neighbourhood
 from edgevpr.runtime.recognise.calibration import read_calibration_for
-from edgevpr.runtime.recognise.evidence import INLIERS_BY_CHANCE, count_beside
+from edgevpr.runtime.recognise.evidence import INLIERS_BY_CHANCE, count_neighbours
 
 SETS = ("thumbs_essex", "corridor", "grief_stromovka_seasons")
 _BESIDE_LEFT_OUT = 8  # places along a way
@@ -29,7 +29,7 @@ def measure(name: str) -> base.Row:
     row: base.Row = {"set": name, "queries": len(dataset.queries), "right": 0, "unproven": 0, "wrong": 0, "left_out": 0}
     with walks.map_of(folder, images=folder / "ref") as (place_map, index, technique):
         calibration = read_calibration_for(place_map)
-        beside = _BESIDE_LEFT_OUT if count_beside(calibration.look_alikes if calibration else None) else 0
+        beside = _BESIDE_LEFT_OUT if count_neighbours(calibration.look_alikes if calibration else None) else 0
         walk, slots = walks.walk(place_map, index, technique), np.arange(len(index))
         with_landmarks = walks.walk(place_map, index, technique, all_evidence=True)
         for query in dataset.queries:
@@ -41,7 +41,7 @@ def measure(name: str) -> base.Row:
                 landmarks = with_landmarks.step(walks.frame(query.path)).evidence.landmarks
                 row["unproven"] += is_right and landmarks <= np.log1p(INLIERS_BY_CHANCE)
             known = [slot for slot in slots if dataset.references[slot] in {*query.right, *query.ignored}]
-            kept = np.all([elsewhere(index, slot, slots, 0.0, beside=beside) for slot in known], axis=0)
+            kept = np.all([outside_neighbourhood(index, slot, slots, 0.0, beside=beside) for slot in known], axis=0)
             without = walks.walk(place_map, index.only(kept), technique, rule=walk.rule)
             row["left_out"] += without.step(walks.frame(query.path)).accepted
     return row

@@ -21,7 +21,7 @@ import sets_page
 import yaml
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.core.text import progress
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, write_positions
@@ -124,8 +124,8 @@ def placed(folder: Path, work: Path) -> Path:
     for row in base.read_csv(folder / "sites.csv"):
         if row["site"] not in sites:
             sites.append(row["site"])
-        site = moved(*_FIRST_SITE, _SITES_APART_M * sites.index(row["site"]), 0.0)
-        position = Position(*moved(*site, _PIXEL_M * float(row["x_px"]), -_PIXEL_M * float(row["y_px"])))
+        site = offset_position(*_FIRST_SITE, _SITES_APART_M * sites.index(row["site"]), 0.0)
+        position = Position(*offset_position(*site, _PIXEL_M * float(row["x_px"]), -_PIXEL_M * float(row["y_px"])))
         tags[row["file"]] = GeoTag(position=position, heading_deg=float(row["yaw_deg"]))
     write_positions(out / "positions.csv", tags)
     return out

@@ -7,7 +7,7 @@ from datetime import date
 
 import numpy as np
 
-from edgevpr.mapmaking.calibrate import MapAnswer, adapted, evidence_matrix, fitted
+from edgevpr.mapmaking.calibrate import MapAnswer, adapt_model, evidence_matrix, fit_logistic
 from edgevpr.runtime.recognise.confidence import Logistic, Model, Scale, Tail
 from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE, Evidence
 
@@ -15,10 +15,10 @@ _PULL = 0.3
 # Parts of the wrong matches that are the tail. With .3 of those of a site itself, the draw of the pictures that a map
 # is adapted with decided whether one tunnel of nordland_tiny was taken for another.
 _OFF_MAP, _OFF_PLACE, _STAND_IN = 0.02, 0.4, 0.2
-_FEWEST_WRONG = 20
+_MIN_WRONG = 20
 _EACH = 100.0  # the weight of the right, and of the wrong, matches of a map
-_FEWEST_IN_TAIL = 5
-_LEAST_SCALE = 0.05
+_MIN_IN_TAIL = 5
+_MIN_SCALE = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +56,7 @@ def shipped_model(kind: str, sites: Sequence[FittedSite], made_of: str) -> Model
     today = date.today().isoformat()
     model = Model(of_map=of_map, of_place=of_place, scale=unknown, made=today, made_of=made_of)
     bare = [(site, model) for site in sites]
-    own = [(site, adapted(model, kind, site.answers, site.name)) for site in sites if site.answers]
+    own = [(site, adapt_model(model, kind, site.answers, site.name)) for site in sites if site.answers]
     matches = sum(len(site.own) + len(site.foreign) for site in sites)
     return replace(model, matches=matches, scale=_scale(bare), adapted_scale=_scale(own) if own else None)
 
@@ -68,7 +68,7 @@ def _regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence],
     weights = np.concatenate([np.full(len(group), _EACH / len(group)) for group, _ in groups])
     scales = np.maximum(evidence_matrix(rows, names).std(0), 1e-3)
     nothing_known = Logistic(tuple(names), (0.0,) * len(names), tuple(scales.tolist()), 0.0)
-    return fitted(nothing_known, rows, right, weights, _PULL * len(groups))
+    return fit_logistic(nothing_known, rows, right, weights, _PULL * len(groups))
 
 
 def _scale(sites: Sequence[tuple[FittedSite, Model]]) -> Scale:
@@ -78,7 +78,7 @@ def _scale(sites: Sequence[tuple[FittedSite, Model]]) -> Scale:
     own = [(model, evidence, right) for site, model in sites for evidence, right in site.own]
     wrong = [(model, evidence) for model, evidence, right in own if not right and evidence.leads]
     count, part = len(own), _OFF_PLACE
-    if len(wrong) < _FEWEST_WRONG:  # ground of other sites stands in for ground that looks alike
+    if len(wrong) < _MIN_WRONG:  # ground of other sites stands in for ground that looks alike
         wrong = [(model, evidence) for model, evidence in foreign if evidence.leads]
         count, part = len(foreign), _STAND_IN
     off_map = _tail([model.of_map.logit(evidence.figures()) for model, evidence in foreign], len(foreign), _OFF_MAP)
@@ -91,12 +91,12 @@ def _scale(sites: Sequence[tuple[FittedSite, Model]]) -> Scale:
             rows += [{"log_chance": -math.log(max(model.chance(evidence.figures()), 1e-15))} for evidence, _ in group]
             right += [each for _, each in group]
             weights += [_EACH / len(group)] * len(group)
-    line = fitted(Logistic(("log_chance",), (1.0,), (1.0,), 0.0), rows, np.array(right), np.array(weights), _PULL)
+    line = fit_logistic(Logistic(("log_chance",), (1.0,), (1.0,), 0.0), rows, np.array(right), np.array(weights), _PULL)
     return replace(scale, slope=line.weights[0], offset=line.bias)
 
 
 def _tail(wrong: Sequence[float], count: int, part: float) -> Tail:
     """Fit the tail of wrong matches, of `count` matches in all, to the highest `part` of their logits."""
-    highest = np.sort(wrong)[::-1][: max(_FEWEST_IN_TAIL, math.ceil(part * len(wrong))) + 1]
+    highest = np.sort(wrong)[::-1][: max(_MIN_IN_TAIL, math.ceil(part * len(wrong))) + 1]
     start, above = float(highest[-1]), highest[:-1]
-    return Tail(start, len(above) / count, max(float((above - start).mean()), _LEAST_SCALE))
+    return Tail(start, len(above) / count, max(float((above - start).mean()), _MIN_SCALE))

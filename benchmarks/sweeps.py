@@ -43,7 +43,7 @@ from edgevpr.techniques import create
 SETS = ("aerial_swindale", "corridor")  # one that looks down, one that looks ahead
 TECHNIQUES = tuple(name for name in techniques.names() if name != "seqslam")  # which asks with several pictures
 WORK = Path("sweeps_work")
-_MOST_ASKED = 24
+_MAX_ASKED = 24
 _LEAST_COVERED, _LEAST_SHOWN = 0.8, 0.7
 _OVERLAP = 0.3  # of a place or of the view is common: it is right
 _TOUCHING = 0.02  # more than this and less than that: it counts neither way
@@ -216,8 +216,8 @@ def _ahead(folder: Path) -> Iterator[Start]:
 
 
 def _some(starts):
-    """Return at most `_MOST_ASKED` of all, evenly spread."""
-    return [starts[at] for at in np.unique(np.linspace(0, len(starts) - 1, _MOST_ASKED).round().astype(int))]
+    """Return at most `_MAX_ASKED` of all, evenly spread."""
+    return [starts[at] for at in np.unique(np.linspace(0, len(starts) - 1, _MAX_ASKED).round().astype(int))]
 
 
 def page(found: Row) -> str:

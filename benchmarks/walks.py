@@ -15,7 +15,7 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.images import read_image
 from edgevpr.frames.source import open_source
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
-from edgevpr.lab.evaluate.evaluate import mapped, read_frames
+from edgevpr.lab.evaluate.evaluate import open_temporary_map, read_frames
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
@@ -69,7 +69,7 @@ def map_of(
     """Map the references of a set, by `cohog` unless another technique is named. The map is refined and calibrated as
     `map build` does where `images` names their folder, from which pictures are read again."""
     technique = technique or cohog(base.camera_of(folder.name))
-    with mapped(frames_of(folder / "ref"), technique, images) as (place_map, index, _):
+    with open_temporary_map(frames_of(folder / "ref"), technique, images) as (place_map, index, _):
         yield place_map, index, technique
 
 
@@ -114,5 +114,5 @@ def names_of(place_map: PlaceMap, index: PlaceIndex) -> list[str]:
 def walk_over(places: Iterable[Path], name: str, looks_down: bool) -> Iterator[Recogniser]:
     """Map images with a technique, and give what recognises in that map, as it flies, and accepts nothing."""
     technique = create(name, {"camera": "nadir"} if looks_down and name == "cohog" else {})
-    with mapped(map(frame, places), technique) as (place_map, index, _):
+    with open_temporary_map(map(frame, places), technique) as (place_map, index, _):
         yield walk(place_map, index, technique, rule=AcceptRule(min_score=1.0, min_margin=1.0, neighbour_m=0.0))

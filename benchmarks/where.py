@@ -24,7 +24,7 @@ import numpy as np
 from base import RESULTS, Row
 from mosaics import read_mosaic
 
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Place
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
@@ -198,7 +198,7 @@ def _add_noise(path: Path, seed: int) -> None:
         table = csv.DictWriter(handle, rows[0])
         table.writeheader()
         for row in rows:
-            at = moved(float(row["lat"]), float(row["lon"]), *rng.normal(0, NOISE_M, 2).tolist())
+            at = offset_position(float(row["lat"]), float(row["lon"]), *rng.normal(0, NOISE_M, 2).tolist())
             table.writerow(row | dict(zip(("lat", "lon"), at, strict=True)))
 
 

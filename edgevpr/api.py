@@ -97,7 +97,7 @@ class Map:
         accept_precision: float | None = None,
         follow: bool = False,
     ) -> None:
-        wanted = {"map": _path_of(path), "source.fov_deg": fov_deg, "match.accept_precision": accept_precision}
+        wanted = {"map": _to_path(path), "source.fov_deg": fov_deg, "match.accept_precision": accept_precision}
         settings = load_config(config, wanted)
         source = settings.source
         known = ("heading", "height", "reach") if source.fov_deg or source.lens else ("heading", "reach")
@@ -170,10 +170,10 @@ class Map:
             event = self._recogniser.step(frame)
         if event.failed:
             raise ImageError(str(event.reason))
-        return _match_of(event)
+        return _to_match(event)
 
 
-def _match_of(event: Recognition) -> Match:
+def _to_match(event: Recognition) -> Match:
     best, where, cost = event.best, event.located, event.cost
     return Match(
         accepted=event.accepted,
@@ -209,9 +209,9 @@ def build(
     shipped one). Pictures that cannot be used are left out with a warning, and one says what could not be done to the
     map. Raises EdgevprError.
     """
-    pictures = images if isinstance(images, FlownPictures | Cuttings) else FlownPictures(source=_path_of(images))
+    pictures = images if isinstance(images, FlownPictures | Cuttings) else FlownPictures(source=_to_path(images))
     order = MapOrder(
-        path=_path_of(path), pictures=pictures, technique=technique, parameters={}, refine=refine, calibrate=calibrate
+        path=_to_path(path), pictures=pictures, technique=technique, parameters={}, refine=refine, calibrate=calibrate
     )
     settings = load_config(config, {"source.camera": camera})
     shown = text.progress if progress is None else _reported_to(progress)
@@ -231,7 +231,7 @@ def _reported_to(progress: Progress) -> Any:
     return shown
 
 
-def _path_of(path: object) -> str:
+def _to_path(path: object) -> str:
     if not isinstance(path, str | os.PathLike):
         raise UsageError(f"A path is {path!r}: give text or a pathlib.Path.")
     return os.fspath(path)

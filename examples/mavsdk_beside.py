@@ -29,7 +29,7 @@ class Edgevpr:
         self.beat_s = time.monotonic() + FIRST_WITHIN_S
         self.match_s, self.confidence, self.is_active = float("-inf"), 0.0, False
 
-    def hear(self, message, _) -> None:
+    def handle(self, message, _) -> None:
         if message.component_id != EDGEVPR:
             return
         said, now_s = json.loads(message.fields_json), time.monotonic()
@@ -51,7 +51,7 @@ def main(port: str = "14540") -> None:
     telemetry, direct, edgevpr = Telemetry(vehicle), MavlinkDirect(vehicle), Edgevpr()
     telemetry.subscribe_status_text(lambda status, _: print("text", status.text, flush=True))
     for name in ("HEARTBEAT", "NAMED_VALUE_FLOAT"):
-        direct.subscribe_message(name, edgevpr.hear)
+        direct.subscribe_message(name, edgevpr.handle)
     while time.monotonic() - edgevpr.beat_s < SILENT_AFTER_S:
         at = telemetry.position()
         here = f"at {at.latitude_deg:.6f}, {at.longitude_deg:.6f}" if not math.isnan(at.latitude_deg) else "nowhere"

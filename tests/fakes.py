@@ -85,9 +85,9 @@ class FakeSource:
         is_live: bool = True,
         work: Callable[[], None] = lambda: None,
     ) -> None:
-        self._left, self._clock, self._work = deque(pictures), clock, work
+        self._leave, self._clock, self._work = deque(pictures), clock, work
         self.is_live = is_live
-        self.total = 0 if is_live else len(self._left)
+        self.total = 0 if is_live else len(self._leave)
         self.dropped = 0 if is_live else None
         self.refused = {"damaged": 0, "patched": 0, "frozen": 0, "late": 0} if is_live else {"damaged": 0}
         self.latency_s = 0.0 if is_live else None
@@ -96,7 +96,7 @@ class FakeSource:
 
     @property
     def ended(self) -> bool:
-        return not self._left
+        return not self._leave
 
     @property
     def condition(self) -> Condition:
@@ -113,10 +113,10 @@ class FakeSource:
         return _STATES.get(self.condition, "streaming" if self.is_live else "reading")
 
     def read(self, timeout_s: float) -> Frame | None:
-        if not self._left:
+        if not self._leave:
             return None
         self._work()
-        picture = self._left.popleft()
+        picture = self._leave.popleft()
         if isinstance(picture, Exception):
             raise picture
         if not isinstance(picture, Frame):
@@ -125,7 +125,7 @@ class FakeSource:
         return replace(picture, t_mono_s=self._clock())
 
     def close(self) -> None:
-        self._left.clear()
+        self._leave.clear()
 
 
 def to_autopilot(link, navigator, clock: "FakeClock", flight_log: FlightLog | None = None, **settings) -> ToAutopilot:
@@ -201,7 +201,7 @@ class FakeLink:
         if vehicle is None:
             return None
         vehicle = replace(vehicle, t_fix_s=self._waiting.t_fix_s)
-        self.listener.hear_vehicle(vehicle)
+        self.listener.handle_vehicle(vehicle)
         return vehicle
 
     @property
@@ -248,9 +248,9 @@ class FakeLink:
             return
         while (sending := self._waiting.next(self._clock())) is not None:
             self._fixes.append(sending.fix)
-            self._waiting.note_sent(sending, self._clock())
+            self._waiting.record_sent(sending, self._clock())
             sending.settle(True)
-            self._waiting.hear(self.answer, Readiness(has_gps=True).why(self.answer), self._clock())
+            self._waiting.handle(self.answer, Readiness(has_gps=True).why(self.answer), self._clock())
             self._acks[self.answer] += 1
 
 

@@ -129,7 +129,7 @@ def test_send_fix_is_answered_or_dropped_and_link_reports_the_vehicle(link):
     vehicle = link.vehicle()
     assert (vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m) == (50.0, 8.0, 300.0)
     assert (vehicle.heading_deg, vehicle.has_gps) == (None, False)
-    assert vehicle.is_fresh_at(clock.now_s)
+    assert vehicle.is_fresh(clock.now_s)
     seen = link.vehicle_at(clock.now_s)
     assert (seen.lat_deg, seen.lon_deg, seen.heading_deg, seen.roll_deg) == (50.0, 8.0, None, None)
 

@@ -66,7 +66,7 @@ def of_camera(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable
 
         yield f"{name}: encode a frame", lambda: technique.encode(picture)
         yield f"{name}: read a place", lambda: place_map.fine_part(index.place_ids[1])
-        yield f"{name}: glance at a place", lambda: technique.glance(asked, fine, one)
+        yield f"{name}: glance at a place", lambda: technique.score_quickly(asked, fine, one)
         yield f"{name}: compare a place in full", lambda: technique.match(asked, fine, one)
         yield f"{name}: encode, and scan {len(small)} places", lambda: scanned(small)
         yield f"{name}: encode, and scan {len(index)} places", lambda: scanned(index)

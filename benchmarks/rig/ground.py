@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import rasterio
 
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Position
-from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, light_scene, photograph
 from edgevpr.lab.simulate.generated import ORIGIN, to_position
 from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.places.mapfile import PlaceMap
@@ -40,7 +40,7 @@ def lit_ground(work: Path, day: str) -> np.ndarray:
         scene = make_scene(SEED, WIDTH_M, DEPTH_M, METRES_PER_PIXEL)
         for number, (name, path) in enumerate(files.items()):
             unfinished = work / f"unfinished-{name}.npy"
-            np.save(unfinished, lit(scene, LIGHTS[name], SEED + number))
+            np.save(unfinished, light_scene(scene, LIGHTS[name], SEED + number))
             unfinished.rename(path)
     return np.load(files[day], mmap_mode="r")
 
@@ -117,7 +117,7 @@ def moved_map(place_map: Path, east_m: float, up_m: float) -> Path:
         with PlaceMap.open_for_adding(unfinished) as places, places.transaction():
             for place in list(places.places()):
                 at = place.position
-                lat_deg, lon_deg = moved(at.lat_deg, at.lon_deg, east_m, 0.0)
+                lat_deg, lon_deg = offset_position(at.lat_deg, at.lon_deg, east_m, 0.0)
                 places.lay(place.place_id, Position(lat_deg, lon_deg, at.alt_m + up_m), place.pose)
         unfinished.rename(path)
     return path

@@ -17,14 +17,14 @@ from edgevpr.cli.shared import (
     load_command_config,
     parse_parameters,
     parse_value,
-    path_of,
     positive,
     report,
     show,
+    to_path,
 )
 from edgevpr.core.config import FORMS
 from edgevpr.core.errors import UsageError
-from edgevpr.core.text import progress, shown
+from edgevpr.core.text import progress, sanitize
 
 if TYPE_CHECKING:
     from edgevpr.lab.evaluate.dataset import Dataset
@@ -81,7 +81,7 @@ def evaluate(args: Namespace) -> int:
         known=args.known,
     )
     plan = Plan(sets=sets, rows=rows, options=options, salience=config.salience)
-    outcome = measure(plan, path_of(args.out), progress)
+    outcome = measure(plan, to_path(args.out), progress)
     content = outcome.as_json()
     if not content["results"]:
         raise next(iter(outcome.failed.values()))
@@ -90,7 +90,7 @@ def evaluate(args: Namespace) -> int:
     elif len(sets) == 1:
         content["techniques"] = {row["row"]: row for row in content.pop("results")}
     tables = [
-        f"{shown(name)}\n\n{results_text([row.result for row in measured])}\n"
+        f"{sanitize(name)}\n\n{results_text([row.result for row in measured])}\n"
         for name, measured in outcome.found.items()
         if measured
     ]
@@ -162,5 +162,5 @@ def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
         has_forms = "form" in techniques.parameters(name) and "form" not in settings[name]
         for form in forms if has_forms else [None]:
             chosen = {**settings[name], "form": form} if form else settings[name]
-            rows[techniques.labelled(name, chosen.get("form"))] = name, chosen
+            rows[techniques.format_name(name, chosen.get("form"))] = name, chosen
     return rows

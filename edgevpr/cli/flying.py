@@ -18,8 +18,8 @@ from edgevpr.cli.shared import (
     group,
     leave_out,
     load_command_config,
-    path_of,
     show,
+    to_path,
 )
 from edgevpr.core.config import place_logs_in
 from edgevpr.core.errors import ImageError, UsageError
@@ -86,7 +86,7 @@ def run_match(args: Namespace) -> int:
     recogniser = open_recogniser(config, board, known=known, follows=args.follow)
     found = []
     unusable: list[ImageError] = []
-    source = open_source(args.source, positions=path_of(args.positions), live=False)
+    source = open_source(args.source, positions=to_path(args.positions), live=False)
     if known:
         _require_known(args, known, recogniser)
     frames = read_to_end(source, lambda error: leave_out(error, unusable))
@@ -117,7 +117,7 @@ def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recognise
     from edgevpr.frames.source import read_tags
     from edgevpr.runtime.recognise.hints import explain_useless
 
-    source, positions = Path(args.source), path_of(args.positions)
+    source, positions = Path(args.source), to_path(args.positions)
     if source.is_dir():
         queries = list(read_tags(source, positions).values())
     else:
@@ -133,7 +133,7 @@ def run_flight(args: Namespace) -> int:
 
     config = load_command_config(args, args.config)
     log = place_logs_in(config.log, os.environ.get("LOGS_DIRECTORY", ""))
-    return fly(replace(config, log=log), path_of(args.positions))
+    return fly(replace(config, log=log), to_path(args.positions))
 
 
 def run_check(args: Namespace) -> int:

@@ -13,7 +13,7 @@ from edgevpr.cli import evaluation, flying, maps, networks, positions, profile, 
 from edgevpr.cli.screen import LineFormatter, guard_output
 from edgevpr.cli.shared import Parser
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.text import meant, shown
+from edgevpr.core.text import sanitize, suggest
 
 EXIT_CODES = {
     0: "Done, and nothing is wrong.",
@@ -51,7 +51,7 @@ def main(argv: list[str] | None = None) -> int:
 def _run(argv: list[str]) -> int:
     args, unknown = command_line().parse_known_args(argv)
     if unknown:
-        hint = meant(unknown[0].partition("=")[0], args.parser._option_string_actions, "")
+        hint = suggest(unknown[0].partition("=")[0], args.parser._option_string_actions, "")
         args.parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint and '; '}{hint}")
     # Set before NumPy is imported: matrix products are small here, and more threads only make them slower.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -63,26 +63,28 @@ def _run(argv: list[str]) -> int:
         code: int = args.run(args)
         return code
     except EdgevprError as error:
-        return _failed(args, error, str(error), error.exit_code)
+        return _report_failure(args, error, str(error), error.exit_code)
     except BrokenPipeError:  # the reader of the output has gone (`edgevpr ... | head`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
         what = f"{error.filename}: " if error.filename else ""
-        return _failed(
+        return _report_failure(
             args, error, f"{what}{error.strerror or error}: check the path, its permissions and the disk.", 1
         )
     except ImportError as error:
-        return _failed(args, error, f"{error}: a package is missing or broken; install edgevpr again (64-bit OS).", 1)
+        return _report_failure(
+            args, error, f"{error}: a package is missing or broken; install edgevpr again (64-bit OS).", 1
+        )
     except KeyboardInterrupt:
         print("edgevpr: stopped; everything confirmed so far is kept.", file=sys.stderr)
         return 130
 
 
-def _failed(args: argparse.Namespace, error: Exception, sentence: str, exit_code: int) -> int:
+def _report_failure(args: argparse.Namespace, error: Exception, sentence: str, exit_code: int) -> int:
     if args.debug:
         logging.exception(error)
-    print(f"edgevpr: {shown(sentence)}", file=sys.stderr)
+    print(f"edgevpr: {sanitize(sentence)}", file=sys.stderr)
     return exit_code
 
 

@@ -21,10 +21,10 @@ from edgevpr.cli.shared import (
     leave_out,
     load_command_config,
     parse_parameters,
-    path_of,
     positive,
     require_out,
     show,
+    to_path,
     write_out,
 )
 from edgevpr.cli.wording import format_build, format_check, format_info, format_move, format_refinement
@@ -146,7 +146,7 @@ def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
         raise UsageError(f"--{given[0].replace('_', '-')} goes with {source}: leave it out.")
     if args.source is not None:
         rate_hz = getattr(args, "rate_hz", None)
-        return FlownPictures(source=args.source, positions=path_of(args.positions), rate_hz=rate_hz)
+        return FlownPictures(source=args.source, positions=to_path(args.positions), rate_hz=rate_hz)
     if args.footprint_m is None or args.spacing_m is None:
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
     about: dict[str, Any] = {name: getattr(args, name, None) for name in _OF_AN_ORTHOPHOTO}
@@ -247,14 +247,14 @@ def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, flo
     from edgevpr.mapmaking.look_alikes import find_look_alikes
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.review.album import album_of_map
-    from edgevpr.review.mappage import MOST_ASKED, make_map_page
-    from edgevpr.runtime.recognise.levelling import lens_of
+    from edgevpr.review.mappage import MAX_ASKED, make_map_page
+    from edgevpr.runtime.recognise.levelling import read_camera_lens
 
-    lens = lens_of(load_command_config(args, args.config).source)
+    lens = read_camera_lens(load_command_config(args, args.config).source)
     with PlaceMap.open(args.map) as place_map:
         places = list(place_map.places())
         pictures = album_of_map(args.map_images, places)
-        asked = places[:: -(-len(places) // MOST_ASKED) or 1] if pictures else []
+        asked = places[:: -(-len(places) // MAX_ASKED) or 1] if pictures else []
         level = ((place.place_id, pictures.level(place, lens)) for place in progress(asked, len(asked), "look-alikes"))
         found = find_look_alikes(place_map, ((place_id, each.image, each.mask) for place_id, each in level if each))
         alike = list(found)

@@ -7,7 +7,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.core.text import aligned, format_probability, shown
+from edgevpr.core.text import align_table, format_probability, sanitize
 
 if TYPE_CHECKING:
     from edgevpr.runtime.recognise.recognition import Recognition
@@ -22,9 +22,9 @@ def format_match(event: "Recognition") -> dict[str, Any]:
     is known of the way from there. `from_gps_tag_m`: distance of the fix from the query's own tag, null without both.
     """
     from edgevpr.core.geodesy import distance_m
-    from edgevpr.runtime.recognise.recognition import fields_of
+    from edgevpr.runtime.recognise.recognition import to_fields
 
-    fields = fields_of(event, exact=True)
+    fields = to_fields(event, exact=True)
     number, image, at = (fields.pop(name) for name in ("place", "reference_image", "position"))
     accuracy_m, fix, where = fields.pop("accuracy_m"), fields.pop("located"), event.located
     tag, from_tag_m = event.frame and event.frame.position, None
@@ -47,10 +47,12 @@ def format_match(event: "Recognition") -> dict[str, Any]:
 def format_matches(found: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield the table of the queries `found` (see `format_match`), and its summary."""
     sure = "confidence" if any("confidence" in each for each in found) else "score"
-    rows = aligned([("query", "accepted", sure, "place, picture"), *(_found(each, sure) for each in found)], left=4)
+    rows = align_table(
+        [("query", "accepted", sure, "place, picture"), *(_format_found(each, sure) for each in found)], left=4
+    )
     fixes = [each for each in found if each["position"]]
     headings = _FIX_HEADINGS if any(each["from_gps_tag_m"] is not None for each in fixes) else _FIX_HEADINGS[:3]
-    heading, *where = aligned([headings, *map(_fix, fixes)], left=0) if fixes else [""]
+    heading, *where = align_table([headings, *map(_fix, fixes)], left=0) if fixes else [""]
     width, at = max(map(len, rows)), iter(where)
     yield f"{rows[0]:<{width}}  {heading}".rstrip()
     for row, each in zip(rows[1:], found, strict=True):
@@ -58,12 +60,12 @@ def format_matches(found: Sequence[dict[str, Any]]) -> Iterator[str]:
     yield from _summary(found, fixes)
 
 
-def _found(match: dict[str, Any], sure: str) -> tuple[str, ...]:
+def _format_found(match: dict[str, Any], sure: str) -> tuple[str, ...]:
     """Return the left part of a row: the query, and the place that was found."""
     place, by = match["place"], match.get(sure)
     certain = "-" if by is None else format_probability(by) if sure == "confidence" else f"{by:.3f}"
-    named = f"{place['number']} {_short(place['image'])}" if place else "-"
-    return _short(match["query"]), "yes" if match["accepted"] else "no", certain, named
+    named = f"{place['number']} {_shorten_name(place['image'])}" if place else "-"
+    return _shorten_name(match["query"]), "yes" if match["accepted"] else "no", certain, named
 
 
 def _fix(match: dict[str, Any]) -> tuple[str, ...]:
@@ -79,9 +81,9 @@ def _why(match: dict[str, Any]) -> str:
     return textwrap.shorten(words, _REASON_COLUMNS, placeholder=" ...")
 
 
-def _short(name: str) -> str:
+def _shorten_name(name: str) -> str:
     """Return the name of a picture for the table; of a long one only the end, which tells it from others."""
-    name = shown(name)
+    name = sanitize(name)
     return name if len(name) <= _NAME_COLUMNS else f"...{name[3 - _NAME_COLUMNS :]}"
 
 

@@ -4,7 +4,7 @@ from argparse import Namespace
 from dataclasses import asdict
 from typing import Any
 
-from edgevpr.cli.shared import add_json, command, group, lines_of, show
+from edgevpr.cli.shared import add_json, command, format_fields, group, show
 
 
 def add(commands: Any) -> None:
@@ -20,5 +20,5 @@ def models_list(args: Namespace) -> int:
 
     found = [asdict(each) for each in list_models()]
     text = {each["name"]: {name: value for name, value in each.items() if name != "name"} for each in found}
-    show(found, args.json, lines_of({**text, "folders": list(map(str, model_folders()))}))
+    show(found, args.json, format_fields({**text, "folders": list(map(str, model_folders()))}))
     return 0

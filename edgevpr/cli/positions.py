@@ -39,7 +39,7 @@ def add(commands: Any) -> None:
 def positions(args: Namespace) -> int:
     """Run `positions`: write the table that all other commands find beside the pictures."""
     from edgevpr.core.errors import UsageError
-    from edgevpr.core.text import at_work
+    from edgevpr.core.text import show_elapsed
     from edgevpr.frames.positions import write_positions, write_track
     from edgevpr.tracks.placing import place_pictures, place_video, round_metres
     from edgevpr.tracks.record import read_record
@@ -50,7 +50,7 @@ def positions(args: Namespace) -> int:
     out = Path(args.out) if args.out else source / "positions.csv" if is_folder else source.with_suffix(".csv")
     if out.exists():
         raise UsageError(f"{out} exists already: move it away, or name another with --out.")
-    with at_work(f"reading {args.record}"):
+    with show_elapsed(f"reading {args.record}"):
         record = read_record(Path(args.record))
     placed = (place_pictures if is_folder else place_video)(record, source, args.offset_s)
     try:

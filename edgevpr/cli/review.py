@@ -39,11 +39,11 @@ def run_report(args: Namespace) -> int:
     from edgevpr.review.logged import read_flight, text
     from edgevpr.review.page import make_flight_page
     from edgevpr.review.webpage import read_ground
-    from edgevpr.runtime.flight.recording import frames_of, open_recording
+    from edgevpr.runtime.flight.recording import list_frames, open_recording
 
     flight = read_flight(args.log)
     folder = open_recording(text(flight.start, "recording"), args.log)
-    frames = make_album(args.images, frames_of(folder) if folder else {})
+    frames = make_album(args.images, list_frames(folder) if folder else {})
     ground: list[Place] = []
     no_ground = "The log does not name a map: give it with --map."
     if path := args.map or text(flight.start, "map"):

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import TextIO
 
-from edgevpr.core.text import shown
+from edgevpr.core.text import sanitize
 
 _LAYOUT = "\n\r\t"  # control characters that pass: tables and progress lines need them
 
@@ -23,17 +23,17 @@ class LineFormatter(logging.Formatter):
     """Formats each log message as one line, so that a file name with a line break cannot fake a second message."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        return shown(super().formatMessage(record))
+        return sanitize(super().formatMessage(record))
 
 
 class _Guarded(io.TextIOBase):
-    """Text stream that passes what is written through `shown`, then to `stream`, for `print` and progress lines."""
+    """Text stream that passes what is written through `sanitize`, then to `stream`, for `print` and progress lines."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        safe = shown(text, keep=_LAYOUT)
+        safe = sanitize(text, keep=_LAYOUT)
         try:
             self._stream.write(safe)
         except UnicodeEncodeError:  # a terminal that is not set to UTF-8

@@ -13,7 +13,7 @@ from typing import Any, TextIO, TypeVar
 from edgevpr.cli.examples import format_examples
 from edgevpr.core.config import Config, list_keys, load_config
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.text import meant, shown
+from edgevpr.core.text import sanitize, suggest
 
 T = TypeVar("T")
 _KEY = "key "  # prefix of the attribute names of `Namespace` that hold keys of the configuration
@@ -32,7 +32,7 @@ class Parser(ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def _check_value(self, action: Action, value: Any) -> None:
-        if action.choices is not None and value not in action.choices and (hint := meant(value, action.choices, "")):
+        if action.choices is not None and value not in action.choices and (hint := suggest(value, action.choices, "")):
             raise ArgumentError(action, f"invalid choice: {value!r}; {hint}")
         super()._check_value(action, value)
 
@@ -148,7 +148,7 @@ def parse_parameters(pairs: list[str]) -> dict[str, str]:
     return dict(pair.split("=", 1) for pair in pairs)
 
 
-def path_of(text: str | None) -> Path | None:
+def to_path(text: str | None) -> Path | None:
     """Return `text`, the value of an optional flag, as a path; None if it is None or empty."""
     return Path(text) if text else None
 
@@ -173,10 +173,12 @@ def show(value: Any, as_json: bool, text: str | Iterable[str] | None = None) -> 
     if as_json:
         print(json.dumps(fields, indent=2, default=str))
     else:
-        print(text if isinstance(text, str) else "\n".join(map(shown, lines_of(fields) if text is None else text)))
+        print(
+            text if isinstance(text, str) else "\n".join(map(sanitize, format_fields(fields) if text is None else text))
+        )
 
 
-def lines_of(fields: dict[str, Any], indent: str = "") -> Iterator[str]:
+def format_fields(fields: dict[str, Any], indent: str = "") -> Iterator[str]:
     """Yield a line of text for each field that is known: its name, and its value with the unit that ends the name. The
     lines of a field that has fields itself are indented; a list of rows or sentences has one line for each."""
     for name, value in fields.items():
@@ -188,14 +190,14 @@ def lines_of(fields: dict[str, Any], indent: str = "") -> Iterator[str]:
         for each in value if is_list else [value]:
             if isinstance(each, dict) and each:
                 yield f"{indent}{label}:"
-                yield from lines_of(each, f"{indent}  ")
+                yield from format_fields(each, f"{indent}  ")
             elif each not in (None, "", (), [], {}):
-                yield f"{indent}{label:<18} {_worded(each)}{unit}"
+                yield f"{indent}{label:<18} {_format_value(each)}{unit}"
 
 
-def _worded(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, list | tuple):
-        return ", ".join(map(_worded, value))
+        return ", ".join(map(_format_value, value))
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
@@ -206,7 +208,7 @@ def _worded(value: Any) -> str:
 def report(*sentences: str) -> None:
     """Print sentences to stderr, each after the name of the program."""
     for sentence in sentences:
-        print(f"edgevpr: {shown(sentence)}", file=sys.stderr)
+        print(f"edgevpr: {sanitize(sentence)}", file=sys.stderr)
 
 
 def positive(text: str) -> float:

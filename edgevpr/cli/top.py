@@ -38,12 +38,12 @@ def run_top(args: Namespace) -> int:
         found = read_status(args.file)
         if found is None or found[1] > _GONE_S:
             raise EdgevprError(" ".join(_no_flight(args.file)))
-        show(found[0], args.json, lines_of(found[0]))
+        show(found[0], args.json, format_status(found[0]))
         return 0
     try:
         while True:
             found = read_status(args.file)
-            lines = lines_of(found[0]) if found else list(_no_flight(args.file))
+            lines = format_status(found[0]) if found else list(_no_flight(args.file))
             if found and found[1] > _SILENT_S:
                 lines.insert(0, f"the flight has said nothing for {found[1]:.0f} s")
             columns, height = shutil.get_terminal_size()
@@ -63,10 +63,10 @@ def _no_flight(file: str) -> tuple[str, str]:
     )
 
 
-def lines_of(status: dict[str, Any]) -> list[str]:
+def format_status(status: dict[str, Any]) -> list[str]:
     """Return the status of a flight (see `runtime.flight.vitals`) for people, as lines of a label and a text."""
-    age_s, heat = status["latency_s"], _known("{:.0f} °C", status["temperature_c"])
-    latency = _known(", {:.2f} s old" if (age_s or 0) < _LONG_S else ", newest picture {:.0f} s old", age_s)
+    age_s, heat = status["latency_s"], _format_known("{:.0f} °C", status["temperature_c"])
+    latency = _format_known(", {:.2f} s old" if (age_s or 0) < _LONG_S else ", newest picture {:.0f} s old", age_s)
     hot, throttled = ", hot" * bool(status["hot"]), ", the board slows itself down" * bool(status["throttled"])
     ram = f"{status['machine_ram_mb']:.0f} of {status['machine_ram_total_mb']:.0f} MB by all programs"
     rows = [
@@ -79,35 +79,35 @@ def lines_of(status: dict[str, Any]) -> list[str]:
         ("heat", f"{heat or 'unknown'}{hot}{throttled}"),
         ("supply", {None: "unknown", False: "fine", True: "under-voltage"}[status["under_voltage"]]),
         ("charge", f"{status['used_mah']:.2f} mAh"),
-        ("match", _seen(status["match"], status["t_mono_s"])),
-        ("newest", _seen(status["newest"], status["t_mono_s"])),
-        *(_of_link(status["link"]) if status["link"] else [("link", "none")]),
+        ("match", _format_query(status["match"], status["t_mono_s"])),
+        ("newest", _format_query(status["newest"], status["t_mono_s"])),
+        *(_format_link(status["link"]) if status["link"] else [("link", "none")]),
         *(("remark", remark) for remark in status["remarks"]),
     ]
     return [f"{label:<11} {printable(text)}" for label, text in rows]
 
 
-def _known(form: str, value: float | None) -> str:
+def _format_known(form: str, value: float | None) -> str:
     return "" if value is None else form.format(value)
 
 
-def _seen(query: dict[str, Any] | None, now_s: float) -> str:
+def _format_query(query: dict[str, Any] | None, now_s: float) -> str:
     if query is None:
         return "none yet"
     ago = f"{now_s - query['t_frame_s']:.0f} s ago"
     if not query["accepted"]:
         return f"{ago}, refused: {read_reason(query['reason']) or 'unknown'}"
     sure = "" if query["confidence"] is None else f", confidence {format_probability(query['confidence'])}"
-    sure += _known(", score {:.3f}", query["score"])
-    good = _known(", good to {:.0f} m", query["accuracy_m"])
+    sure += _format_known(", score {:.3f}", query["score"])
+    good = _format_known(", good to {:.0f} m", query["accuracy_m"])
     return f"{ago}, place {query['place']} ({query['reference_image']}){sure}{good}"
 
 
-def _of_link(link: dict[str, Any]) -> list[tuple[str, str]]:
+def _format_link(link: dict[str, Any]) -> list[tuple[str, str]]:
     channel = _CHANNELS.get(link["channel"], link["channel"])
-    heard = _known(f"flight controller {{:.0f}}, told by {channel}", link["autopilot"])
+    heard = _format_known(f"flight controller {{:.0f}}, told by {channel}", link["autopilot"])
     return [
         ("link", f"{link['trouble'] or 'open'}, {heard or 'no flight controller is heard'}"),
         ("fixes", link["fixes"]),
-        ("navigation", _known("position known to {:.1f} m", link["accuracy_m"]) or "position unknown"),
+        ("navigation", _format_known("position known to {:.1f} m", link["accuracy_m"]) or "position unknown"),
     ]

@@ -4,7 +4,7 @@ function returns the lines of one result; JSON has the same values by their name
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.core.text import beside, shown
+from edgevpr.core.text import format_offset, sanitize
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.making import MadeMap
@@ -72,7 +72,7 @@ def format_refinement(path: str, refined: "Refined") -> Iterator[str]:
     if not_tied := refined.places - refined.without_position - refined.surveyed - refined.refined:
         yield f"  not linked  {not_tied} keep their recorded position: a fix there is as accurate as the spacing"
     for place_id, image, off_m in refined.contradictory:
-        yield f"  amiss       place {place_id} ({shown(image)}): recorded {off_m:.0f} m from where its picture lies"
+        yield f"  amiss       place {place_id} ({sanitize(image)}): recorded {off_m:.0f} m from where its picture lies"
 
 
 def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[str]:
@@ -104,7 +104,7 @@ def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Itera
 
 def format_move(path: str, done: "MapMove") -> Iterator[str]:
     """Yield how `map move` has moved a map."""
-    yield f"{path}: {done.places} places moved {beside(done.east_m, done.north_m)}, +-{done.sd_m:.1f} m"
+    yield f"{path}: {done.places} places moved {format_offset(done.east_m, done.north_m)}, +-{done.sd_m:.1f} m"
     if done.scale is not None:
         yield f"  scale       divided by {1 + done.scale:.4f}, around {done.middle[0]:.6f}, {done.middle[1]:.6f}"
 
@@ -118,7 +118,7 @@ def format_check(found: "MapCheck") -> Iterator[str]:
 
 def format_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iterator[str]:
     """Yield how a replay differs from its flight: in the `lines` of the log, in the `packets` sent, and in its end."""
-    yield from _first([*map(_of_line, lines.others), *packets.others])
+    yield from _first([*map(_format_difference, lines.others), *packets.others])
     yield from (f"The program differs: {name} was {then}, is {now}" for name, (then, now) in lines.program.items())
     yield f"{sum(line.get('kind') == 'query' for line in again.lines)} queries flown again"
     yield f"log      {lines.alike} lines are the same, {len(lines.others)} differ"
@@ -136,7 +136,7 @@ def _first(texts: list[str]) -> list[str]:
     return texts[:_SHOWN] + more
 
 
-def _of_line(difference: dict[str, Any]) -> str:
+def _format_difference(difference: dict[str, Any]) -> str:
     where = f"{difference['t_mono_s']:.3f} s, {difference['query'] or difference['kind']}"
     if "only_in" in difference:
         return f"{where}: only in the {difference['only_in']}"

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 MODE = 0o640  # whatever the umask: positions are private, but the group that reads logs may read them
-_MOST_NUMBER = 999_999  # a file name with eight digits has a date, and is not one of these
+_MAX_NUMBER = 999_999  # a file name with eight digits has a date, and is not one of these
 _NUMBERED = re.compile(r"(.+)-(\d{4,6})", re.DOTALL)
 
 
@@ -87,7 +87,7 @@ def try_lock(file: BinaryIO) -> bool:
     return True
 
 
-def is_at(file: BinaryIO, path: str | Path) -> bool:
+def is_still_at(file: BinaryIO, path: str | Path) -> bool:
     """Return True if the open `file` is still the one at `path`: it was not renamed, replaced or deleted."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
@@ -95,27 +95,27 @@ def is_at(file: BinaryIO, path: str | Path) -> bool:
         return False
 
 
-def numbered(path: str | Path) -> list[Path]:
+def list_numbered(path: str | Path) -> list[Path]:
     """List the numbered files of `path` (see the module), the lowest number first."""
-    return [file for _, file in _numbered(Path(os.path.realpath(path)))]
+    return [file for _, file in _find_numbered(Path(os.path.realpath(path)))]
 
 
 def relatives(path: str | Path) -> list[Path]:
     """List the numbered files of `path`. If `path` is a numbered file itself, list those of NAME.jsonl as well."""
     path = Path(os.path.realpath(path))
     match = _NUMBERED.fullmatch(path.stem)
-    return numbered(path) + (numbered(path.with_name(match[1] + path.suffix)) if match else [])
+    return list_numbered(path) + (list_numbered(path.with_name(match[1] + path.suffix)) if match else [])
 
 
 def claim(path: str | Path) -> Path:
     """Create an empty file with the next number, so that no other process takes the number. Return its path."""
     path = Path(os.path.realpath(path))
-    for number in range(max((number for number, _ in _numbered(path)), default=0) + 1, _MOST_NUMBER + 1):
+    for number in range(max((number for number, _ in _find_numbered(path)), default=0) + 1, _MAX_NUMBER + 1):
         claimed = path.with_name(f"{path.stem}-{number:04d}{path.suffix}")
         with suppress(FileExistsError):  # another process was faster
             os.close(os.open(claimed, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE))
             return claimed
-    raise OSError(errno.EEXIST, f"there is a file of number {_MOST_NUMBER}", str(path))
+    raise OSError(errno.EEXIST, f"there is a file of number {_MAX_NUMBER}", str(path))
 
 
 def set_aside(path: str | Path) -> Path:
@@ -134,7 +134,7 @@ def keep_within(path: str | Path, most_bytes: float) -> bool:
     """Delete the oldest numbered files of `path` until the others take at most `most_bytes` together. A file that a
     process has locked stays. Return True if any was deleted."""
     sizes = {}
-    for file in numbered(path):
+    for file in list_numbered(path):
         with suppress(FileNotFoundError):  # another process deletes as well
             sizes[file] = os.lstat(file).st_size
     kept_bytes = before_bytes = sum(sizes.values())
@@ -145,7 +145,7 @@ def keep_within(path: str | Path, most_bytes: float) -> bool:
     return kept_bytes < before_bytes
 
 
-def _numbered(path: Path) -> list[tuple[int, Path]]:
+def _find_numbered(path: Path) -> list[tuple[int, Path]]:
     files = map(path.with_name, os.listdir(path.parent))
     matches = ((_NUMBERED.fullmatch(file.stem), file) for file in files if file.suffix == path.suffix)
     return sorted((int(match[2]), file) for match, file in matches if match and match[1] == path.stem)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from edgevpr.core.errors import ConfigError
-from edgevpr.core.text import meant
+from edgevpr.core.text import suggest
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -260,7 +260,7 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
     for key in mapping:
         if key not in known:
             name = str(key)[:_SHOWN]
-            hint = meant(name, known, f"known: {', '.join(sorted(known))}")
+            hint = suggest(name, known, f"known: {', '.join(sorted(known))}")
             raise ConfigError(f"{where}: unknown key `{prefix}{name}` ({hint}).")
     values = {}
     for name, spec in known.items():

@@ -24,7 +24,7 @@ class PartSpec:
         return f"{'x'.join(map(str, self.shape))} {np.dtype(self.dtype)}"
 
 
-def nearest_height(height_ratios: Sequence[float], height_ratio: float) -> float:
+def find_nearest_height(height_ratios: Sequence[float], height_ratio: float) -> float:
     """Return the member of `height_ratios` whose quotient with `height_ratio` is nearest to 1."""
     return min(height_ratios, key=lambda ratio: abs(math.log(ratio / height_ratio)))
 
@@ -154,8 +154,8 @@ class Perspective:
 class Technique(Protocol):
     """A technique of place recognition: it describes pictures (`encode`), and compares a query with all places by their
     coarse parts (`coarse_scores`), then with some by their fine parts (`match`). Needed only with the ability:
-    `match` with `spec.fine`, `pack` with `spec.packed`, `glance` with `spec.in_full`, `turned`, `unmoved` and
-    `measure_perspective` with `spec.looks_down`."""
+    `match` with `spec.fine`, `pack` with `spec.packed`, `score_quickly` with `spec.in_full`, `match_rotated`,
+    `match_at_rest` and `measure_perspective` with `spec.looks_down`."""
 
     spec: TechniqueSpec
     candidates: int  # places compared after the scan, unless the configuration sets another number
@@ -192,17 +192,17 @@ class Technique(Protocol):
         """Compare the query with the fine part of one place under `hypotheses` (None: all). These are numbers from 0 to
         H - 1, the columns of the scores of hypotheses that `coarse_scores` returns."""
 
-    def glance(
+    def score_quickly(
         self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None
     ) -> tuple[float, list[int] | None]:
         """Estimate the score that `match` would give from a part of the query's regions. Returns it with a list of only
         the best hypothesis, to be given to `match` (None: there are no hypotheses)."""
 
-    def turned(self, query: Descriptor, fine: np.ndarray, match: FineMatch) -> FineMatch:
+    def match_rotated(self, query: Descriptor, fine: np.ndarray, match: FineMatch) -> FineMatch:
         """Compare the query with the place of a `match` again, at its height, but under other rotations only."""
 
     def measure_perspective(self, query: Descriptor, fine: np.ndarray, match: FineMatch) -> Perspective | None:
         """Measure the perspective of the query over the place of a `match`; None if too little of them agrees."""
 
-    def unmoved(self, query: Descriptor, fine: np.ndarray) -> FineMatch:
+    def match_at_rest(self, query: Descriptor, fine: np.ndarray) -> FineMatch:
         """Compare the query with a place as if it had been taken from the same height, not turned."""

@@ -16,7 +16,7 @@ T = TypeVar("T")
 _KERNEL_FILE_BYTES = 1_000_000  # read at most of a file of /proc or /sys, which report a size of 0
 
 
-def shipped(kind: str) -> Path:
+def find_shipped(kind: str) -> Path:
     """Return the folder `kind` ("profiles", "models" or "deploy") that is shipped with edgevpr: in the wheel, or at the
     top of the checkout."""
     package = Path(__file__).parents[1]
@@ -34,7 +34,7 @@ def own_models() -> Path:
 
 def model_folders() -> tuple[Path, ...]:
     """Return the folders that are searched for a model, in this order: the user's own, the shipped one."""
-    return own_models(), shipped("models")
+    return own_models(), find_shipped("models")
 
 
 def find_model(file: str) -> Path | None:

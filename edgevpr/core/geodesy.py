@@ -47,7 +47,7 @@ def metres(lat_deg: Floats, lon_deg: Floats) -> tuple[Floats, Floats]:
     return offset_m(lat_0_deg, lon_0_deg, lat_deg, lon_deg)
 
 
-def moved(lat_deg: float, lon_deg: float, east_m: float, north_m: float) -> tuple[float, float]:
+def offset_position(lat_deg: float, lon_deg: float, east_m: float, north_m: float) -> tuple[float, float]:
     """Return the point (lat_deg, lon_deg) that lies `east_m` and `north_m` metres from the given point: the reverse of
     `offset_m`."""
     north_deg = math.degrees(north_m / EARTH_RADIUS_M)
@@ -64,7 +64,7 @@ def compute_extent(points: Iterable[LatLon]) -> Extent:
     return min(lats_deg), min(lons_deg), max(lats_deg), max(lons_deg)
 
 
-def axes_of(up_deg: float) -> Doubles:
+def picture_axes(up_deg: float) -> Doubles:
     """Return a picture's axes on the ground, for a picture whose top points to the compass direction `up_deg`: float64
     (2, 2). The first column is the unit vector (east, north) of the picture's right, the second that of its top."""
     up = math.radians(up_deg)

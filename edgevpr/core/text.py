@@ -26,7 +26,7 @@ _SECRET = re.compile(r"(?i)([?&](?:password|passwd|passwort|pass|pwd|token|secre
 _COLUMNS = 120
 _TERMINAL_COLUMNS = 79
 _FEW_WRONG = 1e-3  # of all matches: fewer are not to be told apart in per cent
-_LEAST_WRONG = 1e-6
+_MIN_WRONG = 1e-6
 _SILENT_S = 5.0  # a line is written after so long a silence
 _SOON_S = 10.0  # no remaining time is shown if it, or the time since the start, is shorter
 
@@ -52,7 +52,7 @@ def redact_passwords(text: str) -> str:
     return _SECRET.sub(r"\1***", _PASSWORD.sub(r"\1:***@", text))
 
 
-def shown(text: str, keep: str = "") -> str:
+def sanitize(text: str, keep: str = "") -> str:
     """Make a text fit for messages: see `redact_passwords` and `printable`, which also explains `keep`."""
     return printable(redact_passwords(text), keep)
 
@@ -62,14 +62,14 @@ def decode_name(name: str) -> str:
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
-def meant(name: str, known: Iterable[str], otherwise: str) -> str:
+def suggest(name: str, known: Iterable[str], otherwise: str) -> str:
     """Return "did you mean `X`?" with the one of the `known` names that is most similar to `name`; `otherwise` if none
     is similar."""
     near = get_close_matches(name, list(known), n=1)
     return f"did you mean `{near[0]}`?" if near else otherwise
 
 
-def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
+def align_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
     """Format rows of cells as a table, one line for each row (which may be shorter than others). The first `left`
     columns are flush left, the others flush right."""
     widths = [max(map(len, column)) for column in zip_longest(*rows, fillvalue="")]
@@ -83,7 +83,7 @@ def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int =
     return "\n".join("| " + " | ".join(line) + " |" for line in (headings, ruler, *rows))
 
 
-def wrapped(text: str) -> list[str]:
+def wrap_sentence(text: str) -> list[str]:
     """Break a sentence into lines of at most 120 columns, between words only."""
     return textwrap.wrap(text, _COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
@@ -91,12 +91,12 @@ def wrapped(text: str) -> list[str]:
 def json_line(value: Any) -> bytes:
     """Write a value as one line of JSON, without passwords. Dataclasses become objects, members of
     an Enum their names, NaN and infinities null."""
-    text = json.dumps(_plain(value), ensure_ascii=False, allow_nan=False)
+    text = json.dumps(_to_json(value), ensure_ascii=False, allow_nan=False)
     # Text that is not UTF-8 (a foreign file name) becomes a \u escape, which JSON reads back unchanged.
     return text.encode("utf-8", "backslashreplace") + b"\n"
 
 
-def _plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     """Convert `value` to JSON types; numbers get seven decimals (a centimetre of latitude) or, if below 1, 7 digits."""
     if isinstance(value, str):
         return redact_passwords(value)
@@ -109,13 +109,13 @@ def _plain(value: Any) -> Any:
             return None
         return round(value, 7) if abs(value) >= 1 else float(f"{value:.7g}")
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _to_json(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [_to_json(item) for item in value]
     if is_dataclass(value) and not isinstance(value, type):
-        return _plain(asdict(value))
+        return _to_json(asdict(value))
     if hasattr(value, "tolist"):  # NumPy's scalars and arrays
-        return _plain(value.tolist())
+        return _to_json(value.tolist())
     return redact_passwords(str(value))
 
 
@@ -160,7 +160,7 @@ def progress(
 
 
 @contextmanager
-def at_work(text: str) -> Iterator[None]:
+def show_elapsed(text: str) -> Iterator[None]:
     """Write `text` and the seconds so far to stderr every 5 s until the body of `with` has ended."""
     stream, ended, began_s = sys.stderr, Event(), time.monotonic()
 
@@ -184,7 +184,7 @@ def _time_left(passed_s: float, done: int, total: int) -> str:
     return f", {left_s:.0f} s left" if left_s < 100 else f", {left_s / 60:.0f} min left"
 
 
-def waiting(text: str, stream: TextIO | None = None) -> None:
+def show_waiting(text: str, stream: TextIO | None = None) -> None:
     """Show on a terminal what the program waits for, in a line that the next call replaces; "" clears the line."""
     stream = stream or sys.stderr
     if stream.isatty():
@@ -194,13 +194,13 @@ def waiting(text: str, stream: TextIO | None = None) -> None:
 
 def format_probability(probability: float) -> str:
     """Show the probability of being right: "98.1 %" or, from 99.9 % on, "1 in 3,000 wrong", at most 1 in 1,000,000."""
-    wrong = max(1 - probability, _LEAST_WRONG)
+    wrong = max(1 - probability, _MIN_WRONG)
     if not wrong <= _FEW_WRONG:  # NaN as well
         return f"{100 * probability:.1f} %"
     return f"1 in {float(f'{1 / wrong:.1g}'):,.0f} wrong"
 
 
-def beside(east_m: float, north_m: float) -> str:
+def format_offset(east_m: float, north_m: float) -> str:
     """Write a step on the ground: "3.1 m east and 1.2 m south"."""
     along, up = "east" if east_m > 0 else "west", "north" if north_m > 0 else "south"
     return f"{abs(east_m):.1f} m {along} and {abs(north_m):.1f} m {up}"

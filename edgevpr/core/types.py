@@ -88,7 +88,7 @@ class Vehicle:
     gps: Receiver | None = None
     t_fix_s: float = -math.inf
 
-    def is_fresh_at(self, t_mono_s: float) -> bool:
+    def is_fresh(self, t_mono_s: float) -> bool:
         """Return True if the report came within one second of `t_mono_s`, such as the time of a frame."""
         return abs(t_mono_s - self.t_heard_s) <= _FRESH_S
 

@@ -93,7 +93,7 @@ class StampedTime:
         self._bytes = 0
         self._seen = array("d")  # rows of five, see `_judge`
 
-    def arrived(self, stamp_s: float, order_s: float, t_mono_s: float, size_bytes: int = 0) -> None:
+    def record_arrival(self, stamp_s: float, order_s: float, t_mono_s: float, size_bytes: int = 0) -> None:
         """Record the arrival of a picture with the stamp `stamp_s`. `order_s`: its decoding time stamp, which differs
         in streams that send pictures in another order than they were taken. All in seconds."""
         held_up_s = t_mono_s - self._came_s - self.rate * (order_s - self._order_s)

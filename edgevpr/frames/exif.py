@@ -58,7 +58,7 @@ def read_fov_deg(path: str | Path) -> float | None:
         sides = [float(tags[f"EXIF ExifImage{side}"].values[0]) for side in ("Width", "Length")]
         # Wider pictures than the sensors of 4:3 and 3:2 are cut out of theirs, and as long.
         longest = min(max(sides) / math.hypot(*sides), _LONGEST_OF_DIAGONAL)
-        return _within(math.degrees(2 * math.atan(_FILM_DIAGONAL_MM * longest / 2 / focal_mm)), 5, 150)
+        return _in_range(math.degrees(2 * math.atan(_FILM_DIAGONAL_MM * longest / 2 / focal_mm)), 5, 150)
     return None
 
 
@@ -72,7 +72,7 @@ def _read_tags(path: str | Path) -> Tags:
     return {}
 
 
-def _within(value: float, low: float, high: float) -> float:
+def _in_range(value: float, low: float, high: float) -> float:
     if not low <= value <= high:
         raise ValueError(f"{value:g} where {low:g} to {high:g} is possible")
     return value
@@ -88,26 +88,26 @@ def _position(tags: Tags) -> Position | None:
 def _degrees(tags: Tags, name: str, signs: dict[str, int], limit: float) -> float:
     degrees, minutes, seconds = map(float, tags[name].values)
     # 60 is allowed: 59.99999 may have been rounded to it.
-    value = _within(degrees, 0, limit) + _within(minutes, 0, 60) / 60 + _within(seconds, 0, 60) / 3600
-    return signs[tags[f"{name}Ref"].values.strip()] * _within(value, 0, limit)
+    value = _in_range(degrees, 0, limit) + _in_range(minutes, 0, 60) / 60 + _in_range(seconds, 0, 60) / 3600
+    return signs[tags[f"{name}Ref"].values.strip()] * _in_range(value, 0, limit)
 
 
 def _alt_m(tags: Tags) -> float:
     # 0 is above and 1 below sea level; 2 and 3 (EXIF 3.0) are relative to the ellipsoid: not usable here.
     reference = tags["GPS GPSAltitudeRef"].values[0] if "GPS GPSAltitudeRef" in tags else 0
-    return _within({0: 1, 1: -1}[reference] * float(tags["GPS GPSAltitude"].values[0]), *ALT_M)
+    return _in_range({0: 1, 1: -1}[reference] * float(tags["GPS GPSAltitude"].values[0]), *ALT_M)
 
 
 def _heading_deg(tags: Tags) -> float | None:
     if "GPS GPSImgDirectionRef" in tags and tags["GPS GPSImgDirectionRef"].values != "T":
         return None  # magnetic: off by the declination, which is unknown
-    return _within(float(tags["GPS GPSImgDirection"].values[0]), 0, 360) % 360
+    return _in_range(float(tags["GPS GPSImgDirection"].values[0]), 0, 360) % 360
 
 
 def _gps_time_s(tags: Tags) -> float:
     hours, minutes, seconds = map(float, tags["GPS GPSTimeStamp"].values)
     day_s = _time_s(f"{tags['GPS GPSDate'].values} 00:00:00")
-    return day_s + _within(hours, 0, 24) * 3600 + _within(minutes, 0, 60) * 60 + _within(seconds, 0, 61)
+    return day_s + _in_range(hours, 0, 24) * 3600 + _in_range(minutes, 0, 60) * 60 + _in_range(seconds, 0, 61)
 
 
 def _camera_time_s(tags: Tags) -> float:
@@ -131,7 +131,7 @@ def read_xmp(path: str | Path) -> GeoTag:
     values = _values(head)
     if oriented := _SKYDIO.search(head):
         values |= {f"NED {name}": text for name, text in _values(oriented[1]).items()}
-    height_m = _first_number(values, "RelativeAltitude", ("drone-dji", "drone", "drone-skydio"), *ALT_M)
+    height_m = _find_number(values, "RelativeAltitude", ("drone-dji", "drone", "drone-skydio"), *ALT_M)
     for name in _GIMBALS:
         # Small drones of DJI write zeros, which tell nothing: a gimbal that looks north and ahead is never so exact.
         if angles := _yaw_pitch_roll(values, name):
@@ -141,7 +141,7 @@ def read_xmp(path: str | Path) -> GeoTag:
     if angles := _yaw_pitch_roll(values, "Camera:{}"):
         yaw_deg, pitch_deg, roll_deg = angles
         return GeoTag(heading_deg=yaw_deg % 360, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
-    nose_deg = _first_number(values, "FlightYawDegree", ("drone-dji", "drone"), -360, 360)
+    nose_deg = _find_number(values, "FlightYawDegree", ("drone-dji", "drone"), -360, 360)
     return GeoTag(heading_deg=None if nose_deg is None else nose_deg % 360, height_m=height_m)
 
 
@@ -152,17 +152,17 @@ def _values(packet: bytes) -> dict[str, bytes]:
 def _yaw_pitch_roll(values: Mapping[str, bytes], name: str) -> tuple[float, float, float] | None:
     """Return the angles by a name with {} for Yaw, Pitch and Roll; None if one is missing, or if all are zero."""
     with contextlib.suppress(KeyError, ValueError):
-        yaw, pitch, roll = (_within(float(values[name.format(axis)]), -360, 360) for axis in ("Yaw", "Pitch", "Roll"))
+        yaw, pitch, roll = (_in_range(float(values[name.format(axis)]), -360, 360) for axis in ("Yaw", "Pitch", "Roll"))
         return (yaw, pitch, roll) if any((yaw, pitch, roll)) else None
     return None
 
 
-def _first_number(
+def _find_number(
     values: Mapping[str, bytes], name: str, makers: tuple[str, ...], low: float, high: float
 ) -> float | None:
     for maker in makers:
         with contextlib.suppress(KeyError, ValueError):
-            return _within(float(values[f"{maker}:{name}"]), low, high)
+            return _in_range(float(values[f"{maker}:{name}"]), low, high)
     return None
 
 

@@ -102,35 +102,35 @@ def decode_image(data: bytes, path: str, depth: DepthRange | None = None) -> Ima
     return image  # type: ignore[return-value]  # its dtype has been checked
 
 
-def decoded(jpeg: bytes) -> Image:
+def decode_jpeg(jpeg: bytes) -> Image:
     """Decode a JPEG written by edgevpr. Returns uint8, (H, W, 3) BGR or (H, W) grey."""
     return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_ANYCOLOR)  # type: ignore[return-value]  # uint8
 
 
-def as_jpeg(image: Image) -> bytes:
+def encode_jpeg(image: Image) -> bytes:
     """Encode a picture, uint8 (H, W, 3) BGR or (H, W) grey, as a JPEG of the quality used in recordings of flights."""
-    return _encoded(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _TAPE_QUALITY))
+    return _encode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _TAPE_QUALITY))
 
 
 def small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
     """Encode a picture, uint8 (H, W[, 3]), as a JPEG for people, its longest side at most `longest_px`."""
-    return _encoded(".jpg", at_most(image, longest_px), (cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY))
+    return _encode(".jpg", limit_size(image, longest_px), (cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY))
 
 
 def small_webp(image: Image, longest_px: int) -> bytes:
     """Encode a picture, uint8 (H, W[, 3 or 4]), as a WebP, which is half as large, and can be transparent."""
-    return _encoded(".webp", at_most(image, longest_px), (cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY))
+    return _encode(".webp", limit_size(image, longest_px), (cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY))
 
 
-def at_most(image: Image, longest_px: int) -> Image:
+def limit_size(image: Image, longest_px: int) -> Image:
     """Scale a picture, uint8 (H, W[, C]), down until its longest side has at most `longest_px` pixels."""
     if (scale := longest_px / max(image.shape[:2])) >= 1:
         return image
     width, height = (max(1, round(scale * side)) for side in image.shape[1::-1])
-    return resized(image, (width, height))
+    return resize(image, (width, height))
 
 
-def resized(image: Image, size_px: tuple[int, int]) -> Image:
+def resize(image: Image, size_px: tuple[int, int]) -> Image:
     """Scale a picture to `size_px` (width, height). In a smaller picture each pixel is the mean of those it covers."""
     return cv2.resize(image, size_px, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]  # of the same dtype
 
@@ -141,10 +141,10 @@ def shrunk(image: Image, shrink: float) -> Image:
     if shrink <= 2:
         return image
     height, width = image.shape[:2]
-    return resized(image, (max(1, round(width / shrink)), max(1, round(height / shrink))))
+    return resize(image, (max(1, round(width / shrink)), max(1, round(height / shrink))))
 
 
-def _encoded(extension: str, image: Image, options: Sequence[int] = ()) -> bytes:
+def _encode(extension: str, image: Image, options: Sequence[int] = ()) -> bytes:
     return cv2.imencode(extension, image, options)[1].tobytes()
 
 

@@ -67,7 +67,7 @@ class CalibratedLens:
         pixels, _ = project(points, np.zeros(3), np.zeros(3), self.matrix(), np.array(self.coefficients))
         return np.asarray(pixels, np.float64).reshape(-1, 2)
 
-    def of_size(self, size_px: tuple[int, int]) -> "CalibratedLens":
+    def resize_to(self, size_px: tuple[int, int]) -> "CalibratedLens":
         """Return the calibration for pictures of another size, of the same part of the sensor."""
         scale_x, scale_y = size_px[0] / self.size_px[0], size_px[1] / self.size_px[1]
         (focal_x, focal_y), (column, row) = self.focal_px, self.centre_px
@@ -173,7 +173,7 @@ def line_of_sight(lens: CalibratedLens, size_px: tuple[int, int]) -> LensSight:
             f"The picture has {width}x{height} pixels, and {lens.path} was calibrated with {own_width}x{own_height}: "
             "take pictures of that shape, or calibrate the camera with these."
         )
-    lens = lens.of_size(size_px)
+    lens = lens.resize_to(size_px)
     tangents = np.tan(np.radians(np.arange(0, _FARTHEST_DEG + _STEP_DEG, _STEP_DEG)))
     around = np.radians(_AROUND_DEG)
     rays = np.stack([np.outer(np.cos(around), tangents), np.outer(np.sin(around), tangents)], axis=-1)

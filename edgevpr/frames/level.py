@@ -25,7 +25,7 @@ MAX_TILT_DEG = 63.0  # a camera that looks 60 degrees ahead, and sways
 MAX_TILT_UNLEVELLED_DEG = 20.0
 # Rays, (right, down, 1) in focal lengths, that go down by less are left out: beyond are far too distant ground, the
 # horizon and the sky.
-_LEAST_DOWN = 0.1
+_MIN_DOWN = 0.1
 # Standard deviations of a tilt, as tangents: of one that is reported, and of one that only the camera's mount tells.
 _REPORTED_TILT_SD = math.tan(math.radians(1.0))
 _MOUNT_TILT_SD = math.tan(math.radians(3.0))
@@ -35,9 +35,9 @@ _LEAST_TILT_DEG, _LEAST_TURN_DEG, _LEAST_ZOOM = 1.0, 1.0, 0.03  # smaller correc
 # Limits of a picture's footprint over the wanted footprint. Beyond them too few of its pixels are left, or too little
 # of the output is filled, and the height is more likely wrong than so far from the map's.
 _ZOOMS = (0.3, 4.0)
-_LEAST_FILLED = 1 / 3  # of the output area that the same picture would fill if it were taken straight down
+_MIN_FILLED = 1 / 3  # of the output area that the same picture would fill if it were taken straight down
 _HIGHEST_M = 10_000.0
-_LONGEST_PX = 1024  # largest side of a warped picture: no technique uses more pixels
+_MAX_PX = 1024  # largest side of a warped picture: no technique uses more pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ class Levelled:
     view: View
 
 
-def levelled(
+def level_image(
     frame: Frame,
     vehicle: Vehicle | None,
     lens: Lens,
@@ -165,7 +165,7 @@ def levelled(
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
 
     below &= taking.tilt_deg <= MAX_TILT_UNLEVELLED_DEG
-    side = min(taking.longest_px, _LONGEST_PX)
+    side = min(taking.longest_px, _MAX_PX)
     out_px = taking.focal_px * zoom * side / taking.longest_px  # focal length of the output, in its pixels
     turned = taking.straight if taking.heading_deg is None else taking.level_from_lens(-taking.heading_deg)
     middle = np.zeros(2) if below else turned[:2, 2] / turned[2, 2] * out_px
@@ -174,7 +174,7 @@ def levelled(
     warp = taking.warp(out_from_ray, out_px, side)
 
     width, height = (min(1.0, zoom * px / taking.longest_px) for px in taking.size_px)
-    if (filled := warp.shown.mean() / (height * width)) < _LEAST_FILLED:
+    if (filled := warp.shown.mean() / (height * width)) < _MIN_FILLED:
         reason = Reason(ReasonCode.TILTED_OFF_GROUND, {"shown": float(filled), "tilt_deg": taking.tilt_deg})
         view = View(up_deg=taking.top_deg, reason=reason)
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
@@ -186,7 +186,7 @@ def levelled(
         aside=(0.0, 0.0) if below and taking.is_tilt_known else taking.aside(turned, zoom),
         aside_sd=taking.aside_sd(zoom),
     )
-    return _warped(frame.image, overlay, warp, view)
+    return _warp(frame.image, overlay, warp, view)
 
 
 def level_rotation(frame: Frame, lens: Lens) -> Doubles:
@@ -206,19 +206,19 @@ def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> floa
 
 def undistort_frame(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> Levelled:
     """Take the distortion of `lens` from a picture that is not warped otherwise (None: it has none). `overlay` is as in
-    `levelled`. Raises ImageError for a picture of another shape than the lens takes."""
+    `level_image`. Raises ImageError for a picture of another shape than the lens takes."""
     if lens is None:
         return Levelled(image, overlay, view)
     height, width = image.shape[:2]
-    return _warped(image, overlay, line_of_sight(lens, (width, height)).straightening(_LONGEST_PX), view)
+    return _warp(image, overlay, line_of_sight(lens, (width, height)).straightening(_MAX_PX), view)
 
 
-def _warped(image: Image, overlay: Mask | None, warp: Homography | Remap, view: View) -> Levelled:
+def _warp(image: Image, overlay: Mask | None, warp: Homography | Remap, view: View) -> Levelled:
     mask = warp.shown if overlay is None else warp.shown & warp.overlay(overlay)
     return Levelled(warp.picture(image), None if mask.all() else mask, view)
 
 
-def enlarged(picture: Levelled, zoom: float) -> Levelled:
+def enlarge(picture: Levelled, zoom: float) -> Levelled:
     """Enlarge a picture, that is not warped otherwise, around its middle; its size stays."""
     if zoom == 1:
         return picture
@@ -232,10 +232,10 @@ def enlarged(picture: Levelled, zoom: float) -> Levelled:
     return Levelled(np.asarray(image, np.uint8), None if mask.all() else mask, view)
 
 
-def leaning(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN) -> View:
+def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN) -> View:
     """Return the view of a picture that cannot be warped, because its lens is unknown. It has only `lean_m`; or only
-    `reason`, if the picture is tilted too far; or neither, if too little is known. The arguments are as in `levelled`,
-    and impossible values never raise."""
+    `reason`, if the picture is tilted too far; or neither, if too little is known. The arguments are as in
+    `level_image`, and impossible values never raise."""
     roll_deg, pitch_deg, heading_deg, height_m = _attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
         return UNKNOWN_VIEW
@@ -285,7 +285,7 @@ class _Taking:
         self.is_too_tilted = self.tilt_deg > MAX_TILT_DEG
         if not self.is_too_tilted:
             depth = (self.straight @ self.lens_from_pixel @ self.corners)[2]
-            self.corners = cut_polygon(self.corners, depth - _LEAST_DOWN)
+            self.corners = cut_polygon(self.corners, depth - _MIN_DOWN)
         self.top_deg = None if self.heading_deg is None else (self.heading_deg + lens.up_deg) % 360
 
     def warp(self, out_from_ray: Doubles, out_px: float, side: int) -> Homography | Remap:

@@ -20,12 +20,12 @@ from edgevpr.frames.source import Source
 from edgevpr.frames.twins import TwinCheck
 
 _FIRST_WAIT_S = 0.5
-_LONGEST_WAIT_S = 10.0
+_MAX_WAIT_S = 10.0
 _CLOSE_TIMEOUT_S = 0.5
 _TICK_S = 0.2
 _OPENING_S = 90.0  # longer than any opening that ends by itself, see `frames.programs`
 _AGED_S = 1.0
-_MOST_HANGING = 3  # threads that have not ended: a source that hangs each time must not take ever more of them
+_MAX_HANGING = 3  # threads that have not ended: a source that hangs each time must not take ever more of them
 
 
 class _Opening:
@@ -151,7 +151,7 @@ class LiveSource(Source):
             opening.cancel()
             self._hanging.append(opening.thread)
             has_failed_again = wait_s and self._captured == before and fault.condition is not Condition.FROZEN
-            wait_s = min(2 * wait_s, _LONGEST_WAIT_S) if has_failed_again else _FIRST_WAIT_S
+            wait_s = min(2 * wait_s, _MAX_WAIT_S) if has_failed_again else _FIRST_WAIT_S
             self._liveness.reopen(fault)
             self._set_condition(fault.condition, f"{fault.text}, reopening in {wait_s:g} s")
             self._closing.wait(wait_s)
@@ -185,7 +185,7 @@ class LiveSource(Source):
     def _wait_for_threads(self, fault: Fault) -> None:
         while not self._closing.is_set():
             self._hanging = [thread for thread in self._hanging if thread.is_alive()]
-            if len(self._hanging) < _MOST_HANGING:
+            if len(self._hanging) < _MAX_HANGING:
                 return
             self._set_condition(fault.condition, f"{fault.text}; {len(self._hanging)} calls into it hang")
             self._closing.wait(_FIRST_WAIT_S)

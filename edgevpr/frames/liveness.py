@@ -18,7 +18,7 @@ _FROZEN_S = 1.0
 _FROZEN_PICTURES = 3  # repeats, beside the time: a slow camera may take less than three pictures a second
 _DAMAGED_REOPEN_S = 5.0  # longer than streams need to recover from a lost packet
 _FROZEN_REOPEN_S = 5.0  # and twice as long each time that it has not helped, up to:
-_LONGEST_FROZEN_S = 30.0
+_MAX_FROZEN_S = 30.0
 _LATE = "late: the age of its pictures is unknown, as time stamps do not keep time or decoding lags behind"
 _LATE_REOPEN_S = 30.0  # longer than it takes to find the rate of a clock
 
@@ -94,4 +94,4 @@ class Liveness:
         """Note that the source is opened anew because of this fault."""
         if fault.condition is Condition.FROZEN:
             self._is_doubtful = True
-            self._frozen_reopen_s = min(2 * self._frozen_reopen_s, _LONGEST_FROZEN_S)
+            self._frozen_reopen_s = min(2 * self._frozen_reopen_s, _MAX_FROZEN_S)

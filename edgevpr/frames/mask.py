@@ -11,7 +11,7 @@ from edgevpr.core.arrays import Bools, Image
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.frames.images import read_image
 
-MOST_MASKED = 0.6  # share of the frame: with more masked, too little ground is left
+MAX_MASKED = 0.6  # share of the frame: with more masked, too little ground is left
 _WHITE = 128  # grey level from which on a pixel of a mask file shows ground
 
 
@@ -41,8 +41,8 @@ def load_mask(path: str | None) -> Mask | None:
         raise ImageError(f"The mask of `source.mask` (--mask) cannot be used: {error}") from error
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     allowed = grey >= _WHITE
-    if (masked := 1 - allowed.mean()) > MOST_MASKED:
+    if (masked := 1 - allowed.mean()) > MAX_MASKED:
         raise UsageError(
-            f"{path} masks {masked:.0%} of the frame, and {MOST_MASKED:.0%} is the most: leave more of it white."
+            f"{path} masks {masked:.0%} of the frame, and {MAX_MASKED:.0%} is the most: leave more of it white."
         )
     return Mask(allowed, hashlib.sha256(repr(allowed.shape).encode() + np.packbits(allowed).tobytes()).hexdigest())

@@ -35,9 +35,9 @@ _NEEDED_COLUMNS, _TRACK_COLUMNS = ("file", "lat", "lon"), ("time", "lat", "lon")
 _MAX_FILE_BYTES = 100_000_000  # a million images
 # The years 1900 to 2200. Times written in milliseconds are a thousand times too large, and so lie outside.
 _FIRST_S, _LAST_S = -2_208_988_800, 7_258_118_400
-MOST_GAP_S = 5.0  # positions further apart in time are not interpolated: the aircraft may have turned in between
+MAX_GAP_S = 5.0  # positions further apart in time are not interpolated: the aircraft may have turned in between
 _ROUNDING_S = 0.001  # Matroska counts in milliseconds
-_ANGLES = [1, 3, 4]  # which of `_numbers_of` are angles of a full turn
+_ANGLES = [1, 3, 4]  # which of `_to_numbers` are angles of a full turn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,18 +73,18 @@ def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
     is positive), pitch_deg (nose up), and height_m above the ground or rel_alt (DJI's, over the take-off point). All
     cells but the name may be empty; other columns are ignored. Raises UsageError for a file that cannot be read, and
     for a wrong value, with its line."""
-    return {row["file"]: _tag_of(row, where) for where, row in _rows_of(csv_path)}
+    return {row["file"]: _parse_tag(row, where) for where, row in _read_rows(csv_path)}
 
 
 def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
     """Write a positions.csv of `tags` by file name. `read_positions` gives exactly the same tags back."""
-    rows = [(name, *_numbers_of(tag), tag.t_utc_s) for name, tag in tags.items()]
+    rows = [(name, *_to_numbers(tag), tag.t_utc_s) for name, tag in tags.items()]
     _write(csv_path, ("file", *_WRITTEN, "time"), rows)
 
 
 def write_track(csv_path: str | Path, track: "Track") -> None:
     """Write the table of positions of a video. `read_track` gives exactly the same track back."""
-    rows = ((t_s, *_numbers_of(tag)) for t_s, tag in zip(track.t_s, track.tags, strict=True))
+    rows = ((t_s, *_to_numbers(tag)) for t_s, tag in zip(track.t_s, track.tags, strict=True))
     _write(csv_path, ("time", *_WRITTEN), rows)
 
 
@@ -96,14 +96,14 @@ def _write(csv_path: str | Path, header: Sequence[str], rows: Iterable[Sequence[
     write_whole(Path(csv_path), lambda path: path.write_bytes(text.getvalue().encode()))
 
 
-def _numbers_of(tag: GeoTag) -> tuple[Any, ...]:
+def _to_numbers(tag: GeoTag) -> tuple[Any, ...]:
     """Return latitude, longitude, altitude, heading, roll, pitch and height of a tag; None: unknown."""
     at = tag.position
     where = (at.lat_deg, at.lon_deg, at.alt_m) if at else (None, None, None)
     return *where, tag.heading_deg, tag.roll_deg, tag.pitch_deg, tag.height_m
 
 
-def _rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
+def _read_rows(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
     """Read the rows of a table with the columns `needed`: for each "FILE, line N" and its values as text, by column
     name. If `file` is one of `needed`, file names must be unique. Raises UsageError as `read_positions` does."""
     try:
@@ -133,9 +133,9 @@ def _rows_of(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> l
     return found
 
 
-def _tag_of(row: Mapping[str, str], where: str) -> GeoTag:
+def _parse_tag(row: Mapping[str, str], where: str) -> GeoTag:
     """Convert a table's row (text by column name) to a GeoTag. Raises UsageError for a wrong value."""
-    known = {column: _number_in(row, column, *limits, where) for column, limits in _NUMBERS.items()}
+    known = {column: _parse_number(row, column, *limits, where) for column, limits in _NUMBERS.items()}
     lat_deg, lon_deg, position = known["lat"], known["lon"], None
     if lat_deg is not None and lon_deg is not None:
         position = position_or_none(lat_deg, lon_deg, known["alt"])
@@ -145,7 +145,7 @@ def _tag_of(row: Mapping[str, str], where: str) -> GeoTag:
     return GeoTag(
         position=position,
         heading_deg=None if heading_deg is None else heading_deg % 360,
-        t_utc_s=_time_in(row, where),
+        t_utc_s=_parse_time_cell(row, where),
         roll_deg=known["roll_deg"],
         pitch_deg=known["pitch_deg"],
         height_m=known["rel_alt"] if known["height_m"] is None else known["height_m"],
@@ -157,7 +157,7 @@ def position_or_none(lat_deg: float, lon_deg: float, alt_m: float | None) -> Pos
     return None if lat_deg == lon_deg == 0 else Position(lat_deg, lon_deg, alt_m)
 
 
-def _number_in(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
+def _parse_number(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
     """Return the number in `column` of a row, None if the cell is empty or missing. Raises UsageError for text that is
     no number within `low`..`high`."""
     if not (text := row.get(column)):
@@ -171,7 +171,7 @@ def _number_in(row: Mapping[str, str], column: str, low: float, high: float, whe
     return value
 
 
-def _time_in(row: Mapping[str, str], where: str) -> float | None:
+def _parse_time_cell(row: Mapping[str, str], where: str) -> float | None:
     text = row.get("time")
     try:
         return parse_time(text) if text else None
@@ -208,14 +208,14 @@ class Track:
 
     def interpolate_tag(self, t_s: float) -> GeoTag:
         """Return position, attitude and height at the video time `t_s`, interpolated linearly between the two table
-        rows around it. The tag is empty outside the table, and if these rows are more than `MOST_GAP_S` apart."""
+        rows around it. The tag is empty outside the table, and if these rows are more than `MAX_GAP_S` apart."""
         nearest = int(np.abs(np.subtract(self.t_s, t_s)).argmin())
         if abs(self.t_s[nearest] - t_s) <= _ROUNDING_S:
             return self.tags[nearest]
         after = int(np.searchsorted(self.t_s, t_s))
-        if not 0 < after < len(self.t_s) or self.t_s[after] - self.t_s[after - 1] > MOST_GAP_S:
+        if not 0 < after < len(self.t_s) or self.t_s[after] - self.t_s[after - 1] > MAX_GAP_S:
             return GeoTag()
-        one, other = (np.array(_numbers_of(tag), float) for tag in self.tags[after - 1 : after + 1])  # NaN: unknown
+        one, other = (np.array(_to_numbers(tag), float) for tag in self.tags[after - 1 : after + 1])  # NaN: unknown
         way = other - one
         way[_ANGLES] = shorter_deg(way[_ANGLES])
         share = (t_s - self.t_s[after - 1]) / (self.t_s[after] - self.t_s[after - 1])
@@ -244,8 +244,8 @@ def read_track(csv_path: str | Path) -> Track:
     optionally, those of a positions.csv. Rows without a position are ignored. Raises UsageError for a file that cannot
     be read, a wrong value, and a table without any position."""
     tags: dict[float, GeoTag] = {}
-    for where, row in _rows_of(csv_path, _TRACK_COLUMNS):
-        tag = _tag_of(row, where)
+    for where, row in _read_rows(csv_path, _TRACK_COLUMNS):
+        tag = _parse_tag(row, where)
         if tag.position is None:
             continue
         if tag.t_utc_s is None or (tags and tag.t_utc_s <= next(reversed(tags))):

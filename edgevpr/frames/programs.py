@@ -19,7 +19,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from edgevpr.core.errors import SourceError
-from edgevpr.core.text import shown
+from edgevpr.core.text import sanitize
 from edgevpr.core.types import FRAME_TIME_SD_S
 from edgevpr.frames.age import HIDDEN_DELAY_SD_S
 from edgevpr.frames.shot import OpeningError, Refusal, Shot
@@ -126,7 +126,7 @@ class ErrorLines:
         lines = [line.decode(errors="replace").strip() for line in list(self._lines)]
         lines = [line for line in lines if 0 < len(line) <= _STDERR_CHARS]
         best = [line for line in lines if "error" in line.lower()][:1] or lines[-1:]
-        return f": {shown(best[0])}" if best else ""
+        return f": {sanitize(best[0])}" if best else ""
 
     def _read(self) -> None:
         assert self._process.stderr is not None

@@ -19,7 +19,7 @@ _SIZE_PX = 128, 96  # of a coarse copy, columns and rows
 _BLOCK_PX = 16
 _TEXTURE_LEVELS = 2.5  # least standard deviation in a block, grey levels; noise of a picture in the dark has less
 _MOTION_PX = 1.5
-_LEAST_LOSS = 0.05  # of correlation by that motion: less cannot be told from the noise of a compressed picture
+_MIN_LOSS = 0.05  # of correlation by that motion: less cannot be told from the noise of a compressed picture
 _READ_PX = 640  # columns that are averaged, of a larger picture
 _THUMB_PX = 16, 12
 BLOCKS = _SIZE_PX[0] // _BLOCK_PX * (_SIZE_PX[1] // _BLOCK_PX)
@@ -62,7 +62,7 @@ class CoarsePicture:
     @cached_property
     def is_textured(self) -> Bools:
         """True for each block whose texture would show a motion, bool (48,)."""
-        return np.asarray(self.blocks.any(axis=1) & (self.least_loss > _LEAST_LOSS))
+        return np.asarray(self.blocks.any(axis=1) & (self.least_loss > _MIN_LOSS))
 
     def is_unmoved(self, other: "CoarsePicture") -> Bools:
         """True for each textured block that shows the same in the other picture, unmoved, bool (48,)."""

@@ -89,7 +89,7 @@ class RecordingSource(Source):
         return self._only is None or name in self._only
 
 
-def tagged(image: Image, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
+def make_frame(image: Image, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
     """Make a frame of `image`, uint8 (H, W[, 3]), with the position, attitude, height and time of `tag`."""
     known = {field.name: getattr(tag, field.name) for field in fields(tag)}
     return Frame(image=image, name=name, t_mono_s=t_mono_s, **known)
@@ -134,7 +134,7 @@ class FolderSource(RecordingSource):
         except ImageError:
             self.refused[Refusal.DAMAGED.value] += 1
             raise
-        return tagged(image, name, self._clock(), self._tags.get(name) or read_exif(path))
+        return make_frame(image, name, self._clock(), self._tags.get(name) or read_exif(path))
 
 
 def _read_table(folder: Path, positions: Path | None) -> dict[str, GeoTag]:
@@ -191,7 +191,7 @@ def open_source(
             raise SourceError(f"{uri} is live and never ends: give a folder of images or a video file here.")
         from edgevpr.frames.live import LiveSource
 
-        return LiveSource(_capture_of(uri, clock, step_s or _SNAPSHOT_PERIOD_S), clock)
+        return LiveSource(_make_capture(uri, clock, step_s or _SNAPSHOT_PERIOD_S), clock)
     if not path.is_file():
         raise SourceError(f"There is nothing at `{uri}`: give {SOURCES}.")
     if path.name.lower().endswith(EXTENSIONS):
@@ -239,7 +239,7 @@ def missing_cause(uri: str) -> str | None:
     return None
 
 
-def _capture_of(uri: str, clock: Callable[[], float], period_s: float) -> Callable[[], Capture]:
+def _make_capture(uri: str, clock: Callable[[], float], period_s: float) -> Callable[[], Capture]:
     """Return a function that opens the camera or stream `uri`; `period_s`: seconds between requests for pictures where
     each must be requested. Raises SourceError if that can never succeed: a device or a file that is missing may come
     later."""

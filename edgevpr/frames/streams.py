@@ -136,7 +136,7 @@ class StreamCapture:
         if packet.pts is None:
             return
         order = packet.pts if packet.dts is None else packet.dts
-        stamped.arrived(packet.pts * unit_s, order * unit_s, arrival.came_s, packet.size)
+        stamped.record_arrival(packet.pts * unit_s, order * unit_s, arrival.came_s, packet.size)
         if stamped.is_live:
             self._whole.is_backlog_doubtful = False  # packets from now on were sent after the opening
 

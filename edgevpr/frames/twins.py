@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.errors import ImageError
-from edgevpr.frames.images import cv2, resized
+from edgevpr.frames.images import cv2, resize
 
 _HALVES = ("left and the right", "upper and the lower")
 _COPY_PX = (128, 96)  # width and height of the copy that is compared
@@ -18,8 +18,8 @@ _PEAK_RADIUS_PX = 4.0
 # Chosen on 975 pictures of 14 sets and on stereo pictures made of them, with another exposure, turned by half a degree,
 # shifted, squeezed and noisy: 96 % of these reach both, and none of the ordinary ones (the nearest: 0.46 and 0.13).
 _TWIN_CORRELATION = 0.5
-_LEAST_LEAD = 0.15  # over correlations farther from the largest one; lines (a road) and rows (crops) have none
-_LEAST_DETAIL_LEVELS = 1.5  # standard deviation in grey levels; with less, nothing can be compared
+_MIN_LEAD = 0.15  # over correlations farther from the largest one; lines (a road) and rows (crops) have none
+_MIN_DETAIL_LEVELS = 1.5  # standard deviation in grey levels; with less, nothing can be compared
 _TWINS_TO_DECIDE = 5  # pictures that look like twins, more than single ones
 _SINGLES_TO_DECIDE = 10  # single pictures, more than twins, after which no more are compared
 
@@ -38,7 +38,7 @@ class TwinCheck:
         if self._evidence == -_SINGLES_TO_DECIDE:
             return image
         by_side = {side: correlate_halves(image, side) for side in _HALVES}
-        twins = [side for side, (best, lead) in by_side.items() if best >= _TWIN_CORRELATION and lead >= _LEAST_LEAD]
+        twins = [side for side, (best, lead) in by_side.items() if best >= _TWIN_CORRELATION and lead >= _MIN_LEAD]
         has_detail = all(best > 0 for best, _ in by_side.values())
         is_single = has_detail and all(best < _TWIN_CORRELATION for best, _ in by_side.values())
         self._evidence = min(self._evidence + bool(twins) - is_single, _TWINS_TO_DECIDE)
@@ -56,13 +56,13 @@ def correlate_halves(image: Image, side: str) -> tuple[float, float]:
     """Return the largest correlation, 0 to 1, between both halves of a picture, one of `_HALVES`, over the shifts that
     a stereo camera causes; and by how much it exceeds all others. 0 and 0: there is too little detail."""
     are_above = side == _HALVES[1]
-    copy = resized(image, _COPY_PX)
+    copy = resize(image, _COPY_PX)
     grey = copy if copy.ndim == 2 else copy[:, :, 1]
     first, second = (_details(half) for half in np.array_split(grey, 2, 0 if are_above else 1))
     height, width = first.shape
     dy, dx = height // 4, width // 4
     middle = second[dy:-dy, dx:-dx]
-    if middle.std() < _LEAST_DETAIL_LEVELS:
+    if middle.std() < _MIN_DETAIL_LEVELS:
         return 0.0, 0.0
     correlations = cv2.matchTemplate(first, middle, cv2.TM_CCOEFF_NORMED)
     rows, columns = np.indices(correlations.shape)

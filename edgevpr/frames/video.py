@@ -12,7 +12,7 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.decoding import WholePictures, open_pictures
 from edgevpr.frames.positions import GeoTag, Track, parse_time
 from edgevpr.frames.shot import OpeningError, Refusal
-from edgevpr.frames.source import RecordingSource, tagged
+from edgevpr.frames.source import RecordingSource, make_frame
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
@@ -22,7 +22,7 @@ _USUAL_RATE_HZ = 25.0
 _CUT_S = 1.0  # seconds that may be missing at the end: other streams in the file may last a little longer
 
 
-def recorded_at(path: Path) -> tuple[float | None, float]:
+def read_start_s(path: Path) -> tuple[float | None, float]:
     """Return when a video was begun, in seconds since 1970 by the clock of the camera (None: it does not say), and how
     many seconds it lasts (0: unknown). Raises SourceError for a file that is no video."""
     whole = _open_video(path, "the video file of the positions")
@@ -88,7 +88,7 @@ class VideoSource(RecordingSource):
                 if self.is_wanted(name):
                     tag = self._track.interpolate_tag(self._t_s) if self._track else GeoTag()
                     image = self.twins.require_single(self._whole.conversion(picture)())
-                    return tagged(image, name, self._clock(), tag)
+                    return make_frame(image, name, self._clock(), tag)
             if self._clock() >= deadline_s:
                 break
         return None

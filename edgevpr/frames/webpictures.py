@@ -14,7 +14,7 @@ from edgevpr.core.errors import ImageError
 from edgevpr.core.types import FRAME_TIME_SD_S
 from edgevpr.frames.age import HIDDEN_DELAY_SD_S
 from edgevpr.frames.depth import DepthRange
-from edgevpr.frames.images import as_jpeg, decode_image, jpeg_is_whole
+from edgevpr.frames.images import decode_image, encode_jpeg, jpeg_is_whole
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, coarse
 
 _MAX_BYTES = 64_000_000  # of one picture
@@ -129,7 +129,7 @@ def _read_parts(answer: http.client.HTTPResponse) -> Iterator[bytes]:
             del seen[:end]
             whole_s = time.monotonic()
             with suppress(ImageError):
-                jpeg = data if data.startswith(_JPEG_START) else as_jpeg(decode_image(data, "the part"))
+                jpeg = data if data.startswith(_JPEG_START) else encode_jpeg(decode_image(data, "the part"))
                 yield b"--part\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n" % (len(jpeg), jpeg)
         if len(seen) > _MAX_BYTES or time.monotonic() > whole_s + _MAX_PART_S:
             return

@@ -22,7 +22,7 @@ from edgevpr.core.config import SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.geodesy import shorter_deg
-from edgevpr.core.text import at_work
+from edgevpr.core.text import show_elapsed
 from edgevpr.frames.exif import read_exif, read_fov_deg, read_xmp
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.mask import Mask
@@ -30,8 +30,8 @@ from edgevpr.frames.positions import find_positions, find_track, read_positions,
 from edgevpr.frames.source import Source, open_source, read_to_end
 from edgevpr.mapmaking.pictures import FlownPictures
 from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, measure_tilt
-from edgevpr.runtime.recognise.agreement import PROVEN, agreement
-from edgevpr.runtime.recognise.calibration import FEWEST_PLACES
+from edgevpr.runtime.recognise.agreement import PROVEN, measure_agreement
+from edgevpr.runtime.recognise.calibration import MIN_PLACES
 from edgevpr.runtime.recognise.landmarks import describe
 
 _log = logging.getLogger(__name__)
@@ -87,9 +87,9 @@ def warn_of_gaps(pictures: FlownPictures, total: int, places: int | None) -> Non
             next(Path(uri).parent.glob(f"{Path(uri).stem}.[sS][rR][tT]"), "LOG_OR_TRACK"),
             uri,
         )
-    if total and places is not None and total + places < FEWEST_PLACES:
+    if total and places is not None and total + places < MIN_PLACES:
         text = "%d places at most: a map of fewer than %d cannot be calibrated, and finds little: give more pictures"
-        _log.warning(text, total + places, FEWEST_PLACES)
+        _log.warning(text, total + places, MIN_PLACES)
 
 
 def suggest_lens(pictures: FlownPictures, config: SourceConfig, technique: Technique) -> None:
@@ -105,7 +105,7 @@ def suggest_lens(pictures: FlownPictures, config: SourceConfig, technique: Techn
         _log.info(text, fov_deg, fov_deg)
 
 
-@at_work("looking where the camera looks")
+@show_elapsed("looking where the camera looks")
 def require_ahead(pictures: FlownPictures, mask: Mask | None) -> None:
     """Log that the camera is taken to look ahead, and why. Raises UsageError if the pictures clearly look straight
     down: the user must say then what is meant."""
@@ -121,7 +121,7 @@ def require_ahead(pictures: FlownPictures, mask: Mask | None) -> None:
     _log.info("the camera is taken to look ahead (%s): give --camera nadir if it looks straight down", why)
 
 
-@at_work("measuring the tilt of the camera")
+@show_elapsed("measuring the tilt of the camera")
 def require_level(pictures: FlownPictures, fov_deg: float | None) -> None:
     """Raise UsageError if neighbouring pictures show that a camera that is to look straight down is tilted, and its
     angles are not recorded: then nothing could level them."""
@@ -152,7 +152,7 @@ def _compare_neighbours(pictures: FlownPictures, mask: Mask | None) -> tuple[boo
     pairs, clear, aside = 0, 0, 0
     for run in runs:
         marks = [describe(image, mask.fitted(image) if mask else None, _LANDMARKS) for image in run]
-        for seen in (agreement(one, other) for one, other in pairwise(marks)):
+        for seen in (measure_agreement(one, other) for one, other in pairwise(marks)):
             if seen.inliers < PROVEN or seen.shift_share is None or seen.rotation_deg is None or seen.scale is None:
                 continue
             pairs += 1
@@ -166,7 +166,7 @@ def _compare_neighbours(pictures: FlownPictures, mask: Mask | None) -> tuple[boo
     return is_down, f"of {pairs} pairs of neighbours, {clear} are turned or moved up or down, and {aside} aside"
 
 
-@at_work("looking for a display")
+@show_elapsed("looking for a display")
 def warn_of_display(pictures: FlownPictures, mask: Mask | None) -> None:
     """Warn if something stands still in the pictures where `mask` shows ground (None: everywhere)."""
     if pictures.folder:

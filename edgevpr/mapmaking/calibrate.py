@@ -25,15 +25,15 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
 from edgevpr.core.types import Frame
 from edgevpr.frames.level import Levelled
-from edgevpr.mapmaking.changes import changed
+from edgevpr.mapmaking.changes import change_picture
 from edgevpr.mapmaking.look_alikes import MapSearch, measure_look_alikes
 from edgevpr.mapmaking.mapping import Watch
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import elsewhere
+from edgevpr.places.retrieve import outside_neighbourhood
 from edgevpr.places.rows import readable
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.calibration import FEWEST_PLACES, MapCalibration, calibration_text
+from edgevpr.runtime.recognise.calibration import MIN_PLACES, MapCalibration, calibration_text
 from edgevpr.runtime.recognise.confidence import Figures, Logistic, Model, prior
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder
 from edgevpr.runtime.recognise.evidence import (
@@ -42,7 +42,7 @@ from edgevpr.runtime.recognise.evidence import (
     DOWN,
     DOWN_BARE,
     Evidence,
-    count_beside,
+    count_neighbours,
     list_evidence_kinds,
 )
 from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
@@ -51,11 +51,11 @@ Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the frames of th
 
 THERE, LEFT_OUT, MIRRORED = "there", "left out", "mirrored"
 ASKED_AHEAD, ASKED_DOWN = 120, 60  # pictures, by the camera's direction; each takes longer when it looks down
-_MOST_WITHOUT_POSITION = 0.2  # share of the places of a map that looks down, whose pictures overlap in any order
+_MAX_WITHOUT_POSITION = 0.2  # share of the places of a map that looks down, whose pictures overlap in any order
 _LEFT_OUT_COUNTS = 0.3  # weight of LEFT_OUT results: flights over ground outside the map are rarer
-# Strength with which the fit holds on to the shipped weights, and to the bias (see `fitted`). Chosen on corridor and
-# sat_marash, with the other sets in view. Looking down, with 5 and a free bias, the pictures drawn by chance decided
-# whether 14 or 39 of 80 queries of sat_marash were accepted; ahead, a bias that is held costs corridor half.
+# Strength with which the fit holds on to the shipped weights, and to the bias (see `fit_logistic`). Chosen on corridor
+# and sat_marash, with the other sets in view. Looking down, with 5 and a free bias, the pictures drawn by chance
+# decided whether 14 or 39 of 80 queries of sat_marash were accepted; ahead, a bias that is held costs corridor half.
 _PULL = {AHEAD: (50.0, 0.0), AHEAD_PROVEN: (50.0, 0.0), DOWN: (200.0, 200.0), DOWN_BARE: (200.0, 200.0)}
 _SEED = 15
 _EVEN = 0.5  # precision for which hardly any match is refused for low confidence
@@ -97,17 +97,20 @@ def ask(
             continue
         may_be_same = search.same_ground(slot)
         ways = ((THERE, picture, index), (LEFT_OUT, picture, index.only(~may_be_same)))
-        for way, seen, among in (*ways, (MIRRORED, _mirrored(picture), index)):
+        for way, seen, among in (*ways, (MIRRORED, _mirror(picture), index)):
             if not len(among):
                 continue
-            image, shown = changed(seen.image, rng, technique.spec.looks_down, seen.mask)
+            image, shown = change_picture(seen.image, rng, technique.spec.looks_down, seen.mask)
             event = search.find(place_id, image, shown, among)
             if event.evidence is None or event.best is None or event.confidence is None:
                 yield MapAnswer(place_id=place_id, way=way, right=False, evidence=None)
                 continue
             best = search.slots[event.best.place.place_id]
-            beside = count_beside(rule.look_alikes)
-            right = way == THERE and not elsewhere(index, slot, np.array([best]), search.near_m, beside=beside)[0]
+            beside = count_neighbours(rule.look_alikes)
+            right = (
+                way == THERE
+                and not outside_neighbourhood(index, slot, np.array([best]), search.near_m, beside=beside)[0]
+            )
             if way == THERE and not right and may_be_same[best] and not np.isnan(index.lat_deg[best]):
                 continue  # the two pictures may overlap: it is unknown whether the match is right
             refused = not event.accepted and event.confidence >= sure.threshold(event.evidence)
@@ -139,26 +142,26 @@ def calibrate(
     kinds = list_evidence_kinds(technique.spec)
     require(kinds, f"matches of {technique.spec.name} are judged by score and margin; only `cohog` has a confidence")
     index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
-    require(len(index) >= FEWEST_PLACES, f"it has {len(index)} places, and {FEWEST_PLACES} are needed")
-    is_placed = not technique.spec.looks_down or np.isnan(index.lat_deg).mean() <= _MOST_WITHOUT_POSITION
+    require(len(index) >= MIN_PLACES, f"it has {len(index)} places, and {MIN_PLACES} are needed")
+    is_placed = not technique.spec.looks_down or np.isnan(index.lat_deg).mean() <= _MAX_WITHOUT_POSITION
     require(is_placed, "its places have no positions, so nobody knows which of them show the same ground")
     rule = accept_rule(technique, config)
     if not technique.spec.looks_down:
         near_m = MapSearch(technique, place_map, index, rule, meter=meter).near_m
         described = (
             (place_id, encoded.descriptor)
-            for place_id, encoded in _as_mapped(encoder, place_map, pictures, watch, len(place_map))
+            for place_id, encoded in _read_mapped(encoder, place_map, pictures, watch, len(place_map))
         )
         rule = replace(rule, look_alikes=measure_look_alikes(technique, place_map, index, near_m, described))
     count = query_altered_copies(technique)
     as_mapped = (
-        (place_id, encoded.picture) for place_id, encoded in _as_mapped(encoder, place_map, pictures, watch, count)
+        (place_id, encoded.picture) for place_id, encoded in _read_mapped(encoder, place_map, pictures, watch, count)
     )
     answers = list(ask(technique, place_map, index, rule, meter, as_mapped))
     at_hand = len({answer.place_id for answer in answers})
     require(
-        at_hand >= FEWEST_PLACES,
-        f"the pictures of {at_hand} places are at hand, and those of {FEWEST_PLACES} are needed; give the pictures "
+        at_hand >= MIN_PLACES,
+        f"the pictures of {at_hand} places are at hand, and those of {MIN_PLACES} are needed; give the pictures "
         "that it was made of, with the same camera and mask",
     )
     calibration = replace(_calibration(answers, kinds, config.accept_precision), look_alikes=rule.look_alikes)
@@ -171,7 +174,7 @@ def query_altered_copies(technique: Technique) -> int:
     return ASKED_DOWN if technique.spec.looks_down else ASKED_AHEAD
 
 
-def _as_mapped(
+def _read_mapped(
     encoder: FrameEncoder, place_map: PlaceMap, pictures: Pictures, watch: Watch[Frame], count: int
 ) -> Iterator[tuple[int, EncodedFrame]]:
     """Yield (a place's number, its picture as it was encoded for the map) for `count` pictures in random order, again
@@ -185,7 +188,7 @@ def _as_mapped(
         encoded = encoder.encode(frame)
         of_name = ids_by_image.get(readable(frame.name), ())
         if (
-            place_id := next((at for at in of_name if place_map.is_of(at, encoded.descriptor.coarse)), None)
+            place_id := next((at for at in of_name if place_map.has_descriptor(at, encoded.descriptor.coarse)), None)
         ) is not None:
             yield place_id, encoded
 
@@ -195,7 +198,7 @@ def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: 
     asked for."""
     known = [answer for answer in answers if answer.evidence]
     made_of = f"{len(known)} answers of the map itself"
-    models = {kind: adapted(prior(kind), kind, known, made_of) for kind in kinds}
+    models = {kind: adapt_model(prior(kind), kind, known, made_of) for kind in kinds}
     sure = Sureness(models, precision)
     accepted = [
         answer
@@ -218,7 +221,7 @@ def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: 
     )
 
 
-def adapted(model: Model, kind: str, answers: Iterable[MapAnswer], made_of: str) -> Model:
+def adapt_model(model: Model, kind: str, answers: Iterable[MapAnswer], made_of: str) -> Model:
     """Return a copy of the confidence model `model`, of this kind of evidence, with its `of_place` fitted to the
     answers of a map. Answers without evidence are ignored. `made_of`: a note, kept in the model, on the data that it
     was fitted to."""
@@ -229,7 +232,7 @@ def adapted(model: Model, kind: str, answers: Iterable[MapAnswer], made_of: str)
     of_place = model.of_place
     if not right.all():  # wrong ones are needed to fit anything
         weights = np.array([_LEFT_OUT_COUNTS if answer.way == LEFT_OUT else 1.0 for answer, _ in known])
-        of_place = fitted(of_place, rows, right, weights, *_PULL[kind])
+        of_place = fit_logistic(of_place, rows, right, weights, *_PULL[kind])
     return Model(
         of_map=model.of_map,
         of_place=of_place,
@@ -240,7 +243,7 @@ def adapted(model: Model, kind: str, answers: Iterable[MapAnswer], made_of: str)
     )
 
 
-def fitted(
+def fit_logistic(
     start: Logistic, rows: Sequence[Figures], right: Bools, weights: Doubles, pull: float, pull_of_bias: float = 0.0
 ) -> Logistic:
     """Fit a logistic regression to N `rows` of evidence, of which `right`, bool (N,), is True for right matches;
@@ -270,6 +273,6 @@ def evidence_matrix(rows: Sequence[Figures], names: Sequence[str]) -> Doubles:
     return np.array([[row[name] for name in names] for row in rows], float).reshape(len(rows), len(names))
 
 
-def _mirrored(picture: Levelled) -> Levelled:
+def _mirror(picture: Levelled) -> Levelled:
     mask = None if picture.mask is None else np.ascontiguousarray(picture.mask[:, ::-1])
     return Levelled(np.ascontiguousarray(picture.image[:, ::-1]), mask, picture.view)

@@ -9,17 +9,17 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Array, Doubles, Floats, Image, Mask, Singles
-from edgevpr.frames.images import resized
+from edgevpr.frames.images import resize
 
 _STRENGTH = (0.3, 1.3)  # least and greatest: from a change like a cloud to one like snow
 # Of the pictures of the sets that the strengths were chosen on. Larger ones take long to change, and their noise, which
 # is that of pixels, would be averaged away.
-_LONGEST_PX = 640
+_MAX_PX = 640
 _TONES = 6  # points of a tone curve
 _PATCHES = 2  # most plain patches that hide a part of the picture
 
 
-def changed(
+def change_picture(
     image: Image, rng: np.random.Generator, looks_down: bool, shown: Mask | None = None
 ) -> tuple[Image, Mask | None]:
     """Change a picture, uint8 (H, W[, 3]), at random as if taken at another time. With `looks_down`, it is also rotated
@@ -27,23 +27,23 @@ def changed(
     * the changed picture, uint8 grey, at most 640 pixels long, and
     * `shown` for the changed picture."""
     strength = rng.uniform(*_STRENGTH)
-    if (shrink := _LONGEST_PX / max(image.shape[:2])) < 1:
+    if (shrink := _MAX_PX / max(image.shape[:2])) < 1:
         size_px = round(shrink * image.shape[1]), round(shrink * image.shape[0])
-        image = resized(image, size_px)
+        image = resize(image, size_px)
         if shown is not None:
             shown = cv2.resize(shown.view(np.uint8), size_px, interpolation=cv2.INTER_NEAREST).view(bool)
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
-    warp = _from_beside(grey.shape, rng, strength, looks_down)
-    seen = _warped(grey.astype(np.float32) / 255, warp, cv2.INTER_LINEAR)
+    warp = _change_viewpoint(grey.shape, rng, strength, looks_down)
+    seen = _warp(grey.astype(np.float32) / 255, warp, cv2.INTER_LINEAR)
     seen = another_season(seen, rng, strength)
     lit = _another_light(seen, rng, strength)
     _hide(lit, rng, strength)
     if shown is not None:
-        shown = _warped(shown.view(np.uint8), warp, cv2.INTER_NEAREST).view(bool)
+        shown = _warp(shown.view(np.uint8), warp, cv2.INTER_NEAREST).view(bool)
     return (255 * np.clip(lit, 0, 1)).round().astype(np.uint8), shown
 
 
-def _from_beside(shape: tuple[int, int], rng: np.random.Generator, strength: float, looks_down: bool) -> Doubles:
+def _change_viewpoint(shape: tuple[int, int], rng: np.random.Generator, strength: float, looks_down: bool) -> Doubles:
     """Return a random homography of pixels, (3, 3), that changes a picture of this `shape` as another position, height,
     course and tilt of the camera would."""
     height, width = shape
@@ -58,7 +58,7 @@ def _from_beside(shape: tuple[int, int], rng: np.random.Generator, strength: flo
     return warp
 
 
-def _warped(image: Array, warp: Doubles, flags: int) -> Array:
+def _warp(image: Array, warp: Doubles, flags: int) -> Array:
     return cv2.warpPerspective(image, warp, image.shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT)
 
 

@@ -22,7 +22,7 @@ from edgevpr.frames.source import RecordingSource
 from edgevpr.mapmaking.georaster import WGS84, local_crs, transform
 from edgevpr.mapmaking.missions import Area, read_area, shapely
 from edgevpr.mapmaking.orthophoto import Orthophoto
-from edgevpr.mapmaking.tiles import ground_of
+from edgevpr.mapmaking.tiles import surround
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.pictures import Cuttings
@@ -30,18 +30,18 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 SIDE_PX = 512
-MOST_WITHOUT_DATA = 0.1  # share of a picture's pixels
+MAX_WITHOUT_DATA = 0.1  # share of a picture's pixels
 _GEO_REFERENCE_M = 1.0  # standard deviation of the orthophoto's own position on the Earth, in each axis
 # Pixels of the raster along a picture, by benchmarks/results/from_space.md: with fewer, less is found, or nothing.
 _SHARP_PX = 150
-_LEAST_PX = 32
+_MIN_PX = 32
 _WHITE = 200  # grey values: the least, and the largest difference of colours
 _COLOURLESS = 30
 _CLOUDY = 1 / 3  # share of a picture that is white: in seven sets without clouds it is at most a sixth
 _BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
-_MOST_PLACES = 1_000_000
+_MAX_PLACES = 1_000_000
 _EDGE_MARGIN = 0.01  # of the sides of a box
-_MOST_POINTS = 20 * _MOST_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
+_MAX_POINTS = 20 * _MAX_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +60,7 @@ class Lattice:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def position_of(self, at: int) -> Position:
+    def locate_place(self, at: int) -> Position:
         """Return the position of one place."""
         return Position(float(self.lat_deg[at]), float(self.lon_deg[at]))
 
@@ -99,13 +99,13 @@ class OrthophotoSource(RecordingSource):
         name = f"{self.short_name}{of_several}_r{row}_c{column}"
         if not self.is_wanted(name):
             return None
-        position = lattice.position_of(at)
+        position = lattice.locate_place(at)
         try:
             image, valid = self._orthophoto.cut(position, lattice.footprint_m, SIDE_PX)
         except ImageError:
             self.refused[Refusal.DAMAGED.value] += 1
             raise
-        if valid.mean() < 1 - MOST_WITHOUT_DATA:
+        if valid.mean() < 1 - MAX_WITHOUT_DATA:
             self.counts["without_data"] += 1
             return None
         self.counts["white"] += _white(image) > _CLOUDY
@@ -132,7 +132,7 @@ class OrthophotoSource(RecordingSource):
         )
         if self._orthophoto.is_remote:
             for lattice, at in shown(self._list_places(), self.total, f"fetching tiles from {self._orthophoto.name}"):
-                self._orthophoto.cut(lattice.position_of(at), lattice.footprint_m, SIDE_PX)
+                self._orthophoto.cut(lattice.locate_place(at), lattice.footprint_m, SIDE_PX)
 
     def _list_places(self) -> Iterator[tuple[Lattice, int]]:
         """Yield each place as its lattice and its number there."""
@@ -154,12 +154,12 @@ def open_cuttings(cuttings: "Cuttings", only: Collection[str] | None) -> Orthoph
     """Open an orthophoto and choose the places, see `Cuttings.open`."""
     footprints_m = [float(footprint_m) for footprint_m in np.unique(cuttings.footprint_m)]
     area = read_area(cuttings.area) if cuttings.area else None
-    orthophoto = Orthophoto(cuttings.orthophoto, ground_of(area.points, footprints_m[-1]) if area else None)
+    orthophoto = Orthophoto(cuttings.orthophoto, surround(area.points, footprints_m[-1]) if area else None)
     lattices = [make_lattice(orthophoto, footprint_m, cuttings.spacing_m, area) for footprint_m in footprints_m]
-    if (across_px := footprints_m[0] / orthophoto.resolution_m) < _LEAST_PX:
+    if (across_px := footprints_m[0] / orthophoto.resolution_m) < _MIN_PX:
         raise UsageError(
             f"{orthophoto.name} has {across_px:.0f} pixels along a picture of {footprints_m[0]:g} m, and nothing is "
-            f"found with fewer than {_LEAST_PX}: give a sharper one."
+            f"found with fewer than {_MIN_PX}: give a sharper one."
         )
     return OrthophotoSource(orthophoto, lattices, only=only)
 
@@ -199,7 +199,7 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
             )
         begin = np.clip(np.ceil((area_low - first) / spacing_m), 0, count).astype(int)
         end = np.clip(np.floor((area_high - first) / spacing_m) + 1, begin, count).astype(int)
-    _require_bounded((end - begin).prod(), _MOST_POINTS if area else _MOST_PLACES, spacing_m)
+    _require_bounded((end - begin).prod(), _MAX_POINTS if area else _MAX_PLACES, spacing_m)
     x_m, y_m = (first[axis] + spacing_m * np.arange(begin[axis], end[axis]) for axis in (0, 1))
     y_m = y_m[::-1]
     if area:
@@ -207,7 +207,7 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
     else:
         wanted = np.ones((len(y_m), len(x_m)), bool)
     rows, columns = np.nonzero(wanted)
-    _require_bounded(len(rows), _MOST_PLACES, spacing_m)
+    _require_bounded(len(rows), _MAX_PLACES, spacing_m)
     if not len(rows):
         raise UsageError(
             f"No place of a grid of {spacing_m:g} m lies in the area and in {orthophoto.name}: give a smaller spacing."
@@ -220,9 +220,9 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
 
 def _require_bounded(count: int, most: int, spacing_m: float) -> None:
     if count > most:
-        needed_m = math.ceil(spacing_m * math.sqrt(count / _MOST_PLACES))
+        needed_m = math.ceil(spacing_m * math.sqrt(count / _MAX_PLACES))
         raise UsageError(
-            f"A grid of {spacing_m:g} m has {count:,} points here, and a map {_MOST_PLACES:,} places at most: give "
+            f"A grid of {spacing_m:g} m has {count:,} points here, and a map {_MAX_PLACES:,} places at most: give "
             f"--spacing-m {needed_m}, or an --area."
         )
 

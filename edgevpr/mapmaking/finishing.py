@@ -76,7 +76,7 @@ def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | N
             f"{place_map.path} is of {technique.spec.name}, and not of a camera that looks straight down: only `cohog` "
             "with `--camera nadir` can be refined."
         )
-    with _needing_scipy():
+    with _require_scipy():
         from edgevpr.mapmaking.refine import refine
     refined = refine(place_map, technique, lambda pairs, total: shown(pairs, total, "refining"), images)
     if refined.is_mirrored:
@@ -93,7 +93,7 @@ def calibrate_map(
 ) -> MapCalibration:
     """Calibrate the confidence of an open map with the pictures that it was made from, as far as they can be read (see
     `calibrate`). Raises UsageError if the map cannot be calibrated, or SciPy is missing."""
-    with _needing_scipy():
+    with _require_scipy():
         from edgevpr.mapmaking.calibrate import calibrate
 
     levelling = encoder.levelling
@@ -128,7 +128,7 @@ def make_encoder(source: SourceConfig, pictures: FlownPictures | Cuttings | None
 
 
 @contextmanager
-def _needing_scipy() -> Iterator[None]:
+def _require_scipy() -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:

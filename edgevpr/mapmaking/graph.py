@@ -25,11 +25,11 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from edgevpr.core.arrays import Array, Complexes, Floats
 from edgevpr.core.geodesy import fit_similarity
-from edgevpr.core.text import at_work
+from edgevpr.core.text import show_elapsed
 
 _ROUNDS, _SETTLED = 4, 0.05  # most rounds of estimating the scatters, and their relative change that ends the rounds
 _MOVES, _STAYS = 40, 1e-4  # most Gauss-Newton steps, and the largest move that ends them, as a share of a footprint
-_LONGEST_MOVE = 0.5  # largest change of a log in one Gauss-Newton step
+_MAX_MOVE = 0.5  # largest change of a log in one Gauss-Newton step
 # Factor from the given to the real standard deviations of ties: the first estimate, and the least, since ties that
 # agree well by chance must not make the others look wrong.
 _FIRST, _LEAST = 3.0, 0.5
@@ -75,7 +75,7 @@ class Solved:
     ties_count: np.ndarray
 
 
-@at_work("refining: solving where all pictures lie")
+@show_elapsed("refining: solving where all pictures lie")
 def solve(recorded: np.ndarray, ties: Ties) -> Solved:
     """Solve the pose graph of N places by least squares. `recorded`, complex (N,): the recorded positions, east + i
     north in metres. One standard deviation is estimated for all of them."""
@@ -90,7 +90,7 @@ def solve(recorded: np.ndarray, ties: Ties) -> Solved:
         if len(ties):
             # Unknowns absorb a part of the residuals: the estimate is corrected by the share of spare observations.
             spare = max(2 * len(ties) - 2 * (count - len(np.unique(component))), 1) / (2 * len(ties))
-            times = max(_LEAST, float(np.median(graph.off_ties())) / _MEDIAN_OF_FOUR / np.sqrt(spare))
+            times = max(_LEAST, float(np.median(graph.tie_residuals())) / _MEDIAN_OF_FOUR / np.sqrt(spare))
         off_m = abs(graph.position - recorded)
         # Residual plus the variance of the solution: with few ties, the solution follows every recorded error.
         scatter_m = max(_LEAST_M, float(np.sqrt(_scatter(off_m) ** 2 + np.median(variance[:count]) / 2)))
@@ -130,7 +130,7 @@ class _Graph:
                 base = int(before[at])
                 step, turn = tie_of[at, base]
                 position[at], log[at] = position[base] + np.exp(log[base]) * step, log[base] + turn
-            scale, offset = _laid_over(position[members], recorded[members])
+            scale, offset = _fit_similarity(position[members], recorded[members])
             position[members] = scale * position[members] + offset
             log[members] += np.log(scale)
         self.position, self.log = position, log
@@ -141,20 +141,20 @@ class _Graph:
         each tie, float (T,), 0..1."""
         count, ties = len(self.position), self._ties
         for _ in range(_MOVES):
-            agree = _agree(self.off_ties() / times)
+            agree = _agree(self.tie_residuals() / times)
             by_step, by_turn = (agree / (times * each) ** 2 for each in (ties.step_sd, ties.turn_sd))
             by_recorded = _agree(abs(self.position - self._recorded) / sd_m) / sd_m**2
             jacobian, rest = self._linear(*map(np.sqrt, (by_step, by_turn, by_recorded)))
             normal = (jacobian.conj().T @ jacobian).tocsc()
-            move = _factored(normal).solve(-(jacobian.conj().T @ rest))
+            move = _factorise(normal).solve(-(jacobian.conj().T @ rest))
             # A long move is shortened: far from the solution the logs are not linear.
-            share = min(1.0, _LONGEST_MOVE / max(abs(move[count:]).max(initial=0), 1e-9))
+            share = min(1.0, _MAX_MOVE / max(abs(move[count:]).max(initial=0), 1e-9))
             self.position, self.log = self.position + share * move[:count], self.log + share * move[count:]
             if (abs(move[:count]) < _STAYS * np.exp(self.log.real)).all():
                 break
         return normal, agree
 
-    def off_ties(self) -> Floats:
+    def tie_residuals(self) -> Floats:
         """Return how far each tie differs from the solution, in standard deviations of the tie: float (T,)."""
         steps, turns = self._residuals()
         off: Floats = np.hypot(abs(steps) / self._ties.step_sd, abs(turns) / self._ties.turn_sd)
@@ -194,7 +194,7 @@ def _matrix(ties: Ties, count: int) -> csc_matrix:
     return coo_matrix((ties.step_sd, (ties.query, ties.place)), (count, count)).tocsc()
 
 
-def _laid_over(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, complex]:
+def _fit_similarity(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, complex]:
     """Return two complex numbers, the factor `scale`, which also rotates, and `offset`, so that scale * `shape` +
     offset fits `recorded`; both are points, complex (N,). Outliers get little weight. For one point, the scale is 1."""
     weight = np.ones(len(shape))
@@ -219,7 +219,7 @@ def _scatter(residuals: np.ndarray) -> float:
     return float(np.median(abs(residuals))) / 1.1774 if len(residuals) else 0.0
 
 
-def _factored(normal: csc_matrix) -> SuperLU:
+def _factorise(normal: csc_matrix) -> SuperLU:
     """Factor a Hermitian positive definite matrix (M, M) as L D L^H, its rows and columns in an order that keeps L
     sparse. The factor `U` is D L^H."""
     filled = normal + _NOTHING * identity(normal.shape[0])
@@ -233,7 +233,7 @@ def _inverse_diagonal(normal: csc_matrix) -> Floats:
     and Chen 1973). A column needs the block of the inverse over its rows. That is a part of the block of the column's
     parent, which is the column with the number of its first row.
     """
-    factored = _factored(normal)
+    factored = _factorise(normal)
     lower, pivots = factored.L.tocsc(), factored.U.diagonal().real
     lower.sort_indices()
     below = _rows_below(lower)

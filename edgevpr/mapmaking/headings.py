@@ -18,7 +18,7 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.level import MAX_TILT_DEG, MAX_TILT_UNLEVELLED_DEG, Lens, level_rotation
 from edgevpr.mapmaking.tilt import FEATURES, Features, detect_features, match_features
 
-_LEAST_STEP_M = 3.0  # between two positions: below it their errors turn the course
+_MIN_STEP_M = 3.0  # between two positions: below it their errors turn the course
 _MAX_DIFFERENCE_DEG = 20.0  # of the headings by the motion before and after an image: with more, one of them is wrong
 _MAX_SCALE = 1.2  # by which the same ground may differ between two images: with more, tilt or height have changed
 
@@ -36,10 +36,10 @@ def find_headings(frames: Iterable[Frame], lens: Lens) -> Iterator[Frame]:
             heading_deg, turn_deg = found or (None, None)
         if last:
             before_deg = None if heading_deg is None or turn_deg is None else heading_deg - turn_deg
-            yield _with_heading(last[0], last[2], before_deg)
+            yield _set_heading(last[0], last[2], before_deg)
         last = frame, features, heading_deg
     if last:
-        yield _with_heading(last[0], last[2], None)
+        yield _set_heading(last[0], last[2], None)
 
 
 def lacks_heading(frame: Frame, lens: Lens) -> bool:
@@ -55,7 +55,7 @@ def _compare(before: Frame, start: Features, after: Frame, end: Features, lens: 
         return None
     here, there = ((at.lat_deg, at.lon_deg) for at in (before.position, after.position))
     east_m, north_m = offset_m(*here, *there)
-    pairs = match_features(start, end) if math.hypot(east_m, north_m) >= _LEAST_STEP_M else None
+    pairs = match_features(start, end) if math.hypot(east_m, north_m) >= _MIN_STEP_M else None
     if pairs is None:
         return None
     was, now = (_lay(points, frame, lens) for points, frame in zip(pairs, (before, after), strict=True))
@@ -76,7 +76,7 @@ def _lay(points: Doubles, frame: Frame, lens: Lens) -> Array:
     return np.asarray((rays[0] + 1j * rays[1]) / np.maximum(rays[2], 0.1))
 
 
-def _with_heading(frame: Frame, before_deg: float | None, after_deg: float | None) -> Frame:
+def _set_heading(frame: Frame, before_deg: float | None, after_deg: float | None) -> Frame:
     """Return a frame with the mean of the headings by the motion before and after it, if they agree (None: unknown)."""
     known = [heading_deg for heading_deg in (before_deg, after_deg) if heading_deg is not None]
     if not known or abs(shorter_deg(known[0] - known[-1])) > _MAX_DIFFERENCE_DEG:

@@ -18,9 +18,9 @@ from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame
 from edgevpr.frames.mask import Mask
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
-from edgevpr.places.layers import layers_of
+from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import MAX_BESIDE, Query, compare, elsewhere, scan
+from edgevpr.places.retrieve import MAX_BESIDE, Query, compare, outside_neighbourhood, scan
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import read_calibration_for
@@ -32,7 +32,7 @@ from edgevpr.runtime.recognise.evidence import (
     LookAlike,
     LookAlikes,
     compute_share,
-    count_beside,
+    count_neighbours,
     list_evidence_kinds,
     log_share,
 )
@@ -43,7 +43,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 _BESIDE_PLACES = 10  # so many places before and after one without position may show the same ground
 _OVERLAPS = 2.0  # footprints between two places from which on their pictures, from any heights, share no ground
-LEAST_ALIKE = 0.1  # confidence from which a place elsewhere looks alike, on the page of a map
+MIN_ALIKE = 0.1  # confidence from which a place elsewhere looks alike, on the page of a map
 _DIGITS = 3  # of stored agreements
 
 
@@ -56,7 +56,7 @@ class MapSearch:
     ) -> None:
         self._technique, self._place_map, self._meter = technique, place_map, meter
         self._index, self._rule = index, rule
-        self._layers = layers_of(place_map)
+        self._layers = read_layers(place_map)
         self.near_m = max(rule.neighbour_m, self._layers.median_m or index.spacing_m() or 0.0)
         self.slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
 
@@ -64,7 +64,7 @@ class MapSearch:
         """Return bool (N,), True for each of the index's N places that may show some ground of the place `slot`."""
         index = self._index
         away_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
-        apart, is_way = abs(np.arange(len(index)) - slot), count_beside(self._rule.look_alikes) > 0
+        apart, is_way = abs(np.arange(len(index)) - slot), count_neighbours(self._rule.look_alikes) > 0
         beside = apart <= (_BESIDE_PLACES if is_way else 0)
         return np.where(np.isnan(away_m), beside, away_m <= _OVERLAPS * self.near_m)
 
@@ -92,7 +92,7 @@ def measure_look_alikes(
     all_slots = np.arange(len(index))
 
     def find_elsewhere(slot: int, beside: int) -> Bools:
-        is_elsewhere: Bools = elsewhere(index, slot, all_slots, near_m, beside=beside)
+        is_elsewhere: Bools = outside_neighbourhood(index, slot, all_slots, near_m, beside=beside)
         return np.asarray(is_elsewhere & (all_slots != slot))
 
     def is_beside(slot: int) -> Bools:
@@ -175,10 +175,10 @@ def find_look_alikes(
         if slot is None or np.isnan(index.lat_deg[slot]):
             continue
         away = index.only(~search.same_ground(slot))
-        if not len(away) or not place_map.is_of(place_id, technique.encode(image, mask).coarse):
+        if not len(away) or not place_map.has_descriptor(place_id, technique.encode(image, mask).coarse):
             continue
         event = search.find(place_id, image, mask, away)
-        if event.best is None or event.confidence is None or event.confidence < LEAST_ALIKE:
+        if event.best is None or event.confidence is None or event.confidence < MIN_ALIKE:
             yield None
         else:
             yield FoundLookAlike(place_id, event.best.place.place_id, event.confidence)

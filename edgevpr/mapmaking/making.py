@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from edgevpr.core.config import Config, SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
-from edgevpr.core.text import at_work
+from edgevpr.core.text import show_elapsed
 from edgevpr.core.types import Frame
 from edgevpr.frames.level import STRAIGHT_DOWN
 from edgevpr.frames.mask import Mask, load_mask
@@ -26,10 +26,10 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight.pick import camera_setting, pick_technique
 from edgevpr.runtime.recognise.calibration import MapCalibration
 from edgevpr.runtime.recognise.evidence import list_evidence_kinds
-from edgevpr.runtime.recognise.levelling import lens_of, read_mount
+from edgevpr.runtime.recognise.levelling import read_camera_lens, read_mount
 from edgevpr.runtime.recognise.opening import (
     create_technique,
-    made_for,
+    make_technique,
     open_salience_gate,
     warn_of_other_pictures,
 )
@@ -109,7 +109,11 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             else:
                 place_map.add_attribution(pictures.attribution)
             frames: Iterator[Frame] = filter(None, shown(read_to_end(source, unusable), source.total, "mapping"))
-            if technique.spec.looks_down and isinstance(pictures, FlownPictures) and (camera := lens_of(flown)):
+            if (
+                technique.spec.looks_down
+                and isinstance(pictures, FlownPictures)
+                and (camera := read_camera_lens(flown))
+            ):
                 frames = find_headings(frames, camera)
             encoder = make_encoder(flown, pictures, technique)
             result = build_map(
@@ -155,7 +159,7 @@ def _open_flown(
     if asks_camera and (not name or camera_setting(name, "nadir")):
         advice.require_ahead(pictures, mask)
     if name is None:
-        with at_work("choosing a technique"):
+        with show_elapsed("choosing a technique"):
             name = pick_technique(order.board, source.total or 1, camera)
         settings = settings | camera_setting(name, camera)
     elif camera:  # a technique that knows no camera refuses one that was asked for
@@ -184,4 +188,4 @@ def _make_technique(order: MapOrder, place_map: PlaceMap | None, name: str, sett
     here = load_board("this")
     if place_map is not None:  # one without places is false
         return create_technique(place_map, order.technique, settings, here)
-    return made_for(here.threads, name, settings)
+    return make_technique(here.threads, name, settings)

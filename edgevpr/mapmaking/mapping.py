@@ -12,9 +12,9 @@ from typing import TypeVar
 import numpy as np
 
 from edgevpr.core.errors import ImageError, ModelError
-from edgevpr.core.geodesy import distance_m, metres, moved
+from edgevpr.core.geodesy import distance_m, metres, offset_position
 from edgevpr.core.types import Frame, Position, Salience
-from edgevpr.places.layers import layers_of
+from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import readable
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, explain_failure
@@ -107,7 +107,7 @@ def measure_ground(place_map: PlaceMap) -> Covered | None:
     east_m, north_m = metres(lat_deg, lon_deg)
     steps_m = distance_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])
     middle_m = [float(each.max() + each.min()) / 2 for each in (east_m, north_m)]
-    middle = moved(float(lat_deg[0]), float(lon_deg[0]), *middle_m)
+    middle = offset_position(float(lat_deg[0]), float(lon_deg[0]), *middle_m)
     return Covered(
         north_south_m=float(np.ptp(north_m)),
         east_west_m=float(np.ptp(east_m)),
@@ -154,7 +154,7 @@ def build_map(
     place_map.require(encoder.technique.spec)
     gaps = gaps or Gaps()
     ids_by_image = place_map.select_ids("source_image")
-    result, layers = MappingResult(), layers_of(place_map)
+    result, layers = MappingResult(), read_layers(place_map)
 
     def keep(kept: Iterable[Kept]) -> None:
         for encoded, salience in kept:
@@ -181,7 +181,7 @@ def build_map(
         of_name = ids_by_image.get((readable(frame.name),), ())
         if says_nothing(encoded.descriptor, min_quality):
             result.says_nothing += 1
-        elif any(place_map.is_of(place_id, encoded.descriptor.coarse) for place_id in of_name):
+        elif any(place_map.has_descriptor(place_id, encoded.descriptor.coarse) for place_id in of_name):
             result.already_here += 1
         else:
             result.not_memorable += bool(encoded.worth and encoded.worth.lacks)

@@ -14,7 +14,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, LatLon
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
-from edgevpr.core.geodesy import compute_extent, moved
+from edgevpr.core.geodesy import compute_extent, offset_position
 
 try:
     import shapely as shapely
@@ -123,7 +123,7 @@ def _circle(lat_deg: float, lon_deg: float, radius_m: float) -> Area:
             f"most {_MAX_RADIUS_M:,.0f})."
         )
     turns = (2 * math.pi * corner / _CIRCLE_CORNERS for corner in range(_CIRCLE_CORNERS + 1))
-    ring = [moved(lat_deg, lon_deg, radius_m * math.sin(turn), radius_m * math.cos(turn)) for turn in turns]
+    ring = [offset_position(lat_deg, lon_deg, radius_m * math.sin(turn), radius_m * math.cos(turn)) for turn in turns]
     return Area(polygons=(ring,))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import read_identity
@@ -31,7 +31,7 @@ class MapMove:
         """Return the moved position."""
         away_m = offset_m(*self.middle, position.lat_deg, position.lon_deg)
         east_m, north_m = (each / (1 + (self.scale or 0.0)) for each in map(float, away_m))
-        lat_deg, lon_deg = moved(*self.middle, east_m + self.east_m, north_m + self.north_m)
+        lat_deg, lon_deg = offset_position(*self.middle, east_m + self.east_m, north_m + self.north_m)
         return replace(position, lat_deg=lat_deg, lon_deg=lon_deg)
 
 

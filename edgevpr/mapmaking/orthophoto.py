@@ -13,7 +13,7 @@ from edgevpr.core.arrays import Bools, Doubles, Image
 from edgevpr.core.errors import SourceError, UsageError
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.types import Position
-from edgevpr.frames.images import resized
+from edgevpr.frames.images import resize
 from edgevpr.mapmaking.georaster import (
     CRS,
     HALF_WORLD_M,
@@ -28,7 +28,7 @@ from edgevpr.mapmaking.georaster import (
 from edgevpr.mapmaking.tiles import Ground, describe_address, describe_folder, is_address, parse_host
 
 _EDGE_POINTS = 25  # per edge: a straight edge of the file is a curve in another coordinate system
-_MOST_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
+_MAX_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
 
 Coordinate = TypeVar("Coordinate", float, Doubles)
 
@@ -61,7 +61,7 @@ class Orthophoto:
         self._turn = 360 if self._raster.crs.is_geographic else 2 * HALF_WORLD_M if is_mercator else 0
         try:
             columns, rows = np.array([[self._raster.width / 2], [self._raster.height / 2]])
-            (lon_deg,), (lat_deg,) = self._through(columns, rows, WGS84)
+            (lon_deg,), (lat_deg,) = self._to_crs(columns, rows, WGS84)
             self.middle = Position(lat_deg, shorter_deg(lon_deg))
             lons_deg, lats_deg = self.outline(WGS84)
         except (CPLE_BaseError, RasterioError):
@@ -82,12 +82,12 @@ class Orthophoto:
         along, zero = np.linspace(0, 1, _EDGE_POINTS), np.zeros(_EDGE_POINTS)
         columns = np.concatenate((along, along, zero, zero + 1)) * self._raster.width
         rows = np.concatenate((zero, zero + 1, along, along)) * self._raster.height
-        return self._through(columns, rows, crs)
+        return self._to_crs(columns, rows, crs)
 
-    def _through(self, columns: Doubles, rows: Doubles, crs: CRS) -> tuple[Doubles, Doubles]:
+    def _to_crs(self, columns: Doubles, rows: Doubles, crs: CRS) -> tuple[Doubles, Doubles]:
         """Convert the pixels at `columns` and `rows`, float (N,) each, to x and y in the coordinate system `crs`,
         float64 (N,) each."""
-        x, y = transform(self._raster.crs, crs, *_moved(self._raster.transform, columns, rows))
+        x, y = transform(self._raster.crs, crs, *_transform(self._raster.transform, columns, rows))
         return np.array(x), np.array(y)
 
     def _pixels(self, at: Position, points_m: Doubles) -> Doubles:
@@ -99,9 +99,9 @@ class Orthophoto:
         """Convert points from the coordinate system of the file to pixels: columns and rows, float64 (N,) each."""
         raster, across = self._raster, np.array(x)
         if self._turn:  # a file may have longitudes from 0 to 360 degrees, or cross the date line
-            middle, _ = _moved(raster.transform, raster.width / 2, raster.height / 2)
+            middle, _ = _transform(raster.transform, raster.width / 2, raster.height / 2)
             across += self._turn * np.round((middle - across) / self._turn)
-        return _moved(~raster.transform, across, np.array(y))
+        return _transform(~raster.transform, across, np.array(y))
 
     def cut(self, at: Position, footprint_m: float, side_px: int) -> tuple[Image, Bools]:
         """Cut out the square of ground with its middle at `at`, true north up, and sides of `footprint_m`.
@@ -129,10 +129,10 @@ class Orthophoto:
         )
         large = (large_px, large_px)
         warped = cv2.warpPerspective(ground, view, large, borderMode=cv2.BORDER_REPLICATE)
-        picture = resized(warped, (side_px, side_px))  # type: ignore[arg-type]  # uint8
+        picture = resize(warped, (side_px, side_px))  # type: ignore[arg-type]  # uint8
         warped = cv2.warpPerspective(255 * valid.astype(np.uint8), view, large)
         # Only pixels that are wholly data: one at the edge is mixed with black, and would form a line around the data.
-        seen = resized(warped, (side_px, side_px)) >= 250  # type: ignore[arg-type]  # uint8
+        seen = resize(warped, (side_px, side_px)) >= 250  # type: ignore[arg-type]  # uint8
         if seen.any():
             picture[~seen] = picture[seen].mean(axis=0)
         return picture, seen
@@ -143,14 +143,14 @@ class Orthophoto:
         self._links.cleanup()
 
 
-def _moved(way: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
+def _transform(way: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
     """Apply the affine map `way` to x and y (scalars or arrays). Its own operator differs between releases."""
     return way.a * x + way.b * y + way.c, way.d * x + way.e * y + way.f
 
 
 def _shrink(across_px: float, side_px: int) -> int:
     """Return by which power of two the pixels of a file are averaged when so many become `side_px`."""
-    return 1 << min(int(np.log2(max(across_px / side_px, 1))), _MOST_HALVINGS)
+    return 1 << min(int(np.log2(max(across_px / side_px, 1))), _MAX_HALVINGS)
 
 
 def _nothing(side_px: int) -> tuple[Image, Bools]:

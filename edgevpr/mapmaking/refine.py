@@ -25,18 +25,18 @@ from scipy.spatial import cKDTree
 from edgevpr.core.arrays import Array, Bools, Complexes, Floats
 from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError, PlaceError
-from edgevpr.core.geodesy import metres, moved
+from edgevpr.core.geodesy import metres, offset_position
 from edgevpr.core.text import decode_name
 from edgevpr.core.types import Place, Pose, Position
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.mapmaking.graph import Solved, Ties, solve
 from edgevpr.mapmaking.mapping import Watch
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, agreement
-from edgevpr.runtime.recognise.landmarks import Landmarks, unpacked
+from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, measure_agreement
+from edgevpr.runtime.recognise.landmarks import Landmarks, unpack_bytes
 
-_LEAST_GROUP = 4  # places connected by ties: with three, an error of the scale does not show
-_MOST_TURN = 0.15  # largest standard deviation of a log (see `graph`): 9 degrees, 15 % of the footprint
+_MIN_GROUP = 4  # places connected by ties: with three, an error of the scale does not show
+_MAX_TURN = 0.15  # largest standard deviation of a log (see `graph`): 9 degrees, 15 % of the footprint
 # Positions that miss the shape of the ties by more than this share of their spread are held against mirror images, and
 # one that misses by so much less is the right one. As recorded, sets miss by .01 to .36, and their mirror images by 1.3
 # times as much or more, also with 20 m of noise; with lat and lon exchanged, by .18 to 1.0, and mirrored by .7 or less.
@@ -47,7 +47,7 @@ _INCONSISTENT_SDS = 4.0  # standard deviations of a recorded position from which
 _NEAREST = 8  # each place is compared with so many places recorded nearest
 _BEFORE = 2  # and with so many places mapped just before
 _OVERLAPS = 0.6  # of the longest side: pictures with nearer middles share a third of their ground or more
-_MOST_OVERLAPPING = 12  # pairs of one place, after the graph is solved
+_MAX_OVERLAPPING = 12  # pairs of one place, after the graph is solved
 # Chosen on aerial_caliterra and aerial_garfield28: of their pairs without enough landmarks, and of those of three other
 # sets, no vote with .02 or more was wrong, and of those with landmarks near the vote none at all.
 _MIN_VOTE_SCORE = 0.025  # from which a vote is used without landmarks
@@ -117,18 +117,18 @@ def refine(
     )
     if not placed:
         return result
-    recorded_at = [_recorded(place) for place in placed]
+    recorded_at = [_recorded_position(place) for place in placed]
     east_m, north_m = metres(*np.array([(position.lat_deg, position.lon_deg) for position in recorded_at]).T)
     recorded = east_m + 1j * north_m
     look = _looker(place_map, technique, placed, images)
-    pairs = _likely_pairs(recorded)
+    pairs = _find_likely_pairs(recorded)
     ties = {pair: tie for pair in watch(pairs, len(pairs)) if (tie := look(*pair))}
-    solved = solve(recorded, _ties_of(ties))
+    solved = solve(recorded, _to_ties(ties))
     more = sorted(set(_overlapping_pairs(solved.position, solved.log, _is_sure(solved))) - set(pairs))
     if more:
         ties |= {pair: tie for pair in watch(more, len(more)) if (tie := look(*pair))}
-        solved = solve(recorded, _ties_of(ties))
-    is_mirrored = _is_mirrored(recorded_at, recorded, _ties_of(ties), solved)
+        solved = solve(recorded, _to_ties(ties))
+    is_mirrored = _is_mirrored(recorded_at, recorded, _to_ties(ties), solved)
     sure = _is_sure(solved) & (not is_mirrored)
     _write(place_map, placed, recorded_at, solved, sure)
     off_m = abs(solved.position - recorded)
@@ -150,7 +150,7 @@ def refine(
     )
 
 
-def _recorded(place: Place) -> Position:
+def _recorded_position(place: Place) -> Position:
     """Return the position of a place as it was before any refinement."""
     position = place.pose.recorded if place.pose and place.pose.recorded else place.position
     assert position is not None  # callers pass only places with a position
@@ -160,7 +160,7 @@ def _recorded(place: Place) -> Position:
 def _is_sure(solved: Solved) -> Bools:
     """Return bool (N,), True for places with enough ties and a sufficiently exact solution to get a pose."""
     members = np.bincount(solved.component)[solved.component]
-    is_sure: Bools = (members >= _LEAST_GROUP) & (solved.log_var / 2 <= _MOST_TURN**2)
+    is_sure: Bools = (members >= _MIN_GROUP) & (solved.log_var / 2 <= _MAX_TURN**2)
     return is_sure
 
 
@@ -186,7 +186,7 @@ def _misses(recorded: Complexes, solved: Solved, some: slice) -> float:
     spread of the recorded ones. Only groups of enough places, connected by ties, count; 0 if there is none."""
     component, here = solved.component[some], recorded[some]
     members = np.bincount(component)
-    counts = members[component] >= _LEAST_GROUP
+    counts = members[component] >= _MIN_GROUP
     if not counts.any():
         return 0.0
     middle = (np.bincount(component, here.real) + 1j * np.bincount(component, here.imag)) / np.maximum(members, 1)
@@ -209,7 +209,7 @@ def _write(place_map: PlaceMap, placed: list[Place], recorded_at: list[Position]
             position, pose = recorded_at[at], None
             if sure[at]:
                 var_m2, offset_m = float(solved.position_var[at]) / 2, solved.position[at]
-                position = Position(*moved(origin.lat_deg, origin.lon_deg, offset_m.real, offset_m.imag))
+                position = Position(*offset_position(origin.lat_deg, origin.lon_deg, offset_m.real, offset_m.imag))
                 pose = Pose(
                     up_deg=float(-np.degrees(solved.log[at].imag)) % 360,
                     footprint_m=float(np.exp(solved.log[at].real)),
@@ -224,18 +224,18 @@ def _median(values: Floats) -> float | None:
     return float(np.median(values)) if len(values) else None
 
 
-def _likely_pairs(recorded: Complexes) -> list[Pair]:
+def _find_likely_pairs(recorded: Complexes) -> list[Pair]:
     """Return the pairs of places that may overlap. `recorded`: positions, complex (N,) metres, in the order mapped."""
     count = len(recorded)
     pairs = {(at, at - before) for before in range(1, _BEFORE + 1) for at in range(before, count)}
-    return sorted(pairs | {(at, other) for at, other, _ in _near(recorded, _NEAREST)})
+    return sorted(pairs | {(at, other) for at, other, _ in _pair_nearest(recorded, _NEAREST)})
 
 
 def _overlapping_pairs(position: Complexes, log: Complexes, of: Bools) -> list[Pair]:
     """Return the pairs of places that overlap according to a solved graph. `position` and `log` are those of
     `graph.Solved`; only places where `of`, bool (N,), is True are considered."""
     members, footprint_m = np.flatnonzero(of), np.exp(log.real[of])
-    near = _near(position[members], _MOST_OVERLAPPING)
+    near = _pair_nearest(position[members], _MAX_OVERLAPPING)
     return sorted(
         {
             (int(members[at]), int(members[other]))
@@ -245,7 +245,7 @@ def _overlapping_pairs(position: Complexes, log: Complexes, of: Bools) -> list[P
     )
 
 
-def _near(position: Complexes, most: int) -> Iterator[tuple[int, int, float]]:
+def _pair_nearest(position: Complexes, most: int) -> Iterator[tuple[int, int, float]]:
     """Pair each of N places, at `position`, complex (N,) metres, with the `most` places nearest to it. Yields (number
     of the later place, number of the earlier one, metres between them) for each pair; some pairs come twice."""
     if len(position) > 1:
@@ -256,7 +256,7 @@ def _near(position: Complexes, most: int) -> Iterator[tuple[int, int, float]]:
                 yield max(at, int(other)), min(at, int(other)), float(away_m[at, nth])
 
 
-def _ties_of(tie_of: dict[Pair, Tie]) -> Ties:
+def _to_ties(tie_of: dict[Pair, Tie]) -> Ties:
     """Convert ties to the arrays that `graph.solve` takes."""
     query, place = np.array(list(tie_of), np.intp).reshape(-1, 2).T
     step, turn, step_sd, turn_sd = np.array(list(tie_of.values()), complex).reshape(-1, 4).T
@@ -273,8 +273,8 @@ def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], imag
     @lru_cache(_KEPT)
     def landmarks(at: int) -> Landmarks | None:
         try:
-            blob = place_map.landmarks_of(places[at].place_id)
-            return unpacked(blob) if blob else None
+            blob = place_map.read_landmarks(places[at].place_id)
+            return unpack_bytes(blob) if blob else None
         except (EdgevprError, ValueError):
             return None
 
@@ -286,11 +286,11 @@ def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], imag
             found = technique.encode(read_image(path))
         except EdgevprError:
             return None
-        return found if place_map.is_of(places[at].place_id, found.coarse) else None
+        return found if place_map.has_descriptor(places[at].place_id, found.coarse) else None
 
     def by_landmarks(query: int, place: int, expected: Overlay | None, least: int) -> Tie | None:
         one, other = landmarks(query), landmarks(place)
-        found = None if one is None or other is None else agreement(one, other, expected)
+        found = None if one is None or other is None else measure_agreement(one, other, expected)
         if found is None or found.inliers < least or found.shift_share is None or found.rotation_deg is None:
             return None
         overlay = Overlay(found.shift_share, found.rotation_deg, found.scale)

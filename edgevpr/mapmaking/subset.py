@@ -10,12 +10,12 @@ from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import offset_m
 from edgevpr.mapmaking.missions import Area, shapely
 from edgevpr.places import mapfiles
-from edgevpr.places.examine import Watch, merge, positions_in, select, shrink
+from edgevpr.places.examine import Watch, merge, read_place_positions, select, shrink
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.calibration import (
     MapCalibration,
     calibration_text,
-    of_several,
+    join_calibrations,
     read_calibration_for,
 )
 
@@ -24,7 +24,7 @@ from edgevpr.runtime.recognise.calibration import (
 class Subset:
     """A map that was made for one flight. `maps`: number of those that it was made of. `near`: places near the mission,
     of which the best `places` are in it. `file_bytes`: its size. `is_calibrated`: it has the calibration of the map
-    that it is of, or that of several (see `of_several`)."""
+    that it is of, or that of several (see `join_calibrations`)."""
 
     maps: int
     near: int
@@ -47,7 +47,7 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
     calibrations: list[MapCalibration | None] = []
     for path in _list_maps(source):
         with PlaceMap.open(path) as place_map:
-            place_ids, lat_deg, lon_deg = positions_in(place_map)
+            place_ids, lat_deg, lon_deg = read_place_positions(place_map)
             if there := place_ids[shapely.contains_xy(ground, *project(lat_deg, lon_deg))].tolist():
                 ids_near[path] = there
                 calibrations.append(read_calibration_for(place_map))
@@ -62,7 +62,7 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
             raise UsageError(
                 f"No place of {source} is within {margin_m:g} m of the mission: check both, or the margin."
             )
-        if len(paths) > 1 and (calibration := of_several(calibrations)):
+        if len(paths) > 1 and (calibration := join_calibrations(calibrations)):
             with PlaceMap.open_for_adding(whole) as place_map:
                 place_map.record_calibration(calibration_text(calibration))
         count, file_bytes = near, whole.stat().st_size

@@ -67,7 +67,7 @@ class _Window(NamedTuple):
     bottom: int
 
 
-def ground_of(points: Sequence[LatLon], footprint_m: float) -> Ground:
+def surround(points: Sequence[LatLon], footprint_m: float) -> Ground:
     """Return the ground around `points` (lat, lon), with a margin that suits a path and the pictures along it."""
     footprint_m = min(max(1.0, footprint_m), HALF_WORLD_M)  # what is wrong with another, `make_lattice` says
     south, west, north, east = compute_extent(points)

@@ -132,7 +132,7 @@ def _find_lanes(parameters: Parameters, choice: Choice) -> Iterator[str]:
         yield f"EK3_AFFINITY={int(affinity) & ~_GPS_LANES}"
 
 
-def _by_receiver(*checks: Check) -> Check:
+def _check_receivers(*checks: Check) -> Check:
     """Join the checks of the two receivers to one that goes by that of our own."""
     names = tuple(name for check in checks for name in check.names)
     return Check(names, lambda parameters, choice: checks[choice.receiver].find_changes(parameters, choice))
@@ -194,11 +194,11 @@ _RULES = (
     # AP_GPS.cpp, get_lag: any delay is believed, but the filter's buffer ends (NavEKF3_core::setup_core).
     dangerous(_BY_GPS,
         f"0 to {_MAX_GPS_DELAY_MS}: edgevpr reads it, and sends where it was so long ago (0: 0.2 s)",
-        _by_receiver(*(demand(0, name, allows=at_most(_MAX_GPS_DELAY_MS)) for name in DELAYS)),
+        _check_receivers(*(demand(0, name, allows=at_most(_MAX_GPS_DELAY_MS)) for name in DELAYS)),
         "The filter cannot take a position so far back, and would take it for a newer one.", "GPSn_DELAY_MS"),
     # AP_NavEKF3_Measurements.cpp, CorrectGPSForAntennaOffset: it is taken off our position.
     dangerous(_BY_GPS, f"within {MAX_OFFSET_M:g} m of 0 for our receiver",
-        _by_receiver(*(demand(0, *name_axes(f"GPS{n}_POS"), allows=is_small_offset) for n in (1, 2))),
+        _check_receivers(*(demand(0, *name_axes(f"GPS{n}_POS"), allows=is_small_offset) for n in (1, 2))),
         "We send the position of the vehicle itself, and an antenna's place would move it.", "GPSn_POS_*"),
     dangerous(_BY_GPS, "1",  # AP_AHRS_DCM.cpp and AP_AHRS.cpp, get_relative_position_D_home
         demand(1, "AHRS_GPS_USE", allows=lambda value: value in (0, 1)),

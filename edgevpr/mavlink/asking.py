@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from edgevpr.core.errors import LinkError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import LinkAddress
-from edgevpr.mavlink.channel import Kind, kind_of
+from edgevpr.mavlink.channel import Kind, classify_vehicle
 from edgevpr.mavlink.messages import AUTOPILOT, Health
 from edgevpr.mavlink.parameters import name_alternative
 from edgevpr.mavlink.ports import open_port
@@ -102,7 +102,7 @@ class Inquiry(AbstractContextManager["Inquiry"]):
                 for name in asked:
                     self._put(messages.parameter_request(self.system_id or 0, name))
                 waiting = set(asked)
-                while waiting and (answer := self._first(ANSWER_WAIT_S, _answers_one_of(waiting))):
+                while waiting and (answer := self._first(ANSWER_WAIT_S, _answers_any(waiting))):
                     waiting.remove(answer.param_id)
                     if answer.get_type() == "PARAM_VALUE" and (value := parameter_value(answer, bytewise)) is not None:
                         values[answer.param_id] = value
@@ -219,7 +219,7 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
     return AutopilotReading(
         system_id=beat.get_srcSystem(),
         firmware=firmware,
-        vehicle=kind_of(beat.type).value,
+        vehicle=classify_vehicle(beat.type).value,
         is_armed=bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
         version=version if said else None,
         version_text=".".join(map(str, version)) + _RELEASES.get(packed & 255, "") if said else None,
@@ -244,6 +244,6 @@ def _refuses(message: Message) -> bool:
     return is_answer and message.result in _FINAL
 
 
-def _answers_one_of(names: set[str]) -> Callable[[Message], bool]:
+def _answers_any(names: set[str]) -> Callable[[Message], bool]:
     kinds = ("PARAM_VALUE", "PARAM_ERROR")  # the value, or that the parameter is unknown
     return lambda message: message.get_type() in kinds and message.param_id in names

@@ -73,7 +73,7 @@ class Choice:
         return self.reason if self.channel is Channel.NONE else None
 
 
-def kind_of(mav_type: int) -> Kind:
+def classify_vehicle(mav_type: int) -> Kind:
     """Return the kind of vehicle for the `type` field of its HEARTBEAT (a MAV_TYPE). A VTOL aircraft counts as a plane:
     in forward flight it dead-reckons as one, and its type does not tell whether it hovers."""
     return next((kind for kind, types in _MAV_TYPES.items() if mav_type in types), Kind.OTHER)

@@ -92,18 +92,18 @@ class AutopilotClock:
         self._requests_ns.append(round(now_s * 1e9))
         return mavlink.MAVLink_timesync_message(tc1=0, ts1=self._requests_ns[-1])
 
-    def hear(self, message: Message, now_s: float) -> bool:
+    def handle(self, message: Message, now_s: float) -> bool:
         """Process a message of the autopilot. Returns True if it shows that the autopilot has restarted: its boot time
         goes back or, after a gap of heartbeats, does not go on."""
         kind = message.get_type()
         if kind == "TIMESYNC" and message.tc1 > 0 and message.ts1 in self._requests_ns:
-            if self._hear_answer(message.tc1 / 1e9, message.ts1 / 1e9, now_s):
+            if self._handle_answer(message.tc1 / 1e9, message.ts1 / 1e9, now_s):
                 return True
         elif kind in _BOOT_TIMES:
-            if self._hear_boot_time(kind, message.time_boot_ms):
+            if self._handle_boot_time(kind, message.time_boot_ms):
                 return True
             if kind == "SYSTEM_TIME" and message.time_unix_usec:
-                self._hear_utc(message, now_s)
+                self._handle_utc(message, now_s)
         elif kind == "HEARTBEAT":
             if now_s - self._beat_s > SILENT_AFTER_S:
                 self._doubt_s, self._due_s, self._goes_on = now_s, now_s, False
@@ -138,7 +138,7 @@ class AutopilotClock:
             return 0.0
         return max(math.remainder(boot_s - boot_ms / 1e3, _WRAP_MS / 1e3), self._answers[-1].round_trip_s / 2)
 
-    def _hear_answer(self, boot_s: float, sent_s: float, now_s: float) -> bool:
+    def _handle_answer(self, boot_s: float, sent_s: float, now_s: float) -> bool:
         """Process the answer to the request sent at `sent_s`. Returns True if it is from another boot."""
         answer, before = _Answer(now_s, boot_s - now_s, boot_s - sent_s), self._best
         last = self._answers[-1] if self._answers else None
@@ -154,7 +154,7 @@ class AutopilotClock:
         self._best = min(self._answers, key=lambda kept: kept.round_trip_s)
         return False
 
-    def _hear_boot_time(self, kind: str, boot_ms: int) -> bool:
+    def _handle_boot_time(self, kind: str, boot_ms: int) -> bool:
         """Process the boot time in a message of `kind`. Returns True if it goes back."""
         last_ms = self._boot_ms.get(kind)
         self._boot_ms[kind] = boot_ms
@@ -165,7 +165,7 @@ class AutopilotClock:
         self._goes_on |= not is_back
         return is_back
 
-    def _hear_utc(self, message: Message, now_s: float) -> None:
+    def _handle_utc(self, message: Message, now_s: float) -> None:
         """Process a SYSTEM_TIME: UTC and boot time of one instant, by one clock. Their difference is constant but for
         the rounding of the boot time, and keeps its first value until it is corrected by more."""
         utc_s, boot_s = message.time_unix_usec / 1e6, message.time_boot_ms / 1e3

@@ -151,21 +151,21 @@ class Conversation:
                 continue
             self._packer.seq = (self._packer.seq + 1) % 256
             if sending:
-                self.fixes.note_sent(sending, self._clock())
+                self.fixes.record_sent(sending, self._clock())
             else:
                 self.sent[message.get_type()] += 1
             return packet, sending
         return None
 
-    def note_departed(self, fixes: list[Sending]) -> None:
-        """Count the fixes that have left the port. Call it before `hear` processes the answer to one of them."""
+    def count_departed(self, fixes: list[Sending]) -> None:
+        """Count the fixes that have left the port. Call it before `handle` processes the answer to one of them."""
         self.sent["COMMAND_INT"] += len(fixes)
 
-    def hear(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
+    def handle(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
         """Process bytes received from `sender` at `now_s`. Returns True if they contain the autopilot's heartbeat."""
         is_ours = False
         for message in self.reader.feed(data, sender):
-            if self.autopilot.hear(message, now_s, sender):
+            if self.autopilot.handle(message, now_s, sender):
                 is_ours = True
                 self._packer.srcSystem = self.autopilot.system_id
                 if self._ground:
@@ -177,10 +177,10 @@ class Conversation:
                 self._begin_anew(ReasonCode.AUTOPILOT_RESTARTED)
                 self._announce_restart(now_s)
             if self.autopilot.answer:
-                self._hear_answer(self.autopilot.answer, now_s)
-            if not self.autopilot.identity.is_elsewhere(sender):
-                self._hear_request(message, now_s)
-                self._hear_stamp(message, now_s)
+                self._handle_answer(self.autopilot.answer, now_s)
+            if not self.autopilot.identity.is_foreign(sender):
+                self._handle_request(message, now_s)
+                self._handle_stamp(message, now_s)
         return is_ours
 
     def announce_changes(self) -> None:
@@ -200,7 +200,7 @@ class Conversation:
 
     def break_off(self, lost_fixes: int) -> None:
         """Reset what ends when the port is lost. `lost_fixes` is the number of fixes thrown away with the port."""
-        self.fixes.note_lost(lost_fixes)
+        self.fixes.record_lost(lost_fixes)
         self.autopilot.heard_s = -math.inf  # another one may be at the port when it is open again
         self.reader.parsers.clear()  # with incomplete messages
 
@@ -231,7 +231,7 @@ class Conversation:
                 self.fixes.withhold(why)
             elif (stamp_s := self.autopilot.stamp_s(now_s)) is None:
                 self.fixes.drop_stale(now_s, ReasonCode.CLOCK_UNKNOWN)
-            elif sending := self.fixes.next(now_s) or self._between(now_s):
+            elif sending := self.fixes.next(now_s) or self._next_between(now_s):
                 fix = put_back(sending.fix, now_s, self.autopilot.foreign_stamps.take_lag_s(), self.autopilot.vehicle)
                 return messages.position_fix(fix, now_s, system_id, stamp_s), sending
         else:
@@ -240,7 +240,7 @@ class Conversation:
             return text, None  # not by `send`, which copies to the ground's link: that has its own texts
         return (self._messages.popleft(), None) if self._messages else None
 
-    def _between(self, now_s: float) -> Sending | None:
+    def _next_between(self, now_s: float) -> Sending | None:
         """Return a fix that no match asks for, where one is due and helps. ArduPilot moves its position by it; PX4 may
         move its velocity, too, and would confirm itself."""
         is_due = now_s >= self._between_due_s and self.autopilot.firmware == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
@@ -259,7 +259,7 @@ class Conversation:
         if self.requests.is_paused:
             state = None
         if choice.channel in (Channel.SENSOR, Channel.VISION):
-            return autopilot.px4.told(state, choice.channel is Channel.VISION, autopilot.origin, now_s)
+            return autopilot.px4.make_state_message(state, choice.channel is Channel.VISION, autopilot.origin, now_s)
         if (stamp_s := autopilot.stamp_s(t_s)) is None:
             return None
         if choice.channel is Channel.GPS_INPUT:
@@ -296,7 +296,7 @@ class Conversation:
         self.send(*self.autopilot.interview.questions(now_s, system_id))
         if self.channel is not self._told_channel:
             self._told_channel, self._no_origin_since_s, self._ask_position_s = self.channel, now_s, now_s
-            self.settings.listener.hear_channel(self.channel)
+            self.settings.listener.handle_channel(self.channel)
         if now_s < self._ask_position_s:
             return
         self._ask_position_s = now_s + ASK_AGAIN_S
@@ -329,7 +329,7 @@ class Conversation:
             self.announce(Severity.WARNING, f"autopilot has restarted{often}", "autopilot")
         self._restarted_s = now_s
 
-    def _hear_stamp(self, message: Message, now_s: float) -> None:
+    def _handle_stamp(self, message: Message, now_s: float) -> None:
         """Report a time stamp of another program that spoils those of all senders to an ArduPilot."""
         us = self._packer.srcSystem, self._packer.srcComponent
         sender, autopilot = (message.get_srcSystem(), message.get_srcComponent()), self.autopilot
@@ -338,13 +338,13 @@ class Conversation:
         if found := autopilot.foreign_stamps.find(message, autopilot.clock.boot_time_s(now_s)):
             self.announce(Severity.WARNING, f"wrong stamps: {found}", "stamps")
 
-    def _hear_request(self, message: Message, now_s: float) -> None:
-        self.send(*self.requests.hear(message, (self._packer.srcSystem, self._packer.srcComponent), now_s))
+    def _handle_request(self, message: Message, now_s: float) -> None:
+        self.send(*self.requests.handle(message, (self._packer.srcSystem, self._packer.srcComponent), now_s))
 
-    def _hear_answer(self, answer: str, now_s: float) -> None:
-        sending = self.fixes.hear(answer, self.autopilot.readiness(now_s).why(answer), now_s)
+    def _handle_answer(self, answer: str, now_s: float) -> None:
+        sending = self.fixes.handle(answer, self.autopilot.readiness(now_s).why(answer), now_s)
         if sending and answer == "ACCEPTED":
-            self.autopilot.certainty.note_known(sending.fix.accuracy_m, now_s)
+            self.autopilot.certainty.record_accuracy(sending.fix.accuracy_m, now_s)
         if answer == "FAILED" and self.autopilot.asks_origin(now_s):
             origin = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
             self.send(messages.message_request(self.autopilot.system_id or 0, origin))

@@ -69,7 +69,7 @@ class PortDriver:
         try:
             self._line = self._opened()
         except OSError as error:
-            self._note_trouble(error)
+            self._record_trouble(error)
         except LinkError:
             self.close()
             raise
@@ -115,14 +115,14 @@ class PortDriver:
         if self._closing.wait(self._retry_s):
             return
         self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
-        with self._turns.of_link(self._name):
+        with self._turns.take_link_turn(self._name):
             self._conversation.drop_stale()
         self._line = self._opened()
         self._reopened += 1
 
     def _work(self, line: Line, timeout_s: float) -> None:
         """Write as much as the port accepts, wait until there is something to do or `timeout_s` is over, and read."""
-        with self._turns.of_link(self._name):
+        with self._turns.take_link_turn(self._name):
             if line.port.connected:
                 self._transmit(line)
             self._conversation.announce_changes()
@@ -142,10 +142,10 @@ class PortDriver:
             if self._trouble is not None:
                 log.info("%s is back", self._address)
                 self._trouble = None
-        with self._turns.of_link(self._name):
-            self._note_departed(line)  # before its answer is read
+        with self._turns.take_link_turn(self._name):
+            self._count_departed(line)  # before its answer is read
             self._settings.signing.verdicts.clear()
-            beats = self._conversation.hear(data, self._turns.now_s(), line.port.sender)
+            beats = self._conversation.handle(data, self._turns.now_s(), line.port.sender)
             # An autopilot whose clock is old, which has the key, learns the time from what we send it.
             has_old_clock = OLD in self._settings.signing.verdicts
             is_behind = has_old_clock and not self._conversation.autopilot.listens(self._turns.now_s())
@@ -155,7 +155,7 @@ class PortDriver:
     def _transmit(self, line: Line) -> None:
         while True:
             # Before writing: what has waited too long must not be written on.
-            self._note_departed(line)
+            self._count_departed(line)
             if not line.unsent:
                 next_one = self._conversation.next_packet()
                 if next_one is None:
@@ -165,21 +165,21 @@ class PortDriver:
             if line.unsent:
                 return
 
-    def _note_departed(self, line: Line) -> None:
-        if departed := line.departed():
-            self._conversation.note_departed(departed)
+    def _count_departed(self, line: Line) -> None:
+        if departed := line.take_departed():
+            self._conversation.count_departed(departed)
 
     def _lose(self, error: Exception) -> None:
-        with self._turns.of_link(self._name):
+        with self._turns.take_link_turn(self._name):
             self._conversation.break_off(self._close_line())
-        self._note_trouble(error)
+        self._record_trouble(error)
 
     def _close_line(self) -> int:
         """Close the port, and return the number of fixes thrown away with it."""
         line, self._line = self._line, None
         return line.close() if line else 0
 
-    def _note_trouble(self, error: Exception) -> None:
+    def _record_trouble(self, error: Exception) -> None:
         reason = getattr(error, "strerror", None) or str(error)
         if reason != self._trouble:
             self._trouble = reason
@@ -194,7 +194,7 @@ class PortDriver:
                     break
 
     def _close_all(self) -> None:
-        with self._turns.of_link(self._name):
+        with self._turns.take_link_turn(self._name):
             self._close_line()
             self._conversation.end()
         self._bell.close()

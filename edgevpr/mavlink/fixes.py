@@ -12,7 +12,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 from threading import Event
 
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import FIX_MAX_AGE_S, Vehicle
 from edgevpr.mavlink.ground import Announce
@@ -135,20 +135,20 @@ class Fixes:
             return Reason(ReasonCode.ANSWERS_BEGIN_AGAIN)
         return None
 
-    def note_sent(self, sending: Sending, now_s: float) -> None:
+    def record_sent(self, sending: Sending, now_s: float) -> None:
         """Note that a fix was handed to the port."""
         sending.t_sent_s = self._sent_s = now_s
         self._row += 1
         self._under_way.append((now_s, sending))
 
-    def note_lost(self, count: int) -> None:
+    def record_lost(self, count: int) -> None:
         """Note that `count` fixes were thrown away with the port: they do not count as unanswered in a row, unless the
         sending is stopped already, which only an answer ends."""
         if not self._is_stopped:
             self._row -= count
         self.break_off(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))
 
-    def hear(self, result: str, reason: Reason, now_s: float) -> Sending | None:
+    def handle(self, result: str, reason: Reason, now_s: float) -> Sending | None:
         """Process an answer: `result` is the name of a MAV_RESULT, `reason` explains it. Returns its fix, if any."""
         if self._is_stopped:
             # The answers to all those fixes may arrive now, and must not be matched to a new fix.
@@ -220,5 +220,5 @@ def put_back(fix: Fix, now_s: float, lag_s: float, vehicle: Vehicle | None) -> F
     if younger_s == lag_s or vehicle is None or vehicle.velocity_m_s is None:
         return fix
     east_m, north_m = (-(lag_s - younger_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
-    lat_deg, lon_deg = moved(fix.lat_deg, fix.lon_deg, east_m, north_m)
+    lat_deg, lon_deg = offset_position(fix.lat_deg, fix.lon_deg, east_m, north_m)
     return replace(fix, lat_deg=lat_deg, lon_deg=lon_deg)

@@ -49,7 +49,7 @@ class Requests:
         waiting, self._waiting = self._waiting, None
         return waiting
 
-    def hear(self, message: Message, us: tuple[int, int], now_s: float) -> tuple[Message, ...]:
+    def handle(self, message: Message, us: tuple[int, int], now_s: float) -> tuple[Message, ...]:
         """Process a message and return the replies. `us` is our (system id, component id), `now_s` our clock."""
         sender = message.get_srcSystem(), message.get_srcComponent()
         if sender[0] == 0 or sender == us or not _asks(message, us):

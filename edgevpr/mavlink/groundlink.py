@@ -14,12 +14,12 @@ from edgevpr.mavlink.wire import mavlink
 class GroundConversation(Conversation):
     """The conversation with a ground station: no sender is taken for the autopilot, and the requests of all obeyed."""
 
-    def hear(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
+    def handle(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
         """Process bytes received at `now_s`. Returns True if a ground station, to be answered, beats in them."""
         beats = False
         for message in self.reader.feed(data, sender):
             beats |= message.get_type() == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_GCS
-            self._hear_request(message, now_s)
+            self._handle_request(message, now_s)
         return beats
 
 
@@ -34,7 +34,7 @@ class GroundLink(Link):
         settings = LinkSettings(
             component_id=of_flight.component_id,
             clock=of_flight.clock,
-            signing=of_flight.signing.of_ground(),
+            signing=of_flight.signing.for_ground(),
         )
         super().__init__(address, settings, flight.turns, converse=GroundConversation, drive=drive)
         with self.turn("ground link"):

@@ -60,7 +60,7 @@ class Heights:
         self._takeoff_terrain_m: float | None = None  # altitude of the take-off point by the same terrain data
         self._changing_since_s: float | None = None  # the range finder differs from what `contradiction_m` says
 
-    def hear(self, message: Message, now_s: float, attitude: Attitude | None) -> None:
+    def handle(self, message: Message, now_s: float, attitude: Attitude | None) -> None:
         """Process a TERRAIN_REPORT or a DISTANCE_SENSOR, slanted by the `attitude` (None: unknown)."""
         if message.get_type() == "TERRAIN_REPORT":
             self._handle_terrain(message, now_s)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.ardupilot_parameters import ARDUPILOT_TABLE
-from edgevpr.mavlink.channel import Channel, Choice, Kind, kind_of
+from edgevpr.mavlink.channel import Channel, Choice, Kind, classify_vehicle
 from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.parameters import Decision, ParameterTable, name_alternative
@@ -67,12 +67,12 @@ class Interview:
     def choice(self) -> Choice:
         return self._decision.choice
 
-    def hear(self, message: Message) -> None:
+    def handle(self, message: Message) -> None:
         """Process a message from the autopilot; most kinds are ignored."""
         match message.get_type():
             case "HEARTBEAT":
                 before = self._autopilot, self._kind
-                self._autopilot, self._kind = message.autopilot, kind_of(message.type)
+                self._autopilot, self._kind = message.autopilot, classify_vehicle(message.type)
                 if before != (self._autopilot, self._kind):
                     self._decide()
             case "AUTOPILOT_VERSION":
@@ -80,10 +80,10 @@ class Interview:
             case "PARAM_VALUE" if message.param_id in self._all_names():
                 value = parameter_value(message, bytewise=self._autopilot == mavlink.MAV_AUTOPILOT_PX4)
                 if value is not None:
-                    self._hear_value(message.param_id, value)
+                    self._handle_value(message.param_id, value)
             case "PARAM_ERROR" if message.error == mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST:
                 if message.param_id in self._all_names() and message.param_id not in self._values:
-                    self._note_answer(message.param_id)
+                    self._record_answer(message.param_id)
                     self._absent.add(message.param_id)
                     self._decide()
 
@@ -115,15 +115,15 @@ class Interview:
         for name in names:
             yield messages.parameter_request(target_system, name)
 
-    def _hear_value(self, name: str, value: float) -> None:
-        self._note_answer(name)
+    def _handle_value(self, name: str, value: float) -> None:
+        self._record_answer(name)
         before = self._values.get(name)
         self._values[name] = value
         self._absent.discard(name)
         if value != before:
             self._decide()
 
-    def _note_answer(self, name: str) -> None:
+    def _record_answer(self, name: str) -> None:
         """Note that the autopilot answered for one parameter: so it hears us, and may not have the others."""
         self._version_asks *= bool(self._values)
         self._silent_rounds = 0

@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import replace
 from typing import NamedTuple
 
-from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
@@ -22,8 +22,8 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
 FASTEST_M_S = 150.0  # over ground: a small aircraft is never faster, so such a report is wrong
-_LEAST_HPA = 300.0  # of the air where anything flies
-_MOST_HPA = 1100.0
+_MIN_HPA = 300.0  # of the air where anything flies
+_MAX_HPA = 1100.0
 _MILLI_G_M_S2 = 9.80665e-3
 
 # Reports of where the vehicle is, and how it moves; the first three carry the boot time.
@@ -78,7 +78,7 @@ class Identity:
         self._spoke_s = now_s
         return True
 
-    def is_elsewhere(self, address: Sender | None) -> bool:
+    def is_foreign(self, address: Sender | None) -> bool:
         """Return True if bytes from this address cannot come from our autopilot, whose address is another one."""
         return self.kept is not None and address != self.kept.address
 
@@ -100,16 +100,16 @@ class Listener:
     """Base class of an object that navigates by the reports of the autopilot, and gives the positions to be sent; this
     one does nothing. The link's thread calls the methods, which never block and never raise."""
 
-    def hear_autopilot(self, t_s: float) -> None:
+    def handle_autopilot(self, t_s: float) -> None:
         """Note that at `t_s` an autopilot was first heard, has restarted, or that another one has taken its place."""
 
-    def hear_channel(self, channel: Channel) -> None:
+    def handle_channel(self, channel: Channel) -> None:
         """Note the channel by which the autopilot is told positions: when first chosen, and when it changes."""
 
-    def hear_vehicle(self, vehicle: Vehicle) -> None:
+    def handle_vehicle(self, vehicle: Vehicle) -> None:
         """Process a report of the vehicle's position and velocity."""
 
-    def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
+    def handle_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Process the specific force at `t_s` (m/s^2 along nose, right and down), and the attitude then."""
 
     def believes_gps(self) -> bool:
@@ -193,9 +193,9 @@ class Autopilot:
     def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
         """Return the last report, moved to `t_mono_s`: see `Conversation.vehicle_at`."""
         vehicle, attitude = self.vehicle, self.attitudes.at(t_mono_s)
-        if vehicle and vehicle.velocity_m_s and vehicle.is_fresh_at(t_mono_s):
+        if vehicle and vehicle.velocity_m_s and vehicle.is_fresh(t_mono_s):
             east_m, north_m = ((t_mono_s - vehicle.t_heard_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
-            lat_deg, lon_deg = moved(vehicle.lat_deg, vehicle.lon_deg, east_m, north_m)
+            lat_deg, lon_deg = offset_position(vehicle.lat_deg, vehicle.lon_deg, east_m, north_m)
             vehicle = replace(vehicle, lat_deg=lat_deg, lon_deg=lon_deg)
         if vehicle is None or attitude is None:
             return vehicle
@@ -205,11 +205,11 @@ class Autopilot:
             vehicle, roll_deg=roll_deg, pitch_deg=pitch_deg, tilting_deg_s=tilting_deg_s, heading_deg=heading_deg
         )
 
-    def hear(self, message: Message, now_s: float, address: Sender | None = None) -> bool:
+    def handle(self, message: Message, now_s: float, address: Sender | None = None) -> bool:
         """Process a message received at `now_s` from `address`. Returns True if it is a heartbeat of our autopilot."""
         self.answer, self.has_restarted = None, False
         if message.get_srcComponent() != AUTOPILOT or message.get_srcSystem() == 0:
-            self.identity.foreign_messages += self.identity.is_elsewhere(address)
+            self.identity.foreign_messages += self.identity.is_foreign(address)
             return False
         kind = message.get_type()
         beats = bool(kind == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID)
@@ -217,12 +217,12 @@ class Autopilot:
         if not self.identity.admits(Speaker(message.get_srcSystem(), address), beats, now_s):
             return False
         is_other = self.identity.kept != before
-        self.has_restarted = not is_other and self.clock.hear(message, now_s)
+        self.has_restarted = not is_other and self.clock.handle(message, now_s)
         if is_other or self.has_restarted:
             self._forget()
-            self.clock.hear(message, now_s)
-            self._listener.hear_autopilot(now_s)
-        self.interview.hear(message)
+            self.clock.handle(message, now_s)
+            self._listener.handle_autopilot(now_s)
+        self.interview.handle(message)
         if kind == "COMMAND_ACK" and message.target_component not in (0, self._own_component):  # 0: to all
             return False
         if kind == "COMMAND_ACK":
@@ -231,10 +231,10 @@ class Autopilot:
             self.heard_s, self.firmware = now_s, message.autopilot
             self.is_armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         else:
-            self._hear_report(message, now_s)
+            self._handle_report(message, now_s)
         return beats
 
-    def _hear_report(self, message: Message, now_s: float) -> None:
+    def _handle_report(self, message: Message, now_s: float) -> None:
         kind = message.get_type()
         if kind in _TIMED_REPORTS:
             self.report_delay.update(self.clock.delay_s(message.time_boot_ms, now_s), now_s)
@@ -246,38 +246,38 @@ class Autopilot:
                 self.answer = answer = known.name.removeprefix("MAV_RESULT_") if known else str(message.result)
                 self.acks[answer] += 1
             case "DISTANCE_SENSOR" | "TERRAIN_REPORT":
-                self.heights.hear(message, now_s, self.attitudes.at(now_s))
+                self.heights.handle(message, now_s, self.attitudes.at(now_s))
             case "GPS_RAW_INT" | "GPS2_RAW":
                 self.receivers.handle(message, now_s)
                 if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
                     self._gps_s = now_s
             case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS" as name:
                 self._flags, self._flags_s = message.flags, now_s
-                self.certainty.hear(message, now_s)
+                self.certainty.handle(message, now_s)
                 if name == "ESTIMATOR_STATUS":
-                    self.px4.hear(message, now_s, self._receiver(now_s), self._listener.believes_gps())
+                    self.px4.handle(message, now_s, self._receiver(now_s), self._listener.believes_gps())
             case "GLOBAL_POSITION_INT":
-                self._hear_position(message, now_s)
+                self._handle_position(message, now_s)
             case "ATTITUDE":
-                self.attitudes.hear(message, now_s)
+                self.attitudes.handle(message, now_s)
             case "SCALED_IMU" if attitude := self.attitudes.at(now_s):
                 self.force_s = now_s
                 force_m_s2 = tuple(axis * _MILLI_G_M_S2 for axis in (message.xacc, message.yacc, message.zacc))
-                self._listener.hear_force(now_s, force_m_s2, attitude)
-            case "SCALED_PRESSURE" if _LEAST_HPA < message.press_abs < _MOST_HPA:
+                self._listener.handle_force(now_s, force_m_s2, attitude)
+            case "SCALED_PRESSURE" if _MIN_HPA < message.press_abs < _MAX_HPA:
                 self.pressure_alt_m = 44330.8 * (1 - (message.press_abs / 1013.25) ** 0.190263)
             case "GPS_GLOBAL_ORIGIN":
                 self.origin = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
                 self._origin_s = now_s
 
-    def _hear_position(self, message: Message, now_s: float) -> None:
+    def _handle_position(self, message: Message, now_s: float) -> None:
         """Process a GLOBAL_POSITION_INT. One off the Earth, or at 0, 0, is no position: `vehicle` is then None."""
         gps, lat_deg, lon_deg = self._receiver(now_s), message.lat / 1e7, message.lon / 1e7
         is_near = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= GPS_AGREES_WITHIN_M)
         # By a continuous channel the estimate may be made of our own positions: it says nothing about the receiver.
         has_gps = bool(gps) and (is_near or self.interview.choice.channel.is_continuous) and self.px4.uses_gps
         if gps and has_gps:
-            self.certainty.note_known(gps.sd_m, now_s)
+            self.certainty.record_accuracy(gps.sd_m, now_s)
         is_nowhere = (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7
         east_m_s, north_m_s = message.vy / 100, message.vx / 100
         above_sea_m = None if is_nowhere else message.alt / 1e3
@@ -301,7 +301,7 @@ class Autopilot:
             position_sd_m=self.certainty.now(now_s),
             innovation_ratio=self.certainty.innovation_ratio(now_s),
         )
-        self._listener.hear_vehicle(self.vehicle)
+        self._listener.handle_vehicle(self.vehicle)
 
     def _receiver(self, now_s: float) -> Receiver | None:
         """Return the newest report of the best GPS receiver that is not played by us; None if none has a fix."""

@@ -212,7 +212,7 @@ def open_port(address: LinkAddress) -> Port:
 
 class Line:
     """Writes packets to a port, one after another. A fix counts as sent when all its bytes have left the operating
-    system (over TCP: when they are confirmed). If that has not happened by its `due_s`, `departed` raises
+    system (over TCP: when they are confirmed). If that has not happened by its `due_s`, `take_departed` raises
     ConnectionError; closing the port then throws the bytes away. `unsent` are the bytes of the last packet that the
     port has not accepted yet."""
 
@@ -248,7 +248,7 @@ class Line:
         elif self._clock() - self._blocked_since_s > STUCK_S:
             raise ConnectionError("the port takes no more bytes")
 
-    def departed(self) -> list[Sending]:
+    def take_departed(self) -> list[Sending]:
         """Return the fixes that have left since the last call, now sent. Raises ConnectionError if one is too late."""
         departed = []
         # Read before the bytes are asked for: a clock that jumps meanwhile must not condemn what has just left.

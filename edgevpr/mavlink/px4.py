@@ -21,7 +21,7 @@ _SENDING_FOR_S = 1.0
 # A receiver that has come back has to be steady for so long before it is left to PX4: less would follow a flapping one.
 _STEADY_S = 1.5
 _FIRST_PAUSE_S = 30.0  # from a try that PX4 did not take to the next; twice as long each time
-_LONGEST_PAUSE_S = 240.0
+_MAX_PAUSE_S = 240.0
 
 
 class Px4Use:
@@ -44,7 +44,7 @@ class Px4Use:
         count = self.used + self.unused
         return self.used / count if count else None
 
-    def told(
+    def make_state_message(
         self, state: MotionState | None, is_vision: bool, origin: tuple[float, float, float] | None, now_s: float
     ) -> Message | None:
         """Make the message that tells PX4 a state (None: unknown), by message 296 or, if it `is_vision`, by ODOMETRY,
@@ -54,7 +54,7 @@ class Px4Use:
         self._sent_s, self._is_vision = now_s, is_vision
         return messages.vision_position(state, origin) if is_vision and origin else messages.position_sensor(state)
 
-    def hear(self, report: Message, now_s: float, receiver: Receiver | None, is_believed: bool = True) -> None:
+    def handle(self, report: Message, now_s: float, receiver: Receiver | None, is_believed: bool = True) -> None:
         """Process an ESTIMATOR_STATUS. `receiver` is the best GPS receiver that has a fix (None: none has), which
         `is_believed` unless matches prove it wrong."""
         is_fusing = bool(report.flags & _FUSES_ABSOLUTE)
@@ -91,4 +91,4 @@ class Px4Use:
         elif now_s - self._unused_since_s >= _UNUSED_FOR_S and self.uses_gps:
             self.uses_gps = False
             self._next_try_s = now_s + self._pause_s
-            self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
+            self._pause_s = min(2 * self._pause_s, _MAX_PAUSE_S)

@@ -7,7 +7,7 @@ The autopilot's estimate is another matter: it may be made of our own positions.
 import math
 from dataclasses import dataclass, replace
 
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Receiver
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -71,7 +71,7 @@ def extrapolate(receiver: Receiver, t_s: float, velocity_m_s: tuple[float, float
     (east, north; None: with its own velocity)."""
     since_s = t_s - receiver.t_s + RECEIVER_LAG_S
     east_m, north_m = (since_s * speed_m_s for speed_m_s in velocity_m_s or receiver.velocity_m_s or (0.0, 0.0))
-    return moved(receiver.lat_deg, receiver.lon_deg, east_m, north_m)
+    return offset_position(receiver.lat_deg, receiver.lon_deg, east_m, north_m)
 
 
 def _report(message: Message, now_s: float) -> Receiver:
@@ -102,5 +102,5 @@ def _follows(before: Receiver, report: Receiver) -> bool:
     if len(speeds) < 2:
         return True
     east_m, north_m = (step_s * (one + other) / 2 for one, other in zip(*speeds, strict=True))
-    expected = moved(before.lat_deg, before.lon_deg, east_m, north_m)
+    expected = offset_position(before.lat_deg, before.lon_deg, east_m, north_m)
     return math.hypot(*map(float, offset_m(*expected, report.lat_deg, report.lon_deg))) <= _MAX_STEP_M

@@ -133,7 +133,7 @@ class Signing:
         self._key, self._stamps, self._link_id = key, stamps, link_id
         self.verdicts: list[str | None] = []
 
-    def of_ground(self) -> "Signing":
+    def for_ground(self) -> "Signing":
         """Return the signing of the link to the ground: the same key and time stamps, but another link id."""
         return Signing(self._key, self._stamps, TO_GROUND)
 

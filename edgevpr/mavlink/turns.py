@@ -38,7 +38,7 @@ class Turns:
             self._t_s = None
 
     @contextmanager
-    def of_link(self, name: str) -> Iterator[None]:
+    def take_link_turn(self, name: str) -> Iterator[None]:
         """Context manager: take a turn in the thread of the link `name`."""
         with self._lock, self.again(self._clock()):
             yield

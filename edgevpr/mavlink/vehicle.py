@@ -10,7 +10,7 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.wire import Message, mavlink
 
 _KEPT_S = 3.0  # of attitudes: a frame is hardly ever older when it is recognised
-_MOST_KEPT = 200
+_MAX_KEPT = 200
 _NEAR_S = 0.3  # from an attitude to the time of a frame that it is used for
 # A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that came up when GPS was lost. In a gale it would be
 # four times as much, or four standard deviations.
@@ -43,11 +43,11 @@ class Attitudes:
         """Return how many attitudes a second have come in the last three seconds."""
         return sum(now_s - attitude.t_s <= _KEPT_S for attitude in self._kept) / _KEPT_S
 
-    def hear(self, message: Message, now_s: float) -> None:
+    def handle(self, message: Message, now_s: float) -> None:
         """Add the attitude of an ATTITUDE message; one that is not finite is ignored."""
         radians = message.roll, message.pitch, message.yaw
         if all(map(math.isfinite, radians)):
-            kept = [attitude for attitude in self._kept[1 - _MOST_KEPT :] if now_s - attitude.t_s <= _KEPT_S]
+            kept = [attitude for attitude in self._kept[1 - _MAX_KEPT :] if now_s - attitude.t_s <= _KEPT_S]
             self._kept = (*kept, Attitude(now_s, *map(math.degrees, radians)))
 
     def at(self, t_s: float) -> Attitude | None:
@@ -73,7 +73,7 @@ class Certainty:
         self._own: tuple[float, float] | None = None  # standard deviation that the filter reports, time
         self._ratio: tuple[float, float] | None = None  # innovation of measured positions over the filter's gate, time
 
-    def hear(self, message: Message, now_s: float) -> None:
+    def handle(self, message: Message, now_s: float) -> None:
         """Process a report of the autopilot's position filter: EKF_STATUS_REPORT or ESTIMATOR_STATUS."""
         is_px4 = message.get_type() == "ESTIMATOR_STATUS"
         self._ratio = (message.pos_horiz_ratio if is_px4 else message.pos_horiz_variance), now_s
@@ -90,7 +90,7 @@ class Certainty:
         """Return the newest ratio of the innovation of measured positions to the filter's gate; None if it is old."""
         return self._ratio[0] if self._ratio and now_s - self._ratio[1] <= FILTER_FRESH_S else None
 
-    def note_known(self, sd_m: float, now_s: float) -> None:
+    def record_accuracy(self, sd_m: float, now_s: float) -> None:
         """Note that at `now_s` the position is known this well, by GPS or by an accepted fix of ours."""
         self._known = sd_m, now_s
 

@@ -32,7 +32,7 @@ class PacketReader:
 
     def feed(self, data: bytes, sender: Hashable = None) -> Iterator[Message]:
         """Yield the admitted messages that `data` completes. `sender` is its source, if there can be several."""
-        parser = self._parser_of(sender)
+        parser = self._find_parser(sender)
         while data:
             # The portions end where a message ends, so the parser's buffer is emptied each time and never grows.
             portion = parser.bytes_needed()
@@ -49,7 +49,7 @@ class PacketReader:
                 self.received[message.get_type()] += 1
                 yield message
 
-    def _parser_of(self, sender: Hashable) -> mavlink.MAVLink:
+    def _find_parser(self, sender: Hashable) -> mavlink.MAVLink:
         if (parser := self.parsers.pop(sender, None)) is None:
             parser = mavlink.MAVLink(None)
             parser.robust_parsing = True  # bad data comes as BAD_DATA messages instead of an exception

@@ -162,7 +162,7 @@ class MapConnection:
                 raise PlaceError(self.path, place_id, f"SQLite says: {error}") from error
         if not found:
             raise PlaceError(self.path, place_id, "its row is gone")
-        return rows.content_of(columns, found)
+        return rows.read_columns(columns, found)
 
     def __len__(self) -> int:
         """Return the number of places; in a damaged file, count only the readable ones. Raises MapError."""

@@ -18,7 +18,7 @@ from edgevpr.places.index import best_places
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import Content, Unreadable, Values
 
-_MOST_FAULTS = 20  # most faults of a file that SQLite lists
+_MAX_FAULTS = 20  # most faults of a file that SQLite lists
 _NO_LANDMARKS: Content = {"landmarks": None, "landmarks_crc32": None}
 _LOW = 0.5  # factor on the value of a place that was added only because there would have been too wide a gap
 
@@ -34,7 +34,7 @@ class Examined(NamedTuple):
     is_usable: bool
 
 
-def positions_in(place_map: PlaceMap) -> tuple[Ints, Doubles, Doubles]:
+def read_place_positions(place_map: PlaceMap) -> tuple[Ints, Doubles, Doubles]:
     """Return the ids, int (N,), and the positions, float64 (N,) each, of the readable places; NaN: unknown."""
     place_ids, lat_deg, lon_deg, _ = np.array(list(place_map.outlines())).reshape(-1, 4).T
     return place_ids.astype(int), lat_deg, lon_deg
@@ -44,7 +44,7 @@ def positions_in(place_map: PlaceMap) -> tuple[Ints, Doubles, Doubles]:
 Watch = Callable[[Iterable[Examined], int, str], Iterable[Examined]]
 
 
-def unwatched(places: Iterable[Examined], total: int, label: str) -> Iterable[Examined]:
+def iterate_silently(places: Iterable[Examined], total: int, label: str) -> Iterable[Examined]:
     return places
 
 
@@ -69,9 +69,9 @@ def examine(place_map: PlaceMap, only: Collection[int] | None = None) -> Iterato
     """Read and check all values of every place, or of those with the ids `only`, and yield the results in the order the
     places were added."""
     spec = place_map.spec
-    for place_id, row in place_map.scan(rows.ALL) if only is None else _rows_of(place_map, only):
+    for place_id, row in place_map.scan(rows.ALL) if only is None else _read_rows(place_map, only):
         if row is not None:
-            problem, content = None, rows.content_of(rows.ALL, row)
+            problem, content = None, rows.read_columns(rows.ALL, row)
         else:
             content = _read_but_landmarks(place_map, place_id)
             problem = "SQLite cannot read its landmarks" if content else "SQLite cannot read its row"
@@ -79,11 +79,11 @@ def examine(place_map: PlaceMap, only: Collection[int] | None = None) -> Iterato
         try:
             if content:
                 rows.parse_place(place_id, content)
-                rows.part_of(content, "coarse", spec.coarse)
+                rows.decode_part(content, "coarse", spec.coarse)
                 if spec.fine:
-                    rows.part_of(content, "fine", spec.fine)
+                    rows.decode_part(content, "fine", spec.fine)
                 is_usable = True
-                rows.landmarks_of(content)
+                rows.read_landmarks(content)
         except Unreadable as error:
             problem = str(error)
             content = {**content, **_NO_LANDMARKS}
@@ -97,7 +97,7 @@ def _read_but_landmarks(place_map: PlaceMap, place_id: int) -> Content:
     return {}
 
 
-def _rows_of(place_map: PlaceMap, place_ids: Collection[int]) -> Iterator[tuple[int, Values | None]]:
+def _read_rows(place_map: PlaceMap, place_ids: Collection[int]) -> Iterator[tuple[int, Values | None]]:
     for place_id in sorted(place_ids):
         try:
             yield place_id, tuple(place_map.row(place_id, rows.ALL).values())
@@ -108,7 +108,7 @@ def _rows_of(place_map: PlaceMap, place_ids: Collection[int]) -> Iterator[tuple[
 def merge(
     paths: Sequence[str | Path],
     out: Path,
-    watch: Watch = unwatched,
+    watch: Watch = iterate_silently,
     only: Sequence[Collection[int] | None] | None = None,
 ) -> tuple[list[tuple[int, int]], bool]:
     """Make the new map `out` of the places of several maps, or of those with the ids `only`, a collection for each map;
@@ -148,9 +148,9 @@ def _absorb(place_map: PlaceMap, other: PlaceMap, watch: Watch, only: Collection
         for each in watch(examine(other, only), total, f"copying {other.path.name}"):
             if each.problem:
                 raise PlaceError(other.path, each.place_id, each.problem)
-            part = rows.part_of(each.content, "coarse", other.spec.coarse)
+            part = rows.decode_part(each.content, "coarse", other.spec.coarse)
             alike = here.get((each.content["source_image"], each.content["time"]), ())
-            if any(place_map.is_of(place_id, part) for place_id in alike):
+            if any(place_map.has_descriptor(place_id, part) for place_id in alike):
                 already_here += 1
             else:
                 place_map.insert(each.content)
@@ -158,12 +158,12 @@ def _absorb(place_map: PlaceMap, other: PlaceMap, watch: Watch, only: Collection
     return copied, already_here
 
 
-def check(path: str | Path, watch: Watch = unwatched) -> MapCheck:
+def check(path: str | Path, watch: Watch = iterate_silently) -> MapCheck:
     """Read and check everything in the map file `path`. Raises MapError for a file that cannot be opened as a map."""
     with PlaceMap.open(path) as place_map:
         examined = [each._replace(content={}) for each in watch(examine(place_map), len(place_map), "checking")]
         try:
-            found = [str(text) for (text,) in place_map.db.execute(f"PRAGMA integrity_check({_MOST_FAULTS})")]
+            found = [str(text) for (text,) in place_map.db.execute(f"PRAGMA integrity_check({_MAX_FAULTS})")]
         except (sqlite3.Error, UnicodeDecodeError) as error:
             found = [str(error)]
     damaged = tuple((each.place_id, each.problem) for each in examined if each.problem)
@@ -171,7 +171,7 @@ def check(path: str | Path, watch: Watch = unwatched) -> MapCheck:
     return MapCheck(str(path), usable, len(examined), damaged, () if found == ["ok"] else tuple(found))
 
 
-def repair(path: str | Path, watch: Watch = unwatched) -> Path:
+def repair(path: str | Path, watch: Watch = iterate_silently) -> Path:
     """Replace the map by a copy of its usable places, which keep their ids and get checksums; keep the original as
     `*.damaged` and return its path. Mask hash and calibration are copied if they can be read. Raises MapError, and
     leaves the map as it is, if no place can be read, if the original of an earlier repair exists, or if the copy cannot
@@ -186,7 +186,7 @@ def repair(path: str | Path, watch: Watch = unwatched) -> Path:
         with PlaceMap.open(path) as damaged:
             if not _copy(damaged, copy, watch(examine(damaged), len(damaged), "copying")):
                 raise MapError(f"{path}: no place of it can be read: restore a copy, or build it again.")
-        for left, kept in zip(mapfiles.beside(path), mapfiles.beside(original), strict=True):
+        for left, kept in zip(mapfiles.list_sqlite_files(path), mapfiles.list_sqlite_files(original), strict=True):
             if left.exists():  # else SQLite would apply the log of the damaged map to the copy
                 left.rename(kept)
         try:
@@ -207,7 +207,7 @@ def select(path: str | Path, out: Path, place_ids: Collection[int]) -> int:
         return _copy(place_map, unfinished, examine(place_map, place_ids))
 
 
-def shrink(path: str | Path, out: Path, count: int, watch: Watch = unwatched) -> tuple[int, int]:
+def shrink(path: str | Path, out: Path, count: int, watch: Watch = iterate_silently) -> tuple[int, int]:
     """Copy the `count` best readable places of a map to the new file `out`: those of high quality that leave small gaps
     (see `best_places`). They keep their ids, to which the calibration, copied like the mask hash, refers. Returns
     (number of places copied, number of readable places). Raises MapError if the map cannot be read, or if `out` exists
@@ -217,12 +217,12 @@ def shrink(path: str | Path, out: Path, count: int, watch: Watch = unwatched) ->
         places = [rows.parse_place(each.place_id, each.content) for each in usable]
         points = [place.position or Position(np.nan, np.nan) for place in places]
         lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points], float).reshape(-1, 2).T
-        best = best_places(lat_deg, lon_deg, np.array([_worth_of(place) for place in places]), count)
+        best = best_places(lat_deg, lon_deg, np.array([_rate_place(place) for place in places]), count)
         kept = [places[number].place_id for number in best.tolist()]
         return _copy(place_map, unfinished, watch(examine(place_map, kept), len(kept), "copying")), len(places)
 
 
-def _worth_of(place: Place) -> float:
+def _rate_place(place: Place) -> float:
     """Return the value of keeping a place, 0..1: quality, times memorability and staticity as far as known."""
     salience = place.salience
     if salience is None:

@@ -34,21 +34,21 @@ class Layers:
         """Return the footprint to look among for a picture that shows `seen_m` of ground; None if either is unknown."""
         if not seen_m or not self.footprints_m:
             return None
-        return self.footprints_m[int(_nearest(self.footprints_m, _BEST_SHARE * seen_m))]
+        return self.footprints_m[int(_find_nearest(self.footprints_m, _BEST_SHARE * seen_m))]
 
-    def narrowed(self, expected: Expectation, index: PlaceIndex, footprint_m: float | None) -> Expectation:
+    def narrow(self, expected: Expectation, index: PlaceIndex, footprint_m: float | None) -> Expectation:
         """Narrow a search to the places of the index that were cut at about `footprint_m` (None: search all layers), if
         any of them is in reach. Places that were not cut stay."""
         if footprint_m is None or len(self.footprints_m) < 2:
             return expected
         at = np.minimum(np.searchsorted(self.place_ids, index.place_ids), len(self.place_ids) - 1)
-        is_known, wanted = self.place_ids[at] == index.place_ids, _nearest(self.footprints_m, footprint_m)
+        is_known, wanted = self.place_ids[at] == index.place_ids, _find_nearest(self.footprints_m, footprint_m)
         is_other = is_known & (self.layer[at] != wanted)
         in_reach = ~is_other if expected.in_reach is None else expected.in_reach & ~is_other
         return replace(expected, in_reach=in_reach) if in_reach.any() else expected
 
 
-def layers_of(place_map: PlaceMap) -> Layers:
+def read_layers(place_map: PlaceMap) -> Layers:
     """Read the layers of a map. Raises MapError."""
     place_ids, length_m, is_cut = place_map.footprints()
     footprints_m: list[float] = []
@@ -60,11 +60,11 @@ def layers_of(place_map: PlaceMap) -> Layers:
         return Layers(median_m, (median_m,) if median_m else (), np.zeros(0, int), np.zeros(0, int))
     order = np.argsort(place_ids[is_cut])
     return Layers(
-        median_m, tuple(footprints_m), place_ids[is_cut][order], _nearest(footprints_m, length_m[is_cut][order])
+        median_m, tuple(footprints_m), place_ids[is_cut][order], _find_nearest(footprints_m, length_m[is_cut][order])
     )
 
 
-def _nearest(footprints_m: Sequence[float], to_m: float | Doubles) -> Ints:
+def _find_nearest(footprints_m: Sequence[float], to_m: float | Doubles) -> Ints:
     """Return the number of the footprint that is nearest by ratio to the length, or to each of the lengths, `to_m`."""
     off = np.subtract.outer(np.log(to_m), np.log(footprints_m))
     return np.asarray(np.abs(off).argmin(axis=-1))

@@ -138,7 +138,7 @@ class PlaceMap(MapConnection):
         """Yield the places with `place_ids` in the order given (None: all places, in the order they were added). Raises
         PlaceError for a place that is missing or damaged."""
         for place_id in [place_id for place_id, _ in self.scan("1")] if place_ids is None else map(int, place_ids):
-            with self._named(place_id):
+            with self._name_unreadable(place_id):
                 place = rows.parse_place(place_id, self.row(place_id, rows.OF_PLACE))
             yield place
 
@@ -146,10 +146,10 @@ class PlaceMap(MapConnection):
         """Yield (place_id, (lat_deg, lon_deg) or None, heading_deg or None, coarse part as array of `spec.coarse`) of
         every readable place, in the order they were added. Note the other places in `left_out`."""
         for place_id, row in self.scan(_OF_COARSE):
-            with self._noted(place_id):
-                content = rows.content_of(_OF_COARSE, row)
+            with self._leave_out_unreadable(place_id):
+                content = rows.read_columns(_OF_COARSE, row)
                 point, heading_deg = rows.parse_where(content)
-                part = rows.part_of(content, "coarse", self.spec.coarse)
+                part = rows.decode_part(content, "coarse", self.spec.coarse)
                 yield place_id, point, heading_deg, part
 
     def mean_coarse(self) -> Singles:
@@ -157,7 +157,7 @@ class PlaceMap(MapConnection):
         mean, count = np.zeros(self.spec.coarse.shape), 0
         for _, row in self.scan(columns := "coarse, coarse_crc32"):
             with suppress(Unreadable):
-                part = rows.part_of(rows.content_of(columns, row), "coarse", self.spec.coarse)
+                part = rows.decode_part(rows.read_columns(columns, row), "coarse", self.spec.coarse)
                 count += 1
                 mean += (part - mean) / count
         return mean.astype(np.float32)
@@ -165,18 +165,18 @@ class PlaceMap(MapConnection):
     def fine_part(self, place_id: int) -> tuple[Array, LatLon | None]:
         """Read one place from the file: return its fine part, a read-only array of `spec.fine`, and its (lat_deg,
         lon_deg), None if it has no position. Raises PlaceError for a place that is missing or damaged."""
-        with self._named(place_id):
+        with self._name_unreadable(place_id):
             if self.spec.fine is None:
                 raise Unreadable("it has no fine part")
             content = self.row(int(place_id), "geom, geom_crc32, fine, fine_crc32")
             point = rows.parse_point(content)
-            return rows.part_of(content, "fine", self.spec.fine), point
+            return rows.decode_part(content, "fine", self.spec.fine), point
 
-    def landmarks_of(self, place_id: int) -> bytes | None:
+    def read_landmarks(self, place_id: int) -> bytes | None:
         """Read the encoded landmarks of one place from the file; None if it has none. Raises PlaceError if the place
         is missing or damaged."""
-        with self._named(place_id):
-            return rows.landmarks_of(self.row(int(place_id), "landmarks, landmarks_crc32"))
+        with self._name_unreadable(place_id):
+            return rows.read_landmarks(self.row(int(place_id), "landmarks, landmarks_crc32"))
 
     def footprints(self) -> Footprints:
         """Read the footprints of all places that have one, in the order they were added. Raises MapError."""
@@ -195,11 +195,11 @@ class PlaceMap(MapConnection):
                 ids.setdefault(row, []).append(place_id)
         return ids
 
-    def is_of(self, place_id: int, coarse: Array) -> bool:
+    def has_descriptor(self, place_id: int, coarse: Array) -> bool:
         """Return True if a place's coarse part nearly equals `coarse`, so that both are of one picture; False if the
         place cannot be read. Between two runs of a program the last bits of numbers may differ, or a few elements."""
         try:
-            there = rows.part_of(self.row(place_id, "coarse"), "coarse", self.spec.coarse).astype(np.float32)
+            there = rows.decode_part(self.row(place_id, "coarse"), "coarse", self.spec.coarse).astype(np.float32)
         except (Unreadable, PlaceError):
             return False
         here = np.asarray(coarse, np.float32).reshape(there.shape)
@@ -211,8 +211,8 @@ class PlaceMap(MapConnection):
         the other places in `left_out`."""
         columns = "geom, quality, geom_crc32"
         for place_id, row in self.scan(columns):
-            with self._noted(place_id):
-                content = rows.content_of(columns, row)
+            with self._leave_out_unreadable(place_id):
+                content = rows.read_columns(columns, row)
                 lat_deg, lon_deg = rows.parse_point(content) or (math.nan, math.nan)
                 yield place_id, lat_deg, lon_deg, rows.parse_quality(content)
 
@@ -224,7 +224,7 @@ class PlaceMap(MapConnection):
             self.db.execute("INSERT OR REPLACE INTO edgevpr_map (key, value) VALUES (?, ?)", (key, json.dumps(text)))
 
     @contextmanager
-    def _named(self, place_id: int) -> Iterator[None]:
+    def _name_unreadable(self, place_id: int) -> Iterator[None]:
         """Turn the exception `Unreadable`, raised in the body of `with`, into a PlaceError with the place's id."""
         try:
             yield
@@ -232,7 +232,7 @@ class PlaceMap(MapConnection):
             raise PlaceError(self.path, place_id, str(error)) from error
 
     @contextmanager
-    def _noted(self, place_id: int) -> Iterator[None]:
+    def _leave_out_unreadable(self, place_id: int) -> Iterator[None]:
         """If the body of `with` raises `Unreadable`, enter the place and the reason in `left_out`, and go on."""
         try:
             yield

@@ -15,7 +15,7 @@ _BESIDE = ("-wal", "-shm", "-journal")
 WAIT_S = 5.0  # longest wait for another program that is writing
 # Instructions of SQLite after which a statement is interrupted. A table of a million places takes a tenth of this; a
 # view, or a damaged table that refers to itself, may never end.
-_MOST_STEPS = 500_000_000
+_MAX_STEPS = 500_000_000
 
 # Words of SQLite's messages, and advice to the user.
 _ADVICE = {
@@ -27,7 +27,7 @@ _ADVICE = {
 }
 
 
-def beside(path: Path) -> list[Path]:
+def list_sqlite_files(path: Path) -> list[Path]:
     """Return the paths of the files that SQLite may keep beside a map file, whether they exist or not."""
     return [path.with_name(path.name + end) for end in _BESIDE]
 
@@ -60,7 +60,7 @@ def require_regular(path: Path) -> None:
             f"{path} is a folder, and a map is one file: cut the map of a mission out of a folder of maps with "
             f"`edgevpr map subset {path} --mission FILE --out flight.gpkg`."
         )
-    for each in (path, *beside(path)):
+    for each in (path, *list_sqlite_files(path)):
         if each.exists() and not each.is_file():
             raise MapError(f"{each} is no regular file but a folder, pipe or device: give the path of a map file.")
 
@@ -103,7 +103,7 @@ def whole_or_none(out: Path) -> Iterator[Path]:
 
 def remove(path: Path) -> None:
     """Delete a map file, if it exists, and the files that SQLite keeps beside it."""
-    for each in (path, *beside(path)):
+    for each in (path, *list_sqlite_files(path)):
         each.unlink(missing_ok=True)
 
 
@@ -119,7 +119,7 @@ def connect(path: Path, mode: str, wait_s: float = WAIT_S) -> sqlite3.Connection
         check_same_thread=False,
     )
     db.text_factory = _text
-    db.set_progress_handler(lambda: 1, _MOST_STEPS)
+    db.set_progress_handler(lambda: 1, _MAX_STEPS)
     # The triggers of the spatial index (OGC 12-128r18, annex F.3) call these functions, which SQLite itself lacks. QGIS
     # or GDAL may have added such an index. A damaged geometry is treated as an empty one.
     db.create_function("ST_IsEmpty", 1, lambda geom: point_or_none(geom) is None)
@@ -143,7 +143,7 @@ def settle(db: sqlite3.Connection) -> None:
 
 def settle_left_log(path: Path) -> None:
     """Merge the log that a killed program left into the map file; do nothing if that may not be written."""
-    if beside(path)[0].exists():
+    if list_sqlite_files(path)[0].exists():
         with suppress(sqlite3.Error), closing(connect(path, "rw")) as db:
             settle(db)
 

@@ -11,7 +11,7 @@ from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import PlaceError
 from edgevpr.core.geodesy import Extent, offset_m
 from edgevpr.places import rows
-from edgevpr.places.layers import layers_of
+from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import sentences
 
@@ -87,7 +87,7 @@ def describe_map(place_map: PlaceMap) -> MapInfo:
         last_time=last,
         of_low_quality=int(of_low_quality),
         with_pose=with_pose,
-        footprints_m=layers_of(place_map).footprints_m,
+        footprints_m=read_layers(place_map).footprints_m,
         position_sd_m=None if var_m2 is None else math.sqrt(max(0.0, var_m2) / 2),
         attribution=place_map.attribution,
         one_way_deg=_find_one_way_deg(place_map) if place_map.spec.parameters.get("camera") == "nadir" else None,

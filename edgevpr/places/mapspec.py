@@ -18,12 +18,12 @@ from edgevpr.places import geopackage, rows
 FORMAT_VERSION = 1
 _BEFORE_RELEASE = 4  # format version in maps made before the first release; their format is the same
 _DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for size in "248"), "<f2", "<f4", "<f8")
-_MOST_PART_BYTES = 64_000_000
+_MAX_PART_BYTES = 64_000_000
 _PARTS = ("coarse", "fine", "packed")
 # Keys of texts that a map may lack.
 MASK, LENS, ATTRIBUTION, CALIBRATION = "mask_sha256", "lens", "attribution", "calibration"
 BESIDE = MASK, LENS, ATTRIBUTION, CALIBRATION
-_MOST_STORED = 1000  # rows read from the table, and characters of a damaged one in a message
+_MAX_STORED = 1000  # rows read from the table, and characters of a damaged one in a message
 
 Stored = dict[str, Any]  # the JSON values of the table, by key
 
@@ -54,12 +54,12 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
     try:
         # The others are read only when they are needed: a map can be used without them.
         said = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?, ?)", BESIDE)
-        stored = {key: json.loads(value) for key, value in said.fetchmany(_MOST_STORED)}
+        stored = {key: json.loads(value) for key, value in said.fetchmany(_MAX_STORED)}
         version = stored["format_version"]
         if not isinstance(version, int) or version < 1:
             raise ValueError(f"format version {version}")
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise _damaged(path, error) from error
+        raise _damaged_error(path, error) from error
     if version not in (FORMAT_VERSION, _BEFORE_RELEASE):
         raise MapError(
             f"{path} has the map format {version}, and this edgevpr reads {FORMAT_VERSION}: update edgevpr, or build "
@@ -79,7 +79,7 @@ def read_spec(path: Path, stored: Stored) -> TechniqueSpec:
         if not all(isinstance(value, int | str) or math.isfinite(value) for value in parameters.values()):
             raise ValueError(f"the parameters {parameters!r}")
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise _damaged(path, error) from error
+        raise _damaged_error(path, error) from error
     return TechniqueSpec(name=name, parameters=parameters, coarse=coarse, fine=fine, model_sha256=model, packed=packed)
 
 
@@ -109,8 +109,8 @@ def _require_columns(path: Path, db: sqlite3.Connection) -> None:
         )
 
 
-def _damaged(path: Path, error: Exception) -> MapError:
-    shown = repr(error)[:_MOST_STORED]
+def _damaged_error(path: Path, error: Exception) -> MapError:
+    shown = repr(error)[:_MAX_STORED]
     return MapError(f"{path}: its table edgevpr_map is damaged ({shown}): restore a copy or build the map again.")
 
 
@@ -120,6 +120,6 @@ def _part_spec(value: Any) -> PartSpec | None:
     shape, dtype = value["shape"], value["dtype"]
     if not isinstance(shape, list) or not all(isinstance(side, int) and side > 0 for side in shape):
         raise ValueError(f"the shape {shape!r}")
-    if dtype not in _DTYPES or math.prod(shape) * np.dtype(dtype).itemsize > _MOST_PART_BYTES:
+    if dtype not in _DTYPES or math.prod(shape) * np.dtype(dtype).itemsize > _MAX_PART_BYTES:
         raise ValueError(f"a part of {shape} {dtype!r}")
     return PartSpec(tuple(shape), dtype)

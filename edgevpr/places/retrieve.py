@@ -134,7 +134,7 @@ def compare(query: Query, scanned: Scan, candidates: int | None = None, apart_m:
     if len(comparison.scores) < np.count_nonzero(readable):
         compared = list(comparison.scores)
         best = max(compared, key=comparison.scores.__getitem__)
-        others = elsewhere(index, best, np.arange(len(index)), apart_m)
+        others = outside_neighbourhood(index, best, np.arange(len(index)), apart_m)
         rivals = np.count_nonzero(others[compared])
         if rivals < (1 if in_reach is None else _COMPARED_ELSEWHERE):
             others[compared] = False
@@ -171,12 +171,12 @@ class _Comparison:
         `in_full` hypotheses to try, keep only the `in_full` places with the best glance (None: keep all)."""
         if self._tries_all and self._by_hypothesis is not None:
             count = self._by_hypothesis.size
-        chosen = best_scanned(self._scanned, self._by_hypothesis, among, count)
+        chosen = choose_best(self._scanned, self._by_hypothesis, among, count)
         if self.is_exact or in_full is None or sum(len(tried or [None]) for _, tried in chosen) <= in_full:
             return chosen
         glances: list[Glance] = []
         for slot, fine, hypotheses in _read(self._query, chosen):
-            score, likely = self._query.technique.glance(self._query.descriptor, fine, hypotheses)
+            score, likely = self._query.technique.score_quickly(self._query.descriptor, fine, hypotheses)
             glances.append((self._with_scan(slot, score), (slot, likely)))
         glances.sort(key=lambda glance: -glance[0])
         self._passed_over += glances[in_full:]
@@ -186,7 +186,7 @@ class _Comparison:
         """Choose up to `count` more places where `among` is True: those passed over, or if none of them is, those
         of the best scan scores."""
         more = [choice for _, choice in self._passed_over if among[choice[0]]][:count]
-        return more or best_scanned(self._scanned, self._by_hypothesis, among, count)
+        return more or choose_best(self._scanned, self._by_hypothesis, among, count)
 
     def compare(self, chosen: list[Choice]) -> None:
         """Compare the chosen places in full. Raises as `_read`."""
@@ -255,12 +255,17 @@ def unmoved_outside_neighbourhood(query: Query, best: int, apart_m: float) -> li
     """Compare a query, looking down, with a few places elsewhere than the slot `best`, all over the map, as if it had
     been taken from their height and not turned (see `Technique.unmoved`). Raises as `compare` does."""
     index, left_out = query.index, list(query.place_map.left_out)
-    slots = np.flatnonzero(elsewhere(index, best, np.arange(len(index)), apart_m) & ~np.isin(index.place_ids, left_out))
+    slots = np.flatnonzero(
+        outside_neighbourhood(index, best, np.arange(len(index)), apart_m) & ~np.isin(index.place_ids, left_out)
+    )
     some = slots[:: -(-len(slots) // _ASKED_UNMOVED) or 1].tolist()
-    return [query.technique.unmoved(query.descriptor, fine) for _, fine, _ in _read(query, [(at, None) for at in some])]
+    return [
+        query.technique.match_at_rest(query.descriptor, fine)
+        for _, fine, _ in _read(query, [(at, None) for at in some])
+    ]
 
 
-def together(one: Ranking, other: Ranking) -> Ranking:
+def merge_rankings(one: Ranking, other: Ranking) -> Ranking:
     """Merge two rankings of the same query, made with different expectations. If both compared a place in full, the
     better match counts."""
     compared = dict(one.compared)
@@ -284,7 +289,7 @@ def together(one: Ranking, other: Ranking) -> Ranking:
     )
 
 
-def elsewhere(
+def outside_neighbourhood(
     index: PlaceIndex, best: int, slots: Ints, neighbour_m: float, same: Collection[int] = (), beside: int = MAX_BESIDE
 ) -> Bools:
     """Return bool (K,), True for each of `slots` (K,) that is no neighbour of the slot `best`: it is more than
@@ -295,12 +300,17 @@ def elsewhere(
 
 
 def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Collection[int] = ()) -> float | None:
-    """Return the best score minus the best score of a place elsewhere (see `elsewhere`); None if none is ranked."""
-    runners_up = ranking.scores[1:][elsewhere(index, int(ranking.slots[0]), ranking.slots[1:], neighbour_m, same)]
+    """Return the best score minus the best score of a place elsewhere (see `outside_neighbourhood`); None if none is
+    ranked."""
+    runners_up = ranking.scores[1:][
+        outside_neighbourhood(index, int(ranking.slots[0]), ranking.slots[1:], neighbour_m, same)
+    ]
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None
 
 
-def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int | None = None) -> list[Candidate]:
+def load_candidates(
+    ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int | None = None
+) -> list[Candidate]:
     """Return the best `first` places of a ranking (None: all) as candidates, best first, with data from the map file.
     Raises PlaceError if one of them cannot be read, was left out before, or has changed its position since the index
     was loaded. The place is left out from then on."""
@@ -320,25 +330,25 @@ def named(ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int |
     return candidates
 
 
-def best_scanned(scores: Singles, by_hypothesis: Singles | None, among: Bools, count: int) -> list[Choice]:
+def choose_best(scores: Singles, by_hypothesis: Singles | None, among: Bools, count: int) -> list[Choice]:
     """Choose the `count` slots with the best `scores` where `among` bool (N,) is True, each with the hypotheses to try
     (None: all), in the order of the map file, in which a memory card reads them fastest. With `by_hypothesis` float32
     (N, H) (see `Scan`), the `count` best pairs of a place and a hypothesis are chosen instead, three of a place at
     most, or more if there are too few places."""
     slots = np.flatnonzero(among)
     if by_hypothesis is None or not len(slots):
-        return [(slot, None) for slot in slots[np.sort(_largest(scores[slots], count))].tolist()]
-    slots = slots[np.sort(_largest(by_hypothesis.max(axis=1)[slots], count))]
+        return [(slot, None) for slot in slots[np.sort(_find_largest(scores[slots], count))].tolist()]
+    slots = slots[np.sort(_find_largest(by_hypothesis.max(axis=1)[slots], count))]
     each = by_hypothesis[slots]
     of_place = np.argsort(np.argsort(-each, axis=1, kind="stable"), axis=1)
     each = np.where(of_place < max(_TRIED_EACH, count // len(slots)), each, -np.inf)
     tried = np.zeros(each.shape, bool)
-    tried.flat[_largest(each.ravel(), count)] = True
+    tried.flat[_find_largest(each.ravel(), count)] = True
     tried &= np.isfinite(each)
     return [(int(slots[at]), np.flatnonzero(tried[at]).tolist()) for at in np.flatnonzero(tried.any(axis=1))]
 
 
-def _largest(scores: Singles, count: int) -> Ints:
+def _find_largest(scores: Singles, count: int) -> Ints:
     """Return the indices of the `count` largest of `scores` (N,), in any order."""
     return np.argpartition(-scores, count)[:count] if count < len(scores) else np.arange(len(scores))
 

@@ -32,7 +32,7 @@ CHECKSUMS = "geom_crc32, coarse_crc32, fine_crc32, pose_crc32, landmarks_crc32"
 OF_PLACE = f"{VALUES}, {SALIENCE}, {POSE}, geom_crc32, pose_crc32"
 ALL = f"{VALUES}, {SALIENCE}, {POSE}, {BLOBS}, {CHECKSUMS}"
 BUT_LANDMARKS = f"{VALUES}, {SALIENCE}, {POSE}, coarse, fine, geom_crc32, coarse_crc32, fine_crc32, pose_crc32"
-MOST_LANDMARK_BYTES = 10_000  # per place
+MAX_LANDMARK_BYTES = 10_000  # per place
 
 _POSE = tuple(POSE.split(", "))
 _ALTITUDES_M = (-1000, 100_000)  # above sea level, as in positions.csv
@@ -46,7 +46,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # least and greatest number of a co
     "recorded_lat_deg": (-90, 90),
     "recorded_lon_deg": (-180, 180),
 }
-_MOST_UNREADABLE = 100_000  # successive ids without a readable place, after which a scan ends
+_MAX_UNREADABLE = 100_000  # successive ids without a readable place, after which a scan ends
 
 # Values of some columns of a row as SQLite returns them; their types are not checked yet.
 Values = tuple[Any, ...]
@@ -57,7 +57,7 @@ class Unreadable(ValueError):
     """Raised if a value of a row is missing or invalid; the message says which, in a few words."""
 
 
-def content_of(columns: str, row: Values | None) -> Content:
+def read_columns(columns: str, row: Values | None) -> Content:
     """Return the values of a row by the names in `columns`, of the form "a, b". Raises Unreadable if it is None."""
     if row is None:
         raise Unreadable("its row is gone")
@@ -78,7 +78,7 @@ def parse_point(content: Content) -> LatLon | None:
     return point
 
 
-def part_of(content: Content, name: str, spec: PartSpec) -> Array:
+def decode_part(content: Content, name: str, spec: PartSpec) -> Array:
     """Decode the part `name` ("coarse", "fine") of a descriptor as a read-only array of `spec`. Its checksum is checked
     if it is in `content`. Raises Unreadable."""
     blob = content[name]
@@ -91,12 +91,12 @@ def part_of(content: Content, name: str, spec: PartSpec) -> Array:
     return part
 
 
-def landmarks_of(content: Content) -> bytes | None:
+def read_landmarks(content: Content) -> bytes | None:
     """Return the encoded landmarks of a place; None if there are none. Raises Unreadable."""
     blob = content["landmarks"]
     if blob is None:
         return None
-    if not isinstance(blob, bytes) or len(blob) > MOST_LANDMARK_BYTES:
+    if not isinstance(blob, bytes) or len(blob) > MAX_LANDMARK_BYTES:
         raise Unreadable("its landmarks have a wrong size")
     _hold(content, "landmarks", "set of landmarks")
     return blob
@@ -130,8 +130,8 @@ def parse_place(place_id: int, content: Content) -> Place:
         t_utc_s=geopackage.utc_seconds(content["time"]),
         heading_deg=content["heading_deg"],
         quality=content["quality"],
-        salience=_salience_of([content[name] for name in SALIENCE.split(", ")]),
-        pose=_pose_of(content),
+        salience=_make_salience([content[name] for name in SALIENCE.split(", ")]),
+        pose=_make_pose(content),
     )
 
 
@@ -151,8 +151,8 @@ def frame_content(
         **scores,
         "is_low_quality": int(salience.is_low) if salience else None,
         **pose_content(frame.pose),
-        "coarse": _blob_of(descriptor.coarse, spec.coarse),
-        "fine": _blob_of(descriptor.fine, spec.fine),
+        "coarse": _encode_part(descriptor.coarse, spec.coarse),
+        "fine": _encode_part(descriptor.fine, spec.fine),
         "landmarks": landmarks,
     }
 
@@ -196,7 +196,7 @@ def scan(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Values | N
             yield place_id, tuple(row)
         return
     except sqlite3.Error as error:
-        highest = _highest_id(db, error)
+        highest = _find_highest_id(db, error)
     missing = 0
     for place_id in range(max(last, 0) + 1, highest + 1):
         found: Values | None = None
@@ -210,11 +210,11 @@ def scan(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Values | N
         if is_there:
             yield place_id, found
         missing = 0 if found else missing + 1
-        if missing == _MOST_UNREADABLE:
+        if missing == _MAX_UNREADABLE:
             return
 
 
-def _highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
+def _find_highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
     """Return the highest id of a damaged file. Raises `error`, which showed the damage, if that cannot be read."""
     for query in ("SELECT max(place_id) FROM places", "SELECT seq FROM sqlite_sequence WHERE name = 'places'"):
         with suppress(sqlite3.Error):
@@ -224,7 +224,7 @@ def _highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
     raise error
 
 
-def _salience_of(values: Sequence[Any]) -> Salience | None:
+def _make_salience(values: Sequence[Any]) -> Salience | None:
     """Make a Salience from the columns `SALIENCE`; None if it is unknown. An invalid score becomes None."""
     *scores, is_low = values
     if is_low is None:
@@ -234,7 +234,7 @@ def _salience_of(values: Sequence[Any]) -> Salience | None:
     return Salience(memorability, staticity, entropy, is_low=is_low == 1)
 
 
-def _pose_of(content: Content) -> Pose | None:
+def _make_pose(content: Content) -> Pose | None:
     """Make a Pose from the columns `POSE`; None if they are unknown. Raises Unreadable: a wrong pose misleads fixes."""
     values, checksum = [_number(content, name) for name in _POSE], content["pose_crc32"]
     if checksum is not None and checksum != pose_crc32(values):
@@ -255,7 +255,7 @@ def _pose_of(content: Content) -> Pose | None:
     )
 
 
-def _blob_of(part: Array | None, spec: PartSpec | None) -> bytes | None:
+def _encode_part(part: Array | None, spec: PartSpec | None) -> bytes | None:
     """Encode a part of a descriptor as the bytes to store; None for a part that the technique does not have."""
     if spec is None or part is None:
         return None

@@ -17,8 +17,8 @@ from edgevpr.core.config import (
     build,
 )
 from edgevpr.core.errors import ConfigError
-from edgevpr.core.files import shipped
-from edgevpr.core.text import meant
+from edgevpr.core.files import find_shipped
+from edgevpr.core.text import suggest
 from edgevpr.core.yamlfile import read_yaml
 from edgevpr.power import machine, thermal
 
@@ -81,7 +81,7 @@ class Board:
 
 def board_names() -> tuple[str, ...]:
     """Return the names of the boards that come with edgevpr."""
-    return tuple(sorted(path.stem for path in shipped("profiles").glob("*.yaml")))
+    return tuple(sorted(path.stem for path in find_shipped("profiles").glob("*.yaml")))
 
 
 def load_board(name: str, root: Path = Path("/")) -> Board:
@@ -92,9 +92,9 @@ def load_board(name: str, root: Path = Path("/")) -> Board:
     if name.endswith((".yaml", ".yml")) or "/" in name:
         return _read(Path(name))
     if name in board_names():
-        return _shipped(name)
+        return _read_shipped(name)
     names = ["this", *board_names()]
-    hint = meant(name, names, f"use {', '.join(names)}, or the path of a YAML file.")
+    hint = suggest(name, names, f"use {', '.join(names)}, or the path of a YAML file.")
     raise ConfigError(f"There is no board `{name}`: {hint}")
 
 
@@ -109,8 +109,8 @@ def _matches(board: Board, root: Path) -> bool:
     return bool(model and board.recognised_by and board.recognised_by.lower() in model.lower())
 
 
-def _shipped(name: str) -> Board:
-    return _read(shipped("profiles") / f"{name}.yaml")
+def _read_shipped(name: str) -> Board:
+    return _read(find_shipped("profiles") / f"{name}.yaml")
 
 
 def _read(path: Path) -> Board:
@@ -130,8 +130,10 @@ def _read(path: Path) -> Board:
 def _this_machine(root: Path) -> Board:
     """Return the profile of this machine's board, else generic-x86, with the cores and memory that are really there."""
     model = machine.model(root)
-    recognised = next((board for board in map(_shipped, board_names() if model else ()) if _matches(board, root)), None)
-    profile = recognised or _shipped(_ANY_MACHINE)
+    recognised = next(
+        (board for board in map(_read_shipped, board_names() if model else ()) if _matches(board, root)), None
+    )
+    profile = recognised or _read_shipped(_ANY_MACHINE)
     title = profile.title
     if model and not recognised:
         title = f"{model}, which has no profile: the figures of {_ANY_MACHINE}"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
 _SIDES_PX = (480, 320, 240, 160, 112)  # of a small picture: the largest with which it fits is taken
-_LEAST_BYTES = 2500  # of a picture of the smallest side, as an address
+_MIN_BYTES = 2500  # of a picture of the smallest side, as an address
 _TURNED_DEG = 45.0  # between the tops of a picture and of a place: more is a contradiction
 _CUT_PX = 512  # of a picture from an orthophoto, as the map was made of
 
@@ -64,9 +64,9 @@ class Album:
     def image(self, name: str) -> Image | None:
         """Return the picture `name`, uint8 (H, W[, 3]); None if there is none that can be read."""
         if name in self._kept:
-            from edgevpr.frames.images import decoded
+            from edgevpr.frames.images import decode_jpeg
 
-            return decoded(self._kept[name])
+            return decode_jpeg(self._kept[name])
         picture = self._find(name)
         return picture.image if picture else None
 
@@ -80,10 +80,10 @@ class Album:
         tag = picture.tag() if lens and picture.tag else None
         if lens is None or tag is None:
             return picture
-        from edgevpr.frames.level import levelled
-        from edgevpr.frames.source import tagged
+        from edgevpr.frames.level import level_image
+        from edgevpr.frames.source import make_frame
 
-        level = levelled(tagged(picture.image, place.source_image, 0.0, tag), None, lens, below=True)
+        level = level_image(make_frame(picture.image, place.source_image, 0.0, tag), None, lens, below=True)
         return AlbumPicture(level.image, level.mask)
 
     def lay(self, place: Place, lens: "Lens | None") -> AlbumPicture | None:
@@ -121,11 +121,11 @@ def _find_recorded(recorded: Mapping[str, Path], name: str) -> AlbumPicture | No
 def _find_in_folder(folder: Path, name: str) -> AlbumPicture | None:
     # A log from somebody else may name any file of this machine: show only files in the folder.
     path = folder / Path(name).name
-    return _read(path, lambda: _tags_in(folder).get(path))
+    return _read(path, lambda: _read_folder_tags(folder).get(path))
 
 
 @cache
-def _tags_in(folder: Path) -> Mapping[Path, GeoTag]:
+def _read_folder_tags(folder: Path) -> Mapping[Path, GeoTag]:
     from edgevpr.frames.source import read_tags
 
     with suppress(EdgevprError):
@@ -167,12 +167,12 @@ def _open_orthophoto(source: str | Path, places: Sequence[Place]) -> Finder:
     """Return a finder of the pictures of places that were cut from an orthophoto: they are cut again. Raises
     EdgevprError if it cannot be opened."""
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
-    from edgevpr.mapmaking.tiles import ground_of
+    from edgevpr.mapmaking.tiles import surround
 
     cut = {place.source_image: (place.position, place.pose) for place in places if place.position and place.pose}
     known = [(position, pose) for position, pose in cut.values() if position and pose]
     points = [(position.lat_deg, position.lon_deg) for position, _ in known]
-    orthophoto = Orthophoto(source, ground_of(points, max(pose.footprint_m for _, pose in known)))
+    orthophoto = Orthophoto(source, surround(points, max(pose.footprint_m for _, pose in known)))
 
     def find(name: str) -> AlbumPicture | None:
         position, pose = cut.get(name, (None, None))
@@ -213,7 +213,7 @@ def small_pictures(
     from edgevpr.frames.images import small_webp
 
     keys = list(dict.fromkeys(key for step in steps for key in step if albums[key[0]]))
-    every = max(1, -(-len(keys) * _LEAST_BYTES // max(1, int(room_bytes))))
+    every = max(1, -(-len(keys) * _MIN_BYTES // max(1, int(room_bytes))))
     keys = list(dict.fromkeys(key for step in steps[::every] for key in step if albums[key[0]]))
     pictures: dict[Key, str] = {}
     are_left_out = every > 1

@@ -67,17 +67,17 @@ class Packets:
 
     def compare(self, t_s: float, link: str, then: bytes | None, now: bytes | None) -> None:
         """Compare two packets of `link` (None: none was sent) at the time `t_s` of the flight's clock."""
-        if then and now and _content(then) == _content(now):
+        if then and now and _strip_sequence(then) == _strip_sequence(now):
             self.alike += 1
         elif then or now:
-            self.others.append(f"{t_s:.3f} s, {link}: sent {_described(then)}, now {_described(now)}")
+            self.others.append(f"{t_s:.3f} s, {link}: sent {_describe_packet(then)}, now {_describe_packet(now)}")
 
 
-def _described(packet: bytes | None) -> str:
+def _describe_packet(packet: bytes | None) -> str:
     return str(mavlink.MAVLink(None).parse_buffer(packet)[0]) if packet else "nothing"
 
 
-def _content(packet: bytes) -> bytes:
+def _strip_sequence(packet: bytes) -> bytes:
     """Return a packet without its sequence number, which counts the packets before it, its checksum, which depends on
     that number, and its signature, for which no recording holds the key."""
     if packet[0] != mavlink.PROTOCOL_MARKER_V2:

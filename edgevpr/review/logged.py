@@ -7,7 +7,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.reasons import Reason, ReasonCode, read_reason
 from edgevpr.runtime.flight.flightlog import select_last_flight
 
@@ -124,7 +124,7 @@ def read_flight(path: str | Path) -> LoggedFlight:
             case "between":
                 flight.between += [line] if point(line) else []
             case _:
-                flight.remarks.append((t_s, str(kind), _text_of(line)))
+                flight.remarks.append((t_s, str(kind), _read_text(line)))
     if lines.missing:
         _log.warning("%s", lines.missing)
         flight.remarks.insert(0, (0.0, "missing", lines.missing))
@@ -141,7 +141,7 @@ def _read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
     """Read a log line of kind "query"."""
     t_frame_s = number(line, "t_frame_s")
     accepted = line.get("accepted") is True
-    gps_at = _gps_at(line, t_frame_s)
+    gps_at = _locate_gps(line, t_frame_s)
     has_link = _is_fresh(number(line, "vehicle", "t_heard_s"), t_frame_s)
     autopilot_at = point(line, "vehicle") if has_link else None
     # The confidence by which a match was judged: its own, or that of the flight so far where it is higher.
@@ -186,7 +186,7 @@ def _is_fresh(t_s: float | None, t_frame_s: float | None) -> bool:
     return t_s is not None and t_frame_s is not None and abs(t_frame_s - t_s) <= _FRESH_S
 
 
-def _gps_at(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
+def _locate_gps(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
     """Return where the GPS receiver was when the frame was taken: its newest position, moved on by the velocity. None
     if it is unknown or its time is further than `_FRESH_S` from the frame's."""
     at, t_s = point(line, "vehicle", "gps"), number(line, "vehicle", "gps", "t_s")
@@ -194,11 +194,11 @@ def _gps_at(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
         return None
     match value(line, "vehicle", "velocity_m_s"):
         case [int() | float() as east_m_s, int() | float() as north_m_s]:
-            return moved(*at, (t_frame_s - t_s) * east_m_s, (t_frame_s - t_s) * north_m_s)
+            return offset_position(*at, (t_frame_s - t_s) * east_m_s, (t_frame_s - t_s) * north_m_s)
     return at
 
 
-def _text_of(line: dict[str, Any]) -> str:
+def _read_text(line: dict[str, Any]) -> str:
     reasons = [str(reason) for key in _REASONS if (reason := read_reason(line.get(key)))]
     words = next(iter([*reasons, *(known for key in _TEXTS if (known := text(line, key)))]), None)
     match line:

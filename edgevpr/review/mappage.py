@@ -6,25 +6,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edgevpr.core.geodesy import axes_of, distance_m, moved, offset_m
+from edgevpr.core.geodesy import distance_m, offset_m, offset_position, picture_axes
 from edgevpr.core.text import format_probability
 from edgevpr.core.types import Place
 from edgevpr.mapmaking.look_alikes import FoundLookAlike
 from edgevpr.review.album import Album
 from edgevpr.review.logged import Point
-from edgevpr.review.webpage import UNKNOWN, Layer, Section, Step, at_of, figure, make_layer, make_page
+from edgevpr.review.webpage import UNKNOWN, Layer, Section, Step, figure, make_layer, make_page, to_point
 
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
-MOST_ASKED = 100  # pictures of a map that are looked for among the places elsewhere: each takes half a second
+MAX_ASKED = 100  # pictures of a map that are looked for among the places elsewhere: each takes half a second
 _QUALITIES = {"low": 0.4, "fair": 0.6, "good": 0.8, "best": 1.01}  # below which value it is called so
 _HARD = 0.5  # mean confidence of a place that is hard to recognise
 _TAG_OFF = 4.0  # times the usual distance of a tag from where its picture lies, as in refinement
 _OF_MEDIAN = 1.1774  # of the length of a normally distributed vector, over the standard deviation of an axis
-_LEAST_TAG_OFF_M = 5.0  # less is no more than the receiver's error
+_MIN_TAG_OFF_M = 5.0  # less is no more than the receiver's error
 _CELLS = 24  # of a footprint
-_MOST_CELLS = 4_000_000  # of the whole ground
+_MAX_CELLS = 4_000_000  # of the whole ground
 _SURELY_SEEN = 0.75  # of a footprint: the short side of a picture of 4:3
 _THINNEST = 0.15  # footprints: less is no gap
 _WIDEST = 1.0  # footprints: what is wider and open to one side is outside the map
@@ -53,13 +53,13 @@ def make_map_page(
     the places whose picture was looked for (None: nothing does). `pictures` finds those of the map, `lens` is that of
     its camera (None: unknown)."""
     ground = [place for place in places if place.position]
-    points = {place.place_id: at_of(place) for place in ground}
+    points = {place.place_id: to_point(place) for place in ground}
     tags_off_m, alike = find_tags_off(ground), {each.place_id: each for each in look_alikes if each}
     hard = {place_id for place_id, confidence in recognisable.items() if confidence < _HARD}
     gaps, covered_m2, gaps_m2 = find_gaps(ground)
     steps = list(_steps(places, recognisable, tags_off_m, alike, points))
     pairs = [(points.get(each.place_id), points.get(each.other_id)) for each in alike.values()]
-    tags = [(recorded_at(place), at_of(place)) for place in ground if place.place_id in tags_off_m]
+    tags = [(read_recorded_position(place), to_point(place)) for place in ground if place.place_id in tags_off_m]
     layers = [
         Layer("coverage gaps", "hole", gaps, "area"),
         Layer("look alike", "alike", [(one, other) for one, other in pairs if one and other], "line"),
@@ -137,21 +137,21 @@ def _steps(
         )
 
 
-def recorded_at(place: Place) -> Point:
+def read_recorded_position(place: Place) -> Point:
     """Return where a place was recorded before refinement moved it."""
     recorded = place.pose and place.pose.recorded
-    return (recorded.lat_deg, recorded.lon_deg) if recorded else at_of(place)
+    return (recorded.lat_deg, recorded.lon_deg) if recorded else to_point(place)
 
 
 def find_tags_off(ground: Sequence[Place]) -> dict[int, float]:
     """Return the places whose recorded position lies far from where their pictures lie, and how far: metres by the
     place's number. Far is more than four standard deviations of an axis, taken from the median of all."""
     moved_m = {
-        place.place_id: float(distance_m(*recorded_at(place), *at_of(place)))
+        place.place_id: float(distance_m(*read_recorded_position(place), *to_point(place)))
         for place in ground
         if place.pose and place.pose.recorded
     }
-    far_m = max(_LEAST_TAG_OFF_M, _TAG_OFF * float(np.median(list(moved_m.values()) or [0.0])) / _OF_MEDIAN)
+    far_m = max(_MIN_TAG_OFF_M, _TAG_OFF * float(np.median(list(moved_m.values()) or [0.0])) / _OF_MEDIAN)
     return {place_id: off_m for place_id, off_m in moved_m.items() if off_m > far_m}
 
 
@@ -163,15 +163,15 @@ def find_gaps(ground: Sequence[Place]) -> tuple[list[list[Point]], float, float]
         return [], 0.0, 0.0
     from edgevpr.frames.images import cv2
 
-    origin = at_of(posed[0][0])
-    middles = np.array([offset_m(*origin, *at_of(place)) for place, _ in posed])
+    origin = to_point(posed[0][0])
+    middles = np.array([offset_m(*origin, *to_point(place)) for place, _ in posed])
     footprint_m = float(np.median([pose.footprint_m for _, pose in posed]))
     low, high = middles.min(axis=0) - 2 * footprint_m, middles.max(axis=0) + 2 * footprint_m
-    cell_m = max(footprint_m / _CELLS, float(np.sqrt(np.prod(high - low) / _MOST_CELLS)))
+    cell_m = max(footprint_m / _CELLS, float(np.sqrt(np.prod(high - low) / _MAX_CELLS)))
     shown = np.zeros(np.ceil((high - low) / cell_m).astype(int)[::-1], np.uint8)
     square = np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]]) * _SURELY_SEEN / 2
     for middle, (_, pose) in zip(middles, posed, strict=True):
-        corners = (middle - low)[:, None] + axes_of(pose.up_deg) @ square * pose.footprint_m
+        corners = (middle - low)[:, None] + picture_axes(pose.up_deg) @ square * pose.footprint_m
         cv2.fillConvexPoly(shown, np.rint(corners.T / cell_m).astype(np.int32), (1,))
     thin, wide = (
         cv2.getStructuringElement(cv2.MORPH_ELLIPSE, [max(1, round(share * footprint_m / cell_m))] * 2)
@@ -182,5 +182,5 @@ def find_gaps(ground: Sequence[Place]) -> tuple[list[list[Point]], float, float]
     cv2.drawContours(closed, around, -1, (1,), cv2.FILLED)  # what is surrounded, however wide
     between = cv2.morphologyEx(closed & (1 - shown), cv2.MORPH_OPEN, thin)
     outlines, _ = cv2.findContours(between, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    gaps = [[moved(*origin, *(low + cell_m * point)) for point in outline[:, 0]] for outline in outlines]
+    gaps = [[offset_position(*origin, *(low + cell_m * point)) for point in outline[:, 0]] for outline in outlines]
     return gaps, float(shown.sum()) * cell_m**2, float(between.sum()) * cell_m**2

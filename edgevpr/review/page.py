@@ -30,17 +30,17 @@ from edgevpr.review.webpage import (
     Layer,
     Section,
     Step,
-    at_of,
     clock,
     figure,
     make_layer,
     make_page,
+    to_point,
 )
 
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
-_MOST_REMARKS = 200
+_MAX_REMARKS = 200
 _FAR_M = 15.0  # from GPS: less is the error of a receiver, and no danger
 _FIX_COLOURS = {
     FixOutcome.TAKEN: "taken",
@@ -83,7 +83,7 @@ def make_flight_page(
 def _layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
     """Return the layers of the drawing, from the bottom to the top."""
     return [
-        Layer("places of the map", "places", [[at_of(place) for place in ground]]),
+        Layer("places of the map", "places", [[to_point(place) for place in ground]]),
         make_layer(steps, "places found", "found"),
         Layer("fixes between matches", "between", [list(filter(None, map(point, flight.between)))]),
         make_layer(steps, "GPS", "gps", "line"),
@@ -247,7 +247,7 @@ def _charts(flight: LoggedFlight) -> list[Chart]:
 
 def _remarks(flight: LoggedFlight) -> list[Section]:
     """Return the section of what was reported in flight, as far as there is any."""
-    rows = [(clock(t_s), kind, sentence) for t_s, kind, sentence in flight.remarks[:_MOST_REMARKS]]
+    rows = [(clock(t_s), kind, sentence) for t_s, kind, sentence in flight.remarks[:_MAX_REMARKS]]
     left_out = len(flight.remarks) - len(rows)
     lines = [f"{left_out} more lines are in the log."] if left_out else []
     return [Section("What was said", lines, [("time", "of", "said"), *rows])] if rows else []

@@ -80,7 +80,7 @@ class ReplayedDriver:
                 if verdicts:
                     conversation.settings.signing.verdicts = verdicts
                 try:
-                    conversation.hear(b64decode(data), now_s, tuple(sender) if sender else None)
+                    conversation.handle(b64decode(data), now_s, tuple(sender) if sender else None)
                 except Exception:  # as in the flight, which then lost the link
                     _log.debug("the link failed", exc_info=True)
             case ["said", then]:
@@ -91,7 +91,7 @@ class ReplayedDriver:
                 departed = [self._leaving.popleft() for _ in range(min(count, len(self._leaving)))]
                 for sending in departed:
                     sending.settle(True)
-                conversation.note_departed(departed)
+                conversation.count_departed(departed)
             case ["lost" | "closed" as what, *count]:
                 for sending in self._leaving:
                     sending.settle(False, LOST)
@@ -105,7 +105,7 @@ class ReplayedSigning(Signing):
     """Signing without the key: signs nothing, and admits the messages that the flight admitted. `verdicts` has, for
     each of the next messages, why the flight refused it (None: it did not)."""
 
-    def of_ground(self) -> "ReplayedSigning":
+    def for_ground(self) -> "ReplayedSigning":
         """Return the signing of the link to the ground station."""
         return ReplayedSigning()
 

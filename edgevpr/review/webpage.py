@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from edgevpr.core.geodesy import offset_m
-from edgevpr.core.text import shown
+from edgevpr.core.text import sanitize
 from edgevpr.core.types import Place
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.review.album import Album, AlbumPicture, small_pictures
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 Form = Literal["dots", "line", "area"]
 
 UNKNOWN = "–"
-MOST_PAGE_BYTES = 15_000_000
-_MOST_TEXT_BYTES = 3_000_000  # of the texts of all steps
+MAX_PAGE_BYTES = 15_000_000
+_MAX_TEXT_BYTES = 3_000_000  # of the texts of all steps
 _SPARE_BYTES = 400_000  # for what is not measured: style, script, the frame of the page
-_MOST_PLACES = 6000  # drawn: more are a whole page of dots; then every second, third, ... is
+_MAX_PLACES = 6000  # drawn: more are a whole page of dots; then every second, third, ... is
 _MARGIN_M = 30.0  # around what is drawn, where no place knows how much ground its picture shows
 
 _NO_PICTURE = (
@@ -105,7 +105,7 @@ def read_ground(path: str | Path) -> list[Place]:
         return [place for place in place_map.places() if place.position]
 
 
-def at_of(place: Place) -> Point:
+def to_point(place: Place) -> Point:
     """Return the position (lat_deg, lon_deg) of a place that has one."""
     assert place.position is not None
     return place.position.lat_deg, place.position.lon_deg
@@ -129,7 +129,7 @@ def make_page(
     charts: Sequence[Chart] = (),
     sections: Sequence[Section] = (),
 ) -> str:
-    """Return a whole page of at most `MOST_PAGE_BYTES`. `head` has its title, texts below it (`known`), `figures` by
+    """Return a whole page of at most `MAX_PAGE_BYTES`. `head` has its title, texts below it (`known`), `figures` by
     name, `warnings` and `span_s`, the length of the time axis (None: steps have no times). `ground` are the places
     drawn below the `layers`. `albums` are those of the pictures, by the names that steps give them; "place" is that of
     the map, `lens` that of its camera (None: unknown). `notes` are sentences below the ground."""
@@ -141,14 +141,14 @@ def make_page(
     rest["groups"] = [(group, colours[group], count) for group, count in counts.most_common()]
     numbers = {group: number for number, (group, *_) in enumerate(rest["groups"])}
     rows = [_describe(step, drawing, numbers) for step in steps]
-    if (every := -(-len(_dump(rows)) // _MOST_TEXT_BYTES)) > 1:
+    if (every := -(-len(_dump(rows)) // _MAX_TEXT_BYTES)) > 1:
         steps, rows = steps[::every], rows[::every]
         notes.append(f"The page would be too large with all steps: one in {every} is shown.")
-    laid = ground[:: -(-len(ground) // _MOST_PLACES) or 1]
+    laid = ground[:: -(-len(ground) // _MAX_PLACES) or 1]
     wanted = [[picture[:2] for picture in step.pictures] for step in steps]
     wanted += [[("ground", place.source_image)] for place in laid if place.pose]
     levelled = _level(albums["place"], laid, lens)
-    room_bytes = MOST_PAGE_BYTES - _SPARE_BYTES - len(_dump([rest, rows, drawing.layers]))
+    room_bytes = MAX_PAGE_BYTES - _SPARE_BYTES - len(_dump([rest, rows, drawing.layers]))
     pictures, left_out = small_pictures(wanted, {**albums, "ground": levelled}, room_bytes)
     notes += [left_out] if left_out else []
     if any(place.pose for place in laid) and not any(of == "ground" for of, _ in pictures):
@@ -196,7 +196,7 @@ class _Drawing:
         longest side is that of the square; None if that is unknown."""
         if not (place.pose and place.position):
             return None
-        return *self.convert(at_of(place)), round(place.pose.footprint_m, 2), round(place.pose.up_deg, 1)
+        return *self.convert(to_point(place)), round(place.pose.footprint_m, 2), round(place.pose.up_deg, 1)
 
 
 def _describe(step: Step, drawing: _Drawing, numbers: Mapping[str, int]) -> dict[str, Any]:
@@ -233,7 +233,7 @@ def _dump(value: Any) -> str:
 
 def _clean(value: Any) -> Any:
     if isinstance(value, str):
-        return value if value.startswith("data:image/") else shown(value, keep="\n")
+        return value if value.startswith("data:image/") else sanitize(value, keep="\n")
     if isinstance(value, dict):
         return {key: _clean(each) for key, each in value.items()}
     return [_clean(each) for each in value] if isinstance(value, (list, tuple)) else value

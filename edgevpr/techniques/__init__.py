@@ -12,7 +12,7 @@ from typing import Any
 
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.text import meant
+from edgevpr.core.text import suggest
 
 # The class or function that makes each technique of edgevpr itself.
 _OWN = {
@@ -67,7 +67,7 @@ def parameters(name: str) -> dict[str, Any]:
     return {key: p.default for key, p in inspect.signature(_maker(name)).parameters.items()}
 
 
-def labelled(name: str, form: str | None) -> str:
+def format_name(name: str, form: str | None) -> str:
     """Return the technique and its `form` (see the glossary) as one name, such as "hog 8bit". The default form `float`,
     and None (the technique has no forms), are left out."""
     return name if form in (None, "float") else f"{name} {form}"
@@ -89,7 +89,7 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
     values = {}
     for key, value in (settings or {}).items():
         if key not in defaults:
-            hint = meant(key, defaults, f"it has {', '.join(defaults)}.")
+            hint = suggest(key, defaults, f"it has {', '.join(defaults)}.")
             raise UsageError(f"{name} has no parameter `{key}`: {hint}")
         kind = type(defaults[key])
         try:
@@ -113,6 +113,6 @@ def _maker(name: str) -> Callable[..., Any]:
     card = load_card(name)
     if not card.is_technique:
         raise UsageError(f"The network `{name}` gives no descriptor: use it as the `model` of a technique.")
-    from edgevpr.techniques.network import of_card
+    from edgevpr.techniques.network import make_from_card
 
-    return partial(of_card, card)
+    return partial(make_from_card, card)

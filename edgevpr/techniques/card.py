@@ -14,7 +14,7 @@ from edgevpr.core.config import bounded, build, key
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import ConfigError, ModelError
 from edgevpr.core.files import find_model, model_folders
-from edgevpr.core.text import meant
+from edgevpr.core.text import suggest
 from edgevpr.core.yamlfile import read_yaml
 
 _ADDED_LATER = ("pad", "boxes", "memorability")  # keys, see _used
@@ -94,7 +94,7 @@ class Card:
     def fingerprint(self) -> str:
         """SHA-256 of everything that a feature map or vector depends on: the weights, the preparation of the picture,
         and the names of the outputs."""
-        return compute_digest([self.sha256, _used(self.input), _used(self.outputs)])
+        return compute_digest([self.sha256, _drop_unknown_keys(self.input), _drop_unknown_keys(self.outputs)])
 
 
 def compute_digest(values: list[Any]) -> str:
@@ -102,7 +102,7 @@ def compute_digest(values: list[Any]) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
-def _used(part: InputRule | Outputs) -> dict[str, Any]:
+def _drop_unknown_keys(part: InputRule | Outputs) -> dict[str, Any]:
     """Return a section of a card as a dict, without the keys added in later versions that the card does not use, so
     that its fingerprint stays the same in all versions."""
     return {key: value for key, value in asdict(part).items() if value is not None or key not in _ADDED_LATER}
@@ -122,7 +122,7 @@ def load_card(name: str) -> Card:
             raise ModelError(str(error)) from error
     known = ", ".join(card_names()) or "there are none yet"
     raise ModelError(
-        f"There is no model `{name}`: " + meant(name, card_names(), f"use one of `edgevpr models list` ({known}).")
+        f"There is no model `{name}`: " + suggest(name, card_names(), f"use one of `edgevpr models list` ({known}).")
     )
 
 

@@ -15,20 +15,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Bytes, Doubles, Image, Ints, Mask, Singles
-from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, Perspective, Picture, TechniqueSpec, nearest_height
+from edgevpr.core.contract import (
+    Descriptor,
+    FineMatch,
+    PartSpec,
+    Perspective,
+    Picture,
+    TechniqueSpec,
+    find_nearest_height,
+)
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.techniques import layout, overlay, placecode
-from edgevpr.techniques.contrast import stretched
-from edgevpr.techniques.displacement import aligned, find_most_similar, from_middle, share, voted
+from edgevpr.techniques.contrast import stretch_contrast
+from edgevpr.techniques.displacement import centre_regions, find_most_similar, fit_alignment, share, vote
 from edgevpr.techniques.entropy import block_means, good_blocks
 from edgevpr.techniques.gradients import (
     grey_square,
-    in_square,
     levels,
     mask_square,
     normalise_blocks,
     orient_cells,
+    pad_to_square,
     slow_patterns,
     unit_rows,
 )
@@ -49,16 +57,16 @@ _ACCEPT = {"forward": (0.02, 0.01), "nadir": (0.02, 0.01), "thesis": (0.0, 0.02)
 # covered, that were taken for a wrong place .43 or less; right matches had .91 or more (on the other sites .72 or more,
 # and .47 where pictures have 64 x 32 pixels). With `filled_bins` it was .14, .18 and .30.
 _MIN_QUALITY = {"shannon": 0.4, "filled_bins": 0.2}
-# (kept, wanted, sigma_pixels), see `stretched`. No place of any set lies below `kept` (aerial_copr has one of 45
+# (kept, wanted, sigma_pixels), see `stretch_contrast`. No place of any set lies below `kept` (aerial_copr has one of 45
 # levels, nordland_tiny one of 81), so none changed. Chosen on corridor, aerial_caliterra and aerial_garfield28, with
 # aerial_swindale: looking ahead, noise harms more.
 _CONTRAST = {"forward": (75, 200, 0.4), "nadir": (40, 40, 0.25)}
 _MATCHINGS = ("displacement", "thesis")
 # Places or, looking down, pairs of a place and a rotation.
 _CANDIDATES = {"forward": 42, "nadir": 30}
-# Places compared in full, those with the best `glance`. Ahead it looks at one of so many good regions: on corridor, the
-# seasons and nordland_tiny 12 of 42 find as many places as all of them compared in full (of the 994 of nordland_tiny
-# four fewer). Looking down 6 of 30 find as many as 10 on sat_marash, aerial_swindale and kite_ochota.
+# Places compared in full, those with the best `score_quickly`. Ahead it looks at one of so many good regions: on
+# corridor, the seasons and nordland_tiny 12 of 42 find as many places as all of them compared in full (of the 994 of
+# nordland_tiny four fewer). Looking down 6 of 30 find as many as 10 on sat_marash, aerial_swindale and kite_ochota.
 _IN_FULL, _GLANCE = {"forward": 12, "nadir": 6}, 4
 _BINS_DOWN = 8  # orientations of the regions whose patterns make a layout
 # Agreement of the layouts of query and place at which the share of votes alone is the score. Right matches on
@@ -149,17 +157,17 @@ class CoHog:
         Returns coarse uint8 (12, 12, bins), or uint8 (1120,) with a nadir camera, fine uint8 (blocks, 4 bins), regions
         float32 (blocks, 4 bins) and good bool (blocks,): the rows of matrix A of thesis 6.2.3."""
         if self._is_nadir:
-            image, mask = in_square(image, mask)
+            image, mask = pad_to_square(image, mask)
         grey, allowed = grey_square(image, self.w1), mask_square(mask, self.w1)
         pixel_px = self.w1 / image.shape[1], self.w1 / image.shape[0]
-        grey = stretched(grey, allowed, pixel_px, *_CONTRAST[self.camera])
+        grey = stretch_contrast(grey, allowed, pixel_px, *_CONTRAST[self.camera])
         blocks, seen, good = self._blocks(grey, allowed, self.w2)
         regions = blocks.reshape(-1, 4 * self.bins)
         # The square root of each value in 8 bits: most values are small, and the root keeps more of their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
         if self._is_nadir:
             # In float64 a rounded number of the layout is the same on every processor.
-            coarse = layout.of_place(self._patterns(regions.astype(np.float64)), good.ravel(), self._side)
+            coarse = layout.encode_place(self._patterns(regions.astype(np.float64)), good.ravel(), self._side)
         else:
             coarse = np.rint(255 * placecode.grid(blocks, seen, np.ones_like(seen))[0]).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
@@ -201,13 +209,13 @@ class CoHog:
         the one of five heights that is nearest to `height_ratio`. Returns scores float32 (N,) in 0..1 and, with a nadir
         camera, the score of each hypothesis, float32 (N, 120): 24 rotations from each height, -inf if not tried."""
         if not self._is_nadir:
-            views = self._views_of(query)
+            views = self._make_views(query)
             mean_grid = np.zeros(1, np.float32) if mean is None else mean / 255
             own = placecode.grid(views.blocks(1.0, 0)[0], views.seen, views.seen)
             asked = placecode.hypotheses(*own, mean_grid)
             return np.clip(placecode.scan_ahead(asked, rows), 0, 1), None
-        ratio = nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)
-        self._views_of(query).keep(ratio)
+        ratio = find_nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)
+        self._make_views(query).keep(ratio)
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
         of_ratio = layout.scan(lambda turn, grid: self._field(query, first + turn, grid), rows, turned_deg, in_reach)
         scores = np.full((len(rows), len(HEIGHT_RATIOS) * ROTATIONS), -np.inf, np.float32)
@@ -216,26 +224,26 @@ class CoHog:
 
     def _field(self, query: Descriptor, number: int, grid: layout.Grid) -> Singles:
         """Return the layout of a query under the hypothesis `number`, (C, m, m). It is cached for the newest query."""
-        fields = self._views_of(query).fields
+        fields = self._make_views(query).fields
         if (number, grid.side) not in fields:
-            view = self._views_of(query).regions(number, self._patterns)
+            view = self._make_views(query).regions(number, self._patterns)
             fields[number, grid.side] = layout.field(grid, view.regions, view.numbers, (view.side, self._side))
         return fields[number, grid.side]
 
     def match(self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None) -> FineMatch:
         """Compare the query with a place, whose blocks are `fine`: compute C = A B^T (thesis 6.2.3), with A the good
         regions of the query and B those of the place, then the score by `matching` (0 without a good region). A nadir
-        query is tried under `hypotheses` (None: all); the one with the highest score counts, and `aligned` refines its
-        shift, rotation and height. Last, the less the structures of both agree (see `overlay`), the less is the
-        score."""
+        query is tried under `hypotheses` (None: all); the one with the highest score counts, and `fit_alignment`
+        refines its shift, rotation and height. Last, the less the structures of both agree (see `overlay`), the less is
+        the score."""
         reference = self._reference(fine)
         if self._is_nadir:
-            best, match, nearest = self._likest(query, reference, hypotheses)
+            best, match, nearest = self._find_likest(query, reference, hypotheses)
             if self._votes:
                 view = self._view(query, best)
-                match = aligned((view.numbers, view.side), (nearest, self._side), match)
+                match = fit_alignment((view.numbers, view.side), (nearest, self._side), match)
         else:
-            match, _ = self._matched(self._view(query, self._hypotheses[0]), reference)
+            match, _ = self._match_view(self._view(query, self._hypotheses[0]), reference)
         if match.shift_cells is None:
             return match
         structure = self._agreement(query, reference, match)
@@ -243,33 +251,33 @@ class CoHog:
         counts = min(max(structure, least), most) / most
         return replace(match, score=match.score * counts, votes=match.score, structure=structure)
 
-    def turned(self, query: Descriptor, fine: Bytes, match: FineMatch) -> FineMatch:
+    def match_rotated(self, query: Descriptor, fine: Bytes, match: FineMatch) -> FineMatch:
         """See `Technique.turned`."""
-        ratio, at_deg = nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0), match.rotation_deg or 0.0
+        ratio, at_deg = find_nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0), match.rotation_deg or 0.0
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
         off_deg = np.abs(shorter_deg(360 * np.arange(ROTATIONS) / ROTATIONS - at_deg))
         return self.match(query, fine, (first + np.flatnonzero(off_deg >= _TURNED_DEG)).tolist())
 
     def measure_perspective(self, query: Descriptor, fine: Bytes, match: FineMatch) -> Perspective | None:
         """See `Technique.measure_perspective`."""
-        ratio, step_deg = nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0), 360 / ROTATIONS
+        ratio, step_deg = find_nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0), 360 / ROTATIONS
         turn = round((match.rotation_deg or 0.0) / step_deg) % ROTATIONS
         view = self._view(query, HEIGHT_RATIOS.index(ratio) * ROTATIONS + turn)
         nearest = find_most_similar(view.regions, self._reference(fine))
         scale, off_deg = compute_scale(self._side + 1, ratio), (match.rotation_deg or 0.0) - turn * step_deg
         return fit_perspective(
-            from_middle(view.numbers, view.side),
-            from_middle(nearest, self._side),
+            centre_regions(view.numbers, view.side),
+            centre_regions(nearest, self._side),
             complex((match.height_ratio or 1.0) / scale * np.exp(1j * np.radians(off_deg))),
             complex(*(match.shift_cells or (0.0, 0.0))),
             (self._side + 1) * scale,
         )
 
-    def unmoved(self, query: Descriptor, fine: Bytes) -> FineMatch:
+    def match_at_rest(self, query: Descriptor, fine: Bytes) -> FineMatch:
         """See `Technique.unmoved`."""
-        return self._likest(query, self._reference(fine), [HEIGHT_RATIOS.index(1.0) * ROTATIONS])[1]
+        return self._find_likest(query, self._reference(fine), [HEIGHT_RATIOS.index(1.0) * ROTATIONS])[1]
 
-    def _likest(
+    def _find_likest(
         self, query: Descriptor, reference: Singles, hypotheses: Sequence[int] | None
     ) -> tuple[int, FineMatch, Ints]:
         """Compare a nadir query with a place under `hypotheses` (None: all). Returns the number of the one with the
@@ -280,7 +288,7 @@ class CoHog:
             place = layout.field(layout.FINE, reference[known], known, (self._side, self._side))
         matches, nearest = dict[int, FineMatch](), dict[int, Ints]()
         for each in tried:
-            match, nearest[each] = self._matched(self._view(query, each), reference)
+            match, nearest[each] = self._match_view(self._view(query, each), reference)
             if place is not None and match.shift_cells is not None:
                 shift = match.shift_cells[0] / self._side, match.shift_cells[1] / self._side
                 agrees = layout.agreement(self._field(query, each, layout.FINE), place, shift)
@@ -294,11 +302,11 @@ class CoHog:
     def _agreement(self, query: Descriptor, reference: Singles, match: FineMatch) -> float:
         """Lay a query over a place as `match` says (see `overlay`); `reference` are the regions of the place. Returns
         how well their structures agree, or with a nadir camera, how far this stands out."""
-        views, cells = self._views_of(query), self._side + 1
+        views, cells = self._make_views(query), self._side + 1
         known = reference.any(axis=1).reshape(self._side, self._side)
         place = overlay.structure(reference, known, _AROUND_CELLS[self.camera])
         if self._is_nadir:
-            laid = overlay.laid(*views.halved, match, cells)
+            laid = overlay.overlay_query(*views.halved, match, cells)
             return overlay.stands_out(self._structure(*self._all_blocks(*laid, len(laid[0]) // cells)), place)
         if views.structure is None:
             views.structure = self._structure(views.blocks(1.0, 0)[0], views.seen)
@@ -308,14 +316,14 @@ class CoHog:
         """Return the structure of a picture (see `overlay`) that has these blocks, float32 (n, n, 4 bins)."""
         return overlay.structure(self._patterns(blocks.reshape(-1, 4 * self.bins)), seen, _AROUND_CELLS[self.camera])
 
-    def glance(
+    def score_quickly(
         self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None
     ) -> tuple[float, list[int] | None]:
         """Estimate the score of `match`: with a forward camera from a quarter of the good regions, with a nadir camera
         from the vote and the layouts. See `Technique.glance`."""
         reference = self._reference(fine)
         if self._is_nadir:
-            best, match, _ = self._likest(query, reference, hypotheses)
+            best, match, _ = self._find_likest(query, reference, hypotheses)
             return match.score, [best]
         view = self._view(query, self._hypotheses[0])
         nearest = find_most_similar(view.regions[::_GLANCE], reference)
@@ -327,9 +335,9 @@ class CoHog:
 
     def _view(self, query: Descriptor, number: int) -> ViewRegions:
         """Return the good regions of a query under the hypothesis `number`."""
-        return self._views_of(query).regions(number, self._comparable)
+        return self._make_views(query).regions(number, self._comparable)
 
-    def _views_of(self, query: Descriptor) -> Views:
+    def _make_views(self, query: Descriptor) -> Views:
         if query is not self._query or self._views is None:
             if query.regions is None or query.good is None or query.picture is None:
                 raise ValueError("a place that was read from a map is no query")
@@ -342,9 +350,9 @@ class CoHog:
         """Reduce regions, float32 (N, 4 bins), to patterns (N, patterns) of length 1 (see `slow_patterns`)."""
         return unit_rows(regions @ slow_patterns(self.bins))
 
-    def _matched(self, view: ViewRegions, reference: Singles) -> tuple[FineMatch, Ints]:
+    def _match_view(self, view: ViewRegions, reference: Singles) -> tuple[FineMatch, Ints]:
         if self._votes:  # with a nadir camera, landmarks tell more than the support of all regions
-            return voted(view, reference, _VOTES_COUNT[self.camera], with_support=not self._is_nadir)
+            return vote(view, reference, _VOTES_COUNT[self.camera], with_support=not self._is_nadir)
         likeness = view.regions @ reference.T
         nearest = likeness.argmax(axis=1)
         score = np.clip(likeness[np.arange(len(nearest)), nearest].mean(), 0, 1) if len(nearest) else 0

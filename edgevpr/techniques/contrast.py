@@ -18,11 +18,11 @@ _OUTSIDE = 0.01  # share of the blocks that may be darker than the range, and sh
 # Least contrast of ground, in grey levels: this, or what noise of 3 levels has in means of few pixels.
 _LEAST = 4.0
 _NOISE = 3 * 4.65  # between the hundredths of a normal distribution
-_MOST_SIGMA = 1.4
+_MAX_SIGMA = 1.4
 _ROUNDS = 4  # of smoothing: fewer cannot reach that much
 
 
-def stretched(
+def stretch_contrast(
     grey: Singles, allowed: Mask | None, pixel_px: tuple[float, float], kept: float, wanted: float, sigma_pixels: float
 ) -> Singles:
     """Return a square picture, stretched if its contrast is below `kept`: at half of it or less to `wanted`, which is
@@ -42,7 +42,7 @@ def stretched(
     gain = min(lacks * lacks * lacks, wanted / found)  # from 1 on: no jump
     # Nothing of a bright display may bleed into the ground beside it.
     picture = grey.copy() if allowed is None else np.where(allowed, grey, np.float32((low + high) / 2))
-    sigma = min(_MOST_SIGMA, sigma_pixels * math.log2(gain))
+    sigma = min(_MAX_SIGMA, sigma_pixels * math.log2(gain))
     across, down = (min(max(1, round(each)), len(grey) // 4) for each in pixel_px)
     _smooth(picture, sigma, across)
     _smooth(picture.T, sigma, down)
@@ -54,7 +54,7 @@ def stretched(
 
 
 def _ends(grey: Singles, allowed: Mask | None) -> tuple[float, float]:
-    """Return the ends of the range of grey levels (see `stretched`): (0, 0) where no block is allowed."""
+    """Return the ends of the range of grey levels (see `stretch_contrast`): (0, 0) where no block is allowed."""
     means = _block_means(levels(grey))
     if allowed is not None:
         means = means[_block_means(allowed.view(np.uint8)) > 0.999]

@@ -25,7 +25,7 @@ _WITHIN_CELLS = 1.5  # largest distance of an agreeing region from the fit
 # Beyond these another hypothesis is nearer, or the pairs are of different places.
 _FURTHEST_TURN_DEG = 16.0
 _FURTHEST_SCALE = 1.6
-_LEAST_PAIRS = 8
+_MIN_PAIRS = 8
 _Grid = tuple[Ints, int]  # numbers of regions, row by row, and the regions along one side
 
 
@@ -40,7 +40,7 @@ def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple
     if not len(asking):
         return FineMatch(0.0, shift_cells=(0.0, 0.0), covariance_cells2=(0.0, 0.0, 0.0), coverage=0.0)
     room = len(counts) - 1
-    step, votes, around = _piled(asking, best, sides, counts)
+    step, votes, around = _count_votes(asking, best, sides, counts)
     wide = len(votes)
     weights = _weights(counts)
     peak_y, peak_x = divmod(int(around.argmax()), around.shape[1])
@@ -70,7 +70,7 @@ def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple
 
 def share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> float:
     """Return only the score of `displacement` for these arguments, in half the time."""
-    return float(_piled(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
+    return float(_count_votes(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
 
 
 def find_most_similar(regions: Singles, reference: Singles) -> Ints:
@@ -83,7 +83,7 @@ def find_most_similar(regions: Singles, reference: Singles) -> Ints:
     return best
 
 
-def voted(
+def vote(
     view: ViewRegions, reference: Singles, counts: tuple[float, ...], with_support: bool
 ) -> tuple[FineMatch, Ints]:
     """Match a view of the query with a place, whose regions are `reference` float32 (side * side, P), by vote. `counts`
@@ -131,7 +131,9 @@ def _log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int)
     return float(np.log(1 + np.count_nonzero(alike > there[:, None], axis=1)).mean())
 
 
-def _piled(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> tuple[Ints, Singles, Array]:
+def _count_votes(
+    asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]
+) -> tuple[Ints, Singles, Array]:
     """Count the votes for each shift; for the arguments see `displacement`. Returns the number of the shift that each
     region votes for, int (G,); the number of votes for each shift, on a grid with a border, float32 (n, n); and the
     weighted sum of the votes around each shift, on a grid without this border."""
@@ -161,7 +163,7 @@ def _weights(counts: tuple[float, ...]) -> Singles:
     return np.array(counts, np.float32)[np.maximum.outer(off, off)]
 
 
-def aligned(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
+def fit_alignment(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
     """Fit a shift, a rotation and a scale, by least squares, to pairs of a region of the query and its most similar
     region of the place. `asking` and `best` each hold the numbers of these regions, int (G,), and the side of their
     grid. The fit is repeated, each time with the pairs that agree with the last one, at first with the shift of the
@@ -170,12 +172,12 @@ def aligned(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
     Returns the match with the exact position: turned and scaled, the query's picture lies with its middle at the shift
     from that of the place's. The covariance is that of the distances by which single regions miss. Returns the match as
     it is if fewer than 8 pairs agree, or if the rotation or scale found belongs to another hypothesis."""
-    mine, there = from_middle(*asking), from_middle(*best)
+    mine, there = centre_regions(*asking), centre_regions(*best)
     turned, shift = 1 + 0j, complex(*(match.shift_cells or (0.0, 0.0)))
     for again in range(_ROUNDS + 1):
         off = there - turned * mine - shift
         near = np.maximum(abs(off.real), abs(off.imag)) <= _WITHIN_CELLS
-        if np.count_nonzero(near) < _LEAST_PAIRS:
+        if np.count_nonzero(near) < _MIN_PAIRS:
             return match
         if again == _ROUNDS:
             break
@@ -198,7 +200,7 @@ def aligned(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
     )
 
 
-def from_middle(numbers: Ints, side: int) -> Array:
+def centre_regions(numbers: Ints, side: int) -> Array:
     """Return the positions of regions in cells from the middle of their grid: x + iy, y downwards, complex (G,)."""
     y, x = np.divmod(numbers, side)
     return x + 1j * y - (1 + 1j) * (side - 1) / 2

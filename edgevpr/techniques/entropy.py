@@ -39,7 +39,7 @@ def shannon(grey: Bytes) -> Array:
     """Compute the Shannon entropy (bits) of the intensities in each disc, over 8, from a 100x100 copy scaled back up,
     as the authors' public code does: uint8 (H, W) to float32 (H, W) in 0..1."""
     height, width = grey.shape
-    return cv2.resize(_shannon_of(_shannon_copy(grey)), (width, height), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(_shannon_everywhere(_shannon_copy(grey)), (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def block_means(per_pixel: Array, cell_px: int) -> Array:
@@ -61,7 +61,7 @@ def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: 
         return (block_means(filled_bins(grey), cell_px) >= threshold) & among
     small = _shannon_copy(grey)
     # The entropy of the last four bits is at most that of all; within 16 k values the others add at most log2 k.
-    entropy = _shannon_of(small & 15)
+    entropy = _shannon_everywhere(small & 15)
     at_most = entropy + _LOG2_OVER_8[(_range(small) >> 4) + 1]
     down, across = (_scaled_pairs(side, cell_px) for side in grey.shape)
 
@@ -107,30 +107,32 @@ def _range(grey: Bytes) -> Array:
 
 
 def _count_different(padded: Array) -> Array:
-    """Count the different intensities in each disc, by unions of sets of 256 bits; shapes as in `_over_disc`."""
+    """Count the different intensities in each disc, by unions of sets of 256 bits; shapes as in
+    `_combine_over_disc`."""
     bit, word_of = np.left_shift(np.uint64(1), padded & 63, dtype=np.uint64), padded >> 6
-    unions = (_over_disc(bit * (word_of == word), np.bitwise_or) for word in range(4))
+    unions = (_combine_over_disc(bit * (word_of == word), np.bitwise_or) for word in range(4))
     sizes: Array = reduce(np.add, (np.bitwise_count(union).astype(np.int16) for union in unions))
     return sizes
 
 
-def _shannon_of(small: Array) -> Singles:
+def _shannon_everywhere(small: Array) -> Singles:
     """Compute the Shannon entropy of the disc of every pixel, in bits over 8: uint8 (H, W) to float32 (H, W)."""
     padded = np.pad(small.astype(np.int16), DISC_RADIUS_PX, constant_values=-1)  # -1: outside, no intensity
     of_counts = np.zeros(small.shape, np.float32)
     present = np.flatnonzero(np.bincount(small.ravel()))[:, None, None]
     for start in range(0, len(present), _STRIP_INTENSITIES):
         one_hot = (padded == present[start : start + _STRIP_INTENSITIES]).view(np.uint8)
-        counts = _over_disc(one_hot, np.add)
+        counts = _combine_over_disc(one_hot, np.add)
         of_counts += _COUNT_LOG2.take(counts).sum(axis=0)
-    in_disc = _over_disc((padded >= 0).view(np.uint8), np.add)
+    in_disc = _combine_over_disc((padded >= 0).view(np.uint8), np.add)
     # -sum p log2 p with p = c/n is log2 n - (sum c log2 c)/n.
     entropy: Singles = (_COUNT_LOG2[in_disc] - of_counts) / in_disc / 8
     return entropy
 
 
 def _shannon_at(small: Bytes, pixels: Bools) -> Singles:
-    """Compute `_shannon_of` at the P True pixels of a bool (H, W) only, each from its own histogram: float32 (P,)."""
+    """Compute `_shannon_everywhere` at the P True pixels of a bool (H, W) only, each from its own histogram: float32
+    (P,)."""
     r = DISC_RADIUS_PX
     padded = np.pad(small.astype(np.int16), r, constant_values=256)  # 256: outside
     down, right = np.nonzero(np.hypot(*np.mgrid[-r : r + 1, -r : r + 1]) <= r)
@@ -148,7 +150,7 @@ def _shannon_at(small: Bytes, pixels: Bools) -> Singles:
     return entropy
 
 
-def _over_disc(planes: Array, combine: np.ufunc) -> Array:
+def _combine_over_disc(planes: Array, combine: np.ufunc) -> Array:
     """Combine the values in the disc around each pixel of each plane by an associative ufunc (add, bitwise_or): planes
     padded by the radius r, (..., H + 2r, W + 2r), to (..., H, W)."""
     r, pitch = DISC_RADIUS_PX, planes.shape[-1]

@@ -59,7 +59,7 @@ def mask_square(mask: Mask | None, side_px: int) -> Mask | None:
     return cv2.resize(mask.astype(np.uint8), (side_px, side_px), interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-def in_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
+def pad_to_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
     """Put a picture into the middle of a square, its border repeated outwards. Returns the square, and bool (side,
     side), True for pixels of the picture that `mask` allows (None: all)."""
     height, width = image.shape[:2]

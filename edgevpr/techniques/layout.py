@@ -36,13 +36,13 @@ FINE = Grid(12, (0, 1, 2, 3, 4, 7, 8, 9, 12, 13, 15, 17))
 NBYTES = (COARSE.numbers + FINE.numbers) // 2  # of a place
 ROTATIONS = 24
 _AROUND = 0.25  # standard deviation of what counts as around a cell, as a share of the place's side
-_LEAST_SEEN = 0.1  # share of a cell that good regions must cover
-_LEAST_STRENGTH = 0.01  # of a cell; weaker ones are noise
+_MIN_SEEN = 0.1  # share of a cell that good regions must cover
+_MIN_STRENGTH = 0.01  # of a cell; weaker ones are noise
 _LEVELS = 7  # of a stored number, on either side of 0
-_LARGEST_KEPT = 99  # percentile of a place's numbers that becomes the highest level
-_LEAST_OVERLAP = {8: 0.5, 12: 0.35}  # share of the place that the query covers, by the side of the grid
-_LEAST_OF_LARGER = {8: 1.0, 12: 0.75}  # the same, for a query that shows more ground than a place
-_LEAST_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
+_MAX_KEPT = 99  # percentile of a place's numbers that becomes the highest level
+_MIN_OVERLAP = {8: 0.5, 12: 0.35}  # share of the place that the query covers, by the side of the grid
+_MIN_OF_LARGER = {8: 1.0, 12: 0.75}  # the same, for a query that shows more ground than a place
+_MIN_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
 # Pairs of a place and a rotation that are compared by the fine grid, if headings are known for all places, and if not.
 _LOOKED_CLOSER = 1000, 2000
 _RIVALS = 2048  # unlikely places that are scored
@@ -70,21 +70,21 @@ def field(grid: Grid, patterns: Array, numbers: Ints, sides: tuple[int, int]) ->
     pooled = _both_ways(_pooling(side, of_place, grid.side), whole.reshape(side, side, -1).transpose(2, 0, 1))
     values, weight = pooled[:-1], pooled[-1]
     values = values - weight * (values.sum(axis=(1, 2)) / max(float(weight.sum()), _TINY))[:, None, None]
-    near = _near(len(weight), _AROUND * grid.side)
+    near = _distance_weights(len(weight), _AROUND * grid.side)
     values -= weight * _both_ways(near, values) / np.maximum(_both_ways(near, weight), _TINY)
-    values /= np.sqrt(np.maximum(np.sqrt((values**2).sum(axis=0)), _LEAST_STRENGTH))
-    laid: Array = values * (weight > _LEAST_SEEN)
+    values /= np.sqrt(np.maximum(np.sqrt((values**2).sum(axis=0)), _MIN_STRENGTH))
+    laid: Array = values * (weight > _MIN_SEEN)
     return laid
 
 
-def of_place(patterns: Array, good: Bools, side: int) -> Bytes:
+def encode_place(patterns: Array, good: Bools, side: int) -> Bytes:
     """Return the coarse part of a place, uint8 (NBYTES,), from the patterns (side * side, 20) of all its regions, of
     which those are used that are `good`, bool (side * side,)."""
     numbers = np.flatnonzero(good)
     stored = []
     for grid in (COARSE, FINE):
         values = field(grid, patterns[numbers], numbers, (side, side)).ravel()
-        largest = max(float(np.percentile(np.abs(values), _LARGEST_KEPT)), _TINY)
+        largest = max(float(np.percentile(np.abs(values), _MAX_KEPT)), _TINY)
         levels = np.clip(np.rint(values * (_LEVELS / largest)), -_LEVELS, _LEVELS).astype(np.uint8) + (_LEVELS + 1)
         stored.append(levels[::2] | levels[1::2] << 4)
     packed: Bytes = np.concatenate(stored).astype(np.uint8)
@@ -111,7 +111,7 @@ def scan(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools 
     for turn in np.unique(turns):
         group = slice(None) if turned_deg is None else np.flatnonzero(turns == turn)
         tried = np.arange(0, ROTATIONS, 2) if turn < 0 else np.arange(turn - 1, turn + 2) % ROTATIONS
-        found = _compared(COARSE, [fields(int(each), COARSE) for each in tried], of_coarse[group])
+        found = _compare_fields(COARSE, [fields(int(each), COARSE) for each in tried], of_coarse[group])
         if turn < 0:
             found = np.stack([found, (found + np.roll(found, -1, axis=1)) / 2], axis=2).reshape(len(found), -1)
             tried = np.arange(ROTATIONS)
@@ -123,7 +123,7 @@ def scan(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools 
     slots, turned = np.divmod(best[np.isfinite(chances.flat[best])], ROTATIONS)
     for turn in np.unique(turned):
         there = np.sort(slots[turned == turn])
-        found = _compared(FINE, [fields(int(turn), FINE)], rows[there, COARSE.numbers // 2 :])
+        found = _compare_fields(FINE, [fields(int(turn), FINE)], rows[there, COARSE.numbers // 2 :])
         scores[there, turn] = np.clip(found[:, 0], 0, 1)
     return scores
 
@@ -133,7 +133,7 @@ def agreement(query: Array, place: Array, shift: tuple[float, float]) -> float:
     the query's middle lies `shift` (dx, dy) from the place's, as shares of the place's side, or up to a cell off."""
     n = place.shape[1]
     dx, dy = (round(each * n) for each in shift)
-    padded = _bordered(query, n)
+    padded = _pad_field(query, n)
     first = (padded.shape[1] - n) // 2
     steps = [(first - dy - y, first - dx - x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
     inside = [(y, x) for y, x in steps if 0 <= y <= padded.shape[1] - n and 0 <= x <= padded.shape[1] - n]
@@ -142,19 +142,19 @@ def agreement(query: Array, place: Array, shift: tuple[float, float]) -> float:
     laid = np.stack([padded[:, y : y + n, x : x + n] for y, x in inside])
     of_place = (place**2).sum(axis=0)
     scatter = ((laid**2).sum(axis=1) * of_place).sum(axis=(1, 2))
-    scatter = np.maximum(scatter, _LEAST_SCATTER**2 * _strength(query) * of_place.sum())
+    scatter = np.maximum(scatter, _MIN_SCATTER**2 * _strength(query) * of_place.sum())
     found = np.einsum("scij,cij->s", laid, place) / (np.sqrt(scatter + _TINY) * n)
     return float(np.clip(found.max(), 0, 1))
 
 
-def _compared(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
+def _compare_fields(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
     """Compare R fields of the query with N places, uint8 (N, B): the best score over all shifts, float32 (N, R). The
     scatter is estimated from the query's cells that lie on the place, and the mean strength of the place's."""
-    laid = [_shifted(each, grid.side) for each in queries]
+    laid = [_shift_field(each, grid.side) for each in queries]
     asked = np.concatenate(laid) if len(laid) > 1 else laid[0]  # a megabyte: no copy that is not needed
     strengths = [(each**2).sum(axis=0, keepdims=True) for each in queries]
-    scatter = np.concatenate([_shifted(each, grid.side).sum(axis=1) for each in strengths])
-    least = [_LEAST_SCATTER**2 * float(each.mean()) * grid.side**2 for each in strengths]
+    scatter = np.concatenate([_shift_field(each, grid.side).sum(axis=1) for each in strengths])
+    least = [_MIN_SCATTER**2 * float(each.mean()) * grid.side**2 for each in strengths]
     asked /= np.sqrt(np.maximum(scatter, np.repeat(least, [len(each) for each in laid])) + _TINY)[:, None]
     best = np.empty((len(packed), len(queries)), np.float32)
     was, kept = None, asked
@@ -176,7 +176,7 @@ def _strength(field: Array) -> float:
     return float((field**2).sum() / field[0].size)
 
 
-def _bordered(query: Array, n: int) -> Array:
+def _pad_field(query: Array, n: int) -> Array:
     """Put `n` empty cells around a field (C, m, m). It is `np.pad` in a tenth of the time, and asked for often."""
     m = query.shape[1]
     bordered = np.zeros((len(query), m + 2 * n, m + 2 * n), query.dtype)
@@ -184,9 +184,9 @@ def _bordered(query: Array, n: int) -> Array:
     return bordered
 
 
-def _shifted(query: Singles, n: int) -> Singles:
+def _shift_field(query: Singles, n: int) -> Singles:
     """Return a field (C, m, m) of a query as it lies on a place of `n` x `n` cells under each shift: (S, C n n)."""
-    windows = sliding_window_view(_bordered(query, n), (n, n), axis=(1, 2)).transpose(1, 2, 0, 3, 4)  # (K, K, C, n, n)
+    windows = sliding_window_view(_pad_field(query, n), (n, n), axis=(1, 2)).transpose(1, 2, 0, 3, 4)  # (K, K, C, n, n)
     y, x = _shifts(query.shape[1], n)
     return windows[y, x].reshape(len(y), -1)
 
@@ -197,7 +197,7 @@ def _shifts(m: int, n: int) -> tuple[Ints, Ints]:
     which the query covers enough of a place: int (S,), int (S,)."""
     first = np.arange(m + n + 1)
     covered = np.minimum(first + n, m + n) - np.maximum(first, n)
-    least = _LEAST_OVERLAP[n] if m == n else _LEAST_OF_LARGER[n]
+    least = _MIN_OVERLAP[n] if m == n else _MIN_OF_LARGER[n]
     y, x = np.nonzero(np.outer(covered.clip(0), covered.clip(0)) >= least * n * n)
     return y, x
 
@@ -205,7 +205,7 @@ def _shifts(m: int, n: int) -> tuple[Ints, Ints]:
 @lru_cache
 def _pooling(side: int, of_place: int, cells: int) -> Singles:
     """Return the weights, float32 (m, side), by which `side` regions in a row are averaged in m cells with the same
-    middle, of which `cells` are as long as the `of_place` regions of a place."""
+    middle, of which `cells` are as long as the `encode_place` regions of a place."""
     pitch = of_place / cells
     m = cells + 2 * max(0, int(np.ceil((side / pitch - cells) / 2 - _TINY)))
     begins = (np.arange(m)[:, None] - m / 2) * pitch
@@ -216,7 +216,7 @@ def _pooling(side: int, of_place: int, cells: int) -> Singles:
 
 
 @lru_cache
-def _near(cells: int, sd: float) -> Singles:
+def _distance_weights(cells: int, sd: float) -> Singles:
     """Return Gaussian weights of the distances between cells in a row, float32 (cells, cells)."""
     away = np.subtract.outer(np.arange(cells), np.arange(cells))
     weights: Singles = np.exp(-(away**2) / (2 * sd**2)).astype(np.float32)

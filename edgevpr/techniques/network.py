@@ -126,7 +126,7 @@ def region_vlad(
     return NetworkVector("region_vlad", backbone, head, parameters=parameters, form=form, model_sha256=sha256)
 
 
-def of_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
+def make_from_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
     """Make the technique of a card: the vector of its network. A map records no parameters, since the hash of the
     network covers them. No match is accepted until the configuration sets a minimum margin."""
     backbone = Backbone(card, "descriptor", threads)

@@ -14,13 +14,13 @@ import numpy as np
 from edgevpr.core.arrays import Array, Bools, Mask, Singles
 from edgevpr.core.contract import FineMatch
 
-_LEAST_STRENGTH = 0.02  # of a region's patterns; weaker ones are noise
+_MIN_STRENGTH = 0.02  # of a region's patterns; weaker ones are noise
 _ROOM, _MISSES, _PEAK = 7, 2, 2  # cells: shifts compared; by which a match may miss; that belong to the same peak
-_LEAST_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
+_MIN_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
 _TINY = 1e-9
 
 
-def laid(grey: Array, allowed: Mask, match: FineMatch, cells: int) -> tuple[Array, Mask]:
+def overlay_query(grey: Array, allowed: Mask, match: FineMatch, cells: int) -> tuple[Array, Mask]:
     """Turn, scale and shift a query's picture, float32 (side, side), as its match with a place says, so that it lies
     over the place's, which has `cells` cells along a side. `allowed`, bool of the same shape, is True for pixels that
     may be used. Returns both as they lie over the place."""
@@ -40,10 +40,10 @@ def structure(patterns: Array, seen: Bools, around_cells: float) -> Singles:
     count that are `seen`, bool (n, n). `around_cells` is the standard deviation of what counts as around a region."""
     weight = seen.astype(np.float32)
     values = patterns.reshape(*seen.shape, -1).astype(np.float32) * weight[..., None]
-    near = _around(values, around_cells) / np.maximum(_around(weight, around_cells), _TINY)[..., None]
+    near = _sum_around(values, around_cells) / np.maximum(_sum_around(weight, around_cells), _TINY)[..., None]
     values -= near * weight[..., None]
     strength = np.sqrt((values**2).sum(axis=2))
-    found: Singles = values / np.sqrt(np.maximum(strength, _LEAST_STRENGTH))[..., None]
+    found: Singles = values / np.sqrt(np.maximum(strength, _MIN_STRENGTH))[..., None]
     return found
 
 
@@ -82,8 +82,8 @@ def agreement(query: Singles, place: Singles, shift_cells: tuple[float, float]) 
 def _strengths(query: Singles, place: Singles) -> tuple[Singles, Singles, float]:
     """Return the squared strengths of two structures in each cell, (n, n), and the least scatter of their agreement."""
     of_query, of_place = (query**2).sum(axis=2), (place**2).sum(axis=2)
-    return of_query, of_place, _LEAST_SCATTER**2 * float(of_query.sum()) * float(of_place.sum()) / of_place.size
+    return of_query, of_place, _MIN_SCATTER**2 * float(of_query.sum()) * float(of_place.sum()) / of_place.size
 
 
-def _around(values: Singles, cells: float) -> Singles:
+def _sum_around(values: Singles, cells: float) -> Singles:
     return np.asarray(cv2.GaussianBlur(values, (0, 0), cells, borderType=cv2.BORDER_CONSTANT))

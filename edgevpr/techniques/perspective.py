@@ -13,10 +13,10 @@ from edgevpr.core.contract import Perspective
 
 _ROUNDS = 10
 _WITHIN_CELLS = 1.5  # largest distance of an agreeing region from the fit
-_LEAST_PAIRS = 12
+_MIN_PAIRS = 12
 _PRIOR_SD = 0.17  # of the change of scale from cell to cell: far more than a picture that is taken bears
 _ALIKE = 5.0  # neighbouring regions share pixels and relief: so many count as one
-_LEAST_SCALE = 0.05  # nearer to the horizon of a homography, nothing lies anywhere
+_MIN_SCALE = 0.05  # nearer to the horizon of a homography, nothing lies anywhere
 
 
 def fit_perspective(
@@ -29,7 +29,7 @@ def fit_perspective(
     normal = np.eye(8)
     for _ in range(_ROUNDS):
         agrees, _ = _compare(way, asked, known)
-        if np.count_nonzero(agrees) < _LEAST_PAIRS:
+        if np.count_nonzero(agrees) < _MIN_PAIRS:
             return None
         (x, y), (to_x, to_y) = ((points[agrees].real, points[agrees].imag) for points in (asked, known))
         none = np.zeros_like(x)
@@ -44,7 +44,7 @@ def fit_perspective(
         normal = looks.T @ looks + np.diag([0.0] * 6 + [_PRIOR_SD**-2] * 2)
         way = np.linalg.solve(normal, looks.T @ (weight * np.concatenate([to_x, to_y])))
     agrees, off = _compare(way, asked, known)
-    if np.count_nonzero(agrees) < _LEAST_PAIRS:
+    if np.count_nonzero(agrees) < _MIN_PAIRS:
         return None
     # A region is matched to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
     variance = float((np.abs(off[agrees]) ** 2).mean()) / 2 + 1 / 12
@@ -57,9 +57,7 @@ def _compare(way: Doubles, asked: Array, known: Array) -> tuple[Bools, Array]:
     """Return which regions agree with a homography, bool (n,), and by how much each misses, complex (n,)."""
     x, y = asked.real, asked.imag
     scale = 1 + way[6] * x + way[7] * y
-    there = (way[0] * x + way[1] * y + way[2] + 1j * (way[3] * x + way[4] * y + way[5])) / np.maximum(
-        scale, _LEAST_SCALE
-    )
+    there = (way[0] * x + way[1] * y + way[2] + 1j * (way[3] * x + way[4] * y + way[5])) / np.maximum(scale, _MIN_SCALE)
     off = known - there
-    agrees: Bools = (np.maximum(np.abs(off.real), np.abs(off.imag)) <= _WITHIN_CELLS) & (scale > _LEAST_SCALE)
+    agrees: Bools = (np.maximum(np.abs(off.real), np.abs(off.imag)) <= _WITHIN_CELLS) & (scale > _MIN_SCALE)
     return agrees, off

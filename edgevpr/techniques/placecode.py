@@ -61,7 +61,7 @@ def hypotheses(grid: Singles, seen: Bools, mean: Floats) -> Singles:
     signs = np.where(special(grid, mean) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
     asked = np.zeros((len(SHIFTS), *signs.shape), np.float32)
     for at, (dx, dy) in enumerate(SHIFTS.tolist()):
-        asked[at, _to(dy), _to(dx)] = signs[_to(-dy), _to(-dx)]
+        asked[at, _target_slice(dy), _target_slice(dx)] = signs[_target_slice(-dy), _target_slice(-dx)]
     return asked.reshape(len(SHIFTS), -1)
 
 
@@ -89,14 +89,14 @@ def scan_ahead(asked: Singles, codes: Bytes) -> Singles:
     around it, then only the best 500 places under all shifts."""
     if len(codes) <= _LOOKED_CLOSER:
         return scan(asked, codes)
-    scores = scan(_blurred() @ asked, codes)
+    scores = scan(_blur_weights() @ asked, codes)
     best = np.argpartition(-scores, _LOOKED_CLOSER)[:_LOOKED_CLOSER]
     scores[best] = scan(asked, codes[best])
     return scores
 
 
 @lru_cache
-def _blurred() -> Singles:
+def _blur_weights() -> Singles:
     """Return the weights, float32 (E, S), by which `scan_ahead` averages: row e has the weight of each of all S shifts
     in the mean around the e-th of the E shifts whose dx and dy are even."""
     kept = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
@@ -114,7 +114,7 @@ def _sources(n: int) -> Ints:
     return numbers.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES**2)
 
 
-def _to(step: int) -> slice:
+def _target_slice(step: int) -> slice:
     """Return the slice of one axis of the grid to which cells are copied when the grid is moved by `step` cells along
     it; they are copied from the slice `_to(-step)`."""
     return slice(max(0, step), SIDE + min(0, step))

@@ -18,7 +18,7 @@ _SEQUENCE = 10  # queries that are matched together, unless the configuration se
 _WINDOW = 10  # R_window of the paper: five places before and five after
 _GREYEST = 128  # a pixel as bright as the mean of its patch
 _STEPS = 28  # levels per standard deviation: eight bits reach 4.5 of them either way
-_LEAST_SPREAD = 1.0  # grey levels: a patch with a smaller standard deviation does not describe the place
+_MIN_SPREAD = 1.0  # grey levels: a patch with a smaller standard deviation does not describe the place
 
 
 class SeqSlam:
@@ -53,11 +53,11 @@ class SeqSlam:
         seen = np.ones(image.shape[:2], np.uint8) if mask is None else mask.astype(np.uint8)
         pixels = self._patches(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
         allowed = self._patches(cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST))
-        z, spread = normalised(pixels, allowed)
+        z, spread = normalise_patches(pixels, allowed)
         levels = np.clip(np.rint(_STEPS * z) + _GREYEST, 0, 255).astype(np.uint8)
         rows, columns = self._height // self._patch, self._width // self._patch
         coarse = levels.reshape(rows, columns, self._patch, self._patch).swapaxes(1, 2).ravel()
-        return Descriptor(coarse=coarse, quality=float(np.mean(spread >= _LEAST_SPREAD)))
+        return Descriptor(coarse=coarse, quality=float(np.mean(spread >= _MIN_SPREAD)))
 
     def _patches(self, picture: Array) -> Singles:
         """Cut a picture into patches: (height, width) to float32 (patches, patch * patch)."""
@@ -68,16 +68,16 @@ class SeqSlam:
     def coarse_scores(self, query: Descriptor, rows: Array, mean: None = None) -> tuple[Singles, None]:
         """Score each place by how much better the query fits it than the places around it in the map. `rows` are uint8
         (N, length). Returns scores float32 (N,) in 0..1, and None, since there are no hypotheses. 0.5 means that the
-        place fits as well as those around it. The score is linear in the enhanced difference (see `enhanced`), so the
-        trajectory with the best mean score is that of the least summed difference."""
+        place fits as well as those around it. The score is linear in the enhanced difference (see `enhance_contrast`),
+        so the trajectory with the best mean score is that of the least summed difference."""
         # With one query, the nearest neighbour of each row is that query: K=1 is the fastest way to all sums of
         # absolute differences.
         differences = cv2.batchDistance(rows, query.coarse[None], cv2.CV_32S, normType=cv2.NORM_L1, K=1)[0][:, 0]
         most = _WINDOW / math.sqrt(_WINDOW + 1)  # (n - 1) / sqrt(n): none of n values is farther from their mean
-        return (0.5 - enhanced(differences) / (2 * most)).astype(np.float32), None
+        return (0.5 - enhance_contrast(differences) / (2 * most)).astype(np.float32), None
 
 
-def normalised(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
+def normalise_patches(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
     """Subtract each patch's mean and divide by its standard deviation. `pixels` and `allowed` (1, or 0 for pixels that
     do not count) are float32 (patches, pixels). Returns the normalised pixels, float32 (patches, pixels), 0 where not
     allowed or where the patch is flat; and the standard deviations, float32 (patches,)."""
@@ -87,7 +87,7 @@ def normalised(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
     return np.divide(centred, spread, out=np.zeros_like(centred), where=spread > 1e-3), spread[:, 0]
 
 
-def enhanced(differences: Array) -> Doubles:
+def enhance_contrast(differences: Array) -> Doubles:
     """Enhance the local contrast of the query's differences from the places along the map: int32 (N,) to float64 (N,).
     From each difference the mean of those up to five places away is subtracted, and the rest is divided by their
     (sample) standard deviation; 0 where they are all equal. Sums of whole numbers keep a long map precise."""

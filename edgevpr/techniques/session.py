@@ -18,7 +18,7 @@ from edgevpr.techniques.card import Card, InputRule, load_card
 _FORMS = {"descriptor": (2, "(1, D)"), "features": (4, "(1, C, H, W)")}
 _SEED = 7
 MAX_FILE_BYTES = 2**31  # protobuf, in which ONNX files are written, allows no more
-_MOST_THREADS = 256
+_MAX_THREADS = 256
 _LARGEST = 1e12  # with much larger numbers the length of a vector overflows float32, and the unit vector is zero
 _RESIZE = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR_EXACT, "cubic": cv2.INTER_CUBIC}
 
@@ -73,8 +73,8 @@ def open_backbone(model: str, output: str, threads: int = 1) -> Backbone:
 def open_session(card: Card, threads: int = 1) -> Any:
     """Open the onnxruntime session of a card's file; raises as `Backbone` does. The network is not run, so its inputs
     and outputs are not yet compared with the card."""
-    if not 1 <= threads <= _MOST_THREADS:
-        raise UsageError(f"{card.name} cannot run with threads={threads}: give 1 to {_MOST_THREADS}.")
+    if not 1 <= threads <= _MAX_THREADS:
+        raise UsageError(f"{card.name} cannot run with threads={threads}: give 1 to {_MAX_THREADS}.")
     return _session(card.file_path, card.sha256, threads)
 
 
@@ -110,8 +110,7 @@ def _session(path: Path, sha256: str, threads: int) -> Any:
         return runtime.InferenceSession(read_file(path, MAX_FILE_BYTES), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own classes, and RuntimeError
         raise ModelError(
-            f"{path} cannot be opened as an ONNX model with its weights inside ({_in_one_line(error)}): export it "
-            "again."
+            f"{path} cannot be opened as an ONNX model with its weights inside ({_join_lines(error)}): export it again."
         ) from error
 
 
@@ -123,7 +122,7 @@ def import_onnxruntime() -> Any:
         import onnxruntime
     except Exception as error:  # a broken installation raises OSError, or an error of NumPy
         raise ModelError(
-            f"onnxruntime cannot be imported ({_in_one_line(error)}): install it again (`pip install onnxruntime`) for "
+            f"onnxruntime cannot be imported ({_join_lines(error)}): install it again (`pip install onnxruntime`) for "
             "the techniques with networks; hog, cohog and seqslam fly without it."
         ) from error
     return onnxruntime
@@ -136,7 +135,7 @@ def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -
         results: list[Array] = session.run(names, {session.get_inputs()[0].name: pictures})
     except Exception as error:  # onnxruntime's own classes, and RuntimeError
         raise ModelError(
-            f"{card.file_path} cannot be run as its card says ({_in_one_line(error)}): correct `input` or `outputs` of "
+            f"{card.file_path} cannot be run as its card says ({_join_lines(error)}): correct `input` or `outputs` of "
             "the card, or export the network for it."
         ) from error
     for name, result in zip(names, results, strict=True):
@@ -151,7 +150,7 @@ def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -
     return results
 
 
-def _in_one_line(error: Exception) -> str:
+def _join_lines(error: Exception) -> str:
     return " ".join((str(error) or type(error).__name__).split())[:200]
 
 

@@ -20,7 +20,7 @@ NEVER = 2.0
 _SHIPPED = "calc"
 _TINY = 1e-6
 _BYTES_AT_ONCE = 4 << 20  # of places converted to float32 together
-_FEWEST_AT_ONCE = 16
+_MIN_AT_ONCE = 16
 _BESIDE_BYTES = 8  # at the end of a row in 8 bits: its step and its length, both float32
 _WORD_BITS = 64  # a row in 1 bit is padded to whole words, whose bits are counted at once
 _CODE_BYTES_AT_ONCE = 1 << 20  # of binary vectors compared together: about a second-level cache
@@ -56,7 +56,7 @@ class VectorTechnique:
         is_measured = parameters.get("model", _SHIPPED) == _SHIPPED
         self.min_margin = margins[FORMS.index(form)] if is_measured else NEVER
         self._similarity, self._length = similarity, length
-        self._at_once = max(_BYTES_AT_ONCE // (4 * length), _FEWEST_AT_ONCE)
+        self._at_once = max(_BYTES_AT_ONCE // (4 * length), _MIN_AT_ONCE)
         packed = {
             "float": None,
             "8bit": PartSpec((length + _BESIDE_BYTES,), "|i1"),
@@ -127,7 +127,7 @@ class VectorTechnique:
             part = rows[start : start + self._at_once]
             np.copyto(values[: len(part)], part[:, : self._length])
             beside = np.ascontiguousarray(part[:, self._length :]).view("<f4").T
-            scores[start : start + len(part)] = self._compared(vector, values[: len(part)], beside)
+            scores[start : start + len(part)] = self._compare_vectors(vector, values[: len(part)], beside)
         return scores, None
 
     def _equal_bits(self, vector: Singles, rows: Bytes) -> Singles:
@@ -143,7 +143,7 @@ class VectorTechnique:
             different[block] = np.bitwise_count(places[block] ^ asked).astype(np.float32) @ ones
         return np.asarray(1 - different / np.float32(self._length), np.float32)
 
-    def _compared(self, vector: Singles, values: Singles, beside: Singles) -> Singles:
+    def _compare_vectors(self, vector: Singles, values: Singles, beside: Singles) -> Singles:
         """Score n places by their vectors `values`, float32 (n, D), which are overwritten. `beside` (2, n) are the
         places' steps and lengths in the form `8bit`; in `float` it is empty, (0, n)."""
         if self._similarity == "cosine":

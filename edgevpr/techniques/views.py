@@ -85,7 +85,7 @@ class Views:
         float32 (n, n, 4 bins), and bool (n, n), True for good blocks."""
         quarters, within = divmod(turn, WITHIN_QUARTER)
         if (ratio, within) not in self._encoded:
-            self._encoded[ratio, within] = self._encode(*self._picture_of(ratio, within))
+            self._encoded[ratio, within] = self._encode(*self._warp_picture(ratio, within))
         blocks, good = self._encoded[ratio, within]
         return rotate_blocks(blocks, -quarters), np.rot90(good, -quarters)
 
@@ -113,10 +113,10 @@ class Views:
     def halved(self) -> tuple[Array, Mask]:
         """The picture in half as many pixels along a side, at least two a cell: grey float32 (side, side), and bool
         (side, side), True for allowed pixels."""
-        grey, allowed = self._resized((self._side + 1) * max(2, self._cell_px // 2))
+        grey, allowed = self._resize((self._side + 1) * max(2, self._cell_px // 2))
         return grey, allowed.astype(bool)
 
-    def _resized(self, side: int) -> tuple[Array, Array]:
+    def _resize(self, side: int) -> tuple[Array, Array]:
         """Return the picture with `side` pixels along a side: grey float32, and uint8, 1 for allowed pixels."""
         if self._picture.grey is None or self._picture.allowed is None:
             raise ValueError("a picture that is not kept cannot be turned")
@@ -127,13 +127,13 @@ class Views:
         grey = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA)
         return grey, cv2.resize(allowed, (side, side), interpolation=cv2.INTER_NEAREST)
 
-    def _picture_of(self, ratio: float, within: int) -> tuple[Array, Array, int]:
+    def _warp_picture(self, ratio: float, within: int) -> tuple[Array, Array, int]:
         """Return the picture of the view of the height ratio `ratio`, rotated by `within` steps of 15 degrees, as three
         things: grey float32 (side, side); bool (side, side), True for allowed pixels; and a cell's side in pixels."""
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
         side = cells_along(self._side + 1, ratio) * cell_px
         if ratio not in self._scaled:
-            self._scaled[ratio] = self._resized(side)
+            self._scaled[ratio] = self._resize(side)
         grey, allowed = self._scaled[ratio]
         if within:
             middle = (side - 1) / 2

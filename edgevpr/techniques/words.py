@@ -64,7 +64,7 @@ def vlad(local: Singles, words: Singles, sharpness: float | None = None) -> Sing
     (`sharpness` None), or that of `soft_weights`."""
     if sharpness is None:
         weights = np.zeros((len(local), len(words)), np.float32)
-        weights[np.arange(len(local)), nearest(local, words)] = 1
+        weights[np.arange(len(local)), find_nearest(local, words)] = 1
     else:
         weights = soft_weights(local, words, sharpness)
     return unit(unit(weights.T @ local - weights.sum(axis=0)[:, None] * words).ravel())
@@ -93,11 +93,11 @@ def bag_of_words(local: Singles, words: Singles) -> Singles:
     """Return 1 for each of `words` (K, D) that is nearest to any descriptor of `local` (N, D) and 0 for the others,
     L2-normalised: float32 (K,). Counts find fewer places: many channels mark the same part of a picture."""
     present = np.zeros(len(words), np.float32)
-    present[nearest(local, words)] = 1
+    present[find_nearest(local, words)] = 1
     return unit(present)
 
 
-def nearest(local: Singles, words: Singles) -> Ints:
+def find_nearest(local: Singles, words: Singles) -> Ints:
     """Return the number of the word nearest to each descriptor, the first of equally near ones: (N, D), (K, D) to int
     (N,)."""
     numbers: Ints = _closeness(local, words).argmax(axis=1)

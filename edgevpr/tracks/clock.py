@@ -16,8 +16,8 @@ from edgevpr.core.arrays import Complexes, Doubles, Ints
 from edgevpr.core.errors import ImageError
 from edgevpr.core.geodesy import metres
 from edgevpr.frames.images import read_image
-from edgevpr.frames.positions import MOST_GAP_S, Track
-from edgevpr.runtime.recognise.agreement import PROVEN, Overlay, agreement
+from edgevpr.frames.positions import MAX_GAP_S, Track
+from edgevpr.runtime.recognise.agreement import PROVEN, Overlay, measure_agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks, describe
 
 _LANDMARKS = 500
@@ -36,11 +36,11 @@ Move = tuple[complex, complex]  # step, and logarithm of scale and turn, as thos
 def clock_offset_s(track: Track, times_s: Sequence[float], paths: Iterable[Path]) -> float | None:
     """Estimate what is to be added to `times_s`, those of the pictures of `paths` in their order, to get times of the
     track: at most three minutes. None: the pictures do not tell."""
-    at, changes = _changes_of(paths)
+    at, changes = _find_changes(paths)
     if len(at) < _MIN_TURNS:
         return None
     offsets_s = np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + _STEP_S, _STEP_S)
-    places = _track_at(track, np.array(times_s) + offsets_s[:, None])
+    places = _interpolate_track(track, np.array(times_s) + offsets_s[:, None])
     costs, turning = np.array([_cost(there, at, changes) for there in places]).T
     best = int(np.argmin(costs))
     further = abs(offsets_s - offsets_s[best]) > _NEAR_S
@@ -63,18 +63,18 @@ def _cost(there: Complexes, at: Ints, changes: Complexes) -> tuple[float, float]
     )
 
 
-def _track_at(track: Track, t_s: Doubles) -> Complexes:
+def _interpolate_track(track: Track, t_s: Doubles) -> Complexes:
     """Return where the track is at each of `t_s`, east + i north in metres: complex of its shape, NaN outside the track
     and in its gaps."""
     known_s = np.array(track.t_s)
     lat_deg, lon_deg = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in track.tags if tag.position]).T
     east_m, north_m = metres(lat_deg, lon_deg)
     after = np.clip(np.searchsorted(known_s, t_s), 1, max(len(known_s) - 1, 1))
-    is_known = (t_s >= known_s[0]) & (t_s <= known_s[-1]) & (known_s[after] - known_s[after - 1] <= MOST_GAP_S)
+    is_known = (t_s >= known_s[0]) & (t_s <= known_s[-1]) & (known_s[after] - known_s[after - 1] <= MAX_GAP_S)
     return np.where(is_known, np.interp(t_s, known_s, east_m + 1j * north_m), np.nan)
 
 
-def _changes_of(paths: Iterable[Path]) -> tuple[Ints, Complexes]:
+def _find_changes(paths: Iterable[Path]) -> tuple[Ints, Complexes]:
     """Return, of each three neighbouring pictures that show the same ground, the number of the first, and the logarithm
     of the factor, a complex number, by which the movement changes."""
     moves = [_move(one, other) for one, other in pairwise(_describe(paths))]
@@ -96,7 +96,7 @@ def _describe(paths: Iterable[Path]) -> Iterator[Landmarks | None]:
 
 def _move(one: Landmarks | None, other: Landmarks | None) -> Move | None:
     """Return how the middle moves from picture `one` to the `other`, in the frame of `one`, and how it turns."""
-    seen = agreement(other, one) if one is not None and other is not None else None
+    seen = measure_agreement(other, one) if one is not None and other is not None else None
     if seen is None or seen.inliers < PROVEN or seen.shift_share is None or seen.rotation_deg is None:
         return None
     return Overlay(seen.shift_share, seen.rotation_deg, seen.scale).step_and_turn

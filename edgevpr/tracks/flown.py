@@ -6,8 +6,8 @@ from typing import Any
 
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import GeoTag
-from edgevpr.runtime.flight.recording import frames_of, is_of_camera, read_recorded
-from edgevpr.tracks.record import Record, tag_of
+from edgevpr.runtime.flight.recording import is_of_camera, list_frames, read_recorded
+from edgevpr.tracks.record import Record, make_tag
 
 _FRESH_S = 1.0
 # Seconds after a fix that the autopilot took, or perhaps took, in which its position may only repeat that fix.
@@ -24,7 +24,7 @@ def read_flight(path: Path) -> Record:
             f"{path}: its pictures were no camera's but a folder's or a film's, and the aircraft was elsewhere: place "
             "those pictures by what was recorded with them."
         )
-    files, named = frames_of(folder), dict[str, GeoTag]()
+    files, named = list_frames(folder), dict[str, GeoTag]()
     for line in lines:
         if line.get("kind") == "query" and (file := files.get(str(line.get("query")))):
             with suppress(KeyError, TypeError):  # a line that is damaged, or has no vehicle
@@ -39,4 +39,4 @@ def _tag_of(vehicle: dict[str, Any], t_frame_s: float) -> GeoTag | None:
     if not vehicle["has_gps"] or is_echo or abs(t_frame_s - vehicle["t_heard_s"]) > _FRESH_S:
         return None
     attitude = vehicle["heading_deg"], vehicle["roll_deg"], vehicle["pitch_deg"]
-    return tag_of(vehicle["lat_deg"], vehicle["lon_deg"], vehicle["alt_m"], attitude, vehicle["height_m"])
+    return make_tag(vehicle["lat_deg"], vehicle["lon_deg"], vehicle["alt_m"], attitude, vehicle["height_m"])

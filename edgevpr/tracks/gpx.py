@@ -4,7 +4,7 @@ from pathlib import Path
 
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import parse_time
-from edgevpr.tracks.record import Record, require, tag_of, track_of
+from edgevpr.tracks.record import Record, make_tag, make_track, require
 
 _FIRST_YEAR = 1990  # receivers that have lost the time write others
 
@@ -24,7 +24,7 @@ def read_gpx(path: Path) -> Record:
     if points and not timed:
         raise UsageError(f"{path} has no times: export the track with them, for pictures are placed by time.")
     lines = [
-        (parse_time(point.time.isoformat()), tag_of(point.latitude, point.longitude, point.elevation))
+        (parse_time(point.time.isoformat()), make_tag(point.latitude, point.longitude, point.elevation))
         for point in timed
     ]
-    return Record(kind="GPX track", track=track_of(path, lines))
+    return Record(kind="GPX track", track=make_track(path, lines))

@@ -14,7 +14,7 @@ import numpy as np
 from edgevpr.core.arrays import Array
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import GeoTag
-from edgevpr.tracks.record import Attitude, Record, require, tag_of, track_of
+from edgevpr.tracks.record import Attitude, Record, make_tag, make_track, require
 
 _FIX_3D = 3  # GPS status from which on a position counts
 _NO_HEADING = 65535  # of GLOBAL_POSITION_INT
@@ -42,10 +42,10 @@ def read_ardupilot(path: Path) -> Record:
             if kind in ("CAM", "TRIG"):  # older logs write the names out
                 is_long = hasattr(message, "Yaw")
                 own = tuple(getattr(message, name if is_long else name[0]) for name in ("Yaw", "Roll", "Pitch"))
-            tag = tag_of(message.Lat, message.Lng, message.Alt, own, None if kind == "GPS" else height_m)
+            tag = make_tag(message.Lat, message.Lng, message.Alt, own, None if kind == "GPS" else height_m)
             lines[kind].append((message._timestamp, tag))
     shots = tuple(tag for _, tag in lines["CAM"] or lines["TRIG"])
-    return Record(kind="ArduPilot log", track=track_of(path, lines["POS"] or lines["GPS"]), shots=shots)
+    return Record(kind="ArduPilot log", track=make_track(path, lines["POS"] or lines["GPS"]), shots=shots)
 
 
 def read_telemetry(path: Path) -> Record:
@@ -65,12 +65,14 @@ def read_telemetry(path: Path) -> Record:
             attitude = degrees(message.yaw), degrees(message.roll), degrees(message.pitch)
         elif kind == "CAMERA_FEEDBACK":
             turned = message.yaw, message.roll, message.pitch
-            shots.append(tag_of(message.lat / 1e7, message.lng / 1e7, message.alt_msl, turned, message.alt_rel))
+            shots.append(make_tag(message.lat / 1e7, message.lng / 1e7, message.alt_msl, turned, message.alt_rel))
         else:
             heading = attitude or (None if message.hdg == _NO_HEADING else (message.hdg / 100, None, None))
-            tag = tag_of(message.lat / 1e7, message.lon / 1e7, message.alt / 1000, heading, message.relative_alt / 1000)
+            tag = make_tag(
+                message.lat / 1e7, message.lon / 1e7, message.alt / 1000, heading, message.relative_alt / 1000
+            )
             lines.append((message._timestamp, tag))
-    return Record(kind="telemetry log", track=track_of(path, lines), shots=tuple(shots))
+    return Record(kind="telemetry log", track=make_track(path, lines), shots=tuple(shots))
 
 
 def _messages(open_log: Callable[[str], Any], path: Path, kinds: list[str]) -> list[Any]:
@@ -105,7 +107,7 @@ def read_px4(path: Path) -> Record:
         raise UsageError(f"{path} is no log of PX4 ({error}): copy it again from the autopilot.") from error
     data = {each.name: each.data for each in reversed(datasets) if len(each.data["timestamp"])}  # the first of each
     shots = tuple(tag for _, tag in _read_positions(data, "camera_capture"))
-    return Record(kind="PX4 log", track=track_of(path, _read_positions(data, "vehicle_global_position")), shots=shots)
+    return Record(kind="PX4 log", track=make_track(path, _read_positions(data, "vehicle_global_position")), shots=shots)
 
 
 def _read_positions(data: Topics, topic: str) -> list[tuple[float, GeoTag]]:
@@ -118,13 +120,13 @@ def _read_positions(data: Topics, topic: str) -> list[tuple[float, GeoTag]]:
     if local := data.get("vehicle_local_position"):
         heights_m = np.interp(at_us, local["timestamp"], -local["z"]).tolist()
     if attitude := data.get("vehicle_attitude"):
-        attitudes = _attitudes_at(attitude, at_us)
+        attitudes = _interpolate_attitudes(attitude, at_us)
     where = (positions[name].tolist() for name in ("lat", "lon", "alt"))
-    tags = map(tag_of, *where, attitudes, heights_m)
-    return list(zip((at_us / 1e6 + _behind_utc_s(data)).tolist(), tags, strict=True))
+    tags = map(make_tag, *where, attitudes, heights_m)
+    return list(zip((at_us / 1e6 + _read_utc_offset_s(data)).tolist(), tags, strict=True))
 
 
-def _behind_utc_s(data: Topics) -> float:
+def _read_utc_offset_s(data: Topics) -> float:
     """Return what is to be added to seconds since the start of the autopilot to get those since 1970; 0 if no receiver
     has the time."""
     for receiver in filter(None, map(data.get, _RECEIVERS)):
@@ -134,7 +136,7 @@ def _behind_utc_s(data: Topics) -> float:
     return 0.0
 
 
-def _attitudes_at(attitude: dict[str, Array], at_us: Array) -> list[Attitude]:
+def _interpolate_attitudes(attitude: dict[str, Array], at_us: Array) -> list[Attitude]:
     """Return yaw, roll and pitch in degrees, those last reported at each time."""
     last = np.clip(np.searchsorted(attitude["timestamp"], at_us, side="right") - 1, 0, None)
     w, x, y, z = (attitude[f"q[{axis}]"][last].astype(float) for axis in range(4))

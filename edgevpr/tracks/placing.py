@@ -14,13 +14,13 @@ from edgevpr.core.text import progress
 from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import GeoTag, Track
-from edgevpr.frames.video import recorded_at
+from edgevpr.frames.video import read_start_s
 from edgevpr.tracks.clock import clock_offset_s
 from edgevpr.tracks.record import Record
 
 _ZONE_S, _MOST_ZONE = 900, 4 * 14  # time zones differ by quarters of an hour, and by 14 hours at most
 _LOOKED_AT = 200  # pictures that are compared to set the clock
-_LEAST_SHARE = 0.5  # of the pictures that must lie within the track
+_MIN_SHARE = 0.5  # of the pictures that must lie within the track
 _ROUNDED_DEG = 1e-4  # as subtitles with four decimals
 
 
@@ -44,11 +44,11 @@ def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Plac
     paths = list_images(folder)
     own = {path.name: read_exif(path) for path in progress(paths, len(paths), "reading pictures")}
     if record.named:
-        found, how = _by_name(record.named, list(own)), "by their names"
+        found, how = _match_names(record.named, list(own)), "by their names"
     elif len(record.shots) == len(own):
         found, how = dict(zip(own, record.shots, strict=True)), "in the order of the autopilot's pictures"
     elif record.track and record.is_utc:
-        return _by_time(record.track, folder, own, offset_s)
+        return _match_times(record.track, folder, own, offset_s)
     elif record.shots:
         raise UsageError(
             f"{len(record.shots)} pictures were triggered, and {folder} holds {len(own)}: leave only these in it."
@@ -57,11 +57,11 @@ def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Plac
         raise UsageError(f"These positions ({record.kind}) are those of a video: give it as --images.")
     if not found:
         raise UsageError(f"No picture of {folder} is named there ({record.kind}): give the folder of these pictures.")
-    tags = {name: _filled(tag, own[name]) for name, tag in found.items()}
+    tags = {name: _fill_tag(tag, own[name]) for name, tag in found.items()}
     return Placed(how=how, tags=tags, pictures=len(own))
 
 
-def _by_name(named: Mapping[str, GeoTag], names: list[str]) -> dict[str, GeoTag]:
+def _match_names(named: Mapping[str, GeoTag], names: list[str]) -> dict[str, GeoTag]:
     """Find the pictures by their whole names, or by what stands before the ending, in letters of either case."""
     whole = {name.casefold(): tag for name, tag in named.items()}
     stems = {Path(name).stem.casefold(): tag for name, tag in named.items()}
@@ -69,7 +69,7 @@ def _by_name(named: Mapping[str, GeoTag], names: list[str]) -> dict[str, GeoTag]
     return {name: tag for name, tag in found.items() if tag and tag.position}
 
 
-def _by_time(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s: float | None) -> Placed:
+def _match_times(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s: float | None) -> Placed:
     times = {name: tag.t_utc_s for name, tag in own.items() if tag.t_utc_s is not None}
     if not times:
         raise UsageError("The pictures have no times (EXIF DateTimeOriginal): give those that the camera wrote.")
@@ -84,13 +84,13 @@ def _by_time(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s: fl
     found = {
         name: replace(track.interpolate_tag(t_s + offset_s), t_utc_s=t_s + offset_s) for name, t_s in times.items()
     }
-    tags = {name: _filled(tag, own[name]) for name, tag in found.items() if tag.position}
+    tags = {name: _fill_tag(tag, own[name]) for name, tag in found.items() if tag.position}
     if not tags:
         raise UsageError(f"No picture lies within the track with --offset-s {offset_s:g}: {_spans(track, times_s)}")
     return Placed(how=how, tags=tags, pictures=len(own), offset_s=offset_s)
 
 
-def _filled(tag: GeoTag, own: GeoTag) -> GeoTag:
+def _fill_tag(tag: GeoTag, own: GeoTag) -> GeoTag:
     """Return `tag`, with what it does not know taken from `own`."""
     missing = [each.name for each in fields(GeoTag) if getattr(tag, each.name) is None]
     return replace(tag, **{name: getattr(own, name) for name in missing})
@@ -101,7 +101,7 @@ def place_video(record: Record, video: Path, offset_s: float | None) -> Placed:
     to the time of the video if the record goes by it. Raises UsageError if they do not belong together."""
     if record.track is None:
         raise UsageError(f"These positions ({record.kind}) have no times: a video needs them.")
-    began_s, lasts_s = recorded_at(video)
+    began_s, lasts_s = read_start_s(video)
     if record.is_utc:
         if began_s is None:
             raise UsageError(f"{video} does not say when it was begun: give a recording that goes by the video's time.")
@@ -122,7 +122,7 @@ def _zone_offset_s(track: Track, times_s: Doubles, what: str) -> float:
     offsets_s = np.arange(-_MOST_ZONE, _MOST_ZONE + 1) * _ZONE_S
     first_s, last_s = track.t_s[0], track.t_s[-1]
     within = np.array([np.mean((times_s + each >= first_s) & (times_s + each <= last_s)) for each in offsets_s])
-    if within.max() < _LEAST_SHARE:
+    if within.max() < _MIN_SHARE:
         raise UsageError(f"No time zone brings {what} into the track: {_spans(track, times_s)}")
     fitting_s = offsets_s[within == within.max()].tolist()
     for unit_s in (4 * _ZONE_S, 2 * _ZONE_S, _ZONE_S):

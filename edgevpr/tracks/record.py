@@ -53,7 +53,7 @@ def read_record(path: Path) -> Record:
     return record
 
 
-def tag_of(
+def make_tag(
     lat_deg: float | None,
     lon_deg: float | None,
     alt_m: float | None = None,
@@ -77,7 +77,7 @@ def tag_of(
     )
 
 
-def track_of(path: Path, lines: Iterable[tuple[float, GeoTag]]) -> Track | None:
+def make_track(path: Path, lines: Iterable[tuple[float, GeoTag]]) -> Track | None:
     """Make a track of times and positions in any order; None if there is none. Of lines that repeat a position, as
     subtitles do for each frame, one a second is kept: between two lines positions are interpolated."""
     kept: dict[float, GeoTag] = {}

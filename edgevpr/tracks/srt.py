@@ -9,7 +9,7 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
 from edgevpr.frames.exif import from_straight_down
 from edgevpr.frames.positions import GeoTag
-from edgevpr.tracks.record import Attitude, Record, tag_of, track_of
+from edgevpr.tracks.record import Attitude, Record, make_tag, make_track
 
 _MAX_FILE_BYTES = 200_000_000  # an hour at 60 frames a second
 _STARTS = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
@@ -29,7 +29,7 @@ def read_subtitles(path: Path) -> Record:
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig", errors="replace")
     except OSError as error:
         raise UsageError(f"{path} cannot be read ({error.strerror}): give the subtitles beside the video.") from error
-    track = track_of(path, _lines(text))
+    track = make_track(path, _lines(text))
     return Record(kind="subtitles of a video", track=track, is_utc=False)
 
 
@@ -40,10 +40,10 @@ def _lines(text: str) -> Iterator[tuple[float, GeoTag]]:
     for start, end in zip(starts, ends, strict=False):  # one end more in an empty file
         hours, minutes, seconds, fraction = start.groups()
         t_s = 3600 * int(hours) + 60 * int(minutes) + int(seconds) + float(f"0.{fraction}")
-        yield t_s, _tag_of(text[start.end() : end])
+        yield t_s, _parse_block(text[start.end() : end])
 
 
-def _tag_of(block: str) -> GeoTag:
+def _parse_block(block: str) -> GeoTag:
     named = {name.lower(): float(number) for name, number in _NAMED.findall(block)}
     lat_deg, height_m = named.get("lat", named.get("latitude")), named.get("rel_alt")
     lon_deg = named.get("lon", named.get("longitude", named.get("longtitude")))
@@ -60,4 +60,4 @@ def _tag_of(block: str) -> GeoTag:
     if len(gimbal) == 3 and any(gimbal):
         pitch, roll, yaw = gimbal
         attitude = from_straight_down(yaw, pitch, roll)
-    return tag_of(lat_deg, lon_deg, named.get("abs_alt", named.get("altitude")), attitude, height_m)
+    return make_tag(lat_deg, lon_deg, named.get("abs_alt", named.get("altitude")), attitude, height_m)

@@ -13,7 +13,7 @@ from edgevpr.core.files import read_file
 from edgevpr.frames.exif import from_straight_down
 from edgevpr.frames.images import is_image
 from edgevpr.frames.positions import GeoTag, parse_time
-from edgevpr.tracks.record import Attitude, Record, tag_of
+from edgevpr.tracks.record import Attitude, Record, make_tag
 
 _MAX_FILE_BYTES = 100_000_000
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
@@ -94,7 +94,7 @@ def _read_rows(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, 
     for row in rows:
         cells = {part: row[column].strip() for part, column in columns.items() if column < len(row)}
         try:
-            named[PureWindowsPath(cells["file"]).name] = _tag_of(cells)
+            named[PureWindowsPath(cells["file"]).name] = _parse_row(cells)
         except (KeyError, ValueError) as error:
             raise UsageError(f"{path}: `{' '.join(row):.80}` is not understood ({error}): correct the line.") from error
     if named and not any(tag.position for tag in named.values()):
@@ -102,13 +102,13 @@ def _read_rows(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, 
     return named
 
 
-def _tag_of(cells: Mapping[str, str]) -> GeoTag:
+def _parse_row(cells: Mapping[str, str]) -> GeoTag:
     """Make a tag of the cells of a row; an impossible position is unknown. Raises ValueError for what is no number."""
     number = {part: _angle(text) for part, text in cells.items() if text and part not in ("file", "time")}
     attitude: Attitude = (number.get("nose"), None, None)
     if {"yaw", "pitch", "roll"} <= number.keys():
         attitude = from_straight_down(number["yaw"], number["pitch"], number["roll"])
-    tag = tag_of(number.get("lat"), number.get("lon"), number.get("alt"), attitude, number.get("height"))
+    tag = make_tag(number.get("lat"), number.get("lon"), number.get("alt"), attitude, number.get("height"))
     with suppress(KeyError, ValueError, OverflowError):  # no time, or none that can be read
         return replace(tag, t_utc_s=parse_time(cells["time"]))
     return tag

@@ -21,7 +21,7 @@ from edgevpr.core.text import progress
 from edgevpr.frames.images import list_images
 from edgevpr.techniques.regions import describe, find_regions
 from edgevpr.techniques.session import Backbone, open_backbone
-from edgevpr.techniques.words import local_descriptors, nearest
+from edgevpr.techniques.words import find_nearest, local_descriptors
 
 REGIONS = {"regions": 400, "bow": 200}  # regions per picture, as in `region_vlad` and `cross_region_bow`
 _POINTS = 60_000  # the fewest local descriptors to learn words from, if there are as many ...
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     path = args.out / f"{args.model}_{args.kind}{args.count}.npz"
     np.savez_compressed(path, words=stored, model_sha256=np.array(backbone.sha256))
     some = points[:: max(1, len(points) // _JUDGED)]
-    distance = np.square(some - words[nearest(some, words)]).sum(axis=1).mean()
+    distance = np.square(some - words[find_nearest(some, words)]).sum(axis=1).mean()
     print(
         f"{path}: learnt from {len(points)} descriptors of {pictures} images, whose mean square distance to their word "
         f"is {distance:.3f} (2: nothing in common)"

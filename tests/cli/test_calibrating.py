@@ -17,7 +17,7 @@ PLACES = 8
 
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
-    monkeypatch.setattr(calibrate, "FEWEST_PLACES", PLACES)
+    monkeypatch.setattr(calibrate, "MIN_PLACES", PLACES)
     monkeypatch.setattr(calibrate, "query_altered_copies", lambda technique: PLACES)
 
 
@@ -65,7 +65,7 @@ def test_map_build_reports_what_to_expect(flight, tmp_path, capsys):
 
 
 def test_map_build_makes_a_map_that_it_cannot_calibrate(flight, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(calibrate, "FEWEST_PLACES", PLACES + 1)
+    monkeypatch.setattr(calibrate, "MIN_PLACES", PLACES + 1)
     assert built(tmp_path / "small.gpkg", flight / "ref") == 0
     said = capsys.readouterr()
     assert (said.out + said.err).count(f"it has {PLACES} places") == 1

@@ -10,7 +10,7 @@ pytest.importorskip("rasterio", reason="rasterio is not installed (pip install '
 from rasters import HOME, textured_raster, write_mission
 
 from edgevpr.cli.main import main
-from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.frames.positions import read_positions
 from edgevpr.mapmaking import calibrate
 from edgevpr.places.mapfile import PlaceMap
@@ -24,7 +24,7 @@ def ground(tmp_path_factory):
 @pytest.fixture
 def track(tmp_path):
     """A path of 142 m, 12 m north of the middle."""
-    ends = [(0, *moved(HOME.lat_deg, HOME.lon_deg, east_m, 12.0), 0) for east_m in (-71, 71)]
+    ends = [(0, *offset_position(HOME.lat_deg, HOME.lon_deg, east_m, 12.0), 0) for east_m in (-71, 71)]
     return str(write_mission(tmp_path / "track.waypoints", ends))
 
 
@@ -114,7 +114,7 @@ def test_simulate_flight_refuses_a_wrong_request(tmp_path, ground, track, capsys
 
 @pytest.mark.slow
 def test_map_calibrate_cuts_the_orthophoto_again(tmp_path, ground, track, capsys, monkeypatch):
-    monkeypatch.setattr(calibrate, "FEWEST_PLACES", 6)
+    monkeypatch.setattr(calibrate, "MIN_PLACES", 6)
     monkeypatch.setattr(calibrate, "query_altered_copies", lambda technique: 6)
     path = tmp_path / "m.gpkg"
     cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 80, "--area", track)

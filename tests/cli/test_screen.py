@@ -10,7 +10,7 @@ from pictures import textured
 
 from edgevpr.cli.main import main
 from edgevpr.cli.screen import LineFormatter
-from edgevpr.core.text import decode_name, printable, redact_passwords, shown
+from edgevpr.core.text import decode_name, printable, redact_passwords, sanitize
 
 REDDENING = "\x1b[31m.jpg"  # a name that would make all that follows red
 
@@ -59,7 +59,7 @@ def test_decoded_name_is_utf_8():
 )
 def test_without_passwords_replaces_them(address, without):
     assert redact_passwords(address) == without
-    assert shown(f"{address} is lost, {address} is back") == f"{without} is lost, {without} is back"
+    assert sanitize(f"{address} is lost, {address} is back") == f"{without} is lost, {without} is back"
 
 
 def test_line_formatter_keeps_a_message_in_one_line():

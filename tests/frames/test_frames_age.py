@@ -19,7 +19,7 @@ def feed(time, taken_s, came_s, *, rate=1.0, sizes=None, stamp_s=100.0):
     ages_s, sds_s = [], []
     for taken, came, size in zip(taken_s, came_s, sizes, strict=True):
         stamp, now = stamp_s + rate * taken, START_S + came
-        time.arrived(stamp, stamp, now, int(size))
+        time.record_arrival(stamp, stamp, now, int(size))
         found = time.taken(stamp, now)
         ages_s.append(math.nan if found is None else now - found.t_s)
         sds_s.append(math.nan if found is None else found.sd_s)
@@ -120,7 +120,7 @@ def test_a_camera_that_runs_slow_and_then_right_is_followed():
     time, ages_s = StampedTime(), []
     came_s = np.maximum.accumulate(taken_s + rng.exponential(0.005, len(taken_s)))
     for number, came in enumerate(came_s):
-        time.arrived(number / 25, number / 25, came, int(sizes[number]))
+        time.record_arrival(number / 25, number / 25, came, int(sizes[number]))
         found = time.taken(number / 25, came)
         ages_s.append(math.nan if found is None else came - found.t_s)
     assert np.nanmax(ages_s[60:]) < 0.2
@@ -174,7 +174,7 @@ def test_pictures_that_are_sent_out_of_turn_are_no_new_beginning():
     time, order = StampedTime(), [0, 3, 1, 2, 6, 4, 5, 9, 7, 8, 12, 10, 11]
     for turn, number in enumerate(order):
         now = START_S + turn * STEP_S
-        time.arrived(number * STEP_S, (turn - 1) * STEP_S, now)
+        time.record_arrival(number * STEP_S, (turn - 1) * STEP_S, now)
     assert time.taken(11 * STEP_S, now) is not None
 
 

@@ -12,7 +12,7 @@ from distorted_cameras import SIZE_PX, DistortedCamera, fisheye, wide
 from edgevpr.core.errors import ConfigError, ImageError
 from edgevpr.core.types import Frame
 from edgevpr.frames.lens import CalibratedLens, line_of_sight, read_lens
-from edgevpr.frames.level import UNKNOWN_VIEW, Lens, levelled, undistort_frame
+from edgevpr.frames.level import UNKNOWN_VIEW, Lens, level_image, undistort_frame
 
 PINHOLE = 400.0, 410.0, 322.0, 238.0
 K = ", ".join(map(str, (PINHOLE[0], 0, PINHOLE[2], 0, PINHOLE[1], PINHOLE[3], 0, 0, 1)))
@@ -186,7 +186,7 @@ def test_a_straightened_picture_is_that_of_a_camera_without_distortion(camera, g
 def test_a_picture_is_levelled_and_straightened_in_one_warp(camera, ground, pose):
     lens = lens_of(camera)
     footprint_m = 150.0
-    found = levelled(
+    found = level_image(
         taken(camera, ground, **pose),
         None,
         Lens(line_of_sight(lens, SIZE_PX).fov_deg, 0.0, lens),
@@ -217,7 +217,7 @@ def test_what_lies_beyond_the_lens_shows_no_ground(ground):
     """With strong barrel distortion alone, directions far outside of the picture have pixels inside of it too."""
     camera = DistortedCamera(512.0, (-0.3, 0, 0, 0))
     lens = lens_of(camera)
-    picture = levelled(
+    picture = level_image(
         taken(camera, ground, pitch_deg=30.0), None, Lens(line_of_sight(lens, SIZE_PX).fov_deg, 0.0, lens), 250.0
     )
     assert picture.mask is not None

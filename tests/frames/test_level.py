@@ -8,7 +8,7 @@ import pytest
 
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Pose, Vehicle
-from edgevpr.frames.level import MAX_TILT_UNLEVELLED_DEG, Lens, Mount, View, leaning, levelled
+from edgevpr.frames.level import MAX_TILT_UNLEVELLED_DEG, Lens, Mount, View, estimate_tilted_view, level_image
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph
 
 CAMERA = Camera(noise_sigma=0)
@@ -64,7 +64,7 @@ def off(one, other, mask):
     ],
 )
 def test_levelled_gives_one_taken_from_straight_above(ground, pose, shown, below):
-    found = levelled(taken(ground, **pose), None, LENS, FOOTPRINT_M, below=below)
+    found = level_image(taken(ground, **pose), None, LENS, FOOTPRINT_M, below=below)
     assert (found.view.up_deg, found.view.reason) == (0.0, None)
     assert found.view.footprint_m == pytest.approx(FOOTPRINT_M)
     assert found.image.shape == (640, 640, 3)
@@ -79,10 +79,10 @@ def test_levelled_gives_one_taken_from_straight_above(ground, pose, shown, below
 
 def test_levelled_knows_the_point_under_the_camera(ground):
     """With the nose up and to the east, the camera looks ahead: it hangs west of what it sees."""
-    view = levelled(taken(ground, heading_deg=90, pitch_deg=30), None, LENS, FOOTPRINT_M).view
+    view = level_image(taken(ground, heading_deg=90, pitch_deg=30), None, LENS, FOOTPRINT_M).view
     away = HEIGHT_M * math.tan(math.radians(30)) / FOOTPRINT_M
     assert view.aside == pytest.approx((-away, 0.0), abs=1e-9)
-    view = levelled(taken(ground, heading_deg=0, roll_deg=20), None, LENS, FOOTPRINT_M).view  # it looks to the left
+    view = level_image(taken(ground, heading_deg=0, roll_deg=20), None, LENS, FOOTPRINT_M).view  # it looks to the left
     assert view.aside == pytest.approx((HEIGHT_M * math.tan(math.radians(20)) / FOOTPRINT_M, 0.0), abs=1e-9)
 
 
@@ -92,19 +92,19 @@ def test_levelled_with_a_camera_that_is_mounted_turned(ground, up_deg):
     square = replace(CAMERA, width=640, height=640)
     pose = {"height_m": HEIGHT_M, "heading_deg": 20.0, "roll_deg": 10.0, "pitch_deg": -5.0}
     image = np.ascontiguousarray(np.rot90(seen(ground, square, **pose), up_deg / 90))
-    one = levelled(frame_of(seen(ground, square, **pose), **pose), None, LENS, FOOTPRINT_M)
-    other = levelled(frame_of(image, **pose), None, Lens(LENS.fov_deg, up_deg), FOOTPRINT_M)
+    one = level_image(frame_of(seen(ground, square, **pose), **pose), None, LENS, FOOTPRINT_M)
+    other = level_image(frame_of(image, **pose), None, Lens(LENS.fov_deg, up_deg), FOOTPRINT_M)
     assert other.view.aside == pytest.approx(one.view.aside)
     assert off(one.image, other.image, one.mask & other.mask) < 0.1
-    upright = levelled(frame_of(image, heading_deg=(360 - up_deg) % 360), None, Lens(LENS.fov_deg, up_deg))
+    upright = level_image(frame_of(image, heading_deg=(360 - up_deg) % 360), None, Lens(LENS.fov_deg, up_deg))
     assert (upright.image is image, upright.view.up_deg) == (True, 0.0), "its top points north as it is"
 
 
 def test_levelled_without_a_heading_turns_nothing(ground):
     steep, tilted = (replace(taken(ground, heading_deg=0, pitch_deg=deg), heading_deg=None) for deg in (25, 18))
-    assert levelled(steep, None, LENS, below=True).view.reason.code is ReasonCode.TILTED_WITHOUT_HEADING
+    assert level_image(steep, None, LENS, below=True).view.reason.code is ReasonCode.TILTED_WITHOUT_HEADING
     for frame in (steep, tilted):
-        found = levelled(frame, None, LENS)
+        found = level_image(frame, None, LENS)
         assert found.view.up_deg is None
         assert off(found.image, from_above(ground, found.view), found.mask) < 0.5
 
@@ -112,14 +112,14 @@ def test_levelled_without_a_heading_turns_nothing(ground):
 def test_levelled_without_a_height_scales_nothing(ground):
     pose = {"heading_deg": 60, "roll_deg": 18}
     unknown = replace(taken(ground, **pose), height_m=None)
-    found, known = levelled(unknown, None, LENS, FOOTPRINT_M / 2), levelled(taken(ground, **pose), None, LENS)
+    found, known = level_image(unknown, None, LENS, FOOTPRINT_M / 2), level_image(taken(ground, **pose), None, LENS)
     assert found.view == replace(known.view, footprint_m=None)
     assert np.array_equal(found.image, known.image)
     assert known.view.footprint_m == pytest.approx(FOOTPRINT_M)
 
 
 def test_levelled_without_an_attitude_knows_no_point_below(ground):
-    found = levelled(replace(taken(ground, heading_deg=90), roll_deg=None), None, LENS, FOOTPRINT_M)
+    found = level_image(replace(taken(ground, heading_deg=90), roll_deg=None), None, LENS, FOOTPRINT_M)
     assert found.view == View(
         up_deg=0.0, footprint_m=pytest.approx(FOOTPRINT_M), aside=None, focal=pytest.approx(LENS_FOCAL)
     )
@@ -131,7 +131,7 @@ def test_levelled_without_an_attitude_knows_no_point_below(ground):
 )
 def test_levelled_returns_the_same_object_where_nothing_is_known_or_needed(told):
     image = np.zeros((48, 64), np.uint8)
-    found = levelled(frame_of(image, **told), None, LENS, FOOTPRINT_M)
+    found = level_image(frame_of(image, **told), None, LENS, FOOTPRINT_M)
     assert found.image is image
     assert found.mask is None
     assert (found.view.up_deg, found.view.reason) == (told.get("heading_deg"), None)
@@ -140,7 +140,7 @@ def test_levelled_returns_the_same_object_where_nothing_is_known_or_needed(told)
 def test_levelled_leaves_a_surveyed_picture_as_it_is(ground):
     pose = Pose(up_deg=30.0, footprint_m=50.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
     frame = replace(taken(ground, heading_deg=90, pitch_deg=20), pose=pose)
-    found = levelled(frame, None, LENS, FOOTPRINT_M)
+    found = level_image(frame, None, LENS, FOOTPRINT_M)
     assert found.image is frame.image
     assert found.view == View(up_deg=30.0, footprint_m=50.0, aside=(0.0, 0.0))
 
@@ -149,14 +149,14 @@ def test_levelled_leaves_a_surveyed_picture_as_it_is(ground):
 def test_levelled_scales_nothing_by_a_height_that_cannot_be(ground, height_m):
     """25 and 500 m can be, and are too far from the map's to be of use."""
     frame = replace(taken(ground, heading_deg=90), height_m=height_m)
-    found, unknown = (levelled(each, None, LENS, FOOTPRINT_M) for each in (frame, replace(frame, height_m=None)))
+    found, unknown = (level_image(each, None, LENS, FOOTPRINT_M) for each in (frame, replace(frame, height_m=None)))
     assert np.array_equal(found.image, unknown.image)
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
 def test_levelled_takes_what_is_no_number_as_unknown(wrong):
     odd = dict.fromkeys(("roll_deg", "pitch_deg", "heading_deg", "height_m"), wrong)
-    found = levelled(frame_of(np.zeros((48, 64), np.uint8), **odd), None, LENS, FOOTPRINT_M)
+    found = level_image(frame_of(np.zeros((48, 64), np.uint8), **odd), None, LENS, FOOTPRINT_M)
     assert found.view == View(focal=pytest.approx(LENS_FOCAL))
 
 
@@ -168,7 +168,7 @@ TILTED = {"heading_deg": 90.0, "roll_deg": 0.0, "pitch_deg": 40.0}
 )
 def test_levelled_leaves_a_picture_that_bears_no_warp_with_a_reason(pose):
     image = np.zeros((48, 64), np.uint8)
-    found = levelled(frame_of(image, **TILTED | pose), None, LENS)
+    found = level_image(frame_of(image, **TILTED | pose), None, LENS)
     assert found.image is image
     assert found.view.reason.code is ReasonCode.TILTED
     assert (found.view.footprint_m, found.view.aside) == (None, None)
@@ -176,7 +176,7 @@ def test_levelled_leaves_a_picture_that_bears_no_warp_with_a_reason(pose):
 
 @pytest.mark.parametrize("below", [False, True])
 def test_levelled_keeps_the_middle_of_a_steep_picture_in_place_of_what_is_below(below):
-    found = levelled(frame_of(np.zeros((48, 64), np.uint8), **TILTED), None, Lens(40.0), below=below)
+    found = level_image(frame_of(np.zeros((48, 64), np.uint8), **TILTED), None, Lens(40.0), below=below)
     assert found.view.reason is None
     assert found.view.aside != (0.0, 0.0)
 
@@ -186,8 +186,8 @@ def test_levelled_takes_from_the_vehicle_what_the_frame_does_not_know(ground):
     known = taken(ground, **pose)
     vehicle = Vehicle(lat_deg=50.0, lon_deg=8.0, alt_m=300.0, t_heard_s=0.0, has_gps=True, **pose)
     wrong = replace(vehicle, heading_deg=0.0, roll_deg=0.0, pitch_deg=0.0, height_m=50.0)
-    by_frame = levelled(known, wrong, LENS, FOOTPRINT_M)
-    by_vehicle = levelled(frame_of(known.image), vehicle, LENS, FOOTPRINT_M)
+    by_frame = level_image(known, wrong, LENS, FOOTPRINT_M)
+    by_vehicle = level_image(frame_of(known.image), vehicle, LENS, FOOTPRINT_M)
     assert by_frame.view == by_vehicle.view
     assert np.array_equal(by_frame.image, by_vehicle.image)
 
@@ -196,7 +196,7 @@ def test_levelled_makes_a_large_picture_smaller_without_leaving_pixels_out():
     """Rows of one pixel, black and white in turns, become grey; a warp alone would make stripes of them."""
     stripes = np.zeros((3000, 4000), np.uint8)
     stripes[::2] = 200
-    found = levelled(frame_of(stripes, heading_deg=180.0), None, LENS)
+    found = level_image(frame_of(stripes, heading_deg=180.0), None, LENS)
     assert found.image.shape == (1024, 1024)
     inner = found.image[found.mask][5000:-5000].astype(float)
     assert (inner.mean(), inner.std()) == (pytest.approx(100, abs=1), pytest.approx(0, abs=4))
@@ -208,6 +208,6 @@ def test_levelled_makes_a_large_picture_smaller_without_leaving_pixels_out():
 def test_mount_counts_as_the_attitude_of_a_level_airframe(mount, attitude):
     pose = {"heading_deg": 70.0, "height_m": HEIGHT_M, "roll_deg": 0.0, "pitch_deg": 0.0}
     level, tilted = (frame_of(np.zeros((48, 64), np.uint8), **pose | more) for more in ({}, attitude))
-    expected = levelled(tilted, None, LENS, FOOTPRINT_M).view
-    assert levelled(level, None, replace(LENS, mount=mount), FOOTPRINT_M).view == expected
-    assert leaning(level, None, mount) == leaning(tilted, None)
+    expected = level_image(tilted, None, LENS, FOOTPRINT_M).view
+    assert level_image(level, None, replace(LENS, mount=mount), FOOTPRINT_M).view == expected
+    assert estimate_tilted_view(level, None, mount) == estimate_tilted_view(tilted, None)

@@ -11,7 +11,7 @@ import rasterio
 from rasters import HOME, grid, ground_m, marked_raster, textured_raster, write_raster
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.mapmaking.cuttings import SIDE_PX, OrthophotoSource, make_lattice
 from edgevpr.mapmaking.missions import Area, Waypoint
 from edgevpr.mapmaking.orthophoto import Orthophoto
@@ -39,7 +39,7 @@ def off_m(lattice) -> np.ndarray:
 
 
 def waypoint(east_m: float, north_m: float) -> Waypoint:
-    return Waypoint(*moved(HOME.lat_deg, HOME.lon_deg, east_m, north_m))
+    return Waypoint(*offset_position(HOME.lat_deg, HOME.lon_deg, east_m, north_m))
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4326", "EPSG:3857"])

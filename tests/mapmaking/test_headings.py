@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pictures import rough_ground
 
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import Lens
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph
@@ -26,7 +26,7 @@ def frames():
         heading_deg, east_m, north_m = 20.0 + 6 * number, 130.0 + 4 * number, 60.0 + 6 * number
         pose = CameraPose(east_m=east_m, north_m=north_m, height_m=50, heading_deg=heading_deg, pitch_deg=45)
         image = photograph(ground, 0.25, pose, CAMERA, LIGHT, rng)
-        position = Position(*moved(50.0, 8.0, east_m, north_m))
+        position = Position(*offset_position(50.0, 8.0, east_m, north_m))
         frame = Frame(image=image, name=f"{number}", t_mono_s=float(number), position=position, height_m=50.0)
         made.append((replace(frame, roll_deg=0.0, pitch_deg=45.0), heading_deg))
     return made

@@ -13,8 +13,8 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled
 from edgevpr.mapmaking import calibrate as calibrating
-from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, ask, calibrate, fitted
-from edgevpr.mapmaking.changes import changed
+from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, ask, calibrate, fit_logistic
+from edgevpr.mapmaking.changes import change_picture
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -51,7 +51,7 @@ def at_hand(*frames):
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
     """A map of few places is enough, and few questions."""
-    monkeypatch.setattr(calibrating, "FEWEST_PLACES", PLACES)
+    monkeypatch.setattr(calibrating, "MIN_PLACES", PLACES)
     monkeypatch.setattr(calibrating, "query_altered_copies", lambda technique: 2 * PLACES)
 
 
@@ -143,7 +143,7 @@ def rows_of(count, seed=1):
 
 def test_what_tells_right_from_wrong_weighs_and_the_rest_does_not():
     rows, right = rows_of(2000)
-    found = fitted(START, rows, right, np.ones(len(rows)), 1.0)
+    found = fit_logistic(START, rows, right, np.ones(len(rows)), 1.0)
     # Two normal distributions, 1 apart with the variance 0.25: the logit is 4 (a - 0.5).
     assert found.weights == (pytest.approx(4, abs=0.5), pytest.approx(0, abs=0.15))
     assert found.bias == pytest.approx(-2, abs=0.4)
@@ -152,11 +152,11 @@ def test_what_tells_right_from_wrong_weighs_and_the_rest_does_not():
 
 def test_a_strong_pull_keeps_the_weights_and_only_the_bias_follows():
     rows, right = rows_of(200)
-    start = fitted(START, *rows_of(2000, seed=2), np.ones(2000), 1.0)
-    found = fitted(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6)
+    start = fit_logistic(START, *rows_of(2000, seed=2), np.ones(2000), 1.0)
+    found = fit_logistic(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6)
     assert found.weights == pytest.approx(start.weights, abs=0.01)
     assert found.bias < start.bias - 1
-    held = fitted(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6, pull_of_bias=1e6)
+    held = fit_logistic(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6, pull_of_bias=1e6)
     assert held.bias == pytest.approx(start.bias, abs=0.01)
 
 
@@ -171,7 +171,7 @@ def test_the_part_that_shows_ground_moves_with_the_picture():
 
     followed, left = [], []
     for seed in range(12):
-        seen, now = changed(image, np.random.default_rng(seed), True, shown)
+        seen, now = change_picture(image, np.random.default_rng(seed), True, shown)
         assert (now.shape, now.dtype) == (image.shape, bool)
         followed.append(apart(seen, now))
         left.append(apart(seen, shown))

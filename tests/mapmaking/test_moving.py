@@ -9,7 +9,7 @@ import pytest
 from edgevpr.cli.main import main
 from edgevpr.core.contract import Descriptor
 from edgevpr.core.errors import PlaceError, UsageError
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.mapmaking.moving import move_map
 from edgevpr.places.mapfile import PlaceMap
@@ -31,7 +31,7 @@ def path(tmp_path):
     descriptor = Descriptor(coarse=coarse, fine=fine, quality=1.0)
     pose = Pose(up_deg=10.0, footprint_m=130.0, covariance_m2=(1.0, 0.0, 1.0), recorded=Position(47.0, 8.001))
     frame = Frame(image=PICTURE, name="0", t_mono_s=0.0, position=Position(*HOME, 300.0), pose=pose)
-    other = Position(*moved(*HOME, 500.0, 0.0))
+    other = Position(*offset_position(*HOME, 500.0, 0.0))
     with PlaceMap.create(tmp_path / "m.gpkg", spec) as place_map:
         place_map.add(frame, descriptor)
         place_map.add(replace(frame, name="1", position=other, pose=replace(pose, recorded=None)), descriptor)

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from edgevpr.cli.main import main
-from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.images import read_image
-from edgevpr.lab.simulate.camera import Camera, lit, photograph
+from edgevpr.lab.simulate.camera import Camera, light_scene, photograph
 from edgevpr.lab.simulate.generated import mapping_flight, to_position
 from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.mapmaking.refine import refine
@@ -37,7 +37,7 @@ def photographer(seed):
     """Return the function that takes the picture of a pose in the generated flight."""
     flight, rng = mapping_flight(7), np.random.default_rng(seed)
     scene = make_scene(7, 420.0, 220.0)
-    ground = lit(scene, flight.light, flight.seed)
+    ground = light_scene(scene, flight.light, flight.seed)
     return lambda pose: photograph(ground, scene.metres_per_pixel, pose, Camera(), flight.light, rng), rng
 
 
@@ -55,7 +55,7 @@ def flown(tmp_path_factory):
             cv2.imwrite(str(folder / "images" / f"{number:03d}.jpg"), shot_of(pose))
             true, (east_m, north_m) = to_position(pose), rng.normal(0, NOISE_M, 2)
             east_m += GLITCH_M if number == 9 else 0.0
-            lat_deg, lon_deg = moved(true.lat_deg, true.lon_deg, east_m, north_m)
+            lat_deg, lon_deg = offset_position(true.lat_deg, true.lon_deg, east_m, north_m)
             table.writerow((f"{number:03d}.jpg", f"{lat_deg:.8f}", f"{lon_deg:.8f}"))
     return folder, poses
 
@@ -153,7 +153,7 @@ def some_of(built, path, numbers, position=lambda number, place: place.position)
             )
             descriptor = technique.encode(np.zeros((64, 64), np.uint8))
             descriptor = dataclasses.replace(descriptor, coarse=coarse, fine=fine)
-            place_map.add(frame, descriptor, landmarks=there.landmarks_of(place.place_id))
+            place_map.add(frame, descriptor, landmarks=there.read_landmarks(place.place_id))
     return path
 
 
@@ -198,7 +198,9 @@ def test_where_landmarks_are_missing_votes_tie_pictures(tmp_path):
         for row in csv.DictReader((folder / "mosaic_positions.csv").open()):
             if (path := folder / "ref" / row["file"]).is_file():
                 here, image = (float(row["x_px"]) / 10, -float(row["y_px"]) / 10), read_image(path)
-                frame = Frame(image=image, name=row["file"], t_mono_s=0.0, position=Position(*moved(50.0, 8.0, *here)))
+                frame = Frame(
+                    image=image, name=row["file"], t_mono_s=0.0, position=Position(*offset_position(50.0, 8.0, *here))
+                )
                 place_map.add(frame, technique.encode(image))
     found, _ = refined_of(tmp_path / "m.gpkg", folder / "ref")
     assert (found.refined, found.contradictory) == (19, ())

@@ -19,13 +19,13 @@ from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError, ImageError
 from edgevpr.core.types import Position
 from edgevpr.mapmaking.orthophoto import Orthophoto
-from edgevpr.mapmaking.tiles import ground_of
+from edgevpr.mapmaking.tiles import surround
 from edgevpr.places.mapfile import PlaceMap
 
 HALF_WORLD_M = 20037508.342789244
 ZOOM, REACH = 18, 2
 SECRET = "mykey123"
-HERE = ground_of([(HOME.lat_deg, HOME.lon_deg)], 100.0)
+HERE = surround([(HOME.lat_deg, HOME.lon_deg)], 100.0)
 
 
 def tile(x: int, y: int, side_px: int = 256) -> bytes:

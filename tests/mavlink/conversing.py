@@ -35,13 +35,13 @@ class Ear(Listener):
     def __init__(self):
         self.autopilots, self.channels, self.forces, self.state, self.between = 0, [], [], STATE, None
 
-    def hear_autopilot(self, t_s):
+    def handle_autopilot(self, t_s):
         self.autopilots += 1
 
-    def hear_channel(self, channel):
+    def handle_channel(self, channel):
         self.channels.append(channel)
 
-    def hear_force(self, t_s, force_m_s2, attitude):
+    def handle_force(self, t_s, force_m_s2, attitude):
         self.forces.append((force_m_s2, attitude.roll_deg))
 
     def state_at(self, t_s):
@@ -91,11 +91,11 @@ class Autopilot:
                 self.packets.append(packet)
             if fix:
                 fix.settle(True)
-                self.conversation.note_departed([fix])
+                self.conversation.count_departed([fix])
 
     def say(self, message, system_id=7, component_id=1, address=None):
         packer = self._packers.setdefault((system_id, component_id), mavlink.MAVLink(None, system_id, component_id))
-        self.conversation.hear(message.pack(packer), self.clock.now_s, address)
+        self.conversation.handle(message.pack(packer), self.clock.now_s, address)
 
     def beat(self, base_mode=ARMED, **sender):
         beat = mavlink.MAVLink_heartbeat_message(2, self.firmware, base_mode, 0, 4, 3)
@@ -155,7 +155,7 @@ class Autopilot:
     def wait(self, seconds):
         self.clock.now_s += seconds
 
-    def told(self):
+    def take_sent(self):
         """The messages that have been sent since the last call."""
         self.conversation.announce_changes()
         self._listen()
@@ -165,7 +165,7 @@ class Autopilot:
     def reply(self, parameters, is_lost=lambda message: False, errors=False):
         """Answer the questions among them, and return all. About a parameter that it does not have it is silent, or
         says so (`errors`); a question or answer that `is_lost` does not arrive."""
-        told = self.told()
+        told = self.take_sent()
         for message in told:
             if message.get_type() == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE:
                 nothing = [bytes(8)] * 3
@@ -192,11 +192,11 @@ class Autopilot:
 
     def questions(self):
         """The commands among them."""
-        return [message for message in self.told() if message.get_type() == "COMMAND_LONG"]
+        return [message for message in self.take_sent() if message.get_type() == "COMMAND_LONG"]
 
     def texts(self):
         """The severities and texts among them."""
-        return [(message.severity, message.text) for message in self.told() if message.get_type() == "STATUSTEXT"]
+        return [(message.severity, message.text) for message in self.take_sent() if message.get_type() == "STATUSTEXT"]
 
     @property
     def vehicle(self):

@@ -27,7 +27,7 @@ def next_sent(autopilot, name):
     """The next message of this name, and when it was sent; none for a second: None."""
     for _ in range(40):
         autopilot.wait(0.025)
-        for message in autopilot.told():
+        for message in autopilot.take_sent():
             if message.get_type() == name:
                 return message, autopilot.clock.now_s
     return None
@@ -36,7 +36,7 @@ def next_sent(autopilot, name):
 def test_stamps_are_the_autopilots_own_time_or_ours_for_a_px4_which_converts_them():
     autopilot = streaming(Channel.COMMAND)
     autopilot.put_fix()
-    (fix,) = [message for message in autopilot.told() if message.get_type() == "COMMAND_INT"]
+    (fix,) = [message for message in autopilot.take_sent() if message.get_type() == "COMMAND_INT"]
     assert fix.param1 == pytest.approx(autopilot.boot_s, abs=1e-3)
     odometry, now_s = next_sent(streaming(Channel.ODOMETRY), "ODOMETRY")
     assert odometry.time_usec == pytest.approx((now_s - 600.0) * 1e6, abs=100)
@@ -69,7 +69,7 @@ def test_nothing_with_a_stamp_is_sent_before_the_time_is_known_or_not_answered_f
         autopilot.conversation.autopilot.origin = 47.0, 8.0, 500.0
         autopilot.wait(0.1)
         autopilot.put_fix()
-        for message in autopilot.told():
+        for message in autopilot.take_sent():
             if message.get_type() == name:
                 sent_after_s.append((step + 1) / 10)
                 stamp_s = message.param1 if channel is Channel.COMMAND else message.time_usec / 1e6
@@ -86,7 +86,7 @@ def learnt(*trips, start_s=1000.0):
         sent_s = start_s + number
         request = clock.request(sent_s)
         boot_ns = round((sent_s + there_s - 600.0) * 1e9)
-        assert not clock.hear(mavlink.MAVLink_timesync_message(boot_ns, request.ts1), sent_s + there_s + back_s)
+        assert not clock.handle(mavlink.MAVLink_timesync_message(boot_ns, request.ts1), sent_s + there_s + back_s)
     return clock
 
 
@@ -102,7 +102,7 @@ def test_an_answer_that_we_have_not_asked_for_is_ignored():
     clock = AutopilotClock()
     request = clock.request(1000.0)
     for tc1, ts1 in ((5 * 10**9, request.ts1 + 1), (0, request.ts1), (-5, request.ts1), (2**62, 0)):
-        assert not clock.hear(mavlink.MAVLink_timesync_message(tc1, ts1), 1000.1)
+        assert not clock.handle(mavlink.MAVLink_timesync_message(tc1, ts1), 1000.1)
     assert clock.boot_time_s(1000.0) is None
     autopilot = Autopilot(timesync_s=None)
     autopilot.say(mavlink.MAVLink_timesync_message(5 * 10**9, round(autopilot.clock.now_s * 1e9)), component_id=190)
@@ -113,7 +113,7 @@ def test_an_answer_that_contradicts_older_ones_replaces_them():
     """As after a pause of a simulated autopilot, or of our computer."""
     clock = learnt((0.001, 0.001), (0.001, 0.001))
     request = clock.request(1002.0)
-    assert not clock.hear(mavlink.MAVLink_timesync_message(round(401.5e9), request.ts1), 1002.2)
+    assert not clock.handle(mavlink.MAVLink_timesync_message(round(401.5e9), request.ts1), 1002.2)
     assert clock.boot_time_s(1002.1) == pytest.approx(401.5)
 
 
@@ -129,9 +129,9 @@ def test_an_answer_that_contradicts_older_ones_replaces_them():
 )
 def test_a_boot_time_that_goes_back_is_that_of_another_boot_but_for_its_wrap(first_ms, then_ms, has_restarted):
     clock = AutopilotClock()
-    assert not clock.hear(mavlink.MAVLink_attitude_message(first_ms, 0, 0, 0, 0, 0, 0), 1000.0)
-    assert not clock.hear(mavlink.MAVLink_system_time_message(0, then_ms), 1001.0), "each kind has its own"
-    assert clock.hear(mavlink.MAVLink_attitude_message(then_ms, 0, 0, 0, 0, 0, 0), 1001.0) is has_restarted
+    assert not clock.handle(mavlink.MAVLink_attitude_message(first_ms, 0, 0, 0, 0, 0, 0), 1000.0)
+    assert not clock.handle(mavlink.MAVLink_system_time_message(0, then_ms), 1001.0), "each kind has its own"
+    assert clock.handle(mavlink.MAVLink_attitude_message(then_ms, 0, 0, 0, 0, 0, 0), 1001.0) is has_restarted
 
 
 def foreign(kind, stamp_s):
@@ -168,7 +168,7 @@ def report_late(autopilot, late_s):
         autopilot.say(mavlink.MAVLink_global_position_int_message(boot_ms, 500_000_000, 80_000_000, 0, 0, 0, 0, 0, 0))
         autopilot.say(mavlink.MAVLink_attitude_message(boot_ms, 0.5, 0, 0, 0, 0, 0))
         autopilot.wait(0.1)
-    return [message.text for message in autopilot.told() if message.get_type() == "STATUSTEXT"]
+    return [message.text for message in autopilot.take_sent() if message.get_type() == "STATUSTEXT"]
 
 
 @pytest.mark.parametrize("is_the_way_back", [True, False])
@@ -227,7 +227,7 @@ def test_put_back_gives_ardupilot_the_position_of_the_time_by_which_it_counts(ag
         frame_s = autopilot.boot_s - age_s
         fix = Fix(50.0 + north_deg * frame_s, 8.0, 5.0, autopilot.clock.now_s - age_s)
         autopilot.conversation.fixes.put(fix, autopilot.clock.now_s)
-        (sent,) = [message for message in autopilot.told() if message.get_type() == "COMMAND_INT"]
+        (sent,) = [message for message in autopilot.take_sent() if message.get_type() == "COMMAND_INT"]
         counts_s = link.correct(sent.param1, autopilot.boot_s) - sent.param2
         assert (sent.x / 1e7 - 50.0) / north_deg == pytest.approx(counts_s, abs=0.02)
         autopilot.answer(0)

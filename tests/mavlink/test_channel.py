@@ -56,7 +56,7 @@ def sent(autopilot, name, seconds=1.0):
     messages = []
     for _ in range(round(seconds * 40)):
         autopilot.wait(0.025)
-        messages += [message for message in autopilot.told() if message.get_type() == name]
+        messages += [message for message in autopilot.take_sent() if message.get_type() == name]
     return messages
 
 
@@ -104,7 +104,7 @@ def test_an_origin_without_altitude_gets_that_of_the_air_pressure():
     for _ in range(12):
         autopilot.beat()
         autopilot.wait(1.0)
-        told = autopilot.told()
+        told = autopilot.take_sent()
         origins += [message.altitude / 1e3 for message in told if message.get_type() == "SET_GPS_GLOBAL_ORIGIN"]
         texts += [message.text for message in told if message.get_type() == "STATUSTEXT"]
     assert {round(alt_m) for alt_m in origins} == {584}

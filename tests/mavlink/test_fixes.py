@@ -29,14 +29,14 @@ def sent(fixes, *times_s):
     """Send a fix at each time; give the last."""
     for t_s in times_s:
         sending = Sending(Fix(50.0, 8.0, 20.0, t_s), t_s + 1)
-        fixes.note_sent(sending, t_s)
+        fixes.record_sent(sending, t_s)
         sending.settle(True)
     return sending
 
 
 def hear(fixes, result, t_s):
     """Let an autopilot that has GPS answer."""
-    return fixes.hear(result, Readiness(has_gps=True).why(result), t_s)
+    return fixes.handle(result, Readiness(has_gps=True).why(result), t_s)
 
 
 def test_one_fix_a_second_has_its_own_answer_though_some_are_lost(fixes):
@@ -90,12 +90,12 @@ def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_sto
     reports = []
     fixes = Fixes(announce=lambda *report: reports.append(report))
     sent(fixes, 0, 1, 2, 3, 4)
-    fixes.note_lost(3)
+    fixes.record_lost(3)
     assert fixes.why_not(5.0) is None
     sent(fixes, 5, 6, 7)
     fixes.report_silence(SILENT, 8.5)
     sent(fixes, 17.5)
-    fixes.note_lost(2)
+    fixes.record_lost(2)
     fixes.report_silence(SILENT, 20.0)
     assert fixes.why_not(20.0) == UNANSWERED
     assert [text for _, text, _ in reports] == ["fixes unanswered: signing? system id?"]

@@ -123,6 +123,6 @@ def test_the_ground_is_spoken_to_with_the_same_key_and_another_link_id(clock, tm
         flight = link_to("udpout:127.0.0.1:9", clock=clock, signing=signing)
         with flight, GroundLink(parse_link(f"udpout:127.0.0.1:{port.number}"), flight):
             peer = Peer(port)
-            peer.receiver._parser_of(None).signing.secret_key = bytes(32)
+            peer.receiver._find_parser(None).signing.secret_key = bytes(32)
             heartbeat = peer.expect("HEARTBEAT")
             assert (heartbeat.get_signed(), heartbeat.get_link_id()) == (True, TO_GROUND)

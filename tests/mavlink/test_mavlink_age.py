@@ -75,10 +75,10 @@ def test_a_fix_that_the_system_still_holds_when_it_is_due_is_thrown_away_with_th
     line.write()
     assert not line.unsent
     clock.now_s += 0.99
-    assert line.departed() == []
+    assert line.take_departed() == []
     clock.now_s += 0.02
     with pytest.raises(ConnectionError, match="too long"):
-        line.departed()
+        line.take_departed()
     assert line.close() == 1
     assert (fix.sent, fix.why) == (False, THROWN_AWAY)
     got = drained(far)

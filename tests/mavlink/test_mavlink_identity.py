@@ -78,5 +78,5 @@ def test_after_a_reconnection_no_fix_leaves_before_ours_has_spoken(autopilot, sy
     autopilot.conversation.break_off(0)
     autopilot.beat(system_id=system_id)
     sending = autopilot.conversation.send_fix(Fix(50.0, 8.0, 20.0, autopilot.clock.now_s))
-    autopilot.told()
+    autopilot.take_sent()
     assert sending.sent is sent

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.messages import Fix, MotionState, Severity
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink
@@ -125,7 +125,7 @@ def test_gps_input_says_position_velocity_and_what_they_are_good_to_or_that_it_h
 
 
 def test_odometry_lies_north_east_down_of_the_origin_and_moves_along_the_airframe():
-    origin = *moved(STATE.lat_deg, STATE.lon_deg, -200.0, 300.0), 500.0
+    origin = *offset_position(STATE.lat_deg, STATE.lon_deg, -200.0, 300.0), 500.0
     heard = sent_and_received(messages.odometry(STATE, STATE.attitude, origin, 7.0))
     assert (heard.frame_id, heard.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
     assert (heard.x, heard.y, heard.z) == pytest.approx((-300.0, 200.0, -12.3), abs=0.1)

@@ -43,9 +43,9 @@ def test_any_content_of_the_autopilots_messages_raises_nothing():
     for _ in range(10):
         for packet in a_packet_of_every_kind(rng, system_id=7):
             autopilot.wait(0.01)
-            autopilot.conversation.hear(packet, autopilot.clock.now_s, None)
+            autopilot.conversation.handle(packet, autopilot.clock.now_s, None)
         autopilot.put_fix()
-        autopilot.told()
+        autopilot.take_sent()
         autopilot.at(autopilot.clock.now_s)
     received = autopilot.conversation.reader.received
     assert received.total() - received["UNKNOWN"] > 10 * 300

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Receiver
 from edgevpr.mavlink.receivers import Receivers, extrapolate
 from edgevpr.mavlink.wire import mavlink
@@ -16,7 +16,7 @@ UNKNOWN_ACCURACY_M = (2**32 - 1) / 1000
 
 
 def report(t_s, north_m=0.0, *, speed_m_s=10.0, course_deg=0.0, fix_type=3, h_acc_m=0.5, stamp_s=None):
-    lat_deg, lon_deg = moved(*HOME, 0.0, north_m)
+    lat_deg, lon_deg = offset_position(*HOME, 0.0, north_m)
     stamp_us = round(1e6 * (t_s if stamp_s is None else stamp_s))
     where = round(lat_deg * 1e7), round(lon_deg * 1e7), 300_000
     fields = 100, 100, round(100 * speed_m_s), round(100 * course_deg), 10
@@ -36,7 +36,7 @@ def test_best_receiver_has_position_velocity_and_altitude_of_its_newest_report()
     receivers = receive(*flown, (BEGIN_S + 3.0, {"north_m": 30.0, "speed_m_s": 20.0, "course_deg": 30.0}))
     best = receivers.best(BEGIN_S + 5.5)
     assert (best.sd_m, best.t_s, best.alt_m, best.steady_for_s) == (0.5, BEGIN_S + 3.0, 300.0, 3.0)
-    assert (best.lat_deg, best.lon_deg) == pytest.approx(moved(*HOME, 0.0, 30.0), abs=1e-7)
+    assert (best.lat_deg, best.lon_deg) == pytest.approx(offset_position(*HOME, 0.0, 30.0), abs=1e-7)
     assert best.velocity_m_s == pytest.approx((10.0, 10.0 * math.sqrt(3)))
     assert receivers.best(BEGIN_S + 5.6) is None, "it has fallen silent"
     assert receivers.best(BEGIN_S + 3.0, own="GPS_RAW_INT") is None, "edgevpr plays it"

@@ -24,10 +24,10 @@ def command_int(number, p1=0.0, p2=0.0, to=US):
 
 def replies(autopilot, *messages, sender=STATION):
     """What comes for messages of the ground station."""
-    autopilot.told()
+    autopilot.take_sent()
     for message in messages:
         autopilot.say(message, *sender)
-    return autopilot.told()
+    return autopilot.take_sent()
 
 
 def answered(autopilot, message):
@@ -109,7 +109,7 @@ def react(message, sender=STATION):
     requests = Requests()
     requests.is_under_way = True
     message._header.srcSystem, message._header.srcComponent = sender
-    return requests.hear(message, US, 5.0), requests, requests.take()
+    return requests.handle(message, US, 5.0), requests, requests.take()
 
 
 def test_whatever_a_command_holds_it_has_one_answer_that_can_be_sent():

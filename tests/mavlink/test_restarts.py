@@ -27,7 +27,7 @@ class Aircraft(Autopilot):
         self.received, self.rates = [], set()
 
     def power_cycle(self, silent_s):
-        self.told()
+        self.take_sent()
         self.reboot(silent_s)
         self.has_origin = False
         self.forget()

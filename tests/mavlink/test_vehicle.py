@@ -29,7 +29,7 @@ def test_its_position_is_known_while_it_is_fresh(autopilot):
         velocity_m_s=(12.5, -3.0),
         sink_m_s=0.0,
     )
-    assert [vehicle.is_fresh_at(autopilot.clock.now_s + after_s) for after_s in (1.0, 1.1)] == [True, False]
+    assert [vehicle.is_fresh(autopilot.clock.now_s + after_s) for after_s in (1.0, 1.1)] == [True, False]
     assert autopilot.position(hdg=65535).heading_deg is None
     assert autopilot.position(vx=32_767, vy=32_767).velocity_m_s is None, "no small aircraft has it"
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from edgevpr.core.config import load_config
-from edgevpr.core.files import shipped
+from edgevpr.core.files import find_shipped
 from edgevpr.runtime.recognise.gate_networks import Memorability
 from edgevpr.techniques.card import load_card
 from edgevpr.techniques.words import load_words
 
-MODELS = shipped("models")
+MODELS = find_shipped("models")
 
 
 @pytest.fixture(autouse=True)

@@ -10,14 +10,14 @@ from training_pictures import read_pictures
 
 from edgevpr import techniques
 from edgevpr.core.errors import UsageError
-from edgevpr.core.files import shipped
+from edgevpr.core.files import find_shipped
 
 
 @pytest.fixture(autouse=True)
 def own_models(models, monkeypatch):
     """The backbone alone, so that no shipped words are found."""
     for name in ("calc.onnx", "calc.yaml"):
-        shutil.copy(shipped("models") / name, models / name.replace("calc.yaml", "mine.yaml"))
+        shutil.copy(find_shipped("models") / name, models / name.replace("calc.yaml", "mine.yaml"))
     monkeypatch.setattr(train_words, "_POINTS", 2000)
     return models
 

@@ -161,7 +161,7 @@ def test_a_name_and_a_time_that_cannot_be_written_cost_no_place(map_path):
         for number, each in ((41, odd), (42, later)):
             place_map.add(each, descriptor(number))
             (place_id,) = place_map.select_ids("source_image")[(readable(each.name),)]
-            assert place_map.is_of(place_id, descriptor(number).coarse)
+            assert place_map.has_descriptor(place_id, descriptor(number).coarse)
         *_, first, second = place_map.places()
     assert (first.source_image, first.t_utc_s) == ("\\udcff\\udcfe.jpg", None)
     assert (second.source_image, second.t_utc_s) == ("\\ud800.jpg", None)

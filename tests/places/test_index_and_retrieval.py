@@ -13,7 +13,7 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.places import retrieve
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Query, elsewhere, margin, named, unmoved_outside_neighbourhood
+from edgevpr.places.retrieve import Query, load_candidates, margin, outside_neighbourhood, unmoved_outside_neighbourhood
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_a_map_beyond_the_budget_keeps_its_best_places_in_ram_and_all_on_disk(ru
     assert np.diff(index.place_ids).max() <= 5, "what stays is spread over the whole track"
     assert "10 best" in caplog.messages[0]
     assert len(place_map) == 25
-    found = named(rank(technique, technique.encode(43), place_map, index), index, place_map, 1)
+    found = load_candidates(rank(technique, technique.encode(43), place_map, index), index, place_map, 1)
     assert found[0].place.place_id in index.place_ids
 
 
@@ -79,10 +79,10 @@ def test_all_places_are_compared_unless_candidates_are_limited(ruler):
     query = technique.encode(43)
     everything = rank(technique, query, place_map, index)
     assert technique.compared == 25
-    found = named(everything, index, place_map, 3)
+    found = load_candidates(everything, index, place_map, 3)
     assert [c.place.source_image for c in found] == ["44", "40", "48"]
     technique.compared = 0
-    few = named(rank(technique, query, place_map, index, candidates=3), index, place_map)
+    few = load_candidates(rank(technique, query, place_map, index, candidates=3), index, place_map)
     assert technique.compared == 3
     assert {c.place.source_image for c in few} == {"36", "40", "44"}  # those that round to 40
     assert few[0].place.source_image == "44"
@@ -94,7 +94,9 @@ def test_margin_is_to_the_best_place_elsewhere(ruler):
     # 11 m a number: 16 and 24 are 44 m away, 12 and 28 are 89 m.
     assert margin(ranking, index, 40.0) == pytest.approx(1 - 1 / 5)
     assert margin(ranking, index, 50.0) == pytest.approx(1 - 1 / 9)
-    assert margin(ranking, index, 1e6) == pytest.approx(1 - 1 / 41), "only the place without a position is elsewhere"
+    assert margin(ranking, index, 1e6) == pytest.approx(1 - 1 / 41), (
+        "only the place without a position is outside_neighbourhood"
+    )
     nowhere = rank(technique, technique.encode(60), place_map, index)
     assert margin(nowhere, index, 1e6) == pytest.approx(1 - 1 / 13), "without a position, neighbours are the two beside"
 
@@ -111,10 +113,10 @@ def test_places_out_of_reach_are_no_candidates(ruler):
     technique.compared = 0
     ranking = rank(technique, query, place_map, index, candidates=3, in_reach=allowed)
     assert technique.compared == 3 + 5, "three in reach, and the five best-scanned of all others"
-    found = {c.place.source_image for c in named(ranking, index, place_map)}
+    found = {c.place.source_image for c in load_candidates(ranking, index, place_map)}
     assert {"64", "68", "72"} <= found, "in reach, the nearest to what the picture shows"
     # A false position must not hide the right place behind the best of the wrong ones.
-    assert named(ranking, index, place_map, 1)[0].place.source_image == "44"
+    assert load_candidates(ranking, index, place_map, 1)[0].place.source_image == "44"
 
 
 def test_a_lone_place_in_reach_has_its_rivals_from_the_whole_map(ruler):
@@ -123,10 +125,10 @@ def test_a_lone_place_in_reach_has_its_rivals_from_the_whole_map(ruler):
     alone = rank(technique, query, place_map, index, 20, 40.0, within(index, 80))
     assert len(alone.slots) == 1 + 5
     # The picture shows another place: the one in reach must not be taken for want of it.
-    assert named(alone, index, place_map, 1)[0].place.source_image == "20"
+    assert load_candidates(alone, index, place_map, 1)[0].place.source_image == "20"
     assert margin(alone, index, 40.0) == pytest.approx(1 - 1 / 5)
     right = rank(technique, technique.encode(80), place_map, index, 20, 40.0, within(index, 80))
-    assert named(right, index, place_map, 1)[0].place.source_image == "80"
+    assert load_candidates(right, index, place_map, 1)[0].place.source_image == "80"
     assert margin(right, index, 40.0) == pytest.approx(1 - 1 / 5)
 
 
@@ -232,7 +234,7 @@ class Hasty(Ruler):
     def __init__(self):
         self.glanced = []
 
-    def glance(self, query, fine, hypotheses):
+    def score_quickly(self, query, fine, hypotheses):
         self.glanced.append(float(fine[0]))
         return 1 / (1 + abs(float(fine[0]) + 5 - float(query.fine[0]))), hypotheses
 
@@ -243,11 +245,11 @@ def test_of_many_candidates_those_that_look_best_at_a_glance_are_compared_in_ful
     ranking = rank(technique, technique.encode(41), place_map, index, 8, 5.0)
     assert len(technique.glanced) == 8
     assert technique.compared == 3
-    names = [c.place.source_image for c in named(ranking, index, place_map)]
+    names = [c.place.source_image for c in load_candidates(ranking, index, place_map)]
     assert names[:3] == ["40", "36", "32"]
     assert len(names) == 8, "the others come last, as they looked"
     assert set(ranking.compared) == set(ranking.slots[:3].tolist())
-    whole = [named(ranking, index, place_map)[number].match for number in (0, -1)]
+    whole = [load_candidates(ranking, index, place_map)[number].match for number in (0, -1)]
     assert whole == [ranking.compared[ranking.slots[0]], FineMatch(float(ranking.scores[-1]))]
     assert (np.diff(ranking.scores) <= 0).all()
 
@@ -258,7 +260,7 @@ def test_a_rival_is_one_that_looked_best_elsewhere(ruler):
     # All three that are compared are neighbours, within 150 m of 40: so five rivals are compared as well.
     ranking = rank(technique, technique.encode(41), place_map, index, 12, 150.0)
     assert technique.compared == 8
-    away = elsewhere(index, ranking.slots[0], ranking.slots, 150.0)
+    away = outside_neighbourhood(index, ranking.slots[0], ranking.slots, 150.0)
     rivals = [slot for slot in ranking.slots[away].tolist() if slot in ranking.compared]
     seen = {number: 1 / (1 + abs(number + 5 - 41)) for number in technique.glanced}
     assert len(rivals) == 5
@@ -312,7 +314,7 @@ def test_rivals_are_compared_where_no_candidate_is_one(ruler, candidates, apart_
 
 
 class Unmoved(Ruler):
-    def unmoved(self, query, fine):
+    def match_at_rest(self, query, fine):
         return FineMatch(float(fine[0]))
 
 
@@ -322,7 +324,7 @@ def test_a_few_places_all_over_the_map_are_asked_unmoved(ruler):
     query = Query(technique=technique, descriptor=technique.encode(0), place_map=place_map, index=index)
     place_map.left_out[25] = "gone"
     asked = [match.score for match in unmoved_outside_neighbourhood(query, 0, 100.0)]
-    assert asked == list(range(12, 96, 12)), "of 21 places elsewhere that can be read, every third"
+    assert asked == list(range(12, 96, 12)), "of 21 places outside_neighbourhood that can be read, every third"
     place_map.left_out[16] = "gone"
-    assert unmoved_outside_neighbourhood(query, 0, 1e6) == [], "the only one elsewhere cannot be read"
+    assert unmoved_outside_neighbourhood(query, 0, 1e6) == [], "the only one outside_neighbourhood cannot be read"
     assert unmoved_outside_neighbourhood(query, 15, 1e6)[0].score == 0.0, "only neighbours of one without a position"

@@ -8,7 +8,7 @@ from map_writer import SPEC, descriptor, frame
 from ranking import index_of
 
 from edgevpr.core.types import Pose
-from edgevpr.places.layers import layers_of
+from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation
 
@@ -20,7 +20,7 @@ def layers(path, shown):
             pose = Pose(up_deg=0.0, footprint_m=footprint_m, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=is_surveyed)
             place_map.add(replace(frame(number), pose=pose), descriptor(number))
     with PlaceMap.open(path) as place_map:
-        return layers_of(place_map)
+        return read_layers(place_map)
 
 
 CUT = [(150.0, True), (100.0, True), (102.0, True), (150.0, True), (300.0, False)]
@@ -41,14 +41,14 @@ def test_a_picture_is_looked_for_among_places_that_show_a_little_less(tmp_path, 
 def test_a_search_leaves_out_what_was_cut_otherwise(tmp_path):
     found = layers(tmp_path / "m.gpkg", CUT)
     whole = index_of([1, 2, 3, 4, 5, 9])  # 9 was learnt since
-    assert found.narrowed(Expectation(), whole, 150.0).in_reach.tolist() == [True, False, False, True, True, True]
-    assert found.narrowed(Expectation(), whole, 90.0).in_reach.tolist() == [False, True, True, False, True, True]
+    assert found.narrow(Expectation(), whole, 150.0).in_reach.tolist() == [True, False, False, True, True, True]
+    assert found.narrow(Expectation(), whole, 90.0).in_reach.tolist() == [False, True, True, False, True, True]
     near = Expectation(in_reach=np.array([True, True, False, False, False, False]))
-    assert found.narrowed(near, whole, 150.0).in_reach.tolist() == [True, False, False, False, False, False]
-    assert found.narrowed(near, whole, None) is near
-    assert found.narrowed(Expectation(), index_of([2, 3]), 150.0).in_reach is None, "none of them is in reach"
+    assert found.narrow(near, whole, 150.0).in_reach.tolist() == [True, False, False, False, False, False]
+    assert found.narrow(near, whole, None) is near
+    assert found.narrow(Expectation(), index_of([2, 3]), 150.0).in_reach is None, "none of them is in reach"
 
 
 def test_a_map_of_one_layer_is_searched_whole(tmp_path):
     expected = Expectation()
-    assert layers(tmp_path / "m.gpkg", CUT[1:3]).narrowed(expected, index_of([1, 2]), 300.0) is expected
+    assert layers(tmp_path / "m.gpkg", CUT[1:3]).narrow(expected, index_of([1, 2]), 300.0) is expected

@@ -13,7 +13,7 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import margin, named
+from edgevpr.places.retrieve import load_candidates, margin
 from edgevpr.runtime.recognise.judge import AcceptRule, Findings, judge
 
 RULE = AcceptRule(min_score=0.1, min_margin=0.1, neighbour_m=20.0)
@@ -86,7 +86,7 @@ def test_the_query_that_meets_a_damaged_place_is_refused_and_the_next_goes_witho
     ranking = rank(technique, query, place_map, index, candidates=10)
     assert 10 not in ranking.slots
     assert len(ranking.slots) == 10, "the next best takes its turn"
-    assert named(ranking, index, place_map, 1)[0].place.source_image == "140"
+    assert load_candidates(ranking, index, place_map, 1)[0].place.source_image == "140"
     assert not len(ranking.unread)
     assert judge(Findings(ranking), index, RULE).accepted
 
@@ -100,7 +100,7 @@ def test_without_the_right_place_no_other_is_accepted(ruler):
     with pytest.raises(PlaceError):
         rank(technique, query, place_map, index)
     ranking = rank(technique, query, place_map, index)
-    assert named(ranking, index, place_map, 1)[0].place.source_image == "110"
+    assert load_candidates(ranking, index, place_map, 1)[0].place.source_image == "110"
     bare = dataclasses.replace(ranking, unread=np.empty(0, np.intp))
     assert judge(Findings(bare), index, rule).accepted, "but for the rule"
     verdict = judge(Findings(ranking), index, rule)
@@ -166,13 +166,13 @@ def test_of_one_stage_a_place_left_out_is_still_a_rival_and_never_named(short):
     damage(place_map, f"geom = x'{point_blob(1.0, 1.0).hex()}'", 140)
     ranking = rank(technique, technique.encode(142), place_map, index)
     with pytest.raises(PlaceError, match="position"):
-        named(ranking, index, place_map, 1)
+        load_candidates(ranking, index, place_map, 1)
     again = rank(technique, technique.encode(142), place_map, index)
     np.testing.assert_array_equal(again.scores, ranking.scores)
     assert len(rank(technique, technique.encode(142), place_map, index, 3).slots) == 30, "rows are all there is"
     with pytest.raises(PlaceError, match="place 15"):
-        named(again, index, place_map, 1)
+        load_candidates(again, index, place_map, 1)
     other = rank(technique, technique.encode(132), place_map, index)
     assert 14 in other.slots
-    assert named(other, index, place_map, 1)[0].place.source_image == "130"
+    assert load_candidates(other, index, place_map, 1)[0].place.source_image == "130"
     assert list(place_map.left_out) == [15]

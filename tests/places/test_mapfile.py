@@ -12,7 +12,7 @@ from map_writer import SPEC, descriptor, frame, make_map, write_sql
 
 from edgevpr.core.contract import PartSpec
 from edgevpr.core.errors import MapError, PlaceError
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Position
 from edgevpr.places.examine import merge, repair, shrink
 from edgevpr.places.geopackage import point_blob
@@ -208,8 +208,8 @@ def test_a_place_is_known_again_where_the_last_bits_differ_and_not_where_the_pic
             coarse = next(part for number, _, _, part in place_map.coarse_parts() if number == place_id)
             for off, same in ((0.0, True), (1e-4, True), (0.5, False)):
                 other = coarse + off * np.linalg.norm(coarse) * unit(rng, coarse.shape)
-                assert place_map.is_of(place_id, other) is same
-        assert not place_map.is_of(10**6, coarse)
+                assert place_map.has_descriptor(place_id, other) is same
+        assert not place_map.has_descriptor(10**6, coarse)
 
 
 def unit(rng, shape):
@@ -225,7 +225,7 @@ def test_a_place_of_bytes_is_known_again_where_a_few_of_them_differ(tmp_path):
         for others, same in ((0, True), (3, True), (30, False)):
             again = there.copy()
             again[:others] += 128
-            assert place_map.is_of(place_id, again) is same
+            assert place_map.has_descriptor(place_id, again) is same
 
 
 def test_one_map_of_several_names_the_owners_of_all(tmp_path):
@@ -275,7 +275,7 @@ def test_describe_map_tells_the_course_of_a_map_whose_lines_are_flown_one_way(tm
         for line, course_deg in enumerate(courses_deg):
             for nth in range(8):
                 step_m = 20.0 * nth * np.exp(1j * math.radians(90.0 - course_deg)) + 40j * line
-                lat_deg, lon_deg = moved(50.0, 8.0, step_m.real, step_m.imag)
+                lat_deg, lon_deg = offset_position(50.0, 8.0, step_m.real, step_m.imag)
                 taken_s = 1.7e9 + 60.0 * line + nth  # the way back to the next line is flown without pictures
                 added = dataclasses.replace(frame(8 * line + nth), position=Position(lat_deg, lon_deg), t_utc_s=taken_s)
                 place_map.add(added, descriptor(nth))

@@ -32,7 +32,7 @@ def test_pose_and_landmarks_come_back_and_a_place_may_have_none(posed, tmp_path)
             first, second = each.places()
             assert first.pose == POSE
             assert second.pose is None
-            assert (each.landmarks_of(1), each.landmarks_of(2)) == (LANDMARKS, None)
+            assert (each.read_landmarks(1), each.read_landmarks(2)) == (LANDMARKS, None)
             assert {found.problem for found in examine(each)} == {None}
             assert (
                 None not in each.db.execute("SELECT geom_crc32, coarse_crc32 FROM places WHERE place_id = 2").fetchone()
@@ -60,7 +60,7 @@ def test_a_pose_that_cannot_be_true_is_not_believed(posed, change, says):
         (broken,) = [each for each in examine(place_map) if each.problem]
         assert broken.place_id == 1
         with pytest.raises(PlaceError, match=says):
-            [*place_map.places([1]), place_map.landmarks_of(1)]
+            [*place_map.places([1]), place_map.read_landmarks(1)]
 
 
 def test_repair_keeps_a_place_whose_landmarks_alone_are_damaged_without_them(posed):
@@ -71,7 +71,7 @@ def test_repair_keeps_a_place_whose_landmarks_alone_are_damaged_without_them(pos
     assert check(posed).is_whole
     with PlaceMap.open(posed) as place_map:
         assert [place.place_id for place in place_map.places()] == [1, 2]
-        assert place_map.landmarks_of(1) is None
+        assert place_map.read_landmarks(1) is None
 
 
 def test_a_place_moved_by_another_program_keeps_its_pose_and_forgets_where_it_was_recorded(posed):

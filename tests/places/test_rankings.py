@@ -7,12 +7,12 @@ import pytest
 from ranking import index_of
 
 from edgevpr.core.contract import FineMatch
-from edgevpr.places.retrieve import Ranking, best_scanned, elsewhere, together
+from edgevpr.places.retrieve import Ranking, choose_best, merge_rankings, outside_neighbourhood
 
 
 def tried(by_hypothesis, count, among=None):
     among = np.ones(len(by_hypothesis), bool) if among is None else among
-    return dict(best_scanned(by_hypothesis.max(axis=1), by_hypothesis, among, count))
+    return dict(choose_best(by_hypothesis.max(axis=1), by_hypothesis, among, count))
 
 
 def test_of_many_places_the_best_hypotheses_of_all_are_tried():
@@ -67,7 +67,7 @@ def ranking(compared, rest=(), unread=()):
 def test_of_a_place_that_both_compared_the_better_match_counts():
     one = ranking({4: 0.3, 7: 0.1}, rest=[(2, 0.09), (5, 0.08)])
     other = ranking({7: 0.5, 2: 0.06}, rest=[(9, 0.05), (5, 0.04)], unread=[3])
-    both = together(one, other)
+    both = merge_rankings(one, other)
     assert both.slots.tolist() == [7, 4, 2, 5, 9]
     np.testing.assert_allclose(both.scores, [0.5, 0.3, 0.06, 0.06, 0.05], rtol=1e-6)
     assert {slot: match.score for slot, match in both.compared.items()} == {4: 0.3, 7: 0.5, 2: 0.06}
@@ -76,8 +76,8 @@ def test_of_a_place_that_both_compared_the_better_match_counts():
 
 def test_together_has_tried_the_rotations_of_both():
     known, all_of_them = (dataclasses.replace(ranking({1: 0.2}), tried=tried) for tried in (0.125, 1.0))
-    assert together(known, known).tried == 0.25
-    assert together(known, all_of_them).tried == 1.0
+    assert merge_rankings(known, known).tried == 0.25
+    assert merge_rankings(known, all_of_them).tried == 1.0
 
 
 def test_promote_moves_a_place_to_the_front():
@@ -88,6 +88,6 @@ def test_promote_moves_a_place_to_the_front():
 
 def test_elsewhere_is_beyond_the_two_beside_and_not_of_the_same_places():
     index, slots = index_of(range(10, 17)), np.arange(7)
-    assert elsewhere(index, 3, slots, 50.0).tolist() == [True, False, False, False, False, False, True]
-    assert elsewhere(index, 3, slots, 50.0, same=(10,)).tolist() == [False] * 6 + [True]
-    assert elsewhere(index, 3, slots, 50.0, beside=3).tolist() == [False] * 7
+    assert outside_neighbourhood(index, 3, slots, 50.0).tolist() == [True, False, False, False, False, False, True]
+    assert outside_neighbourhood(index, 3, slots, 50.0, same=(10,)).tolist() == [False] * 6 + [True]
+    assert outside_neighbourhood(index, 3, slots, 50.0, beside=3).tolist() == [False] * 7

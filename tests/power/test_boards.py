@@ -6,10 +6,10 @@ import os
 import pytest
 
 from edgevpr.core.errors import ConfigError
-from edgevpr.core.files import shipped
+from edgevpr.core.files import find_shipped
 from edgevpr.power.boards import board_names, load_board
 
-PROFILE = (shipped("profiles") / "rpi-4b.yaml").read_text()
+PROFILE = (find_shipped("profiles") / "rpi-4b.yaml").read_text()
 
 
 def changed_profile(tmp_path, **changes):

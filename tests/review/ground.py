@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from logs import query
 
-from edgevpr.core.geodesy import axes_of, moved
+from edgevpr.core.geodesy import offset_position, picture_axes
 from edgevpr.core.types import Place, Pose, Position
 
 ORIGIN = 50.0, 8.0
@@ -30,7 +30,7 @@ def landscape() -> np.ndarray:
 
 def position(east_m: float, north_m: float) -> tuple[float, float]:
     """A point on the ground (lat_deg, lon_deg)."""
-    return moved(*ORIGIN, east_m, north_m)
+    return offset_position(*ORIGIN, east_m, north_m)
 
 
 def places_in(folder: Path, turned_deg: float = 0.0) -> list[Place]:
@@ -42,7 +42,7 @@ def places_in(folder: Path, turned_deg: float = 0.0) -> list[Place]:
         up_deg = 25.0 * at
         width, height = int(SIDE_M * METRE_PX), int(0.75 * SIDE_M * METRE_PX)
         corners = np.array([[-1, 1, 1], [1, 1, -1]]) * [[width / 2], [height / 2]] / METRE_PX
-        east, north = middle_m[:, None] + axes_of(up_deg) @ corners
+        east, north = middle_m[:, None] + picture_axes(up_deg) @ corners
         seen = np.float32([280 + east * METRE_PX, 280 - north * METRE_PX]).T
         way = cv2.getAffineTransform(seen, np.float32([[0, 0], [width, 0], [width, height]]))
         name = f"{at:02d}.png"

@@ -4,7 +4,7 @@ import json
 
 from logs import query, write_log
 
-from edgevpr.core.appending import numbered
+from edgevpr.core.appending import list_numbered
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.review.logged import FixOutcome, read_flight
 from edgevpr.runtime.flight.flightlog import FlightLog
@@ -32,7 +32,7 @@ def test_a_file_that_is_missing_is_a_remark(tmp_path):
         log.write("start", map="m.gpkg", t_mono_s=1000.0)
         for second in range(1, 5):
             log.write("query", **query(str(second), note="x" * 3000), t_mono_s=1000.0 + second)
-    numbered(path)[0].unlink()
+    list_numbered(path)[0].unlink()
     flight = read_flight(path)
     assert (flight.start["map"], flight.start["repeated"]) == ("m.gpkg", True)
     assert flight.remarks[0][:2] == (0.0, "missing")

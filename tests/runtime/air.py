@@ -9,7 +9,7 @@ import numpy as np
 from fakes import receiver_at, vehicle_at
 
 from edgevpr.core.contract import FineMatch
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import FRAME_TIME_SD_S, Candidate, Frame, Place, Position, QueryCost, Steps, Vehicle
 from edgevpr.frames.level import Levelled, View
 from edgevpr.mavlink.conversation import BETWEEN_S
@@ -162,7 +162,7 @@ class Air:
     def _see(self, step, vehicle, is_query=True) -> None:
         frame = Frame(image=_PICTURE, name="", t_mono_s=step * _STEP_S)
         event = Recognition(frame=frame, vehicle=vehicle, stride=self._stride(step))
-        self.navigator.hear_frame(event, is_query)
+        self.navigator.handle_frame(event, is_query)
 
     def _stride(self, step) -> Stride | None:
         before, self.strode = self.strode, step
@@ -179,7 +179,7 @@ class Air:
 
     def match(self, step, vehicle, off_m=(0.0, 0.0), view=None) -> Advice:
         seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2) + off_m
-        where = Position(*moved(*HOME, *seen_m))
+        where = Position(*offset_position(*HOME, *seen_m))
         event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, self.places(step), view)
         frame = replace(event.frame, t_sd_s=self.t_sd_s)
         event = replace(event, frame=frame, stride=self._stride(step))
@@ -210,12 +210,12 @@ class Air:
 
     def _feel(self, acceleration_m_s2: np.ndarray) -> None:
         east, north = acceleration_m_s2 + self.bias + self.rng.normal(0, 0.2, 2)
-        self.navigator.hear_force(self.t_s, (north, east, -_GRAVITY_M_S2), Attitude(self.t_s, 0.0, 0.0, 0.0))
+        self.navigator.handle_force(self.t_s, (north, east, -_GRAVITY_M_S2), Attitude(self.t_s, 0.0, 0.0, 0.0))
 
     def _report(self, velocity: np.ndarray) -> None:
-        here = moved(*HOME, *(self.at_m + self.off_m))
+        here = offset_position(*HOME, *(self.at_m + self.off_m))
         measured_m = self.way[max(0, self.step - round(RECEIVER_LAG_S / _STEP_S))]
-        there = moved(*HOME, *(measured_m + self.gps_off_m))
+        there = offset_position(*HOME, *(measured_m + self.gps_off_m))
         wrong = 0.0 if self.has_gps else self.rng.normal(0, self.velocity_sd, 2) - self.wind
         if self.has_gps:
             self.known = GPS_SD_M, self.t_s
@@ -232,7 +232,7 @@ class Air:
             roll_deg=roll_deg,
             pitch_deg=pitch_deg,
         )
-        self.navigator.hear_vehicle(self.vehicle)
+        self.navigator.handle_vehicle(self.vehicle)
 
 
 def lengths(errors_m) -> np.ndarray:

@@ -11,7 +11,7 @@ from fakes import FakeClock
 from simulated.controller import STEP_S, FlightController
 from simulated.motion import Hover, displacement_m
 
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import Levelled, View
 from edgevpr.lab.simulate.generated import ORIGIN
@@ -105,7 +105,7 @@ class ClosedLoop:
         """Let the ground station send a command to edgevpr; return the result."""
         padded = [*values, *[0] * (7 - len(values))]
         command = mavlink.MAVLink_command_long_message(1, 197, number, 0, *padded)
-        self.conversation.hear(command.pack(mavlink.MAVLink(None, 255, 190)), self._clock.now_s, None)
+        self.conversation.handle(command.pack(mavlink.MAVLink(None, 255, 190)), self._clock.now_s, None)
         first = len(self.sent)
         self._exchange([])
         return next(each.result for _, each in self.sent[first:] if each.get_type() == "COMMAND_ACK")
@@ -121,14 +121,14 @@ class ClosedLoop:
             return
         while True:
             if said:
-                conversation.hear(b"".join(map(self._pack, said)), now_s, None)
+                conversation.handle(b"".join(map(self._pack, said)), now_s, None)
             said, sending = [], []
             while packet := conversation.next_packet():
                 sending += [packet[1]] if packet[1] else []
                 for message in self._reader.feed(packet[0]):
                     self.sent.append((self.now_s, message))
                     said += self.controller.receive(message)
-            conversation.note_departed(sending)
+            conversation.count_departed(sending)
             if not said:
                 break
         if self._steps % round(1 / STEP_S) == 0:
@@ -148,7 +148,7 @@ class ClosedLoop:
             # A camera that is levelled by an attitude that is wrong puts the place beside the true one.
             off_m = self.map_off_m + HEIGHT_M * math.tan(math.radians(self.mount_tilt_deg))
             off_m += HEIGHT_M * self.brain.tilt + self._noise(_MATCH_SD_M)
-            place = Position(*moved(truth.lat_deg, truth.lon_deg, off_m.real, off_m.imag))
+            place = Position(*offset_position(truth.lat_deg, truth.lon_deg, off_m.real, off_m.imag))
             shown = self.show_tilt and self._noise(_SHOWN_SD) - self.brain.tilt
             error = AttitudeError((shown.real, shown.imag), _SHOWN_SD) if self.show_tilt else None
             event = match_at(place, t_s, vehicle, _MATCH_SD_M, (self._steps,), _VIEW, error)
@@ -171,7 +171,7 @@ class ClosedLoop:
 
     def _recognise(self, event):
         if not event.accepted:
-            self.navigator.hear_frame(event)
+            self.navigator.handle_frame(event)
             return
         fix = self.navigator.advise(event, self._clock.now_s).fix
         if fix:

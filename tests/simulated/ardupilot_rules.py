@@ -30,8 +30,8 @@ _OLDEST_FIX_S = 5.0
 _ALIGNED_AFTER_S = 5.0  # of GPS, at the start; a real one needs half a minute
 _REALIGNED_AFTER_S = 0.5
 _ODOMETRY_GOOD_FOR_S = 0.3
-_LEAST_NOISE_M = 0.2  # of ODOMETRY: VISO_POS_M_NSE
-_MOST_NOISE_M = 100.0
+_MIN_NOISE_M = 0.2  # of ODOMETRY: VISO_POS_M_NSE
+_MAX_NOISE_M = 100.0
 # The share of a wind that comes up without GPS which neither accelerometers nor airspeed reveal to the filter. A plane
 # in ArduPilot's simulator was 767 m off after 150 s in 6 m/s.
 _UNNOTICED_SHARE = 0.85
@@ -107,7 +107,7 @@ class ArduPilot(Firmware):
             variances = [message.pose_covariance[number] for number in (0, 6, 11)]
             # The cube root is ArduPilot's own.
             sd_m = 0.0 if math.isnan(variances[0]) else sum(variance**2 for variance in variances) ** (1 / 3)
-            sd_m = min(_MOST_NOISE_M, max(_LEAST_NOISE_M, sd_m))
+            sd_m = min(_MAX_NOISE_M, max(_MIN_NOISE_M, sd_m))
             self._odometry = complex(message.y, message.x), sd_m, self.now_s
 
     def use_source_set(self, number: float) -> int:

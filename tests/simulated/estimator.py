@@ -13,7 +13,7 @@ import numpy as np
 
 from simulated.motion import GRAVITY_M_S2
 
-LEAST_SD_M = 0.3
+MIN_SD_M = 0.3
 _LOOP_S = 0.01  # EKF_TARGET_DT: noise is given as a standard deviation for one step of this length
 _ACCELERATION_NOISE_M_S2 = 0.35  # EK3_ACC_P_NSE
 _GYRO_NOISE_RAD_S = 0.015  # EK3_GYRO_P_NSE
@@ -29,7 +29,7 @@ class Estimator:
 
     def __init__(self, gyro_error_rad_s: float) -> None:
         self._state = np.zeros(3, complex)
-        self._covariance = np.diag([LEAST_SD_M**2, 0.1**2, math.radians(0.3) ** 2])
+        self._covariance = np.diag([MIN_SD_M**2, 0.1**2, math.radians(0.3) ** 2])
         self._gyro_error_rad_s = gyro_error_rad_s * (1 + 1j) / math.sqrt(2)
 
     @property
@@ -84,4 +84,4 @@ class Estimator:
         """Set the error of the position, and its standard deviation."""
         self._state[0] = error_m
         self._covariance[0, :] = self._covariance[:, 0] = 0.0
-        self._covariance[0, 0] = max(LEAST_SD_M, sd_m) ** 2
+        self._covariance[0, 0] = max(MIN_SD_M, sd_m) ** 2

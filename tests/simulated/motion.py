@@ -12,7 +12,7 @@ from pathlib import Path
 
 from edgevpr.core.arrays import LatLon
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import moved, offset_m, shorter_deg
+from edgevpr.core.geodesy import offset_m, offset_position, shorter_deg
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import read_positions
 
@@ -194,7 +194,7 @@ def displacement_m(point: LatLon, other: LatLon) -> complex:
 
 def displace(point: LatLon, vector_m: complex) -> LatLon:
     """Return the point that lies `vector_m` metres from another: the inverse of `displacement_m`."""
-    return moved(*point, vector_m.real, vector_m.imag) if vector_m else point
+    return offset_position(*point, vector_m.real, vector_m.imag) if vector_m else point
 
 
 def _limit(value: complex, most: float) -> complex:

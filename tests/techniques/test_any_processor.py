@@ -88,5 +88,5 @@ def test_all_that_is_made_of_a_picture_is_the_same_whatever_the_processor_can_do
 def test_a_query_is_turned_to_the_same_picture():
     """Where there is FMA: without it some pixels differ, which no map holds."""
     technique = create("cohog", {"camera": "nadir"})
-    turned, allowed, _ = technique._views_of(technique.encode(whole_numbers()))._picture_of(1.0, 5)
+    turned, allowed, _ = technique._make_views(technique.encode(whole_numbers()))._warp_picture(1.0, 5)
     assert (zlib.crc32(turned), zlib.crc32(allowed)) == (1188350251, 19798888)

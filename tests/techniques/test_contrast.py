@@ -5,7 +5,7 @@ import pytest
 from pictures import textured
 
 from edgevpr.techniques import create
-from edgevpr.techniques.contrast import stretched
+from edgevpr.techniques.contrast import stretch_contrast
 from edgevpr.techniques.gradients import grey_square
 
 CAMERAS = ("forward", "nadir")
@@ -47,11 +47,13 @@ def test_sensor_noise_does_not_become_ground(camera, size, level):
 
 def test_a_picture_is_stretched_the_more_the_less_it_holds_and_without_a_jump():
     plenty = ramp(50, 160)
-    assert stretched(plenty, None, PIXEL_PX, *DOUBLED) is plenty
+    assert stretch_contrast(plenty, None, PIXEL_PX, *DOUBLED) is plenty
     inner = slice(8, -8)  # the ends of the range may be cut off
     nearly = ramp(50, 50 + 101)
-    assert abs(stretched(nearly, None, PIXEL_PX, *DOUBLED) - nearly)[:, inner].max() < 3
-    ranges = [np.ptp(stretched(ramp(20, 20 + levels), None, PIXEL_PX, *DOUBLED)) for levels in (95, 90, 80, 70, 15)]
+    assert abs(stretch_contrast(nearly, None, PIXEL_PX, *DOUBLED) - nearly)[:, inner].max() < 3
+    ranges = [
+        np.ptp(stretch_contrast(ramp(20, 20 + levels), None, PIXEL_PX, *DOUBLED)) for levels in (95, 90, 80, 70, 15)
+    ]
     assert ranges[:4] == sorted(ranges[:4])
     assert ranges[-1] == pytest.approx(200, abs=8), "never to more than what is wanted"
 
@@ -61,7 +63,7 @@ def test_what_is_masked_changes_nothing_of_what_is_not():
     allowed = np.ones((512, 512), bool)
     allowed[200:300, 100:400] = False
     changed = np.where(allowed, dim, np.float32(255))
-    found, other = (stretched(each, allowed, PIXEL_PX, *DOUBLED) for each in (dim, changed))
+    found, other = (stretch_contrast(each, allowed, PIXEL_PX, *DOUBLED) for each in (dim, changed))
     assert found is not dim
     np.testing.assert_array_equal(found[allowed], other[allowed])
-    assert not np.array_equal(stretched(changed, None, PIXEL_PX, *DOUBLED)[allowed], found[allowed])
+    assert not np.array_equal(stretch_contrast(changed, None, PIXEL_PX, *DOUBLED)[allowed], found[allowed])

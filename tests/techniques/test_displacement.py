@@ -8,7 +8,7 @@ from pictures import textured
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.techniques import create
-from edgevpr.techniques.displacement import aligned, displacement, support
+from edgevpr.techniques.displacement import displacement, fit_alignment, support
 
 
 def count_by_hand(asking, best, side, counts):
@@ -118,7 +118,7 @@ def pairs(shift, turn_deg, scale, side=SIDE, wrong=0.0, seed=0):
 
 
 def align(asking, best, shift_cells):
-    return aligned(asking, best, FineMatch(0.5, shift_cells=shift_cells, rotation_deg=350.0, height_ratio=2.0))
+    return fit_alignment(asking, best, FineMatch(0.5, shift_cells=shift_cells, rotation_deg=350.0, height_ratio=2.0))
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def test_a_query_is_laid_as_its_match_says(turned_deg, right_px, down_px, height
         rotation_deg=turned_deg,
         height_ratio=height,
     )
-    laid, seen = overlay.laid(view(ground, turned_deg, right_px, down_px, height), ALLOWED, match, CELLS)
+    laid, seen = overlay.overlay_query(view(ground, turned_deg, right_px, down_px, height), ALLOWED, match, CELLS)
     assert 0.4 < seen.mean() < 1
     inside = cv2.erode(seen.astype(np.uint8), np.ones((5, 5))).astype(bool)
     assert np.corrcoef(laid[inside], view(ground)[inside])[0, 1] > 0.98

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pictures import seen_from_above
 
-from edgevpr.core.contract import nearest_height
+from edgevpr.core.contract import find_nearest_height
 from edgevpr.techniques import create
 from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, hypothesis
 
@@ -35,7 +35,7 @@ def town():
 def test_a_hypothesis_is_a_height_and_a_rotation():
     assert hypothesis(0) == (0.5, 0)
     assert hypothesis(2 * ROTATIONS + 7) == (1.0, 7)
-    nearest = [nearest_height(HEIGHT_RATIOS, ratio) for ratio in (0.1, 0.58, 0.6, 0.9, 1.3, 5)]
+    nearest = [find_nearest_height(HEIGHT_RATIOS, ratio) for ratio in (0.1, 0.58, 0.6, 0.9, 1.3, 5)]
     assert nearest == [0.5, 0.5, 0.7, 1.0, 1.42, 2.0]
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 from recordings import START_S, write_dataflash, write_gpx
 
 from edgevpr.cli.main import main
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.frames.positions import read_positions
 from edgevpr.tracks.clock import clock_offset_s
 from edgevpr.tracks.record import read_record
@@ -120,7 +120,9 @@ def flown(count=40):
         turn = cv2.getRotationMatrix2D((at[number].real, -at[number].imag), np.degrees(course[number]) + 30, 1.0)
         turn[:, 2] += SIDE_PX / 2 - np.array([at[number].real, -at[number].imag])
         pictures.append(cv2.warpAffine(ground.astype(np.uint8), turn, (SIDE_PX, SIDE_PX), flags=cv2.INTER_LINEAR))
-    track = [(t, *moved(*HOME, east, north)) for t, east, north in zip(t_s.tolist(), at.real, at.imag, strict=True)]
+    track = [
+        (t, *offset_position(*HOME, east, north)) for t, east, north in zip(t_s.tolist(), at.real, at.imag, strict=True)
+    ]
     return track, pictures
 
 

@@ -29,7 +29,7 @@ from edgevpr.mapmaking.mapping import build_map
 from edgevpr.mapmaking.pictures import FlownPictures
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import elsewhere
+from edgevpr.places.retrieve import outside_neighbourhood
 from edgevpr.places.sequence import make_sequence_search, sequence_length
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack, queries_ah
@@ -44,7 +44,7 @@ from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
-from edgevpr.techniques import create, labelled
+from edgevpr.techniques import create, format_name
 from edgevpr.techniques.card import find_weights
 
 # Yields the items, of that number, and shows it with a label.
@@ -70,8 +70,8 @@ class MatchOptions:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryAnswer:
     """The judged answer to one query. `has_match`: its place is in the map. `found` is the name of the best reference
-    that is not ignored (None: there is none) and `score` its score (-inf); `first_right` is the rank of the first right
-    reference, from 0 (infinite: none).
+    that is not ignored (None: there is none) and `score` its score (-inf); `rank_first_right` is the rank of the first
+    right reference, from 0 (infinite: none).
 
     `accepted`: a flight would have accepted the match; `accepted_wrong`: and it is wrong; `accepted_off_map`: and the
     query has no place in the map; `accepted_elsewhere`: it is wrong, and no neighbour of a right or ignored reference
@@ -122,14 +122,14 @@ def answer_queries(
     technique: Technique, dataset: Dataset, options: MatchOptions, progress: Progress, gate: Gate | None = None
 ) -> tuple[list[QueryAnswer], tuple[str, ...]]:
     """Map the references of `dataset` in a temporary file, and ask every query. Return one judged answer for each that
-    is scored, and what could not be done to the map (see `mapped`). Raises UsageError where no query has what
-    `options.known` asks for, ModelError for a query that fails."""
+    is scored, and what could not be done to the map (see `open_temporary_map`). Raises UsageError where no query has
+    what `options.known` asks for, ModelError for a query that fails."""
     spec = technique.spec
     prior, tags = read_known(options.known, dataset, spec, options.sequence)
     together = sequence_length(spec, options.sequence)
     source, meter = open_source(str(dataset.ref_dir), live=False), QueryMeter(load_board("this"))
     frames = progress(read_frames(source), source.total, f"{spec.name}: references")
-    with mapped(frames, technique, dataset.ref_dir, progress) as (place_map, index, not_done):
+    with open_temporary_map(frames, technique, dataset.ref_dir, progress) as (place_map, index, not_done):
         rule = accept_rule(technique, MatchConfig(), together, read_calibration_for(place_map))
         follows = options.follow and together == 1 and rule.sure is not None
 
@@ -161,7 +161,7 @@ def answer_queries(
 
 
 @contextmanager
-def mapped(
+def open_temporary_map(
     frames: Iterable[Frame],
     technique: Technique,
     images: Path | None = None,
@@ -206,7 +206,7 @@ def summarise(
     )
     cost = query_cost(encoding, matching, board, parse_pack(battery.pack), efficiency, rss_mb=0.0)
     return metrics.TechniqueResult(
-        technique=labelled(technique.spec.name, technique.spec.form),
+        technique=format_name(technique.spec.name, technique.spec.form),
         weights=find_weights(technique.spec),
         parameters=technique.spec.parameters,
         references=references,
@@ -282,13 +282,13 @@ def _judge(event: Recognition, query: ScoredQuery, references: Sequence[str], in
     right, ignored = (np.array([name in names for name in references]) for names in (query.right, query.ignored))
     counted = np.flatnonzero(~ignored[slots])
     wrong = event.accepted and not (right | ignored)[slots[0]]
-    away = wrong and elsewhere(index, slots[0], np.flatnonzero(right | ignored), 0.0).all()
+    away = wrong and outside_neighbourhood(index, slots[0], np.flatnonzero(right | ignored), 0.0).all()
     return QueryAnswer(
         query=query.path.name,
         has_match=bool(query.right),
         found=references[slots[counted[0]]] if len(counted) else None,
         score=float(ranking.scores[counted[0]]) if ranking and len(counted) else -math.inf,
-        first_right=metrics.first_right(slots[counted], right),
+        first_right=metrics.rank_first_right(slots[counted], right),
         accepted=event.accepted,
         accepted_wrong=bool(wrong),
         accepted_off_map=bool(wrong and not query.right),

@@ -96,7 +96,7 @@ class TechniqueResult(Quality):
     pcu: float | None = None
 
 
-def first_right(ranked: np.ndarray, right: np.ndarray) -> float:
+def rank_first_right(ranked: np.ndarray, right: np.ndarray) -> float:
     """Return the rank, from 0, of the first right reference; infinite if there is none. `ranked` are numbers of
     references, best first. `right`, bool (references,), is True for those that are right."""
     hits = np.flatnonzero(right[ranked])

@@ -13,7 +13,7 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.images import counting_order
 from edgevpr.lab.evaluate.dataset import GroundTruth
-from edgevpr.lab.evaluate.metrics import Quality, compute_both, first_right
+from edgevpr.lab.evaluate.metrics import Quality, compute_both, rank_first_right
 
 
 def read_similarities(path: str | Path) -> Doubles:
@@ -57,7 +57,7 @@ def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequenc
             ranked = np.argsort(-row, kind="stable")
             ranked = ranked[~ignored[ranked]]
             best = row[ranked[0]] if len(ranked) else -math.inf
-            answers.append((best, first_right(ranked, right), bool(right.any())))
+            answers.append((best, rank_first_right(ranked, right), bool(right.any())))
     if not answers:
         raise UsageError(f"{label}: the ground truth scores none of its queries: give the one that belongs to it.")
     columns = map(np.array, zip(*answers, strict=True))

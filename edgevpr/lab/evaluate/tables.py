@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from edgevpr.core.text import aligned
+from edgevpr.core.text import align_table
 from edgevpr.lab.evaluate.metrics import Figures, Interval, Quality, TechniqueResult
 from edgevpr.lab.evaluate.provenance import versions
 
@@ -29,13 +29,13 @@ def _share(heading: str, field: str) -> Column:
     return heading, lambda result: share_text(getattr(result, field, None))
 
 
-def _off_map(result: Figures) -> str:
+def _count_off_map(result: Figures) -> str:
     if not isinstance(result, TechniqueResult) or not result.queries_off_map:
         return "-"
     return f"{result.accepted_off_map} of {result.queries_off_map}"
 
 
-def _accepted(result: Figures) -> str:
+def _count_accepted(result: Figures) -> str:
     return f"{result.accepted} ({result.accepted_wrong})" if isinstance(result, TechniqueResult) else "-"
 
 
@@ -59,8 +59,8 @@ CURVE: tuple[Column, ...] = (
 )
 DECIDED: tuple[Column, ...] = (
     _share("PCU", "pcu"),
-    ("accepted (wrong)", _accepted),
-    ("off the map", _off_map),
+    ("accepted (wrong)", _count_accepted),
+    ("off the map", _count_off_map),
 )
 COSTS: tuple[Column, ...] = (
     ("t_e ms", lambda result: f"{result.t_encode_s * 1000:.1f}"),
@@ -94,7 +94,7 @@ def results_text(results: Sequence[Quality]) -> str:
     texts = []
     for columns in (RECALLS, (*CURVE, *DECIDED), COSTS) if has_costs else (RECALLS, CURVE):
         rows = [row for result in results for row in make_rows(result, columns, both=columns is not COSTS)]
-        texts.append("\n".join(aligned([list_headings(columns), *rows])) + "\n")
+        texts.append("\n".join(align_table([list_headings(columns), *rows])) + "\n")
     return "\n".join([*texts, *list_notes(results)])
 
 

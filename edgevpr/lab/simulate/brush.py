@@ -101,7 +101,7 @@ def roof(
     canvas: Scene, centre_m: Doubles, length_m: float, width_m: float, turn_rad: float, wall_m: float, colour: Doubles
 ) -> None:
     """Paint a building with walls `wall_m` high and a gable roof. Its ridge is `turn_rad` anticlockwise from east."""
-    along, across = axes_of(turn_rad)
+    along, across = rotate_axes(turn_rad)
     corners = [centre_m + a * along * length_m / 2 + b * across * width_m / 2 for a, b in AROUND]
     box = canvas.box(corners, 1.0)
     cover = canvas.polygon(box, corners)
@@ -137,7 +137,7 @@ def stand(canvas: Scene, dome: Singles, centre_m: tuple[float, float], top_m: fl
     canvas.albedo[box][seen] = np.clip(np.asarray(colour) * (0.55 + 0.5 * dome[seen][:, None]), 0, 255)
 
 
-def axes_of(turn_rad: float) -> tuple[Doubles, Doubles]:
+def rotate_axes(turn_rad: float) -> tuple[Doubles, Doubles]:
     """Return two unit vectors (2,): along the direction `turn_rad`, anticlockwise from east, and to the left of it."""
     return np.array([np.cos(turn_rad), np.sin(turn_rad)]), np.array([-np.sin(turn_rad), np.cos(turn_rad)])
 
@@ -170,7 +170,7 @@ def parcels(
         side = longest_side(piece)
         angle = np.arctan2(side[1], side[0]) + np.pi / 2 + rng.normal(0, 0.16)
         through = piece.mean(axis=0) + rng.uniform(-0.2, 0.2) * side
-        halves, line = _cut(piece, through, axes_of(angle)[1])
+        halves, line = _cut(piece, through, rotate_axes(angle)[1])
         cuts.append((level, line))
         todo += [(level + 1, half) for half in halves]
     return fields, cuts

@@ -9,7 +9,7 @@ import numpy as np
 from edgevpr.core.arrays import Array, Doubles, Image
 from edgevpr.lab.simulate.brush import Scene, noise, smooth_step
 
-_LONGEST_SHADOW_M = 30.0
+_MAX_SHADOW_M = 30.0
 _STRIP = 256  # rows lit at a time: the working memory stays small
 
 
@@ -70,7 +70,7 @@ def ground_to_pixel(pose: CameraPose, camera: Camera) -> Doubles:
     return pixel_from_ground
 
 
-def lit(scene: Scene, light: Light, seed: int) -> Image:
+def light_scene(scene: Scene, light: Light, seed: int) -> Image:
     """Light the scene: uint8 (H, W, 3) BGR with shaded slopes, cast shadows, and shadows of clouds made from `seed`."""
     azimuth, elevation = np.radians((light.sun_azimuth_deg, light.sun_elevation_deg))
     towards_sun = float(np.sin(azimuth)), float(-np.cos(azimuth))  # in columns and rows
@@ -99,7 +99,7 @@ def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: flo
     # (x, y). The maximum over 2k pixels comes from those over the first and the next k: eight passes look 256 far.
     drop_cm = 100 * scene.metres_per_pixel * steepness
     blocking, steps = scene.height_cm, 1
-    while steps * scene.metres_per_pixel < _LONGEST_SHADOW_M:
+    while steps * scene.metres_per_pixel < _MAX_SHADOW_M:
         shift = np.array([[1, 0, steps * towards_sun[0]], [0, 1, steps * towards_sun[1]]])
         flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
         size = blocking.shape[::-1]
@@ -134,8 +134,8 @@ def photograph(
     rng: np.random.Generator,
     border: int = cv2.BORDER_REFLECT,
 ) -> np.ndarray:
-    """Take one frame, uint8 (camera.height, camera.width, 3) BGR, of a `lit` ground; `rng` makes the sensor's noise.
-    `border` is what OpenCV shows beyond the ground: its mirror image, or nothing (BORDER_CONSTANT)."""
+    """Take one frame, uint8 (camera.height, camera.width, 3) BGR, of a `light_scene` ground; `rng` makes the sensor's
+    noise. `border` is what OpenCV shows beyond the ground: its mirror image, or nothing (BORDER_CONSTANT)."""
     # The centre of the north-west pixel is half a pixel inside of the scene.
     half, depth_m = metres_per_pixel / 2, len(ground) * metres_per_pixel
     metres_from_pixel = np.array([[metres_per_pixel, 0, half], [0, -metres_per_pixel, depth_m - half], [0, 0, 1]])

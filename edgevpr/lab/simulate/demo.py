@@ -16,7 +16,7 @@ from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import progress
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
-from edgevpr.lab.simulate.camera import lit, view_on_ground
+from edgevpr.lab.simulate.camera import light_scene, view_on_ground
 from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
     SCENE_WIDTH_M,
@@ -68,7 +68,7 @@ def run_demo(folder: str | Path) -> str:
     run_command("map", "build", map_path, *images, "--technique", "cohog", "--no-calibrate")
     run_command("run", "--map", map_path, "--source", second / "images", *_CAMERA, "--log", log_path)
     queries, places = read_queries(log_path, first, second)
-    _draw(picture_path, lit(scene, mapping.light, mapping.seed), mapping, queries)
+    _draw(picture_path, light_scene(scene, mapping.light, mapping.seed), mapping, queries)
     return f"""{summarise(queries, places)}
 picture           {picture_path}
 page              edgevpr report {log_path} --out {folder / "report.html"}"""

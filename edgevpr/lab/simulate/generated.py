@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Image
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.simulate.brush import Scene
-from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, light_scene, photograph
 from edgevpr.lab.simulate.landscape import make_scene
 
 # The south-west corner of every scene: the home of ArduPilot's simulator (its Tools/autotest/locations.txt, CMAC).
@@ -89,7 +89,7 @@ def later_flight(seed: int) -> GeneratedFlight:
 
 def write_flight(folder: str | Path, scene: Scene, flight: GeneratedFlight) -> Iterator[str]:
     """Write the pictures of a flight over a scene with `write_shots`."""
-    ground = lit(scene, flight.light, flight.seed)
+    ground = light_scene(scene, flight.light, flight.seed)
     rng = np.random.default_rng((flight.seed, 3))
 
     def shots() -> Iterator[tuple[GeoTag, Image]]:
@@ -134,7 +134,7 @@ def fly_and_write(folder: Path, which: str, seed: int) -> str:
 
 def to_position(pose: CameraPose) -> Position:
     """Return the geographic position of a pose in the scene, a plane that touches the globe at ORIGIN."""
-    lat_deg, lon_deg = moved(ORIGIN.lat_deg, ORIGIN.lon_deg, pose.east_m, pose.north_m)
+    lat_deg, lon_deg = offset_position(ORIGIN.lat_deg, ORIGIN.lon_deg, pose.east_m, pose.north_m)
     return Position(lat_deg, lon_deg, _ORIGIN_ALT_M + pose.height_m)
 
 

@@ -15,13 +15,13 @@ from edgevpr.lab.simulate.brush import (
     BASE_CM,
     Bend,
     Scene,
-    axes_of,
     bgr_mix,
     crown,
     longest_side,
     noise,
     parcels,
     roof,
+    rotate_axes,
     smooth_step,
     stand,
     winding,
@@ -74,22 +74,22 @@ def _border(rng: np.random.Generator, canvas: Scene, line_m: Doubles, level: int
         canvas.paint(box, wall, _STONE)
         canvas.height_cm[box] = np.where(wall > 0.5, BASE_CM + 130, canvas.height_cm[box])
     if kind == "strip" or (kind in ("lane", "wall") and rng.random() < 0.6):
-        return _along(rng, line_m, step_m=26, spread_m=1.5 if kind == "strip" else 4.5, radius_m=2.6)
+        return _plant_along(rng, line_m, step_m=26, spread_m=1.5 if kind == "strip" else 4.5, radius_m=2.6)
     if kind == "hedge":
-        shrubs = _along(rng, line_m, step_m=1.3, spread_m=0.35, radius_m=1.25)
+        shrubs = _plant_along(rng, line_m, step_m=1.3, spread_m=0.35, radius_m=1.25)
         gaps = np.sin(np.arange(len(shrubs)) * rng.uniform(0.05, 0.2) + rng.uniform(0, 6)) > -0.85
-        return np.concatenate((shrubs[gaps], _along(rng, line_m, step_m=22, spread_m=0.8, radius_m=2.9)))
+        return np.concatenate((shrubs[gaps], _plant_along(rng, line_m, step_m=22, spread_m=0.8, radius_m=2.9)))
     return np.empty((0, 4))
 
 
-def _along(rng: np.random.Generator, line_m: Doubles, step_m: float, spread_m: float, radius_m: float) -> Doubles:
+def _plant_along(rng: np.random.Generator, line_m: Doubles, step_m: float, spread_m: float, radius_m: float) -> Doubles:
     """Return trees about every `step_m` along a line, about `spread_m` off it, with radii of about `radius_m`."""
     run_m = np.concatenate(([0], np.cumsum(np.hypot(*np.diff(line_m, axis=0).T))))
     at_m = np.arange(rng.uniform(0, step_m), run_m[-1], step_m)
     at_m += rng.normal(0, step_m * 0.25, len(at_m))
     points = np.column_stack([np.interp(at_m, run_m, line_m[:, axis]) for axis in (0, 1)])
     points += rng.normal(0, spread_m, points.shape)
-    return _grown(rng, points, radius_m, (1.4, 2.2))
+    return _grow_trees(rng, points, radius_m, (1.4, 2.2))
 
 
 def _river(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> Doubles:
@@ -107,7 +107,7 @@ def _river(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> Doubles:
     level_cm = BASE_CM + bank * 12 * fine - 170 * smooth_step(away_m, 8.5, 5.5)
     canvas.height_cm[box] = np.where(bank > 0, np.clip(level_cm, 0, None), canvas.height_cm[box])
     beside = np.gradient(line_m, axis=0)[:, ::-1] * (-1, 1) / np.hypot(*np.gradient(line_m, axis=0).T)[:, None]
-    return np.concatenate([_along(rng, line_m + side * 11 * beside, 8.0, 2.5, 2.6) for side in (-1, 1)])
+    return np.concatenate([_plant_along(rng, line_m + side * 11 * beside, 8.0, 2.5, 2.6) for side in (-1, 1)])
 
 
 def _road(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> None:
@@ -128,7 +128,7 @@ def _farms(rng: np.random.Generator, canvas: Scene, road_m: Doubles, river_m: Do
     for at in range(18, len(road_m) - 18, 13):
         ahead = road_m[at + 1] - road_m[at]
         turn_rad = float(np.arctan2(ahead[1], ahead[0])) + rng.normal(0, 0.12)
-        along, beside = axes_of(turn_rad)
+        along, beside = rotate_axes(turn_rad)
         middle = road_m[at] + beside * rng.choice([-1, 1]) * 24 + along * rng.normal(0, 4)
         if np.hypot(*(river_m - middle).T).min() > 42 and rng.random() < 0.7:
             _farm(rng, canvas, middle, turn_rad)
@@ -138,7 +138,7 @@ def _farms(rng: np.random.Generator, canvas: Scene, road_m: Doubles, river_m: Do
 
 def _farm(rng: np.random.Generator, canvas: Scene, middle: Doubles, turn_rad: float) -> None:
     """Paint a yard with ragged edges, buildings around it and vehicles on it."""
-    along, beside = axes_of(turn_rad)
+    along, beside = rotate_axes(turn_rad)
     yard = np.array([middle + a * along * 19 + b * beside * 17 for a, b in AROUND])
     box = canvas.box(yard, 4.0)
     cover = canvas.polygon(box, yard)
@@ -191,7 +191,7 @@ def _plant(
 Look = tuple[Array, Array]  # colour (H, W, 3) BGR, relief (H, W) cm
 
 
-def _ploughed(patches: Singles, tufts: Singles, across_m: Array) -> Look:
+def _plough(patches: Singles, tufts: Singles, across_m: Array) -> Look:
     furrow = np.sin(across_m * (2 * np.pi / 1.2) + 0.5 * tufts)
     return bgr_mix(SOIL, MUD, smooth_step(patches + 0.7 * tufts + 0.25 * furrow, -2, 2.4)), 2 * furrow + 2 * tufts
 
@@ -235,7 +235,7 @@ def _forest_floor(patches: Singles, tufts: Singles, across_m: Array) -> Look:
 _KINDS: tuple[tuple[float, Callable[[Singles, Singles, Array], Look], tuple[float, float, float] | None], ...] = (
     (7, _pasture, (31, 40, 2.6)),
     (4, _meadow, (60, 60, 2.8)),
-    (4, _ploughed, None),
+    (4, _plough, None),
     (5, _cereal, None),
     (4, _row_crop, None),
     (2.5, _forest_floor, (4.1, 1.4, 2.8)),
@@ -249,7 +249,7 @@ def _field(rng: np.random.Generator, canvas: Scene, outline_m: Doubles) -> Doubl
     _, look, trees_m = _KINDS[rng.choice(len(_KINDS), p=weights / weights.sum())]
     side = longest_side(outline_m[:: max(1, len(outline_m) // 10)])
     turn_rad = np.arctan2(side[1], side[0]) + rng.normal(0, 0.06)
-    along, _ = axes_of(turn_rad)
+    along, _ = rotate_axes(turn_rad)
     box = canvas.box(outline_m)
     if canvas.height_cm[box].size:
         cover = canvas.polygon(box, outline_m)
@@ -267,16 +267,16 @@ def _trees(
     rng: np.random.Generator, outline_m: Doubles, turn_rad: float, spacing_m: float, scatter_m: float, radius_m: float
 ) -> Doubles:
     """Return trees in rows along `turn_rad`, `spacing_m` apart, moved at random by about `scatter_m`."""
-    along, across = axes_of(turn_rad)
+    along, across = rotate_axes(turn_rad)
     reach_m = np.arange(-110, 110, spacing_m)
     u, v = (axis.reshape(-1, 1) for axis in np.meshgrid(reach_m, reach_m))
     points_m = outline_m.mean(axis=0) + u * along + v * across
     points_m = points_m + rng.normal(0, scatter_m, points_m.shape)
     outline = outline_m.astype(np.float32)
     inside = [cv2.pointPolygonTest(outline, (float(x), float(y)), True) > 2.5 for x, y in points_m]
-    return _grown(rng, points_m[np.array(inside, bool)], radius_m, (1.6, 2.6))
+    return _grow_trees(rng, points_m[np.array(inside, bool)], radius_m, (1.6, 2.6))
 
 
-def _grown(rng: np.random.Generator, points_m: Doubles, radius_m: float, slender: tuple[float, float]) -> Doubles:
+def _grow_trees(rng: np.random.Generator, points_m: Doubles, radius_m: float, slender: tuple[float, float]) -> Doubles:
     radius = radius_m * rng.uniform(0.6, 1.35, len(points_m))
     return np.column_stack((points_m, radius, radius * rng.uniform(*slender, len(points_m))))

@@ -16,10 +16,10 @@ from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph, view_on_ground
 from edgevpr.lab.simulate.generated import wander, write_shots
-from edgevpr.mapmaking.cuttings import MOST_WITHOUT_DATA, extent_words
+from edgevpr.mapmaking.cuttings import MAX_WITHOUT_DATA, extent_words
 from edgevpr.mapmaking.missions import read_area
 from edgevpr.mapmaking.orthophoto import Orthophoto
-from edgevpr.mapmaking.tiles import Ground, ground_of
+from edgevpr.mapmaking.tiles import Ground, surround
 
 SPEED_M_S = 10.0
 _SWAY_DEG = 2.0  # the most roll, pitch and yaw off a track that tells none
@@ -36,7 +36,7 @@ def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list
     if Path(path).suffix.lower() == ".csv":
         shots = [tag for tag in read_positions(path).values() if tag.position]
     else:
-        shots = _of_mission(path, every_m)
+        shots = _fly_mission(path, every_m)
     if not shots:
         raise UsageError(f"{path} has no path: a track needs waypoints, or lines with lat and lon.")
     places = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
@@ -56,7 +56,7 @@ def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list
     return flown
 
 
-def _of_mission(path: str | Path, every_m: float) -> list[GeoTag]:
+def _fly_mission(path: str | Path, every_m: float) -> list[GeoTag]:
     waypoints = read_area(path).path
     if len(waypoints) < 2:
         return []
@@ -74,7 +74,7 @@ def ground_under(shots: Sequence[GeoTag], fov_deg: float) -> Ground:
     """Return the ground that the pictures show, for tiles of it."""
     points = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
     highest_m = max(shot.height_m or 0.0 for shot in shots)
-    return ground_of(points, 2 * highest_m * math.tan(math.radians(fov_deg / 2)))
+    return surround(points, 2 * highest_m * math.tan(math.radians(fov_deg / 2)))
 
 
 def make_poses(shots: list[GeoTag], seed: int) -> list[CameraPose]:
@@ -92,7 +92,7 @@ def make_poses(shots: list[GeoTag], seed: int) -> list[CameraPose]:
     return poses
 
 
-def seen_from(
+def photograph_from(
     orthophoto: Orthophoto, at: Position, pose: CameraPose, camera: Camera, light: Light, rng: np.random.Generator
 ) -> Image | None:
     """Take one picture over `at`, uint8 (camera.height, camera.width, 3) BGR. Returns None if the orthophoto lacks a
@@ -110,7 +110,7 @@ def seen_from(
     view = np.zeros(valid.shape, np.uint8)
     in_pixels = (corners_m * (1, -1) + half_m) / metres_per_pixel - 0.5
     cv2.fillConvexPoly(view, in_pixels.round().astype(np.int32), 1)
-    if valid[view > 0].mean() < 1 - MOST_WITHOUT_DATA:
+    if valid[view > 0].mean() < 1 - MAX_WITHOUT_DATA:
         return None
     over_patch = replace(pose, east_m=half_m, north_m=half_m)
     return photograph(ground, metres_per_pixel, over_patch, camera, light, rng)
@@ -127,7 +127,7 @@ def write_overflight(
 
     def taken() -> Iterator[tuple[GeoTag, Image | None]]:
         for shot, pose in zip(shots, make_poses(shots, seed), strict=True):
-            picture = seen_from(orthophoto, shot.position, pose, camera, _LIGHT, rng) if shot.position else None
+            picture = photograph_from(orthophoto, shot.position, pose, camera, _LIGHT, rng) if shot.position else None
             tag = replace(shot, heading_deg=pose.heading_deg, roll_deg=pose.roll_deg, pitch_deg=pose.pitch_deg)
             yield tag, picture
 

@@ -23,13 +23,13 @@ from edgevpr.runtime.recognise.recognition import Recognition
 DELAYS_S = np.arange(-1.0, 6.05, 0.1)  # those that are tried
 
 _KEPT_S = 60.0  # of the motion; matches of that time are compared with it
-_LONGEST_GAP_S = 1.0  # between two reports
+_MAX_GAP_S = 1.0  # between two reports
 _EVERY_S = 0.9  # matches nearer to each other say the same
 _MAX_MATCHES = 20
-_LEAST_MATCHES = 4  # that say anything of a delay
+_MIN_MATCHES = 4  # that say anything of a delay
 # What the usual delay counts against another one, as chi-square: at most this, since a delay of seconds is possible;
 # pictures that are newer than they claim are so many times less usual than older ones, without this limit.
-_MOST_AGAINST = 30.0
+_MAX_AGAINST = 30.0
 _NEWER = 4.0
 # By how much reported motion and matches may differ, beside the accuracy that a match says of itself: velocity by an
 # unknown wind (m/s), which changes (m/s in one second), or with GPS; direction by compass and mounting, which wanders.
@@ -54,7 +54,7 @@ _MAY_CHANGE_S = 0.5
 _OF_ANOTHER_AGE_S = 1.5
 _COMPARED = 12  # matches
 _DETERMINED_S = 0.3  # standard deviation of a delay that is known
-_MOST_COST = 3.0  # chi-square of each match, of those that have one delay
+_MAX_COST = 3.0  # chi-square of each match, of those that have one delay
 _SHOW_ANOTHER = 8  # matches that may show a delay that is another one
 _REMEMBERED = 0.9  # share of what was learnt half a minute ago that still counts
 _AGREEING = 2  # matches in a row after which pictures count as before
@@ -118,7 +118,7 @@ class AgeWatch:
         not, and heading of the aircraft."""
         if self._motion and t_s <= self._motion[-1][0]:
             return
-        if self._motion and t_s - self._motion[-1][0] > _LONGEST_GAP_S:
+        if self._motion and t_s - self._motion[-1][0] > _MAX_GAP_S:
             self._motion.clear()
             self._sightings, self._others = [], []
         heading_deg = math.nan if heading_deg is None else heading_deg
@@ -170,13 +170,13 @@ class AgeWatch:
     def _learn(self, now_s: float) -> None:
         """Estimate the delay anew with one match more."""
         new = [each for each in self._sightings if each.t_s > self._learnt_s and each.delay_s is None]
-        if len(new) < _LEAST_MATCHES:
+        if len(new) < _MIN_MATCHES:
             return
         shown = self._learnt + self._cost(new, np.tile(DELAYS_S[:, None], len(new)))
-        if shown.min() > _MOST_COST * len(new):
+        if shown.min() > _MAX_COST * len(new):
             return
         over = DELAYS_S / self._usual_s
-        self._delay = _estimate(shown + np.where(over < 0, (_NEWER * over) ** 2, np.minimum(over**2, _MOST_AGAINST)))
+        self._delay = _estimate(shown + np.where(over < 0, (_NEWER * over) ** 2, np.minimum(over**2, _MAX_AGAINST)))
         if now_s - new[0].t_s > _KEPT_S / 2 or len(new) == _MAX_MATCHES:
             self._learnt_s, self._learnt = now_s, _REMEMBERED * (shown - shown.min())
 
@@ -198,7 +198,7 @@ class AgeWatch:
             return
         shown = self._cost(self._others, np.tile(DELAYS_S[:, None], len(self._others)))
         found = _estimate(shown)
-        if shown.min() < _MOST_COST * len(self._others) and found.sd_s < _DETERMINED_S and found.s > -_MAY_CHANGE_S:
+        if shown.min() < _MAX_COST * len(self._others) and found.sd_s < _DETERMINED_S and found.s > -_MAY_CHANGE_S:
             self._sightings, self._others, self._delay, self.is_unknown = self._others, [], found, False
             self._learnt_s, self._learnt = -math.inf, np.zeros(len(DELAYS_S))
 
@@ -214,7 +214,7 @@ class AgeWatch:
         if where is None or frame is None or not self._motion:
             return None
         t_s, here = frame.t_mono_s + self._taken_out_s, where.position
-        if not self._motion[0][0] <= t_s - DELAYS_S[-1] <= t_s <= self._motion[-1][0] + _LONGEST_GAP_S:
+        if not self._motion[0][0] <= t_s - DELAYS_S[-1] <= t_s <= self._motion[-1][0] + _MAX_GAP_S:
             return None
         self._origin = self._origin or here
         east_m, north_m = offset_m(self._origin.lat_deg, self._origin.lon_deg, here.lat_deg, here.lon_deg)
@@ -229,7 +229,7 @@ class AgeWatch:
     def _compare(self, seen: Sighting) -> tuple[Comparison, Delay | None]:
         """Compare a match with the delay of those before it; return also its own delay (None: none fits)."""
         before = self._sightings[-_COMPARED:]
-        if self._delay is None or len(before) < _LEAST_MATCHES:
+        if self._delay is None or len(before) < _MIN_MATCHES:
             return Comparison.UNKNOWN, None
         usual_s = self._delay.s
         delays_s = np.tile([usual_s if each.delay_s is None else each.delay_s for each in before], (len(DELAYS_S), 1))

@@ -93,7 +93,7 @@ class ToAutopilot:
         was given up before it was sent; and a line "between" for each fix that was sent between two matches."""
         with self._link.turn("answers"):
             for sending in self._link.take_between():
-                self._notifier.log("between", t_sent_s=sending.t_sent_s, **_place_of(sending.fix))
+                self._notifier.log("between", t_sent_s=sending.t_sent_s, **_position_fields(sending.fix))
             # An answer can arrive a moment before the link has noted that the fix was sent.
             settled = [each for each in self._unanswered if each[1].sent is False or (each[1].sent and each[1].outcome)]
             for query, sending in settled:
@@ -116,9 +116,9 @@ class ToAutopilot:
         with self._link.turn("told"):
             fix, sending = None, None
             if event.accepted:
-                fix, sending = self._fixed(event)
+                fix, sending = self._send_match(event)
             else:
-                self._navigator.hear_frame(event)
+                self._navigator.handle_frame(event)
             is_heard = self._link.listens()
         if sending and is_heard:
             sending.wait(_SETTLED_WITHIN_S)
@@ -126,8 +126,8 @@ class ToAutopilot:
             if sending:
                 if sending.sent is not False:  # a fix that was not sent gets no answer; the line of its query says why
                     self._unanswered.append((event.name, sending))
-                fix = _reported(event.name, sending)
-            self._tell(event, used_mah)
+                fix = _make_report(event.name, sending)
+            self._send_figures(event, used_mah)
         return replace(event, fix=fix)
 
     def correct_age(self, frame: Frame) -> Frame:
@@ -164,14 +164,14 @@ class ToAutopilot:
     def add_motion(self, event: Recognition) -> None:
         """Report to the navigator the motion that a picture shows which is no query."""
         with self._link.turn("saw"):
-            self._navigator.hear_frame(event, is_query=False)
+            self._navigator.handle_frame(event, is_query=False)
 
     def needs_motion_frames(self) -> bool:
         """Tell whether the position rests on matches, so that the motion between two of them is of use."""
         with self._link.turn("wants strides"):
             return not self._navigator.has_gps
 
-    def _tell(self, event: Recognition, used_mah: float) -> None:
+    def _send_figures(self, event: Recognition, used_mah: float) -> None:
         now_s = self._clock.mono_s()
         if event.accepted and (best := event.best):
             place, score = best.place.place_id, best.match.score
@@ -217,11 +217,11 @@ class ToAutopilot:
 
     def _ask_for_sources(self) -> None:
         vehicle, now_s = self._link.vehicle(), self._clock.mono_s()
-        if vehicle is None or not vehicle.is_fresh_at(now_s) or not self._send_fixes or not self._source_sets.are_set:
+        if vehicle is None or not vehicle.is_fresh(now_s) or not self._send_fixes or not self._source_sets.are_set:
             return
         has_own, stats = self._navigator.knows_position(now_s), self._link.stats()
         answered_s = stats.answered_s.get(messages.SOURCE_SET, -math.inf)
-        if number := self._source_sets.wanted(now_s, self._navigator.has_gps, has_own, answered_s):
+        if number := self._source_sets.choose_set(now_s, self._navigator.has_gps, has_own, answered_s):
             self._notifier.announce(messages.Severity.WARNING, f"source set {number} asked for", topic="sources")
             self._link.send(messages.source_set(number, stats.autopilot_system_id or 0))
 
@@ -233,7 +233,7 @@ class ToAutopilot:
             self._notifier.log("output", state=output.name)
             self._notifier.announce(output.severity, output.text, topic="output")
 
-    def _fixed(self, event: Recognition) -> tuple[FixReport | None, Sending | None]:
+    def _send_match(self, event: Recognition) -> tuple[FixReport | None, Sending | None]:
         """Send the fix of an accepted match. Return (None, the sending), or (a report of why it is not sent, None)."""
         try:
             advice = self._navigator.advise(event, self._clock.mono_s())
@@ -271,10 +271,10 @@ class SourceSets:
 
     @property
     def are_set(self) -> bool:
-        """True if both numbers are configured; `wanted` is asked for only then."""
+        """True if both numbers are configured; `choose_set` is asked for only then."""
         return self._with_gps is not None and self._without is not None
 
-    def wanted(self, now_s: float, has_gps: bool, has_own: bool, answered_s: float) -> int | None:
+    def choose_set(self, now_s: float, has_gps: bool, has_own: bool, answered_s: float) -> int | None:
         """Return the number of the set to ask for now (None: none). `has_gps`: there is a GPS that is believed;
         `has_own`: our own position is known well enough; `answered_s`: when such a question was last answered."""
         if not has_gps:
@@ -289,17 +289,17 @@ class SourceSets:
         return wanted
 
 
-def _reported(query: str, sending: Sending) -> FixReport:
+def _make_report(query: str, sending: Sending) -> FixReport:
     return FixReport(
         query=query,
         sent=sending.sent,
         why=sending.why,
         answer=sending.answer,
-        **_place_of(sending.fix),
+        **_position_fields(sending.fix),
     )
 
 
-def _place_of(fix: Fix) -> dict[str, float]:
+def _position_fields(fix: Fix) -> dict[str, float]:
     at = {"lat_deg": round(fix.lat_deg, 7), "lon_deg": round(fix.lon_deg, 7)}
     return {**at, "accuracy_m": round(fix.accuracy_m, 2)}
 

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 
 from edgevpr.core.errors import ImageError
 from edgevpr.core.types import Frame
-from edgevpr.frames.images import as_jpeg, decoded
+from edgevpr.frames.images import decode_jpeg, encode_jpeg
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source
 from edgevpr.mavlink.address import LinkAddress
@@ -147,11 +147,11 @@ class RecordedSource(Source):
         if frame is None:
             self._tape.note("frame", None)
             return None
-        jpeg = as_jpeg(frame.image)
+        jpeg = encode_jpeg(frame.image)
         known = {name: getattr(frame, name) for name in Frame.__slots__ if name not in _UNPACKED}
         position = frame.position and asdict(frame.position)
         self._tape.note("frame", known | {"number": self._keep(jpeg), "position": position} | self._step())
-        return replace(frame, image=decoded(jpeg))
+        return replace(frame, image=decode_jpeg(jpeg))
 
     def _step(self) -> dict[str, float]:
         self.step_s = self._source.step_s
@@ -170,8 +170,8 @@ class TapedTurns(Turns):
         self.steps: list[tuple[Any, ...]] = []
 
     @contextmanager
-    def of_link(self, name: str) -> Iterator[None]:
-        with super().of_link(name):
+    def take_link_turn(self, name: str) -> Iterator[None]:
+        with super().take_link_turn(name):
             self.steps = []
             try:
                 yield

@@ -9,7 +9,7 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.runtime.flight.measurements import PositionedMatch
-from edgevpr.runtime.recognise.locate import in_sd
+from edgevpr.runtime.recognise.locate import mahalanobis
 
 # Limits in standard deviations. A right fix is more than _CONTRADICTS from the expected position once in 3000 times. A
 # second right fix is within _AGREES of the first seven times in eight; otherwise the one after it is.
@@ -75,8 +75,8 @@ class Consistency:
         """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed; `is_followed`: the path
         is known from frame to frame, so that it takes several to be wrong."""
         step_m, is_turned = fix.beside_m, not fix.seen.is_turned_like(self._turn_deg)
-        if in_sd(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS and not is_turned:
-            return self._believed(fix, BELIEVED)
+        if mahalanobis(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS and not is_turned:
+            return self._believe(fix, BELIEVED)
         off_m, good_to_m = math.hypot(*step_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
         turned = Reason(ReasonCode.HELD_TURNED, {"turn_deg": fix.seen.turn_deg or 0.0})
         if has_gps:
@@ -86,7 +86,7 @@ class Consistency:
         if all(fix.seen.is_of_other_places(each.seen) for each in self._row):  # neighbours share places
             self._row.append(fix)
         if len(self._row) == _IN_A_ROW:
-            return self._believed(fix, GateResult(is_against=True, is_lost=True))
+            return self._believe(fix, GateResult(is_against=True, is_lost=True))
         if is_turned:
             return GateResult(turned)
         drift_m_s = _FOLLOWED_DRIFT_M_S if is_followed else _DRIFT_M_S
@@ -94,12 +94,12 @@ class Consistency:
             self._agreeing.append(fix)
             is_enough = not is_followed or len(self._agreeing) >= _IN_A_ROW
             if is_enough and _is_independent(self._agreeing[0], fix, drift_m_s):
-                return self._believed(fix, GateResult(is_against=True))
+                return self._believe(fix, GateResult(is_against=True))
         else:
             self._agreeing = [fix]
         return GateResult(Reason(ReasonCode.HELD_OFF_PATH, {"off_m": off_m, "accuracy_m": good_to_m}))
 
-    def _believed(self, fix: ComparedFix, verdict: GateResult) -> GateResult:
+    def _believe(self, fix: ComparedFix, verdict: GateResult) -> GateResult:
         self._agreeing, self._row = [], []
         if fix.seen.turn_deg is not None:
             self._turn_deg = fix.seen.turn_deg
@@ -111,7 +111,7 @@ def _differ(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> float:
     they are 30 s apart."""
     if abs(other.seen.t_s - one.seen.t_s) > _GOOD_FOR_S:
         return math.inf
-    return in_sd(other.beside_m - one.beside_m, _sum_covariances(one, other, drift_m_s))
+    return mahalanobis(other.beside_m - one.beside_m, _sum_covariances(one, other, drift_m_s))
 
 
 def _could_follow(one: ComparedFix, other: ComparedFix) -> bool:
@@ -128,7 +128,7 @@ def _is_independent(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> b
     if other.seen.is_of_other_places(one.seen):
         return True
     flown_m = other.path_m + other.expected_m - one.path_m - one.expected_m
-    return in_sd(flown_m, _sum_covariances(one, other, drift_m_s)) > _CONTRADICTS
+    return mahalanobis(flown_m, _sum_covariances(one, other, drift_m_s)) > _CONTRADICTS
 
 
 def _sum_covariances(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> Doubles:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
-from edgevpr.runtime.recognise.locate import in_sd
+from edgevpr.runtime.recognise.locate import mahalanobis
 
 GRAVITY_M_S2 = 9.80665
 # So long an error of the attitude of an autopilot that reckons lasts. Nothing but pictures shows it, and not all do: if
@@ -160,7 +160,7 @@ class DriftFilter:
         x, p = go_on @ self._x, go_on @ self._p @ go_on.T
         x[_F] += stride.off_m
         p[_F, _F] += stride.sd_m**2 * _EYE
-        if in_sd(look @ x, look @ p @ look.T + variance_m2 * _EYE) > _CONTRADICTS:
+        if mahalanobis(look @ x, look @ p @ look.T + variance_m2 * _EYE) > _CONTRADICTS:
             self._begin_frame()
             return False
         self._x, self._p = x, p

@@ -42,7 +42,7 @@ from edgevpr.runtime.flight.stop import StopNow
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import MapWatch, Sight, Surveyor, Tally
 from edgevpr.runtime.preflight.pick import limit_candidates
-from edgevpr.runtime.recognise.recognition import Recognition, fields_of
+from edgevpr.runtime.recognise.recognition import Recognition, to_fields
 
 _MAX_WAIT_S = 0.2  # a pass of the loop waits no longer than this for a frame
 
@@ -103,7 +103,7 @@ class Flight:
     def open(cls, config: Config, io: FlightIO) -> "Flight":
         """Open map, log, links and source. Raises EdgevprError, and StopNow if a signal ends the flight before it
         begins."""
-        systemd.notify(EXTEND_TIMEOUT_USEC=systemd.LONGEST_START_US)
+        systemd.notify(EXTEND_TIMEOUT_USEC=systemd.MAX_START_US)
         with ExitStack() as stack:
             with io.stop.beginning():
                 recogniser = open_map(config, io)
@@ -183,7 +183,7 @@ class Flight:
         if (not is_query and not self._is_time_for_stride()) or (is_paused and not source.is_live):  # a recording waits
             clock.sleep(_MAX_WAIT_S if is_query else min(wait_s, _MAX_WAIT_S))
             return
-        with meter.timed() as reading:
+        with meter.measure_cost() as reading:
             try:
                 frame: Frame | ImageError | None = source.read(_MAX_WAIT_S)
             except ImageError as error:
@@ -196,7 +196,7 @@ class Flight:
             pace.taken(source.step_s)
         if is_paused:  # the newest picture is dropped, so that none is old when the flight goes on
             return
-        with meter.timed(thread_only=True) as work:
+        with meter.measure_cost(thread_only=True) as work:
             with self._parts.io.stop.breaks_off():
                 event = self._recognise(frame, is_query)
             event = replace(event, steps=replace(event.steps, read=reading.cost))
@@ -236,7 +236,7 @@ class Flight:
         it must not end the flight."""
         meter = self._parts.meter
         meter.count(event)
-        with meter.timed() as reporting:
+        with meter.measure_cost() as reporting:
             try:
                 if self._parts.autopilot:
                     event = self._parts.autopilot.report_match(event, meter.totals()["used_mah"])
@@ -258,7 +258,7 @@ class Flight:
         self._parts.flight_log.write(
             "query",
             t_frame_s=event.frame.t_mono_s,
-            **fields_of(event),
+            **to_fields(event),
             fix=event.fix,
             reading=event.steps.read,
             vehicle=event.vehicle,

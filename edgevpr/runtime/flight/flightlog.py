@@ -18,7 +18,7 @@ from typing import Any
 
 from edgevpr.core.appending import (
     append,
-    is_at,
+    is_still_at,
     keep_within,
     open_appending,
     relatives,
@@ -85,7 +85,7 @@ class FlightLog:
                         f"The flight log {path} cannot be opened ({error.strerror}): give each flight a file of its "
                         "own, in a folder that is there and may be written to."
                     ) from error
-                self._note_trouble(error)
+                self._record_trouble(error)
 
     def __enter__(self) -> "FlightLog":
         return self
@@ -98,7 +98,7 @@ class FlightLog:
         Never raises OSError."""
         if self.path is None:
             return
-        if self._file is not None and not is_at(self._file, self._at):
+        if self._file is not None and not is_still_at(self._file, self._at):
             self._warn(f"The flight log {self._at} was deleted or moved in flight: it goes on in a new file.")
             self._let_go()
         now_s, utc_s = self._clock(), self._utc_s()
@@ -120,7 +120,7 @@ class FlightLog:
                 self._sync(file, now_s)
         except OSError as error:
             self.lost_lines += 1
-            self._note_trouble(error)
+            self._record_trouble(error)
         else:
             if self.state is not None:
                 self.state = None
@@ -133,7 +133,7 @@ class FlightLog:
         try:
             self._sync(self._file, now_s)
         except OSError as error:
-            self._note_trouble(error)
+            self._record_trouble(error)
 
     def close(self) -> None:
         """Sync all lines to the disk and close the file. A failure is logged, not raised."""
@@ -184,7 +184,7 @@ class FlightLog:
         sync(file)
         self._is_synced, self._synced_s = True, now_s
 
-    def _note_trouble(self, error: OSError) -> None:
+    def _record_trouble(self, error: OSError) -> None:
         """Note that the file cannot be written. The next line opens it anew: the card may be another one."""
         if self.state is None:
             self.state = (

@@ -22,13 +22,13 @@ from edgevpr.frames.sameness import BLOCKS, CoarsePicture, make_coarse
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.notifier import Notifier
-from edgevpr.runtime.recognise.levelling import lens_of
+from edgevpr.runtime.recognise.levelling import read_camera_lens
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
 # Motions are shares of the picture's longest side. A picture that has moved by 0.012 is not taken for unmoved.
 WITNESS_SHARE = 0.03  # least motion by the aircraft that contradicts an unmoved picture
 PROOF_SHARE = 0.09  # sum of such motions by which pictures are frozen: one reset of an autopilot's heading is no proof
-_MOST_OF_ONE = 0.04  # that one rotation, or one repeated picture, counts for
+_MAX_OF_ONE = 0.04  # that one rotation, or one repeated picture, counts for
 _PROOF_WITHIN_S = 20.0
 _LEAST_S = 2.5  # that pictures stay the same, or that lie between a picture and its repetition
 # Repeated pictures in a row, in flight, that are a proof by themselves: a route that is flown again, 500 m high with a
@@ -42,15 +42,15 @@ _HEIGHT_DOUBT = 1.5  # the ground may be lower than the height says
 _FASTEST_M_S = 100.0  # a velocity that is reported beyond is wrong
 _HIGHEST_M = 10_000.0  # and so is a height
 _LOWEST_M = 5.0  # below, a height over ground is too uncertain as a measure
-_LONGEST_STEP_S = 5.0  # from picture to picture, for which a velocity is taken
+_MAX_STEP_S = 5.0  # from picture to picture, for which a velocity is taken
 _HEADING_JUMP_DEG = 30.0  # an autopilot that has turned by more, and by more than the next a second,
 _HEADING_JUMP_DEG_S = 60.0  # has corrected its heading
 _AXIS_SHARE = 0.36  # root mean square distance of a picture's points from its middle
 _WIDEST_FOV_DEG = 120.0  # of a lens that is unknown
 _SAME_BLOCKS = 0.75  # share of the blocks that must be unmoved
-_FEWEST_BLOCKS = BLOCKS // 3  # that can be judged
+_MIN_BLOCKS = BLOCKS // 3  # that can be judged
 _BLOCK_MEMORY = 8  # pictures: time constant of the share of pictures in which a block stays while most others move
-_MOST_STAY = 0.5  # of the blocks, in a picture that says which ones always stay
+_MAX_STAY = 0.5  # of the blocks, in a picture that says which ones always stay
 _REMEMBERED = 300  # pictures; 4 MB
 _REMEMBER_EVERY_S = 0.5
 _THUMB_ALIKE = 0.97  # least correlation of the coarsest copies
@@ -91,7 +91,7 @@ class Optics:
 
 def read_optics(source: SourceConfig, recogniser: Recogniser) -> Optics:
     """Return the optics of a configured camera; a lens that is unknown is taken as the widest usual one."""
-    lens = lens_of(source)
+    lens = read_camera_lens(source)
     focal_share = 0.5 / math.tan(math.radians(lens.fov_deg if lens else _WIDEST_FOV_DEG) / 2)
     looks_down = recogniser.technique.spec.looks_down
     return Optics(focal_share=focal_share, looks_down=looks_down, is_level=source.gimbal)
@@ -136,7 +136,7 @@ class FrozenWatch:
 
     def judge(self, frame: Frame, vehicle: Vehicle | None) -> Reason | None:
         """Judge the next picture, with the autopilot's report at its time. Return why it is refused, or None."""
-        if vehicle and not vehicle.is_fresh_at(frame.t_mono_s):
+        if vehicle and not vehicle.is_fresh(frame.t_mono_s):
             vehicle = None
         now = self._locate_picture(make_coarse(frame.image), frame.t_mono_s, vehicle)
         is_same = None if self._first is None else self._is_same(self._first.picture, now.picture, learns=True)
@@ -157,7 +157,7 @@ class FrozenWatch:
         if before:
             path_m = before.path_m
             was_m_s, is_m_s = _velocity(before.vehicle), _velocity(vehicle)
-            if was_m_s and is_m_s and 0 < t_s - before.t_s <= _LONGEST_STEP_S:
+            if was_m_s and is_m_s and 0 < t_s - before.t_s <= _MAX_STEP_S:
                 path_m = path_m + (t_s - before.t_s) * np.mean([was_m_s, is_m_s], axis=0)
             if _has_jumped(before, vehicle, t_s):
                 self._remembered.clear()
@@ -176,7 +176,7 @@ class FrozenWatch:
         self._flown_share = max(self._flown_share, self._flown_by(first, now, _SPEED_DOUBT_M_S))
         turned_share = self._optics.rotation_share(self._turned_from, now.vehicle)
         if turned_share >= WITNESS_SHARE:
-            self._rotations.append((now.t_s, min(turned_share, _MOST_OF_ONE)))
+            self._rotations.append((now.t_s, min(turned_share, _MAX_OF_ONE)))
         if turned_share >= WITNESS_SHARE or self._turned_from is None:
             self._turned_from = now.vehicle
 
@@ -204,7 +204,7 @@ class FrozenWatch:
         turned_share = self._optics.rotation_share(then.vehicle, now.vehicle)
         share = max(turned_share, self._flown_by(then, now, _DRIFT_M_S))
         if share >= WITNESS_SHARE:
-            self._repeats.append((now.t_s, min(share, _MOST_OF_ONE)))
+            self._repeats.append((now.t_s, min(share, _MAX_OF_ONE)))
 
     def _flown_by(self, then: TimedPicture, now: TimedPicture, doubt_m_s: float) -> float:
         moved_m = float(np.hypot(*(now.path_m - then.path_m))) - doubt_m_s * (now.t_s - then.t_s)
@@ -214,10 +214,10 @@ class FrozenWatch:
         """Tell whether two pictures show the same, unmoved; None if their texture cannot show a motion. Blocks that
         always stay, as those of a display or of the airframe, are not used; with `learns`, they are learnt."""
         textured, unmoved = then.is_textured, then.is_unmoved(now)
-        judged = textured & (self._stays < _MOST_STAY)
-        if learns and unmoved.sum() <= _MOST_STAY * textured.sum():
+        judged = textured & (self._stays < _MAX_STAY)
+        if learns and unmoved.sum() <= _MAX_STAY * textured.sum():
             self._stays += textured * (unmoved - self._stays) / _BLOCK_MEMORY
-        return None if judged.sum() < _FEWEST_BLOCKS else bool(unmoved[judged].mean() >= _SAME_BLOCKS)
+        return None if judged.sum() < _MIN_BLOCKS else bool(unmoved[judged].mean() >= _SAME_BLOCKS)
 
     def _decide(self, now_s: float) -> None:
         for witnesses in (self._rotations, self._repeats):

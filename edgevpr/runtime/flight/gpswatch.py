@@ -63,7 +63,7 @@ class GpsWatch:
         if event.view.reason or vehicle is None or vehicle.gps is None:
             return
         seen = measure_for_gps(event, vehicle)
-        if seen is None or not vehicle.is_fresh_at(seen.t_s):
+        if seen is None or not vehicle.is_fresh(seen.t_s):
             return
         gps_deg = extrapolate(vehicle.gps, seen.t_s, vehicle.velocity_m_s or (0.0, 0.0))
         off_m = np.array(offset_m(*gps_deg, seen.position.lat_deg, seen.position.lon_deg))

@@ -55,7 +55,7 @@ class HeightWatch:
         if frame is None or vehicle is None or where is None or not event.accepted or event.view.reason:
             return
         is_known = where.height_m and where.height_ratio and vehicle.height_m is not None
-        if not is_known or frame.t_mono_s == self._last_s or not vehicle.is_fresh_at(frame.t_mono_s):
+        if not is_known or frame.t_mono_s == self._last_s or not vehicle.is_fresh(frame.t_mono_s):
             return
         self._last_s = frame.t_mono_s
         self._heights_m.append((max(LOWEST_M, where.height_m or 0.0), max(LOWEST_M, vehicle.height_m or 0.0)))

@@ -46,7 +46,7 @@ class FlightMeter:
         self.limit_c = self._machine.limit_c() if board.thermal_limit_c is None else board.thermal_limit_c
         self.queries_throttled = 0
 
-    def timed(self, thread_only: bool = False) -> AbstractContextManager[Stage]:
+    def measure_cost(self, thread_only: bool = False) -> AbstractContextManager[Stage]:
         """Return a context manager that measures time and CPU time: of all threads or, with `thread_only`, of this
         one."""
         return stage(self._clock.mono_s, self._clock.thread_cpu_s if thread_only else self._clock.process_cpu_s)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Position, Receiver, Vehicle
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S, extrapolate
 from edgevpr.runtime.flight.consistency import BELIEVED, ComparedFix, GateResult
@@ -14,7 +14,7 @@ from edgevpr.runtime.flight.drift import Drift, DriftFilter, OdometryMeasurement
 from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurement, PositionedMatch, worst_sd
 from edgevpr.runtime.flight.output import PROOF_S
 from edgevpr.runtime.flight.path import Path, Point
-from edgevpr.runtime.recognise.locate import in_sd
+from edgevpr.runtime.recognise.locate import mahalanobis
 
 _GPS_EVERY_S = 1.0
 _GPS_NEW_S = 0.7  # positions of a receiver come five times a second; without new ones the autopilot dead-reckons
@@ -24,7 +24,7 @@ _GPS_VELOCITY_SD = 0.3  # m/s
 _UNKNOWN_M = 1e4
 _ANY_M_S = 10.0  # standard deviation of the velocity while only a fix is known
 _FOLLOWED_S = 4.0  # after the frame of the last stride, and the longest time between two queries
-_MOST_ALIKE = 16.0  # fixes of the same ground that count as one
+_MAX_ALIKE = 16.0  # fixes of the same ground that count as one
 # Between matches the ground under the strides may be higher or lower than taken for: what neighbouring pictures show of
 # that sums up. An attitude that is two degrees wrong shows as much as the first over 300 m, 100 m high. After a gap of
 # so many seconds nothing is known of it, and 0.3 is a valley of 30 m, seen from 100 m.
@@ -90,7 +90,7 @@ class Navigation:
         """Velocity (2,) of the path now, which no match has corrected; None if it is not known."""
         return self._valid_path.now.velocity_m_s if self._valid_path else None
 
-    def is_followed_at(self, t_s: float) -> bool:
+    def is_followed(self, t_s: float) -> bool:
         """Tell whether the path is followed from frame to frame, by strides that it does not contradict, and queries
         are so frequent that several can contradict it soon."""
         return max(t_s - self._strode_s, self._asks_every_s) <= _FOLLOWED_S
@@ -122,7 +122,7 @@ class Navigation:
             self._filter.lose_gps()
         there = path.at(t_s)
         if there and self.has_gps and t_s - self._gps_s >= _GPS_EVERY_S:
-            self._note_gps(t_s)
+            self._record_gps(t_s)
             off_m = path.from_origin(vehicle.lat_deg, vehicle.lon_deg) - there.at_m
             sd_m = _GPS_ALIKE * (vehicle.position_sd_m or _UNKNOWN_M)
             self._filter.correct_by_gps(off_m, sd_m, velocity_m_s - there.velocity_m_s, _GPS_VELOCITY_SD)
@@ -144,12 +144,12 @@ class Navigation:
             return
         off_m, sd_m, off_m_s, sd_m_s, age_s = off
         expected_m, _, covariance = self._filter.errors(age_s)
-        if in_sd(off_m - expected_m, covariance[:2, :2] + sd_m**2 * np.eye(2)) > _CONTRADICTS_SD:
+        if mahalanobis(off_m - expected_m, covariance[:2, :2] + sd_m**2 * np.eye(2)) > _CONTRADICTS_SD:
             self._contradict(receiver, vehicle.t_heard_s)
             return
         self.has_gps, self.is_in_doubt, self._contradicted_since_s = True, False, None
         if vehicle.t_heard_s - self._gps_s >= _GPS_EVERY_S:
-            self._note_gps(vehicle.t_heard_s)
+            self._record_gps(vehicle.t_heard_s)
             self._filter.correct_by_gps(off_m, sd_m, off_m_s, sd_m_s, age_s)
 
     def _contradict(self, receiver: Receiver, now_s: float) -> None:
@@ -193,11 +193,11 @@ class Navigation:
         self._start(
             Position(*extrapolate(receiver, now_s)), _GPS_ALIKE * receiver.sd_m, velocity_m_s, now_s, velocity_sd_m_s
         )
-        self._note_gps(now_s)
+        self._record_gps(now_s)
         self.is_in_doubt, self._contradicted_since_s = False, None
         return True
 
-    def _note_gps(self, now_s: float) -> None:
+    def _record_gps(self, now_s: float) -> None:
         self._gps_s, self._strides_since_fix = now_s, _StridesSinceFix(now_s)
 
     def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
@@ -260,7 +260,7 @@ class Navigation:
         if fix.seen.frame.stride is None or before_m is None or alike_m == 0:
             return 1.0
         away_m = float(np.hypot(*(at_m - before_m)))
-        return max(1.0, alike_m / max(away_m, alike_m / _MOST_ALIKE))
+        return max(1.0, alike_m / max(away_m, alike_m / _MAX_ALIKE))
 
     def begin(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
         """Begin the path at `now_s`, when neither position nor velocity is known, at the `position` of a fix whose
@@ -281,7 +281,7 @@ class Navigation:
         velocity_m_s = there.velocity_m_s + off_m_s
         return NavState(
             t_s=t_s,
-            position=Position(*moved(path.origin.lat_deg, path.origin.lon_deg, *at_m.tolist())),
+            position=Position(*offset_position(path.origin.lat_deg, path.origin.lon_deg, *at_m.tolist())),
             velocity_m_s=(float(velocity_m_s[0]), float(velocity_m_s[1])),
             accuracy_m=math.hypot(worst_sd(covariance[:2, :2]), self._strides_since_fix.error_m),
             speed_accuracy_m_s=worst_sd(covariance[2:, 2:]),

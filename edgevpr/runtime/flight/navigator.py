@@ -6,7 +6,7 @@ main one, each within a turn (`mavlink/turns.py`): it needs no lock."""
 import math
 from dataclasses import dataclass
 
-from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.channel import Channel
@@ -114,7 +114,7 @@ class Navigator(Listener):
         `ratio_sd`, the share by which the ratio may be wrong."""
         self._height_ratio, self._height_ratio_sd = ratio, ratio_sd
 
-    def hear_channel(self, channel: Channel) -> None:
+    def handle_channel(self, channel: Channel) -> None:
         """Note the channel by which positions are sent. With a continuous one, the autopilot's velocity comes from our
         positions, and we must not use it: the path is then summed up from accelerations."""
         before, self._channel = self._channel, channel
@@ -126,11 +126,11 @@ class Navigator(Listener):
         self._navigation, self._consistency = Navigation(_choose_drift(self._channel), self._map_sd_m), Consistency()
         self._watch = OutputWatch()
 
-    def hear_autopilot(self, t_s: float) -> None:
+    def handle_autopilot(self, t_s: float) -> None:
         """Note that at `t_s` an autopilot was first heard, or that another one has taken its place."""
         self._appeared_s, self._vehicle = t_s, None
 
-    def hear_vehicle(self, vehicle: Vehicle) -> None:
+    def handle_vehicle(self, vehicle: Vehicle) -> None:
         """Process a report of position and velocity."""
         self._vehicle = vehicle
         if rests_on_gps(vehicle) and vehicle.t_heard_s - self._sent_s > _OURS_FOR_S:
@@ -142,13 +142,13 @@ class Navigator(Listener):
             has_gps = navigation.has_gps and not self._channel.is_continuous
             self.age.add_motion(vehicle.t_heard_s, navigation.path_velocity_m_s, vehicle.heading_deg, has_gps)
 
-    def hear_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
+    def handle_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Process the specific force that the accelerometers measure, m/s2 (nose, right, down), and the attitude."""
         acceleration_m_s2 = to_ground_acceleration(force_m_s2, attitude.roll_deg, attitude.pitch_deg, attitude.yaw_deg)
         self._attitude = attitude
         self._navigation.add_acceleration(t_s, acceleration_m_s2)
 
-    def hear_frame(self, event: Recognition, is_query: bool = True) -> None:
+    def handle_frame(self, event: Recognition, is_query: bool = True) -> None:
         """Process the frame of an event without an accepted match, or of one that is no query: its motion since the
         frame before."""
         if frame := self._measure(event):
@@ -165,7 +165,7 @@ class Navigator(Listener):
         vehicle, late_m = self._vehicle, shared_time_error_m(event, event.vehicle or self._vehicle)
         accuracy_m = math.hypot(seen.accuracy_m, late_m)
         fix = Fix(seen.position.lat_deg, seen.position.lon_deg, accuracy_m, seen.t_s)
-        if vehicle is None or not vehicle.is_fresh_at(now_s):
+        if vehicle is None or not vehicle.is_fresh(now_s):
             return self._advise_unheard(fix, now_s)
         if vehicle.velocity_m_s is None:
             return _withhold(ReasonCode.NO_TELEMETRY) if self._channel.is_continuous else Advice(fix)
@@ -173,7 +173,7 @@ class Navigator(Listener):
         if compared is None:
             self._navigation.begin(seen.position, worst_sd(seen.scatter_m2), seen.t_s, vehicle.t_heard_s)
             return _withhold(ReasonCode.CONTINUOUS) if self._channel.is_continuous else Advice(fix)
-        is_followed = self._navigation.is_followed_at(seen.t_s)
+        is_followed = self._navigation.is_followed(seen.t_s)
         verdict = self._consistency.judge(compared, self.has_gps, is_followed)
         if verdict.why:
             return Advice(None, verdict.why, is_held=True)
@@ -189,9 +189,9 @@ class Navigator(Listener):
         vehicle = self._vehicle
         if self._is_muted or self._channel is not Channel.COMMAND or self.age.is_unknown:
             return None
-        if self._consistency.is_contradicted(now_s, self._navigation.is_followed_at(now_s)):
+        if self._consistency.is_contradicted(now_s, self._navigation.is_followed(now_s)):
             return None
-        if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh_at(now_s):
+        if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh(now_s):
             return None
         if rests_on_gps(vehicle) or self._estimate(now_s) is None:
             return None
@@ -217,7 +217,7 @@ class Navigator(Listener):
             self._slew.reset()
             return None
         self._sent_s = t_s
-        self._watch.note_sent(t_s)
+        self._watch.record_sent(t_s)
         lat_deg, lon_deg, lag_m = self._slew.follow(estimate)
         east, north = estimate.velocity_m_s
         attitude, alike = self._attitude, self._correlation_factor(t_s)
@@ -299,7 +299,7 @@ class Navigator(Listener):
         here, claimed_m = estimate.position, self._claimed_m(estimate)
         east_m_s, north_m_s = velocity_m_s
         since_s = now_s - vehicle.t_heard_s
-        there = moved(vehicle.lat_deg, vehicle.lon_deg, since_s * east_m_s, since_s * north_m_s)
+        there = offset_position(vehicle.lat_deg, vehicle.lon_deg, since_s * east_m_s, since_s * north_m_s)
         off_m = float(distance_m(*there, here.lat_deg, here.lon_deg))
         # Mean square errors: of our estimate 2 * accuracy_m**2 (two axes), of the autopilot's position off_m**2 more.
         if off_m**2 <= 2 * estimate.accuracy_m**2:
@@ -308,7 +308,7 @@ class Navigator(Listener):
         # Lead by the drift of half the time to the next fix, so that the autopilot is right in the middle of it. Now it
         # is off by this lead, in one direction: half of its square is added to the variance of each axis.
         ahead_m = [self._next_s / 2 * each for each in self._navigation.path_drift_m_s()]
-        at = moved(here.lat_deg, here.lon_deg, *ahead_m)
+        at = offset_position(here.lat_deg, here.lon_deg, *ahead_m)
         return Advice(Fix(*at, math.hypot(claimed_m, math.hypot(*ahead_m) / math.sqrt(2)), now_s))
 
     def _correlation_factor(self, t_s: float) -> float:

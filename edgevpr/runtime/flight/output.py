@@ -56,7 +56,7 @@ class OutputWatch:
         self._sent_s = -math.inf
         self._refused_since_s = self._led_away_since_s = math.inf
 
-    def note_sent(self, t_s: float) -> None:
+    def record_sent(self, t_s: float) -> None:
         """Note that a position was sent at `t_s`."""
         self._sent_s = t_s
 

@@ -13,7 +13,7 @@ from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
 
 KEPT_S = 6.0  # a frame is at most 5 s old when it is recognised
-_LONGEST_STEP_S = 1.0  # after a longer gap in the reports the path is not known
+_MAX_STEP_S = 1.0  # after a longer gap in the reports the path is not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class Path:
         step_s = t_s - last.t_s
         if not step_s > 0:
             return 0.0
-        self.is_broken |= step_s > _LONGEST_STEP_S
+        self.is_broken |= step_s > _MAX_STEP_S
         velocity_m_s = np.asarray(velocity_m_s, float)
         at_m = last.at_m + step_s / 2 * (last.velocity_m_s + velocity_m_s)
         self._points.append(Point(t_s, at_m, velocity_m_s))
@@ -66,7 +66,7 @@ class Path:
     def at(self, t_s: float) -> Point | None:
         """Return the point at `t_s`; after the last point, its velocity is continued. None if `t_s` is before the first
         point kept or more than a second after the last."""
-        if not self._points[0].t_s <= t_s <= self._points[-1].t_s + _LONGEST_STEP_S:
+        if not self._points[0].t_s <= t_s <= self._points[-1].t_s + _MAX_STEP_S:
             return None
         after = bisect_left(self._points, t_s, key=lambda point: point.t_s)
         if after == len(self._points):

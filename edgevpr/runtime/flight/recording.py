@@ -184,7 +184,7 @@ def read_recorded(log: str | Path) -> tuple[list[Line], Path]:
     return lines, folder
 
 
-def frames_of(folder: Path) -> dict[str, Path]:
+def list_frames(folder: Path) -> dict[str, Path]:
     """Return the picture files of the recording in `folder`, by the frames' names in the flight log."""
     found = {}
     with open(folder / TAPE, "rb") as tape:

@@ -2,7 +2,7 @@
 
 import math
 
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.runtime.flight.navigation import NavState
 
 MAX_CORRECTION_M_S = 2.0  # ArduPilot did not follow a jump of 25 m for 8 s
@@ -32,12 +32,12 @@ class Slew:
             return *self._at, 0.0
         step_s = max(0.0, estimate.t_s - self._last.t_s)
         east_m_s, north_m_s = estimate.velocity_m_s
-        moved_on = moved(*self._at, step_s * east_m_s, step_s * north_m_s)
+        moved_on = offset_position(*self._at, step_s * east_m_s, step_s * north_m_s)
         east_m, north_m = offset_m(*moved_on, here.lat_deg, here.lon_deg)
         lag_m = math.hypot(east_m, north_m)
         if lag_m > MAX_LAG_M:
             self.reset()
             return self.follow(estimate)
         part = min(1.0, MAX_CORRECTION_M_S * step_s / lag_m) if lag_m > 0 else 1.0
-        self._last, self._at = estimate, moved(*moved_on, part * float(east_m), part * float(north_m))
+        self._last, self._at = estimate, offset_position(*moved_on, part * float(east_m), part * float(north_m))
         return *self._at, (1 - part) * lag_m

@@ -22,7 +22,7 @@ from edgevpr.places.mapinfo import MapIdentity, read_identity
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.flight.flightio import FlightIO
 from edgevpr.runtime.preflight.pick import explain_technique
-from edgevpr.runtime.recognise.levelling import lens_of
+from edgevpr.runtime.recognise.levelling import read_camera_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
@@ -58,7 +58,7 @@ def apply_recorded_rate(source: SourceConfig, steps_s: Sequence[float]) -> Sourc
 def find_origin(place_map: PlaceMap, source: SourceConfig) -> Position | None:
     """Return the first position of a map (None: it has none), at the altitude of the ground: the median, over the first
     places, of the camera's altitude less its height by footprint and lens. The altitude is None if one is unknown."""
-    first, altitudes_m, lens = None, [], lens_of(source)
+    first, altitudes_m, lens = None, [], read_camera_lens(source)
     has_lens_of_map = place_map.lens is None or place_map.lens == (source.lens and Path(source.lens).name)
     with suppress(PlaceError):  # a damaged place ends the search
         for place in islice((place for place in place_map.places() if place.position), _ORIGIN_PLACES):

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from edgevpr.core.arrays import Bools, Doubles
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Position, Vehicle
 from edgevpr.frames.level import Mount
 from edgevpr.mavlink.receivers import extrapolate
 from edgevpr.runtime.flight.measurements import FrameMeasurement, picture_error_m, position_match
 from edgevpr.runtime.flight.navigation import rests_on_gps
-from edgevpr.runtime.recognise.locate import in_sd
+from edgevpr.runtime.recognise.locate import mahalanobis
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _EVERY_S = 5.0  # matches that are nearer in time count once
@@ -124,7 +124,7 @@ class Sightings:
         frame_sd_m = picture_error_m(vehicle, height_m or 0.0, event.frame.t_sd_s)
         seen = position_match(event, FrameMeasurement(t_s=t_s, sd_m=frame_sd_m))
         jacobian = self._derive(vehicle, height_m, seen.turn_deg or 0.0) if seen else None
-        if seen is None or jacobian is None or not vehicle.is_fresh_at(t_s):
+        if seen is None or jacobian is None or not vehicle.is_fresh(t_s):
             return False
         at = Position(vehicle.lat_deg, vehicle.lon_deg)  # by the autopilot, which knows how late its receiver is
         if t_s - vehicle.t_fix_s <= _OURS_S:  # it may repeat us
@@ -172,7 +172,7 @@ class Sightings:
         kept = list(self._kept)
         if len(kept) < _FEWEST or self._origin is None:
             return None
-        way, covariance, counts = fitted(kept)
+        way, covariance, counts = fit_sightings(kept)
         middle_m = np.mean([each.jacobian[:, 4] for each in kept], axis=0)
         there = np.eye(6)
         there[:2, 4] = middle_m
@@ -188,11 +188,11 @@ class Sightings:
             "ahead_deg": Measure((ahead_deg,), ahead_sd_deg, 1.5, 1.0),
             "right_deg": Measure((right_deg,), right_sd_deg, 1.5, 1.0),
         }
-        middle = Position(*moved(self._origin.lat_deg, self._origin.lon_deg, *middle_m.tolist()))
+        middle = Position(*offset_position(self._origin.lat_deg, self._origin.lon_deg, *middle_m.tolist()))
         return Surveyed(matches=int(counts.sum()), middle=middle, measures=measures)
 
 
-def fitted(sightings: list[Sighting]) -> tuple[Doubles, Doubles, Bools]:
+def fit_sightings(sightings: list[Sighting]) -> tuple[Doubles, Doubles, Bools]:
     """Fit sightings: return what is sought (6,), its covariance (6, 6), and bool (n,), False for those that are wrong.
 
     The first rounds let no sighting pull much harder than the others, the last leave out what is far off. Scatter that
@@ -235,7 +235,7 @@ def _explains_doubts(sightings: list[Sighting], counts: Bools, there: Doubles, m
     halves = np.array_split(np.arange(len(sightings)), 2)
     if min(np.mean(~doubted[half]) for half in halves) < _UNDOUBTED or counts[~doubted].mean() < _LEAST_ALIKE:
         return False
-    (one, of_one, _), (other, of_other, _) = (fitted([sightings[at] for at in half]) for half in halves)
+    (one, of_one, _), (other, of_other, _) = (fit_sightings([sightings[at] for at in half]) for half in halves)
     worst_m2 = max(np.diag(there @ covariance @ there.T)[:2].max() for covariance in (of_one, of_other))
-    off_sd = in_sd(there @ (one - other), there @ (of_one + of_other) @ there.T)
+    off_sd = mahalanobis(there @ (one - other), there @ (of_one + of_other) @ there.T)
     return worst_m2 <= _HALF_KNOWS_M**2 and off_sd <= _HALVES_AGREE

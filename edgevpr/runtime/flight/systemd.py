@@ -4,10 +4,10 @@ import os
 import socket
 from contextlib import suppress
 
-from edgevpr.core.text import shown
+from edgevpr.core.text import sanitize
 
 # Asked for at the start: loading a map or picking a technique takes minutes on a slow board.
-LONGEST_START_US = 1_800_000_000
+MAX_START_US = 1_800_000_000
 _SEND_TIMEOUT_S = 0.5
 
 
@@ -25,7 +25,7 @@ def notify(**assignments: object) -> None:
     if address[0] == "@":  # a name in the abstract namespace, which begins with a zero byte
         address = "\0" + address[1:]
     # A line break in a value would begin an assignment of its own.
-    lines = (f"{key}={shown(' '.join(str(value).splitlines()))}" for key, value in assignments.items())
+    lines = (f"{key}={sanitize(' '.join(str(value).splitlines()))}" for key, value in assignments.items())
     with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
         sender.settimeout(_SEND_TIMEOUT_S)  # the receiver's queue may be full; the main loop must not hang on it
         sender.sendto("\n".join(lines).encode("utf-8"), address)

@@ -20,7 +20,7 @@ from edgevpr.runtime.flight.flightio import FlightParts
 from edgevpr.runtime.flight.frozenwatch import FrozenWatch
 from edgevpr.runtime.flight.notifier import Commands, Trouble
 from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW, NOTHING_IN_A_ROW, Tally
-from edgevpr.runtime.recognise.recognition import Recognition, fields_of
+from edgevpr.runtime.recognise.recognition import Recognition, to_fields
 
 _HEALTH_S, _MINUTE_S = 1.0, 60.0
 _START_S = 10.0  # from the start to a camera's first picture, if nothing is to be said of it
@@ -187,6 +187,6 @@ class Vitals:
 
 def _summarise(event: Recognition) -> dict[str, Any]:
     """Return the fields of the status about a query (None: unknown)."""
-    fields = fields_of(event)
+    fields = to_fields(event)
     names = ("query", "accepted", "reason", "place", "reference_image", "score", "accuracy_m")
     return {name: fields[name] for name in names} | {"confidence": combine_confidence(event)}

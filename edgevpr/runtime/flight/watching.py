@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.core.text import beside
+from edgevpr.core.text import format_offset
 from edgevpr.frames.level import Mount
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.gpswatch import GpsWatch
@@ -173,7 +173,7 @@ class Surveyor:
     def _report(self, found: Surveyed, names: set[str]) -> None:
         """Write a line of all that is known, and say what of `names` is not as it should be."""
         clear = {name: each for name, each in found.measures.items() if each.differs_from(self._expected[name])}
-        sentences = {name: _surveyed(name, each) for name, each in clear.items()}
+        sentences = {name: _format_result(name, each) for name, each in clear.items()}
         said = "; ".join(sentence for sentence, _ in sentences.values()) or "map and camera are as GPS says"
         self._notifier.log("survey", said=said, **found.fields())
         self._reported |= {name: found.measures[name].value for name in names}
@@ -189,11 +189,11 @@ class Surveyor:
         self._set_mount(mount)
 
 
-def _surveyed(name: str, found: Measure) -> tuple[str, str]:
+def _format_result(name: str, found: Measure) -> tuple[str, str]:
     """Return a result of the survey as a sentence, and in a few words."""
     first = found.value[0]
     if name == "off_m":
-        there = f"{beside(*found.value)} of GPS"
+        there = f"{format_offset(*found.value)} of GPS"
         return f"the map lies {there}, +-{found.sd:.1f} m", f"map {there}"
     if name == "scale":
         size = f"{abs(first):.1%} too {'large' if first > 0 else 'small'}"

@@ -13,7 +13,7 @@ from edgevpr.power.equations import Pack, pack_ah, queries_ah
 from edgevpr.power.meter import query_cost
 from edgevpr.power.speed import Speed
 from edgevpr.runtime.preflight.choose import Demand, Option, choose_best, explain_no_choice, make_option
-from edgevpr.runtime.preflight.scale import SAME_MACHINE, count_work, on_board
+from edgevpr.runtime.preflight.scale import SAME_MACHINE, count_work, scale_to_board
 from edgevpr.runtime.preflight.trial import Trial
 
 
@@ -76,7 +76,7 @@ def estimate(board: Board, ratio: Speed | None, trials: Iterable[Trial], plan: F
     rows: list[TechniqueEstimate] = []
     for trial in trials:
         if trial.costs:
-            costs = on_board(trial.costs, board, ratio, count_work(trial.name, trial.parameters))
+            costs = scale_to_board(trial.costs, board, ratio, count_work(trial.name, trial.parameters))
             rows.append(_estimate_option(make_option(board, trial.label, trial.name, costs, plan), board, plan))
     recommended, reason = _recommend(rows, board, plan)
     weights = dict.fromkeys(f"Weights of {trial.weights}." for trial in trials if trial.weights)

@@ -19,8 +19,8 @@ from edgevpr.runtime.preflight.choose import (
     make_option,
 )
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe, ram_bytes
-from edgevpr.runtime.preflight.scale import compare_speed, count_work, on_board
-from edgevpr.runtime.recognise.opening import made_for
+from edgevpr.runtime.preflight.scale import compare_speed, count_work, scale_to_board
+from edgevpr.runtime.recognise.opening import make_technique
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import find_weights
 
@@ -39,7 +39,7 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
     options: list[Option] = []
     for name in list_preferred(board, camera):
         try:
-            technique = made_for(board.threads, name, camera_setting(name, camera))
+            technique = make_technique(board.threads, name, camera_setting(name, camera))
         except ModelError as error:
             _log.warning("technique %s is passed over: %s", name, error)
             continue
@@ -103,7 +103,7 @@ def camera_setting(name: str, camera: str | None) -> dict[str, str]:
 
 def _label(spec: TechniqueSpec) -> str:
     """Return the name and form of a technique. If it matches in a way that was not measured, the label says so too."""
-    return techniques.labelled(spec.name, spec.form) + ("" if spec.name != "cohog" or _votes(spec) else ", thesis")
+    return techniques.format_name(spec.name, spec.form) + ("" if spec.name != "cohog" or _votes(spec) else ", thesis")
 
 
 def _votes(spec: TechniqueSpec) -> bool:
@@ -122,4 +122,4 @@ def _measure_costs(technique: Technique, board: Board) -> TechniqueCosts:
     """Measure the costs of a technique here, and convert them to `board`."""
     spec = technique.spec
     work = count_work(spec.name, spec.parameters) if _votes(spec) else None
-    return on_board(probe(technique), board, compare_speed(board), work)
+    return scale_to_board(probe(technique), board, compare_speed(board), work)

@@ -1,6 +1,6 @@
 """Estimates for people: a table of at most 120 columns with a line per technique, and notes."""
 
-from edgevpr.core.text import aligned, wrapped
+from edgevpr.core.text import align_table, wrap_sentence
 from edgevpr.runtime.preflight.estimate import FlightEstimate, TechniqueEstimate
 
 # The columns of the two tables: what each technique needs and draws, and what it finds.
@@ -18,15 +18,15 @@ def format_table(estimate: FlightEstimate) -> str:
         f"{plan.pack.capacity_mah} at {plan.regulator_efficiency:.0%} regulator efficiency; times measured"
         + {"measured": "", "scaled": ", scaled", "unscaled": " here, unscaled"}[estimate.times]
     )
-    needs = aligned([_NEEDS + _DRAWS, *map(_needs, rows), *([name, "n/a"] for name in estimate.unusable)], left=2)
-    finds = aligned([_FINDS, *(_finds(row, estimate.recommended) for row in rows)])
+    needs = align_table([_NEEDS + _DRAWS, *map(_needs, rows), *([name, "n/a"] for name in estimate.unusable)], left=2)
+    finds = align_table([_FINDS, *(_finds(row, estimate.recommended) for row in rows)])
     notes = [f"{row.option.label} {row.option.fit.misfit}." for row in rows if row.option.fit.misfit]
     for why in dict.fromkeys(estimate.unusable.values()):
         names = [name for name, problem in estimate.unusable.items() if problem == why]
         notes.append(f"{', '.join(names)} cannot be used: {why}")
     notes += estimate.notes
-    answer = wrapped(f"Recommended: {estimate.reason}")
-    text = [line for note in notes for line in wrapped(note)]
+    answer = wrap_sentence(f"Recommended: {estimate.reason}")
+    text = [line for note in notes for line in wrap_sentence(note)]
     return "\n".join([*answer, "", heading, "", *needs, "", *finds, "", *text])
 
 

@@ -18,7 +18,7 @@ from edgevpr.core.types import NO_COST, Frame, StageCost, Steps
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import times_as_many
-from edgevpr.places.rows import MOST_LANDMARK_BYTES
+from edgevpr.places.rows import MAX_LANDMARK_BYTES
 from edgevpr.places.sequence import bytes_beside_place, make_sequence_search, sequence_length
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
@@ -83,7 +83,7 @@ def ram_bytes(spec: TechniqueSpec, sequence: int) -> int:
 
 def disk_bytes(spec: TechniqueSpec) -> int:
     """Return the bytes that a place takes in the map file, with the most landmarks that it may have."""
-    return spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + (MOST_LANDMARK_BYTES if spec.cells else 0)
+    return spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + (MAX_LANDMARK_BYTES if spec.cells else 0)
 
 
 def probe(technique: Technique, *, tried_s: float = 0.0, meter: QueryMeter | None = None) -> TechniqueCosts:
@@ -108,11 +108,11 @@ def probe(technique: Technique, *, tried_s: float = 0.0, meter: QueryMeter | Non
         most, fewer = (round(count / times) for count in (candidates, max(spec.in_full or 1, candidates // 2)))
         large = bench.try_map(trial_map, large_index, most)
         half = bench.try_map(trial_map, large_index, fewer) if spec.in_full else large
-    once = _least([steps.scan for steps in small]) if spec.fine else NO_COST
+    once = _find_least([steps.scan for steps in small]) if spec.fine else NO_COST
     # The time of scanning six places is not spent on them, but on preparing the query and on the call.
-    scan = _subtract(_least([steps.scan if spec.fine else steps.match for steps in large]), once)
+    scan = _subtract(_find_least([steps.scan if spec.fine else steps.match for steps in large]), once)
     scan *= 1 / len(large_index)
-    compare, part = (_least([steps.compare for steps in tries]) for tries in (large, half))
+    compare, part = (_find_least([steps.compare for steps in tries]) for tries in (large, half))
     if spec.in_full:
         one_more = _subtract(compare, part) * (1 / max(1, times * (most - fewer)))
         # Only a query that is found is verified: of the pictures of noise, the one that is in the map.
@@ -121,7 +121,7 @@ def probe(technique: Technique, *, tried_s: float = 0.0, meter: QueryMeter | Non
     else:
         one_more, compare_once = compare * (1 / candidates) if spec.fine else scan, NO_COST
     return TechniqueCosts(
-        encode=_least([steps.encode for steps in [*small, *large]]),
+        encode=_find_least([steps.encode for steps in [*small, *large]]),
         match_per_place=one_more,
         compare_once=compare_once,
         in_full=spec.in_full or 1,
@@ -174,7 +174,7 @@ class _Bench:
         while len(rounds) < most and time.monotonic() < end_s:
             rounds.append(ask())
         return [
-            Steps(**{name: _least([getattr(steps, name) for steps in tries]) for name in _STEPS})
+            Steps(**{name: _find_least([getattr(steps, name) for steps in tries]) for name in _STEPS})
             for tries in zip(*rounds, strict=True)
         ]
 
@@ -215,7 +215,7 @@ def _subtract(cost: StageCost, part: StageCost) -> StageCost:
     return StageCost(max(cost.wall_s - part.wall_s, least.wall_s), max(cost.cpu_s - part.cpu_s, least.cpu_s))
 
 
-def _least(costs: list[StageCost]) -> StageCost:
+def _find_least(costs: list[StageCost]) -> StageCost:
     """Return the least cost of several tries: the least CPU time, and as wall time the least CPU time too or, if that
     is less, the least wall time. So the wall time spent waiting for other programs is left out, and work on several
     cores, whose wall time is less than its CPU time, is kept."""

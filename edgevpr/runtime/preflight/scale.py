@@ -31,7 +31,7 @@ def count_work(name: str, parameters: Mapping[str, Any]) -> dict[str, float] | N
     name of the field of `TechniqueCosts` that they are the cost of; None if they were not counted."""
     if name != "cohog" or any(parameters.get(key, value) != value for key, value in _COUNTED_SETTINGS.items()):
         return None
-    work: dict[str, float] = _counted()[parameters.get("camera", "forward")]
+    work: dict[str, float] = _read_counts()[parameters.get("camera", "forward")]
     return work
 
 
@@ -47,7 +47,7 @@ def compare_speed(board: Board) -> Speed | None:
     return Speed(products=speed.products / here.products, passes=speed.passes / here.passes)
 
 
-def on_board(
+def scale_to_board(
     costs: TechniqueCosts, board: Board, ratio: Speed | None, work: Mapping[str, float] | None = None
 ) -> TechniqueCosts:
     """Convert costs measured on this machine to `board`, by the `ratio` that `compare_speed` returns, or by the counted
@@ -76,8 +76,8 @@ def _board_speed(score: MachineSpeed) -> Speed | None:
     `arm64_mips` and the instructions counted for a round of the micro-benchmark, unless its `products` are known. Of
     others `single` is that at passes, and a modest share of it that at products."""
     if mips := score.arm64_mips:
-        products = 1e6 * mips / float(_counted()["products"]) / REFERENCE_PRODUCTS_HZ
-        return Speed(score.products or products, 1e6 * mips / float(_counted()["passes"]) / REFERENCE_PASSES_HZ)
+        products = 1e6 * mips / float(_read_counts()["products"]) / REFERENCE_PRODUCTS_HZ
+        return Speed(score.products or products, 1e6 * mips / float(_read_counts()["passes"]) / REFERENCE_PASSES_HZ)
     if single := score.single:
         return Speed(score.products or UNKNOWN_PRODUCTS * single, single)
     return None
@@ -94,7 +94,7 @@ def _scale(cost: StageCost, ratio: float, threads: int) -> StageCost:
 
 
 @cache
-def _counted() -> dict[str, Any]:
+def _read_counts() -> dict[str, Any]:
     """Return the counted instructions: of cohog by camera direction, and of a round of each micro-benchmark."""
     content: dict[str, Any] = json.loads(COUNTED_PATH.read_text("utf-8"))
     return content

@@ -18,7 +18,7 @@ from edgevpr import techniques
 from edgevpr.core.config import FORMS
 from edgevpr.core.errors import EdgevprError
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
-from edgevpr.runtime.recognise.opening import made_for
+from edgevpr.runtime.recognise.opening import make_technique
 from edgevpr.techniques.card import find_weights
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
@@ -53,7 +53,7 @@ def offers(names: Iterable[str], settings: Mapping[str, Mapping[str, Any]] | Non
         own = dict((settings or {}).get(name, {}))
         is_one = "form" in own or "form" not in techniques.parameters(name)
         for chosen in (own,) if is_one else ({**own, "form": form} for form in FORMS):
-            trials.append(Trial(label=techniques.labelled(name, chosen.get("form")), name=name, settings=chosen))
+            trials.append(Trial(label=techniques.format_name(name, chosen.get("form")), name=name, settings=chosen))
     return tuple(trials)
 
 
@@ -85,7 +85,7 @@ def _begin_child(parent_pid: int) -> None:
 def _try_here(trials: list[Trial], threads: int) -> list[Trial]:
     tried = []
     for offer in trials:
-        technique = made_for(threads, offer.name, offer.settings)
+        technique = make_technique(threads, offer.name, offer.settings)
         costs = probe(technique, tried_s=_TRIED_S)
         spec = technique.spec
         tried.append(replace(offer, costs=costs, weights=find_weights(spec), parameters=spec.parameters))

@@ -108,10 +108,10 @@ class Agreement:
 def compare_near(query: Landmarks, place: Landmarks, expected: Overlay) -> Agreement:
     """Compare two pictures near the `expected` overlay. If few landmarks agree there and many on another overlay,
     return the agreement on that one, with `is_expected` False."""
-    found = agreement(query, place, expected)
+    found = measure_agreement(query, place, expected)
     if found.inliers >= CONFIRMED:
         return found
-    otherwise = agreement(query, place)
+    otherwise = measure_agreement(query, place)
     if otherwise.inliers < PROVEN or otherwise.is_at_rest or otherwise.shift_share is None:
         return found  # an agreement at rest may come from a display, not from the ground
     turn_scale = (otherwise.scale or 1.0) * np.exp(1j * np.radians(otherwise.rotation_deg or 0.0))
@@ -119,7 +119,7 @@ def compare_near(query: Landmarks, place: Landmarks, expected: Overlay) -> Agree
     return found if is_near else replace(otherwise, is_expected=False)
 
 
-def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = None) -> Agreement:
+def measure_agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = None) -> Agreement:
     """Compare the landmarks of two pictures, by ways near to the `expected` overlay only (None: by all ways)."""
     possible = min(len(query), len(place))
     nothing = Agreement(inliers=0, matched=0, possible=possible)
@@ -134,7 +134,7 @@ def agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = Non
     mutual = np.flatnonzero((differing.argmin(axis=0)[best] == np.arange(len(asked))) & (least <= _MAX_DIFFERENT_BITS))
     mutual = mutual[np.argsort(least[mutual], kind="stable")]
     asked, known = asked[mutual].astype(complex), known[best[mutual]].astype(complex)
-    way = _most_followed(asked, known, expected)
+    way = _find_most_followed(asked, known, expected)
     nothing = replace(nothing, matched=len(mutual))
     if way is None:
         return nothing
@@ -197,7 +197,7 @@ def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
     return np.asarray((turned_deg <= _MAX_TURN_DEG) & (stretched <= most) & is_there)
 
 
-def _most_followed(asked: Array, known: Array, expected: Overlay | None) -> tuple[complex, complex] | None:
+def _find_most_followed(asked: Array, known: Array, expected: Overlay | None) -> tuple[complex, complex] | None:
     """Return the way that most matches follow, out of those that two matches define; None if none is near to the
     expected overlay. `asked` and `known`, complex (n,), are the points in query and place, best matches first."""
     one, other = np.triu_indices(min(_BEST_MATCHES, len(asked)), 1)

@@ -148,20 +148,20 @@ class Belief:
         """Update the belief with the candidates that a query proposes (None: its picture shows too little; those that
         are not finite do not count), the motion since the previous query, and the number of places in the map now."""
         odds = (1 - self._lost) / max(self._lost, _MIN_WEIGHT)
-        now, lost, appears = self._left()
+        now, lost, appears = self._leave()
         ways = self._ways(now, motion, places)
         p = np.zeros(0 if proposed is None else len(proposed.p))
         numbers: Ints = np.zeros(0, int)
         if proposed is None:
             lost += appears  # whoever enters the map now is at an unknown place
-            after = _unseen(now, ways, 1.0)
+            after = _keep_unseen(now, ways, 1.0)
         else:
             self._enters = _ENTERS
             numbers, proposed = _usable(proposed, self._scale)
             there, alike, staleness, left = self._credit(proposed, now, ways, motion.elapsed_s, appears, places)
             lost *= alike
             # Of a miss, too, pictures of the same ground are no new evidence.
-            unseen = _unseen(now, ways, _MISSED ** motion.share_of_new_ground(self._scale.spacing))
+            unseen = _keep_unseen(now, ways, _MISSED ** motion.share_of_new_ground(self._scale.spacing))
             # A lost aircraft that sees the same ground again has not moved either, so staying is no evidence for it.
             kept = (left * odds * lost - float(unseen.w.sum())) / max(float(there.w.sum()), _MIN_WEIGHT)
             there = replace(there, w=there.w * max(1.0, kept) ** staleness)
@@ -174,7 +174,7 @@ class Belief:
         self._lost = max(0.0, 1 - float(self._now.w.sum()))
         return self._posterior(p)
 
-    def _left(self) -> tuple[_Hypotheses, float, float]:
+    def _leave(self) -> tuple[_Hypotheses, float, float]:
         """Return the hypotheses after the chances of leaving, entering and jumping between two queries, the probability
         of being lost, and that of having entered or jumped to any place."""
         held = float(self._now.w.sum())
@@ -229,7 +229,7 @@ class Belief:
         strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
         same, self._strongest = min(before, strongest), strongest
         scatter = np.sqrt(of_step[:, 0, 0] if scale.is_ordinal else np.trace(of_step, axis1=1, axis2=2) / 2)
-        fresh = np.clip((_apart(now.anchor, at) - _SAME_POSITION_SD * scatter) / scale.spacing, 0, 1)
+        fresh = np.clip((_distances_m(now.anchor, at) - _SAME_POSITION_SD * scatter) / scale.spacing, 0, 1)
         evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None])) * (scale.cell * now.w[:, None])
         led = [way.share[:, None] * evidence * _density(way, at, of_step, scale.is_ordinal) for way in ways]
         weight = sum(each.sum(0) for each in led)  # of the hypotheses that lead to each candidate
@@ -241,12 +241,12 @@ class Belief:
         agreement = float(weight.sum()) * rest / max(_LEAST, float(now.w.sum() * proposed.p.sum()))
         alike = (1 - _ALIKE + _ALIKE * agreement) ** (1 - staleness) if len(now.w) else 1.0
 
-        at_before, of_before = _mean_of(
+        at_before, of_before = _mix_gaussians(
             np.concatenate(led).T / np.maximum(weight, _LEAST)[:, None],
             np.concatenate([way.at for way in ways]),
             np.concatenate([way.covariance for way in ways]),
         )
-        at_both, of_both = _fused(at, of_step, at_before, of_before)
+        at_both, of_both = _fuse(at, of_step, at_before, of_before)
         learns = np.where(np.isnan(now.velocity[:, :1]), 1.0, _NEWEST_WEIGHT)
         kept = (1 - learns) * np.nan_to_num(now.velocity) - learns * now.at / elapsed_s
         velocity = (by.T @ learns) * at / elapsed_s + by.T @ kept
@@ -268,17 +268,17 @@ class Belief:
         now = self._now
         if not len(now.w):
             return Posterior(lost=self._lost, p=p)
-        is_near = _apart(now.at, now.at) <= self._scale.near
+        is_near = _distances_m(now.at, now.at) <= self._scale.near
         there = is_near[(is_near @ now.w).argmax()]
         mass = float(now.w[there].sum())
         share = now.w[there] / mass
-        (at,), (covariance,) = _mean_of(share[None], now.at[there], now.covariance[there])
+        (at,), (covariance,) = _mix_gaussians(share[None], now.at[there], now.covariance[there])
         north, east = (share @ now.heading[there]).tolist()
         heading_deg = math.degrees(math.atan2(east, north)) % 360 if math.hypot(north, east) > 0.5 else None
         return Posterior(lost=self._lost, p=p, mass=mass, at=at, covariance=covariance, heading_deg=heading_deg)
 
 
-def _unseen(now: _Hypotheses, ways: list[_Way], chance: float) -> _Hypotheses:
+def _keep_unseen(now: _Hypotheses, ways: list[_Way], chance: float) -> _Hypotheses:
     """Return the hypotheses after their motion, if the query proposes none of them: `w` times this `chance`."""
     share = np.stack([way.share for way in ways], 1)[..., None]
     at = np.stack([way.at for way in ways], 1)
@@ -289,7 +289,7 @@ def _unseen(now: _Hypotheses, ways: list[_Way], chance: float) -> _Hypotheses:
     return replace(now, w=chance * now.w, at=mean, covariance=spread)
 
 
-def _apart(one: Doubles, other: Doubles) -> Doubles:
+def _distances_m(one: Doubles, other: Doubles) -> Doubles:
     """Return the distance between each of `one` (M, 2) and each of `other` (K, 2): (M, K)."""
     return np.asarray(np.sqrt(((one[:, None] - other) ** 2).sum(2)))
 
@@ -312,7 +312,7 @@ def _firm(covariance: Doubles, least: float) -> Doubles:
     return covariance + more[:, None, None] * np.eye(2)
 
 
-def _fused(one: Doubles, of_one: Doubles, other: Doubles, of_other: Doubles) -> tuple[Doubles, Doubles]:
+def _fuse(one: Doubles, of_one: Doubles, other: Doubles, of_other: Doubles) -> tuple[Doubles, Doubles]:
     """Combine K positions and K others of related errors by covariance intersection (Julier and Uhlmann 1997)."""
     traces = [np.trace(each, axis1=1, axis2=2) for each in (of_one, of_other)]
     share = (traces[1] / (traces[0] + traces[1]))[:, None, None]
@@ -322,7 +322,7 @@ def _fused(one: Doubles, of_one: Doubles, other: Doubles, of_other: Doubles) -> 
     return at[..., 0], covariance
 
 
-def _mean_of(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
+def _mix_gaussians(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
     """Return the means (K, 2) and covariances (K, 2, 2) of K mixtures of M Gaussians with means `at` (M, 2) and
     `covariance` (M, 2, 2), weighted by `share` (K, M)."""
     middle = at.mean(0) if len(at) else np.zeros(2)  # coordinates far from zero would lose digits in their squares

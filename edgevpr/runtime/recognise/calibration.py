@@ -13,7 +13,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.confidence import Model, prior, select_model
 from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE, LookAlike, LookAlikes
 
-FEWEST_PLACES = 30  # a map with fewer is not calibrated
+MIN_PLACES = 30  # a map with fewer is not calibrated
 _MIN_RECOGNISABLE = 0.5  # mean confidence below which a place is hardly recognisable
 _CHECKSUM_DIGITS = 8
 
@@ -60,7 +60,7 @@ class MapCalibration:
 
     def described(self) -> str:
         """Describe the calibration in one sentence: matches accepted, wrong matches, and hardly recognisable places."""
-        if not self.recognisable:  # see `of_several`
+        if not self.recognisable:  # see `join_calibrations`
             return (
                 f"the most cautious of its parts counts: of {self.asked} altered copies of their own images at least "
                 f"{100 * self.accepted:.0f} % were accepted, at a precision of {100 * self.precision:.6g} %"
@@ -105,7 +105,7 @@ def read_calibration_for(place_map: PlaceMap) -> MapCalibration | None:
     return found
 
 
-def of_several(maps: Sequence[MapCalibration | None]) -> MapCalibration | None:
+def join_calibrations(maps: Sequence[MapCalibration | None]) -> MapCalibration | None:
     """Join the calibrations of maps whose places are put together (None: a map has none): a match is only accepted if
     each of them accepts it, and the shipped confidence, if one has none. Places of different maps that look alike were
     never seen together. Returns None if no map has one, or if different versions have made them."""
@@ -143,8 +143,8 @@ def of_several(maps: Sequence[MapCalibration | None]) -> MapCalibration | None:
 
 def not_calibrated(places: int) -> str:
     """Return a sentence for a map with so many places: it is not calibrated, and why."""
-    if places < FEWEST_PLACES:
-        return f"not calibrated ({places} places: fewer than {FEWEST_PLACES}): the shipped confidence is used"
+    if places < MIN_PLACES:
+        return f"not calibrated ({places} places: fewer than {MIN_PLACES}): the shipped confidence is used"
     return "not calibrated: the shipped confidence is used; `edgevpr map calibrate` makes its own of its pictures"
 
 

@@ -19,7 +19,7 @@ from functools import lru_cache
 from typing import Any
 
 from edgevpr.core.errors import ModelError
-from edgevpr.core.files import read_file, shipped
+from edgevpr.core.files import find_shipped, read_file
 
 Figures = Mapping[str, float]  # the figures of the evidence of a match, by their names
 
@@ -144,7 +144,7 @@ def select_model(stored: Mapping[str, Any]) -> Model:
 @lru_cache
 def prior(kind: str) -> Model:
     """Return the shipped model for a kind of evidence (see `evidence`). Raises ModelError if its file is unusable."""
-    path = shipped("models") / f"confidence_{kind}.json"
+    path = find_shipped("models") / f"confidence_{kind}.json"
     try:
         return select_model(json.loads(read_file(path, _MAX_FILE_BYTES)))
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -21,8 +21,8 @@ from edgevpr.places.retrieve import (
     Expectation,
     Query,
     Ranking,
-    elsewhere,
-    named,
+    load_candidates,
+    outside_neighbourhood,
     unmoved_outside_neighbourhood,
 )
 from edgevpr.places.sequence import SequenceSearch
@@ -31,15 +31,15 @@ from edgevpr.runtime.recognise.agreement import (
     CONFIRMED,
     Agreement,
     Overlay,
-    agreement,
     compare_near,
     compose_overlays,
+    measure_agreement,
 )
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder
 from edgevpr.runtime.recognise.evidence import (
     Evidence,
     compute_share,
-    count_beside,
+    count_neighbours,
     gather_evidence,
     log_count,
     log_share,
@@ -53,8 +53,8 @@ from edgevpr.runtime.recognise.judge import (
     is_at_rest,
     judge,
 )
-from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, unpacked
-from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, allow_for_tilt, at_place, locate
+from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, unpack_bytes
+from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, allow_for_tilt, locate, locate_at_place
 from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, ShownTilt, convert_to_tilt
 from edgevpr.runtime.recognise.place_filter import Followed, PlaceFilter
 from edgevpr.runtime.recognise.tilted import SUPPOSED_TILT, agrees_better_tilted
@@ -112,7 +112,7 @@ class Verifier:
         """Return the number of landmarks of the query and of the best place that agree on the overlay of its match: 0
         if those of the place are unknown, or if they are at rest, as a display is."""
         expected, known = self._place(ranking, int(ranking.slots[0]))
-        found = None if known is None else agreement(self.landmarks, known, expected)
+        found = None if known is None else measure_agreement(self.landmarks, known, expected)
         return 0 if found is None or found.is_at_rest else found.inliers
 
     def count_rival(
@@ -121,11 +121,13 @@ class Verifier:
         """Return the number of landmarks of the query and of the best place elsewhere (see `places.retrieve.elsewhere`)
         that agree on the overlay of its match: 0 if there is no place elsewhere, the largest possible number if its
         landmarks are unknown. Places with the numbers `same` are not elsewhere."""
-        away = ranking.slots[elsewhere(self._index, int(ranking.slots[0]), ranking.slots, neighbour_m, same, beside)]
+        away = ranking.slots[
+            outside_neighbourhood(self._index, int(ranking.slots[0]), ranking.slots, neighbour_m, same, beside)
+        ]
         if not len(away):
             return 0
         expected, known = self._place(ranking, int(away[0]))
-        return OF_PLACE if known is None else agreement(self.landmarks, known, expected).inliers
+        return OF_PLACE if known is None else measure_agreement(self.landmarks, known, expected).inliers
 
     def find_same_ground(self, ranking: Ranking) -> tuple[int, ...]:
         """Of the best few places compared, return the numbers of those that show the same ground as the best one: the
@@ -143,7 +145,7 @@ class Verifier:
             for place_id, (other, landmarks) in others.items()
             if other
             and landmarks
-            and agreement(known, landmarks, compose_overlays(expected, other)).inliers >= CONFIRMED
+            and measure_agreement(known, landmarks, compose_overlays(expected, other)).inliers >= CONFIRMED
         )
 
     def _place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
@@ -157,12 +159,12 @@ class Verifier:
         shift_share = dx * width / cells, dy * height / cells
         expected = Overlay(shift_share, match.rotation_deg or 0.0, match.height_ratio)
         try:
-            blob = self._map.landmarks_of(int(self._index.place_ids[slot]))
+            blob = self._map.read_landmarks(int(self._index.place_ids[slot]))
         except PlaceError as error:
             self._map.left_out.setdefault(error.place_id, error.problem)
             raise
         with suppress(ValueError):
-            return expected, None if blob is None else unpacked(blob)
+            return expected, None if blob is None else unpack_bytes(blob)
         return expected, None
 
     @property
@@ -246,7 +248,7 @@ class Decider:
         """Verify the best place of a ranking by landmarks, locate the aircraft by it, and gather the evidence."""
         index, spec, step, rule = self.matcher.index, self.technique.spec, self.meter.step, self.matcher.rule
         with step("compare"):
-            (best,) = named(ranking, index, self.place_map, first=1)
+            (best,) = load_candidates(ranking, index, self.place_map, first=1)
         where = proof = evidence = None
         is_worth_it = best.match.score >= rule.worth_a_look
         # The newest query of a sequence need not be sure by itself.
@@ -256,10 +258,12 @@ class Decider:
                 proof = verifier.compare_best(ranking)
         if is_worth_it:
             with step("locate"):
-                places = named(ranking, index, self.place_map, first=MAX_PLACES_CHECKED if spec.looks_down else 1)
+                places = load_candidates(
+                    ranking, index, self.place_map, first=MAX_PLACES_CHECKED if spec.looks_down else 1
+                )
                 where = locate(places, spec.cells, query.view, proof)
                 if where is None and best.place.position:
-                    where = at_place(best.place.position, self.accuracy_m)
+                    where = locate_at_place(best.place.position, self.accuracy_m)
         same: Collection[int] = where.places if where else ()
         if proof and not same:
             with step("verify"):
@@ -270,7 +274,7 @@ class Decider:
         if is_ahead and rule.sure and evidence and (self.settings.all_evidence or rule.sure.is_open(evidence)):
             with step("verify"):
                 inliers = verifier.count_inliers(ranking)
-                rival = verifier.count_rival(ranking, rule.neighbour_m, beside=count_beside(rule.look_alikes))
+                rival = verifier.count_rival(ranking, rule.neighbour_m, beside=count_neighbours(rule.look_alikes))
             evidence = replace(evidence, proof=log_times_more(inliers, rival), landmarks=log_count(inliers))
         if evidence and proof and evidence.is_hardly_ahead:
             with step("verify"):
@@ -285,7 +289,9 @@ class Decider:
             return None
         with self.meter.step("compare"):
             fine, _ = self.place_map.fine_part(best.place.place_id)
-            return evidence.agree - log_share(compute_share(self.technique.turned(query.descriptor, fine, best.match)))
+            return evidence.agree - log_share(
+                compute_share(self.technique.match_rotated(query.descriptor, fine, best.match))
+            )
 
     def _measure_tilt(self, best: Candidate, query: EncodedFrame) -> ShownTilt:
         """Return the tilt of the query against the place, as both show it."""

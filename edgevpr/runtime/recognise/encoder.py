@@ -8,10 +8,10 @@ from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError, MapError, PlaceError
 from edgevpr.core.reasons import NOT_SEARCHED, Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
-from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, Mount, View, enlarged
+from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, Mount, View, enlarge
 from edgevpr.frames.mask import Mask
 from edgevpr.places.layers import Layers
-from edgevpr.runtime.recognise.landmarks import AHEAD_PX, DOWN_PX, OF_PLACE, Landmarks, describe, packed
+from edgevpr.runtime.recognise.landmarks import AHEAD_PX, DOWN_PX, OF_PLACE, Landmarks, describe, pack_bytes
 from edgevpr.runtime.recognise.levelling import Levelling, Straightening
 from edgevpr.runtime.recognise.salience_gate import Gate, Worth
 
@@ -49,7 +49,7 @@ class FrameEncoder:
         """Return the levelled picture of a frame, with its mask and view. See `Levelling.prepare` for the rest."""
         mask = self.mask.fitted(frame.image) if self.mask else None
         if self.levelling is None:
-            return enlarged(Levelled(frame.image, mask, UNKNOWN_VIEW), scale)
+            return enlarge(Levelled(frame.image, mask, UNKNOWN_VIEW), scale)
         return self.levelling.prepare(frame, vehicle, mask, layers=layers, scale=scale)
 
     def encode(
@@ -78,7 +78,7 @@ class FrameEncoder:
 
     def pack_landmarks(self, picture: Levelled) -> bytes | None:
         """Return the landmarks to store for a place; None if the technique has no use for them."""
-        return packed(self.detect_landmarks(picture)) if self.technique.spec.cells else None
+        return pack_bytes(self.detect_landmarks(picture)) if self.technique.spec.cells else None
 
     def with_mount(self, mount: Mount) -> "FrameEncoder":
         """Return the same for a camera that looks straight down but for `mount`."""

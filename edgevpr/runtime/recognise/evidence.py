@@ -27,7 +27,7 @@ import numpy as np
 
 from edgevpr.core.contract import FineMatch, TechniqueSpec
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.retrieve import MAX_BESIDE, Ranking, elsewhere
+from edgevpr.places.retrieve import MAX_BESIDE, Ranking, outside_neighbourhood
 from edgevpr.runtime.recognise.agreement import Agreement
 
 AHEAD, AHEAD_PROVEN, DOWN, DOWN_BARE = "ahead", "ahead_proven", "down", "down_bare"
@@ -182,8 +182,10 @@ def gather_evidence(
         return None
     slots = np.array(list(matches))
     best = int(slots[0])
-    beside = count_beside(look_alikes)
-    away = frozenset(slots[elsewhere(index, best, slots, neighbour_m, same if down else (), beside)].tolist())
+    beside = count_neighbours(look_alikes)
+    away = frozenset(
+        slots[outside_neighbourhood(index, best, slots, neighbour_m, same if down else (), beside)].tolist()
+    )
     agree = {slot: compute_share(match) for slot, match in matches.items()}
     rivals = (agree[slot] for slot in away)
     evidence = Evidence(
@@ -207,7 +209,7 @@ def gather_evidence(
     return replace(evidence, landmarks=log_count(proof.inliers if proof.is_expected and not proof.is_at_rest else 0))
 
 
-def count_beside(look_alikes: LookAlikes | None) -> int:
+def count_neighbours(look_alikes: LookAlikes | None) -> int:
     """Return how many places before and after one without a position, in the order of mapping, are its neighbours."""
     return MAX_BESIDE if look_alikes is None or look_alikes.overlap else 0
 

@@ -26,12 +26,12 @@ from edgevpr.techniques.session import open_session, prepare, run_outputs, share
 _CAR_M = 4.5
 _CAR_PX = 24  # least length of a car on the input: small detectors find little that is smaller
 _LARGEST_M = 25.0  # no vehicle or boat that moves about is longer
-_MOST_TILES = 4  # along each side; each tile is a run of the network
+_MAX_TILES = 4  # along each side; each tile is a run of the network
 _OVERLAP = 0.1  # of a tile's side, so that what lies across a border is whole in one of them
 CROPS = 5  # along each side; the thesis's C is 5x5
 _SEED = 7
 _STRIDES_PX = (8, 16, 32)  # of the grids of yolox
-_LARGEST_LOG = 20.0  # of the side of a box in cells; the exponential of more would overflow
+_MAX_LOG = 20.0  # of the side of a box in cells; the exponential of more would overflow
 
 Decoded = tuple[Floats, Floats]
 
@@ -71,7 +71,7 @@ def prepare_crops(image: Image, rule: InputRule) -> Singles:
     return np.concatenate([prepare(image[y[0] : y[-1] + 1, x[0] : x[-1] + 1], rule) for y in rows for x in columns])
 
 
-def as_map(matrix: Singles, size_px: tuple[int, int]) -> Singles:
+def interpolate_map(matrix: Singles, size_px: tuple[int, int]) -> Singles:
     """Interpolate the memorability of the crops, float32 (5, 5), bilinearly to float32 `size_px` (height, width)."""
     return np.asarray(cv2.resize(matrix, size_px[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
@@ -110,7 +110,7 @@ class Detector:
         if footprint_m is None:
             return 1
         car_px = _CAR_M / footprint_m * self.card.input.width
-        return min(_MOST_TILES, max(1, math.ceil(_CAR_PX / car_px)))
+        return min(_MAX_TILES, max(1, math.ceil(_CAR_PX / car_px)))
 
     def _boxes_px(self, image: Image) -> Ints:
         """Return the boxes of dynamic classes, int (N, 4): left, top, right, bottom, clipped to the picture."""
@@ -150,7 +150,7 @@ def yolox(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
         strides.append(np.full((len(cells[-1]), 1), stride))
     stride_px = np.concatenate(strides).astype(np.float32)
     centre_px = (values[:, :2] + np.concatenate(cells).astype(np.float32)) * stride_px
-    side_px = np.exp(np.minimum(values[:, 2:4], _LARGEST_LOG)) * stride_px
+    side_px = np.exp(np.minimum(values[:, 2:4], _MAX_LOG)) * stride_px
     boxes = np.concatenate([centre_px - side_px / 2, centre_px + side_px / 2], 1) / (width, height, width, height)
     return boxes.astype(np.float32), values[:, 4:5] * values[:, 5:]
 

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from edgevpr.core.contract import nearest_height
+from edgevpr.core.contract import find_nearest_height
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m, shorter_deg
 from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
@@ -176,7 +176,7 @@ class Prior(RecordedPrior):
         from our last fix if that is at most a minute old. Without a highest speed, the area is where the flight so far
         puts the aircraft, if it is sure.
         """
-        if not self._is_live or (vehicle and not vehicle.is_fresh_at(frame.t_mono_s)):
+        if not self._is_live or (vehicle and not vehicle.is_fresh(frame.t_mono_s)):
             vehicle = None
         known, reach = self._last_fix, None
         if vehicle and vehicle.has_gps:
@@ -200,7 +200,7 @@ class Prior(RecordedPrior):
         ratio = self.height_ratio
         if not height_ratios or abs(math.log(ratio)) <= math.log(_SAME_SCALE):
             return 1.0
-        return max(ratio, _MIN_SCALE) if ratio < 1 else ratio / nearest_height(height_ratios, ratio)
+        return max(ratio, _MIN_SCALE) if ratio < 1 else ratio / find_nearest_height(height_ratios, ratio)
 
     def update(
         self,

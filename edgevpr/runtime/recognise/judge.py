@@ -16,7 +16,7 @@ from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.frames.level import MAX_TILT_UNLEVELLED_DEG
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.retrieve import Ranking, elsewhere, margin
+from edgevpr.places.retrieve import Ranking, margin, outside_neighbourhood
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.calibration import MapCalibration
@@ -289,7 +289,7 @@ def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: S
     """
     if ranking.compared and int(ranking.slots[0]) not in ranking.compared:
         return Reason(ReasonCode.NEWEST_DISAGREES)
-    away = elsewhere(index, int(ranking.slots[0]), np.arange(len(index)), rule.neighbour_m)
+    away = outside_neighbourhood(index, int(ranking.slots[0]), np.arange(len(index)), rule.neighbour_m)
     if not search.goes_on(~away, rule.min_score):
         return Reason(ReasonCode.NEWEST_LEFT)
     ahead_of_rivals = float(ranking.scores[0]) - float(search.rivals[away].max(initial=0))

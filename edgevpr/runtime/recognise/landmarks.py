@@ -97,7 +97,7 @@ def _spread(at_px: Singles, most: int, cell_px: float) -> Ints:
     return kept[np.argsort(turn, kind="stable")[:most]]
 
 
-def packed(landmarks: Landmarks) -> bytes:
+def pack_bytes(landmarks: Landmarks) -> bytes:
     """Convert landmarks to the form of map files: a header of 3 bytes, then 38 bytes for each."""
     stored = np.empty(len(landmarks), _STORED)
     at = np.rint((landmarks.points.astype(np.float64) + 0.5) * 65535).clip(0, 65535)
@@ -108,8 +108,8 @@ def packed(landmarks: Landmarks) -> bytes:
     return _HEADER.pack(_VERSION, len(stored)) + stored.tobytes()
 
 
-def unpacked(blob: bytes) -> Landmarks:
-    """Convert bytes made by `packed` back to landmarks. Raises ValueError for anything else."""
+def unpack_bytes(blob: bytes) -> Landmarks:
+    """Convert bytes made by `pack_bytes` back to landmarks. Raises ValueError for anything else."""
     version, count = _HEADER.unpack(blob[: _HEADER.size].ljust(_HEADER.size, b"\0"))
     if version != _VERSION or len(blob) != _HEADER.size + count * _STORED.itemsize:
         raise ValueError("its landmarks have a form that this edgevpr does not know")

@@ -10,7 +10,7 @@ from edgevpr.core.arrays import Mask
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import axes_of, moved
+from edgevpr.core.geodesy import offset_position, picture_axes
 from edgevpr.core.types import Frame, Pose, Position, Vehicle
 from edgevpr.frames.lens import CalibratedLens, line_of_sight, read_lens
 from edgevpr.frames.level import (
@@ -21,9 +21,9 @@ from edgevpr.frames.level import (
     Mount,
     View,
     compute_footprint,
-    enlarged,
-    leaning,
-    levelled,
+    enlarge,
+    estimate_tilted_view,
+    level_image,
     undistort_frame,
 )
 from edgevpr.frames.source import is_live
@@ -73,15 +73,15 @@ class Levelling:
         False where the picture shows no ground (None: nowhere). Its longest side is scaled to a length on the ground,
         that of the places to look among by their `layers` (None: no scaling). It shows `scale` times as much ground as
         its height tells or, where that is unknown, as those of the map."""
-        if vehicle and not (self.is_live and vehicle.is_fresh_at(frame.t_mono_s)):
+        if vehicle and not (self.is_live and vehicle.is_fresh(frame.t_mono_s)):
             vehicle = None
         if vehicle and self.on_gimbal:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
         if self.lens is None:
-            return enlarged(Levelled(frame.image, overlay, leaning(frame, vehicle, self.mount)), scale)
+            return enlarge(Levelled(frame.image, overlay, estimate_tilted_view(frame, vehicle, self.mount)), scale)
         own_m = compute_footprint(frame, vehicle, self.lens) if layers else None
         footprint_m = layers.fitting(own_m and scale * own_m) if layers else None
-        picture = levelled(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self.below, scale=scale)
+        picture = level_image(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self.below, scale=scale)
         if picture.view.reason and not self._has_warned:
             self._has_warned = True
             _log.warning("%s is taken as it is, as others like it will be: %s", frame.name, picture.view.reason)
@@ -108,7 +108,7 @@ def make_levelling(
     if technique.spec.parameters.get("camera") != "nadir":
         calibrated = load_calibrated_lens(config)
         return Straightening(calibrated) if calibrated else None
-    lens, mount = lens_of(config), read_mount(config)
+    lens, mount = read_camera_lens(config), read_mount(config)
     if lens is None:
         _log.info("no correction for tilt, height or heading: set source.fov_deg (--fov-deg)")
         if config.gimbal and mount == STRAIGHT_DOWN:
@@ -116,7 +116,7 @@ def make_levelling(
     return Levelling(lens, below=below, on_gimbal=config.gimbal, is_live=is_live(config.uri), mount=mount)
 
 
-def lens_of(config: SourceConfig) -> Lens | None:
+def read_camera_lens(config: SourceConfig) -> Lens | None:
     """Return the lens of a configuration's camera; None if it is unknown. Raises as `make_levelling`."""
     calibrated = load_calibrated_lens(config)
     fov_deg = line_of_sight(calibrated, calibrated.size_px).fov_deg if calibrated else config.fov_deg
@@ -156,7 +156,7 @@ def place_at_middle(frame: Frame, view: View) -> Frame:
         return replace(frame, position=None)
     if frame.position and view.lean_m:
         east_m, north_m = view.lean_m
-        middle = moved(frame.position.lat_deg, frame.position.lon_deg, -east_m, -north_m)
+        middle = offset_position(frame.position.lat_deg, frame.position.lon_deg, -east_m, -north_m)
         return replace(frame, position=Position(*middle, frame.position.alt_m))
     if frame.pose is not None or frame.position is None or view.up_deg is None or view.footprint_m is None:
         return frame
@@ -166,7 +166,7 @@ def place_at_middle(frame: Frame, view: View) -> Frame:
     else:
         # The point `aside` is below the aircraft: the picture's middle is as far from it, in the opposite direction.
         variance_m2 += (view.aside_sd * view.footprint_m) ** 2
-        off_m = -view.footprint_m * axes_of(view.up_deg) @ view.aside
-        position = Position(*moved(position.lat_deg, position.lon_deg, *off_m.tolist()), position.alt_m)
+        off_m = -view.footprint_m * picture_axes(view.up_deg) @ view.aside
+        position = Position(*offset_position(position.lat_deg, position.lon_deg, *off_m.tolist()), position.alt_m)
     pose = Pose(up_deg=view.up_deg, footprint_m=view.footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2))
     return replace(frame, position=position, pose=pose)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgevpr.core.arrays import Covariance, Doubles
-from edgevpr.core.geodesy import axes_of, moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position, picture_axes
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Candidate, Place, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
@@ -86,10 +86,10 @@ class _PlaceEstimate:
         """Return True if both positions are about the same. Relative to each other, poses are known far better than on
         the Earth, so only half of the variance of each counts."""
         covariance = self.of_step + other.of_step + (self.of_pose + other.of_pose) / 2
-        return in_sd(self.at_m - other.at_m, covariance) <= _MAX_DIFFERENCE_SD
+        return mahalanobis(self.at_m - other.at_m, covariance) <= _MAX_DIFFERENCE_SD
 
 
-def at_place(position: Position, accuracy_m: float) -> Located:
+def locate_at_place(position: Position, accuracy_m: float) -> Located:
     """Return the position of a place as that of the aircraft; `accuracy_m` is the standard deviation along one axis."""
     return Located(position=position, covariance_m2=(accuracy_m**2, 0.0, accuracy_m**2))
 
@@ -130,7 +130,7 @@ def locate(
     if sum(score for score, _ in against) > _OUTWEIGHS * sum(each.score for each in agreeing):
         objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"apart_m": max(against)[1]})
     footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
-    here = moved(best.position.lat_deg, best.position.lon_deg, *at_m.tolist())
+    here = offset_position(best.position.lat_deg, best.position.lon_deg, *at_m.tolist())
     return Located(
         position=Position(*here, best.position.alt_m),
         covariance_m2=to_triple(covariance),
@@ -158,7 +158,7 @@ def covariance_matrix(covariance: Covariance) -> Doubles:
     return np.array([[covariance[0], covariance[1]], [covariance[1], covariance[2]]])
 
 
-def in_sd(step: Doubles, covariance: Doubles) -> float:
+def mahalanobis(step: Doubles, covariance: Doubles) -> float:
     """Return the length of a shift (2,) in standard deviations: its Mahalanobis distance, by a covariance (2, 2)."""
     return math.sqrt(step @ np.linalg.solve(covariance, step))
 
@@ -186,7 +186,7 @@ def _estimate(
         return None
     if place.position is None or pose is None or best.position is None or best.pose is None:
         return None
-    off_m = _off_m(best.position, place.position)
+    off_m = _offset_m(best.position, place.position)
     if float(np.hypot(*off_m)) > (pose.footprint_m + best.pose.footprint_m) / 2:
         return None
     if proof:
@@ -202,7 +202,7 @@ def _estimate(
     right, up = aside
     dx = step[0] + ratio * (right * math.cos(turn) + up * math.sin(turn))
     dy = step[1] + ratio * (right * math.sin(turn) - up * math.cos(turn))
-    axes = axes_of(pose.up_deg)
+    axes = picture_axes(pose.up_deg)
     step_m = pose.footprint_m * (axes @ (dx, -dy))
     by_length = (_POSE_SD * float(np.hypot(*step_m))) ** 2 * np.eye(2)
     upwards = covariance * [[1, -1], [-1, 1]]  # y up instead of down
@@ -217,7 +217,7 @@ def _estimate(
     )
 
 
-def _off_m(origin: Position, position: Position) -> Doubles:
+def _offset_m(origin: Position, position: Position) -> Doubles:
     """Return how far east and north of `origin` a position is (2,), metres."""
     return np.array(offset_m(origin.lat_deg, origin.lon_deg, position.lat_deg, position.lon_deg))
 

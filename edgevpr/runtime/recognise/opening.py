@@ -25,7 +25,7 @@ from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling, make_levelling
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.runtime.recognise.salience_gate import MOST_ENTROPY, Gate
+from edgevpr.runtime.recognise.salience_gate import MAX_ENTROPY, Gate
 from edgevpr.runtime.recognise.stride import Strides
 from edgevpr.techniques.card import load_card
 
@@ -98,9 +98,9 @@ def open_salience_gate(config: SalienceConfig, threads: int = 1) -> Gate | None:
     network."""
     if not config.use:
         return None
-    if config.entropy > MOST_ENTROPY:
+    if config.entropy > MAX_ENTROPY:
         raise ConfigError(
-            f"`salience.entropy` is {config.entropy:g}, and no picture has more than {MOST_ENTROPY:.3f}: lower it."
+            f"`salience.entropy` is {config.entropy:g}, and no picture has more than {MAX_ENTROPY:.3f}: lower it."
         )
     memorability = detector = None
     if config.memorability > 0:
@@ -118,7 +118,7 @@ def open_salience_gate(config: SalienceConfig, threads: int = 1) -> Gate | None:
     return Gate(config, memorability, detector)
 
 
-def made_for(threads: int | None, name: str, settings: Settings | None = None) -> Technique:
+def make_technique(threads: int | None, name: str, settings: Settings | None = None) -> Technique:
     """Make the technique `name`; its network gets `threads` (None: one) unless `settings` give a number."""
     own = {"threads": threads} if threads and "threads" in techniques.parameters(name) else {}
     return techniques.create(name, {**own, **(settings or {})})
@@ -141,7 +141,7 @@ def create_technique(
         )
     if name in (None, built_with.name):
         try:
-            technique = made_for(threads, built_with.name, {**built_with.parameters, **settings})
+            technique = make_technique(threads, built_with.name, {**built_with.parameters, **settings})
         except (UsageError, TypeError, OverflowError) as error:
             if settings and isinstance(error, UsageError):
                 raise
@@ -149,7 +149,7 @@ def create_technique(
                 f"{place_map.path}: its parameters cannot be used ({error}): restore a copy or build the map again."
             ) from error
     else:
-        technique = made_for(threads, name, settings)
+        technique = make_technique(threads, name, settings)
     place_map.require(technique.spec)
     return technique
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Array
 from edgevpr.core.contract import Perspective
-from edgevpr.core.geodesy import axes_of, fit_similarity
+from edgevpr.core.geodesy import fit_similarity, picture_axes
 from edgevpr.frames.level import View
 
 _FEWEST = 12  # landmarks
@@ -110,5 +110,5 @@ def fit_attitude_error(asked: Array, known: Array, view: View, up_deg: float) ->
     left = seen - looks @ way
     variance = float(left @ left) / (2 * count - len(way)) * _ALIKE * float(inverse[6, 6] + inverse[7, 7]) / 2
     right, down = way[6:]
-    east, north = axes_of(up_deg) @ (-right, down)
+    east, north = picture_axes(up_deg) @ (-right, down)
     return AttitudeError((float(east), float(north)), math.hypot(math.sqrt(variance), _PLACE_SD))

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Ints
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.layers import layers_of
+from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.belief import (
@@ -72,7 +72,7 @@ class _Survey:
         if known.mean() > _HALF:
             first = int(np.flatnonzero(known)[0])
             self.origin = Position(float(index.lat_deg[first]), float(index.lon_deg[first]))
-            spacing_m, footprint_m = index.spacing_m() or 0.0, layers_of(place_map).median_m
+            spacing_m, footprint_m = index.spacing_m() or 0.0, read_layers(place_map).median_m
             self.spread = max(_MIN_SPACING_M, spacing_m)
             near_m = _NEAR_FOOTPRINT * footprint_m if footprint_m else self.spread
             self.scale = MapScale(
@@ -115,7 +115,7 @@ class PlaceFilter:
         now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
         before_s, self._t_now_s = self._t_committed_s, now_s
         self._elapsed_s = None if before_s is None or now_s is None else now_s - before_s
-        is_fresh = self._is_live and vehicle is not None and vehicle.is_fresh_at(frame.t_mono_s)
+        is_fresh = self._is_live and vehicle is not None and vehicle.is_fresh(frame.t_mono_s)
         self._velocity_m_s = vehicle.velocity_m_s if vehicle and is_fresh else None
         self._stride = stride if stride and stride.from_s == before_s else None
 
@@ -143,7 +143,7 @@ class PlaceFilter:
             confidence = self._limit_repetition(at, confidence, float(proposed.p[is_near].sum()))
         estimate = None
         if survey.origin and posterior.mass:
-            position = Position(*moved(survey.origin.lat_deg, survey.origin.lon_deg, *posterior.at.tolist()))
+            position = Position(*offset_position(survey.origin.lat_deg, survey.origin.lon_deg, *posterior.at.tolist()))
             covariance_m2, heading_deg = to_triple(posterior.covariance), posterior.heading_deg
             estimate = Located(position=position, covariance_m2=covariance_m2, heading_deg=heading_deg)
         return Followed(slot=slot, confidence=confidence, lost=posterior.lost, mass=posterior.mass, estimate=estimate)

@@ -9,13 +9,13 @@ import logging
 from dataclasses import replace
 from itertools import islice
 
-from edgevpr.core.contract import Descriptor, nearest_height
+from edgevpr.core.contract import Descriptor, find_nearest_height
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.level import Mount, View
-from edgevpr.places.layers import layers_of
+from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Expectation, Ranking, compare, scan, together
+from edgevpr.places.retrieve import Expectation, Ranking, compare, merge_rankings, scan
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Decider, Decision, Matcher, Verifier, WalkSettings
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, explain_failure
@@ -55,7 +55,7 @@ class Recogniser:
         self._settings, self._strides, self._place_filter = settings, strides, place_filter
         self._prior = prior or RecordedPrior()
         self._left_out_reported = 0  # places
-        self._layers = matcher.layers or layers_of(place_map)
+        self._layers = matcher.layers or read_layers(place_map)
         self.matcher, self.index, self.rule = matcher, matcher.index, matcher.rule
         # Places nearer to each other show the same ground: neither is a rival of the other.
         self._footprint_m = max(self._layers.footprints_m, default=0.0)
@@ -209,17 +209,17 @@ class Recogniser:
         height_ratio = prior.height_ratio / self._scale
         expected = to_expectation(hints, height_ratio, self.index)
         footprint_m = query.view.footprint_m or prior.footprint_m
-        ranking = self._search(query.descriptor, self._layers.narrowed(expected, self.index, footprint_m))
+        ranking = self._search(query.descriptor, self._layers.narrow(expected, self.index, footprint_m))
         if search:
             ranking = search.follow(ranking, self.index, query.frame.t_mono_s)
         decision = self._decider.decide(ranking, query, hints, verifier, place_filter)
         if decision.verdict.accepted or search or not height_ratios or not prior.looks_again:
             return decision
-        first = nearest_height(height_ratios, height_ratio)
+        first = find_nearest_height(height_ratios, height_ratio)
         for ratio in height_ratios:
             if ratio != first:
                 other = self._search(query.descriptor, replace(expected, height_ratio=ratio), _LATER_PASS_SHARE)
-                ranking = together(ranking, other)
+                ranking = merge_rankings(ranking, other)
         # Matches of all passes are judged together: each can speak against the best one.
         return self._decider.decide(ranking, query, hints, verifier, place_filter)
 

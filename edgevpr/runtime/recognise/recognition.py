@@ -72,7 +72,7 @@ class Recognition:
         return self.descriptor is not None
 
 
-def fields_of(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
+def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
     """Return the event as a dict for the flight log (kind "query"), or with an `exact` confidence, of which six digits
     would make 1 where it is nearly sure. `edgevpr match` and the status of a flight are made of it too.
 
@@ -87,23 +87,23 @@ def fields_of(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
         "salience": event.worth and event.worth.salience.rounded(),
         "stride": event.stride and event.stride.fields(),
         "landmarks": event.proof and _landmarks(event.proof),
-        "confidence": event.confidence if exact else _rounded(event.confidence, 6),
+        "confidence": event.confidence if exact else _round(event.confidence, 6),
         "evidence": evidence,
-        "followed": event.followed and _followed(event.followed),
+        "followed": event.followed and _followed_fields(event.followed),
     }
     return {
         "query": event.frame and event.frame.name,
-        **_best(event.best),
+        **_best_fields(event.best),
         **{key: value for key, value in known.items() if value is not None and value != {}},
         "accepted": event.accepted,
         "reason": event.reason.fields(),
         "accuracy_m": event.accuracy_m,
-        "located": event.located and _located(event.located),
+        "located": event.located and _located_fields(event.located),
         "costs": {key: value and float(f"{value:.6g}") for key, value in asdict(event.cost).items()},
     }
 
 
-def _best(candidate: Candidate | None) -> dict[str, Any]:
+def _best_fields(candidate: Candidate | None) -> dict[str, Any]:
     if candidate is None:
         return dict.fromkeys(_OF_THE_BEST)
     place, match = candidate.place, candidate.match
@@ -117,17 +117,17 @@ def _landmarks(proof: Agreement) -> dict[str, Any]:
     fields: dict[str, Any] = {"inliers": proof.inliers, "matched": proof.matched}
     if proof.shift_share is not None:
         fields["shift_share"] = [round(share, 4) for share in proof.shift_share]
-        fields |= {"rotation_deg": _rounded(proof.rotation_deg, 1), "scale": _rounded(proof.scale, 3)}
+        fields |= {"rotation_deg": _round(proof.rotation_deg, 1), "scale": _round(proof.scale, 3)}
     return fields
 
 
-def _followed(followed: Followed) -> dict[str, Any]:
+def _followed_fields(followed: Followed) -> dict[str, Any]:
     fields = {"confidence": round(followed.confidence, 6), "lost": round(followed.lost, 6)}
     return fields | (_where(followed.estimate) if followed.estimate else {})
 
 
-def _located(where: Located) -> dict[str, Any]:
-    fields = _where(where) | {"height_ratio": _rounded(where.height_ratio, 3), "places": list(where.places)}
+def _located_fields(where: Located) -> dict[str, Any]:
+    fields = _where(where) | {"height_ratio": _round(where.height_ratio, 3), "places": list(where.places)}
     if where.height_m is not None:
         fields["height_m"] = round(where.height_m, 1)
     if where.lean:
@@ -140,9 +140,9 @@ def _where(where: Located) -> dict[str, Any]:
         "lat_deg": round(where.position.lat_deg, 8),
         "lon_deg": round(where.position.lon_deg, 8),
         "covariance_m2": [round(value, 3) for value in where.covariance_m2],
-        "heading_deg": _rounded(where.heading_deg, 1),
+        "heading_deg": _round(where.heading_deg, 1),
     }
 
 
-def _rounded(value: float | None, digits: int) -> float | None:
+def _round(value: float | None, digits: int) -> float | None:
     return None if value is None else round(value, digits)

@@ -18,16 +18,16 @@ from edgevpr.core.arrays import Image, Mask
 from edgevpr.core.config import SalienceConfig
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Salience
-from edgevpr.runtime.recognise.gate_networks import Detector, Memorability, as_map
+from edgevpr.runtime.recognise.gate_networks import Detector, Memorability, interpolate_map
 from edgevpr.techniques.entropy import filled_bins
 
-MOST_ENTROPY = float(np.log2(81) / 8)  # entropy / 8 bits of a disc of 81 pixels, all different
+MAX_ENTROPY = float(np.log2(81) / 8)  # entropy / 8 bits of a disc of 81 pixels, all different
 GAP_FRAMES = 20  # if none of so many frames passes, the thresholds are lowered
 STEP = 0.03  # by which they are lowered at a time
 _TO_KNOW, _REMEMBERED = 8, 100  # frames that tell what entropy is usual: at least, at most
 # A tenth of a normal distribution lies more than so many differences of its 90th and 75th percentiles below the 75th.
 _STEPS_BELOW, _LEAST_STEP = 3.2, 0.005
-_LONGEST_PX = 320  # of the copy on which entropy is computed: a larger one costs more and gives the same
+_MAX_PX = 320  # of the copy on which entropy is computed: a larger one costs more and gives the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ def compute_scores(image: Image, memorability: Memorability | None = None, is_st
 
     `is_static`, bool (H, W), is the detector's result for the picture (None: no detector). Raises ModelError.
     """
-    shrink, grey = _LONGEST_PX / max(image.shape[:2]), image
+    shrink, grey = _MAX_PX / max(image.shape[:2]), image
     if shrink < 1:
         size = tuple(max(1, round(side * shrink)) for side in image.shape[1::-1])
         grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -116,7 +116,7 @@ def compute_scores(image: Image, memorability: Memorability | None = None, is_st
         covered = cv2.resize((~is_static).astype(np.float32), grey.shape[::-1], interpolation=cv2.INTER_AREA)
         is_static = covered < 0.5
     static = 1.0 if is_static is None else is_static
-    memorable = None if memorability is None else as_map(memorability.matrix(image), grey.shape)
+    memorable = None if memorability is None else interpolate_map(memorability.matrix(image), grey.shape)
     return Salience(
         memorability=None if memorable is None else float((memorable * static).mean()),
         staticity=None if is_static is None else float(is_static.mean()),

@@ -8,9 +8,9 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-from edgevpr.core.geodesy import axes_of, shorter_deg
+from edgevpr.core.geodesy import picture_axes, shorter_deg
 from edgevpr.frames.level import View
-from edgevpr.runtime.recognise.agreement import agreement
+from edgevpr.runtime.recognise.agreement import measure_agreement
 from edgevpr.runtime.recognise.landmarks import OF_PLACE, Landmarks
 
 # Over ground that repeats, as furrows do, landmarks match at many shifts: few of the matches agree on one.
@@ -63,7 +63,7 @@ class Strides:
             return None
         if start.footprint_m is None or view.footprint_m is None:
             return None
-        found = agreement(landmarks, known)
+        found = measure_agreement(landmarks, known)
         if found.inliers < max(_MIN_INLIERS, _MIN_INLIER_SHARE * found.matched):
             return None
         if found.shift_share is None or found.rotation_deg is None or found.scale is None:
@@ -76,7 +76,7 @@ class Strides:
         factor = found.scale * complex(math.cos(turn := math.radians(found.rotation_deg)), math.sin(turn))
         step = factor * complex(view.aside[0], -view.aside[1]) + complex(*found.shift_share)
         step -= complex(start.aside[0], -start.aside[1])
-        east_m, north_m = start.footprint_m * axes_of(start.up_deg) @ (step.real, -step.imag)
+        east_m, north_m = start.footprint_m * picture_axes(start.up_deg) @ (step.real, -step.imag)
         return Stride(
             from_s=from_s,
             to_s=t_s,

@@ -24,7 +24,7 @@ _DIRECTIONS = 6
 # A match of a tilted picture is one of its near part: its middle shows more ground than the match says.
 _SCALES = (1.25, 1.5)
 _MAX_SIDE_PX = 512
-_LEAST_DOWN = 0.1  # as in `frames.level`
+_MIN_DOWN = 0.1  # as in `frames.level`
 
 
 def agrees_better_tilted(picture: Levelled, focal: float, technique: Technique, fine: Array, match: FineMatch) -> bool:
@@ -57,7 +57,7 @@ def _score(
     right, down = np.array(match.shift_cells or (0.0, 0.0)) * side / (technique.spec.cells or 1) + (side - 1) / 2
     over_place = [[turn_scale.real, -turn_scale.imag, right], [turn_scale.imag, turn_scale.real, down], [0, 0, 1]]
     corners = np.array([[0, width - 1, width - 1, 0], [0, 0, height - 1, height - 1], [1] * 4], float)
-    corners = cut_polygon(corners, (level_from_lens @ lens_from_pixel @ corners)[2] - _LEAST_DOWN)
+    corners = cut_polygon(corners, (level_from_lens @ lens_from_pixel @ corners)[2] - _MIN_DOWN)
     warp = Homography(over_place @ level @ lens_from_pixel, corners, side, focal_px / (out_px * abs(turn_scale)))
     mask = warp.shown if picture.mask is None else warp.shown & warp.overlay(picture.mask)
-    return technique.unmoved(technique.encode(warp.picture(picture.image), mask), fine).score
+    return technique.match_at_rest(technique.encode(warp.picture(picture.image), mask), fine).score

@@ -9,7 +9,7 @@ from pathlib import Path
 from edgevpr.core.config import Config, MavlinkConfig, SourceConfig, load_config
 from edgevpr.core.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.core.text import waiting
+from edgevpr.core.text import show_waiting
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import is_live, missing_cause, open_source, recorded_intervals
@@ -43,11 +43,11 @@ def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
         findings.append(run_check("map", lambda what: _check_map(what, config, board)))
     except ConfigError as error:  # then nothing is known of what the map would take
         findings.append(refuse("board", error))
-    waiting("opening the source" if offline else f"waiting for a frame of the source, {FRAME_WAIT_S:g} s at most")
+    show_waiting("opening the source" if offline else f"waiting for a frame of the source, {FRAME_WAIT_S:g} s at most")
     findings.append(run_check("source", lambda what: _check_source(what, source, offline)))
-    waiting("waiting for the flight controller")
+    show_waiting("waiting for the flight controller")
     findings.append(run_check("link", lambda what: _check_link(what, config.mavlink, offline)))
-    waiting("")
+    show_waiting("")
     return [*findings, run_check("log", lambda what: check_log(what, config.log.path))]
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from edgevpr.core.config import Config
 from edgevpr.core.errors import LinkError
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.core.text import waiting
+from edgevpr.core.text import show_waiting
 from edgevpr.frames.source import is_live
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.asking import HEARTBEAT_WAIT_S, AutopilotReading, Inquiry, read_autopilot
@@ -34,10 +34,10 @@ def doctor(config: Config, address: LinkAddress) -> tuple[list[Finding], Autopil
     if (uri := source.uri) and is_live(uri):
         of_camera = list(check_camera(uri))
         if all(finding.ok for finding in of_camera):
-            waiting(f"waiting for a frame of {uri}")
+            show_waiting(f"waiting for a frame of {uri}")
             of_camera.append(run_check("frames", lambda what: check_frame(what, source)))
         of_machine += of_camera
-    waiting(f"asking the autopilot at {address}")
+    show_waiting(f"asking the autopilot at {address}")
     reading = None
     try:
         with Inquiry(address, settings.component_id, settings.system_id, signing) as inquiry:
@@ -49,7 +49,7 @@ def doctor(config: Config, address: LinkAddress) -> tuple[list[Finding], Autopil
             )
     except LinkError as error:
         reading, of_autopilot = None, [refuse("link", error)]
-    waiting("")
+    show_waiting("")
     return of_autopilot + of_machine, reading
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from edgevpr.core.config import LogConfig
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.files import shipped
+from edgevpr.core.files import find_shipped
 from edgevpr.core.reasons import Code, Reason, ReasonCode
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.power import machine
@@ -109,7 +109,7 @@ def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
         return fine(what, FindingCode.DEVICE_READY, **access)
     changes = [f"sudo usermod --append --groups {group} USER", f"docker run --group-add {status.st_gid}"]
     if group in _SYSTEM_GROUPS:
-        rules = shipped("deploy") / "99-edgevpr.rules"
+        rules = find_shipped("deploy") / "99-edgevpr.rules"
         changes = [no_login if is_serial else f"sudo install -D -m 644 -t /etc/udev/rules.d {rules}"]
     return wrong(what, FindingCode.DEVICE_DENIED, *changes, user=os.getuid(), **access)
 

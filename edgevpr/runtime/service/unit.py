@@ -2,7 +2,7 @@
 
 import re
 
-from edgevpr.core.files import shipped
+from edgevpr.core.files import find_shipped
 from edgevpr.core.text import printable
 from edgevpr.power.boards import Board
 
@@ -15,5 +15,5 @@ def render_unit(board: Board) -> str:
         "CPUQuota=": f"{100 * board.cpu_share * board.cores:.0f}%",
     }
     keys = re.compile(f"(?m)^({'|'.join(changed)}).*$")
-    text = (shipped("deploy") / "edgevpr.service").read_text(encoding="utf-8")
+    text = (find_shipped("deploy") / "edgevpr.service").read_text(encoding="utf-8")
     return keys.sub(lambda line: line[1] + changed[line[1]], text)

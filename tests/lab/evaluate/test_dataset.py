@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.lab.evaluate.dataset import load_dataset, open_folder
 
 
@@ -113,7 +113,9 @@ def test_open_folder_matches_positions_by_distance(tmp_path):
     places = {"near.jpg": (3, 0), "beside.jpg": (20, 0), "far.jpg": (60, 0)}
     for side, offsets in (("query", queries), ("ref", places)):
         write_pictures(tmp_path / side, [*offsets, "nowhere.jpg"])
-        rows = [f"{name},{','.join(map(repr, moved(*here, *offset_m)))}" for name, offset_m in offsets.items()]
+        rows = [
+            f"{name},{','.join(map(repr, offset_position(*here, *offset_m)))}" for name, offset_m in offsets.items()
+        ]
         (tmp_path / side / "positions.csv").write_text("\n".join(["file,lat,lon", *rows]))
     dataset = open_folder(tmp_path, 25)
     assert right_of(dataset) == {"q.jpg": ({"near.jpg", "beside.jpg"}, set()), "far.jpg": (set(), set())}

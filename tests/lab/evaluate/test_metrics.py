@@ -67,7 +67,11 @@ def test_precision_recall_accepts_no_query_that_found_nothing():
 
 def test_first_right_is_the_rank_of_the_first_right_reference():
     right = np.array([False, True, False, True])
-    assert [metrics.first_right(np.array(order), right) for order in ([1, 0], [0, 2, 3, 1], [2, 0])] == [0, 2, NEVER]
+    assert [metrics.rank_first_right(np.array(order), right) for order in ([1, 0], [0, 2, 3, 1], [2, 0])] == [
+        0,
+        2,
+        NEVER,
+    ]
 
 
 def test_pcu_of_the_slowest_technique_is_its_precision():

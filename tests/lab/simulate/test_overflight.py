@@ -10,11 +10,11 @@ pytest.importorskip("rasterio", reason="rasterio is not installed (pip install '
 from rasters import HOME, MARKS_M, marked_raster, write_mission
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel
-from edgevpr.lab.simulate.overflight import make_poses, read_shots, seen_from, write_overflight
+from edgevpr.lab.simulate.overflight import make_poses, photograph_from, read_shots, write_overflight
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 pytestmark = pytest.mark.slow
@@ -43,9 +43,9 @@ def orthophoto(tmp_path_factory):
     ],
 )
 def test_seen_from_shows_a_mark_where_the_pinhole_camera_does(orthophoto, change, off_m):
-    at = Position(*moved(HOME.lat_deg, HOME.lon_deg, *off_m))
+    at = Position(*offset_position(HOME.lat_deg, HOME.lon_deg, *off_m))
     pose = replace(LEVEL, **change)
-    picture = seen_from(orthophoto, at, pose, CAMERA, CLEAR, np.random.default_rng(0))
+    picture = photograph_from(orthophoto, at, pose, CAMERA, CLEAR, np.random.default_rng(0))
     assert picture.shape == (480, 640, 3)
     bright = np.clip(picture[..., 2].astype(float) - 75, 0, None)
     rows, columns = np.indices(bright.shape)
@@ -63,11 +63,11 @@ def test_seen_from_shows_a_mark_where_the_pinhole_camera_does(orthophoto, change
 
 def test_seen_from_takes_none_beyond_the_orthophoto_and_refuses_the_horizon(orthophoto):
     rng = np.random.default_rng(0)
-    edge = Position(*moved(HOME.lat_deg, HOME.lon_deg, 300, 0))
-    assert seen_from(orthophoto, edge, LEVEL, CAMERA, CLEAR, rng) is None
+    edge = Position(*offset_position(HOME.lat_deg, HOME.lon_deg, 300, 0))
+    assert photograph_from(orthophoto, edge, LEVEL, CAMERA, CLEAR, rng) is None
     for angle_deg in (58, 75):
         with pytest.raises(UsageError, match="horizon"):
-            seen_from(orthophoto, HOME, replace(LEVEL, roll_deg=angle_deg), CAMERA, CLEAR, rng)
+            photograph_from(orthophoto, HOME, replace(LEVEL, roll_deg=angle_deg), CAMERA, CLEAR, rng)
 
 
 def csv_of(tmp_path, text):
@@ -123,7 +123,7 @@ def test_read_shots_refuses_a_track_without_path_or_height(tmp_path):
 
 
 def test_write_overflight_writes_the_truth_and_is_the_same_each_time(tmp_path, orthophoto):
-    north = [moved(HOME.lat_deg, HOME.lon_deg, 0, 15.0 * step) for step in range(-2, 12)]
+    north = [offset_position(HOME.lat_deg, HOME.lon_deg, 0, 15.0 * step) for step in range(-2, 12)]
     shots = [GeoTag(position=Position(*at), height_m=70, t_utc_s=2.0 * n, heading_deg=0) for n, at in enumerate(north)]
     written = {}
     for name, seed in (("one", 1), ("two", 1), ("other", 2)):

@@ -10,7 +10,7 @@ import numpy as np
 from fakes import vehicle_at
 
 from edgevpr.core.types import Frame
-from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, light_scene, photograph
 from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.runtime.flight.frozenwatch import FrozenWatch, Optics
 
@@ -22,7 +22,7 @@ DOWN = Optics(focal_share=0.77, looks_down=True, is_level=False)
 
 
 def make_ground() -> np.ndarray:
-    return lit(make_scene(3, 400, 240, metres_per_pixel=METRES_PER_PIXEL), LIGHT, 3)
+    return light_scene(make_scene(3, 400, 240, metres_per_pixel=METRES_PER_PIXEL), LIGHT, 3)
 
 
 class Flown:

@@ -9,7 +9,7 @@ import pytest
 from air import HOME, Air, match_at
 from fakes import to_autopilot
 
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import FRAME_TIME_SD_S, Frame, Position
 from edgevpr.frames.age import HIDDEN_DELAY_SD_S
@@ -52,7 +52,7 @@ class LateAir(Air):
         claimed = Frame(image=_PICTURE, name="", t_mono_s=step * _STEP_S, delay_sd_s=self.delay_sd_s)
         frame = age.correct(claimed)
         seen_m = self.way[true_step] + self.rng.normal(0, self.noise_sd_m, 2)
-        where = Position(*moved(*HOME, *seen_m))
+        where = Position(*offset_position(*HOME, *seen_m))
         event = match_at(where, frame.t_mono_s, vehicle, self.said_sd_m, self.places(true_step))
         picture = Levelled(_PICTURE, None, replace(event.view, up_deg=self.heading_deg(frame.t_mono_s)))
         heading_deg = self.heading_deg(true_step * _STEP_S) + self.rng.normal(0, 1.0)
@@ -71,10 +71,10 @@ class LateAir(Air):
         return advice
 
     def _report(self, velocity):
-        hear = self.navigator.hear_vehicle
-        self.navigator.hear_vehicle = lambda vehicle: hear(replace(vehicle, heading_deg=self.heading_deg(self.t_s)))
+        hear = self.navigator.handle_vehicle
+        self.navigator.handle_vehicle = lambda vehicle: hear(replace(vehicle, heading_deg=self.heading_deg(self.t_s)))
         super()._report(velocity)
-        self.navigator.hear_vehicle = hear
+        self.navigator.handle_vehicle = hear
 
 
 @pytest.mark.parametrize("path", [CIRCLE, TIGHT_CIRCLE, STRAIGHT, HOVER])

@@ -8,7 +8,7 @@ from fakes import FakeSource
 from flights import flight_meter, of_kind
 from pictures import textured
 
-from edgevpr.cli.top import lines_of
+from edgevpr.cli.top import format_status
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
 from edgevpr.power.thermal import ThermalState, ThermalWatch
@@ -78,6 +78,6 @@ def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(make_f
     assert [record.levelname for record in caplog.records if record.message == begun] == ["WARNING"]
     assert statuses[2]["under_voltage"] is False
     assert (statuses[3]["under_voltage"], statuses[3]["throttled"]) == (True, True)
-    assert "supply      under-voltage" in lines_of(statuses[3])
-    assert f"remark      {begun}" in lines_of(statuses[5]), "it is still shown when it has blinked"
+    assert "supply      under-voltage" in format_status(statuses[3])
+    assert f"remark      {begun}" in format_status(statuses[5]), "it is still shown when it has blinked"
     assert begun not in statuses[-1]["remarks"]

@@ -10,7 +10,7 @@ from fakes import FakeClock, FakeLink, FakeSource, vehicle_at
 from flights import STEP_DEG, Flight, of_kind
 from pictures import textured
 
-from edgevpr.core.geodesy import distance_m, moved
+from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Position
 from edgevpr.frames.level import View
@@ -35,16 +35,16 @@ class Aircraft:
         said = {"has_gps": self.has_gps, "position_sd_m": 2.0} | said
         while self.t_s < t_s:
             self.t_s = round(self.t_s + 0.2, 3)
-            here = moved(*HOME, 0.0, self.speed_m_s * (self.t_s - START_S))
+            here = offset_position(*HOME, 0.0, self.speed_m_s * (self.t_s - START_S))
             velocity = (0.0, self.speed_m_s)
             self.vehicle = vehicle_at(*here, self.t_s, velocity_m_s=velocity, roll_deg=0.0, pitch_deg=0.0, **said)
-            self.navigator.hear_vehicle(self.vehicle)
+            self.navigator.handle_vehicle(self.vehicle)
 
     def report(self, off_m, after_s=0.0, *, places=(1,), fix_sd_m=8.0, heard=True, turned_deg=None):
         """The advice on a match `after_s` seconds after the loss of GPS, `off_m` (east, north) off the aircraft."""
         if heard:
             self.go_on(START_S + after_s)
-        here = moved(self.vehicle.lat_deg, self.vehicle.lon_deg, *off_m)
+        here = offset_position(self.vehicle.lat_deg, self.vehicle.lon_deg, *off_m)
         view = View(up_deg=0.0)
         event = match_at(Position(*here), START_S + after_s, self.vehicle, fix_sd_m, places, view)
         event = replace(event, located=replace(event.located, heading_deg=turned_deg))
@@ -101,7 +101,9 @@ def test_a_second_one_of_another_place_that_says_the_same_is_sent_and_so_are_tho
     advices = [aircraft.report((500, 5 * t_s), t_s, places=(t_s,)) for t_s in range(1, 7)]
     assert [advice.is_held for advice in advices] == [True] + [False] * 5
     sent = advices[1].fix
-    assert distance_m(sent.lat_deg, sent.lon_deg, *moved(*HOME, 500, 10 + 15 * 2)) < 8, "and not between the two"
+    assert distance_m(sent.lat_deg, sent.lon_deg, *offset_position(*HOME, 500, 10 + 15 * 2)) < 8, (
+        "and not between the two"
+    )
 
 
 def test_the_same_place_again_is_no_second_one_until_the_aircraft_has_moved_on():

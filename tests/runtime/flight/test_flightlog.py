@@ -13,7 +13,7 @@ import pytest
 from fakes import FakeClock
 from full_disk import no_file_larger_than
 
-from edgevpr.core.appending import numbered
+from edgevpr.core.appending import list_numbered
 from edgevpr.core.config import load_config
 from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.core.errors import EdgevprError
@@ -22,7 +22,7 @@ from edgevpr.core.types import Position, QueryCost, Steps
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log, select_last_flight
 from edgevpr.runtime.flight.startup import start_fields
-from edgevpr.runtime.recognise.locate import at_place
+from edgevpr.runtime.recognise.locate import locate_at_place
 from edgevpr.runtime.recognise.recognition import Recognition
 
 COST = QueryCost(
@@ -61,7 +61,7 @@ def test_a_match_is_written_as_it_is_with_nan_as_null(path):
         frame=None,
         accepted=True,
         reason=Reason(ReasonCode.ACCEPTED_WITHOUT_RIVAL, {"score": 0.9}),
-        located=at_place(Position(50.12345678901, -1.5, None), 20.0),
+        located=locate_at_place(Position(50.12345678901, -1.5, None), 20.0),
         accuracy_m=20.0,
         steps=Steps(),
         cost=COST,
@@ -221,7 +221,7 @@ def written(path: Path, count: int, begin: int = 0, **settings) -> FlightLog:
 
 
 def parts(path: Path) -> list[Path]:
-    return [*numbered(path), path]
+    return [*list_numbered(path), path]
 
 
 def test_a_log_that_is_full_goes_on_in_a_new_file_and_each_can_be_read_alone(path, caplog):
@@ -237,7 +237,7 @@ def test_a_log_that_is_full_goes_on_in_a_new_file_and_each_can_be_read_alone(pat
 def test_a_flight_and_those_before_it_stay_within_the_limit_and_the_oldest_go_first(path):
     for flight in range(10):
         written(path, 100, 100 * flight)
-        assert sum(part.stat().st_size for part in numbered(path)) <= 3e6 * PART_MB, "the newest may grow"
+        assert sum(part.stat().st_size for part in list_numbered(path)) <= 3e6 * PART_MB, "the newest may grow"
     assert all(part.stat().st_size <= 1e6 * PART_MB for part in parts(path))
     kept = [n for part in parts(path) for n in numbers(part)]
     assert kept == list(range(kept[0], 1000))
@@ -255,7 +255,7 @@ def test_a_log_that_cannot_be_renamed_is_written_on_and_said_once(path, caplog, 
     written(path, 100)
     log = written(path, 100, 100)
     assert numbers(path) == list(range(200))
-    assert not numbered(path), "no number is left without a file"
+    assert not list_numbered(path), "no number is left without a file"
     assert (log.state, log.lost_lines) == (None, 0)
     said = (
         f"The flight log {path} cannot be set aside (Read-only file system), so it is written on, and may grow past "

@@ -10,7 +10,7 @@ import pytest
 from air import HOME, match_at
 from fakes import receiver_at, vehicle_at
 
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import FRAME_TIME_SD_S, Position
 from edgevpr.frames.level import Levelled, View
@@ -41,7 +41,7 @@ class Known:
     def state_at(self, t_s):
         if self.accuracy_m is None:
             return None
-        where = Position(*moved(*HOME, *self.off_m))
+        where = Position(*offset_position(*HOME, *self.off_m))
         return NavState(
             t_s=t_s, position=where, velocity_m_s=(3.0, 4.0), accuracy_m=self.accuracy_m, speed_accuracy_m_s=0.5
         )
@@ -61,7 +61,7 @@ class Known:
     def begin(self, *how):
         self.begun.append(how)
 
-    def is_followed_at(self, t_s):
+    def is_followed(self, t_s):
         return False
 
     def path_drift_m_s(self):
@@ -71,11 +71,11 @@ class Known:
 def navigate(channel=Channel.COMMAND, *, reports=None, is_heard=True, map_sd_m=1.0, every_s=1.0, how=None, **known):
     """A navigator that knows its position, beside an autopilot without GPS that `reports`."""
     navigator = Navigator(map_sd_m, every_s, **how or {})
-    navigator.hear_channel(channel)
+    navigator.handle_channel(channel)
     navigator._navigation = Known(**known)
     if is_heard:
         said = {"has_gps": False, "velocity_m_s": (0.0, 0.0)} | (reports or {})
-        navigator.hear_vehicle(vehicle_at(*HOME, said.pop("t_heard_s", NOW_S), **said))
+        navigator.handle_vehicle(vehicle_at(*HOME, said.pop("t_heard_s", NOW_S), **said))
     return navigator
 
 
@@ -159,7 +159,7 @@ def test_no_position_is_sent_that_is_unknown_contradicted_or_withdrawn():
 
 def test_continuous_position_claims_accuracy_and_lag_for_fifty_like_it():
     navigator = navigate(Channel.GPS_INPUT, reports={"sink_m_s": 0.7}, map_sd_m=1.0)
-    navigator.hear_force(NOW_S, (0.0, 0.0, -9.8), Attitude(NOW_S, 90.0, -45.0, 180.0))
+    navigator.handle_force(NOW_S, (0.0, 0.0, -9.8), Attitude(NOW_S, 90.0, -45.0, 180.0))
     state = navigator.state_at(NOW_S)
     assert (state.t_mono_s, state.alt_m, state.alt_accuracy_m, state.is_reserve) == (NOW_S, 300.0, 3.0, False)
     assert (state.lat_deg, state.lon_deg) == pytest.approx(HOME)
@@ -206,7 +206,7 @@ def test_estimate_may_be_ours_for_ten_seconds(after_s, reports, is_ours):
     assert navigator._navigation.reports == [(True, False)]
     navigator.state_at(NOW_S)
     navigator.believe_gps(False)
-    navigator.hear_vehicle(vehicle_at(*HOME, NOW_S + after_s, velocity_m_s=(0.0, 0.0), **reports))
+    navigator.handle_vehicle(vehicle_at(*HOME, NOW_S + after_s, velocity_m_s=(0.0, 0.0), **reports))
     assert navigator._navigation.reports[1:] == [(False, is_ours)]
 
 
@@ -218,20 +218,20 @@ def test_age_of_pictures_is_found_by_the_path(channel, has_gps, rests):
     navigator, motions = navigate(channel), []
     navigator.age = SimpleNamespace(add_motion=lambda *motion: motions.append(motion))
     vehicle = vehicle_at(*HOME, NOW_S, velocity_m_s=(0.0, 0.0))
-    navigator.hear_vehicle(vehicle)
+    navigator.handle_vehicle(vehicle)
     navigator._navigation.has_gps, navigator._navigation.path_velocity_m_s = has_gps, (1.0, 2.0)
-    navigator.hear_vehicle(vehicle)
+    navigator.handle_vehicle(vehicle)
     assert motions == [(NOW_S, (1.0, 2.0), None, rests)]
 
 
 def test_frame_claims_an_error_of_the_height_that_pictures_show():
     navigator = navigate(reports={"velocity_m_s": (30.0, 40.0)})
-    navigator.hear_frame(matched())
+    navigator.handle_frame(matched())
     navigator.correct_height(1.2)
-    navigator.hear_frame(matched(vehicle=vehicle_at(*HOME, NOW_S)), is_query=False)
+    navigator.handle_frame(matched(vehicle=vehicle_at(*HOME, NOW_S)), is_query=False)
     navigator.correct_height(1.0, 0.3)
-    navigator.hear_frame(matched())
-    navigator.hear_frame(matched(frame=None))
+    navigator.handle_frame(matched())
+    navigator.handle_frame(matched(frame=None))
     frames = navigator._navigation.frames
     assert [frame.sd_m for frame, _ in frames] == pytest.approx([50 * FRAME_TIME_SD_S, 0.0, 50 * FRAME_TIME_SD_S])
     assert [frame.scale_sd for frame, _ in frames] == pytest.approx([0.0, 0.2, 0.3])
@@ -282,7 +282,7 @@ def test_accuracy_of_a_fix_contains_the_error_of_its_time():
 def test_autopilot_that_has_just_been_heard_is_sent_nothing_for_five_seconds(is_heard):
     navigator = navigate(is_heard=is_heard, reports={"t_heard_s": NOW_S - 5.0})
     if not is_heard:
-        navigator.hear_autopilot(NOW_S - 5.0)
+        navigator.handle_autopilot(NOW_S - 5.0)
     assert navigator.advise(matched(), NOW_S).why.code is ReasonCode.NO_TELEMETRY
     assert navigator.advise(matched(), NOW_S + 0.1).fix
 
@@ -344,7 +344,7 @@ def test_no_fix_is_sent_between_matches_that_contradict_or_of_unknown_age():
 def test_navigation_begins_anew_where_the_path_errs_otherwise():
     navigator, seen = Navigator(1.0, 1.0), []
     for channel in (Channel.NONE, Channel.COMMAND, Channel.SENSOR, Channel.VISION, Channel.GPS_INPUT, Channel.ODOMETRY):
-        navigator.hear_channel(channel)
+        navigator.handle_channel(channel)
         seen.append(navigator._navigation)
     assert [one is other for one, other in pairwise(seen)] == [True, False, True, False, True]
     assert [each._drift for each in seen[::2]] == [RECKONED, INERTIAL_PX4, INERTIAL]

@@ -6,7 +6,7 @@ import pytest
 from air import HOME, match_at
 from fakes import FakeClock, FakeLink, receiver_at, to_autopilot, vehicle_at
 
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Position
 from edgevpr.frames.level import View
@@ -35,7 +35,9 @@ class Watched:
         """Watch a match that is so far east of GPS, and return whether GPS is wrong."""
         t_s = BEGIN_S + after_s
         vehicle = vehicle or vehicle_at(*HOME, t_s, gps=receiver_at(HOME, self.sd_m[1], t_s), **said)
-        self.watch.update(match_at(Position(*moved(*HOME, off_m, 0.0)), t_s, vehicle, self.sd_m[0], places, view, lean))
+        self.watch.update(
+            match_at(Position(*offset_position(*HOME, off_m, 0.0)), t_s, vehicle, self.sd_m[0], places, view, lean)
+        )
         return self.watch.is_wrong
 
     def matches(self, *offsets_m, begin_s=0):
@@ -151,7 +153,7 @@ def test_match_may_be_off_gps_by_the_attitude_error_that_it_shows(lean, height_m
 
 def test_match_is_compared_with_where_the_receiver_was():
     velocity_m_s = 25.0, 0.0
-    watched, where = Watched(), moved(*HOME, -25.0 * (0.8 + RECEIVER_LAG_S), 0.0)
+    watched, where = Watched(), offset_position(*HOME, -25.0 * (0.8 + RECEIVER_LAG_S), 0.0)
     receiver = receiver_at(where, 1.0, BEGIN_S - 0.8, velocity_m_s=(0.0, 9.0))
     for velocity, off_m in ((velocity_m_s, 0.0), (None, 22.5)):
         watched.match(0.0, 0.0, (1,), vehicle=vehicle_at(*HOME, BEGIN_S, gps=receiver, velocity_m_s=velocity))

@@ -8,7 +8,7 @@ import pytest
 from air import GPS_SD_M, HOME, Air, lengths, match_at
 from fakes import FakeClock, FakeLink, receiver_at, to_autopilot, vehicle_at
 
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import ReasonCode, read_reason
 from edgevpr.core.types import FRAME_TIME_SD_S, Position
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
@@ -211,9 +211,9 @@ def test_no_false_alarm_in_thirty_minutes_of_noise_outliers_and_a_wandering_rece
             if rng.random() < 0.01:
                 turn = rng.uniform(0, 2 * math.pi)
                 off_m = 100 * np.array([math.cos(turn), math.sin(turn)])
-            gps = moved(*HOME, *(at_m + wander_m))
+            gps = offset_position(*HOME, *(at_m + wander_m))
             known = {"gps": receiver_at(gps, GPS_SD_M, t_s), "velocity_m_s": velocity, "height_m": 100.0}
-            seen = Position(*moved(*HOME, *(at_m + off_m)))
+            seen = Position(*offset_position(*HOME, *(at_m + off_m)))
             watch.update(match_at(seen, t_s, vehicle_at(*gps, t_s, **known), fix_sd_m, (int(t_s),)))
             assert not watch.is_wrong
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fakes import receiver_at, vehicle_at
 
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight import drift
@@ -63,7 +63,7 @@ class Flown:
             if self.step % 5 == 0:
                 said = {"has_gps": has_gps, "position_sd_m": 0.5 if has_gps else 20.0}
                 speed = tuple(velocity if has_gps else velocity - self.wind)
-                here = moved(*HOME, *self.reckoned_m)
+                here = offset_position(*HOME, *self.reckoned_m)
                 self.navigation.add_report(vehicle_at(*here, self.t_s, velocity_m_s=speed, **said))
             if self.step % 50 == 0 and self.step > self.late_steps:
                 if fixes:
@@ -84,7 +84,7 @@ class Flown:
         return seen_m + off_m
 
     def take(self, seen_m, fix_sd_m=None, **match):
-        seen = match_at(Position(*moved(*HOME, *seen_m)), self.seen_s, fix_sd_m or self.fix_sd_m, **match)
+        seen = match_at(Position(*offset_position(*HOME, *seen_m)), self.seen_s, fix_sd_m or self.fix_sd_m, **match)
         self.navigation.correct_by_fix(self.navigation.compare(seen))
 
     def fix(self):
@@ -156,10 +156,10 @@ class Received:
             self.t_s += 0.1
             self.navigation.add_acceleration(self.t_s, np.zeros(2))
             steady_for_s = self.t_s - self.steady_since_s
-            where = moved(*HOME, off_m - RECEIVER_LAG_S * velocity_m_s[0], 0.0)
+            where = offset_position(*HOME, off_m - RECEIVER_LAG_S * velocity_m_s[0], 0.0)
             known = {"velocity_m_s": velocity_m_s, "steady_for_s": steady_for_s}
             gps = receiver_at(where, 1.0, self.t_s, **known) if has_gps else None
-            estimate = moved(*HOME, estimate_m, 0.0)
+            estimate = offset_position(*HOME, estimate_m, 0.0)
             known = {"has_gps": has_gps, "gps": gps, "velocity_m_s": (9.0, 0.0), "position_sd_m": 1.0}
             self.navigation.add_report(vehicle_at(*estimate, self.t_s, **known), is_estimate_ours=True)
         return self

@@ -30,7 +30,7 @@ def lost(navigator=None, **how):
 
 
 def inertial(navigator):
-    navigator.hear_channel(Channel.GPS_INPUT)
+    navigator.handle_channel(Channel.GPS_INPUT)
     return navigator
 
 

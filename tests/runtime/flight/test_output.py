@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from fakes import receiver_at, vehicle_at
 
-from edgevpr.core.geodesy import moved
+from edgevpr.core.geodesy import offset_position
 from edgevpr.mavlink.messages import TEXT_BYTES
 from edgevpr.runtime.flight.output import Output, OutputWatch
 
@@ -23,9 +23,9 @@ def withdrawn(*reports):
     for after_s, known in reports:
         known = {"off_m": 0.0, "ratio": 0.1, "has_gps": True, "sd_m": 1.0, "steady_s": 60.0} | known
         t_s, has_gps = BEGIN_S + after_s, known["has_gps"]
-        watch.note_sent(t_s - known.get("sent_ago_s", 0.0))
+        watch.record_sent(t_s - known.get("sent_ago_s", 0.0))
         receiver = receiver_at(HOME, known["sd_m"], t_s, steady_for_s=known["steady_s"]) if has_gps else None
-        vehicle = vehicle_at(*moved(*HOME, known["off_m"], 0.0), t_s, has_gps=has_gps, gps=receiver)
+        vehicle = vehicle_at(*offset_position(*HOME, known["off_m"], 0.0), t_s, has_gps=has_gps, gps=receiver)
         fixed_s = t_s - known.get("fixed_ago_s", math.inf)
         watch.update(replace(vehicle, innovation_ratio=known["ratio"]), fixed_s, has_gps)
     return watch.withdrawn

@@ -92,14 +92,14 @@ def test_without_both_numbers_and_in_a_dry_run_none_is_asked_for(settings):
 
 def test_a_question_that_is_not_answered_is_asked_again():
     sets = SourceSets(ALLOWED)
-    asked = [sets.wanted(t_s / 2, False, True, answered_s=5.1 if t_s > 10 else NEVER) for t_s in range(30)]
+    asked = [sets.choose_set(t_s / 2, False, True, answered_s=5.1 if t_s > 10 else NEVER) for t_s in range(30)]
     assert [t_s / 2 for t_s, number in enumerate(asked) if number == 2] == [0, 2, 4]
-    assert sets.wanted(40.0, True, True, answered_s=5.1) == 1, "GPS is good"
-    assert sets.wanted(43.0, True, True, answered_s=5.1) == 1, "that answer was for the other one"
+    assert sets.choose_set(40.0, True, True, answered_s=5.1) == 1, "GPS is good"
+    assert sets.choose_set(43.0, True, True, answered_s=5.1) == 1, "that answer was for the other one"
 
 
 def test_without_a_position_of_ours_none_is_asked_for():
     sets = SourceSets(ALLOWED)
-    assert sets.wanted(0.0, has_gps=False, has_own=False, answered_s=NEVER) is None
-    assert sets.wanted(1.0, has_gps=False, has_own=True, answered_s=NEVER) == 2
-    assert sets.wanted(2.0, has_gps=False, has_own=True, answered_s=1.1) is None
+    assert sets.choose_set(0.0, has_gps=False, has_own=False, answered_s=NEVER) is None
+    assert sets.choose_set(1.0, has_gps=False, has_own=True, answered_s=NEVER) == 2
+    assert sets.choose_set(2.0, has_gps=False, has_own=True, answered_s=1.1) is None

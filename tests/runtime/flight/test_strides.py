@@ -13,7 +13,7 @@ GAP_S = 60
 
 def air_of(channel, **how):
     ours = Navigator(1.0, 1.0)
-    ours.hear_channel(channel)
+    ours.handle_channel(channel)
     return Air(ours, wind=WIND, gusts=0.2, fix_sd_m=1.5, other_sd_m=0.5, bias=(0.1, 0.0), **how)
 
 

@@ -10,7 +10,7 @@ from air import HOME, match_at
 from fakes import FakeClock, FakeLink, receiver_at, vehicle_at
 
 from edgevpr.core.config import load_config
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.frames.level import STRAIGHT_DOWN, View
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
@@ -67,13 +67,13 @@ def events(way, seconds, seed=1, wrong=0.0, scale=SCALE, compass_deg=0.0, **said
         fix_m = at_m + OFF_M + scale * at_m + mount_m + rng.normal(0, FIX_SD_M, 2)
         if rng.random() < wrong:
             fix_m = fix_m + rng.normal(0, 150, 2)
-        gps = moved(*HOME, *(at_m + gps_off_m))
+        gps = offset_position(*HOME, *(at_m + gps_off_m))
         velocity = np.clip((after_m - at_m) / 0.01, -SPEED_M_S, SPEED_M_S)
         told_deg = (heading_deg + compass_deg) % 360
         known = {"heading_deg": told_deg, "height_m": HEIGHT_M, "roll_deg": 0.0, "pitch_deg": 0.0}
         known |= {"velocity_m_s": tuple(velocity), "gps": receiver_at(gps, GPS_SD_M, t_s)} | said
         event = match_at(
-            Position(*moved(*HOME, *fix_m)),
+            Position(*offset_position(*HOME, *fix_m)),
             t_s,
             vehicle_at(*gps, t_s, **known),
             FIX_SD_M,
@@ -156,8 +156,8 @@ def test_a_position_that_may_be_ours_is_not_gps():
     sightings = Sightings(STRAIGHT_DOWN, is_level=False)
     for event in events(lanes, 900):
         vehicle, v = event.vehicle, event.vehicle.velocity_m_s
-        late = moved(vehicle.lat_deg, vehicle.lon_deg, -0.1 * v[0], -0.1 * v[1])
-        ours = moved(vehicle.lat_deg, vehicle.lon_deg, *rng.normal(20, 5, 2))
+        late = offset_position(vehicle.lat_deg, vehicle.lon_deg, -0.1 * v[0], -0.1 * v[1])
+        ours = offset_position(vehicle.lat_deg, vehicle.lon_deg, *rng.normal(20, 5, 2))
         gps = receiver_at(late, GPS_SD_M, event.frame.t_mono_s)
         vehicle = replace(vehicle, lat_deg=ours[0], lon_deg=ours[1], gps=gps, t_fix_s=event.frame.t_mono_s)
         sightings.take(replace(event, vehicle=vehicle))
@@ -176,7 +176,7 @@ def levelled(event, mount, was):
     east_m = ahead_m * math.sin(heading) + right_m * math.cos(heading)
     north_m = ahead_m * math.cos(heading) - right_m * math.sin(heading)
     at = event.located.position
-    return Position(*moved(at.lat_deg, at.lon_deg, -east_m, -north_m))
+    return Position(*offset_position(at.lat_deg, at.lon_deg, -east_m, -north_m))
 
 
 class Flown:
@@ -221,7 +221,7 @@ def right(way=lanes, seconds=900):
     """The matches of a map and a camera that are right."""
     rng = np.random.default_rng(2)
     for event in events(way, seconds):
-        at = Position(*moved(event.vehicle.lat_deg, event.vehicle.lon_deg, *rng.normal(0, FIX_SD_M, 2)))
+        at = Position(*offset_position(event.vehicle.lat_deg, event.vehicle.lon_deg, *rng.normal(0, FIX_SD_M, 2)))
         yield replace(event, located=replace(event.located, position=at))
 
 
@@ -238,7 +238,7 @@ def led(law, flight):
     for event in flight:
         away_m = law(event.frame.t_mono_s)
         vehicle = event.vehicle
-        there = moved(vehicle.lat_deg, vehicle.lon_deg, away_m, 0.0)
+        there = offset_position(vehicle.lat_deg, vehicle.lon_deg, away_m, 0.0)
         gps = replace(vehicle.gps, lat_deg=there[0], lon_deg=there[1])
         yield replace(event, vehicle=replace(vehicle, lat_deg=there[0], lon_deg=there[1], gps=gps))
 

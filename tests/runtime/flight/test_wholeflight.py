@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from edgevpr.core.appending import numbered
+from edgevpr.core.appending import list_numbered
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.runtime.flight.flightlog import FlightLog, select_last_flight
 
@@ -35,7 +35,7 @@ def flown(path) -> list[Path]:
     """The files of two flights, of two and of four files with a query each."""
     fly(path, range(2), version="1")
     fly(path, range(100, 104), version="2")
-    files = [*numbered(path), path]
+    files = [*list_numbered(path), path]
     assert [each.name for each in files] == [*(f"flight-{n:04d}.jsonl" for n in range(1, 6)), "flight.jsonl"]
     return files
 

@@ -177,7 +177,7 @@ def test_picked_technique_passes_over_a_network_that_is_not_there(monkeypatch, c
             raise ModelError("There is no model.")
         return really(threads, name, settings)
 
-    monkeypatch.setattr(pick, "made_for", made_for)
+    monkeypatch.setattr(pick, "make_technique", made_for)
     own = board(technique="netvlad", budget_mb=20.0, memory_max_mb=4000.0)
     monkeypatch.setattr(pick, "load_board", lambda name: own)
     assert pick.pick_technique("this", 10) == "cohog"

@@ -19,7 +19,7 @@ COSTS = replace(REGIONS, match_per_place=StageCost(0.01, 0.01), candidates=42)
 def measure_at(recording, monkeypatch):
     def found(rate_hz, costs=COSTS, **settings):
         monkeypatch.setattr(pick, "probe", lambda technique: costs)
-        monkeypatch.setattr(pick, "on_board", lambda costs, *_: costs)
+        monkeypatch.setattr(pick, "scale_to_board", lambda costs, *_: costs)
         config = load_config(None, {"map": str(recording / "cohog.gpkg"), **settings})
         board = replace(load_board("this"), cores=4, cpu_share=0.5, rate_hz=rate_hz)
         recogniser = open_recogniser(config, board)

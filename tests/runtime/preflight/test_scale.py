@@ -12,7 +12,7 @@ from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.power.speed import REFERENCE_PASSES_HZ, Speed
 from edgevpr.runtime.preflight import scale
-from edgevpr.runtime.preflight.scale import SAME_MACHINE, compare_speed, count_work, on_board
+from edgevpr.runtime.preflight.scale import SAME_MACHINE, compare_speed, count_work, scale_to_board
 
 REGIONS = replace(example_costs.REGIONS, candidates=40, scan_per_place=StageCost(1e-6, 1e-6))
 PI = load_board("rpi-4b")
@@ -26,7 +26,7 @@ def reference(monkeypatch):
 
 
 def test_on_board_scales_products_and_passes_apart_and_no_memory():
-    scaled = on_board(REGIONS, PI, SLOWER)
+    scaled = scale_to_board(REGIONS, PI, SLOWER)
     assert scaled.encode == StageCost(pytest.approx(0.1 / 0.2), pytest.approx(0.1 / 0.2))
     assert scaled.match_per_place.cpu_s == pytest.approx(0.004 / 0.05), "region against region is a product"
     assert scaled.scan_per_place.wall_s == pytest.approx(1e-6 / 0.2)
@@ -55,15 +55,17 @@ def test_compare_speed_measures_this_machine_for_other_boards(monkeypatch):
 
 def test_on_board_takes_counted_instructions_whatever_was_measured_here():
     work = count_work("cohog", {"camera": "nadir"})
-    there = on_board(REGIONS, PI, SLOWER, work)
+    there = scale_to_board(REGIONS, PI, SLOWER, work)
     parts, rate_hz = counted_parts(), 1e6 * PI.benchmark_score.arm64_mips
     assert there.encode.wall_s == pytest.approx(parts["down: encode a frame"] / rate_hz, rel=1e-6)
     query_s = there.encode.wall_s + replace(there, candidates=30).match(10_000).wall_s
     landmarks = parts["flight: landmarks of a frame"] + 2 * parts["flight: the stride since the frame before"]
     assert query_s == pytest.approx((parts["down: a query"] + landmarks) / rate_hz, rel=1e-3)
-    assert on_board(REGIONS, PI, SAME_MACHINE, work) == REGIONS
+    assert scale_to_board(REGIONS, PI, SAME_MACHINE, work) == REGIONS
     odroid = load_board("odroid-xu4")
-    assert on_board(REGIONS, odroid, SLOWER, work) == on_board(REGIONS, odroid, SLOWER), "which is no aarch64 board"
+    assert scale_to_board(REGIONS, odroid, SLOWER, work) == scale_to_board(REGIONS, odroid, SLOWER), (
+        "which is no aarch64 board"
+    )
 
 
 def test_counted_work_is_known_only_of_what_was_counted():
@@ -80,8 +82,8 @@ def counted_parts():
 
 def test_on_board_takes_longer_with_fewer_cores():
     eight_threads = replace(REGIONS, encode=StageCost(0.1, 0.8))
-    scaled = on_board(eight_threads, replace(PI, cores=2), Speed(0.4, 0.4)).encode
+    scaled = scale_to_board(eight_threads, replace(PI, cores=2), Speed(0.4, 0.4)).encode
     assert scaled == StageCost(pytest.approx(0.1 / 0.4 * 4), pytest.approx(0.8 / 0.4))
     network = replace(VECTOR, encode=StageCost(0.1, 0.8), is_network=True)
-    two = on_board(network, replace(PI, cores=4, threads=2), Speed(0.4, 0.4)).encode
+    two = scale_to_board(network, replace(PI, cores=4, threads=2), Speed(0.4, 0.4)).encode
     assert two == StageCost(pytest.approx(0.8 / 0.4 / 2), pytest.approx(0.8 / 0.4)), "as many as the board gives it"

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from edgevpr.core.types import Frame
-from edgevpr.frames.level import Lens, Levelled, levelled
-from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, lit, photograph
+from edgevpr.frames.level import Lens, Levelled, level_image
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, light_scene, photograph
 from edgevpr.lab.simulate.landscape import make_scene
 
 FOOTPRINT_M = 130.0
@@ -17,7 +17,7 @@ _LIGHT = Light(sun_azimuth_deg=50, sun_elevation_deg=50)
 
 def lit_ground(east_m: float, north_m: float) -> np.ndarray:
     """Ground of this size, in the light of a day."""
-    return lit(make_scene(5, east_m, north_m, _METRES_PER_PIXEL), _LIGHT, 5)
+    return light_scene(make_scene(5, east_m, north_m, _METRES_PER_PIXEL), _LIGHT, 5)
 
 
 def view_from(ground: np.ndarray, pose: CameraPose, told: CameraPose | None = None) -> Levelled:
@@ -25,4 +25,4 @@ def view_from(ground: np.ndarray, pose: CameraPose, told: CameraPose | None = No
     image = photograph(ground, _METRES_PER_PIXEL, pose, Camera(), _LIGHT, np.random.default_rng(1))
     names = ("heading_deg", "roll_deg", "pitch_deg", "height_m")
     said = {name: getattr(told or pose, name) for name in names}
-    return levelled(Frame(image=image, name="", t_mono_s=0.0, **said), None, _LENS, FOOTPRINT_M)
+    return level_image(Frame(image=image, name="", t_mono_s=0.0, **said), None, _LENS, FOOTPRINT_M)

@@ -5,8 +5,15 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, agreement, compare_near, compose_overlays
-from edgevpr.runtime.recognise.landmarks import OF_QUERY, Landmarks, describe, packed, unpacked
+from edgevpr.runtime.recognise.agreement import (
+    CONFIRMED,
+    PROVEN,
+    Overlay,
+    compare_near,
+    compose_overlays,
+    measure_agreement,
+)
+from edgevpr.runtime.recognise.landmarks import OF_QUERY, Landmarks, describe, pack_bytes, unpack_bytes
 from edgevpr.techniques import create
 
 WIDE, HIGH = 640, 480
@@ -41,7 +48,7 @@ def asked(image):
 
 
 def kept(image):
-    return unpacked(packed(describe(image)))
+    return unpack_bytes(pack_bytes(describe(image)))
 
 
 @pytest.mark.slow
@@ -53,7 +60,7 @@ def test_the_signs_are_those_of_a_match_of_cohog(landscape, right_px, down_px, t
     """The query's middle lies right of the place's by `right_px`, and below it by `down_px`."""
     place = cut(landscape, 800, 600)
     query = cut(landscape, 800 + right_px, 600 + down_px, turned_deg, scale)
-    found = agreement(asked(query), kept(place))
+    found = measure_agreement(asked(query), kept(place))
     assert found.inliers >= PROVEN
     assert np.array(found.shift_share) * WIDE == pytest.approx((right_px, down_px), abs=2)
     assert abs((found.rotation_deg - turned_deg + 180) % 360 - 180) < 1
@@ -74,7 +81,7 @@ def test_the_signs_are_those_of_a_match_of_cohog(landscape, right_px, down_px, t
 def test_landmarks_that_lie_otherwise_than_expected_are_not_taken_for_what_is(landscape):
     query, place = asked(cut(landscape, 860, 560)), kept(cut(landscape, 800, 600))
     wrong = Overlay((-0.2, 0.1), 90.0)
-    assert agreement(query, place, wrong).inliers < CONFIRMED
+    assert measure_agreement(query, place, wrong).inliers < CONFIRMED
     found = compare_near(query, place, wrong)
     assert not found.is_expected
     assert np.array(found.shift_share) * WIDE == pytest.approx((60, -40), abs=2)
@@ -93,8 +100,8 @@ def test_pictures_with_hardly_any_landmarks_do_not_agree(landscape):
     place = kept(cut(landscape, 800, 600))
     for count in range(4):
         few = Landmarks(place.points[:count], place.angle_deg[:count], place.size[:count], place.bits[:count])
-        assert agreement(few, place).inliers <= count
-        assert agreement(place, few, Overlay((0.0, 0.0), 0.0)).inliers <= count
+        assert measure_agreement(few, place).inliers <= count
+        assert measure_agreement(place, few, Overlay((0.0, 0.0), 0.0)).inliers <= count
 
 
 def test_landmarks_all_on_one_spot_do_not_agree(landscape):
@@ -102,8 +109,8 @@ def test_landmarks_all_on_one_spot_do_not_agree(landscape):
     place = kept(cut(landscape, 800, 600))
     heap = Landmarks(np.zeros_like(place.points), place.angle_deg, np.zeros_like(place.size), place.bits)
     for expected in (None, Overlay((0.0, 0.0), 0.0)):
-        assert agreement(asked(cut(landscape, 800, 600)), heap, expected).inliers < CONFIRMED
-        assert agreement(heap, place, expected).inliers < CONFIRMED
+        assert measure_agreement(asked(cut(landscape, 800, 600)), heap, expected).inliers < CONFIRMED
+        assert measure_agreement(heap, place, expected).inliers < CONFIRMED
 
 
 @pytest.mark.parametrize(
@@ -119,13 +126,13 @@ def test_how_two_places_lie_on_each_other_follows_from_one_query_on_both(landsca
     first, second = cut(landscape, *one), cut(landscape, *other)
     ways = []
     for place in (first, second):
-        found = agreement(query, kept(place))
+        found = measure_agreement(query, kept(place))
         ways.append(Overlay(found.shift_share, found.rotation_deg, found.scale))
-    truth, told = agreement(asked(first), kept(second)), compose_overlays(*ways)
+    truth, told = measure_agreement(asked(first), kept(second)), compose_overlays(*ways)
     assert truth.inliers >= PROVEN
     assert told.shift_share == pytest.approx(truth.shift_share, abs=0.01)
     assert abs((told.rotation_deg - truth.rotation_deg + 180) % 360 - 180) < 1.5
     assert told.scale == pytest.approx(truth.scale, rel=0.03)
-    assert agreement(kept(first), kept(second), told).inliers >= CONFIRMED
+    assert measure_agreement(kept(first), kept(second), told).inliers >= CONFIRMED
     unscaled = compose_overlays(Overlay(ways[0].shift_share, ways[0].rotation_deg), ways[1])
     assert unscaled.scale is None, "where one height is unknown, that of both is"

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edgevpr.runtime.recognise.agreement import Agreement, Overlay, agreement, compare_near, compose_overlays
+from edgevpr.runtime.recognise.agreement import Agreement, Overlay, compare_near, compose_overlays, measure_agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks
 
 SAME = Overlay((0.0, 0.0), 0.0, 1.0)
@@ -62,7 +62,7 @@ def laid(points, shift=0.0, rotation_deg=0.0, scale=1.0, first=0):
     ],
 )
 def test_agreement_is_found_on_overlays_near_the_expected_one(way, expected, is_near):
-    found = agreement(*laid(ring(20), **way), expected)
+    found = measure_agreement(*laid(ring(20), **way), expected)
     assert found.inliers == (20 if is_near else 0)
     if is_near:
         shift = complex(way.get("shift", 0.0))
@@ -93,7 +93,7 @@ def test_landmark_matches_one_of_a_plausible_place_direction_and_size(way, at, m
     more = landmarks([turn_scale * at + way.get("shift", 0.0) + moved_by], angle_deg, size, first=10)
     asked = landmarks([at], -way.get("rotation_deg", 0.0), 1 / way.get("scale", 1.0), first=10)
     expected = Overlay((way.get("shift", 0.0), 0.0), way.get("rotation_deg", 0.0), way.get("scale", 1.0))
-    assert agreement(join(query, asked), join(place, more), expected).matched == 10 + matches
+    assert measure_agreement(join(query, asked), join(place, more), expected).matched == 10 + matches
 
 
 @pytest.mark.parametrize(("bits", "matches"), [(64, True), (65, False)])
@@ -102,21 +102,21 @@ def test_landmark_matches_one_that_differs_in_a_quarter_of_its_bits(bits, matche
     flipped = np.unpackbits(query.bits[3])
     flipped[:bits] ^= 1
     query.bits[3] = np.packbits(flipped)
-    assert agreement(query, place).matched == 9 + matches
+    assert measure_agreement(query, place).matched == 9 + matches
 
 
 @pytest.mark.parametrize(("off", "inliers"), [(0.0150, 41), (0.0165, 40)])
 def test_landmark_is_an_inlier_within_the_tolerance(off, inliers):
     query, place = laid([*ring(40), 0.0])
     place.points[40, 0] = off
-    found = agreement(query, place)
+    found = measure_agreement(query, place)
     assert (found.inliers, found.matched, found.possible) == (inliers, 41, 41)
     assert len(found.coinciding[0]) == inliers
 
 
 @pytest.mark.parametrize(("count", "inliers"), [(2, 0), (3, 3)])
 def test_three_landmarks_agree(count, inliers):
-    found = agreement(*laid(ring(count)))
+    found = measure_agreement(*laid(ring(count)))
     assert (found.inliers, found.possible) == (inliers, count)
 
 
@@ -125,7 +125,7 @@ def test_variance_grows_with_what_is_off_and_away_from_the_middle(middle, off, v
     """Twelve landmarks whose errors no rotation, scale or shift takes out: of 24 coordinates four are fitted."""
     query, place = laid(ring(12, middle=middle))
     place.points[:, 0] += off * (-1.0) ** np.arange(12)
-    found = agreement(query, place)
+    found = measure_agreement(query, place)
     unit = off**2 if off else (10 / 6400) ** 2 * 40 / 12
     assert found.covariance_share2 == pytest.approx((variance * unit, 0.0, variance * unit), rel=1e-3)
     assert found.shift_share == pytest.approx((0.0, 0.0), abs=1e-5)

@@ -22,7 +22,7 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.calibration import (
     MapCalibration,
     calibration_text,
-    of_several,
+    join_calibrations,
     read_calibration,
     read_calibration_for,
     require_usable,
@@ -154,7 +154,7 @@ def adapted_to(rng, kind):
 def test_joined_maps_accept_nothing_that_one_of_them_refuses(kind, bare):
     rng = np.random.default_rng(3)
     maps = [*(adapted_to(rng, kind) for _ in range(3)), *[None] * bare]
-    joined = read_calibration(calibration_text(of_several(maps)))
+    joined = read_calibration(calibration_text(join_calibrations(maps)))
     require_usable(kind, joined.models[kind])
     every = [Sureness(each.models if each else {kind: prior(kind)}, 0.999) for each in maps]
     of_joined, accepted, refused = Sureness(joined.models, 0.999), 0, 0
@@ -176,5 +176,8 @@ def test_joined_maps_accept_nothing_that_one_of_them_refuses(kind, bare):
 
 def test_maps_that_cannot_be_joined_are_not_calibrated():
     other = replace(prior("ahead"), of_map=replace(prior("ahead").of_map, bias=1.0))  # of another version
-    assert of_several([None, None]) is None
-    assert of_several([adapted_to(np.random.default_rng(1), "ahead"), replace(FOUND, models={"ahead": other})]) is None
+    assert join_calibrations([None, None]) is None
+    assert (
+        join_calibrations([adapted_to(np.random.default_rng(1), "ahead"), replace(FOUND, models={"ahead": other})])
+        is None
+    )

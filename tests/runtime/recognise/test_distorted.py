@@ -10,7 +10,7 @@ from pictures import rough_ground
 from edgevpr.api import Map
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import moved, offset_m
+from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.mapmaking.making import MapOrder, make_map
@@ -53,7 +53,7 @@ def maps(ground, lenses, tmp_path_factory):
         for number, north_m in enumerate((100.0, 200.0, 300.0)):
             image = camera.photograph(ground, M_PER_PX, east_m=250.0, north_m=north_m, **STRAIGHT)
             cv2.imwrite(str(folder / f"{number}.png"), image)
-            tags[f"{number}.png"] = GeoTag(position=Position(*moved(*ORIGIN, 250.0, north_m)), **STRAIGHT)
+            tags[f"{number}.png"] = GeoTag(position=Position(*offset_position(*ORIGIN, 250.0, north_m)), **STRAIGHT)
         write_positions(folder / "positions.csv", tags)
         made[name] = str(folder / "map.gpkg")
         order = MapOrder(
@@ -79,7 +79,7 @@ def off_m(map_path, camera, ground, **source):
             event = recogniser.step(Frame(image=image, name="it", t_mono_s=0.0, **pose))
             assert not event.failed, event.reason
             where = event.located.position if event.accepted else None
-            truth = moved(*ORIGIN, east_m, north_m)
+            truth = offset_position(*ORIGIN, east_m, north_m)
             found.append(where and math.hypot(*offset_m(*truth, where.lat_deg, where.lon_deg)))
     return found
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.places.rows import MOST_LANDMARK_BYTES
-from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, describe, packed, unpacked
+from edgevpr.places.rows import MAX_LANDMARK_BYTES
+from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, describe, pack_bytes, unpack_bytes
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +40,9 @@ def test_none_touches_what_the_mask_leaves_out(ground):
 
 def test_they_come_back_as_they_were_packed_and_fit_into_a_place(ground):
     found = describe(ground)
-    blob = packed(found)
-    assert len(blob) <= MOST_LANDMARK_BYTES
-    again = unpacked(blob)
+    blob = pack_bytes(found)
+    assert len(blob) <= MAX_LANDMARK_BYTES
+    again = unpack_bytes(blob)
     assert again.points == pytest.approx(found.points, abs=1e-5)
     assert again.size == pytest.approx(found.size, abs=6e-4)
     assert np.abs((again.angle_deg - found.angle_deg + 180) % 360 - 180).max() < 0.71
@@ -62,7 +62,7 @@ def test_they_come_back_as_they_were_packed_and_fit_into_a_place(ground):
 )
 def test_what_is_damaged_is_said_to_be(ground, spoil):
     with pytest.raises(ValueError, match="its landmarks"):
-        unpacked(spoil(packed(describe(ground))))
+        unpack_bytes(spoil(pack_bytes(describe(ground))))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
-from edgevpr.frames.level import STRAIGHT_DOWN, UNKNOWN_VIEW, Lens, Levelled, Mount, View, enlarged
+from edgevpr.frames.level import STRAIGHT_DOWN, UNKNOWN_VIEW, Lens, Levelled, Mount, View, enlarge
 from edgevpr.frames.mask import Mask
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, photograph
 from edgevpr.places.layers import Layers
@@ -316,7 +316,7 @@ def test_a_height_that_is_told_wrongly_is_found_out_by_the_first_match(walk, gro
 def test_a_picture_is_enlarged_around_its_middle(zoom):
     image = np.zeros((81, 121), np.uint8)
     image[40, 60] = image[40, 60 + 12] = 255
-    picture = enlarged(Levelled(image, None, UNKNOWN_VIEW), zoom)
+    picture = enlarge(Levelled(image, None, UNKNOWN_VIEW), zoom)
     assert picture.view.zoom == zoom
     assert picture.image[40, 60] == 255
     assert picture.image[40, 60 + round(12 * zoom)] > 100

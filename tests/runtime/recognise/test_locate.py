@@ -7,18 +7,18 @@ import pytest
 from sureness import agreed
 
 from edgevpr.core.contract import FineMatch
-from edgevpr.core.geodesy import metres, moved
+from edgevpr.core.geodesy import metres, offset_position
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import View
-from edgevpr.runtime.recognise.locate import at_place, locate
+from edgevpr.runtime.recognise.locate import locate, locate_at_place
 
 ORIGIN = Position(50.0, 8.0, 120.0)
 CELLS, FOOTPRINT_M = 32, 64.0
 
 
 def candidate(number=1, shift=(0.0, 0.0), east_m=0.0, north_m=0.0, up_deg=0.0, turned_deg=0.0, score=0.3, **pose):
-    lat_deg, lon_deg = moved(ORIGIN.lat_deg, ORIGIN.lon_deg, east_m, north_m)
+    lat_deg, lon_deg = offset_position(ORIGIN.lat_deg, ORIGIN.lon_deg, east_m, north_m)
     lies = Pose(**{"up_deg": up_deg, "footprint_m": FOOTPRINT_M, "covariance_m2": (4.0, 0.0, 4.0), **pose})
     place = Place(place_id=number, source_image=f"{number}", position=Position(lat_deg, lon_deg, 120.0), pose=lies)
     match = FineMatch(score, shift_cells=shift, covariance_cells2=(0.2, 0.0, 0.2), rotation_deg=turned_deg)
@@ -126,7 +126,7 @@ def test_without_a_pose_or_a_step_there_is_nothing_to_say():
     assert locate([Candidate(bare, candidate().match)], CELLS) is None
     assert locate([Candidate(candidate().place, FineMatch(0.5))], CELLS) is None
     assert locate([candidate()], None) is None, "ahead, a step says nothing about metres"
-    assert at_place(ORIGIN, 20.0).accuracy_m == pytest.approx(20.0)
+    assert locate_at_place(ORIGIN, 20.0).accuracy_m == pytest.approx(20.0)
 
 
 def test_the_covariance_is_that_of_the_place_turned_to_the_ground():

@@ -10,7 +10,7 @@ from levelled_views import lit_ground, view_from
 
 from edgevpr.frames.level import View
 from edgevpr.lab.simulate.camera import CameraPose
-from edgevpr.runtime.recognise.agreement import agreement
+from edgevpr.runtime.recognise.agreement import measure_agreement
 from edgevpr.runtime.recognise.landmarks import OF_QUERY, describe
 from edgevpr.runtime.recognise.perspective import fit_attitude_error
 
@@ -99,7 +99,7 @@ def test_pictures_show_by_how_much_the_reported_attitude_is_wrong(ground, roll_d
         east_m=168.0, north_m=134.0, height_m=102.0, heading_deg=40.0, roll_deg=roll_deg, pitch_deg=pitch_deg
     )
     query = view_from(ground, pose, replace(pose, roll_deg=told_roll_deg, pitch_deg=0.0))
-    found = agreement(describe(query.image, query.mask, OF_QUERY), describe(place.image, place.mask))
+    found = measure_agreement(describe(query.image, query.mask, OF_QUERY), describe(place.image, place.mask))
     lean = fit_attitude_error(*found.coinciding, query.view, found.rotation_deg)
     # The left wing is up: the camera looks to the left, and the aircraft is right of where it is taken to be.
     right, ahead = (math.tan(math.radians(each)) for each in (roll_deg - told_roll_deg, -pitch_deg))

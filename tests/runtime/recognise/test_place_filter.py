@@ -8,10 +8,10 @@ from fakes import vehicle_at
 from sureness import told
 
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
-from edgevpr.core.geodesy import distance_m, moved, offset_m
+from edgevpr.core.geodesy import distance_m, offset_m, offset_position
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.places.index import PlaceIndex, empty_index
-from edgevpr.places.layers import layers_of
+from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.evidence import Evidence
@@ -29,7 +29,7 @@ BESIDE = 7  # places elsewhere that a look is a little like
 
 
 def at(place):
-    return Position(*moved(50.0, 8.0, 0.6 * SPACING_M * place, 0.8 * SPACING_M * place))
+    return Position(*offset_position(50.0, 8.0, 0.6 * SPACING_M * place, 0.8 * SPACING_M * place))
 
 
 def index_of(positions):
@@ -50,7 +50,7 @@ class Flight:
     def __init__(self, place_map: PlaceMap, index: PlaceIndex, max_speed_m_s: float | None = None) -> None:
         self.follower = PlaceFilter(place_map, max_speed_m_s=max_speed_m_s, is_live=True)
         self.place_map, self.index, self.t_s = place_map, index, 1000.0
-        self.has_poses = layers_of(place_map).median_m is not None
+        self.has_poses = read_layers(place_map).median_m is not None
 
     def go_on(self, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None):
         """Go on, `moved_m` (east, north) by the camera's own motion."""
@@ -59,7 +59,7 @@ class Flight:
         stride = moved_m and Stride(from_s=before_s, to_s=self.t_s, moved_m=moved_m, sd_m=0.2, inliers=100)
         self.follower.predict(Frame(image=NOTHING, name="", t_mono_s=self.t_s), vehicle, stride)
 
-    def hear(self, place, p, of_map=None, others=(), lead=1.0, rival=0):
+    def handle(self, place, p, of_map=None, others=(), lead=1.0, rival=0):
         """A look whose best place is this one (a number between two is one between two places). 80 landmarks agree with
         it, and `rival` with a place elsewhere."""
         best = round(place)
@@ -80,7 +80,7 @@ class Flight:
 
     def look(self, place, p=0.8, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None, **more):
         self.go_on(elapsed_s, velocity_m_s, moved_m)
-        followed = self.hear(place, p, **more)
+        followed = self.handle(place, p, **more)
         self.follower.commit()
         assert_sound(followed)
         return followed
@@ -186,7 +186,7 @@ def test_a_recording_without_times_is_followed_too(flight, t_utc_s):
     follower = flight.follower = PlaceFilter(flight.place_map, max_speed_m_s=None, is_live=False)
     for place in range(10, 70, STRIDE):
         follower.predict(Frame(image=NOTHING, name="", t_mono_s=0.0, t_utc_s=t_utc_s), None)
-        followed = flight.hear(place, 0.9)
+        followed = flight.handle(place, 0.9)
         follower.commit()
     assert followed.slot == 67
     assert followed.confidence > 0.95
@@ -197,8 +197,8 @@ def test_of_two_looks_at_one_frame_only_the_last_is_kept(flight):
     for each in (flight, other):
         each.over(range(10, 40, STRIDE))
         each.go_on()
-    flight.hear(90, 0.9)
-    assert flight.hear(40, 0.9) == other.hear(40, 0.9)
+    flight.handle(90, 0.9)
+    assert flight.handle(40, 0.9) == other.handle(40, 0.9)
     flight.follower.commit(), other.follower.commit()
     assert flight.look(43) == other.look(43)
 

@@ -22,8 +22,8 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.decide import Verifier, WalkSettings
 from edgevpr.runtime.recognise.judge import AcceptRule
-from edgevpr.runtime.recognise.landmarks import describe, packed, unpacked
-from edgevpr.runtime.recognise.recognition import fields_of
+from edgevpr.runtime.recognise.landmarks import describe, pack_bytes, unpack_bytes
+from edgevpr.runtime.recognise.recognition import to_fields
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -81,7 +81,7 @@ def test_a_map_made_looking_down_has_landmarks_and_they_are_found_again(mapped, 
     assert event.reason.parameters["landmarks"] == event.proof.inliers
     assert event.proof.inliers >= 10
     assert np.array(event.proof.shift_share) * 320 == pytest.approx((20, -10), abs=1.5)
-    said = fields_of(event)["landmarks"]
+    said = to_fields(event)["landmarks"]
     assert (said["inliers"], said["scale"]) == (event.proof.inliers, pytest.approx(1, abs=0.02))
 
 
@@ -114,7 +114,7 @@ def test_looking_ahead_landmarks_count_where_a_match_is_not_sure_without_them(ma
 
 
 def test_a_clear_match_with_the_landmarks_of_another_picture_is_refused(mapped, technique):
-    others = packed(describe(frame(77).image))
+    others = pack_bytes(describe(frame(77).image))
     keep(mapped, others, zlib.crc32(others))
     event = asked(mapped, technique, frame(1, 20, -10))
     assert event.best.match.score > 0.2
@@ -124,7 +124,7 @@ def test_a_clear_match_with_the_landmarks_of_another_picture_is_refused(mapped, 
 
 
 def test_a_place_whose_landmarks_lie_otherwise_than_its_regions_is_refused(mapped, technique):
-    turned = packed(describe(np.ascontiguousarray(np.rot90(frame(1).image, 2))))
+    turned = pack_bytes(describe(np.ascontiguousarray(np.rot90(frame(1).image, 2))))
     keep(mapped, turned, zlib.crc32(turned))
     event = asked(mapped, technique, frame(1, 20, -10))
     assert not event.accepted
@@ -203,7 +203,7 @@ def test_places_without_positions_that_overlap_are_the_same_ground(overlapping, 
         assert event.evidence.lead > math.log(1.5), "places of the same ground are no rivals"
 
 
-@pytest.mark.parametrize("blob", [None, b"", b"\x09of a newer form", packed(describe(np.zeros((9, 9), np.uint8)))])
+@pytest.mark.parametrize("blob", [None, b"", b"\x09of a newer form", pack_bytes(describe(np.zeros((9, 9), np.uint8)))])
 def test_a_place_without_landmarks_is_judged_as_ever(mapped, technique, blob):
     without = asked(mapped, technique, frame(1, 20, -10), verify=False)
     keep(mapped, blob, None if blob is None else zlib.crc32(blob))
@@ -211,7 +211,7 @@ def test_a_place_without_landmarks_is_judged_as_ever(mapped, technique, blob):
     assert (event.accepted, event.best, without.accepted) == (True, without.best, True)
     assert event.proof is None or event.proof.inliers == 0
     assert without.proof is None
-    assert "landmarks" not in fields_of(without)
+    assert "landmarks" not in to_fields(without)
 
 
 def test_damaged_landmarks_are_a_refusal_and_the_place_is_left_out(mapped, technique):
@@ -230,7 +230,7 @@ def test_the_mask_holds_for_landmarks_too(whole, technique, tmp_path):
     allowed[:, :160] = False
     path = map_of(tmp_path / "half.gpkg", technique, [frame(1)], mask=Mask(allowed, "half"))
     with PlaceMap.open(path) as place_map:
-        there = unpacked(place_map.landmarks_of(1))
+        there = unpack_bytes(place_map.read_landmarks(1))
     assert len(there) > 30
     assert there.points[:, 0].min() > 0
 

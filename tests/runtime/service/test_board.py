@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from edgevpr.core.config import LogConfig
-from edgevpr.core.files import shipped
+from edgevpr.core.files import find_shipped
 from edgevpr.mavlink.address import parse_link
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.service.finding import check_device, check_machine
@@ -80,7 +80,7 @@ def test_check_device_refuses_what_is_not_a_device(root):
     [
         (0, "serial", "sudo systemctl disable --now serial-getty@null"),
         (grp.getgrnam("tty").gr_gid, "serial", "sudo systemctl disable --now serial-getty@null"),
-        (0, "camera", f"sudo install -D -m 644 -t /etc/udev/rules.d {shipped('deploy')}/99-edgevpr.rules"),
+        (0, "camera", f"sudo install -D -m 644 -t /etc/udev/rules.d {find_shipped('deploy')}/99-edgevpr.rules"),
         (5000, "serial", "sudo usermod --append --groups 5000 USER"),
         (5000, "camera", "sudo usermod --append --groups 5000 USER"),
     ],
