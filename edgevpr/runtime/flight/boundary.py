@@ -39,13 +39,13 @@ SOURCE_STATE = {
 }
 # The calls by which a driver uses its conversation, and their names on the tape.
 _STEPS = {
-    "drop_stale": "waits",
-    "announce_changes": "answers",
-    "next_packet": "said",
-    "note_departed": "departed",
-    "hear": "heard",
-    "break_off": "lost",
-    "end": "closed",
+    Conversation.drop_stale.__name__: "waits",
+    Conversation.announce_changes.__name__: "answers",
+    Conversation.next_packet.__name__: "said",
+    Conversation.count_departed.__name__: "departed",
+    Conversation.handle.__name__: "heard",
+    Conversation.break_off.__name__: "lost",
+    Conversation.end.__name__: "closed",
 }
 _UNPACKED = "image", "position", "pose"  # of a frame, not on the tape as they are
 
@@ -205,23 +205,23 @@ class _RecordedConversation:
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self._conversation, name)
-        return partial(self._call, name, value) if name in _STEPS else value
+        return partial(self._call, _STEPS[name], value) if name in _STEPS else value
 
-    def _call(self, name: str, method: Callable[..., Any], *args: Any) -> Any:
+    def _call(self, step: str, method: Callable[..., Any], *args: Any) -> Any:
         result = None
         try:
             result = method(*args)
             return result
         finally:
-            self._turns.steps.append((_STEPS[name], *self._describe(name, args, result)))
+            self._turns.steps.append((step, *self._describe(step, args, result)))
 
-    def _describe(self, name: str, args: tuple[Any, ...], result: Any) -> tuple[Any, ...]:
+    def _describe(self, step: str, args: tuple[Any, ...], result: Any) -> tuple[Any, ...]:
         """Return what a replay needs of a call: the bytes and their sender, the packet, the number of fixes."""
-        match name, args:
-            case "hear", (data, _, sender):
+        match step, args:
+            case "heard", (data, _, sender):
                 return data, sender, list(self._conversation.settings.signing.verdicts)
-            case "next_packet", _:
+            case "said", _:
                 return (result and result[0],)
-            case "note_departed", (fixes,):
+            case "departed", (fixes,):
                 return (len(fixes),)
         return args
