@@ -2,9 +2,9 @@
 
 The flight of [from_space](from_space.md), by a camera of 28 degrees across that looks ahead of straight down and sees
 the same ground, is asked in a map of the raster `before` of sat_marash: every second picture, each alone. Known are
-heading and height and, where `tilt` is told, roll and pitch; without, a picture is taken to look straight down.
-Pictures that show ground beyond the raster are left out. `within`: share of the accepted whose error is at most two
-standard deviations as claimed; `too sure`: those that are not, and claim less than 40 m.
+heading, height and, where `tilt` is told, roll and pitch. `level`: the autopilot reports a level airframe, and nobody
+the camera's tilt. Pictures that show ground beyond the raster are left out. `within`: share of the accepted whose error
+is at most two standard deviations as claimed; `too sure`: those that are not, and claim less than 40 m.
 
 The map is cut at one footprint. Constants of edgevpr were chosen on this set, those of levelling on other views of it.
 """
@@ -19,6 +19,7 @@ from base import Row
 
 FOV_DEG = 28.0
 TILTS_DEG = (0.0, 20.0, 45.0, 60.0)
+_TOLD = {"tilt": {}, "nothing": {"roll_deg": None, "pitch_deg": None}, "level": {"roll_deg": 0.0, "pitch_deg": 0.0}}
 _COLUMNS = {
     "tilt": "{tilt:.0f}",
     "told": "{told}",
@@ -36,9 +37,8 @@ def measure(folder: Path, work: Path) -> list[Row]:
     base.edgevpr("map", "build", path, "--orthophoto", folder / "raster" / "before.vrt", *size)
     for tilt_deg in TILTS_DEG:
         frames = list(from_space.flown(folder / "raster" / "after.vrt", FOV_DEG, tilt_deg))[::2]
-        untold = [replace(frame, roll_deg=None, pitch_deg=None) for frame in frames]
-        for told, pictures in (("heading, height, tilt", frames), ("heading, height", untold)):
-            found = from_space.matched(path, pictures, "heading, height", FOV_DEG)
+        for told, angles in _TOLD.items():
+            found = from_space.matched(path, (replace(each, **angles) for each in frames), "heading, height", FOV_DEG)
             rows.append({"tilt": tilt_deg, "told": told, **found})
             print(rows[-1], flush=True)
     return rows

@@ -142,13 +142,29 @@ class FineMatch:
     votes: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Perspective:
-    """Perspective of a query over a place. `slope`: change of scale (right, down) across the query's picture, relative,
-    per longest side; it is the tangent of the tilt over the focal length. `sd`: standard deviation of each."""
+    """Perspective of a query over a place. The homography `over_place` (3, 3) maps points of the query's picture to
+    the place's: (right, down, 1) from the middle, in longest sides; its last value is 1. `regions` agree on it.
+    `slope_sd`: standard deviation of `slope`, along each axis."""
 
-    slope: tuple[float, float]
-    sd: float
+    over_place: np.ndarray
+    slope_sd: float
+    regions: int
+
+    @property
+    def slope(self) -> float:
+        """Change of scale across the query's picture, relative, per longest side: the tangent of its tilt over the
+        focal length."""
+        return float(np.hypot(*self.over_place[2, :2]))
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Largest and smallest scale at the middle of the query's picture, by direction. Of a tilted one, their ratio
+        is the cosine of the tilt, whatever the lens."""
+        derivative = self.over_place[:2, :2] - np.outer(self.over_place[:2, 2], self.over_place[2, :2])
+        largest, smallest = np.linalg.svd(derivative, compute_uv=False)
+        return float(largest), float(smallest)
 
 
 class Technique(Protocol):

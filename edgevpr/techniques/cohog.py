@@ -265,13 +265,21 @@ class CoHog:
         view = self._view(query, HEIGHT_RATIOS.index(ratio) * ROTATIONS + turn)
         nearest = find_most_similar(view.regions, self._reference(fine))
         scale, off_deg = compute_scale(self._side + 1, ratio), (match.rotation_deg or 0.0) - turn * step_deg
-        return fit_perspective(
+        found = fit_perspective(
             centre_regions(view.numbers, view.side),
             centre_regions(nearest, self._side),
             complex((match.height_ratio or 1.0) / scale * np.exp(1j * np.radians(off_deg))),
             complex(*(match.shift_cells or (0.0, 0.0))),
-            (self._side + 1) * scale,
         )
+        if found is None:
+            return None
+        place_from_view, sd, regions = found
+        cells, turned = (self._side + 1) * scale, np.radians(turn * step_deg)
+        view_from_query = cells * np.exp(1j * turned)
+        right, down = view_from_query.real, view_from_query.imag
+        over_place = place_from_view @ [[right, -down, 0], [down, right, 0], [0, 0, 1]]
+        over_place[:2] /= self._side + 1
+        return Perspective(over_place, cells * sd, regions)
 
     def match_at_rest(self, query: Descriptor, fine: Bytes) -> FineMatch:
         """See `Technique.unmoved`."""

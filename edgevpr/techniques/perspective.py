@@ -9,7 +9,6 @@ agree with the last one, so that more of the picture follows.
 import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Doubles
-from edgevpr.core.contract import Perspective
 
 _ROUNDS = 10
 _WITHIN_CELLS = 1.5  # largest distance of an agreeing region from the fit
@@ -20,11 +19,12 @@ _MIN_SCALE = 0.05  # nearer to the horizon of a homography, nothing lies anywher
 
 
 def fit_perspective(
-    asked: Array, known: Array, turn_scale: complex, shift: complex, cells: float
-) -> Perspective | None:
+    asked: Array, known: Array, turn_scale: complex, shift: complex
+) -> tuple[Doubles, float, int] | None:
     """Fit a homography to regions of a query and the most similar ones of a place, `asked` and `known`, complex (n,),
     in cells from the middles of the pictures, right and down. It begins with the rotation, scale and shift of a match.
-    `cells` is the number of cells along the query's longest side. Returns None if fewer than 12 regions agree."""
+    Returns it (3, 3), the standard deviation of its change of scale from cell to cell, and how many regions agree; None
+    if fewer than 12 do."""
     way = np.array([turn_scale.real, -turn_scale.imag, shift.real, turn_scale.imag, turn_scale.real, shift.imag, 0, 0])
     normal = np.eye(8)
     for _ in range(_ROUNDS):
@@ -49,8 +49,8 @@ def fit_perspective(
     # A region is matched to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
     variance = float((np.abs(off[agrees]) ** 2).mean()) / 2 + 1 / 12
     covariance = _ALIKE * variance * np.linalg.inv(normal)[6:, 6:]
-    slope = (-cells * float(way[6]), -cells * float(way[7]))
-    return Perspective(slope, cells * float(np.sqrt(np.trace(covariance) / 2)))
+    homography = np.append(way, 1.0).reshape(3, 3)
+    return homography, float(np.sqrt(np.trace(covariance) / 2)), int(np.count_nonzero(agrees))
 
 
 def _compare(way: Doubles, asked: Array, known: Array) -> tuple[Bools, Array]:

@@ -22,11 +22,12 @@ def test_fit_perspective_finds_the_slope_among_wrong_pairs(slope):
     known = lay(GRID, slope, turn_scale, shift)
     wrong = rng.random(len(GRID)) < 0.5
     known[wrong] = rng.permutation(GRID)[wrong]
-    found = fit_perspective(GRID, known, turn_scale, shift, CELLS)
-    assert np.hypot(*np.subtract(found.slope, slope)) < 4 * found.sd < 0.3
+    homography, sd, regions = fit_perspective(GRID, known, turn_scale, shift)
+    assert np.hypot(*(CELLS * homography[2, :2] + slope)) < 4 * CELLS * sd < 0.3
+    assert regions == pytest.approx(np.count_nonzero(~wrong), abs=20)
 
 
 def test_fit_perspective_knows_nothing_of_few_pairs():
     known = np.full(len(GRID), 40 + 40j)
     known[:11] = GRID[:11]
-    assert fit_perspective(GRID, known, 1 + 0j, 0j, CELLS) is None
+    assert fit_perspective(GRID, known, 1 + 0j, 0j) is None

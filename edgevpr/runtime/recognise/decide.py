@@ -55,9 +55,9 @@ from edgevpr.runtime.recognise.judge import (
 )
 from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, unpack_bytes
 from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, allow_for_tilt, locate, locate_at_place
-from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, ShownTilt, convert_to_tilt
+from edgevpr.runtime.recognise.perspective import ShownTilt, convert_to_tilt
 from edgevpr.runtime.recognise.place_filter import Followed, PlaceFilter
-from edgevpr.runtime.recognise.tilted import SUPPOSED_TILT, agrees_better_tilted
+from edgevpr.runtime.recognise.tilted import measure_again
 
 _MAX_SAME_GROUND = 12  # places that may show the same ground: so many overlap on kite_ochota, which has no positions
 # Of the votes of the best place, those that a place elsewhere has at rest: behind a display or figures nearly all have
@@ -297,15 +297,9 @@ class Decider:
         """Return the tilt of the query against the place, as both show it."""
         with self.meter.step("compare"):
             fine, _ = self.place_map.fine_part(best.place.place_id)
-            found = self.technique.measure_perspective(query.descriptor, fine, best.match)
-            tilt = convert_to_tilt(found, query.view.focal)
-            if tilt.is_level or (query.view.is_tilt_known and not tilt.is_clear):
-                return tilt
-            focal = query.view.focal or TYPICAL_FOCAL
-            is_better = agrees_better_tilted(query.picture, focal, self.technique, fine, best.match)
-            if query.view.is_tilt_known:  # a few regions alone do not contradict what is recorded
-                return tilt if is_better else ShownTilt(0.0, tilt.sd)
-            return SUPPOSED_TILT if is_better else tilt
+            if found := self.technique.measure_perspective(query.descriptor, fine, best.match):
+                found = measure_again(query.picture, self.technique, fine, found)
+            return convert_to_tilt(found, query.view.focal)
 
     def _share_at_rest_elsewhere(self, candidate: Candidate, ranking: Ranking, encoded: EncodedFrame) -> float:
         """Return the share of a few places elsewhere that agree with the query at rest, as the best one (0: it is not

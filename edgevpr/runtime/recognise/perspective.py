@@ -19,10 +19,14 @@ from edgevpr.frames.level import View
 _FEWEST = 12  # landmarks
 _POINT_SD, _SHEAR_SD = 2.5 / 640, 0.01  # of a landmark, as a share of the longest side; of a shear
 TYPICAL_FOCAL = 0.77  # 66 degrees across
-_LEVEL_TILT = math.tan(math.radians(8.0))
-_UNKNOWN_TILT_SD = math.tan(math.radians(20.0))  # where too little agrees to show a tilt
+_UNKNOWN_TILT_SD = math.tan(math.radians(30.0))  # where too little agrees to show a tilt
 _CLEAR_SD = 3.0  # of a tilt beyond the reported one
 _CLEAR_TILT = math.tan(math.radians(5.0))
+# Of a slope: the pictures of places are tilted by some degrees, and relief looks like a tilt, too.
+_PLACE_SLOPE_SD = 0.1
+# Share by which scales differ by direction. Level views of aerial_garfield28 and aerial_caliterra have 0.07 at most,
+# those of 45 degrees 0.08 to 0.25; it is the square of the tangent of half the tilt.
+_CLEAR_STRETCH, _STRETCH_TILT_SD = 0.075, 0.12
 # Relief moves neighbouring landmarks alike: so many of them count as one. The place's own picture is tilted too.
 _ALIKE, _PLACE_SD = 5.0, math.tan(math.radians(0.5))
 
@@ -40,10 +44,11 @@ class AttitudeError:
 @dataclass(frozen=True, slots=True)
 class ShownTilt:
     """Tilt of a levelled picture against that of a place, as both show it: `tangent`, and the standard deviation `sd`
-    of each of its two axes."""
+    of each of its two axes, by the regions compared; `place_sd` is that by tilt and relief of the place."""
 
     tangent: float
     sd: float
+    place_sd: float = 0.0
 
     @property
     def deg(self) -> float:
@@ -53,17 +58,12 @@ class ShownTilt:
     @property
     def least_deg(self) -> float:
         """The tilt in degrees, less two standard deviations."""
-        return math.degrees(math.atan(self.tangent - 2 * self.sd))
-
-    @property
-    def is_level(self) -> bool:
-        """True if there is no tilt, but for a few degrees."""
-        return math.hypot(self.tangent, _CLEAR_SD * self.sd) < _LEVEL_TILT
+        return math.degrees(math.atan(self.tangent - 2 * math.hypot(self.sd, self.place_sd)))
 
     @property
     def is_clear(self) -> bool:
         """True if there clearly is a tilt."""
-        return self.tangent > max(_CLEAR_SD * self.sd, _CLEAR_TILT)
+        return self.tangent > max(_CLEAR_SD * math.hypot(self.sd, self.place_sd), _CLEAR_TILT)
 
     def get_sd(self, is_reported: bool) -> float:
         """Return what it says of the error of a tilt, as a tangent. One that `is_reported` is taken to be right unless
@@ -77,7 +77,12 @@ def convert_to_tilt(found: Perspective | None, focal: float | None) -> ShownTilt
     if found is None:
         return ShownTilt(0.0, _UNKNOWN_TILT_SD)
     focal = focal or TYPICAL_FOCAL
-    return ShownTilt(focal * math.hypot(*found.slope), focal * found.sd)
+    by_slope = ShownTilt(focal * found.slope, focal * found.slope_sd, focal * _PLACE_SLOPE_SD)
+    largest, smallest = found.scales
+    if (largest - smallest) / (largest + smallest) < _CLEAR_STRETCH:
+        return by_slope
+    by_stretch = ShownTilt(math.sqrt((largest / smallest) ** 2 - 1), _STRETCH_TILT_SD)
+    return max(by_slope, by_stretch, key=lambda tilt: tilt.least_deg)
 
 
 def fit_attitude_error(asked: Array, known: Array, view: View, up_deg: float) -> AttitudeError | None:

@@ -263,9 +263,12 @@ def test_a_camera_that_looks_ahead_is_located_right_with_its_mount_and_wrong_wit
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pitch_deg", [12.0, 20.0, 40.0, 60.0])
-def test_a_view_of_unreported_tilt_claims_no_more_than_it_knows(walk, ground, pitch_deg):
-    told = STRAIGHT | {"roll_deg": None, "pitch_deg": None}
+@pytest.mark.parametrize(
+    ("pitch_deg", "reported_deg"),
+    [(12.0, None), (20.0, None), (40.0, None), (60.0, None), (20.0, 0.0), (40.0, 0.0), (60.0, 0.0)],
+)
+def test_a_view_of_unreported_tilt_claims_no_more_than_it_knows(walk, ground, pitch_deg, reported_deg):
+    told = STRAIGHT | {"roll_deg": reported_deg, "pitch_deg": reported_deg}
     event = walk(scaling()).step(frame(ground, 1, pitch_deg=pitch_deg, told=told))
     ahead_m = HEIGHT_M * math.tan(math.radians(pitch_deg))
     assert event.accepted or pitch_deg > 12

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from levelled_views import lit_ground, view_from
 
+from edgevpr.core.contract import Perspective
 from edgevpr.frames.level import View
 from edgevpr.lab.simulate.camera import CameraPose
 from edgevpr.runtime.recognise.agreement import measure_agreement
 from edgevpr.runtime.recognise.landmarks import OF_QUERY, describe
-from edgevpr.runtime.recognise.perspective import fit_attitude_error
+from edgevpr.runtime.recognise.perspective import convert_to_tilt, fit_attitude_error
 
 FOCAL = 0.77  # shares of the longest side: 66 degrees across
 SEEN = View(aside=(0.0, 0.0), focal=FOCAL, up_deg=0.0)
@@ -110,3 +111,13 @@ def test_pictures_show_by_how_much_the_reported_attitude_is_wrong(ground, roll_d
     )
     assert lean.over_height == pytest.approx((east, north), abs=max(0.012, 2 * lean.sd))
     assert lean.sd < 0.03
+
+
+@pytest.mark.parametrize(("tilt_deg", "is_clear"), [(0.0, False), (20.0, False), (45.0, True), (60.0, True)])
+def test_convert_to_tilt_of_a_narrow_lens_goes_by_the_stretch(tilt_deg, is_clear):
+    """Without a change of scale across the picture, and turned."""
+    stretch = np.diag([1.0, math.cos(math.radians(tilt_deg)), 1.0])
+    turn = np.array([[0.6, -0.8, 0.1], [0.8, 0.6, -0.2], [0.0, 0.0, 1.0]])
+    tilt = convert_to_tilt(Perspective(turn @ stretch @ turn.T, slope_sd=0.05, regions=100), focal=3.0)
+    assert tilt.is_clear == is_clear
+    assert tilt.deg == pytest.approx(tilt_deg if is_clear else 0.0, abs=0.1)
