@@ -118,6 +118,6 @@ def test_convert_to_tilt_of_a_narrow_lens_goes_by_the_stretch(tilt_deg, is_clear
     """Without a change of scale across the picture, and turned."""
     stretch = np.diag([1.0, math.cos(math.radians(tilt_deg)), 1.0])
     turn = np.array([[0.6, -0.8, 0.1], [0.8, 0.6, -0.2], [0.0, 0.0, 1.0]])
-    tilt = convert_to_tilt(Perspective(turn @ stretch @ turn.T, slope_sd=0.05, regions=100), focal=3.0)
+    tilt = convert_to_tilt(Perspective(turn @ stretch, slope_sd=0.05, regions=100), focal=3.0)
     assert tilt.is_clear == is_clear
     assert tilt.deg == pytest.approx(tilt_deg if is_clear else 0.0, abs=0.1)
