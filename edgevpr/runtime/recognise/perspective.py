@@ -26,7 +26,8 @@ _CLEAR_TILT = math.tan(math.radians(5.0))
 _PLACE_SLOPE_SD = 0.1
 # Share by which scales differ by direction. Level views of aerial_garfield28 and aerial_caliterra have 0.07 at most,
 # those of 45 degrees 0.08 to 0.25; it is the square of the tangent of half the tilt.
-_CLEAR_STRETCH, _STRETCH_TILT_SD = 0.075, 0.12
+_CLEAR_STRETCH = 0.075
+_STRETCH_SD_SHARE = 0.3  # of the tilt by it: clear enough for what a match may claim, too little to refuse 30 degrees
 # Relief moves neighbouring landmarks alike: so many of them count as one. The place's own picture is tilted too.
 _ALIKE, _PLACE_SD = 5.0, math.tan(math.radians(0.5))
 
@@ -79,10 +80,11 @@ def convert_to_tilt(found: Perspective | None, focal: float | None) -> ShownTilt
     focal = focal or TYPICAL_FOCAL
     by_slope = ShownTilt(focal * found.slope, focal * found.slope_sd, focal * _PLACE_SLOPE_SD)
     largest, smallest = found.scales
-    if (largest - smallest) / (largest + smallest) < _CLEAR_STRETCH:
+    by_stretch = math.sqrt((largest / smallest) ** 2 - 1)
+    is_stretched = (largest - smallest) / (largest + smallest) >= _CLEAR_STRETCH
+    if not is_stretched or (by_slope.is_clear and by_slope.tangent > by_stretch):
         return by_slope
-    by_stretch = ShownTilt(math.sqrt((largest / smallest) ** 2 - 1), _STRETCH_TILT_SD)
-    return max(by_slope, by_stretch, key=lambda tilt: tilt.least_deg)
+    return ShownTilt(by_stretch, _STRETCH_SD_SHARE * by_stretch)
 
 
 def fit_attitude_error(asked: Array, known: Array, view: View, up_deg: float) -> AttitudeError | None:
