@@ -132,43 +132,6 @@ def seconds_to_alarm(air, drift_m_s):
     return until_found(air, 0.0)
 
 
-@pytest.mark.parametrize("drift_m_s", [None, 1.0, 5.0])
-def test_a_copter_that_hovers_over_a_place_that_agreed_before_is_warned_too(watched, drift_m_s):
-    air = watched(speed_m_s=0.0, fix_sd_m=1.0)
-    air.places = lambda step: (7, 8)
-    air.fly(60)
-    assert seconds_to_alarm(air, drift_m_s) <= 20
-
-
-def test_it_is_over_when_gps_agrees_again(watched):
-    air = watched().fly(30)
-    glitch(air, None)
-    air.fly(30)
-    air.gps_off_m = np.zeros(2)
-    air.fly(30)
-    assert [line["is_wrong"] for line in air.news] == [True, False]
-    assert air.news[1]["note"]["code"] == "GPS_AGREES"
-    assert air.link.texts()[-1] == (6, "edgevpr: GPS agrees with the map again")
-    assert air.navigator.has_gps
-    glitch(air, None)
-    air.fly(30)
-    assert [line["is_wrong"] for line in air.news] == [True, False, True]
-
-
-@pytest.mark.parametrize("every_s", [1, 2, 3])
-def test_a_jammer_that_comes_and_goes_is_told_and_is_over_when_it_stays_away(watched, every_s):
-    air = watched().fly(30)
-    for _ in range(60 // every_s):
-        air.gps_off_m = np.array([0.0, 80.0]) - air.gps_off_m
-        air.fly(every_s)
-    assert air.news[0]["t_mono_s"] - 30 <= 15
-    before = [line["is_wrong"] for line in air.news]
-    assert before in ([True], [True, False, True]), "the first time it may be a glitch that has passed"
-    air.gps_off_m = np.zeros(2)
-    air.fly(30)
-    assert [line["is_wrong"] for line in air.news] == [*before, False]
-
-
 @GLITCHES
 def test_the_navigation_believes_the_fixes_and_no_longer_gps_but_sends_none_to_an_autopilot_that_has_it(
     watched, drift_m_s
@@ -187,14 +150,6 @@ def test_the_navigation_believes_the_fixes_and_no_longer_gps_but_sends_none_to_a
     assert lengths(off_m).max() < 8, "where the autopilot is 60 m off and more"
     assert air.link.stats().fixes_sent == 0
     assert {report.why.code for report in air.reports[-20:]} == {ReasonCode.HAS_WRONG_GPS}
-
-
-def test_an_autopilot_that_rejects_a_wrong_receiver_is_sent_fixes(watched):
-    air = watched(wind=(6.0, 0.0)).fly(30)
-    air.reject_gps()
-    glitch(air, None)
-    air.fly(30)
-    assert air.link.stats().fixes_sent > 10
 
 
 @pytest.mark.parametrize("fix_sd_m", [1.0, 3.0, 8.0])
@@ -216,14 +171,6 @@ def test_no_false_alarm_in_thirty_minutes_of_noise_outliers_and_a_wandering_rece
             seen = Position(*offset_position(*HOME, *(at_m + off_m)))
             watch.update(match_at(seen, t_s, vehicle_at(*gps, t_s, **known), fix_sd_m, (int(t_s),)))
             assert not watch.is_wrong
-
-
-def test_without_a_receiver_nothing_is_compared(watched):
-    air = watched().fly(3)
-    air.lose_gps()
-    air.link.sent.clear()
-    air.fly(5)
-    assert air.distances() == []
 
 
 @pytest.mark.parametrize("seed", range(2))
