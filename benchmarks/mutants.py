@@ -12,10 +12,10 @@ import os
 import re
 import resource
 import sys
-import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib import util
+from multiprocessing import connection, get_context
 from pathlib import Path
 
 import base
@@ -30,37 +30,18 @@ PLAN = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
 WORK = base.REPOSITORY / "mutants_work"
 JOBS = int(os.environ.get("JOBS", 2))
 MAX_CPU_S = 60  # of the tests of one mutant; one that takes longer counts as killed
+FORK = get_context("fork")
 
 
 def main() -> int:
-    WORK.mkdir(exist_ok=True)
     for module in sys.argv[1:] or PLAN["modules"]:
-        if run_forked(lambda module=module: run_module(module)):
+        process = FORK.Process(target=run_module, args=(module,))
+        process.start()
+        process.join()
+        if process.exitcode:
             return 1
     write_page()
     return 0
-
-
-def run_forked(task: Callable[[], int]) -> int:
-    """Run a task in a process of its own, and return its status."""
-    return os.waitpid(fork(task), 0)[1]
-
-
-def fork(task: Callable[[], int]) -> int:
-    """Run a task that returns an exit code in a process of its own, and return the process's id."""
-    sys.stdout.flush()
-    if pid := os.fork():
-        return pid
-    try:
-        os._exit(task())
-    except BaseException:  # a forked process must not go on as this one
-        traceback.print_exc()
-        os._exit(1)
-
-
-def kept_outcomes(module: str) -> Path:
-    """Return the file that says of each change of a module whether it was killed."""
-    return WORK / Path(module).with_suffix(".json").name
 
 
 def list_mutants(source: str) -> Iterator[tuple[str, str]]:
@@ -78,28 +59,30 @@ def list_mutants(source: str) -> Iterator[tuple[str, str]]:
                 yield f"{change} ({seen[change]})", mutant
 
 
-def run_module(module: str) -> int:
+def run_module(module: str) -> None:
     """Run the tests of a module on each of its mutants, and keep which ones were killed."""
-    source, kept = (base.REPOSITORY / module).read_text(), kept_outcomes(module)
-    name = module.removesuffix(".py").replace("/", ".")
+    name, source = module.removesuffix(".py").replace("/", "."), (base.REPOSITORY / module).read_text()
+    kept = WORK / f"{Path(module).stem}.json"
     pytest.main(["--collect-only", "-qq", "-p", "no:xdist", *PLAN["modules"][module]])  # loads all that is needed
     forget(name)
-    if run_forked(lambda: run_tests(module, name, source, is_quiet=False)):
-        return 1
-    before = json.loads(kept.read_text()) if kept.exists() else {}
-    mutants = dict(list_mutants(source))
-    killed = {change: before.get(change) for change in mutants}
-    waiting, running = [change for change in mutants if not killed[change]], dict[int, str]()
+    mutants, before = dict(list_mutants(source)), json.loads(kept.read_text()) if kept.exists() else {}
+    killed = {"": False} | {change: before.get(change, False) for change in mutants}  # the first is the module itself
+    waiting, running = [change for change in reversed(killed) if not killed[change]], {}
     while waiting or running:
         while waiting and len(running) < JOBS:
             change = waiting.pop()
-            running[fork(lambda source=mutants[change]: run_tests(module, name, source))] = change
-        pid, status = os.wait()
-        killed[running.pop(pid)] = bool(status)
+            process = FORK.Process(target=run_tests, args=(module, name, mutants.get(change, source)))
+            process.start()
+            running[process.sentinel] = process, change
+        for sentinel in connection.wait(running):
+            process, change = running.pop(sentinel)
+            process.join()
+            killed[change] = process.exitcode != 0
+        if killed[""]:
+            sys.exit(f"{module}: its tests fail without a change")
+        WORK.mkdir(exist_ok=True)
         kept.write_text(json.dumps(killed, indent=0))
-    kept.write_text(json.dumps(killed, indent=0))
-    print(f"{module}: {len(killed)} mutants, {sum(killed.values())} killed", flush=True)
-    return 0
+    print(f"{module}: {len(mutants)} mutants, {sum(killed.values())} killed", flush=True)
 
 
 def forget(name: str) -> None:
@@ -114,36 +97,35 @@ def forget(name: str) -> None:
             del sys.modules[other]
 
 
-def run_tests(module: str, name: str, source: str, is_quiet: bool = True) -> int:
-    """Run the tests of a module with another source, and return the exit code."""
+def run_tests(module: str, name: str, source: str) -> None:
+    """Run the tests of a module with another source, and exit with their code."""
     resource.setrlimit(resource.RLIMIT_CPU, (MAX_CPU_S, MAX_CPU_S))
-    if is_quiet:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        os.dup2(1, 2)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    os.dup2(1, 2)
     mutant = util.module_from_spec(util.find_spec(name))
     parent, _, child = name.rpartition(".")
     sys.modules[name] = mutant
     setattr(sys.modules[parent], child, mutant)
     exec(compile(source, module, "exec"), mutant.__dict__)
-    return pytest.main(["-x", "-p", "no:xdist", *PLAN["modules"][module]])
+    sys.exit(pytest.main(["-x", "-p", "no:xdist", *PLAN["modules"][module]]))
 
 
 def write_page() -> None:
     """Write benchmarks/results/mutants.md."""
-    rows, survivors = [], []
+    rows, survivors = [], {why: [] for why in PLAN["survivors"]}
     for module in PLAN["modules"]:
-        kept = kept_outcomes(module)
-        killed = json.loads(kept.read_text()) if kept.exists() else {}
+        killed = json.loads((WORK / f"{Path(module).stem}.json").read_text())
+        del killed[""]
         for change in (change for change, is_killed in killed.items() if not is_killed):
             after = change.rpartition(" (")[0].partition(" => ")[2]
-            reasons = (why for why, lines in PLAN["survivors"].items() if after in lines)
-            survivors.append({"module": Path(module).name, "mutant": after, "why": next(reasons, "**a gap**")})
+            reasons = (why for why, parts in PLAN["survivors"].items() if any(part in after for part in parts))
+            survivors.setdefault(next(reasons, "Gaps"), []).append(f"- {Path(module).name}: `{after}`")
         rows.append({"module": module, "mutants": len(killed), "killed": sum(killed.values())})
     total = {name: sum(row[name] for row in rows) for name in ("mutants", "killed")}
-    rows = [{**row, "share": row["killed"] / max(row["mutants"], 1)} for row in [*rows, {"module": "all", **total}]]
+    rows = [{**row, "share": row["killed"] / row["mutants"]} for row in [*rows, {"module": "all", **total}]]
     columns = {"module": "{module}", "mutants": "{mutants}", "killed": "{killed}", "share": "{share:.1%}"}
-    listed = {"module": "{module}", "survivor": "`{mutant}`", "why it may live": "{why}"}
-    parts = ["# Mutants", base.told(__doc__), base.table(rows, columns), base.table(survivors, listed, left=3)]
+    parts = ["# Mutants", base.told(__doc__), base.table(rows, columns), "## Survivors"]
+    parts += [f"{why}:\n\n" + "\n".join(lines) for why, lines in survivors.items() if lines]
     page = "\n\n".join([*parts, base.made_line(base.made_by(), "make mutants")])
     (base.RESULTS / "mutants.md").write_text(page + "\n")
 

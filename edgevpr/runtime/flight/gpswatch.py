@@ -47,7 +47,7 @@ class GpsWatch:
         self._agreeing = 0
         self._usual_m, self._usual_of = np.zeros(2), 0  # the mean offset of matches that agreed, and their number
         self._agreed: set[int] = set()  # places of the last match that agreed
-        self._reported_m = 0.0  # the distance that was last reported
+        self._reported_m = math.inf  # the distance that was last reported
         self._have_agreed = False  # GPS and map, in this flight
         self.is_wrong = False
 

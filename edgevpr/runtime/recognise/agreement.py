@@ -114,8 +114,8 @@ def compare_near(query: Landmarks, place: Landmarks, expected: Overlay) -> Agree
     otherwise = measure_agreement(query, place)
     if otherwise.inliers < PROVEN or otherwise.is_at_rest or otherwise.shift_share is None:
         return found  # an agreement at rest may come from a display, not from the ground
-    turn_scale = (otherwise.scale or 1.0) * np.exp(1j * np.radians(otherwise.rotation_deg or 0.0))
-    is_near = _is_near(complex(turn_scale), complex(*otherwise.shift_share), expected)
+    way = Overlay(otherwise.shift_share, otherwise.rotation_deg or 0.0, otherwise.scale)
+    is_near = _is_near(way.turn_scale, complex(*way.shift_share), expected)
     return found if is_near else replace(otherwise, is_expected=False)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, agreement, compare_near
+from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, compare_near, measure_agreement
 from edgevpr.runtime.recognise.landmarks import OF_QUERY, Landmarks, describe, packed, unpacked
 from edgevpr.techniques import create
 
@@ -53,7 +53,7 @@ def test_the_signs_are_those_of_a_match_of_cohog(landscape, right_px, down_px, t
     """The query's middle lies right of the place's by `right_px`, and below it by `down_px`."""
     place = cut(landscape, 800, 600)
     query = cut(landscape, 800 + right_px, 600 + down_px, turned_deg, scale)
-    found = agreement(asked(query), kept(place))
+    found = measure_agreement(asked(query), kept(place))
     assert found.inliers >= PROVEN
     assert np.array(found.shift_share) * WIDE == pytest.approx((right_px, down_px), abs=2)
     assert abs((found.rotation_deg - turned_deg + 180) % 360 - 180) < 1
@@ -85,5 +85,5 @@ def test_landmarks_all_on_one_spot_do_not_agree(landscape):
     place = kept(cut(landscape, 800, 600))
     heap = Landmarks(np.zeros_like(place.points), place.angle_deg, np.zeros_like(place.size), place.bits)
     for expected in (None, Overlay((0.0, 0.0), 0.0)):
-        assert agreement(asked(cut(landscape, 800, 600)), heap, expected).inliers < CONFIRMED
-        assert agreement(heap, place, expected).inliers < CONFIRMED
+        assert measure_agreement(asked(cut(landscape, 800, 600)), heap, expected).inliers < CONFIRMED
+        assert measure_agreement(heap, place, expected).inliers < CONFIRMED

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edgevpr.runtime.recognise.agreement import Agreement, Overlay, compare_near, compose_overlays, measure_agreement
+from edgevpr.runtime.recognise.agreement import Agreement, Overlay, measure_agreement, compare_near, compose_overlays
 from edgevpr.runtime.recognise.landmarks import Landmarks
 
 SAME = Overlay((0.0, 0.0), 0.0, 1.0)
@@ -18,7 +18,10 @@ def ring(count, radius=0.3, middle=0.0):
     return middle + radius * np.exp(2j * np.pi * np.arange(count) / count)
 
 
-def landmarks(points, angle_deg=0.0, size=1.0, first=0):
+ANGLE_DEG = 20.0  # of all landmarks on the ground
+
+
+def landmarks(points, angle_deg=ANGLE_DEG, size=1.0, first=0):
     """Landmarks at complex points, each described otherwise: the same in all pictures by its number from `first` on."""
     points = np.asarray(points, complex)
     bits = np.random.default_rng(1).integers(0, 256, (100, 32), np.uint8)[first : first + len(points)]
@@ -34,7 +37,7 @@ def join(*each):
 def laid(points, shift=0.0, rotation_deg=0.0, scale=1.0, first=0):
     """Landmarks of a place, and those of a query that lies on it so."""
     turn_scale = cmath.rect(scale, math.radians(rotation_deg))
-    query = landmarks((np.asarray(points) - shift) / turn_scale, -rotation_deg, 1 / scale, first)
+    query = landmarks((np.asarray(points) - shift) / turn_scale, ANGLE_DEG - rotation_deg, 1 / scale, first)
     return query, landmarks(points, first=first)
 
 
@@ -90,10 +93,18 @@ def test_agreement_is_found_on_overlays_near_the_expected_one(way, expected, is_
 def test_landmark_matches_one_of_a_plausible_place_direction_and_size(way, at, moved_by, angle_deg, size, matches):
     query, place = laid(ring(10), **way)
     turn_scale = cmath.rect(way.get("scale", 1.0), math.radians(way.get("rotation_deg", 0.0)))
-    more = landmarks([turn_scale * at + way.get("shift", 0.0) + moved_by], angle_deg, size, first=10)
-    asked = landmarks([at], -way.get("rotation_deg", 0.0), 1 / way.get("scale", 1.0), first=10)
+    more = landmarks([turn_scale * at + way.get("shift", 0.0) + moved_by], ANGLE_DEG + angle_deg, size, first=10)
+    asked = landmarks([at], ANGLE_DEG - way.get("rotation_deg", 0.0), 1 / way.get("scale", 1.0), first=10)
     expected = Overlay((way.get("shift", 0.0), 0.0), way.get("rotation_deg", 0.0), way.get("scale", 1.0))
     assert measure_agreement(join(query, asked), join(place, more), expected).matched == 10 + matches
+
+
+def test_landmark_matches_one_whose_size_is_at_the_limit():
+    most = np.float32(1.35 * 1.2)
+    for sizes in ((most, 1.0), (1.0, most)):
+        query, place = laid(ring(10))
+        query.size[3], place.size[3] = sizes
+        assert measure_agreement(query, place, SAME).matched == 10
 
 
 @pytest.mark.parametrize(("bits", "matches"), [(64, True), (65, False)])
@@ -102,7 +113,8 @@ def test_landmark_matches_one_that_differs_in_a_quarter_of_its_bits(bits, matche
     flipped = np.unpackbits(query.bits[3])
     flipped[:bits] ^= 1
     query.bits[3] = np.packbits(flipped)
-    assert measure_agreement(query, place).matched == 9 + matches
+    other_order = Landmarks(*(np.roll(getattr(place, name), 1, axis=0)[1:] for name in Landmarks.__slots__))
+    assert measure_agreement(query, other_order).matched == 8 + matches
 
 
 @pytest.mark.parametrize(("off", "inliers"), [(0.0150, 41), (0.0165, 40)])
@@ -118,24 +130,31 @@ def test_agreement_that_all_inliers_put_beyond_the_expected_overlays_is_none():
     query, place = laid(ring(12), shift=0.1097)
     place.points[::2, 0] -= 0.004  # half of them alone lie near it
     place.points[1::2, 0] += 0.004
-    assert agreement(query, place, SAME).inliers == 0
+    assert measure_agreement(query, place, SAME).inliers == 0
 
 
 @pytest.mark.parametrize(("count", "inliers"), [(2, 0), (3, 3)])
 def test_three_landmarks_agree(count, inliers):
     found = measure_agreement(*laid(ring(count)))
-    assert (found.inliers, found.possible) == (inliers, count)
+    assert (found.inliers, found.matched, found.possible) == (inliers, inliers, count)
+
+
+def test_landmarks_on_one_spot_do_not_agree():
+    """What a damaged map may hold."""
+    spot, points = landmarks([0.0] * 20), landmarks(ring(20))
+    for expected in (None, SAME):
+        assert measure_agreement(spot, points, expected).inliers == measure_agreement(points, spot, expected).inliers == 0
 
 
 @pytest.mark.parametrize(("middle", "off", "variance"), [(0.0, 0.0, 1.0), (0.0, 0.005, 2.0), (0.3, 0.005, 4.0)])
 def test_variance_grows_with_what_is_off_and_away_from_the_middle(middle, off, variance):
     """Twelve landmarks whose errors no rotation, scale or shift takes out: of 24 coordinates four are fitted."""
-    query, place = laid(ring(12, middle=middle))
+    query, place = laid(ring(12, middle=middle + 0.05), shift=0.05)
     place.points[:, 0] += off * (-1.0) ** np.arange(12)
     found = measure_agreement(query, place)
+    assert found.shift_share == pytest.approx((0.05, 0.0), abs=1e-5)
     unit = off**2 if off else (10 / 6400) ** 2 * 40 / 12
     assert found.covariance_share2 == pytest.approx((variance * unit, 0.0, variance * unit), rel=1e-3)
-    assert found.shift_share == pytest.approx((0.0, 0.0), abs=1e-5)
 
 
 AWAY = {"shift": 0.3}
@@ -164,9 +183,9 @@ def test_compare_near_returns_another_overlay_that_many_landmarks_prove(as_expec
 def test_compare_near_takes_no_display_and_nothing_near_for_another_overlay():
     still = laid(ring(20))
     assert compare_near(*still, Overlay((0.3, 0.0), 0.0, 1.0)).inliers == 0
-    query, place = laid(ring(20), shift=0.05)
+    query, place = laid(ring(20), shift=0.05, rotation_deg=90.0)
     wrong = replace(query, angle_deg=query.angle_deg + 90)
-    found = compare_near(wrong, place, SAME)
+    found = compare_near(wrong, place, Overlay((0.0, 0.0), 90.0, 1.0))
     assert (found.inliers, found.is_expected) == (0, True)
 
 
