@@ -6,7 +6,7 @@ import pytest
 from pictures import textured
 
 from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, compare_near, measure_agreement
-from edgevpr.runtime.recognise.landmarks import OF_QUERY, Landmarks, describe, packed, unpacked
+from edgevpr.runtime.recognise.landmarks import OF_QUERY, Landmarks, describe, pack_bytes, unpack_bytes
 from edgevpr.techniques import create
 
 WIDE, HIGH = 640, 480
@@ -41,7 +41,7 @@ def asked(image):
 
 
 def kept(image):
-    return unpacked(packed(describe(image)))
+    return unpack_bytes(pack_bytes(describe(image)))
 
 
 @pytest.mark.slow
