@@ -14,7 +14,7 @@ from base import DATA
 
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.frames.images import list_images
-from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
+from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage
 from edgevpr.lab.evaluate.dataset import ScoredQuery
 from edgevpr.mapmaking.calibrate import ask, query_altered_copies
 from edgevpr.places.index import PlaceIndex
@@ -99,7 +99,7 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
         order = np.random.default_rng(15).permutation(len(frames))
         frames = [frames[at] for at in np.resize(order, min(query_altered_copies(technique), 6 * len(frames)))]
         ids = {place.source_image: place.place_id for place in place_map.places()}
-        pictures = ((ids[frame.name], Levelled(frame.image, None, UNKNOWN_VIEW)) for frame in frames)
+        pictures = ((ids[frame.name], LevelledImage(frame.image, None, UNKNOWN_VIEW)) for frame in frames)
         for answer in ask(technique, place_map, index, rule, walks.meter(), pictures):
             if answer.evidence is not None:
                 told = {"kind": answer.way, "right": answer.right, "evidence": answer.evidence}

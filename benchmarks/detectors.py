@@ -6,7 +6,7 @@ import json
 import os
 from pathlib import Path
 
-from edgevpr.techniques.session import file_sha256
+from edgevpr.techniques.session import hash_model_file
 
 FILES = Path(os.environ.get("EDGEVPR_DETECTORS") or Path(__file__).resolve().parents[2] / "shared" / "models")
 NAMES = ("fastestdet", "yolox_nano")
@@ -44,7 +44,7 @@ def write_card(name: str, folder: Path) -> None:
     card = {
         "title": name,
         "file": f"{name}.onnx",
-        "sha256": file_sha256(file),
+        "sha256": hash_model_file(file),
         "licence": "see the file's own",
         "source": "an ONNX file beside the project",
         **_SAID[name],

@@ -31,7 +31,7 @@ from edgevpr.lab.evaluate.evaluate import MatchOptions, evaluate, read_known
 from edgevpr.lab.evaluate.metrics import compare
 from edgevpr.runtime.preflight.choose import ACCURACY_PATH as ACCURACY
 from edgevpr.techniques import create
-from edgevpr.techniques.session import file_sha256
+from edgevpr.techniques.session import hash_model_file
 
 FIVE_PLACES = "five places only: made for studies of change, recall on them says nothing"
 JOINED = "aerial_joined"  # all sets from the air as one map: the rows that are measured on it
@@ -159,7 +159,7 @@ def write_original_calc(cards: Path, weights: Path) -> None:
     """Put CALC's published weights and a card for them where edgevpr looks for the models of a user."""
     (cards / "calc_original.onnx").symlink_to(weights.resolve())
     card = yaml.safe_load((base.REPOSITORY / "models" / "calc.yaml").read_text())
-    card |= {"title": "CALC, the authors' weights", "file": "calc_original.onnx", "sha256": file_sha256(weights)}
+    card |= {"title": "CALC, the authors' weights", "file": "calc_original.onnx", "sha256": hash_model_file(weights)}
     card |= {"licence": "see the file's own", "source": "Merrill and Huang 2018, as an ONNX file"}
     card |= {"outputs": {"descriptor": "descriptor", "features": None}}
     (cards / "calc_original.yaml").write_text(yaml.safe_dump(card))

@@ -36,12 +36,14 @@ from sweep_changes import NONE, OF_CAMERA, SWEEPS, spoilt, view
 from edgevpr import techniques
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.images import read_image
-from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
+from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
 
 SETS = ("aerial_swindale", "corridor")  # one that looks down, one that looks ahead
-TECHNIQUES = tuple(name for name in techniques.names() if name != "seqslam")  # which asks with several pictures
+TECHNIQUES = tuple(
+    name for name in techniques.list_techniques() if name != "seqslam"
+)  # which asks with several pictures
 WORK = Path("sweeps_work")
 _MAX_ASKED = 24
 _LEAST_COVERED, _LEAST_SHOWN = 0.8, 0.7
@@ -70,9 +72,9 @@ class Shown:
 
     mask: np.ndarray | None = None
 
-    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None, **_: object) -> Levelled:
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: np.ndarray | None, **_: object) -> LevelledImage:
         """Return the picture with the mask."""
-        return Levelled(frame.image, self.mask, UNKNOWN_VIEW)
+        return LevelledImage(frame.image, self.mask, UNKNOWN_VIEW)
 
 
 Asked = tuple[Recogniser, Shown, list[str]]  # a walk over a map, what it is shown, and the places' names by slot

@@ -21,7 +21,7 @@ from encoders import Encoder, describe_rtp
 from loopback import free_port
 from numbered_pictures import HEIGHT, WIDTH, numbers_in, picture
 
-from edgevpr.frames.decoding import Fetched, WholePictures
+from edgevpr.frames.decoding import TimedPacket, VideoDecoder
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
 
@@ -247,17 +247,17 @@ def run(
 @contextmanager
 def _slow_decoder(work_s: float) -> Iterator[None]:
     """Let every packet take so much longer to decode."""
-    decode = WholePictures.decode
+    decode = VideoDecoder.decode
 
-    def slowly(whole: WholePictures, fetched: Fetched) -> object:
+    def slowly(whole: VideoDecoder, fetched: TimedPacket) -> object:
         time.sleep(work_s)
         return decode(whole, fetched)
 
-    WholePictures.decode = slowly
+    VideoDecoder.decode = slowly
     try:
         yield
     finally:
-        WholePictures.decode = decode
+        VideoDecoder.decode = decode
 
 
 def _judge(stream: str, camera: Camera) -> Row:

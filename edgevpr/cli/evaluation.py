@@ -145,7 +145,7 @@ def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
 
     wanted = [name.strip() for name in args.techniques.split(",") if name.strip()]
     if not wanted:
-        raise UsageError(f"--techniques names none: use some of {', '.join(techniques.names())}.")
+        raise UsageError(f"--techniques names none: use some of {', '.join(techniques.list_techniques())}.")
     forms = [form.strip() for form in args.form.split(",")]
     if unknown := [form for form in forms if form not in FORMS]:
         raise UsageError(f"--form names `{unknown[0]}`: use some of {', '.join(FORMS)}.")
@@ -155,11 +155,11 @@ def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
         if name not in settings or not parameter:
             raise UsageError(f"--param {key}: write TECHNIQUE.KEY=VALUE with a technique of --techniques.")
         settings[name][parameter] = value
-    if any("camera" in techniques.parameters(name) and "camera" not in settings[name] for name in wanted):
+    if any("camera" in techniques.read_parameters(name) and "camera" not in settings[name] for name in wanted):
         report("the camera is taken to look ahead: where it looks straight down, say `--camera nadir`")
     rows = {}
     for name in wanted:
-        has_forms = "form" in techniques.parameters(name) and "form" not in settings[name]
+        has_forms = "form" in techniques.read_parameters(name) and "form" not in settings[name]
         for form in forms if has_forms else [None]:
             chosen = {**settings[name], "form": form} if form else settings[name]
             rows[techniques.format_name(name, chosen.get("form"))] = name, chosen

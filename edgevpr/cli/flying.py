@@ -79,7 +79,7 @@ def run_match(args: Namespace) -> int:
     from edgevpr.runtime.recognise.evidence import list_evidence_kinds
     from edgevpr.runtime.recognise.hints import parse_known_fields
     from edgevpr.runtime.recognise.opening import open_recogniser
-    from edgevpr.techniques.card import find_weights
+    from edgevpr.techniques.card import describe_weights
 
     config, known = load_command_config(args, args.config, map=args.map), parse_known_fields(args.known)
     board = resolve_board(load_board(config.board), config.source, config.memory)
@@ -105,7 +105,7 @@ def run_match(args: Namespace) -> int:
         lines.append(f"The map is {not_calibrated(len(place_map))}.")
     if known:
         lines.append(f"Known of each query: {','.join(known)}.")
-    if weights := find_weights(recogniser.technique.spec):
+    if weights := describe_weights(recogniser.technique.spec):
         lines.append(f"Weights of {weights}.")
     show(found, args.json, "\n".join(lines))
     return exit_code(unusable)

@@ -222,7 +222,7 @@ def map_info(args: Namespace) -> int:
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import describe_map
     from edgevpr.runtime.recognise.calibration import not_calibrated, read_calibration_for
-    from edgevpr.techniques import WITH_CONFIDENCE
+    from edgevpr.techniques import CONFIDENCE_TECHNIQUE
 
     if args.page:
         require_out(args.page, args.map)
@@ -232,7 +232,7 @@ def map_info(args: Namespace) -> int:
     if calibration:
         confidence: str | None = f"calibrated {calibration.made}: {calibration.described()}"
     else:
-        confidence = not_calibrated(info.places) if info.spec.name == WITH_CONFIDENCE else None
+        confidence = not_calibrated(info.places) if info.spec.name == CONFIDENCE_TECHNIQUE else None
     ram_mb = info.places * each_bytes / 1e6
     known = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": each_bytes}
     said = list(format_info(info, confidence, ram_mb))

@@ -73,7 +73,9 @@ def _plan(args: Namespace, config: Config, board: "Board") -> "tuple[FlightPlan,
         camera = str(spec.parameters["camera"]) if "camera" in spec.parameters else camera
         wanted = offers((spec.name,), settings={spec.name: spec.parameters})
     else:
-        wanted = offers(techniques.names(), settings={n: camera_setting(n, camera) for n in techniques.names()})
+        wanted = offers(
+            techniques.list_techniques(), settings={n: camera_setting(n, camera) for n in techniques.list_techniques()}
+        )
     plan = FlightPlan(
         places=places,
         rate_hz=board.rate_hz,

@@ -48,7 +48,7 @@ class TechniqueSpec:
     `looks_down`: pictures show what is under the camera, so that shifts give metres.
     `height_ratios`: heights of the camera, over that of the map, at which a query can be recognised.
     `in_full`: most candidates that are compared by `match`. Of more, those with the best estimates by
-    `Technique.glance` are chosen. None: all candidates are compared by `match`.
+    `Technique.score_quickly` are chosen. None: all candidates are compared by `match`.
     """
 
     name: str

@@ -13,7 +13,7 @@ import av
 import av.logging
 
 from edgevpr.core.arrays import Image
-from edgevpr.frames.images import jpeg_is_whole
+from edgevpr.frames.images import is_whole_jpeg
 from edgevpr.frames.pixels import PixelConverter
 from edgevpr.frames.shot import OpeningError, Refusal, StreamFacts
 
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
     from av.packet import Packet
     from av.video.frame import VideoFrame
 
-    from edgevpr.frames.webpictures import AnswerFile
+    from edgevpr.frames.webpictures import ResponseFile
 
 # FFmpeg's messages are searched for lost packets. All others are dropped: edgevpr reports faults in its own words.
 av.logging.set_level(av.logging.WARNING)
 av.logging.set_skip_repeated(False)
 logging.getLogger("libav").setLevel(logging.CRITICAL + 1)
-_MISSED = "missed"  # "RTP: missed 3 packets", the only sign of it
+_LOSS_WORD = "missed"  # "RTP: missed 3 packets", the only sign of it
 
-_PACKETS_IN_DOUBT = 2  # after a sign of loss: this packet and the next
-_UNSTAMPED = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: the time stamps are made up from a frame rate
+_DOUBTFUL_PACKETS = 2  # after a sign of loss: this packet and the next
+_NO_STAMPS_FLAG = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: the time stamps are made up from a frame rate
 
-_UNKNOWN_HOST = re.compile(r"(?:resolve hostname |getaddrinfo\()([^\s:,]+)")
-_STATUS = re.compile(r"(?:failed:|HTTP error|returned) ([45]\d\d)\b")  # of RTSP and of HTTP
-_BY_STATUS = {"403": "access forbidden (403)", "404": "no stream at this path (404)"}
-_BY_ERROR = {
+_UNKNOWN_HOST_PATTERN = re.compile(r"(?:resolve hostname |getaddrinfo\()([^\s:,]+)")
+_STATUS_PATTERN = re.compile(r"(?:failed:|HTTP error|returned) ([45]\d\d)\b")  # of RTSP and of HTTP
+_STATUS_CAUSES = {"403": "access forbidden (403)", "404": "no stream at this path (404)"}
+_ERRNO_CAUSES = {
     errno.ECONNREFUSED: "connection refused",
     errno.ECONNRESET: "connection closed by the camera",
     errno.EHOSTUNREACH: "no route to the host",
@@ -50,7 +50,7 @@ class TransportError(OpeningError):
     """The camera refuses the transport that was requested for RTSP."""
 
 
-class Fetched(NamedTuple):
+class TimedPacket(NamedTuple):
     """A packet of a stream. `is_doubtful`: packets before it may be missing. `asked_s`, `came_s`: when the call that
     fetched it began and returned (seconds, monotonic). `is_after_gap`: packets before it were dropped here."""
 
@@ -61,13 +61,13 @@ class Fetched(NamedTuple):
     is_after_gap: bool = False
 
 
-def open_pictures(
+def open_decoder(
     uri: str,
     options: dict[str, str],
     timeouts_s: tuple[float, float] | None = None,
     form: str | None = None,
-    file: "AnswerFile | None" = None,
-) -> "WholePictures":
+    file: "ResponseFile | None" = None,
+) -> "VideoDecoder":
     """Open the stream or file `uri` with `options` of FFmpeg. `timeouts_s`: time limits in seconds for opening it and
     for each read (None: no limits). `form`: name of its format (None: FFmpeg finds out). `file`: an open file that is
     read instead, and closed. Raises OpeningError with the cause if it cannot be opened or has no pictures."""
@@ -80,7 +80,7 @@ def open_pictures(
                 file.close()
             raise _explain_failure(uri, error, messages, timeouts_s[0] if timeouts_s else 0.0) from None
     if container.streams.video and getattr(container.streams.video[0], "codec_context", None):  # None: unknown codec
-        return WholePictures(container, _has_loss(logged), file)
+        return VideoDecoder(container, _has_loss(logged), file)
     has_video = bool(container.streams.video)
     container.close()
     if file:
@@ -89,7 +89,7 @@ def open_pictures(
 
 
 def _has_loss(logged: list[tuple[int, str, str]]) -> bool:
-    return any(_MISSED in message for _, _, message in logged)
+    return any(_LOSS_WORD in message for _, _, message in logged)
 
 
 def _explain_failure(uri: str, error: Exception, messages: list[str], timeout_s: float) -> OpeningError:
@@ -103,21 +103,21 @@ def _explain_failure(uri: str, error: Exception, messages: list[str], timeout_s:
 
 
 def _find_cause(uri: str, error: Exception, text: str, timeout_s: float) -> str:
-    if host := _UNKNOWN_HOST.search(text):
+    if host := _UNKNOWN_HOST_PATTERN.search(text):
         if uri.count("@") > 1:  # then the host may be a part of the password
             return "no such host: percent-encode the password's special characters, such as @ as %40"
         return f"no such host {host[1]}"
     if isinstance(error, (av.HTTPClientError, av.HTTPServerError)):
-        found = _STATUS.search(f"{text}\n{error}")
+        found = _STATUS_PATTERN.search(f"{text}\n{error}")
         status = found[1] if found else "HTTP"
         if status == "401":
             if "@" not in urlsplit(uri).netloc:
                 return "password needed (401): write USER:PASSWORD@ before the host"
             return "password refused (401): correct it, with special characters percent-encoded, such as % as %25"
-        return _BY_STATUS.get(status, f"refused by the camera ({status})")
+        return _STATUS_CAUSES.get(status, f"refused by the camera ({status})")
     number = errno.EADDRINUSE if "Address already in use" in text else getattr(error, "errno", 0)
-    if number in _BY_ERROR:
-        return _BY_ERROR[number]
+    if number in _ERRNO_CAUSES:
+        return _ERRNO_CAUSES[number]
     if isinstance(error, av.ExitError) or "Immediate exit" in text or number == errno.ETIMEDOUT:
         missing = "video in the packets" if uri.lower().startswith(("udp:", "rtp:")) else "answer"
         return f"no {missing} within {timeout_s:g} s"
@@ -126,7 +126,7 @@ def _find_cause(uri: str, error: Exception, text: str, timeout_s: float) -> str:
     return getattr(error, "strerror", None) or type(error).__name__
 
 
-class WholePictures:
+class VideoDecoder:
     """The complete pictures of one stream or file: `fetch` a packet, then `decode` it. A damaged picture is rejected,
     and so are all pictures after it up to the next key frame, which is decoded without others.
 
@@ -135,11 +135,11 @@ class WholePictures:
     not say which: all are rejected until this is set to False."""
 
     def __init__(
-        self, container: "InputContainer", is_backlog_doubtful: bool, file: "AnswerFile | None" = None
+        self, container: "InputContainer", is_backlog_doubtful: bool, file: "ResponseFile | None" = None
     ) -> None:
         self.container, self.stream, self._file = container, container.streams.video[0], file
         self.unit_s = float(self.stream.time_base or 1e-6)  # of the time stamps
-        self.is_stamped = not container.format.flags & _UNSTAMPED
+        self.is_stamped = not container.format.flags & _NO_STAMPS_FLAG
         self.is_backlog_doubtful = is_backlog_doubtful
         self.is_cancelled = False
         self._codec = self.stream.codec_context
@@ -164,7 +164,7 @@ class WholePictures:
             rate_hz=float(rate) if rate and self.is_stamped else None,
         )
 
-    def fetch(self) -> Fetched | None:
+    def fetch(self) -> TimedPacket | None:
         """Wait for the next packet and return it; None at the end of the file, or if the stream is lost. One thread may
         fetch while another one decodes."""
         ours = self.stream.index
@@ -177,16 +177,16 @@ class WholePictures:
             return None
         if packet.is_corrupt or _has_loss(logged):
             # FFmpeg reports a gap while it assembles the picture after the one that it returns.
-            self._doubtful = _PACKETS_IN_DOUBT
+            self._doubtful = _DOUBTFUL_PACKETS
         self._doubtful -= 1
-        return Fetched(packet, self._doubtful >= 0)
+        return TimedPacket(packet, self._doubtful >= 0)
 
     def skip(self) -> Refusal:
         """Reject the packet just fetched without decoding it, and all after it up to the next key frame. Returns the
         reason of the rejection: LATE, or that of an earlier rejection which still lasts."""
         return self._refuse(Refusal.LATE)
 
-    def decode(self, fetched: Fetched) -> "list[VideoFrame] | Refusal":
+    def decode(self, fetched: TimedPacket) -> "list[VideoFrame] | Refusal":
         """Return the pictures that are complete after this packet (none, one, or at the end several), or the reason why
         it is rejected."""
         packet = fetched.packet
@@ -202,7 +202,7 @@ class WholePictures:
             self._refusal, self._has_begun = None, True
         # Changed bytes within a JPEG are detected only if they are invalid or data run out. Most are valid and give a
         # picture whose remainder is shifted or brighter, but that contains nothing of an older picture.
-        if self._codec.name == "mjpeg" and not jpeg_is_whole(bytes(packet)):
+        if self._codec.name == "mjpeg" and not is_whole_jpeg(bytes(packet)):
             return self._refuse()
         return self._decode_packet(packet)
 

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Image
-from edgevpr.frames.shot import coarse
+from edgevpr.frames.shot import make_thumbnail
 
 Counts: TypeAlias = NDArray[np.uint16]
 Limits: TypeAlias = tuple[int, int]  # the counts that become grey levels 0 and 255
 
-_PERCENTILES = (1.0, 99.0)  # dead pixels and small hot spots are outside
+_RANGE_PERCENTILES = (1.0, 99.0)  # dead pixels and small hot spots are outside
 _MIN_SPAN_COUNTS = 64  # a picture of sensor noise only stays flat
 _PICTURES_TO_FOLLOW = 30  # time constant: what passes through a picture does not change the grey levels of the rest
 _MAX_CLIPPED_SHARE = 0.25  # of a picture; with more outside the range, the camera or the scene is another one
@@ -31,7 +31,7 @@ class DepthRange:
     def update(self, counts: Counts) -> Limits:
         """Return the range to show this picture with, uint16 (H, W[, C]). It begins with the picture's own range, and
         does so again when a picture does not fit."""
-        sample = coarse(counts)
+        sample = make_thumbnail(counts)
         low, high = _find_limits(sample)
         clipped_share = float(((sample < self._low) | (sample > self._high)).mean())
         has_contrast = high - low >= _MIN_USED_SHARE * (self._high - self._low)
@@ -46,10 +46,10 @@ class DepthRange:
         return to_8_bits(counts, self.update(counts))
 
 
-def coarse_counts(counts: Counts) -> Image:
+def make_counts_thumbnail(counts: Counts) -> Image:
     """Return a coarse copy of a picture, see `shot.coarse`, over its own range, so that copies of a frozen picture are
     equal."""
-    sample = coarse(counts)
+    sample = make_thumbnail(counts)
     return to_8_bits(sample, _find_limits(sample))
 
 
@@ -61,7 +61,7 @@ def to_8_bits(counts: Counts, limits: Limits) -> Image:
 
 
 def _find_limits(sample: Counts) -> Limits:
-    low, high = (int(count) for count in np.percentile(sample, _PERCENTILES))
+    low, high = (int(count) for count in np.percentile(sample, _RANGE_PERCENTILES))
     missing = max(0, _MIN_SPAN_COUNTS - (high - low))
     low = max(0, low - missing // 2)
     return low, max(high, low + _MIN_SPAN_COUNTS)

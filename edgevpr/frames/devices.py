@@ -11,10 +11,10 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Image
 from edgevpr.frames.age import UnstampedTime
-from edgevpr.frames.depth import DepthRange, coarse_counts, to_8_bits
-from edgevpr.frames.shot import OpeningError, Shot, coarse
+from edgevpr.frames.depth import DepthRange, make_counts_thumbnail, to_8_bits
+from edgevpr.frames.shot import OpeningError, Shot, make_thumbnail
 
-_CAUSES = {
+_ERRNO_CAUSES = {
     errno.ENOENT: "not connected",
     errno.ENXIO: "no driver for this device",
     errno.ENODEV: "no driver for this device",
@@ -26,7 +26,7 @@ _QUERY_CAPABILITIES = 0x80685600  # VIDIOC_QUERYCAP
 _CAPABILITIES_BYTES = 104
 _DEVICE_CAPABILITIES = slice(88, 92)
 _VIDEO_CAPTURE = 0x1001  # of one plane, or of several
-_FORMATS_OF_COUNTS = [cv2.VideoWriter.fourcc(*name) for name in ("Y16 ", "Y12 ", "Y10 ")]  # of thermal cameras
+_COUNT_FORMATS = [cv2.VideoWriter.fourcc(*name) for name in ("Y16 ", "Y12 ", "Y10 ")]  # of thermal cameras
 
 
 def open_device(path: str, clock: Callable[[], float]) -> "DeviceCapture":
@@ -35,14 +35,14 @@ def open_device(path: str, clock: Callable[[], float]) -> "DeviceCapture":
     if capture.isOpened():
         return DeviceCapture(capture, clock)
     capture.release()
-    raise OpeningError(_explain(path))
+    raise OpeningError(_find_cause(path))
 
 
-def _explain(path: str) -> str:
+def _find_cause(path: str) -> str:
     try:
         device = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     except OSError as error:
-        return _CAUSES.get(error.errno or 0, f"cannot be opened: {error.strerror}")
+        return _ERRNO_CAUSES.get(error.errno or 0, f"cannot be opened: {error.strerror}")
     capabilities = bytearray(_CAPABILITIES_BYTES)
     try:
         fcntl.ioctl(device, _QUERY_CAPABILITIES, capabilities)
@@ -61,7 +61,7 @@ class DeviceCapture:
     def __init__(self, capture: cv2.VideoCapture, clock: Callable[[], float]) -> None:
         self._capture, self._clock = capture, clock
         self._time, self._depth = UnstampedTime(clock()), DepthRange()
-        if int(capture.get(cv2.CAP_PROP_FOURCC)) in _FORMATS_OF_COUNTS:
+        if int(capture.get(cv2.CAP_PROP_FOURCC)) in _COUNT_FORMATS:
             capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # else OpenCV keeps the upper 8 bits only
 
     def read(self) -> Shot | None:
@@ -80,9 +80,9 @@ class DeviceCapture:
         if picture.dtype == np.uint16:
             counts = np.asarray(picture, np.uint16)
             limits = self._depth.update(counts)
-            return coarse_counts(counts), lambda: to_8_bits(counts, limits)
+            return make_counts_thumbnail(counts), lambda: to_8_bits(counts, limits)
         image: Image = np.asarray(picture, np.uint8)
-        return coarse(image if image.ndim == 2 else image[:, :, 1]), lambda: image
+        return make_thumbnail(image if image.ndim == 2 else image[:, :, 1]), lambda: image
 
     def cancel(self) -> None:
         """Do nothing: OpenCV's wait for a picture cannot be ended, and lasts ten seconds at most."""

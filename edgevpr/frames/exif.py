@@ -11,20 +11,25 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from edgevpr.core.types import Position
-from edgevpr.frames.positions import ALT_M, GeoTag, parse_time, position_or_none
+from edgevpr.frames.positions import ALT_LIMITS_M, GeoTag, make_position, parse_time
 
 T = TypeVar("T")
 Tags = Mapping[str, Any]  # values of exifread by their names, such as "GPS GPSLatitude"
 
-_FILM_DIAGONAL_MM, _LONGEST_OF_DIAGONAL = 43.27, 0.82
+_FILM_DIAGONAL_MM = 43.27
+_MAX_SIDE_SHARE = 0.82  # of the diagonal
 _HEAD_BYTES = 300_000  # in a JPEG the XMP stands before the picture, behind EXIF data of 64 KB at most
 # A value in XMP, as an attribute or an element, of DJI, Parrot, Skydio, Autel (`drone`) or Pix4D (`Camera`).
-_XMP = re.compile(rb"""\b((?:drone(?:-dji|-parrot|-skydio)?|Camera):\w+)(?:\s*=\s*["']|>)\s*([-+.\deE]+)\s*["'<]""")
-_GIMBALS = (
+_XMP_PATTERN = re.compile(
+    rb"""\b((?:drone(?:-dji|-parrot|-skydio)?|Camera):\w+)(?:\s*=\s*["']|>)\s*([-+.\deE]+)\s*["'<]"""
+)
+_GIMBAL_NAMES = (
     "drone-dji:Gimbal{}Degree", "drone:Gimbal{}Degree", "drone-parrot:Camera{}Degree", "NED drone-skydio:{}"
 )  # fmt: skip
 # Skydio gives the same names to the angles of several frames: those against north, east and down count.
-_SKYDIO = re.compile(rb"<drone-skydio:CameraOrientationNED\b(.*?)(?:/>|</drone-skydio:CameraOrientationNED)", re.DOTALL)
+_SKYDIO_PATTERN = re.compile(
+    rb"<drone-skydio:CameraOrientationNED\b(.*?)(?:/>|</drone-skydio:CameraOrientationNED)", re.DOTALL
+)
 
 
 def read_exif(path: str | Path) -> GeoTag:
@@ -39,12 +44,12 @@ def read_exif(path: str | Path) -> GeoTag:
                 return read(tags)
         return None
 
-    position, alt_m = first(_position), first(_alt_m)
+    position, alt_m = first(_read_position), first(_read_alt_m)
     return replace(
         xmp,
         position=position and replace(position, alt_m=alt_m),
-        heading_deg=first(_heading_deg) if xmp.heading_deg is None else xmp.heading_deg,
-        t_utc_s=first(_gps_time_s, _camera_time_s),
+        heading_deg=first(_read_heading_deg) if xmp.heading_deg is None else xmp.heading_deg,
+        t_utc_s=first(_read_gps_time_s, _read_camera_time_s),
     )
 
 
@@ -57,8 +62,8 @@ def read_fov_deg(path: str | Path) -> float | None:
         focal_mm = float(tags["EXIF FocalLengthIn35mmFilm"].values[0])
         sides = [float(tags[f"EXIF ExifImage{side}"].values[0]) for side in ("Width", "Length")]
         # Wider pictures than the sensors of 4:3 and 3:2 are cut out of theirs, and as long.
-        longest = min(max(sides) / math.hypot(*sides), _LONGEST_OF_DIAGONAL)
-        return _in_range(math.degrees(2 * math.atan(_FILM_DIAGONAL_MM * longest / 2 / focal_mm)), 5, 150)
+        longest = min(max(sides) / math.hypot(*sides), _MAX_SIDE_SHARE)
+        return _require_range(math.degrees(2 * math.atan(_FILM_DIAGONAL_MM * longest / 2 / focal_mm)), 5, 150)
     return None
 
 
@@ -72,50 +77,57 @@ def _read_tags(path: str | Path) -> Tags:
     return {}
 
 
-def _in_range(value: float, low: float, high: float) -> float:
+def _require_range(value: float, low: float, high: float) -> float:
     if not low <= value <= high:
         raise ValueError(f"{value:g} where {low:g} to {high:g} is possible")
     return value
 
 
-def _position(tags: Tags) -> Position | None:
+def _read_position(tags: Tags) -> Position | None:
     if "GPS GPSStatus" in tags and tags["GPS GPSStatus"].values == "V":  # void: the receiver has lost its fix
         return None
-    lat_deg = _degrees(tags, "GPS GPSLatitude", {"N": 1, "S": -1}, 90)
-    return position_or_none(lat_deg, _degrees(tags, "GPS GPSLongitude", {"E": 1, "W": -1}, 180), None)
+    lat_deg = _read_degrees(tags, "GPS GPSLatitude", {"N": 1, "S": -1}, 90)
+    return make_position(lat_deg, _read_degrees(tags, "GPS GPSLongitude", {"E": 1, "W": -1}, 180), None)
 
 
-def _degrees(tags: Tags, name: str, signs: dict[str, int], limit: float) -> float:
+def _read_degrees(tags: Tags, name: str, signs: dict[str, int], limit: float) -> float:
     degrees, minutes, seconds = map(float, tags[name].values)
     # 60 is allowed: 59.99999 may have been rounded to it.
-    value = _in_range(degrees, 0, limit) + _in_range(minutes, 0, 60) / 60 + _in_range(seconds, 0, 60) / 3600
-    return signs[tags[f"{name}Ref"].values.strip()] * _in_range(value, 0, limit)
+    value = (
+        _require_range(degrees, 0, limit) + _require_range(minutes, 0, 60) / 60 + _require_range(seconds, 0, 60) / 3600
+    )
+    return signs[tags[f"{name}Ref"].values.strip()] * _require_range(value, 0, limit)
 
 
-def _alt_m(tags: Tags) -> float:
+def _read_alt_m(tags: Tags) -> float:
     # 0 is above and 1 below sea level; 2 and 3 (EXIF 3.0) are relative to the ellipsoid: not usable here.
     reference = tags["GPS GPSAltitudeRef"].values[0] if "GPS GPSAltitudeRef" in tags else 0
-    return _in_range({0: 1, 1: -1}[reference] * float(tags["GPS GPSAltitude"].values[0]), *ALT_M)
+    return _require_range({0: 1, 1: -1}[reference] * float(tags["GPS GPSAltitude"].values[0]), *ALT_LIMITS_M)
 
 
-def _heading_deg(tags: Tags) -> float | None:
+def _read_heading_deg(tags: Tags) -> float | None:
     if "GPS GPSImgDirectionRef" in tags and tags["GPS GPSImgDirectionRef"].values != "T":
         return None  # magnetic: off by the declination, which is unknown
-    return _in_range(float(tags["GPS GPSImgDirection"].values[0]), 0, 360) % 360
+    return _require_range(float(tags["GPS GPSImgDirection"].values[0]), 0, 360) % 360
 
 
-def _gps_time_s(tags: Tags) -> float:
+def _read_gps_time_s(tags: Tags) -> float:
     hours, minutes, seconds = map(float, tags["GPS GPSTimeStamp"].values)
-    day_s = _time_s(f"{tags['GPS GPSDate'].values} 00:00:00")
-    return day_s + _in_range(hours, 0, 24) * 3600 + _in_range(minutes, 0, 60) * 60 + _in_range(seconds, 0, 61)
+    day_s = _parse_time_s(f"{tags['GPS GPSDate'].values} 00:00:00")
+    return (
+        day_s
+        + _require_range(hours, 0, 24) * 3600
+        + _require_range(minutes, 0, 60) * 60
+        + _require_range(seconds, 0, 61)
+    )
 
 
-def _camera_time_s(tags: Tags) -> float:
+def _read_camera_time_s(tags: Tags) -> float:
     zone = tags["EXIF OffsetTimeOriginal"].values if "EXIF OffsetTimeOriginal" in tags else ""
-    return _time_s(f"{tags['EXIF DateTimeOriginal'].values}{zone}")
+    return _parse_time_s(f"{tags['EXIF DateTimeOriginal'].values}{zone}")
 
 
-def _time_s(text: str) -> float:
+def _parse_time_s(text: str) -> float:
     if ":" not in text:  # it would be seconds, which EXIF does not have
         raise ValueError(text)
     return parse_time(text)
@@ -128,31 +140,33 @@ def read_xmp(path: str | Path) -> GeoTag:
     head = b""
     with contextlib.suppress(OSError), open(path, "rb") as handle:
         head = handle.read(_HEAD_BYTES)
-    values = _values(head)
-    if oriented := _SKYDIO.search(head):
-        values |= {f"NED {name}": text for name, text in _values(oriented[1]).items()}
-    height_m = _find_number(values, "RelativeAltitude", ("drone-dji", "drone", "drone-skydio"), *ALT_M)
-    for name in _GIMBALS:
+    values = _find_values(head)
+    if oriented := _SKYDIO_PATTERN.search(head):
+        values |= {f"NED {name}": text for name, text in _find_values(oriented[1]).items()}
+    height_m = _find_number(values, "RelativeAltitude", ("drone-dji", "drone", "drone-skydio"), *ALT_LIMITS_M)
+    for name in _GIMBAL_NAMES:
         # Small drones of DJI write zeros, which tell nothing: a gimbal that looks north and ahead is never so exact.
-        if angles := _yaw_pitch_roll(values, name):
-            heading_deg, roll_deg, pitch_deg = from_straight_down(*angles)
+        if angles := _find_angles(values, name):
+            heading_deg, roll_deg, pitch_deg = to_nadir_angles(*angles)
             return GeoTag(heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
     # In the tags of Pix4D, 0 is straight down; a camera without an IMU writes zeros, which are ignored.
-    if angles := _yaw_pitch_roll(values, "Camera:{}"):
+    if angles := _find_angles(values, "Camera:{}"):
         yaw_deg, pitch_deg, roll_deg = angles
         return GeoTag(heading_deg=yaw_deg % 360, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
     nose_deg = _find_number(values, "FlightYawDegree", ("drone-dji", "drone"), -360, 360)
     return GeoTag(heading_deg=None if nose_deg is None else nose_deg % 360, height_m=height_m)
 
 
-def _values(packet: bytes) -> dict[str, bytes]:
-    return {name.decode(): text for name, text in reversed(_XMP.findall(packet))}  # the first of a name counts
+def _find_values(packet: bytes) -> dict[str, bytes]:
+    return {name.decode(): text for name, text in reversed(_XMP_PATTERN.findall(packet))}  # the first of a name counts
 
 
-def _yaw_pitch_roll(values: Mapping[str, bytes], name: str) -> tuple[float, float, float] | None:
+def _find_angles(values: Mapping[str, bytes], name: str) -> tuple[float, float, float] | None:
     """Return the angles by a name with {} for Yaw, Pitch and Roll; None if one is missing, or if all are zero."""
     with contextlib.suppress(KeyError, ValueError):
-        yaw, pitch, roll = (_in_range(float(values[name.format(axis)]), -360, 360) for axis in ("Yaw", "Pitch", "Roll"))
+        yaw, pitch, roll = (
+            _require_range(float(values[name.format(axis)]), -360, 360) for axis in ("Yaw", "Pitch", "Roll")
+        )
         return (yaw, pitch, roll) if any((yaw, pitch, roll)) else None
     return None
 
@@ -162,11 +176,11 @@ def _find_number(
 ) -> float | None:
     for maker in makers:
         with contextlib.suppress(KeyError, ValueError):
-            return _in_range(float(values[f"{maker}:{name}"]), low, high)
+            return _require_range(float(values[f"{maker}:{name}"]), low, high)
     return None
 
 
-def from_straight_down(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
+def to_nadir_angles(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
     """Convert the angles of a gimbal (a pitch of -90 is straight down) to (heading of the picture's top, roll, pitch),
     where roll and pitch are the camera's deviation from straight down. All in degrees."""
     # The result is the attitude of an imaginary airframe whose nose points along the top of the picture, and whose down

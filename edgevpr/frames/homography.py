@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Image, Mask
-from edgevpr.frames.images import shrunk
+from edgevpr.frames.images import shrink_image
 
 _SUBPIXEL_BITS = 4
 
@@ -27,7 +27,7 @@ class Homography:
         )
 
     def picture(self, image: Image) -> Image:
-        small, out_from_pixel = shrunk(image, self._shrink), self._out_from_pixel
+        small, out_from_pixel = shrink_image(image, self._shrink), self._out_from_pixel
         if small is not image:
             along, across = (before / after for before, after in zip(image.shape[:2], small.shape[:2], strict=True))
             out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]

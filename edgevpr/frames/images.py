@@ -28,13 +28,18 @@ EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm",
 MIN_SIDE_PX = 16
 MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])
 _MAX_FILE_BYTES = 4 * MAX_PIXELS  # size of an uncompressed picture of so many pixels, with transparency
-_SMALL_PX, _SMALL_QUALITY, _WEBP_QUALITY, _TAPE_QUALITY = 640, 80, 55, 95
+_SMALL_PX = 640
+_SMALL_QUALITY = 80
+_WEBP_QUALITY = 55
+_RECORDING_QUALITY = 95
 
 _JPEG_START = b"\xff\xd8\xff"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
-_STARTS = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n|II|MM|BM|RIFF|P[1-6]\s")  # JPEG, PNG, TIFF (2), BMP, WebP, PNM
+_START_PATTERN = re.compile(
+    rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n|II|MM|BM|RIFF|P[1-6]\s"
+)  # JPEG, PNG, TIFF (2), BMP, WebP, PNM
 # In the scan data of a JPEG, 0xFF followed by 00 (stuffing) or D0..D7 (restart) does not end the data.
-_MARKER = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
+_MARKER_PATTERN = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
 _END_OF_IMAGE = 0xD9
 
 
@@ -43,7 +48,7 @@ def list_images(folder: str | Path) -> list[Path]:
     Raises SourceError for a folder that cannot be read or has no images."""
     folder = Path(folder)
     try:
-        names = sorted((path.name for path in folder.iterdir()), key=counting_order)
+        names = sorted((path.name for path in folder.iterdir()), key=make_sort_key)
     except OSError as error:
         raise SourceError(f"{folder} cannot be listed ({error.strerror}): give a folder of images.") from None
     if images := [folder / name for name in names if is_image(name)]:
@@ -59,7 +64,7 @@ def is_image(name: str) -> bool:
     return name.lower().endswith(EXTENSIONS) and not name.startswith(".")
 
 
-def counting_order(name: str) -> tuple[list[str | int], str]:
+def make_sort_key(name: str) -> tuple[list[str | int], str]:
     """Return the sort key of a file name; numbers within names sort in counting order (2 before 10)."""
     parts = re.split(r"(\d+)", name.lower())
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
@@ -84,7 +89,7 @@ def decode_image(data: bytes, path: str, depth: DepthRange | None = None) -> Ima
         raise ImageError(f"{path} is empty, cut short or damaged: copy it again from the camera.")
     image = None
     with contextlib.suppress(cv2.error):  # raised for too many pixels
-        if _STARTS.match(data):
+        if _START_PATTERN.match(data):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     # A program that has imported OpenCV before edgevpr has another limit there: so the size is checked here as well.
     if image is None or image.dtype not in (np.uint8, np.uint16) or image.shape[0] * image.shape[1] > MAX_PIXELS:
@@ -109,15 +114,15 @@ def decode_jpeg(jpeg: bytes) -> Image:
 
 def encode_jpeg(image: Image) -> bytes:
     """Encode a picture, uint8 (H, W, 3) BGR or (H, W) grey, as a JPEG of the quality used in recordings of flights."""
-    return _encode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _TAPE_QUALITY))
+    return _encode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _RECORDING_QUALITY))
 
 
-def small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
+def encode_small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
     """Encode a picture, uint8 (H, W[, 3]), as a JPEG for people, its longest side at most `longest_px`."""
     return _encode(".jpg", limit_size(image, longest_px), (cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY))
 
 
-def small_webp(image: Image, longest_px: int) -> bytes:
+def encode_small_webp(image: Image, longest_px: int) -> bytes:
     """Encode a picture, uint8 (H, W[, 3 or 4]), as a WebP, which is half as large, and can be transparent."""
     return _encode(".webp", limit_size(image, longest_px), (cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY))
 
@@ -135,7 +140,7 @@ def resize(image: Image, size_px: tuple[int, int]) -> Image:
     return cv2.resize(image, size_px, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]  # of the same dtype
 
 
-def shrunk(image: Image, shrink: float) -> Image:
+def shrink_image(image: Image, shrink: float) -> Image:
     """Scale a picture down until `shrink` of its pixels along a side have become one: before a warp, whose
     interpolation alone would ignore most pixels. Up to two it stays as it is."""
     if shrink <= 2:
@@ -152,22 +157,22 @@ def _is_incomplete(data: bytes) -> bool:
     # OpenCV 4 fills the missing part of a JPEG with grey, and ignores the checksums of a PNG. Its decoders of the other
     # formats detect damage themselves. Bytes after the end mark are allowed.
     if data.startswith(_JPEG_START):
-        return not jpeg_is_whole(data)
-    return not data or (data.startswith(_PNG_START) and not _png_is_whole(data))
+        return not is_whole_jpeg(data)
+    return not data or (data.startswith(_PNG_START) and not _is_whole_png(data))
 
 
-def jpeg_is_whole(data: bytes) -> bool:
+def is_whole_jpeg(data: bytes) -> bool:
     """Walk through the markers of a JPEG (ITU-T T.81, annex B); return True if its end mark is there. Segments are
     skipped by their length, so that an EXIF thumbnail's end mark is not taken for the image's."""
     position = 2
-    while marker := _MARKER.search(data, position):
+    while marker := _MARKER_PATTERN.search(data, position):
         if data[marker.end() - 1] == _END_OF_IMAGE:
             return True
         position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
     return False
 
 
-def _png_is_whole(data: bytes) -> bool:
+def _is_whole_png(data: bytes) -> bool:
     """Walk through the chunks (length, kind, content, checksum) of a PNG; return True if all are intact to the end."""
     position = len(_PNG_START)
     while position + 12 <= len(data):

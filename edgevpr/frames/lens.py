@@ -2,8 +2,8 @@
 pixels shows what.
 
 A *straightened* picture is the one that a lens without distortion would take from the same place, along the same axis.
-Its longest side shows as much as the calibrated lens does (at most `_WIDEST_DEG`), so everything that is computed with
-a field of view holds for it. A *ray* is a direction from the lens, as its tangents to the right and down.
+Its longest side shows as much as the calibrated lens does (at most `_MAX_STRAIGHT_FOV_DEG`), so everything that is
+computed with a field of view holds for it. A *ray* is a direction from the lens, as its tangents to the right and down.
 """
 
 import math
@@ -20,26 +20,26 @@ from edgevpr.core.arrays import Doubles, Image, Mask, Singles
 from edgevpr.core.errors import ConfigError, ImageError
 from edgevpr.core.files import read_file
 from edgevpr.core.yamlfile import parse_yaml
-from edgevpr.frames.images import shrunk
+from edgevpr.frames.images import shrink_image
 
 _MAX_FILE_BYTES = 300_000  # OpenCV's program writes all corners of the board into its file too
 # What of OpenCV's files is no YAML. Its own reader is not used: it crashes on damaged files.
-_NO_YAML = re.compile(rb"^%YAML.*|!!opencv-matrix\b", re.MULTILINE)
-_COEFFICIENTS = (4, 5, 8, 12, 14)  # numbers of them that OpenCV knows, k1 k2 p1 p2 first; of a fisheye only 4
+_OPENCV_TAGS = re.compile(rb"^%YAML.*|!!opencv-matrix\b", re.MULTILINE)
+_COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)  # numbers of them that OpenCV knows, k1 k2 p1 p2 first; of a fisheye only 4
 _FISHEYE = "equidistant"
 _NO_DISTORTION = "none"
 # Names of models in files of ROS and Kalibr; "" stands for a file of OpenCV.
 _MODELS = ("", "plumb_bob", "rational_polynomial", "radtan", _FISHEYE, _NO_DISTORTION)
-_WIDEST_DEG = 100.0  # of a straightened picture: beyond, its corners would show little, in many pixels
+_MAX_STRAIGHT_FOV_DEG = 100.0  # of a straightened picture: beyond, its corners would show little, in many pixels
 _MAX_SKEW = 0.002  # over the focal length: what is left out moves a pixel by less than one
-_NARROWEST_DEG = 5.0  # as of `source.fov_deg`
-_FARTHEST_DEG = 85.0  # from the axis: up to here a lens is sampled
-_STEP_DEG = 0.25
-_AROUND_DEG = range(0, 360, 15)
-_RIGHT, _DOWN, _LEFT, _UP = (_AROUND_DEG.index(degrees) for degrees in (0, 90, 180, 270))
+_MIN_FOV_DEG = 5.0  # as of `source.fov_deg`
+_MAX_OFF_AXIS_DEG = 85.0  # from the axis: up to here a lens is sampled
+_OFF_AXIS_STEP_DEG = 0.25
+_DIRECTIONS_DEG = range(0, 360, 15)
+_RIGHT, _DOWN, _LEFT, _UP = (_DIRECTIONS_DEG.index(degrees) for degrees in (0, 90, 180, 270))
 # Pixels are computed for every eighth pixel of a picture and interpolated, which is wrong by less than a tenth of one.
 _CELL_PX = 8
-_NOWHERE_PX = -1e6  # so far outside that what is interpolated with it is outside as well
+_OUTSIDE_PX = -1e6  # so far outside that what is interpolated with it is outside as well
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +80,7 @@ class CalibratedLens:
 
 
 @dataclass(frozen=True, slots=True)
-class LensSight:
+class LensView:
     """The view of a `lens`, for pictures of its size. `half`: the ray to the lower right corner of its straightened
     picture. `farthest`: the length of a ray up to which its model holds. `field_deg`: all that it shows across the
     longest side of its pictures, at most 170."""
@@ -121,7 +121,7 @@ class LensSight:
         flat = rays[..., :2] / np.where(is_ahead, rays[..., 2], 1)[..., None]
         holds = is_ahead & (np.hypot(flat[..., 0], flat[..., 1]) <= self.farthest)
         nodes = self.lens.projected(np.where(holds[..., None], flat, 0).reshape(-1, 2)).reshape(flat.shape)
-        nodes[~holds] = _NOWHERE_PX
+        nodes[~holds] = _OUTSIDE_PX
         finer = np.array([[_CELL_PX, 0, 0], [0, _CELL_PX, 0]], float)
         pixels = np.asarray(cv2.warpAffine(nodes.astype(np.float32), finer, size_px), np.float32)
         most = np.array([side - 0.5 for side in self.lens.size_px])
@@ -140,25 +140,25 @@ class Remap:
 
     def overlay(self, overlay: Mask) -> Mask:
         """Warp a mask, bool, of the camera's picture."""
-        return _remap(overlay.view(np.uint8), self.pixels, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT).view(bool)
+        return _remap_image(overlay.view(np.uint8), self.pixels, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT).view(bool)
 
     def picture(self, image: Image) -> Image:
         """Warp the camera's picture. Outside of it its edge is repeated, so that no gradient arises."""
-        small, pixels = shrunk(image, self.shrink), self.pixels
+        small, pixels = shrink_image(image, self.shrink), self.pixels
         if small is not image:
             pixels = pixels + np.float32(0.5)  # the only copy: a board has little memory
             pixels *= np.array([small.shape[axis] / image.shape[axis] for axis in (1, 0)], np.float32)
             pixels -= np.float32(0.5)
-        return _remap(small, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+        return _remap_image(small, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
 
-def _remap(image: Image, pixels: Singles, interpolation: int, border: int) -> Image:
+def _remap_image(image: Image, pixels: Singles, interpolation: int, border: int) -> Image:
     # None: of the two arrays of a map the first has both coordinates. OpenCV's types ask for a second one.
     return cv2.remap(image, pixels, None, interpolation, borderMode=border)  # type: ignore
 
 
 @lru_cache(maxsize=8)
-def line_of_sight(lens: CalibratedLens, size_px: tuple[int, int]) -> LensSight:
+def compute_lens_view(lens: CalibratedLens, size_px: tuple[int, int]) -> LensView:
     """Return what a lens shows in pictures of `size_px` (width, height). Raises ImageError for pictures of another
     shape than those that it was calibrated with, and ConfigError for a calibration that can be of no lens."""
     (width, height), (own_width, own_height), (column, row) = size_px, lens.size_px, lens.centre_px
@@ -174,8 +174,8 @@ def line_of_sight(lens: CalibratedLens, size_px: tuple[int, int]) -> LensSight:
             "take pictures of that shape, or calibrate the camera with these."
         )
     lens = lens.resize_to(size_px)
-    tangents = np.tan(np.radians(np.arange(0, _FARTHEST_DEG + _STEP_DEG, _STEP_DEG)))
-    around = np.radians(_AROUND_DEG)
+    tangents = np.tan(np.radians(np.arange(0, _MAX_OFF_AXIS_DEG + _OFF_AXIS_STEP_DEG, _OFF_AXIS_STEP_DEG)))
+    around = np.radians(_DIRECTIONS_DEG)
     rays = np.stack([np.outer(np.cos(around), tangents), np.outer(np.sin(around), tangents)], axis=-1)
     with np.errstate(all="ignore"):
         off_px = lens.projected(rays.reshape(-1, 2)).reshape(rays.shape) - lens.centre_px
@@ -192,14 +192,14 @@ def line_of_sight(lens: CalibratedLens, size_px: tuple[int, int]) -> LensSight:
 
     right, left = reach(_RIGHT, 0, width - 0.5), reach(_LEFT, 0, -0.5)
     lower, upper = reach(_DOWN, 1, height - 0.5), reach(_UP, 1, -0.5)
-    widest = math.tan(math.radians(_WIDEST_DEG / 2))
+    widest = math.tan(math.radians(_MAX_STRAIGHT_FOV_DEG / 2))
     half, farthest = (min(right, left, widest), min(lower, upper, widest)), float(tangents[steady.min()])
     field_deg = math.degrees(sum(map(math.atan, (right, left) if width >= height else (lower, upper))))
     if math.hypot(*half) > farthest:
         raise lens.refuse("pixels towards the corners of the picture have no direction of their own")
-    if field_deg < _NARROWEST_DEG:
+    if field_deg < _MIN_FOV_DEG:
         raise lens.refuse(f"it sees {field_deg:.1f} degrees")
-    return LensSight(lens, half, farthest, field_deg)
+    return LensView(lens, half, farthest, field_deg)
 
 
 def read_lens(path: str) -> CalibratedLens:
@@ -209,7 +209,7 @@ def read_lens(path: str) -> CalibratedLens:
         data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
         raise ConfigError(f"{path} cannot be read ({error.strerror}): give the calibration of the lens.") from error
-    content = _read_xml(data, path) if data.lstrip().startswith(b"<") else parse_yaml(_NO_YAML.sub(b"", data), path)
+    content = _read_xml(data, path) if data.lstrip().startswith(b"<") else parse_yaml(_OPENCV_TAGS.sub(b"", data), path)
     fields = {str(name).lower(): value for name, value in content.items()}  # old files of OpenCV have capitals
     try:
         lens = _read_kalibr(fields["cam0"], path) if "cam0" in fields else _read_matrix(fields, path)
@@ -218,13 +218,13 @@ def read_lens(path: str) -> CalibratedLens:
         raise ConfigError(
             f"{path} {lacking}: give a calibration of OpenCV, ROS or Kalibr (docs/how-to/cameras.md)."
         ) from error
-    line_of_sight(lens, lens.size_px)
+    compute_lens_view(lens, lens.size_px)
     return lens
 
 
 def _read_matrix(fields: Mapping[str, Any], path: str) -> CalibratedLens:
     """Make the lens of a file of OpenCV or ROS: they name their fields alike."""
-    matrix, coefficients = _numbers(fields["camera_matrix"]), _numbers(fields["distortion_coefficients"])
+    matrix, coefficients = _read_numbers(fields["camera_matrix"]), _read_numbers(fields["distortion_coefficients"])
     if len(matrix) != 9:
         raise ConfigError(f"{path}: `camera_matrix` has {len(matrix)} numbers, and nine are needed.")
     if abs(matrix[1]) > _MAX_SKEW * abs(matrix[0]):
@@ -237,9 +237,9 @@ def _read_matrix(fields: Mapping[str, Any], path: str) -> CalibratedLens:
 def _read_kalibr(camera: Mapping[str, Any], path: str) -> CalibratedLens:
     if (model := camera["camera_model"]) != "pinhole":
         raise ConfigError(f"{path} is of the camera model `{model}`: calibrate with the model `pinhole`.")
-    coefficients = _numbers(camera.get("distortion_coeffs") or ())
+    coefficients = _read_numbers(camera.get("distortion_coeffs") or ())
     width, height = map(int, camera["resolution"])
-    pinhole = _numbers(camera["intrinsics"])
+    pinhole = _read_numbers(camera["intrinsics"])
     return _make_lens(path, pinhole, camera["distortion_model"], coefficients, (width, height))
 
 
@@ -253,7 +253,7 @@ def _make_lens(
         raise ConfigError(f"{path} is of the distortion model `{model}`: calibrate with {', '.join(_MODELS[1:])}.")
     if model == _NO_DISTORTION or not coefficients:
         model, coefficients = "", (0.0,) * 4
-    if len(coefficients) not in (_COEFFICIENTS[:1] if model == _FISHEYE else _COEFFICIENTS):
+    if len(coefficients) not in (_COEFFICIENT_COUNTS[:1] if model == _FISHEYE else _COEFFICIENT_COUNTS):
         raise ConfigError(f"{path} has {len(coefficients)} coefficients, which fit no model that edgevpr knows.")
     return CalibratedLens(
         path=path,
@@ -265,7 +265,7 @@ def _make_lens(
     )
 
 
-def _numbers(value: Any) -> tuple[float, ...]:
+def _read_numbers(value: Any) -> tuple[float, ...]:
     """Return the numbers of a matrix, which is a list, or as in files of ROS a section with `data`."""
     return tuple(map(float, value["data"] if isinstance(value, dict) else value))
 

@@ -17,7 +17,7 @@ from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.homography import Homography, cut_polygon
-from edgevpr.frames.lens import CalibratedLens, Remap, line_of_sight
+from edgevpr.frames.lens import CalibratedLens, Remap, compute_lens_view
 
 MAX_TILT_DEG = 63.0  # a camera that looks 60 degrees ahead, and sways
 # Without a lens an image is not levelled, and beyond this tilt it looks otherwise than straight down. With one, the
@@ -25,19 +25,22 @@ MAX_TILT_DEG = 63.0  # a camera that looks 60 degrees ahead, and sways
 MAX_TILT_UNLEVELLED_DEG = 20.0
 # Rays, (right, down, 1) in focal lengths, that go down by less are left out: beyond are far too distant ground, the
 # horizon and the sky.
-_MIN_DOWN = 0.1
+_MIN_RAY_DOWN = 0.1
 # Standard deviations of a tilt, as tangents: of one that is reported, and of one that only the camera's mount tells.
 _REPORTED_TILT_SD = math.tan(math.radians(1.0))
 _MOUNT_TILT_SD = math.tan(math.radians(3.0))
 # Of a height, as a share: the ground that a tilted camera shows is higher or lower than that below (tilt_ariel).
-_HEIGHT_SD = 0.13
-_LEAST_TILT_DEG, _LEAST_TURN_DEG, _LEAST_ZOOM = 1.0, 1.0, 0.03  # smaller corrections do not affect matches
+_HEIGHT_SD_SHARE = 0.13
+# Smaller corrections do not affect matches.
+_MIN_TILT_DEG = 1.0
+_MIN_TURN_DEG = 1.0
+_MIN_ZOOM_CHANGE = 0.03
 # Limits of a picture's footprint over the wanted footprint. Beyond them too few of its pixels are left, or too little
 # of the output is filled, and the height is more likely wrong than so far from the map's.
-_ZOOMS = (0.3, 4.0)
-_MIN_FILLED = 1 / 3  # of the output area that the same picture would fill if it were taken straight down
-_HIGHEST_M = 10_000.0
-_MAX_PX = 1024  # largest side of a warped picture: no technique uses more pixels
+_ZOOM_LIMITS = (0.3, 4.0)
+_MIN_FILLED_SHARE = 1 / 3  # of the output area that the same picture would fill if it were taken straight down
+_MAX_HEIGHT_M = 10_000.0
+_MAX_SIDE_PX = 1024  # largest side of a warped picture: no technique uses more pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +54,7 @@ class Mount:
     def body_from_straight(self) -> Doubles:
         """Return the rotation (3, 3), in the axes of the airframe, from straight down to where the camera looks."""
         # To look ahead is to turn as the airframe does with its nose up, to the right as with its left wing down.
-        return _level_from_body(-self.right_deg, self.ahead_deg)
+        return _rotate_body_to_level(-self.right_deg, self.ahead_deg)
 
 
 STRAIGHT_DOWN = Mount()
@@ -113,7 +116,7 @@ UNKNOWN_VIEW = View()
 
 
 @dataclass(frozen=True, slots=True)
-class Levelled:
+class LevelledImage:
     """A picture ready to be encoded: `image` uint8 (H, W[, 3]); `mask` bool (H, W), False where it does not show ground
     (None: it shows ground everywhere); and `view`, its direction, size and offset on the ground."""
 
@@ -131,7 +134,7 @@ def level_image(
     overlay: Mask | None = None,
     below: bool = False,
     scale: float = 1.0,
-) -> Levelled:
+) -> LevelledImage:
     """Warp a picture as if it had been taken straight from above. Roll, pitch, heading and height are those of the
     frame, or where it has none those of `vehicle` (None: no report).
 
@@ -145,8 +148,8 @@ def level_image(
     """
     if frame.pose is not None:
         known = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
-        return Levelled(frame.image, overlay, known)
-    taking = _Taking(frame, vehicle, lens)
+        return LevelledImage(frame.image, overlay, known)
+    taking = _CameraGeometry(frame, vehicle, lens)
     if taking.is_too_tilted:
         view = View(up_deg=taking.top_deg, reason=Reason(ReasonCode.TILTED, {"tilt_deg": taking.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
@@ -156,16 +159,16 @@ def level_image(
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     own_m = taking.own_m and scale * taking.own_m
     zoom = own_m / footprint_m if own_m and footprint_m else scale
-    if not _ZOOMS[0] <= zoom <= _ZOOMS[1]:
+    if not _ZOOM_LIMITS[0] <= zoom <= _ZOOM_LIMITS[1]:
         zoom = 1.0
     turn_deg = abs(shorter_deg(taking.top_deg or 0.0))
-    if taking.tilt_deg < _LEAST_TILT_DEG and turn_deg < _LEAST_TURN_DEG and abs(zoom - 1) < _LEAST_ZOOM:
+    if taking.tilt_deg < _MIN_TILT_DEG and turn_deg < _MIN_TURN_DEG and abs(zoom - 1) < _MIN_ZOOM_CHANGE:
         aside, focal = taking.aside(taking.straight, 1.0), taking.focal_px / taking.longest_px
         view = View(up_deg=taking.top_deg, footprint_m=own_m, aside=aside, aside_sd=taking.aside_sd(1.0), focal=focal)
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
 
     below &= taking.tilt_deg <= MAX_TILT_UNLEVELLED_DEG
-    side = min(taking.longest_px, _MAX_PX)
+    side = min(taking.longest_px, _MAX_SIDE_PX)
     out_px = taking.focal_px * zoom * side / taking.longest_px  # focal length of the output, in its pixels
     turned = taking.straight if taking.heading_deg is None else taking.level_from_lens(-taking.heading_deg)
     middle = np.zeros(2) if below else turned[:2, 2] / turned[2, 2] * out_px
@@ -174,7 +177,7 @@ def level_image(
     warp = taking.warp(out_from_ray, out_px, side)
 
     width, height = (min(1.0, zoom * px / taking.longest_px) for px in taking.size_px)
-    if (filled := warp.shown.mean() / (height * width)) < _MIN_FILLED:
+    if (filled := warp.shown.mean() / (height * width)) < _MIN_FILLED_SHARE:
         reason = Reason(ReasonCode.TILTED_OFF_GROUND, {"shown": float(filled), "tilt_deg": taking.tilt_deg})
         view = View(up_deg=taking.top_deg, reason=reason)
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
@@ -186,39 +189,39 @@ def level_image(
         aside=(0.0, 0.0) if below and taking.is_tilt_known else taking.aside(turned, zoom),
         aside_sd=taking.aside_sd(zoom),
     )
-    return _warp(frame.image, overlay, warp, view)
+    return _warp_image(frame.image, overlay, warp, view)
 
 
-def level_rotation(frame: Frame, lens: Lens) -> Doubles:
+def compute_level_rotation(frame: Frame, lens: Lens) -> Doubles:
     """Return the rotation (3, 3) from the axes of the lens to those of a level picture with the same top, by roll and
     pitch of a frame (unknown: taken as 0) and the mount of the lens."""
-    return _Taking(frame, None, lens).straight
+    return _CameraGeometry(frame, None, lens).straight
 
 
 def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> float | None:
     """Return the ground length in metres of a picture's longest side if it were level, by the height of `frame` or,
     where it has none, of `vehicle`. None: unknown."""
-    *_, height_m = _attitude(frame, vehicle)
-    if height_m is None or not 0 < height_m <= _HIGHEST_M:
+    *_, height_m = _choose_attitude(frame, vehicle)
+    if height_m is None or not 0 < height_m <= _MAX_HEIGHT_M:
         return None
     return 2 * height_m * math.tan(math.radians(lens.fov_deg) / 2)
 
 
-def undistort_frame(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> Levelled:
+def undistort_frame(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> LevelledImage:
     """Take the distortion of `lens` from a picture that is not warped otherwise (None: it has none). `overlay` is as in
     `level_image`. Raises ImageError for a picture of another shape than the lens takes."""
     if lens is None:
-        return Levelled(image, overlay, view)
+        return LevelledImage(image, overlay, view)
     height, width = image.shape[:2]
-    return _warp(image, overlay, line_of_sight(lens, (width, height)).straightening(_MAX_PX), view)
+    return _warp_image(image, overlay, compute_lens_view(lens, (width, height)).straightening(_MAX_SIDE_PX), view)
 
 
-def _warp(image: Image, overlay: Mask | None, warp: Homography | Remap, view: View) -> Levelled:
+def _warp_image(image: Image, overlay: Mask | None, warp: Homography | Remap, view: View) -> LevelledImage:
     mask = warp.shown if overlay is None else warp.shown & warp.overlay(overlay)
-    return Levelled(warp.picture(image), None if mask.all() else mask, view)
+    return LevelledImage(warp.picture(image), None if mask.all() else mask, view)
 
 
-def enlarge(picture: Levelled, zoom: float) -> Levelled:
+def enlarge_image(picture: LevelledImage, zoom: float) -> LevelledImage:
     """Enlarge a picture, that is not warped otherwise, around its middle; its size stays."""
     if zoom == 1:
         return picture
@@ -229,21 +232,21 @@ def enlarge(picture: Levelled, zoom: float) -> Levelled:
     shows = np.ones((high_px, wide_px), np.uint8) if picture.mask is None else picture.mask.astype(np.uint8)
     mask = cv2.warpAffine(shows, matrix, (wide_px, high_px), flags=cv2.INTER_NEAREST) > 0
     view = replace(picture.view, zoom=zoom * picture.view.zoom)
-    return Levelled(np.asarray(image, np.uint8), None if mask.all() else mask, view)
+    return LevelledImage(np.asarray(image, np.uint8), None if mask.all() else mask, view)
 
 
 def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN) -> View:
     """Return the view of a picture that cannot be warped, because its lens is unknown. It has only `lean_m`; or only
     `reason`, if the picture is tilted too far; or neither, if too little is known. The arguments are as in
     `level_image`, and impossible values never raise."""
-    roll_deg, pitch_deg, heading_deg, height_m = _attitude(frame, vehicle)
+    roll_deg, pitch_deg, heading_deg, height_m = _choose_attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
         return UNKNOWN_VIEW
-    ahead, right, down = (_level_from_body(roll_deg, pitch_deg) @ mount.body_from_straight())[:, 2]
+    ahead, right, down = (_rotate_body_to_level(roll_deg, pitch_deg) @ mount.body_from_straight())[:, 2]
     tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, down))))
     if tilt_deg > MAX_TILT_UNLEVELLED_DEG:
         return View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": tilt_deg}))
-    if heading_deg is None or height_m is None or not 0 <= height_m <= _HIGHEST_M:
+    if heading_deg is None or height_m is None or not 0 <= height_m <= _MAX_HEIGHT_M:
         return UNKNOWN_VIEW
     heading = math.radians(heading_deg)
     north = height_m / down * (ahead * math.cos(heading) - right * math.sin(heading))
@@ -251,7 +254,7 @@ def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = S
     return View(lean_m=(-float(east), -float(north)))
 
 
-class _Taking:
+class _CameraGeometry:
     """The geometry of a picture when it was taken, as far as known; of a lens with distortion, of the straightened one.
 
     Rotation matrices are (3, 3). Their axes are those of the lens (right and down in the picture, and the way that it
@@ -262,15 +265,15 @@ class _Taking:
     enough, homogeneous pixels. `is_tilt_known`: by a reported attitude or, within some degrees, by the mount alone."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
-        roll_deg, pitch_deg, self.heading_deg, _ = _attitude(frame, vehicle)
+        roll_deg, pitch_deg, self.heading_deg, _ = _choose_attitude(frame, vehicle)
         is_attitude_known = roll_deg is not None and pitch_deg is not None
         self.is_tilt_known = is_attitude_known or lens.mount != STRAIGHT_DOWN
         self._is_attitude_known = is_attitude_known
         known = (roll_deg or 0.0, pitch_deg or 0.0) if is_attitude_known else (0.0, 0.0)
-        self._level_from_straight = _level_from_body(*known) @ lens.mount.body_from_straight()
+        self._level_from_straight = _rotate_body_to_level(*known) @ lens.mount.body_from_straight()
         self._lens = lens
         height, width = frame.image.shape[:2]
-        self._sight = line_of_sight(lens.calibrated, (width, height)) if lens.calibrated else None
+        self._sight = compute_lens_view(lens.calibrated, (width, height)) if lens.calibrated else None
         if self._sight:
             width, height = self._sight.straight_px
         self.size_px, self.longest_px = (width, height), max(height, width)
@@ -285,7 +288,7 @@ class _Taking:
         self.is_too_tilted = self.tilt_deg > MAX_TILT_DEG
         if not self.is_too_tilted:
             depth = (self.straight @ self.lens_from_pixel @ self.corners)[2]
-            self.corners = cut_polygon(self.corners, depth - _MIN_DOWN)
+            self.corners = cut_polygon(self.corners, depth - _MIN_RAY_DOWN)
         self.top_deg = None if self.heading_deg is None else (self.heading_deg + lens.up_deg) % 360
 
     def warp(self, out_from_ray: Doubles, out_px: float, side: int) -> Homography | Remap:
@@ -297,7 +300,9 @@ class _Taking:
 
     def level_from_lens(self, up_deg: float) -> Doubles:
         """Return the rotation from the lens to a level picture whose top is `up_deg` clockwise from the nose."""
-        return np.asarray(_body_from_lens(up_deg).T @ self._level_from_straight @ _body_from_lens(self._lens.up_deg))
+        return np.asarray(
+            _rotate_lens_to_body(up_deg).T @ self._level_from_straight @ _rotate_lens_to_body(self._lens.up_deg)
+        )
 
     def aside(self, turned: Doubles, zoom: float) -> tuple[float, float] | None:
         """Return `View.aside` after the rotation `turned` and scaling by `zoom`; None if the tilt is unknown."""
@@ -311,18 +316,18 @@ class _Taking:
             return 0.0
         tangent, focal = math.tan(math.radians(self.tilt_deg)), zoom * self.focal_px / self.longest_px
         by_tilt = _REPORTED_TILT_SD * tangent**2 if self._is_attitude_known else _MOUNT_TILT_SD * (1 + tangent**2)
-        by_height = _HEIGHT_SD * tangent if self.tilt_deg > MAX_TILT_UNLEVELLED_DEG else 0.0
+        by_height = _HEIGHT_SD_SHARE * tangent if self.tilt_deg > MAX_TILT_UNLEVELLED_DEG else 0.0
         return float(focal * math.hypot(by_tilt, by_height))
 
 
-def _attitude(frame: Frame, vehicle: Vehicle | None) -> Iterator[float | None]:
+def _choose_attitude(frame: Frame, vehicle: Vehicle | None) -> Iterator[float | None]:
     """Yield roll, pitch, heading (degrees) and height (m): each of the frame, else of the vehicle, else None."""
     for name in ("roll_deg", "pitch_deg", "heading_deg", "height_m"):
         values = (getattr(frame, name), getattr(vehicle, name, None))
         yield next((value for value in values if value is not None and math.isfinite(value)), None)
 
 
-def _level_from_body(roll_deg: float, pitch_deg: float) -> Doubles:
+def _rotate_body_to_level(roll_deg: float, pitch_deg: float) -> Doubles:
     """Return the rotation (3, 3) of the airframe's axes (nose, right, down) to those of a level one."""
     roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)
     about_right = [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]]
@@ -330,7 +335,7 @@ def _level_from_body(roll_deg: float, pitch_deg: float) -> Doubles:
     return np.asarray(np.array(about_right) @ np.array(about_nose))
 
 
-def _body_from_lens(up_deg: float) -> Doubles:
+def _rotate_lens_to_body(up_deg: float) -> Doubles:
     """Return the rotation (3, 3) of the axes of a camera that looks straight down to those of the airframe."""
     up = math.radians(up_deg)
     return np.array([[-math.sin(up), -math.cos(up), 0], [math.cos(up), -math.sin(up), 0], [0, 0, 1]])

@@ -14,18 +14,18 @@ from queue import SimpleQueue
 
 from edgevpr.core.arrays import Image
 from edgevpr.core.types import Frame
-from edgevpr.frames.liveness import LOST_S, Fault, Liveness
-from edgevpr.frames.shot import Capture, Condition, Newness, OpeningError, Refusal, Shot
+from edgevpr.frames.liveness import LOST_AFTER_S, Fault, Liveness
+from edgevpr.frames.shot import Capture, Condition, OpeningError, Refusal, RepeatDetector, Shot
 from edgevpr.frames.source import Source
 from edgevpr.frames.twins import TwinCheck
 
 _FIRST_WAIT_S = 0.5
 _MAX_WAIT_S = 10.0
 _CLOSE_TIMEOUT_S = 0.5
-_TICK_S = 0.2
-_OPENING_S = 90.0  # longer than any opening that ends by itself, see `frames.programs`
-_AGED_S = 1.0
-_MAX_HANGING = 3  # threads that have not ended: a source that hangs each time must not take ever more of them
+_POLL_PERIOD_S = 0.2
+_OPENING_TIMEOUT_S = 90.0  # longer than any opening that ends by itself, see `frames.programs`
+_STALE_PICTURE_S = 1.0
+_MAX_HANGING_THREADS = 3  # threads that have not ended: a source that hangs each time must not take ever more of them
 
 
 class _Opening:
@@ -92,7 +92,7 @@ class LiveSource(Source):
         self._t_start_s = clock()
         self._captured = 0
         self._last_taken_s = float("-inf")
-        self._newness = Newness()  # over all openings: a server may begin with the picture that it has kept
+        self._newness = RepeatDetector()  # over all openings: a server may begin with the picture that it has kept
         self._liveness = Liveness()
         self._newest: tuple[int, Shot] | None = None
         self._conversion: _Conversion | None = None
@@ -137,7 +137,7 @@ class LiveSource(Source):
             opening.cancel()
             opening.thread.join(_CLOSE_TIMEOUT_S)
         self._converter.requests.put(None)
-        self._converter.thread.join(_TICK_S)
+        self._converter.thread.join(_POLL_PERIOD_S)
         self._thread.join(_CLOSE_TIMEOUT_S)
         self.end()
 
@@ -160,7 +160,7 @@ class LiveSource(Source):
     def _watch(self, opening: _Opening) -> Fault:
         """Wait until a source that is being opened, or is open, must be opened anew, and return why."""
         while opening.thread.is_alive() and not self._closing.is_set():
-            opening.thread.join(_TICK_S)
+            opening.thread.join(_POLL_PERIOD_S)
             with self._changed:
                 if opening.thread.is_alive() and (fault := self._fault(opening)):
                     self._set_condition(fault.condition, fault.text)
@@ -170,9 +170,9 @@ class LiveSource(Source):
 
     def _fault(self, opening: _Opening) -> Fault | None:
         now_s, conversion = self._clock(), self._conversion
-        if self._captured and now_s - self._last_taken_s > _AGED_S:
+        if self._captured and now_s - self._last_taken_s > _STALE_PICTURE_S:
             self.latency_s = now_s - self._last_taken_s
-        if conversion and not conversion.done.is_set() and now_s - conversion.began_s > LOST_S:
+        if conversion and not conversion.done.is_set() and now_s - conversion.began_s > LOST_AFTER_S:
             self._converter.requests.put(None)
             self._hanging.append(self._converter.thread)
             self._converter, self._conversion = _Converter(), None
@@ -180,12 +180,16 @@ class LiveSource(Source):
             return Fault(Condition.LOST, "lost: a picture cannot be converted", True)
         if opening.opened_s is not None:
             return self._liveness.fault(now_s)
-        return Fault(Condition.LOST, "lost: the opening hangs", True) if now_s - opening.began_s > _OPENING_S else None
+        return (
+            Fault(Condition.LOST, "lost: the opening hangs", True)
+            if now_s - opening.began_s > _OPENING_TIMEOUT_S
+            else None
+        )
 
     def _wait_for_threads(self, fault: Fault) -> None:
         while not self._closing.is_set():
             self._hanging = [thread for thread in self._hanging if thread.is_alive()]
-            if len(self._hanging) < _MAX_HANGING:
+            if len(self._hanging) < _MAX_HANGING_THREADS:
                 return
             self._set_condition(fault.condition, f"{fault.text}; {len(self._hanging)} calls into it hang")
             self._closing.wait(_FIRST_WAIT_S)

@@ -7,19 +7,19 @@ from statistics import median_low
 
 from edgevpr.frames.shot import Condition, Refusal
 
-LOST_S = 3.0  # without a new picture, for a source that has given more than one in this time
+LOST_AFTER_S = 3.0  # without a new picture, for a source that has given more than one in this time
 # A source of which no rate is known yet: a key frame comes every ten seconds at most, a still picture of a slow camera
 # as well.
-_UNKNOWN_RATE_S = 12.0
-_INTERVALS = 5  # pictures by which the rate of a source is known
+_UNKNOWN_RATE_TIMEOUT_S = 12.0
+_RATE_INTERVALS = 5  # pictures by which the rate of a source is known
 _MISSED_INTERVALS = 2.5  # a slow source is lost if it leaves out two pictures,
-_LONGEST_S = 30.0  # or gives none for so long
-_FROZEN_S = 1.0
-_FROZEN_PICTURES = 3  # repeats, beside the time: a slow camera may take less than three pictures a second
+_MAX_TIMEOUT_S = 30.0  # or gives none for so long
+_FROZEN_AFTER_S = 1.0
+_MIN_REPEATS = 3  # repeats, beside the time: a slow camera may take less than three pictures a second
 _DAMAGED_REOPEN_S = 5.0  # longer than streams need to recover from a lost packet
 _FROZEN_REOPEN_S = 5.0  # and twice as long each time that it has not helped, up to:
-_MAX_FROZEN_S = 30.0
-_LATE = "late: the age of its pictures is unknown, as time stamps do not keep time or decoding lags behind"
+_MAX_FROZEN_REOPEN_S = 30.0
+_LATE_TEXT = "late: the age of its pictures is unknown, as time stamps do not keep time or decoding lags behind"
 _LATE_REOPEN_S = 30.0  # longer than it takes to find the rate of a clock
 
 
@@ -37,7 +37,7 @@ class Liveness:
     """Judges a source by what it gives. Times are in seconds of the monotonic clock."""
 
     def __init__(self) -> None:
-        self._intervals_s: deque[float] = deque(maxlen=_INTERVALS)
+        self._intervals_s: deque[float] = deque(maxlen=_RATE_INTERVALS)
         self._last_new_s: float | None = None
         self._since_s = self._refused_s = 0.0
         self._is_rate_known = False
@@ -72,20 +72,20 @@ class Liveness:
 
     def fault(self, now_s: float) -> Fault | None:
         """Return what is wrong with the source at this time (None: nothing)."""
-        silent_s, usual_s = now_s - self._since_s, LOST_S
+        silent_s, usual_s = now_s - self._since_s, LOST_AFTER_S
         if self._is_rate_known:
-            usual_s = min(max(LOST_S, _MISSED_INTERVALS * median_low(self._intervals_s)), _LONGEST_S)
-        limit_s = usual_s if self._is_rate_known else _UNKNOWN_RATE_S
-        if self._repeats >= _FROZEN_PICTURES and silent_s > _FROZEN_S:
+            usual_s = min(max(LOST_AFTER_S, _MISSED_INTERVALS * median_low(self._intervals_s)), _MAX_TIMEOUT_S)
+        limit_s = usual_s if self._is_rate_known else _UNKNOWN_RATE_TIMEOUT_S
+        if self._repeats >= _MIN_REPEATS and silent_s > _FROZEN_AFTER_S:
             must_reopen = silent_s > max(self._frozen_reopen_s, usual_s)
             return Fault(Condition.FROZEN, "frozen: the same picture over and over", must_reopen)
         if self._refusal in (Refusal.DAMAGED, Refusal.PATCHED) and silent_s > usual_s:
             must_reopen = silent_s > max(_DAMAGED_REOPEN_S, limit_s)
             return Fault(Condition.DAMAGED, "damaged: no picture is whole", must_reopen)
-        is_late = self._refusal is Refusal.LATE and now_s - self._refused_s <= LOST_S
+        is_late = self._refusal is Refusal.LATE and now_s - self._refused_s <= LOST_AFTER_S
         if silent_s > limit_s and is_late:
             # Before the first picture they may only wait for a key frame, or be too few to know their age by.
-            return Fault(Condition.LATE, _LATE, silent_s > _LATE_REOPEN_S)
+            return Fault(Condition.LATE, _LATE_TEXT, silent_s > _LATE_REOPEN_S)
         if silent_s > limit_s:
             return Fault(Condition.LOST, "lost: no new picture", True)
         return None
@@ -94,4 +94,4 @@ class Liveness:
         """Note that the source is opened anew because of this fault."""
         if fault.condition is Condition.FROZEN:
             self._is_doubtful = True
-            self._frozen_reopen_s = min(2 * self._frozen_reopen_s, _MAX_FROZEN_S)
+            self._frozen_reopen_s = min(2 * self._frozen_reopen_s, _MAX_FROZEN_REOPEN_S)

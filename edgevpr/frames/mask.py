@@ -11,12 +11,12 @@ from edgevpr.core.arrays import Bools, Image
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.frames.images import read_image
 
-MAX_MASKED = 0.6  # share of the frame: with more masked, too little ground is left
-_WHITE = 128  # grey level from which on a pixel of a mask file shows ground
+MAX_MASKED_SHARE = 0.6  # share of the frame: with more masked, too little ground is left
+_MIN_WHITE_LEVEL = 128  # grey level from which on a pixel of a mask file shows ground
 
 
 @dataclass(frozen=True, slots=True)
-class Mask:
+class OverlayMask:
     """An overlay mask. `allowed`, bool (H, W), is True where frames show ground; `fitted` scales it to a frame's size.
     `sha256` is the hash of the mask's pixels, not of its file."""
 
@@ -29,7 +29,7 @@ class Mask:
         return cv2.resize(self.allowed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-def load_mask(path: str | None) -> Mask | None:
+def load_mask(path: str | None) -> OverlayMask | None:
     """Read the image that the configuration names as a mask (`source.mask`): bright pixels show ground, dark ones are
     ignored. None if it names none. Raises ImageError for a file that is no image, and UsageError for a mask that leaves
     too little of the frame."""
@@ -40,9 +40,11 @@ def load_mask(path: str | None) -> Mask | None:
     except ImageError as error:  # its message sounds as if a frame were meant
         raise ImageError(f"The mask of `source.mask` (--mask) cannot be used: {error}") from error
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    allowed = grey >= _WHITE
-    if (masked := 1 - allowed.mean()) > MAX_MASKED:
+    allowed = grey >= _MIN_WHITE_LEVEL
+    if (masked := 1 - allowed.mean()) > MAX_MASKED_SHARE:
         raise UsageError(
-            f"{path} masks {masked:.0%} of the frame, and {MAX_MASKED:.0%} is the most: leave more of it white."
+            f"{path} masks {masked:.0%} of the frame, and {MAX_MASKED_SHARE:.0%} is the most: leave more of it white."
         )
-    return Mask(allowed, hashlib.sha256(repr(allowed.shape).encode() + np.packbits(allowed).tobytes()).hexdigest())
+    return OverlayMask(
+        allowed, hashlib.sha256(repr(allowed.shape).encode() + np.packbits(allowed).tobytes()).hexdigest()
+    )

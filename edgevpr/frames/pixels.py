@@ -10,14 +10,14 @@ from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
 from edgevpr.core.arrays import Image
-from edgevpr.frames.depth import DepthRange, coarse_counts, to_8_bits
-from edgevpr.frames.shot import coarse
+from edgevpr.frames.depth import DepthRange, make_counts_thumbnail, to_8_bits
+from edgevpr.frames.shot import make_thumbnail
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
 # Formats whose first plane is the brightness: grey, the bits of a channel (none: 8), and the order of its two bytes.
-_LUMA_FIRST = re.compile(r"(?:(gray)|yuv[aj]?\d{3}p|nv12|nv21|nv16)(?:(9|1\d)(le|be))?")
+_LUMA_FORMATS = re.compile(r"(?:(gray)|yuv[aj]?\d{3}p|nv12|nv21|nv16)(?:(9|1\d)(le|be))?")
 _SQUARE_TOLERANCE = 0.01  # pixels count as square within it: the positions are off by less than by other errors
 _MAX_ASPECT = 4.0  # the widest in use is 2.2; an encoder that states more than this, or less than 1/4, is wrong
 
@@ -35,24 +35,24 @@ class PixelConverter:
 
     def look(self, picture: "VideoFrame") -> Image:
         """Return a coarse grey copy of a picture, uint8 (h, w), see `Shot.look`."""
-        layout = _layout(picture)
+        layout = _match_layout(picture)
         if layout is None:
-            return coarse(np.asarray(self._reformat(picture, "gray").to_ndarray(), np.uint8))
-        plane = _first_plane(picture, layout)
+            return make_thumbnail(np.asarray(self._reformat(picture, "gray").to_ndarray(), np.uint8))
+        plane = _read_luma(picture, layout)
         if layout[1] and layout[2]:
-            return coarse_counts(plane)
-        return np.asarray(coarse(plane) >> (int(layout[2] or 8) - 8), np.uint8)
+            return make_counts_thumbnail(plane)
+        return np.asarray(make_thumbnail(plane) >> (int(layout[2] or 8) - 8), np.uint8)
 
     def conversion(self, picture: "VideoFrame", aspect: float) -> Callable[[], Image]:
         """Return a function that converts a picture to uint8 (H, W, 3) BGR, or (H, W) grey for counts, with square
         pixels of the same height. `aspect` is the width of its pixels over their height."""
         is_usable = abs(aspect - 1) > _SQUARE_TOLERANCE and 1 / _MAX_ASPECT <= aspect <= _MAX_ASPECT
         width_px = round(picture.width * aspect) if is_usable else picture.width
-        layout = _layout(picture)
+        layout = _match_layout(picture)
         if not (layout and layout[1] and layout[2]):
             return lambda: np.asarray(self._reformat(picture, "bgr24", width_px).to_ndarray(), np.uint8)
-        limits = self._depth.update(_first_plane(picture, layout))
-        return lambda: to_8_bits(_first_plane(self._reformat(picture, picture.format.name, width_px), layout), limits)
+        limits = self._depth.update(_read_luma(picture, layout))
+        return lambda: to_8_bits(_read_luma(self._reformat(picture, picture.format.name, width_px), layout), limits)
 
     def _reformat(self, picture: "VideoFrame", form: str, width_px: int | None = None) -> "VideoFrame":
         converter: VideoReformatter | None = getattr(self._of_thread, form, None)
@@ -62,13 +62,13 @@ class PixelConverter:
         return converter.reformat(picture, width=width_px, format=form, interpolation="BICUBIC")
 
 
-def _layout(picture: "VideoFrame") -> re.Match[str] | None:
-    """Return how the brightness lies in the first plane, by `_LUMA_FIRST`; None if it has to be computed. Rows from the
-    bottom to the top cannot be read in place."""
-    return None if picture.planes[0].line_size < 0 else _LUMA_FIRST.fullmatch(picture.format.name)
+def _match_layout(picture: "VideoFrame") -> re.Match[str] | None:
+    """Return how the brightness lies in the first plane, by `_LUMA_FORMATS`; None if it has to be computed. Rows from
+    the bottom to the top cannot be read in place."""
+    return None if picture.planes[0].line_size < 0 else _LUMA_FORMATS.fullmatch(picture.format.name)
 
 
-def _first_plane(picture: "VideoFrame", layout: re.Match[str]) -> NDArray[Any]:
+def _read_luma(picture: "VideoFrame", layout: re.Match[str]) -> NDArray[Any]:
     """Return the first plane of a picture, uint8 or uint16 (H, W), without a copy."""
     dtype = np.dtype({"le": "<u2", "be": ">u2"}[layout[3]] if layout[2] else np.uint8)
     plane = picture.planes[0]

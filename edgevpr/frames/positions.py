@@ -17,27 +17,29 @@ from edgevpr.core.files import read_file, write_whole
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.types import Position
 
-ALT_M = (-1000.0, 100_000.0)  # plausible altitudes
+ALT_LIMITS_M = (-1000.0, 100_000.0)  # plausible altitudes
 # Each column of numbers with its limits. Of heading_deg and yaw_deg, and of height_m and rel_alt, the first counts.
-_NUMBERS = {
+_COLUMN_LIMITS = {
     "lat": (-90.0, 90.0),
     "lon": (-180.0, 180.0),
-    "alt": ALT_M,
+    "alt": ALT_LIMITS_M,
     "heading_deg": (-360.0, 360.0),
     "yaw_deg": (-360.0, 360.0),
     "roll_deg": (-180.0, 180.0),
     "pitch_deg": (-90.0, 90.0),
-    "height_m": ALT_M,
-    "rel_alt": ALT_M,
+    "height_m": ALT_LIMITS_M,
+    "rel_alt": ALT_LIMITS_M,
 }
-_WRITTEN = ("lat", "lon", "alt", "yaw_deg", "roll_deg", "pitch_deg", "height_m")
-_NEEDED_COLUMNS, _TRACK_COLUMNS = ("file", "lat", "lon"), ("time", "lat", "lon")
+_TAG_COLUMNS = ("lat", "lon", "alt", "yaw_deg", "roll_deg", "pitch_deg", "height_m")
+_NEEDED_COLUMNS = ("file", "lat", "lon")
+_TRACK_COLUMNS = ("time", "lat", "lon")
 _MAX_FILE_BYTES = 100_000_000  # a million images
 # The years 1900 to 2200. Times written in milliseconds are a thousand times too large, and so lie outside.
-_FIRST_S, _LAST_S = -2_208_988_800, 7_258_118_400
+_MIN_TIME_S = -2_208_988_800
+_MAX_TIME_S = 7_258_118_400
 MAX_GAP_S = 5.0  # positions further apart in time are not interpolated: the aircraft may have turned in between
-_ROUNDING_S = 0.001  # Matroska counts in milliseconds
-_ANGLES = [1, 3, 4]  # which of `_to_numbers` are angles of a full turn
+_TIME_ROUNDING_S = 0.001  # Matroska counts in milliseconds
+_ANGLE_INDICES = [1, 3, 4]  # which of `_to_numbers` are angles of a full turn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,16 +81,16 @@ def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
 def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
     """Write a positions.csv of `tags` by file name. `read_positions` gives exactly the same tags back."""
     rows = [(name, *_to_numbers(tag), tag.t_utc_s) for name, tag in tags.items()]
-    _write(csv_path, ("file", *_WRITTEN, "time"), rows)
+    _write_table(csv_path, ("file", *_TAG_COLUMNS, "time"), rows)
 
 
 def write_track(csv_path: str | Path, track: "Track") -> None:
     """Write the table of positions of a video. `read_track` gives exactly the same track back."""
     rows = ((t_s, *_to_numbers(tag)) for t_s, tag in zip(track.t_s, track.tags, strict=True))
-    _write(csv_path, ("time", *_WRITTEN), rows)
+    _write_table(csv_path, ("time", *_TAG_COLUMNS), rows)
 
 
-def _write(csv_path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+def _write_table(csv_path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     text = io.StringIO(newline="")
     table = csv.writer(text)
     table.writerow(header)
@@ -115,7 +117,7 @@ def _read_rows(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) ->
         raise UsageError(f"{csv_path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{csv_path} is not a text file of commas ({error}): save it as CSV in UTF-8.") from error
-    for name in (*needed, *_NUMBERS, "time"):
+    for name in (*needed, *_COLUMN_LIMITS, "time"):
         if header.count(name) > 1 or (name in needed and name not in header):
             raise UsageError(
                 f"{csv_path}, line 1 has no column `{name}`, or two: it must name {', '.join(needed)} once each, with "
@@ -135,10 +137,10 @@ def _read_rows(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) ->
 
 def _parse_tag(row: Mapping[str, str], where: str) -> GeoTag:
     """Convert a table's row (text by column name) to a GeoTag. Raises UsageError for a wrong value."""
-    known = {column: _parse_number(row, column, *limits, where) for column, limits in _NUMBERS.items()}
+    known = {column: _parse_number(row, column, *limits, where) for column, limits in _COLUMN_LIMITS.items()}
     lat_deg, lon_deg, position = known["lat"], known["lon"], None
     if lat_deg is not None and lon_deg is not None:
-        position = position_or_none(lat_deg, lon_deg, known["alt"])
+        position = make_position(lat_deg, lon_deg, known["alt"])
     elif lat_deg is not None or lon_deg is not None:
         raise UsageError(f"{where} has only one of lat and lon: write both, or leave both empty.")
     heading_deg = known["yaw_deg"] if known["heading_deg"] is None else known["heading_deg"]
@@ -152,7 +154,7 @@ def _parse_tag(row: Mapping[str, str], where: str) -> GeoTag:
     )
 
 
-def position_or_none(lat_deg: float, lon_deg: float, alt_m: float | None) -> Position | None:
+def make_position(lat_deg: float, lon_deg: float, alt_m: float | None) -> Position | None:
     """Make a position; return None for exactly (0, 0), which a receiver without a fix writes."""
     return None if lat_deg == lon_deg == 0 else Position(lat_deg, lon_deg, alt_m)
 
@@ -192,7 +194,7 @@ def parse_time(text: str) -> float:
             text = text.replace(":", "-", 2)
         moment = datetime.fromisoformat(text.replace("Z", "+00:00"))  # Python 3.10 does not know Z
         seconds = (moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)).timestamp()
-    if not _FIRST_S <= seconds < _LAST_S:  # false for NaN too
+    if not _MIN_TIME_S <= seconds < _MAX_TIME_S:  # false for NaN too
         raise ValueError(f"{text} is no time between 1900 and 2200")
     return seconds
 
@@ -210,14 +212,14 @@ class Track:
         """Return position, attitude and height at the video time `t_s`, interpolated linearly between the two table
         rows around it. The tag is empty outside the table, and if these rows are more than `MAX_GAP_S` apart."""
         nearest = int(np.abs(np.subtract(self.t_s, t_s)).argmin())
-        if abs(self.t_s[nearest] - t_s) <= _ROUNDING_S:
+        if abs(self.t_s[nearest] - t_s) <= _TIME_ROUNDING_S:
             return self.tags[nearest]
         after = int(np.searchsorted(self.t_s, t_s))
         if not 0 < after < len(self.t_s) or self.t_s[after] - self.t_s[after - 1] > MAX_GAP_S:
             return GeoTag()
         one, other = (np.array(_to_numbers(tag), float) for tag in self.tags[after - 1 : after + 1])  # NaN: unknown
         way = other - one
-        way[_ANGLES] = shorter_deg(way[_ANGLES])
+        way[_ANGLE_INDICES] = shorter_deg(way[_ANGLE_INDICES])
         share = (t_s - self.t_s[after - 1]) / (self.t_s[after] - self.t_s[after - 1])
         between: list[Any] = [None if math.isnan(number) else number for number in (one + share * way).tolist()]
         lat_deg, lon_deg, alt_m, heading_deg, roll_deg, pitch_deg, height_m = between
@@ -232,7 +234,7 @@ class Track:
     def require_within(self, video: Path, lasts_s: float) -> None:
         """Raise UsageError if the times of the table and of the video, which lasts `lasts_s` seconds, do not overlap.
         `video` is its path, for the message."""
-        if self.t_s[-1] < -_ROUNDING_S or self.t_s[0] > lasts_s:
+        if self.t_s[-1] < -_TIME_ROUNDING_S or self.t_s[0] > lasts_s:
             raise UsageError(
                 f"{self.path} has positions from {self.t_s[0]:.1f} to {self.t_s[-1]:.1f} s, and {video} lasts from 0 "
                 f"to {lasts_s:.1f} s: write `time` in seconds from its first frame."

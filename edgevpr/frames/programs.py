@@ -25,25 +25,28 @@ from edgevpr.frames.age import HIDDEN_DELAY_SD_S
 from edgevpr.frames.shot import OpeningError, Refusal, Shot
 from edgevpr.frames.streams import StreamCapture, open_raw
 
-_RIBBON, _PIPELINE = "rpicam-vid", "gst-launch-1.0"
+_RPICAM = "rpicam-vid"
+_GSTREAMER = "gst-launch-1.0"
 _PACKAGES = {
-    _RIBBON: "rpicam-apps-lite",
-    _PIPELINE: "gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-good",
+    _RPICAM: "rpicam-apps-lite",
+    _GSTREAMER: "gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-good",
 }
 _ADVICE = {
-    _RIBBON: "`rpicam-hello --list-cameras` says if it is found, and whether it is in use",
-    _PIPELINE: "run `gst-launch-1.0 -v` with it to see why, and end it with raw video (video/x-raw)",
+    _RPICAM: "`rpicam-hello --list-cameras` says if it is found, and whether it is in use",
+    _GSTREAMER: "run `gst-launch-1.0 -v` with it to see why, and end it with raw video (video/x-raw)",
 }
 # For this size the usual sensors (OV5647, IMX219, IMX477, IMX708) read all of their pixels, binned: for a smaller one
 # some read the middle only, and see less.
-_SIZE_PX, _RATE_HZ, _QUALITY = (1280, 960), 10, 90
-_APPSINK = re.compile(r"!\s*appsink\b[^!]*$")  # as pipelines for OpenCV end
-_WAITING_PICTURES = 10  # of a reader that does not read: older ones are dropped
+_SIZE_PX = (1280, 960)
+_RATE_HZ = 10
+_QUALITY = 90
+_APPSINK_PATTERN = re.compile(r"!\s*appsink\b[^!]*$")  # as pipelines for OpenCV end
+_MAX_QUEUED_PICTURES = 10  # of a reader that does not read: older ones are dropped
 # From the start to the first picture. A camera takes a second or two, but GStreamer that looks for its plugins, or a
 # sensor behind several drivers, 10 s and more on a small board; and whoever is ended too early starts as slowly again.
-_FIRST_PICTURE_S = 60.0
-_POLL_S = 0.2
-_END_S = 2.0
+_FIRST_PICTURE_TIMEOUT_S = 60.0
+_POLL_PERIOD_S = 0.2
+_TERMINATE_TIMEOUT_S = 2.0
 _STDERR_LINES = 20  # the last ones are kept
 _STDERR_CHARS = 160  # a longer line explains nothing in a status
 _log = logging.getLogger(__name__)
@@ -52,8 +55,8 @@ _log = logging.getLogger(__name__)
 def require_program(uri: str) -> str:
     """Return the path of the system's program that reads this camera. Raises SourceError if it is not installed, or if
     `uri` is no pipeline."""
-    name = _name_program(uri)
-    if name == _PIPELINE:
+    name = _choose_program(uri)
+    if name == _GSTREAMER:
         _split_pipeline(uri)
     path = shutil.which(name)
     if path is None:
@@ -61,21 +64,21 @@ def require_program(uri: str) -> str:
     return path
 
 
-def open_by_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
+def open_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
     """Start the program for the camera `uri`, connect to it, and wait for its first picture for as long as it runs, a
     minute at most. `clock` is the monotonic clock, in seconds. Raises OpeningError if it gives none."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    name = _name_program(uri)
+    name = _choose_program(uri)
     process = subprocess.Popen(
-        _pipeline_command(uri, port) if name == _PIPELINE else _ribbon_command(uri, port),
+        _make_gstreamer_command(uri, port) if name == _GSTREAMER else _make_rpicam_command(uri, port),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
     )
     errors = ErrorLines(process)
-    end_s = time.monotonic() + _FIRST_PICTURE_S
+    end_s = time.monotonic() + _FIRST_PICTURE_TIMEOUT_S
     while process.poll() is None and (left_s := end_s - time.monotonic()) > 0:
         with suppress(OpeningError):
             # A pipeline may read a stream.
@@ -84,12 +87,12 @@ def open_by_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
             if time.monotonic() < end_s:
                 return ProgramCapture(stream, process)
             stream.release()  # FFmpeg calls a stream open when its time is over, without a picture too
-        time.sleep(_POLL_S)
+        time.sleep(_POLL_PERIOD_S)
     exit_code = process.poll()
     _log.warning("%s gives no picture: %s", uri, _ADVICE[name])
-    _end(process)
+    _terminate(process)
     if exit_code is None:
-        raise OpeningError(f"no picture from {name} in {_FIRST_PICTURE_S:g} s")
+        raise OpeningError(f"no picture from {name} in {_FIRST_PICTURE_TIMEOUT_S:g} s")
     raise OpeningError(f"{name} has ended with code {exit_code}{errors.explain_exit()}")
 
 
@@ -107,7 +110,7 @@ class ProgramCapture:
         self._stream.cancel()
 
     def release(self) -> None:
-        _end(self._process)  # first: a stream without a sender ends at once
+        _terminate(self._process)  # first: a stream without a sender ends at once
         self._stream.release()
 
 
@@ -122,7 +125,7 @@ class ErrorLines:
 
     def explain_exit(self) -> str:
         """Return the line that tells best why the program has ended, after a colon; "" if there is none."""
-        self._thread.join(_POLL_S)
+        self._thread.join(_POLL_PERIOD_S)
         lines = [line.decode(errors="replace").strip() for line in list(self._lines)]
         lines = [line for line in lines if 0 < len(line) <= _STDERR_CHARS]
         best = [line for line in lines if "error" in line.lower()][:1] or lines[-1:]
@@ -134,11 +137,11 @@ class ErrorLines:
             self._lines.extend(iter(lambda: pipe.readline(2 * _STDERR_CHARS), b""))
 
 
-def _name_program(uri: str) -> str:
-    return _PIPELINE if uri.startswith("gst:") else _RIBBON
+def _choose_program(uri: str) -> str:
+    return _GSTREAMER if uri.startswith("gst:") else _RPICAM
 
 
-def _ribbon_command(uri: str, port: int) -> list[str]:
+def _make_rpicam_command(uri: str, port: int) -> list[str]:
     """Return the command that sends the pictures of a ribbon camera to the first who connects to `port`."""
     return [
         *("setpriv", "--pdeathsig", "KILL"),  # ends with our thread: it has nothing to close
@@ -149,10 +152,10 @@ def _ribbon_command(uri: str, port: int) -> list[str]:
     ]
 
 
-def _pipeline_command(uri: str, port: int) -> list[str]:
+def _make_gstreamer_command(uri: str, port: int) -> list[str]:
     """Return the command that sends the pictures of a pipeline to those who connect to `port`. It does not notice that
     they have gone."""
-    sink = f"sync=false buffers-soft-max={_WAITING_PICTURES} recover-policy=latest host=127.0.0.1 port={port}"
+    sink = f"sync=false buffers-soft-max={_MAX_QUEUED_PICTURES} recover-policy=latest host=127.0.0.1 port={port}"
     encoder = f"! videoconvert ! jpegenc quality={_QUALITY} ! tcpserversink {sink}"
     ends = "setpriv", "--pdeathsig", "TERM"  # with our thread; it closes its camera upon this
     return [*ends, require_program(uri), "-q", *_split_pipeline(uri), *encoder.split()]
@@ -161,15 +164,15 @@ def _pipeline_command(uri: str, port: int) -> list[str]:
 def _split_pipeline(uri: str) -> list[str]:
     """Split a pipeline, without an appsink, into words. Raises SourceError if there is none or a quote does not end."""
     with suppress(ValueError):
-        if words := shlex.split(_APPSINK.sub("", uri.removeprefix("gst:"))):
+        if words := shlex.split(_APPSINK_PATTERN.sub("", uri.removeprefix("gst:"))):
             return words
     raise SourceError(f"`{uri}` is no pipeline: write one as for gst-launch-1.0 after `gst:`, with quotes that end.")
 
 
-def _end(process: "subprocess.Popen[bytes]") -> None:
+def _terminate(process: "subprocess.Popen[bytes]") -> None:
     process.terminate()
     try:
-        process.wait(_END_S)
+        process.wait(_TERMINATE_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()

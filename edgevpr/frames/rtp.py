@@ -14,26 +14,28 @@ from edgevpr.frames.shot import OpeningError
 
 _VERSION_2 = 0x80  # the two highest bits of an RTP packet
 _HEADER_BYTES = 12
-_PACKETS = 10  # by which the codec is found: most of them are fragments, which no other codec's packets look like
+_MAX_PACKETS = 10  # by which the codec is found: most of them are fragments, which no other codec's packets look like
 _STATIC_TYPES = {26: "JPEG", 32: "MPV", 33: "MP2T"}  # payload types of RFC 3551
 _FIRST_DYNAMIC_TYPE = 96
 _H264_TYPES = (1, 5, 6, 7, 8, 9, 24, 28)  # of NAL units, aggregates and fragments (RFC 6184)
 _H265_TYPES = (0, 1, 19, 20, 21, 32, 33, 34, 35, 39, 48, 49)  # the same (RFC 7798)
-_OF_FFMPEG = re.compile(r"\w+://@?(2(2[4-9]|3\d)\.|\[)")  # a multicast group, or IPv6: FFmpeg receives it by itself
+_MULTICAST_OR_IPV6 = re.compile(
+    r"\w+://@?(2(2[4-9]|3\d)\.|\[)"
+)  # a multicast group, or IPv6: FFmpeg receives it by itself
 
 
 def describe_rtp(uri: str, timeout_s: float) -> str | None:
     """Wait for packets at `uri`, udp://[HOST]:PORT or rtp://[HOST]:PORT. If they are RTP, return the address of an SDP
     that describes them; None if they are something else, which FFmpeg may know. Raises OpeningError if no packet comes,
     if the port is in use, or if the codec is none of H.264, H.265, JPEG, MPEG-2 and MPEG-TS."""
-    if _OF_FFMPEG.match(uri):
+    if _MULTICAST_OR_IPV6.match(uri):
         return None
     try:
         port = urlsplit(uri).port or 0
     except ValueError:
         raise OpeningError("no host and port in the address") from None
     with _open_port(port) as receiver:
-        packets = _receive(receiver, timeout_s)
+        packets = _receive_packets(receiver, timeout_s)
     if not packets and "?" in uri:  # FFmpeg may know better how to receive them
         return None
     if not packets:
@@ -65,12 +67,12 @@ def _open_port(port: int) -> socket.socket:
     return receiver
 
 
-def _receive(receiver: socket.socket, timeout_s: float) -> list[bytes]:
+def _receive_packets(receiver: socket.socket, timeout_s: float) -> list[bytes]:
     """Return the first packets: one that is no RTP, or some that are; as many as come in `timeout_s` seconds."""
     packets: list[bytes] = []
     end_s = time.monotonic() + timeout_s
     with suppress(TimeoutError):
-        while len(packets) < _PACKETS and (left_s := end_s - time.monotonic()) > 0:
+        while len(packets) < _MAX_PACKETS and (left_s := end_s - time.monotonic()) > 0:
             receiver.settimeout(left_s)
             packets.append(receiver.recv(65536))
             if not _is_rtp(packets[-1]):

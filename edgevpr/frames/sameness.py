@@ -1,5 +1,5 @@
 """Comparison of two pictures by their content: do they show the same, unmoved, whatever noise, clock or display they
-carry? (Two exactly equal pictures are found by `shot.Newness`, before they are decoded in full.)
+carry? (Two exactly equal pictures are found by `shot.RepeatDetector`, before they are decoded in full.)
 
 Coarse copies are compared block by block. The texture of each block says by how much its correlation would fall if the
 picture had moved by 1.5 of their pixels, in any direction; a block that has lost less has not moved. So neither
@@ -15,14 +15,14 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Image, Singles
 
-_SIZE_PX = 128, 96  # of a coarse copy, columns and rows
+_SIZE_PX = (128, 96)  # of a coarse copy, columns and rows
 _BLOCK_PX = 16
-_TEXTURE_LEVELS = 2.5  # least standard deviation in a block, grey levels; noise of a picture in the dark has less
+_MIN_TEXTURE_LEVELS = 2.5  # least standard deviation in a block, grey levels; noise of a picture in the dark has less
 _MOTION_PX = 1.5
 _MIN_LOSS = 0.05  # of correlation by that motion: less cannot be told from the noise of a compressed picture
-_READ_PX = 640  # columns that are averaged, of a larger picture
-_THUMB_PX = 16, 12
-BLOCKS = _SIZE_PX[0] // _BLOCK_PX * (_SIZE_PX[1] // _BLOCK_PX)
+_MAX_READ_COLUMNS = 640  # columns that are averaged, of a larger picture
+_THUMBNAIL_PX = (16, 12)
+BLOCK_COUNT = _SIZE_PX[0] // _BLOCK_PX * (_SIZE_PX[1] // _BLOCK_PX)
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,16 @@ class CoarsePicture:
     @cached_property
     def blocks(self) -> Singles:
         """Its blocks, float32 (48, 256), each without its mean and of length 1; of length 0 without texture."""
-        blocks = _cut(self.grey)
+        blocks = _cut_blocks(self.grey)
         blocks = blocks - blocks.mean(axis=1, keepdims=True)
         length = np.linalg.norm(blocks, axis=1, keepdims=True)
-        has_texture = length >= _TEXTURE_LEVELS * _BLOCK_PX
+        has_texture = length >= _MIN_TEXTURE_LEVELS * _BLOCK_PX
         return np.asarray(np.where(has_texture, blocks / np.maximum(length, 1e-6), 0), np.float32)
 
     @cached_property
     def thumb(self) -> Singles:
         """A still coarser copy, float32 (192,), without its mean and of length 1."""
-        small = cv2.resize(self.grey.astype(np.float32), _THUMB_PX, interpolation=cv2.INTER_AREA).ravel()
+        small = cv2.resize(self.grey.astype(np.float32), _THUMBNAIL_PX, interpolation=cv2.INTER_AREA).ravel()
         small -= small.mean()
         return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6), np.float32)
 
@@ -51,11 +51,11 @@ class CoarsePicture:
     def least_loss(self) -> Singles:
         """By how much the correlation of each block falls, float32 (48,), if the picture moves by 1.5 pixels in the
         direction in which that is seen least: from the least eigenvalue of its structure tensor."""
-        right, down = (_cut(cv2.Sobel(self.grey, cv2.CV_32F, 1 - axis, axis, ksize=1) / 2) for axis in (0, 1))
+        right, down = (_cut_blocks(cv2.Sobel(self.grey, cv2.CV_32F, 1 - axis, axis, ksize=1) / 2) for axis in (0, 1))
         pairs = (right, right), (down, down), (right, down)
         across, along, both = ((one * other).sum(axis=1) for one, other in pairs)
         least = (across + along) / 2 - np.hypot((across - along) / 2, both)
-        blocks = _cut(self.grey)
+        blocks = _cut_blocks(self.grey)
         energy = ((blocks - blocks.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
         return np.asarray(_MOTION_PX**2 * least / (2 * np.maximum(energy, 1e-6)), np.float32)
 
@@ -72,13 +72,13 @@ class CoarsePicture:
 
 def make_coarse(image: Image) -> CoarsePicture:
     """Return the coarse copy of a picture, uint8 (H, W) grey or (H, W, 3) BGR, of which green is taken."""
-    step = max(1, image.shape[1] // _READ_PX)
+    step = max(1, image.shape[1] // _MAX_READ_COLUMNS)
     plane = np.ascontiguousarray((image if image.ndim == 2 else image[:, :, 1])[::step, ::step])
     return CoarsePicture(np.asarray(cv2.resize(plane, _SIZE_PX, interpolation=cv2.INTER_AREA), np.uint8))
 
 
-def _cut(plane: Array) -> Singles:
+def _cut_blocks(plane: Array) -> Singles:
     """Cut a plane (96, 128) into its blocks, float32 (48, 256)."""
     columns, rows = (px // _BLOCK_PX for px in _SIZE_PX)
     blocks = plane.astype(np.float32).reshape(rows, _BLOCK_PX, columns, _BLOCK_PX)
-    return np.asarray(blocks.swapaxes(1, 2).reshape(BLOCKS, -1))
+    return np.asarray(blocks.swapaxes(1, 2).reshape(BLOCK_COUNT, -1))

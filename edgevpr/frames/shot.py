@@ -1,4 +1,5 @@
-"""One picture of a camera or stream (`Shot`), what gives them (`Capture`), and the detection of repeats (`Newness`).
+"""One picture of a camera or stream (`Shot`), what gives them (`Capture`), and the detection of repeats
+(`RepeatDetector`).
 
 A decoder that fills lost parts from older pictures, and a camera that hangs, do not always report that. But no two new
 pictures are exactly equal, because of the camera's noise. They are compared by coarse grey copies, in bands of rows.
@@ -18,15 +19,19 @@ from edgevpr.core.types import FRAME_TIME_SD_S
 
 Plane = TypeVar("Plane", bound=NDArray[Any])
 
-_LOOK_PX = (60, 80)  # least rows and columns of a coarse copy
+_MIN_THUMBNAIL_PX = (60, 80)  # least rows and columns of a coarse copy
 _BANDS = 12
-_REMEMBERED = 6  # pictures: decoders use about as many buffers in rotation
-_SAME_LEVELS, _SAME_SHARE = 1, 0.99  # bands are equal if this share of their pixels differs by at most this many levels
-_TEXTURE_LEVELS = 8.0  # least standard deviation of a band with enough texture to be judged, in grey levels
-_MOVED_LEVELS = 3.0  # mean difference, in grey levels, of a band that has certainly changed
-_BANDS_TO_TELL = 2
-_PICTURES_TO_LEARN = 8  # time constant, in pictures, of the share of pictures in which a band changed
-_MOVES_ALWAYS = 0.75  # least share of pictures in which a band changed; a band that changes less often is not judged
+_HISTORY_PICTURES = 6  # pictures: decoders use about as many buffers in rotation
+# Bands are equal if this share of their pixels differs by at most this many grey levels.
+_MIN_EQUAL_SHARE = 0.99
+_MAX_EQUAL_LEVELS = 1
+_MIN_TEXTURE_LEVELS = 8.0  # least standard deviation of a band with enough texture to be judged, in grey levels
+_MIN_CHANGE_LEVELS = 3.0  # mean difference, in grey levels, of a band that has certainly changed
+_MIN_BANDS = 2
+_LEARNING_PICTURES = 8  # time constant, in pictures, of the share of pictures in which a band changed
+_MIN_CHANGE_SHARE = (
+    0.75  # least share of pictures in which a band changed; a band that changes less often is not judged
+)
 
 
 class Condition(Enum):
@@ -104,14 +109,14 @@ class Capture(Protocol):
         """Close the camera or the connection."""
 
 
-def coarse(plane: Plane) -> Plane:
+def make_thumbnail(plane: Plane) -> Plane:
     """Return a small copy of a picture's grey plane (H, W[, C]): every n-th row and column, 60 x 80 pixels or a few
     more. Pixels are not averaged, as that would remove the noise that tells a new picture from a repeated one."""
     height, width = plane.shape[:2]
-    return plane[:: max(1, height // _LOOK_PX[0]), :: max(1, width // _LOOK_PX[1])].copy()  # type: ignore[return-value]
+    return plane[:: max(1, height // _MIN_THUMBNAIL_PX[0]), :: max(1, width // _MIN_THUMBNAIL_PX[1])].copy()  # type: ignore[return-value]
 
 
-class Newness:
+class RepeatDetector:
     """Compares every picture of one source with the six before.
 
     A picture is PATCHED if at least two bands of rows equal those of an older picture, while at least two others have
@@ -119,7 +124,7 @@ class Newness:
     over the picture, and static parts of a scene."""
 
     def __init__(self) -> None:
-        self._before: deque[NDArray[np.int16]] = deque(maxlen=_REMEMBERED)  # pictures as bands, the newest first
+        self._before: deque[NDArray[np.int16]] = deque(maxlen=_HISTORY_PICTURES)  # pictures as bands, the newest first
         self._moving = np.zeros(_BANDS)  # share of the latest pictures in which each band changed
 
     def refusal(self, look: Image) -> Refusal | None:
@@ -130,14 +135,14 @@ class Newness:
             self._before.appendleft(bands)
             return None
         apart = np.abs(np.stack(self._before) - bands)
-        same = (apart <= _SAME_LEVELS).mean(-1) >= _SAME_SHARE  # (pictures, bands)
+        same = (apart <= _MAX_EQUAL_LEVELS).mean(-1) >= _MIN_EQUAL_SHARE  # (pictures, bands)
         if same[0].all():
             return Refusal.FROZEN  # not remembered, so that it does not push out an older picture
         self._before.appendleft(bands)
-        moved = (apart[0].mean(-1) > _MOVED_LEVELS) & ~same[0]
-        must_move = (bands.std(-1) > _TEXTURE_LEVELS) & (self._moving > _MOVES_ALWAYS)
-        is_patched = ((same & must_move).sum(-1) >= _BANDS_TO_TELL).any()
-        if is_patched and moved.sum() >= _BANDS_TO_TELL:
+        moved = (apart[0].mean(-1) > _MIN_CHANGE_LEVELS) & ~same[0]
+        must_move = (bands.std(-1) > _MIN_TEXTURE_LEVELS) & (self._moving > _MIN_CHANGE_SHARE)
+        is_patched = ((same & must_move).sum(-1) >= _MIN_BANDS).any()
+        if is_patched and moved.sum() >= _MIN_BANDS:
             return Refusal.PATCHED  # no update below: a band that is patched for long must not count as a static one
-        self._moving += (moved - self._moving) / _PICTURES_TO_LEARN
+        self._moving += (moved - self._moving) / _LEARNING_PICTURES
         return None

@@ -25,11 +25,11 @@ from edgevpr.frames.twins import TwinCheck
 
 _READ_TIMEOUT_S = 1.0
 _SNAPSHOT_PERIOD_S = 0.5
-_BY_PROGRAM = re.compile(r"rpicam(:\d+)?|gst:.*", re.DOTALL)
+_PROGRAM_PATTERN = re.compile(r"rpicam(:\d+)?|gst:.*", re.DOTALL)
 # udp://:PORT: on all interfaces.
-_ADDRESS = re.compile(r"(?i)(rtsps?|https?)://[^/].*|tcp://.+:\d+.*|(udp|rtp)://.*:\d+.*")
+_ADDRESS_PATTERN = re.compile(r"(?i)(rtsps?|https?)://[^/].*|tcp://.+:\d+.*|(udp|rtp)://.*:\d+.*")
 # A password with a character that ends the part of an address in which FFmpeg looks for one. Port digits are none.
-_UNESCAPED = re.compile(r"\w+://(?!\[)[^\s/?#@:]*:(?!\d*([/?#]|$))[^@]*[\s/?#].*@.*", re.DOTALL)
+_UNESCAPED_PASSWORD = re.compile(r"\w+://(?!\[)[^\s/?#@:]*:(?!\d*([/?#]|$))[^@]*[\s/?#].*@.*", re.DOTALL)
 
 
 class Source:
@@ -149,7 +149,7 @@ def read_tags(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]
     return {path: tags.get(decode_name(path.name)) or read_exif(path) for path in list_images(folder)}
 
 
-def recorded_intervals(uri: str | None, positions: Path | None = None) -> list[float]:
+def read_intervals(uri: str | None, positions: Path | None = None) -> list[float]:
     """Return the seconds from each image of a folder to the next, by their times in `positions` or EXIF data. Empty:
     `uri` is no folder that can be used, an image has no time, one is older than that before it, or all are equal."""
     times: list[float | None] = []
@@ -178,7 +178,7 @@ def open_source(
     of a folder the positions.csv in or beside it, else EXIF data; of a video the .csv of the same name beside it).
     `live`: allow cameras and streams, which never end. One that is not there yet is opened as soon as it is.
     `clock`: the monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`:
-    for a folder that is flown by its recorded times, the `recorded_intervals` (empty: it is not).
+    for a folder that is flown by its recorded times, the `read_intervals` (empty: it is not).
     Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions.
     """
     path = Path(uri)
@@ -219,18 +219,18 @@ def is_live(uri: str | None) -> bool:
     if uri is None:
         return False
     is_device = uri.startswith("/dev/") and not Path(uri).is_file()  # /dev/shm holds plain files
-    return "://" in uri or is_device or uri.lower().endswith(".sdp") or is_by_program(uri)
+    return "://" in uri or is_device or uri.lower().endswith(".sdp") or is_program_uri(uri)
 
 
-def is_by_program(uri: str) -> bool:
+def is_program_uri(uri: str) -> bool:
     """Return True if `uri` names a camera that a program of the system reads, see `frames.programs`."""
-    return bool(_BY_PROGRAM.fullmatch(uri))
+    return bool(_PROGRAM_PATTERN.fullmatch(uri))
 
 
-def missing_cause(uri: str) -> str | None:
+def find_missing_cause(uri: str) -> str | None:
     """Return why the device or the .sdp file `uri` cannot be read at present, in a few words; None: it can, or `uri` is
     neither."""
-    if "://" in uri or is_by_program(uri):
+    if "://" in uri or is_program_uri(uri):
         return None
     if not Path(uri).exists():
         return f"there is nothing at {uri}"
@@ -243,23 +243,23 @@ def _make_capture(uri: str, clock: Callable[[], float], period_s: float) -> Call
     """Return a function that opens the camera or stream `uri`; `period_s`: seconds between requests for pictures where
     each must be requested. Raises SourceError if that can never succeed: a device or a file that is missing may come
     later."""
-    if is_by_program(uri):
-        from edgevpr.frames.programs import open_by_program, require_program  # loads FFmpeg
+    if is_program_uri(uri):
+        from edgevpr.frames.programs import open_program, require_program  # loads FFmpeg
 
         require_program(uri)
-        return lambda: open_by_program(uri, clock)
-    if "://" in uri and _UNESCAPED.fullmatch(uri):
+        return lambda: open_program(uri, clock)
+    if "://" in uri and _UNESCAPED_PASSWORD.fullmatch(uri):
         raise SourceError(
             "The password in the address of the source must be percent-encoded: write %2F for /, %23 for #, %3F "
             "for ?, %40 for @, %25 for % and %20 for a space."
         )
-    if "://" in uri and not _ADDRESS.fullmatch(uri):
+    if "://" in uri and not _ADDRESS_PATTERN.fullmatch(uri):
         raise SourceError(
             f"{uri} is no address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCES}."
         )
 
     def open_capture() -> Capture:
-        if cause := missing_cause(uri):
+        if cause := find_missing_cause(uri):
             raise OpeningError(cause)
         if uri.startswith("/dev/"):
             from edgevpr.frames.devices import open_device

@@ -1,5 +1,5 @@
 """Network streams, decoded by FFmpeg: complete pictures, each with the time at which it was taken (`frames.age`). A
-thread receives packets as they come (`Arrivals`), the thread of `frames.live` decodes them (`StreamCapture`)."""
+thread receives packets as they come (`PacketQueue`), the thread of `frames.live` decodes them (`StreamCapture`)."""
 
 import threading
 from collections import deque
@@ -7,11 +7,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from edgevpr.core.types import FRAME_TIME_SD_S
-from edgevpr.frames.age import HIDDEN_DELAY_SD_S, StampedTime, Taken, UnstampedTime
-from edgevpr.frames.decoding import Fetched, TransportError, WholePictures, open_pictures
+from edgevpr.frames.age import HIDDEN_DELAY_SD_S, CaptureTime, StampedTime, UnstampedTime
+from edgevpr.frames.decoding import TimedPacket, TransportError, VideoDecoder, open_decoder
 from edgevpr.frames.rtp import describe_rtp
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, StreamFacts
-from edgevpr.frames.webpictures import AnswerFile, Snapshots, try_request
+from edgevpr.frames.webpictures import ResponseFile, SnapshotCapture, try_request
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
@@ -30,14 +30,14 @@ _OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2", "fpsprobesize": 
 _UDP_OPTIONS = {"rtsp_transport": "udp", "fpsprobesize": "0"}
 _SDP_OPTIONS = {"protocol_whitelist": "data,file,rtp,udp"}
 _RAW_OPTIONS = {"analyzeduration": "1", "fpsprobesize": "0"}  # else FFmpeg watches for its rate for up to 5 s
-_BEHIND_S = 0.3  # a packet that has waited longer for decoding is skipped if a later key frame has arrived
-_TOO_OLD_S = 5.0  # a packet that has waited longer for decoding is skipped in any case
-_WAITING_BYTES = 16_000_000  # most bytes of packets that wait for decoding: five seconds of 25 Mbit/s
-_WAITING_PACKETS = 2000
-_CLOSE_S = 0.5  # longest wait for a stream to be closed
+_SKIPPABLE_AGE_S = 0.3  # a packet that has waited longer for decoding is skipped if a later key frame has arrived
+_MAX_PACKET_AGE_S = 5.0  # a packet that has waited longer for decoding is skipped in any case
+_MAX_QUEUED_BYTES = 16_000_000  # most bytes of packets that wait for decoding: five seconds of 25 Mbit/s
+_MAX_QUEUED_PACKETS = 2000
+_CLOSE_TIMEOUT_S = 0.5  # longest wait for a stream to be closed
 
 
-def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "StreamCapture | Snapshots":
+def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "StreamCapture | SnapshotCapture":
     """Open a network stream, an .sdp file, or an address of a single picture, which is then requested every `period_s`
     seconds. `clock` is the monotonic clock, in seconds. Raises OpeningError with the cause."""
     opened_s = clock()
@@ -45,18 +45,18 @@ def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "Stre
     kind = answer.headers.get_content_type() if answer else ""
     timeouts_s = OPEN_TIMEOUT_S, READ_TIMEOUT_S
     if answer and kind.startswith("multipart/"):
-        parts = AnswerFile(answer, is_multipart=True)
-        return StreamCapture(open_pictures(uri, _RAW_OPTIONS, timeouts_s, "mpjpeg", parts), clock, opened_s)
+        parts = ResponseFile(answer, is_multipart=True)
+        return StreamCapture(open_decoder(uri, _RAW_OPTIONS, timeouts_s, "mpjpeg", parts), clock, opened_s)
     if answer and kind == "application/octet-stream":  # of FFmpeg as a server, which would answer no second request
-        file = AnswerFile(answer, is_multipart=False)
-        return StreamCapture(open_pictures(uri, _OPTIONS, timeouts_s, file=file), clock, opened_s)
+        file = ResponseFile(answer, is_multipart=False)
+        return StreamCapture(open_decoder(uri, _OPTIONS, timeouts_s, file=file), clock, opened_s)
     if answer:
         answer.close()
     if kind.startswith("image/"):
-        return Snapshots(uri, period_s, OPEN_TIMEOUT_S, clock)
+        return SnapshotCapture(uri, period_s, OPEN_TIMEOUT_S, clock)
     if kind == "text/html":
         raise OpeningError(f"no video at this address, but {kind}")
-    return StreamCapture(_open(uri), clock, opened_s)
+    return StreamCapture(_open_stream(uri), clock, opened_s)
 
 
 def open_raw(
@@ -65,22 +65,22 @@ def open_raw(
     """Open a stream of a format without time stamps, `form` by its name in FFmpeg, whose first picture is waited for
     `timeout_s` seconds. `delay_sd_s`: see `Shot`. Raises OpeningError with the cause."""
     opened_s = clock()
-    whole = open_pictures(uri, _RAW_OPTIONS, (timeout_s, READ_TIMEOUT_S), form)
+    whole = open_decoder(uri, _RAW_OPTIONS, (timeout_s, READ_TIMEOUT_S), form)
     return StreamCapture(whole, clock, opened_s, delay_sd_s)
 
 
-def _open(uri: str) -> WholePictures:
+def _open_stream(uri: str) -> VideoDecoder:
     udp_timeouts_s = OPEN_TIMEOUT_S, UDP_READ_TIMEOUT_S
     if "://" not in uri:
-        return open_pictures(uri, _SDP_OPTIONS, udp_timeouts_s)
+        return open_decoder(uri, _SDP_OPTIONS, udp_timeouts_s)
     if uri.lower().startswith(("udp:", "rtp:")):
         if sdp := describe_rtp(uri, OPEN_TIMEOUT_S):
-            return open_pictures(sdp, _SDP_OPTIONS, udp_timeouts_s, "sdp")
-        return open_pictures(uri, _OPTIONS, udp_timeouts_s)
+            return open_decoder(sdp, _SDP_OPTIONS, udp_timeouts_s, "sdp")
+        return open_decoder(uri, _OPTIONS, udp_timeouts_s)
     try:
-        return open_pictures(uri, _OPTIONS, (OPEN_TIMEOUT_S, READ_TIMEOUT_S))
+        return open_decoder(uri, _OPTIONS, (OPEN_TIMEOUT_S, READ_TIMEOUT_S))
     except TransportError:
-        return open_pictures(uri, _UDP_OPTIONS, udp_timeouts_s)
+        return open_decoder(uri, _UDP_OPTIONS, udp_timeouts_s)
 
 
 class StreamCapture:
@@ -89,7 +89,7 @@ class StreamCapture:
 
     def __init__(
         self,
-        whole: WholePictures,
+        whole: VideoDecoder,
         clock: Callable[[], float],
         opened_s: float,
         delay_sd_s: float = HIDDEN_DELAY_SD_S,
@@ -98,7 +98,7 @@ class StreamCapture:
         self._stamped = StampedTime() if whole.is_stamped else None
         self._unstamped = UnstampedTime(opened_s)
         self._ready: deque[Shot | Refusal] = deque()
-        self._arrivals = Arrivals(whole.fetch, clock, whole.close)
+        self._arrivals = PacketQueue(whole.fetch, clock, whole.close)
 
     @property
     def facts(self) -> StreamFacts:
@@ -115,7 +115,7 @@ class StreamCapture:
                 self._follow_stamps(self._stamped, arrival)
             taken = self._unstamped.taken(arrival.asked_s, arrival.came_s)
             waited_s = self._clock() - arrival.came_s
-            if waited_s > _TOO_OLD_S or (waited_s > _BEHIND_S and self._arrivals.can_begin_anew()):
+            if waited_s > _MAX_PACKET_AGE_S or (waited_s > _SKIPPABLE_AGE_S and self._arrivals.can_begin_anew()):
                 return self._whole.skip()
             pictures = self._whole.decode(arrival)
             if isinstance(pictures, Refusal):
@@ -131,7 +131,7 @@ class StreamCapture:
         self.cancel()
         self._arrivals.close()
 
-    def _follow_stamps(self, stamped: StampedTime, arrival: Fetched) -> None:
+    def _follow_stamps(self, stamped: StampedTime, arrival: TimedPacket) -> None:
         packet, unit_s = arrival.packet, self._whole.unit_s
         if packet.pts is None:
             return
@@ -140,8 +140,8 @@ class StreamCapture:
         if stamped.is_live:
             self._whole.is_backlog_doubtful = False  # packets from now on were sent after the opening
 
-    def _make_shot(self, picture: "VideoFrame", by_wait: Taken, came_s: float) -> Shot | Refusal:
-        taken: Taken | None = by_wait
+    def _make_shot(self, picture: "VideoFrame", by_wait: CaptureTime, came_s: float) -> Shot | Refusal:
+        taken: CaptureTime | None = by_wait
         if self._stamped:
             taken = None if picture.pts is None else self._stamped.taken(picture.pts * self._whole.unit_s, came_s)
         if taken is None:
@@ -151,7 +151,7 @@ class StreamCapture:
         return Shot(look=look, pixels=pixels, **times)
 
 
-class Arrivals:
+class PacketQueue:
     """A queue filled by a thread that fetches packets as soon as they come. If the board decodes too slowly, packets
     wait in this queue, with known arrival times, and not in network buffers, where the time would be unknown. If more
     wait than are decoded in time, all are dropped, and those to come up to the next key frame.
@@ -160,10 +160,10 @@ class Arrivals:
     be interrupted, and closing a stream in use would crash the process."""
 
     def __init__(
-        self, fetch: Callable[[], Fetched | None], clock: Callable[[], float], close_stream: Callable[[], None]
+        self, fetch: Callable[[], TimedPacket | None], clock: Callable[[], float], close_stream: Callable[[], None]
     ) -> None:
         self._fetch, self._clock, self._close_stream = fetch, clock, close_stream
-        self._waiting: deque[Fetched] = deque()
+        self._waiting: deque[TimedPacket] = deque()
         self._waiting_bytes = 0
         self._has_gap = self._is_lost = False
         self._changed = threading.Condition()
@@ -171,7 +171,7 @@ class Arrivals:
         self._thread = threading.Thread(target=self._run, name="fetch", daemon=True)
         self._thread.start()
 
-    def next(self) -> Fetched | None:
+    def next(self) -> TimedPacket | None:
         """Wait for the next packet and return it; None if the stream is lost or cancelled."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._is_lost)
@@ -198,7 +198,7 @@ class Arrivals:
         the stream may be used any more."""
         self.cancel()
         self._is_unused.set()
-        self._thread.join(_CLOSE_S)
+        self._thread.join(_CLOSE_TIMEOUT_S)
 
     def _run(self) -> None:
         try:
@@ -215,9 +215,9 @@ class Arrivals:
             self._is_unused.wait()
             self._close_stream()
 
-    def _put(self, arrival: Fetched) -> None:
+    def _put(self, arrival: TimedPacket) -> None:
         with self._changed:
-            if self._waiting_bytes > _WAITING_BYTES or len(self._waiting) > _WAITING_PACKETS:
+            if self._waiting_bytes > _MAX_QUEUED_BYTES or len(self._waiting) > _MAX_QUEUED_PACKETS:
                 self._clear()
                 self._has_gap = True
             if self._is_lost or (self._has_gap and not arrival.packet.is_keyframe):

@@ -17,7 +17,7 @@ _MAX_OFFSET_SHARE = 0.04  # of its height, by how the lenses are mounted
 _PEAK_RADIUS_PX = 4.0
 # Chosen on 975 pictures of 14 sets and on stereo pictures made of them, with another exposure, turned by half a degree,
 # shifted, squeezed and noisy: 96 % of these reach both, and none of the ordinary ones (the nearest: 0.46 and 0.13).
-_TWIN_CORRELATION = 0.5
+_MIN_TWIN_CORRELATION = 0.5
 _MIN_LEAD = 0.15  # over correlations farther from the largest one; lines (a road) and rows (crops) have none
 _MIN_DETAIL_LEVELS = 1.5  # standard deviation in grey levels; with less, nothing can be compared
 _TWINS_TO_DECIDE = 5  # pictures that look like twins, more than single ones
@@ -38,9 +38,9 @@ class TwinCheck:
         if self._evidence == -_SINGLES_TO_DECIDE:
             return image
         by_side = {side: correlate_halves(image, side) for side in _HALVES}
-        twins = [side for side, (best, lead) in by_side.items() if best >= _TWIN_CORRELATION and lead >= _MIN_LEAD]
+        twins = [side for side, (best, lead) in by_side.items() if best >= _MIN_TWIN_CORRELATION and lead >= _MIN_LEAD]
         has_detail = all(best > 0 for best, _ in by_side.values())
-        is_single = has_detail and all(best < _TWIN_CORRELATION for best, _ in by_side.values())
+        is_single = has_detail and all(best < _MIN_TWIN_CORRELATION for best, _ in by_side.values())
         self._evidence = min(self._evidence + bool(twins) - is_single, _TWINS_TO_DECIDE)
         self._twins = twins or self._twins
         self._are_twins = self._evidence == _TWINS_TO_DECIDE or (self._are_twins and self._evidence > 0)
@@ -58,7 +58,7 @@ def correlate_halves(image: Image, side: str) -> tuple[float, float]:
     are_above = side == _HALVES[1]
     copy = resize(image, _COPY_PX)
     grey = copy if copy.ndim == 2 else copy[:, :, 1]
-    first, second = (_details(half) for half in np.array_split(grey, 2, 0 if are_above else 1))
+    first, second = (_extract_detail(half) for half in np.array_split(grey, 2, 0 if are_above else 1))
     height, width = first.shape
     dy, dx = height // 4, width // 4
     middle = second[dy:-dy, dx:-dx]
@@ -73,6 +73,6 @@ def correlate_halves(image: Image, side: str) -> tuple[float, float]:
     return best, best - float(correlations[is_elsewhere].max())
 
 
-def _details(half: Image) -> NDArray[np.float32]:
+def _extract_detail(half: Image) -> NDArray[np.float32]:
     grey = half.astype(np.float32)
     return grey - cv2.GaussianBlur(grey, (0, 0), _DETAIL_SIGMA_PX)

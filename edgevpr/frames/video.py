@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.core.types import Frame
-from edgevpr.frames.decoding import WholePictures, open_pictures
+from edgevpr.frames.decoding import VideoDecoder, open_decoder
 from edgevpr.frames.positions import GeoTag, Track, parse_time
 from edgevpr.frames.shot import OpeningError, Refusal
 from edgevpr.frames.source import RecordingSource, make_frame
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
 _TIMESTAMP_ROUNDING_S = 0.001  # Matroska counts in milliseconds
-_USUAL_RATE_HZ = 25.0
-_CUT_S = 1.0  # seconds that may be missing at the end: other streams in the file may last a little longer
+_DEFAULT_RATE_HZ = 25.0
+_MAX_MISSING_S = 1.0  # seconds that may be missing at the end: other streams in the file may last a little longer
 
 
 def read_start_s(path: Path) -> tuple[float | None, float]:
@@ -34,9 +34,9 @@ def read_start_s(path: Path) -> tuple[float | None, float]:
     return None, lasts_s
 
 
-def _open_video(path: Path, wanted: str) -> WholePictures:
+def _open_video(path: Path, wanted: str) -> VideoDecoder:
     try:
-        return open_pictures(str(path), {})
+        return open_decoder(str(path), {})
     except OpeningError:
         raise SourceError(f"{path} is not a video that can be decoded: give {wanted}.") from None
 
@@ -62,7 +62,7 @@ class VideoSource(RecordingSource):
         self._whole = whole = _open_video(path, "a video file or a folder of images")
         stream = whole.stream
         self._first_stamp = stream.start_time or 0
-        self._frame_s = 1 / float(stream.average_rate or _USUAL_RATE_HZ)
+        self._frame_s = 1 / float(stream.average_rate or _DEFAULT_RATE_HZ)
         lasts_s = stream.duration * whole.unit_s if stream.duration else (whole.container.duration or 0) / 1e6
         stated_s = lasts_s if whole.is_stamped else 0.0
         frames = stream.frames or stated_s / self._frame_s
@@ -134,7 +134,7 @@ class VideoSource(RecordingSource):
             self._report_damage(until=", to the end of the file, which may be cut short")
         self.end()
         missing_s = self._promised_s - self._read_s - self._frame_s
-        if missing_s > _CUT_S:
+        if missing_s > _MAX_MISSING_S:
             raise ImageError(
                 f"{self._path} ends after {self._promised_s - missing_s:.1f} s of {self._promised_s:.1f} s: it is cut "
                 "short: copy the video again.",

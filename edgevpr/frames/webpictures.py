@@ -1,5 +1,5 @@
 """Pictures over HTTP that FFmpeg does not read as a stream: an address of one picture, requested again and again
-(`Snapshots`), and a multipart stream whose parts may be of any image type (`AnswerFile`)."""
+(`SnapshotCapture`), and a multipart stream whose parts may be of any image type (`ResponseFile`)."""
 
 import http.client
 import re
@@ -14,8 +14,8 @@ from edgevpr.core.errors import ImageError
 from edgevpr.core.types import FRAME_TIME_SD_S
 from edgevpr.frames.age import HIDDEN_DELAY_SD_S
 from edgevpr.frames.depth import DepthRange
-from edgevpr.frames.images import decode_image, encode_jpeg, jpeg_is_whole
-from edgevpr.frames.shot import OpeningError, Refusal, Shot, coarse
+from edgevpr.frames.images import decode_image, encode_jpeg, is_whole_jpeg
+from edgevpr.frames.shot import OpeningError, Refusal, Shot, make_thumbnail
 
 _MAX_BYTES = 64_000_000  # of one picture
 _MAX_PART_S = 15.0  # for one picture of a multipart stream: a sender that trickles must not hold a thread for ever
@@ -23,12 +23,12 @@ _CHUNK_BYTES = 65536
 _MAX_PERIOD_S = 1.0  # from one request for a picture to the next
 _JPEG_START = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
-_FAILURES = (OSError, http.client.HTTPException, ValueError)
+_REQUEST_ERRORS = (OSError, http.client.HTTPException, ValueError)
 
 
-def request(uri: str, timeout_s: float) -> http.client.HTTPResponse:
+def send_request(uri: str, timeout_s: float) -> http.client.HTTPResponse:
     """Return the answer to a request for `uri`, http or https, that may hold user and password. `timeout_s` limits each
-    wait. Raises one of `_FAILURES`."""
+    wait. Raises one of `_REQUEST_ERRORS`."""
     parts = urlsplit(uri)
     account, _, host = parts.netloc.rpartition("@")
     address = parts._replace(netloc=host).geturl()
@@ -51,14 +51,14 @@ def request(uri: str, timeout_s: float) -> http.client.HTTPResponse:
 def try_request(uri: str, timeout_s: float) -> http.client.HTTPResponse | None:
     """Request `uri`; None if that fails, for a cause that FFmpeg can find. Raises OpeningError if nothing answers."""
     try:
-        return request(uri, timeout_s)
-    except _FAILURES as error:
+        return send_request(uri, timeout_s)
+    except _REQUEST_ERRORS as error:
         if isinstance(getattr(error, "reason", error), TimeoutError):
             raise OpeningError(f"no answer within {timeout_s:g} s") from None
     return None
 
 
-class Snapshots:
+class SnapshotCapture:
     """A `Capture` that requests the picture at `uri` every `period_s` seconds. Its time is that of the request, as most
     cameras take it then. One that gave the same file twice keeps a picture ready, which may be as old as the request
     before."""
@@ -74,13 +74,13 @@ class Snapshots:
         before_s, self._asked_s = self._asked_s, self._clock()
         self._due_s = self._asked_s + self._period_s
         try:
-            with request(self._uri, self._timeout_s) as answer:
+            with send_request(self._uri, self._timeout_s) as answer:
                 data = answer.read(_MAX_BYTES)
             answered_s = self._clock()
             image = decode_image(data, "the snapshot", self._depth)
         except ImageError:
             return Refusal.DAMAGED
-        except _FAILURES:
+        except _REQUEST_ERRORS:
             return None
         self._is_kept = self._is_kept or data == self._data
         self._data = data
@@ -88,7 +88,7 @@ class Snapshots:
         taken_s = before_s if self._is_kept else self._asked_s
         sd_s = max(FRAME_TIME_SD_S, self._period_s if self._is_kept else answered_s - self._asked_s)
         times = {"t_mono_s": taken_s, "t_sd_s": sd_s, "delay_sd_s": HIDDEN_DELAY_SD_S}
-        return Shot(look=coarse(plane), pixels=lambda: image, **times)
+        return Shot(look=make_thumbnail(plane), pixels=lambda: image, **times)
 
     def cancel(self) -> None:
         """Do nothing: a request lasts a few seconds at most."""
@@ -97,7 +97,7 @@ class Snapshots:
         """Do nothing: no connection is open between two requests."""
 
 
-class AnswerFile:
+class ResponseFile:
     """A file of what comes in the `answer` to a request, without waiting for more than that, and for `is_multipart` as
     FFmpeg can read it: each part an image/jpeg. It ends if the connection is lost."""
 
@@ -113,7 +113,7 @@ class AnswerFile:
 
 
 def _read_chunks(answer: http.client.HTTPResponse) -> Iterator[bytes]:
-    with suppress(*_FAILURES):
+    with suppress(*_REQUEST_ERRORS):
         while chunk := answer.read1(_CHUNK_BYTES):
             yield chunk
 
@@ -145,7 +145,7 @@ def _find_end(seen: bytearray, part: re.Match[bytes], boundary: bytes) -> int:
         return end if end <= len(seen) else 0
     end = start
     while seen.startswith(_JPEG_START, start) and (end := seen.find(_JPEG_END, end) + 2) >= 2:
-        if jpeg_is_whole(bytes(seen[start:end])):
+        if is_whole_jpeg(bytes(seen[start:end])):
             return end
     next_part = re.search(rb"\r?\n--" + boundary, seen[start:])
     return start + next_part.start() if next_part else 0

@@ -25,7 +25,7 @@ from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.text import show_elapsed
 from edgevpr.frames.exif import read_exif, read_fov_deg, read_xmp
 from edgevpr.frames.images import list_images, read_image
-from edgevpr.frames.mask import Mask
+from edgevpr.frames.mask import OverlayMask
 from edgevpr.frames.positions import find_positions, find_track, read_positions, read_track
 from edgevpr.frames.source import Source, open_source, read_to_end
 from edgevpr.mapmaking.pictures import FlownPictures
@@ -106,7 +106,7 @@ def suggest_lens(pictures: FlownPictures, config: SourceConfig, technique: Techn
 
 
 @show_elapsed("looking where the camera looks")
-def require_ahead(pictures: FlownPictures, mask: Mask | None) -> None:
+def require_ahead(pictures: FlownPictures, mask: OverlayMask | None) -> None:
     """Log that the camera is taken to look ahead, and why. Raises UsageError if the pictures clearly look straight
     down: the user must say then what is meant."""
     tilt_deg = _gimbal_tilt_deg(pictures.folder) if pictures.folder else None
@@ -145,7 +145,7 @@ def require_level(pictures: FlownPictures, fov_deg: float | None) -> None:
         )
 
 
-def _compare_neighbours(pictures: FlownPictures, mask: Mask | None) -> tuple[bool, str]:
+def _compare_neighbours(pictures: FlownPictures, mask: OverlayMask | None) -> tuple[bool, str]:
     """Compare neighbouring pictures. Returns whether they clearly look down, and what was found, as text."""
     folder = pictures.folder
     runs = map(_read_usable, _runs(folder)) if folder else [_read_film(pictures.source, _FILM_PICTURES)]
@@ -167,7 +167,7 @@ def _compare_neighbours(pictures: FlownPictures, mask: Mask | None) -> tuple[boo
 
 
 @show_elapsed("looking for a display")
-def warn_of_display(pictures: FlownPictures, mask: Mask | None) -> None:
+def warn_of_display(pictures: FlownPictures, mask: OverlayMask | None) -> None:
     """Warn if something stands still in the pictures where `mask` shows ground (None: everywhere)."""
     if pictures.folder:
         paths = list_images(pictures.folder)
@@ -185,7 +185,7 @@ def warn_of_display(pictures: FlownPictures, mask: Mask | None) -> None:
         _log.warning(text, 100 * share)
 
 
-def measure_still_share(images: Iterable[Image], mask: Mask | None) -> float | None:
+def measure_still_share(images: Iterable[Image], mask: OverlayMask | None) -> float | None:
     """Return the share (0..1) of the pixels of `images` that lie on an edge that stands still, where `mask` shows
     ground (None: everywhere). None if they are too few to tell, or if the camera itself stood still."""
     count, allowed = 0, np.ones(_DISPLAY_SHAPE, bool)

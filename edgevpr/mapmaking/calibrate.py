@@ -24,7 +24,7 @@ from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
 from edgevpr.core.types import Frame
-from edgevpr.frames.level import Levelled
+from edgevpr.frames.level import LevelledImage
 from edgevpr.mapmaking.changes import change_picture
 from edgevpr.mapmaking.look_alikes import MapSearch, measure_look_alikes
 from edgevpr.mapmaking.mapping import Watch
@@ -81,7 +81,7 @@ def ask(
     index: PlaceIndex,
     rule: AcceptRule,
     meter: QueryMeter,
-    pictures: Iterable[tuple[int, Levelled]],
+    pictures: Iterable[tuple[int, LevelledImage]],
     seed: int = 0,
 ) -> Iterator[MapAnswer]:
     """Run queries with changed pictures of the map's own places, in all three ways, and yield the results. `index` has
@@ -273,6 +273,6 @@ def evidence_matrix(rows: Sequence[Figures], names: Sequence[str]) -> Doubles:
     return np.array([[row[name] for name in names] for row in rows], float).reshape(len(rows), len(names))
 
 
-def _mirror(picture: Levelled) -> Levelled:
+def _mirror(picture: LevelledImage) -> LevelledImage:
     mask = None if picture.mask is None else np.ascontiguousarray(picture.mask[:, ::-1])
-    return Levelled(np.ascontiguousarray(picture.image[:, ::-1]), mask, picture.view)
+    return LevelledImage(np.ascontiguousarray(picture.image[:, ::-1]), mask, picture.view)

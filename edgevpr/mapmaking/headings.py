@@ -15,7 +15,7 @@ import numpy as np
 from edgevpr.core.arrays import Array, Doubles
 from edgevpr.core.geodesy import fit_similarity, offset_m, shorter_deg
 from edgevpr.core.types import Frame
-from edgevpr.frames.level import MAX_TILT_DEG, MAX_TILT_UNLEVELLED_DEG, Lens, level_rotation
+from edgevpr.frames.level import MAX_TILT_DEG, MAX_TILT_UNLEVELLED_DEG, Lens, compute_level_rotation
 from edgevpr.mapmaking.tilt import FEATURES, Features, detect_features, match_features
 
 _MIN_STEP_M = 3.0  # between two positions: below it their errors turn the course
@@ -44,7 +44,7 @@ def find_headings(frames: Iterable[Frame], lens: Lens) -> Iterator[Frame]:
 
 def lacks_heading(frame: Frame, lens: Lens) -> bool:
     """Tell whether a frame that is tilted by 20 to 60 degrees has no heading."""
-    tilt_deg = math.degrees(math.acos(min(1.0, float(level_rotation(frame, lens)[2, 2]))))
+    tilt_deg = math.degrees(math.acos(min(1.0, float(compute_level_rotation(frame, lens)[2, 2]))))
     return frame.heading_deg is None and MAX_TILT_UNLEVELLED_DEG < tilt_deg <= MAX_TILT_DEG
 
 
@@ -72,7 +72,7 @@ def _lay(points: Doubles, frame: Frame, lens: Lens) -> Array:
     """Return where points of an image (n, 2) lie on the ground, in heights right and down of the point under the
     camera, complex (n,)."""
     focal = 0.5 / math.tan(math.radians(lens.fov_deg) / 2)
-    rays = level_rotation(frame, lens) @ np.column_stack([points / focal, np.ones(len(points))]).T
+    rays = compute_level_rotation(frame, lens) @ np.column_stack([points / focal, np.ones(len(points))]).T
     return np.asarray((rays[0] + 1j * rays[1]) / np.maximum(rays[2], 0.1))
 
 

@@ -16,7 +16,7 @@ from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame
-from edgevpr.frames.mask import Mask
+from edgevpr.frames.mask import OverlayMask
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
@@ -71,7 +71,7 @@ class MapSearch:
     def find(self, place_id: int, image: Image, shown: Shown | None, among: PlaceIndex) -> Recognition:
         """Look for a picture of the place `place_id` among some places. `shown`, bool (H, W), is False where it shows
         no ground (None: it shows ground everywhere)."""
-        encoder = FrameEncoder(technique=self._technique, mask=None if shown is None else Mask(shown, sha256=""))
+        encoder = FrameEncoder(technique=self._technique, mask=None if shown is None else OverlayMask(shown, sha256=""))
         matcher = Matcher(among, self._rule, layers=self._layers)
         settings = WalkSettings(candidates=self._technique.candidates, all_evidence=True)
         walk = Recogniser(encoder, self._place_map, matcher, self._meter, settings=settings)

@@ -12,7 +12,7 @@ from edgevpr.core.errors import EdgevprError, ImageError, UsageError
 from edgevpr.core.text import show_elapsed
 from edgevpr.core.types import Frame
 from edgevpr.frames.level import STRAIGHT_DOWN
-from edgevpr.frames.mask import Mask, load_mask
+from edgevpr.frames.mask import OverlayMask, load_mask
 from edgevpr.frames.source import Source, read_to_end
 from edgevpr.mapmaking import advice
 from edgevpr.mapmaking.finishing import Shown, finish_map, make_encoder
@@ -148,7 +148,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
 
 
 def _open_flown(
-    order: MapOrder, pictures: FlownPictures, flown: SourceConfig, place_map: PlaceMap | None, mask: Mask | None
+    order: MapOrder, pictures: FlownPictures, flown: SourceConfig, place_map: PlaceMap | None, mask: OverlayMask | None
 ) -> tuple[Source, Technique]:
     """Open the pictures, and make the technique: the one asked for, else that of the map (`place_map` None: there is no
     map yet), else the best for the board. Raises UsageError if the camera looks down, and nobody has said so, and for

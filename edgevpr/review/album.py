@@ -57,9 +57,9 @@ class Album:
 
     def keep(self, name: str, image: Image) -> None:
         """Keep a small copy of the picture `name`, uint8 (H, W[, 3]): no file has to be read for it any more."""
-        from edgevpr.frames.images import small_jpeg
+        from edgevpr.frames.images import encode_small_jpeg
 
-        self._kept[name] = small_jpeg(image, _SIDES_PX[0])
+        self._kept[name] = encode_small_jpeg(image, _SIDES_PX[0])
 
     def image(self, name: str) -> Image | None:
         """Return the picture `name`, uint8 (H, W[, 3]); None if there is none that can be read."""
@@ -210,7 +210,7 @@ def small_pictures(
     """Load the pictures of all steps as data: addresses, in `room_bytes` together: each as large as its share of them
     allows, and if that is too little, those of every second, third, ... step. Returns them by their keys, and a
     sentence on what is left out ("": nothing)."""
-    from edgevpr.frames.images import small_webp
+    from edgevpr.frames.images import encode_small_webp
 
     keys = list(dict.fromkeys(key for step in steps for key in step if albums[key[0]]))
     every = max(1, -(-len(keys) * _MIN_BYTES // max(1, int(room_bytes))))
@@ -222,7 +222,7 @@ def small_pictures(
         if image is None:
             continue
         for side_px in _SIDES_PX:
-            address = f"data:image/webp;base64,{b64encode(small_webp(image, side_px)).decode()}"
+            address = f"data:image/webp;base64,{b64encode(encode_small_webp(image, side_px)).decode()}"
             if len(address) <= room_bytes / (len(keys) - number):
                 break
         if len(address) <= room_bytes:

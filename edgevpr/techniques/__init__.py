@@ -15,7 +15,7 @@ from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.text import suggest
 
 # The class or function that makes each technique of edgevpr itself.
-_OWN = {
+_FACTORIES = {
     "cohog": "cohog:CoHog",
     "hog": "vectors:Hog",
     "seqslam": "seqslam:SeqSlam",
@@ -30,15 +30,15 @@ _OWN = {
 }
 # Chosen without being asked for: the first that fits the board. Networks must be asked for: they need onnxruntime in
 # RAM, and weights that a person has chosen. So must `seqslam`: a sequence needs a flight along the mapped route.
-AUTOMATIC = ("cohog", "hog")
-WITH_CONFIDENCE = "cohog"  # whose matches have a confidence, where its spec is not at hand
-_WORDS = {int: "a whole number", float: "a number", str: "a word"}
+DEFAULT_TECHNIQUES = ("cohog", "hog")
+CONFIDENCE_TECHNIQUE = "cohog"  # whose matches have a confidence, where its spec is not at hand
+_TYPE_NAMES = {int: "a whole number", float: "a number", str: "a word"}
 
 
-def names() -> tuple[str, ...]:
+def list_techniques() -> tuple[str, ...]:
     """Return the names of all techniques: those of edgevpr, then the networks whose cards make a vector by themselves.
     A card that cannot be read is left out."""
-    from edgevpr.techniques.card import card_names, load_card
+    from edgevpr.techniques.card import list_cards, load_card
 
     def is_technique(card: str) -> bool:
         try:
@@ -46,25 +46,25 @@ def names() -> tuple[str, ...]:
         except EdgevprError:
             return False
 
-    return (*_OWN, *(name for name in card_names() if not is_own(name) and is_technique(name)))
+    return (*_FACTORIES, *(name for name in list_cards() if not is_builtin(name) and is_technique(name)))
 
 
-def is_own(name: str) -> bool:
+def is_builtin(name: str) -> bool:
     """Tell whether `name` is one of edgevpr's own techniques. A card of that name then only supplies its weights."""
-    return name in _OWN
+    return name in _FACTORIES
 
 
 def is_known(name: str) -> bool:
     """Tell whether `name` is a technique or the card of a network."""
-    from edgevpr.techniques.card import card_names
+    from edgevpr.techniques.card import list_cards
 
-    return name in _OWN or name in card_names()
+    return name in _FACTORIES or name in list_cards()
 
 
-def parameters(name: str) -> dict[str, Any]:
+def read_parameters(name: str) -> dict[str, Any]:
     """Return the parameters of the technique `name`, each with its default. Raises UsageError for an unknown technique
     or a network that gives feature maps only, ModelError for a card that cannot be read."""
-    return {key: p.default for key, p in inspect.signature(_maker(name)).parameters.items()}
+    return {key: p.default for key, p in inspect.signature(_find_factory(name)).parameters.items()}
 
 
 def format_name(name: str, form: str | None) -> str:
@@ -73,10 +73,10 @@ def format_name(name: str, form: str | None) -> str:
     return name if form in (None, "float") else f"{name} {form}"
 
 
-def network_output(name: str) -> str | None:
+def find_network_output(name: str) -> str | None:
     """Return the output, "features" or "descriptor", that a technique of edgevpr uses of the network which its
     parameter `model` names. None for a technique without this parameter."""
-    if "model" not in parameters(name):
+    if "model" not in read_parameters(name):
         return None
     return "descriptor" if name == "calc" else "features"
 
@@ -85,7 +85,7 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
     """Make the technique `name`. `settings` are values of its parameters by name (None: all defaults); a text is
     converted to the type of its parameter. Raises UsageError for an unknown technique or parameter, a value that cannot
     be read, or one out of range, and ModelError for a network that cannot be used."""
-    defaults = parameters(name)
+    defaults = read_parameters(name)
     values = {}
     for key, value in (settings or {}).items():
         if key not in defaults:
@@ -95,19 +95,19 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
         try:
             values[key] = kind(value)
         except ValueError:
-            raise UsageError(f"{name}: `{key}` is {value!r}; it must be {_WORDS[kind]}.") from None
-    technique: Technique = _maker(name)(**values)
+            raise UsageError(f"{name}: `{key}` is {value!r}; it must be {_TYPE_NAMES[kind]}.") from None
+    technique: Technique = _find_factory(name)(**values)
     return technique
 
 
-def _maker(name: str) -> Callable[..., Any]:
+def _find_factory(name: str) -> Callable[..., Any]:
     """Return the class or function that makes the technique `name`; its arguments are the technique's parameters.
-    Raises as `parameters` does."""
-    if is_own(name):
-        own: Callable[..., Any] = resolve_name(f"edgevpr.techniques.{_OWN[name]}")
+    Raises as `read_parameters` does."""
+    if is_builtin(name):
+        own: Callable[..., Any] = resolve_name(f"edgevpr.techniques.{_FACTORIES[name]}")
         return own
     if not is_known(name):
-        raise UsageError(f"There is no technique `{name}`: use one of {', '.join(names())}.")
+        raise UsageError(f"There is no technique `{name}`: use one of {', '.join(list_techniques())}.")
     from edgevpr.techniques.card import load_card
 
     card = load_card(name)

@@ -17,7 +17,7 @@ from edgevpr.core.files import find_model, model_folders
 from edgevpr.core.text import suggest
 from edgevpr.core.yamlfile import read_yaml
 
-_ADDED_LATER = ("pad", "boxes", "memorability")  # keys, see _used
+_LATER_KEYS = ("pad", "boxes", "memorability")  # keys, see _used
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,10 +105,10 @@ def compute_digest(values: list[Any]) -> str:
 def _drop_unknown_keys(part: InputRule | Outputs) -> dict[str, Any]:
     """Return a section of a card as a dict, without the keys added in later versions that the card does not use, so
     that its fingerprint stays the same in all versions."""
-    return {key: value for key, value in asdict(part).items() if value is not None or key not in _ADDED_LATER}
+    return {key: value for key, value in asdict(part).items() if value is not None or key not in _LATER_KEYS}
 
 
-def card_names() -> tuple[str, ...]:
+def list_cards() -> tuple[str, ...]:
     """Return the names of all cards in the user's folder and the shipped one, including cards that cannot be read."""
     return tuple(sorted({path.stem for folder in model_folders() for path in folder.glob("*.yaml")}))
 
@@ -120,13 +120,13 @@ def load_card(name: str) -> Card:
             return read_card(path)
         except ConfigError as error:  # one network cannot be used; the user's request is not wrong
             raise ModelError(str(error)) from error
-    known = ", ".join(card_names()) or "there are none yet"
+    known = ", ".join(list_cards()) or "there are none yet"
     raise ModelError(
-        f"There is no model `{name}`: " + suggest(name, card_names(), f"use one of `edgevpr models list` ({known}).")
+        f"There is no model `{name}`: " + suggest(name, list_cards(), f"use one of `edgevpr models list` ({known}).")
     )
 
 
-def find_weights(spec: TechniqueSpec) -> str | None:
+def describe_weights(spec: TechniqueSpec) -> str | None:
     """Return a line for people on the weights that a technique uses: name, title, licence and source of the network's
     card. None: the technique has no network."""
     if spec.model_sha256 is None:
@@ -138,12 +138,12 @@ def find_weights(spec: TechniqueSpec) -> str | None:
 def read_card(path: Path) -> Card:
     """Read one card. Raises ConfigError or ModelError for a card that is not valid."""
     card = build(Card, {"path": path, **read_yaml(path)}, str(path))
-    for problem in _problems(card):
+    for problem in _find_problems(card):
         raise ModelError(f"{path}: {problem}")
     return card
 
 
-def _problems(card: Card) -> Iterator[str]:
+def _find_problems(card: Card) -> Iterator[str]:
     """Yield a sentence for each fault of a card that the checks of types and ranges cannot find, with its remedy."""
     boxes, rule, channels = card.outputs.boxes, card.detector, 1 if card.input.colour == "grey" else 3
     per_channel = f"write one number or {channels}, one a channel"

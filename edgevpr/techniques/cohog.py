@@ -28,31 +28,37 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.techniques import layout, overlay, placecode
 from edgevpr.techniques.contrast import stretch_contrast
-from edgevpr.techniques.displacement import centre_regions, find_most_similar, fit_alignment, share, vote
-from edgevpr.techniques.entropy import block_means, good_blocks
+from edgevpr.techniques.displacement import (
+    compute_vote_share,
+    find_most_similar,
+    fit_alignment,
+    locate_regions,
+    match_view,
+)
+from edgevpr.techniques.entropy import average_blocks, find_good_blocks
 from edgevpr.techniques.gradients import (
-    grey_square,
-    levels,
-    mask_square,
+    make_grey_square,
+    make_mask_square,
+    make_slow_patterns,
     normalise_blocks,
+    normalise_rows,
     orient_cells,
     pad_to_square,
-    slow_patterns,
-    unit_rows,
+    round_levels,
 )
 from edgevpr.techniques.layout import ROTATIONS
 from edgevpr.techniques.perspective import fit_perspective
-from edgevpr.techniques.views import HEIGHT_RATIOS, ViewRegions, Views, compute_scale, hypothesis
+from edgevpr.techniques.views import HEIGHT_RATIOS, QueryViews, ViewRegions, compute_scale, decode_hypothesis
 
 # The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
 _DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
 # Weight of a vote that is 0, 1, 2 ... cells off the peak. With a forward camera, near and far ground move by different
 # steps; with a nadir camera (one that looks straight down) the step is known more exactly.
-_VOTES_COUNT = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
+_VOTE_WEIGHTS = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
 # (min_score, min_margin), by which sequences are judged: of corridor, the seasons and nordland_tiny no sequence of ten
 # was accepted elsewhere. The thesis's score has no safe threshold: its margin rejects queries of two other sites in the
 # map of aerial_caliterra, and most right matches too.
-_ACCEPT = {"forward": (0.02, 0.01), "nadir": (0.02, 0.01), "thesis": (0.0, 0.02)}
+_ACCEPT_LIMITS = {"forward": (0.02, 0.01), "nadir": (0.02, 0.01), "thesis": (0.0, 0.02)}
 # Least quality. On the tuning sets, accepted pictures that show nothing had .39 or less, and real ones, washed out or
 # covered, that were taken for a wrong place .43 or less; right matches had .91 or more (on the other sites .72 or more,
 # and .47 where pictures have 64 x 32 pixels). With `filled_bins` it was .14, .18 and .30.
@@ -67,19 +73,20 @@ _CANDIDATES = {"forward": 42, "nadir": 30}
 # Places compared in full, those with the best `score_quickly`. Ahead it looks at one of so many good regions: on
 # corridor, the seasons and nordland_tiny 12 of 42 find as many places as all of them compared in full (of the 994 of
 # nordland_tiny four fewer). Looking down 6 of 30 find as many as 10 on sat_marash, aerial_swindale and kite_ochota.
-_IN_FULL, _GLANCE = {"forward": 12, "nadir": 6}, 4
-_BINS_DOWN = 8  # orientations of the regions whose patterns make a layout
+_MAX_FULL_MATCHES = {"forward": 12, "nadir": 6}
+_QUICK_STEP = 4
+_NADIR_BINS = 8  # orientations of the regions whose patterns make a layout
 # Agreement of the layouts of query and place at which the share of votes alone is the score. Right matches on
 # sat_marash have .18 to .38, those of one season up to .5. At .35 one foreign picture was accepted in the map of
 # aerial_caliterra, from .4 on none in the maps of sat_marash, kite_ochota, aerial_swindale and aerial_caliterra.
-_LAYOUT_AGREES = 0.45
+_FULL_LAYOUT_AGREEMENT = 0.45
 # What counts as around a region in the structure of a picture (see `overlay`). Ahead, things are larger.
-_AROUND_CELLS = {"forward": 5.0, "nadir": 3.0}
-_TURNED_DEG = 45.0  # a rotation from which on a picture lies otherwise
+_SURROUND_SD_CELLS = {"forward": 5.0, "nadir": 3.0}
+_MIN_ROTATED_DEG = 45.0  # a rotation from which on a picture lies otherwise
 # A match whose structures agree by the second figure keeps its score; below the first one they count as this much.
 # Foreign pictures have at most 4.9 ahead and 2.7 looking down; in corridor, built alike all along, wrong places 9.9.
-_STRUCTURE = {"forward": (1.0, 6.0), "nadir": (1.0, 3.0)}
-_HEADING_WITHIN_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on either side
+_STRUCTURE_LIMITS = {"forward": (1.0, 6.0), "nadir": (1.0, 3.0)}
+_MAX_HEADING_OFF_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on either side
 
 
 @dataclass(eq=False, kw_only=True)
@@ -108,7 +115,7 @@ class CoHog:
         self._side = self.w1 // self.w2 - 1  # blocks along one side
         self._is_nadir, self._votes = self.camera == "nadir", self.matching == "displacement"
         tells_height = self._is_nadir and self._votes  # the thesis's score does not say which of two heights is right
-        self.min_score, self.min_margin = _ACCEPT[self.camera if self._votes else "thesis"]
+        self.min_score, self.min_margin = _ACCEPT_LIMITS[self.camera if self._votes else "thesis"]
         self.min_quality = _MIN_QUALITY[self.entropy]
         self.candidates = _CANDIDATES[self.camera]
         as_it_is = HEIGHT_RATIOS.index(1.0) * ROTATIONS
@@ -116,26 +123,26 @@ class CoHog:
         if tells_height:
             self._hypotheses = range(len(HEIGHT_RATIOS) * ROTATIONS)
         # Converts blocks, float32 (N, 4 bins), to the vectors of length 1 that `matching` compares.
-        self._comparable: Callable[[Singles], Singles] = self._patterns if self._votes else unit_rows
+        self._comparable: Callable[[Singles], Singles] = self._patterns if self._votes else normalise_rows
         self._query: Descriptor | None = None
-        self._views: Views | None = None
+        self._views: QueryViews | None = None
         code = PartSpec((placecode.SIDE, placecode.SIDE, self.bins), "|u1")
         self.spec = TechniqueSpec(
             name="cohog",
             parameters={key: getattr(self, key) for key in ("w1", "w2", "bins", "gt", "entropy", "camera")},
-            coarse=PartSpec((layout.NBYTES,), "|u1") if self._is_nadir else code,
+            coarse=PartSpec((layout.PLACE_BYTES,), "|u1") if self._is_nadir else code,
             fine=PartSpec((self._side**2, 4 * self.bins), "|u1"),
             packed=None if self._is_nadir else PartSpec((placecode.SIDE**2 * self.bins // 8,), "|u1"),
             scan_counts=self._votes and not self._is_nadir,
-            heading_within_deg=_HEADING_WITHIN_DEG if self._is_nadir else None,
+            heading_within_deg=_MAX_HEADING_OFF_DEG if self._is_nadir else None,
             cells=self.w1 // self.w2 if self._votes else None,
             looks_down=tells_height,
             height_ratios=HEIGHT_RATIOS if tells_height else (),
-            in_full=_IN_FULL[self.camera] if self._votes else None,
+            in_full=_MAX_FULL_MATCHES[self.camera] if self._votes else None,
         )
 
     def _require_parameters(self) -> None:
-        allowed: dict[str, Collection[str]] = {"entropy": _DEFAULT_GT, "camera": _VOTES_COUNT, "matching": _MATCHINGS}
+        allowed: dict[str, Collection[str]] = {"entropy": _DEFAULT_GT, "camera": _VOTE_WEIGHTS, "matching": _MATCHINGS}
         for what, values in allowed.items():
             if (value := getattr(self, what)) not in values:
                 raise UsageError(f"cohog has no {what} `{value}`: use {' or '.join(sorted(values))}.")
@@ -145,8 +152,8 @@ class CoHog:
                 f"cohog cannot use w1={w1}, w2={w2}, bins={bins}: w1 must be a multiple of w2 (more than "
                 f"{placecode.SIDE} regions of at least 2 pixels, at most 4096 pixels), bins 2 to 64."
             )
-        if self.camera == "nadir" and bins != _BINS_DOWN:
-            raise UsageError(f"cohog looking down uses {_BINS_DOWN} bins, and not {bins}.")
+        if self.camera == "nadir" and bins != _NADIR_BINS:
+            raise UsageError(f"cohog looking down uses {_NADIR_BINS} bins, and not {bins}.")
         if self.gt > 1:
             raise UsageError(f"cohog: gt is {self.gt:g}; it is a share of the largest entropy, 0 to 1.")
 
@@ -158,7 +165,7 @@ class CoHog:
         float32 (blocks, 4 bins) and good bool (blocks,): the rows of matrix A of thesis 6.2.3."""
         if self._is_nadir:
             image, mask = pad_to_square(image, mask)
-        grey, allowed = grey_square(image, self.w1), mask_square(mask, self.w1)
+        grey, allowed = make_grey_square(image, self.w1), make_mask_square(mask, self.w1)
         pixel_px = self.w1 / image.shape[1], self.w1 / image.shape[0]
         grey = stretch_contrast(grey, allowed, pixel_px, *_CONTRAST[self.camera])
         blocks, seen, good = self._blocks(grey, allowed, self.w2)
@@ -169,7 +176,7 @@ class CoHog:
             # In float64 a rounded number of the layout is the same on every processor.
             coarse = layout.encode_place(self._patterns(regions.astype(np.float64)), good.ravel(), self._side)
         else:
-            coarse = np.rint(255 * placecode.grid(blocks, seen, np.ones_like(seen))[0]).astype(np.uint8)
+            coarse = np.rint(255 * placecode.make_grid(blocks, seen, np.ones_like(seen))[0]).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
         picture = Picture(grey if self._is_nadir else None, allowed, seen)
         return Descriptor(
@@ -181,19 +188,19 @@ class CoHog:
         4 bins); bool (n, n), True for seen blocks, those on `allowed` pixels only; and bool (n, n), True for good
         blocks: seen ones whose entropy is at least `gt`."""
         blocks, seen = self._all_blocks(grey, allowed, cell_px)
-        return blocks, seen, good_blocks(levels(grey), self.entropy, cell_px, self.gt, among=seen)
+        return blocks, seen, find_good_blocks(round_levels(grey), self.entropy, cell_px, self.gt, among=seen)
 
     def _all_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools]:
         """Return the first two results of `_blocks`."""
         blocks = normalise_blocks(orient_cells(grey, cell_px, self.bins, signed=True, allowed=allowed))
         if allowed is None:
             return blocks, np.ones(blocks.shape[:2], bool)
-        return blocks, block_means(allowed.astype(np.float32), cell_px) >= 1.0
+        return blocks, average_blocks(allowed.astype(np.float32), cell_px) >= 1.0
 
     def pack(self, coarse: Bytes, mean: Singles) -> Bytes:
         """Make the rows of the index in RAM, uint8 (N, B), from the coarse parts of N places, uint8 (N, 12, 12, bins),
         and the map's mean (12, 12, bins)."""
-        return placecode.pack(coarse.astype(np.float32) / 255, mean / 255)
+        return placecode.pack_grids(coarse.astype(np.float32) / 255, mean / 255)
 
     def coarse_scores(
         self,
@@ -211,13 +218,15 @@ class CoHog:
         if not self._is_nadir:
             views = self._make_views(query)
             mean_grid = np.zeros(1, np.float32) if mean is None else mean / 255
-            own = placecode.grid(views.blocks(1.0, 0)[0], views.seen, views.seen)
-            asked = placecode.hypotheses(*own, mean_grid)
-            return np.clip(placecode.scan_ahead(asked, rows), 0, 1), None
+            own = placecode.make_grid(views.blocks(1.0, 0)[0], views.seen, views.seen)
+            asked = placecode.make_hypotheses(*own, mean_grid)
+            return np.clip(placecode.scan_in_two_steps(asked, rows), 0, 1), None
         ratio = find_nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)
         self._make_views(query).keep(ratio)
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
-        of_ratio = layout.scan(lambda turn, grid: self._field(query, first + turn, grid), rows, turned_deg, in_reach)
+        of_ratio = layout.scan_places(
+            lambda turn, grid: self._field(query, first + turn, grid), rows, turned_deg, in_reach
+        )
         scores = np.full((len(rows), len(HEIGHT_RATIOS) * ROTATIONS), -np.inf, np.float32)
         scores[:, first : first + ROTATIONS] = of_ratio
         return np.clip(of_ratio.max(axis=1), 0, 1), scores
@@ -227,7 +236,7 @@ class CoHog:
         fields = self._make_views(query).fields
         if (number, grid.side) not in fields:
             view = self._make_views(query).regions(number, self._patterns)
-            fields[number, grid.side] = layout.field(grid, view.regions, view.numbers, (view.side, self._side))
+            fields[number, grid.side] = layout.make_field(grid, view.regions, view.numbers, (view.side, self._side))
         return fields[number, grid.side]
 
     def match(self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None) -> FineMatch:
@@ -247,16 +256,16 @@ class CoHog:
         if match.shift_cells is None:
             return match
         structure = self._agreement(query, reference, match)
-        least, most = _STRUCTURE[self.camera]
+        least, most = _STRUCTURE_LIMITS[self.camera]
         counts = min(max(structure, least), most) / most
         return replace(match, score=match.score * counts, votes=match.score, structure=structure)
 
     def match_rotated(self, query: Descriptor, fine: Bytes, match: FineMatch) -> FineMatch:
-        """See `Technique.turned`."""
+        """See `Technique.match_rotated`."""
         ratio, at_deg = find_nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0), match.rotation_deg or 0.0
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
         off_deg = np.abs(shorter_deg(360 * np.arange(ROTATIONS) / ROTATIONS - at_deg))
-        return self.match(query, fine, (first + np.flatnonzero(off_deg >= _TURNED_DEG)).tolist())
+        return self.match(query, fine, (first + np.flatnonzero(off_deg >= _MIN_ROTATED_DEG)).tolist())
 
     def measure_perspective(self, query: Descriptor, fine: Bytes, match: FineMatch) -> Perspective | None:
         """See `Technique.measure_perspective`."""
@@ -266,8 +275,8 @@ class CoHog:
         nearest = find_most_similar(view.regions, self._reference(fine))
         scale, off_deg = compute_scale(self._side + 1, ratio), (match.rotation_deg or 0.0) - turn * step_deg
         found = fit_perspective(
-            centre_regions(view.numbers, view.side),
-            centre_regions(nearest, self._side),
+            locate_regions(view.numbers, view.side),
+            locate_regions(nearest, self._side),
             complex((match.height_ratio or 1.0) / scale * np.exp(1j * np.radians(off_deg))),
             complex(*(match.shift_cells or (0.0, 0.0))),
         )
@@ -282,7 +291,7 @@ class CoHog:
         return Perspective(over_place, cells * sd, regions)
 
     def match_at_rest(self, query: Descriptor, fine: Bytes) -> FineMatch:
-        """See `Technique.unmoved`."""
+        """See `Technique.match_at_rest`."""
         return self._find_likest(query, self._reference(fine), [HEIGHT_RATIOS.index(1.0) * ROTATIONS])[1]
 
     def _find_likest(
@@ -293,17 +302,17 @@ class CoHog:
         tried, place = self._hypotheses if hypotheses is None else hypotheses, None
         if self._votes:
             known = np.flatnonzero(reference.any(axis=1))
-            place = layout.field(layout.FINE, reference[known], known, (self._side, self._side))
+            place = layout.make_field(layout.FINE, reference[known], known, (self._side, self._side))
         matches, nearest = dict[int, FineMatch](), dict[int, Ints]()
         for each in tried:
             match, nearest[each] = self._match_view(self._view(query, each), reference)
             if place is not None and match.shift_cells is not None:
                 shift = match.shift_cells[0] / self._side, match.shift_cells[1] / self._side
-                agrees = layout.agreement(self._field(query, each, layout.FINE), place, shift)
-                match = replace(match, score=min(1.0, match.score * agrees / _LAYOUT_AGREES))
+                agrees = layout.compute_agreement(self._field(query, each, layout.FINE), place, shift)
+                match = replace(match, score=min(1.0, match.score * agrees / _FULL_LAYOUT_AGREEMENT))
             matches[each] = match
         best = max(matches, key=lambda each: matches[each].score)
-        ratio, turn = hypothesis(best)
+        ratio, turn = decode_hypothesis(best)
         scale = compute_scale(self._side + 1, ratio)
         return best, replace(matches[best], rotation_deg=360 * turn / ROTATIONS, height_ratio=scale), nearest[best]
 
@@ -312,30 +321,34 @@ class CoHog:
         how well their structures agree, or with a nadir camera, how far this stands out."""
         views, cells = self._make_views(query), self._side + 1
         known = reference.any(axis=1).reshape(self._side, self._side)
-        place = overlay.structure(reference, known, _AROUND_CELLS[self.camera])
+        place = overlay.compute_structure(reference, known, _SURROUND_SD_CELLS[self.camera])
         if self._is_nadir:
             laid = overlay.overlay_query(*views.halved, match, cells)
-            return overlay.stands_out(self._structure(*self._all_blocks(*laid, len(laid[0]) // cells)), place)
+            return overlay.measure_prominence(self._structure(*self._all_blocks(*laid, len(laid[0]) // cells)), place)
         if views.structure is None:
             views.structure = self._structure(views.blocks(1.0, 0)[0], views.seen)
-        return overlay.agreement(views.structure, place, match.shift_cells or (0.0, 0.0))
+        return overlay.compute_agreement(views.structure, place, match.shift_cells or (0.0, 0.0))
 
     def _structure(self, blocks: Singles, seen: Bools) -> Singles:
         """Return the structure of a picture (see `overlay`) that has these blocks, float32 (n, n, 4 bins)."""
-        return overlay.structure(self._patterns(blocks.reshape(-1, 4 * self.bins)), seen, _AROUND_CELLS[self.camera])
+        return overlay.compute_structure(
+            self._patterns(blocks.reshape(-1, 4 * self.bins)), seen, _SURROUND_SD_CELLS[self.camera]
+        )
 
     def score_quickly(
         self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None
     ) -> tuple[float, list[int] | None]:
         """Estimate the score of `match`: with a forward camera from a quarter of the good regions, with a nadir camera
-        from the vote and the layouts. See `Technique.glance`."""
+        from the vote and the layouts. See `Technique.score_quickly`."""
         reference = self._reference(fine)
         if self._is_nadir:
             best, match, _ = self._find_likest(query, reference, hypotheses)
             return match.score, [best]
         view = self._view(query, self._hypotheses[0])
-        nearest = find_most_similar(view.regions[::_GLANCE], reference)
-        return share(view.numbers[::_GLANCE], nearest, (view.side, self._side), _VOTES_COUNT[self.camera]), None
+        nearest = find_most_similar(view.regions[::_QUICK_STEP], reference)
+        return compute_vote_share(
+            view.numbers[::_QUICK_STEP], nearest, (view.side, self._side), _VOTE_WEIGHTS[self.camera]
+        ), None
 
     def _reference(self, fine: Bytes) -> Singles:
         """Restore the vectors that are compared from the `fine` part of a place, which holds square roots of blocks."""
@@ -345,22 +358,22 @@ class CoHog:
         """Return the good regions of a query under the hypothesis `number`."""
         return self._make_views(query).regions(number, self._comparable)
 
-    def _make_views(self, query: Descriptor) -> Views:
+    def _make_views(self, query: Descriptor) -> QueryViews:
         if query is not self._query or self._views is None:
             if query.regions is None or query.good is None or query.picture is None:
                 raise ValueError("a place that was read from a map is no query")
             own = query.regions.reshape(self._side, self._side, -1), query.good.reshape(self._side, -1)
-            self._views = Views(query.picture, own, self.w2, lambda *view: self._blocks(*view)[::2])
+            self._views = QueryViews(query.picture, own, self.w2, lambda *view: self._blocks(*view)[::2])
             self._query = query
         return self._views
 
     def _patterns(self, regions: Singles) -> Singles:
-        """Reduce regions, float32 (N, 4 bins), to patterns (N, patterns) of length 1 (see `slow_patterns`)."""
-        return unit_rows(regions @ slow_patterns(self.bins))
+        """Reduce regions, float32 (N, 4 bins), to patterns (N, patterns) of length 1 (see `make_slow_patterns`)."""
+        return normalise_rows(regions @ make_slow_patterns(self.bins))
 
     def _match_view(self, view: ViewRegions, reference: Singles) -> tuple[FineMatch, Ints]:
         if self._votes:  # with a nadir camera, landmarks tell more than the support of all regions
-            return vote(view, reference, _VOTES_COUNT[self.camera], with_support=not self._is_nadir)
+            return match_view(view, reference, _VOTE_WEIGHTS[self.camera], with_support=not self._is_nadir)
         likeness = view.regions @ reference.T
         nearest = likeness.argmax(axis=1)
         score = np.clip(likeness[np.arange(len(nearest)), nearest].mean(), 0, 1) if len(nearest) else 0

@@ -11,15 +11,15 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Array, Mask, Singles
-from edgevpr.techniques.gradients import levels
+from edgevpr.techniques.gradients import round_levels
 
-_BLOCKS_ALONG = 64  # the contrast is that of the means of so many blocks along a side: they hold little of the noise
-_OUTSIDE = 0.01  # share of the blocks that may be darker than the range, and share that may be brighter
+_BLOCKS_PER_SIDE = 64  # the contrast is that of the means of so many blocks along a side: they hold little of the noise
+_CLIPPED_SHARE = 0.01  # share of the blocks that may be darker than the range, and share that may be brighter
 # Least contrast of ground, in grey levels: this, or what noise of 3 levels has in means of few pixels.
-_LEAST = 4.0
-_NOISE = 3 * 4.65  # between the hundredths of a normal distribution
+_MIN_CONTRAST_LEVELS = 4.0
+_NOISE_LEVELS = 3 * 4.65  # between the hundredths of a normal distribution
 _MAX_SIGMA = 1.4
-_ROUNDS = 4  # of smoothing: fewer cannot reach that much
+_SMOOTHING_ROUNDS = 4  # of smoothing: fewer cannot reach that much
 
 
 def stretch_contrast(
@@ -33,10 +33,10 @@ def stretch_contrast(
     of pixels that are `allowed`, bool (side, side) (None: all). `grey` is float32 (side, side), 0 to 255; the same
     array is returned where its contrast is enough or too low. `pixel_px`: width and height, in pixels of the square, of
     a pixel of the picture as it came."""
-    low, high = _ends(grey, allowed)
+    low, high = _find_range(grey, allowed)
     found = high - low
-    of_noise = _NOISE * math.sqrt(pixel_px[0] * pixel_px[1]) * _BLOCKS_ALONG / len(grey)
-    if not max(_LEAST, of_noise) <= found < kept:
+    of_noise = _NOISE_LEVELS * math.sqrt(pixel_px[0] * pixel_px[1]) * _BLOCKS_PER_SIDE / len(grey)
+    if not max(_MIN_CONTRAST_LEVELS, of_noise) <= found < kept:
         return grey
     lacks = kept / found
     gain = min(lacks * lacks * lacks, wanted / found)  # from 1 on: no jump
@@ -44,8 +44,8 @@ def stretch_contrast(
     picture = grey.copy() if allowed is None else np.where(allowed, grey, np.float32((low + high) / 2))
     sigma = min(_MAX_SIGMA, sigma_pixels * math.log2(gain))
     across, down = (min(max(1, round(each)), len(grey) // 4) for each in pixel_px)
-    _smooth(picture, sigma, across)
-    _smooth(picture.T, sigma, down)
+    _smooth_rows(picture, sigma, across)
+    _smooth_rows(picture.T, sigma, down)
     picture -= np.float32(low)
     picture *= np.float32(gain)
     picture += np.float32(min(low, 255 - wanted))
@@ -53,34 +53,34 @@ def stretch_contrast(
     return clipped
 
 
-def _ends(grey: Singles, allowed: Mask | None) -> tuple[float, float]:
+def _find_range(grey: Singles, allowed: Mask | None) -> tuple[float, float]:
     """Return the ends of the range of grey levels (see `stretch_contrast`): (0, 0) where no block is allowed."""
-    means = _block_means(levels(grey))
+    means = _average_blocks(round_levels(grey))
     if allowed is not None:
-        means = means[_block_means(allowed.view(np.uint8)) > 0.999]
+        means = means[_average_blocks(allowed.view(np.uint8)) > 0.999]
     if not means.size:
         return 0.0, 0.0
-    outside = int(_OUTSIDE * means.size)
+    outside = int(_CLIPPED_SHARE * means.size)
     ordered = np.sort(means, axis=None)
     return float(ordered[outside]), float(ordered[-1 - outside])
 
 
-def _block_means(whole: Array) -> Array:
+def _average_blocks(whole: Array) -> Array:
     """Average whole numbers, uint8 (side, side), over square blocks: float32 (n, n). Sums of whole numbers are exact in
     any order."""
-    block_px = max(1, len(whole) // _BLOCKS_ALONG)
+    block_px = max(1, len(whole) // _BLOCKS_PER_SIDE)
     n = len(whole) // block_px
     part = whole[: n * block_px, : n * block_px].astype(np.float32)
     return cv2.resize(part, (n, n), interpolation=cv2.INTER_AREA)
 
 
-def _smooth(grey: Array, sigma_pixels: float, pixel_px: int) -> None:
+def _smooth_rows(grey: Array, sigma_pixels: float, pixel_px: int) -> None:
     """Smooth (H, W) in place along its rows, by `sigma_pixels` pixels of `pixel_px` each: each round averages every
     pixel with the two that are `pixel_px` away."""
-    beside = np.float32(sigma_pixels * sigma_pixels / (2 * _ROUNDS))
+    beside = np.float32(sigma_pixels * sigma_pixels / (2 * _SMOOTHING_ROUNDS))
     middle = np.float32(1) - 2 * beside
     sides, step = np.empty_like(grey), pixel_px
-    for _ in range(_ROUNDS):
+    for _ in range(_SMOOTHING_ROUNDS):
         np.add(grey[:, : -2 * step], grey[:, 2 * step :], out=sides[:, step:-step])
         np.add(grey[:, :1], grey[:, step : 2 * step], out=sides[:, :step])
         np.add(grey[:, -2 * step : -step], grey[:, -1:], out=sides[:, -step:])

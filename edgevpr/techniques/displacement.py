@@ -17,19 +17,19 @@ from edgevpr.core.contract import FineMatch, Support
 from edgevpr.core.geodesy import fit_similarity
 from edgevpr.techniques.views import ViewRegions
 
-_ALONG = 3  # cells by which the shifts of near and far ground differ, where the camera looks ahead
-_RANKED = 4  # one of so many regions is ranked: ranks cost more than all the rest
-_AT_ONCE = 256  # regions compared with all of a place: their likeness, a megabyte, stays in the cache
-_ROUNDS = 8
-_WITHIN_CELLS = 1.5  # largest distance of an agreeing region from the fit
+_SHIFT_SPREAD_CELLS = 3  # cells by which the shifts of near and far ground differ, where the camera looks ahead
+_RANK_STEP = 4  # one of so many regions is ranked: ranks cost more than all the rest
+_REGIONS_PER_PRODUCT = 256  # regions compared with all of a place: their likeness, a megabyte, stays in the cache
+_FIT_ROUNDS = 8
+_MAX_RESIDUAL_CELLS = 1.5  # largest distance of an agreeing region from the fit
 # Beyond these another hypothesis is nearer, or the pairs are of different places.
-_FURTHEST_TURN_DEG = 16.0
-_FURTHEST_SCALE = 1.6
+_MAX_ROTATION_DEG = 16.0
+_MAX_SCALE = 1.6
 _MIN_PAIRS = 8
 _Grid = tuple[Ints, int]  # numbers of regions, row by row, and the regions along one side
 
 
-def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> FineMatch:
+def find_displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> FineMatch:
     """Find the shift on which most regions agree. `asking` and `best` are int (G,): the good regions of the query, and
     for each the most similar region of the reference. `sides` are the regions along one side of the query's grid and of
     the reference's, both even or both odd. A shift is counted from the middle of one grid to that of the other.
@@ -42,7 +42,7 @@ def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple
     room = len(counts) - 1
     step, votes, around = _count_votes(asking, best, sides, counts)
     wide = len(votes)
-    weights = _weights(counts)
+    weights = _make_peak_weights(counts)
     peak_y, peak_x = divmod(int(around.argmax()), around.shape[1])
     agreeing = votes[peak_y : peak_y + len(weights), peak_x : peak_x + len(weights)] * weights
     count = float(agreeing.sum())
@@ -68,8 +68,8 @@ def displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple
     )
 
 
-def share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> float:
-    """Return only the score of `displacement` for these arguments, in half the time."""
+def compute_vote_share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> float:
+    """Return only the score of `find_displacement` for these arguments, in half the time."""
     return float(_count_votes(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
 
 
@@ -77,26 +77,26 @@ def find_most_similar(regions: Singles, reference: Singles) -> Ints:
     """Return the number of the most similar region of a place, whose regions are `reference` (N, P), for each of
     `regions` (G, P): int (G,)."""
     best = np.empty(len(regions), np.intp)
-    for first in range(0, len(regions), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
+    for first in range(0, len(regions), _REGIONS_PER_PRODUCT):
+        some = slice(first, first + _REGIONS_PER_PRODUCT)
         best[some] = (regions[some] @ reference.T).argmax(axis=1)
     return best
 
 
-def vote(
+def match_view(
     view: ViewRegions, reference: Singles, counts: tuple[float, ...], with_support: bool
 ) -> tuple[FineMatch, Ints]:
     """Match a view of the query with a place, whose regions are `reference` float32 (side * side, P), by vote. `counts`
-    is that of `displacement`, and `with_support` tells whether the match gets its `support`. Returns the match, and the
-    number of the most similar region of the place for each region of the view, int (G,)."""
+    is that of `find_displacement`, and `with_support` tells whether the match gets its `support`. Returns the match,
+    and the number of the most similar region of the place for each region of the view, int (G,)."""
     best = find_most_similar(view.regions, reference)
-    found = displacement(view.numbers, best, (view.side, math.isqrt(len(reference))), counts)
+    found = find_displacement(view.numbers, best, (view.side, math.isqrt(len(reference))), counts)
     asks_all = with_support and len(best)
-    backed = support(view.numbers, view.regions, reference, best, found.shift_cells) if asks_all else None
+    backed = measure_support(view.numbers, view.regions, reference, best, found.shift_cells) if asks_all else None
     return replace(found, score=min(1.0, found.score * view.worth), support=backed), best
 
 
-def support(
+def measure_support(
     asking: Ints, regions: Singles, reference: Singles, best: Ints, shift_cells: tuple[float, float] | None
 ) -> Support:
     """Measure how all regions of query and place support the shift that a vote has found. `asking` int (G,) and
@@ -109,13 +109,15 @@ def support(
     y, x = np.divmod(np.arange(len(reference)), side)
     off = np.maximum(abs(x - of_x[back] - step_x), abs(y - of_y[back] - step_y))
     return Support(
-        back=float((off <= _ALONG).mean()),
+        back=float((off <= _SHIFT_SPREAD_CELLS).mean()),
         likeness=float(np.einsum("ij,ij->i", regions, reference[best]).mean()),
-        log_rank=_log_rank(regions[::_RANKED], reference, of_x[::_RANKED] + step_x, of_y[::_RANKED] + step_y, side),
+        log_rank=_compute_log_rank(
+            regions[::_RANK_STEP], reference, of_x[::_RANK_STEP] + step_x, of_y[::_RANK_STEP] + step_y, side
+        ),
     )
 
 
-def _log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int) -> float:
+def _compute_log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int) -> float:
     """Return the mean logarithm of a rank, 0 for the best possible. Each of the query's `regions` (n, P) has moved to
     the position `x`, `y` of the place. Its rank says how many regions of the place resemble it more than the best of
     the 3x3 regions around that position."""
@@ -134,31 +136,31 @@ def _log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int)
 def _count_votes(
     asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]
 ) -> tuple[Ints, Singles, Array]:
-    """Count the votes for each shift; for the arguments see `displacement`. Returns the number of the shift that each
-    region votes for, int (G,); the number of votes for each shift, on a grid with a border, float32 (n, n); and the
-    weighted sum of the votes around each shift, on a grid without this border."""
+    """Count the votes for each shift; for the arguments see `find_displacement`. Returns the number of the shift that
+    each region votes for, int (G,); the number of votes for each shift, on a grid with a border, float32 (n, n); and
+    the weighted sum of the votes around each shift, on a grid without this border."""
     # Both are numbered on a grid as wide as there are shifts, so that their difference is the number of the shift. A
     # border around the possible shifts leaves room for the square around the peak.
     room = len(counts) - 1
     of_query, of_reference = sides
     wide = of_query + of_reference - 1 + 2 * room
     first = (of_query - 1 + room) * (wide + 1)
-    step = _numbers(of_reference, wide)[best] - _numbers(of_query, wide)[asking] + first
+    step = _number_regions(of_reference, wide)[best] - _number_regions(of_query, wide)[asking] + first
     votes = np.bincount(step, minlength=wide * wide).reshape(wide, wide).astype(np.float32)
-    around = cv2.filter2D(votes, -1, _weights(counts), borderType=cv2.BORDER_CONSTANT)
+    around = cv2.filter2D(votes, -1, _make_peak_weights(counts), borderType=cv2.BORDER_CONSTANT)
     return step, votes, around[room : wide - room, room : wide - room]
 
 
 @lru_cache
-def _numbers(side: int, wide: int) -> Ints:
+def _number_regions(side: int, wide: int) -> Ints:
     """Return the numbers of `side` x `side` regions in the corner of a grid of width `wide`: int (side * side,)."""
     return np.add.outer(np.arange(side) * wide, np.arange(side)).ravel()
 
 
 @lru_cache
-def _weights(counts: tuple[float, ...]) -> Singles:
+def _make_peak_weights(counts: tuple[float, ...]) -> Singles:
     """Return the weights of the votes for the shifts around a peak, with the peak in the middle: float32 (2 n - 1, 2 n
-    - 1) for n `counts`, see `displacement`."""
+    - 1) for n `counts`, see `find_displacement`."""
     off = np.abs(np.arange(1 - len(counts), len(counts)))
     return np.array(counts, np.float32)[np.maximum.outer(off, off)]
 
@@ -172,21 +174,21 @@ def fit_alignment(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
     Returns the match with the exact position: turned and scaled, the query's picture lies with its middle at the shift
     from that of the place's. The covariance is that of the distances by which single regions miss. Returns the match as
     it is if fewer than 8 pairs agree, or if the rotation or scale found belongs to another hypothesis."""
-    mine, there = centre_regions(*asking), centre_regions(*best)
+    mine, there = locate_regions(*asking), locate_regions(*best)
     turned, shift = 1 + 0j, complex(*(match.shift_cells or (0.0, 0.0)))
-    for again in range(_ROUNDS + 1):
+    for again in range(_FIT_ROUNDS + 1):
         off = there - turned * mine - shift
-        near = np.maximum(abs(off.real), abs(off.imag)) <= _WITHIN_CELLS
+        near = np.maximum(abs(off.real), abs(off.imag)) <= _MAX_RESIDUAL_CELLS
         if np.count_nonzero(near) < _MIN_PAIRS:
             return match
-        if again == _ROUNDS:
+        if again == _FIT_ROUNDS:
             break
         if np.ptp(mine[near].real) == np.ptp(mine[near].imag) == 0:
             return match  # one point has no rotation
         turned, shift = fit_similarity(mine[near], there[near])
-        if not 1 / _FURTHEST_SCALE < abs(turned) < _FURTHEST_SCALE:
+        if not 1 / _MAX_SCALE < abs(turned) < _MAX_SCALE:
             return match
-        if abs(np.angle(turned, deg=True)) > _FURTHEST_TURN_DEG:
+        if abs(np.angle(turned, deg=True)) > _MAX_ROTATION_DEG:
             return match
     x, y = off[near].real, off[near].imag
     # A region is matched to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
@@ -200,7 +202,7 @@ def fit_alignment(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
     )
 
 
-def centre_regions(numbers: Ints, side: int) -> Array:
+def locate_regions(numbers: Ints, side: int) -> Array:
     """Return the positions of regions in cells from the middle of their grid: x + iy, y downwards, complex (G,)."""
     y, x = np.divmod(numbers, side)
     return x + 1j * y - (1 + 1j) * (side - 1) / 2

@@ -16,13 +16,13 @@ SHANNON_SIDE_PX = 100  # the authors' public code takes the Shannon entropy of a
 _STRIP_ROWS = 32
 _STRIP_PIXELS = 256
 _STRIP_INTENSITIES = 16
-_ROUNDING = 1e-5  # more than float32 rounding can change the mean entropy of a block
+_MAX_ROUNDING = 1e-5  # more than float32 rounding can change the mean entropy of a block
 _LOG2 = np.log2(np.arange(257, dtype=np.float32).clip(1))
 _LOG2_OVER_8 = _LOG2 / 8
 _COUNT_LOG2 = np.arange(256, dtype=np.float32) * _LOG2[:256]
 
 
-def filled_bins(grey: Bytes) -> Singles:
+def compute_filled_bins(grey: Bytes) -> Singles:
     """Compute log2 of the number of different intensities in each disc, over 8: the algorithm printed in thesis 6.2.1.
     uint8 (H, W) to float32 (H, W) in 0..1."""
     r = DISC_RADIUS_PX
@@ -35,14 +35,14 @@ def filled_bins(grey: Bytes) -> Singles:
     return entropy
 
 
-def shannon(grey: Bytes) -> Array:
+def compute_shannon(grey: Bytes) -> Array:
     """Compute the Shannon entropy (bits) of the intensities in each disc, over 8, from a 100x100 copy scaled back up,
     as the authors' public code does: uint8 (H, W) to float32 (H, W) in 0..1."""
     height, width = grey.shape
-    return cv2.resize(_shannon_everywhere(_shannon_copy(grey)), (width, height), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(_compute_shannon_map(_make_shannon_copy(grey)), (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def block_means(per_pixel: Array, cell_px: int) -> Array:
+def average_blocks(per_pixel: Array, cell_px: int) -> Array:
     """Average values of pixels over every block of 2x2 cells of `cell_px` pixels. The blocks start one cell apart:
     float32 (H, W) to (H/cell_px - 1, W/cell_px - 1)."""
     cell = _cell_means(per_pixel, cell_px)
@@ -50,7 +50,7 @@ def block_means(per_pixel: Array, cell_px: int) -> Array:
     return means
 
 
-def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: Bools | bool = True) -> Bools:
+def find_good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: Bools | bool = True) -> Bools:
     """Find the good blocks (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). `which` names the
     entropy: "filled_bins" or "shannon". `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool
     (H/cell_px - 1, W/cell_px - 1), False where `among`, bool of this shape, is False (True: consider all).
@@ -58,23 +58,23 @@ def good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: 
     Of the Shannon entropy, cheap bounds decide nearly every block, and it is computed only at the pixels that the
     others depend on. The result is that of the whole map."""
     if which == "filled_bins":
-        return (block_means(filled_bins(grey), cell_px) >= threshold) & among
-    small = _shannon_copy(grey)
+        return (average_blocks(compute_filled_bins(grey), cell_px) >= threshold) & among
+    small = _make_shannon_copy(grey)
     # The entropy of the last four bits is at most that of all; within 16 k values the others add at most log2 k.
-    entropy = _shannon_everywhere(small & 15)
-    at_most = entropy + _LOG2_OVER_8[(_range(small) >> 4) + 1]
-    down, across = (_scaled_pairs(side, cell_px) for side in grey.shape)
+    entropy = _compute_shannon_map(small & 15)
+    at_most = entropy + _LOG2_OVER_8[(_compute_range(small) >> 4) + 1]
+    down, across = (_make_block_matrix(side, cell_px) for side in grey.shape)
 
     def means(values: Array) -> Singles:
         return np.asarray(down @ values @ across.T)
 
-    undecided = (means(entropy) < threshold + _ROUNDING) & (means(at_most) >= threshold - _ROUNDING)
+    undecided = (means(entropy) < threshold + _MAX_ROUNDING) & (means(at_most) >= threshold - _MAX_ROUNDING)
     undecided &= among
     if undecided.any():
         matters = (down.T @ undecided @ across > 0) & (entropy < at_most)
-        entropy[matters] = _shannon_at(small, matters)
-        if (np.abs(means(entropy)[undecided] - threshold) < _ROUNDING).any():
-            return (block_means(shannon(grey), cell_px) >= threshold) & among
+        entropy[matters] = _compute_shannon_pixels(small, matters)
+        if (np.abs(means(entropy)[undecided] - threshold) < _MAX_ROUNDING).any():
+            return (average_blocks(compute_shannon(grey), cell_px) >= threshold) & among
     return (means(entropy) >= threshold) & among
 
 
@@ -83,13 +83,13 @@ def _cell_means(per_pixel: Array, cell_px: int) -> Array:
     return cv2.resize(per_pixel, (width // cell_px, height // cell_px), interpolation=cv2.INTER_AREA)
 
 
-def _shannon_copy(grey: Bytes) -> Array:
+def _make_shannon_copy(grey: Bytes) -> Array:
     # INTER_LINEAR_EXACT: plain INTER_LINEAR differs by a grey level between processors, and a map must work on all.
     return cv2.resize(grey, (SHANNON_SIDE_PX, SHANNON_SIDE_PX), interpolation=cv2.INTER_LINEAR_EXACT)
 
 
 @lru_cache(maxsize=4)
-def _scaled_pairs(side_px: int, cell_px: int) -> Singles:
+def _make_block_matrix(side_px: int, cell_px: int) -> Singles:
     """Return the matrix float32 (cells - 1, 100) that enlarges a row of the 100x100 copy to `side_px` pixels, and
     averages it over each pair of neighbouring cells of `cell_px` pixels."""
     unit = np.eye(SHANNON_SIDE_PX, dtype=np.float32)
@@ -100,7 +100,7 @@ def _scaled_pairs(side_px: int, cell_px: int) -> Singles:
     return matrix
 
 
-def _range(grey: Bytes) -> Array:
+def _compute_range(grey: Bytes) -> Array:
     """Return, for each pixel, the largest minus the smallest intensity in the square around its disc: uint8 (H, W)."""
     square = np.ones((2 * DISC_RADIUS_PX + 1,) * 2, np.uint8)
     return cv2.subtract(cv2.dilate(grey, square), cv2.erode(grey, square))
@@ -115,7 +115,7 @@ def _count_different(padded: Array) -> Array:
     return sizes
 
 
-def _shannon_everywhere(small: Array) -> Singles:
+def _compute_shannon_map(small: Array) -> Singles:
     """Compute the Shannon entropy of the disc of every pixel, in bits over 8: uint8 (H, W) to float32 (H, W)."""
     padded = np.pad(small.astype(np.int16), DISC_RADIUS_PX, constant_values=-1)  # -1: outside, no intensity
     of_counts = np.zeros(small.shape, np.float32)
@@ -130,8 +130,8 @@ def _shannon_everywhere(small: Array) -> Singles:
     return entropy
 
 
-def _shannon_at(small: Bytes, pixels: Bools) -> Singles:
-    """Compute `_shannon_everywhere` at the P True pixels of a bool (H, W) only, each from its own histogram: float32
+def _compute_shannon_pixels(small: Bytes, pixels: Bools) -> Singles:
+    """Compute `_compute_shannon_map` at the P True pixels of a bool (H, W) only, each from its own histogram: float32
     (P,)."""
     r = DISC_RADIUS_PX
     padded = np.pad(small.astype(np.int16), r, constant_values=256)  # 256: outside

@@ -15,7 +15,9 @@ from edgevpr.core.arrays import Array, Bytes, Image, Ints, Mask, Singles
 _STRIP_ROWS = 64  # rows computed at once, so that the planes of a strip stay in cache
 _SIGN_BIT = np.uint32(1 << 31)
 # Fitted for the smallest maximum error over -45..45 degrees (2e-6 of the magnitude): see _vote_by_octant.
-_P, _Q, _R = 2.904936713, 2.067222680, 0.162280117
+_P = 2.904936713
+_Q = 2.067222680
+_R = 0.162280117
 # Rows: the sums of _vote_by_octant. Columns: 0, 45, ... 315 degrees (x to the right, y down).
 _ORIENTATIONS = np.array(
     [
@@ -32,7 +34,7 @@ _ORIENTATIONS = np.array(
 )
 # Weights of the cells top left, top right, bottom left, bottom right, and the frequencies over the orientations that
 # are kept with them (None: all).
-_KEPT = (
+_PATTERN_WAVES = (
     ((1, 1, 1, 1), None),
     ((1, -1, 1, -1), (0, 1, 2)),
     ((1, 1, -1, -1), (0, 1, 2)),
@@ -40,19 +42,19 @@ _KEPT = (
 )
 
 
-def grey_square(image: Image, side_px: int) -> Array:
+def make_grey_square(image: Image, side_px: int) -> Array:
     """Convert a uint8 image, (H, W) grey or (H, W, 3) BGR, to float32 grey (side_px, side_px), 0 to 255. The values are
     not rounded to grey levels: processors would round those between two levels differently."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return cv2.resize(grey.astype(np.float32), (side_px, side_px), interpolation=cv2.INTER_LINEAR)
 
 
-def levels(grey: Singles) -> Bytes:
+def round_levels(grey: Singles) -> Bytes:
     """Round grey, float32 0 to 255, to uint8, halves up."""
     return (grey + np.float32(0.5)).astype(np.uint8)
 
 
-def mask_square(mask: Mask | None, side_px: int) -> Mask | None:
+def make_mask_square(mask: Mask | None, side_px: int) -> Mask | None:
     """Scale a bool mask (H, W) to bool (side_px, side_px), by nearest neighbour; None stays None (all allowed)."""
     if mask is None:
         return None
@@ -80,7 +82,7 @@ def orient_cells(grey: Array, cell_px: int, bins: int, signed: bool, allowed: Ma
     with sides that are multiples of `cell_px`. Pixels where the bool (H, W) `allowed` is False do not count (None: all
     do). Returns float32 (H/cell_px, W/cell_px, bins), sums of magnitude, all >= 0."""
     rows, cols = grey.shape[0] // cell_px, grey.shape[1] // cell_px
-    vote = _vote_by_octant if signed and bins == 8 else _vote_by_angle
+    vote = _sum_octants if signed and bins == 8 else _sum_angles
     mirrored = cv2.copyMakeBorder(grey, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)  # no gradient across the image's border
     root = cv2.sqrt(mirrored.astype(np.float32, copy=False))
     cells = np.empty((rows, cols, bins), np.float32)
@@ -97,9 +99,9 @@ def orient_cells(grey: Array, cell_px: int, bins: int, signed: bool, allowed: Ma
     return cells
 
 
-def _vote_by_angle(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) -> Array:
+def _sum_angles(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) -> Array:
     """Sum the gradients `dx` and `dy`, float32 (H, W), by cell and orientation: float (H/cell_px, W/cell_px, bins)."""
-    magnitude, _ = _magnitude(dx, dy)
+    magnitude, _ = _compute_magnitude(dx, dy)
     at = np.arctan2(dy, dx)
     at *= np.float32(bins / (2 * np.pi if signed else np.pi))  # in bins; whole numbers are the centres of orientations
     low = np.floor(at)
@@ -115,8 +117,8 @@ def _vote_by_angle(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) 
     return votes.reshape(rows, cols, bins)
 
 
-def _vote_by_octant(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
-    """Compute the same sums as `_vote_by_angle` for 8 orientations over 360 degrees, without angles, branches or
+def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
+    """Compute the same sums as `_sum_angles` for 8 orientations over 360 degrees, without angles, branches or
     scattered sums.
 
     A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from its diagonal, whose orientation gets m -
@@ -127,7 +129,7 @@ def _vote_by_octant(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
     across, along = np.abs(dx), np.abs(dy)
     u = across + along
     g = np.subtract(along, across, out=along)
-    m, spare = _magnitude(dx, dy, across)
+    m, spare = _compute_magnitude(dx, dy, across)
     below = np.multiply(m, _Q, out=spare)
     below += u
     below += 1e-20  # never 0
@@ -165,7 +167,7 @@ def _vote_by_octant(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
     return oriented
 
 
-def _magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[Array, Array]:
+def _compute_magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[Array, Array]:
     """Return the length of each gradient, written to `out` if given, and an array of its shape that the caller may
     overwrite."""
     squares, spare = np.multiply(dx, dx, out=out), dy * dy
@@ -183,40 +185,40 @@ def normalise_blocks(cells: Singles) -> Singles:
     return blocks
 
 
-def unit_rows(rows: Singles) -> Singles:
+def normalise_rows(rows: Singles) -> Singles:
     """Scale each row of (N, D) to length 1; a zero row stays zero."""
     unit: Singles = rows / np.maximum(np.sqrt(np.einsum("ij,ij->i", rows, rows)), 1e-6)[:, None]
     return unit
 
 
 @lru_cache
-def slow_patterns(bins: int) -> Singles:
+def make_slow_patterns(bins: int) -> Singles:
     """Return the patterns of low ("slow") frequency of a block of 2x2 cells of `bins` orientations: float32 (4 * bins,
     patterns), one per column, orthonormal. A pattern is a wave over the cells (mean, left against right, top against
     bottom, diagonal against diagonal) times a wave over the orientations. Of the 32 patterns of 8 orientations these
     are the 20 with the most power on the tuning sets; recall does not fall."""
-    frequency = _frequencies(bins)
+    frequency = _list_frequencies(bins)
     return np.vstack(
         [
             np.kron(np.array(cells) / 2, wave)
-            for cells, kept in _KEPT
-            for at, wave in zip(frequency, waves(bins), strict=True)
+            for cells, kept in _PATTERN_WAVES
+            for at, wave in zip(frequency, make_waves(bins), strict=True)
             if kept is None or at in kept
         ]
     ).T.astype(np.float32, order="C")
 
 
 @lru_cache
-def waves(bins: int) -> Singles:
+def make_waves(bins: int) -> Singles:
     """Return the real Fourier series over `bins` orientations: float32 (bins, bins), one wave per row, each of length
     1. The constant comes first, then cosine and sine of each frequency (the highest of an even number: cosine only)."""
     turn = 2 * np.pi * np.arange(bins) / bins
-    frequency, number = _frequencies(bins), np.arange(bins)
+    frequency, number = _list_frequencies(bins), np.arange(bins)
     series = np.cos(frequency[:, None] * turn - np.pi / 2 * (number[:, None] % 2 == 0) * (number[:, None] > 0))
     unit: Singles = (series / np.linalg.norm(series, axis=1, keepdims=True)).astype(np.float32)
     return unit
 
 
-def _frequencies(bins: int) -> Ints:
-    """Return the frequency of each row of `waves`, in periods per full circle of orientations: int (bins,)."""
+def _list_frequencies(bins: int) -> Ints:
+    """Return the frequency of each row of `make_waves`, in periods per full circle of orientations: int (bins,)."""
     return (np.arange(bins) + 1) // 2

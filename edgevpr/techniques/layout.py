@@ -1,11 +1,11 @@
 """The coarse stage of `cohog` for a camera that looks straight down: a place is the *layout* of its structures.
 
-The patterns of a picture's good regions (see `slow_patterns`) are averaged in the cells of a square grid, less what the
-cells around have in common. A query is laid over a place under each of 24 rotations, 15 degrees apart, and every shift
-by whole cells under which enough of the place is covered. The score is the correlation of the two fields where they
-overlap, over what two independent fields of that strength would scatter by. All places are compared by a coarse grid,
-under every second rotation, and only the best pairs of a place and a rotation by a fine one. A place keeps both in RAM,
-in 4 bits a number."""
+The patterns of a picture's good regions (see `make_slow_patterns`) are averaged in the cells of a square grid, less
+what the cells around have in common. A query is laid over a place under each of 24 rotations, 15 degrees apart, and
+every shift by whole cells under which enough of the place is covered. The score is the correlation of the two fields
+where they overlap, over what two independent fields of that strength would scatter by. All places are compared by a
+coarse grid, under every second rotation, and only the best pairs of a place and a rotation by a fine one. A place keeps
+both in RAM, in 4 bits a number."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,32 +33,32 @@ class Grid:
 
 COARSE = Grid(8, (0, 1, 2, 3, 4, 7, 8, 13))
 FINE = Grid(12, (0, 1, 2, 3, 4, 7, 8, 9, 12, 13, 15, 17))
-NBYTES = (COARSE.numbers + FINE.numbers) // 2  # of a place
+PLACE_BYTES = (COARSE.numbers + FINE.numbers) // 2  # of a place
 ROTATIONS = 24
-_AROUND = 0.25  # standard deviation of what counts as around a cell, as a share of the place's side
-_MIN_SEEN = 0.1  # share of a cell that good regions must cover
+_SURROUND_SD = 0.25  # standard deviation of what counts as around a cell, as a share of the place's side
+_MIN_SEEN_SHARE = 0.1  # share of a cell that good regions must cover
 _MIN_STRENGTH = 0.01  # of a cell; weaker ones are noise
-_LEVELS = 7  # of a stored number, on either side of 0
-_MAX_KEPT = 99  # percentile of a place's numbers that becomes the highest level
+_MAX_LEVEL = 7  # of a stored number, on either side of 0
+_LEVEL_PERCENTILE = 99  # percentile of a place's numbers that becomes the highest level
 _MIN_OVERLAP = {8: 0.5, 12: 0.35}  # share of the place that the query covers, by the side of the grid
-_MIN_OF_LARGER = {8: 1.0, 12: 0.75}  # the same, for a query that shows more ground than a place
+_MIN_LARGER_OVERLAP = {8: 1.0, 12: 0.75}  # the same, for a query that shows more ground than a place
 _MIN_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
 # Pairs of a place and a rotation that are compared by the fine grid, if headings are known for all places, and if not.
-_LOOKED_CLOSER = 1000, 2000
-_RIVALS = 2048  # unlikely places that are scored
-_ROWS_AT_ONCE = 256
+_FINE_PAIRS = (1000, 2000)
+_RIVAL_PLACES = 2048  # unlikely places that are scored
+_ROWS_PER_PRODUCT = 256
 _TINY = 1e-9
 
 # Gives the field of the query under a rotation, in steps of 15 degrees, on a grid.
 Fields = Callable[[int, Grid], Singles]
 
-_NOTHING = 0x88  # a byte of two numbers that are 0
+_EMPTY_BYTE = 0x88  # a byte of two numbers that are 0
 
 # The two numbers of each byte, the low half first.
-_HALVES = np.stack(np.divmod(np.arange(256), 16)[::-1], axis=1).astype(np.float32) - (_LEVELS + 1)
+_BYTE_NUMBERS = np.stack(np.divmod(np.arange(256), 16)[::-1], axis=1).astype(np.float32) - (_MAX_LEVEL + 1)
 
 
-def field(grid: Grid, patterns: Array, numbers: Ints, sides: tuple[int, int]) -> Array:
+def make_field(grid: Grid, patterns: Array, numbers: Ints, sides: tuple[int, int]) -> Array:
     """Lay the patterns of good regions on a grid. `patterns` (G, 20) are those of the regions with these `numbers`, int
     (G,), row by row of `sides[0]` x `sides[0]` regions; a place has `sides[1]` along a side, and the same middle.
     Returns the field (C, m, m) of C channels. m is `grid.side` or, for a picture of more ground, larger by an even
@@ -67,13 +67,13 @@ def field(grid: Grid, patterns: Array, numbers: Ints, sides: tuple[int, int]) ->
     whole = np.zeros((side * side, len(grid.channels) + 1), patterns.dtype)
     whole[numbers, :-1] = patterns[:, grid.channels]
     whole[numbers, -1] = 1
-    pooled = _both_ways(_pooling(side, of_place, grid.side), whole.reshape(side, side, -1).transpose(2, 0, 1))
+    pooled = _apply_weights(_make_pooling(side, of_place, grid.side), whole.reshape(side, side, -1).transpose(2, 0, 1))
     values, weight = pooled[:-1], pooled[-1]
     values = values - weight * (values.sum(axis=(1, 2)) / max(float(weight.sum()), _TINY))[:, None, None]
-    near = _distance_weights(len(weight), _AROUND * grid.side)
-    values -= weight * _both_ways(near, values) / np.maximum(_both_ways(near, weight), _TINY)
+    near = _make_distance_weights(len(weight), _SURROUND_SD * grid.side)
+    values -= weight * _apply_weights(near, values) / np.maximum(_apply_weights(near, weight), _TINY)
     values /= np.sqrt(np.maximum(np.sqrt((values**2).sum(axis=0)), _MIN_STRENGTH))
-    laid: Array = values * (weight > _MIN_SEEN)
+    laid: Array = values * (weight > _MIN_SEEN_SHARE)
     return laid
 
 
@@ -83,26 +83,28 @@ def encode_place(patterns: Array, good: Bools, side: int) -> Bytes:
     numbers = np.flatnonzero(good)
     stored = []
     for grid in (COARSE, FINE):
-        values = field(grid, patterns[numbers], numbers, (side, side)).ravel()
-        largest = max(float(np.percentile(np.abs(values), _MAX_KEPT)), _TINY)
-        levels = np.clip(np.rint(values * (_LEVELS / largest)), -_LEVELS, _LEVELS).astype(np.uint8) + (_LEVELS + 1)
+        values = make_field(grid, patterns[numbers], numbers, (side, side)).ravel()
+        largest = max(float(np.percentile(np.abs(values), _LEVEL_PERCENTILE)), _TINY)
+        levels = np.clip(np.rint(values * (_MAX_LEVEL / largest)), -_MAX_LEVEL, _MAX_LEVEL).astype(np.uint8) + (
+            _MAX_LEVEL + 1
+        )
         stored.append(levels[::2] | levels[1::2] << 4)
     packed: Bytes = np.concatenate(stored).astype(np.uint8)
     return packed
 
 
-def scan(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools | None) -> Singles:
+def scan_places(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools | None) -> Singles:
     """Score all places by their coarse parts, `rows` uint8 (N, NBYTES), under each rotation: float32 (N, 24).
     `turned_deg` (N,) is the rotation under which each place is expected: only the nearest step and the two next to it
     are scored, and the others are -inf (NaN or None: all are scored). `likely` bool (N,): places that may be compared
     by the fine grid (None: all). A pair that is has a score of 0 to 1; any other has its score by the coarse grid, less
     1. Of the places that are not likely some two thousand are scored, evenly chosen, as rivals."""
     scores = np.full((len(rows), ROTATIONS), -np.inf, np.float32)
-    if likely is not None and (step := np.count_nonzero(~likely) // _RIVALS) > 1:
+    if likely is not None and (step := np.count_nonzero(~likely) // _RIVAL_PLACES) > 1:
         some = likely.copy()
         some[np.flatnonzero(~likely)[::step]] = True
         of_some = None if turned_deg is None else turned_deg[some]
-        scores[some] = scan(fields, rows[some], of_some, likely[some])
+        scores[some] = scan_places(fields, rows[some], of_some, likely[some])
         return scores
     turns = np.full(len(rows), -1)
     if turned_deg is not None:
@@ -118,7 +120,7 @@ def scan(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools 
         scores[np.arange(len(rows))[group][:, None], tried] = found
     scores -= 1
     chances = scores if likely is None else np.where(likely[:, None], scores, -np.inf)
-    count = min(_LOOKED_CLOSER[int(turns.min() < 0)], chances.size)
+    count = min(_FINE_PAIRS[int(turns.min() < 0)], chances.size)
     best = np.argpartition(-chances, count - 1, axis=None)[:count]
     slots, turned = np.divmod(best[np.isfinite(chances.flat[best])], ROTATIONS)
     for turn in np.unique(turned):
@@ -128,9 +130,10 @@ def scan(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools 
     return scores
 
 
-def agreement(query: Array, place: Array, shift: tuple[float, float]) -> float:
-    """Return the score (see `scan`), 0 to 1, of the fine field of a query, (C, m, m), on that of a place, (C, n, n), if
-    the query's middle lies `shift` (dx, dy) from the place's, as shares of the place's side, or up to a cell off."""
+def compute_agreement(query: Array, place: Array, shift: tuple[float, float]) -> float:
+    """Return the score (see `scan_places`), 0 to 1, of the fine field of a query, (C, m, m), on that of a place, (C, n,
+    n), if the query's middle lies `shift` (dx, dy) from the place's, as shares of the place's side, or up to a cell
+    off."""
     n = place.shape[1]
     dx, dy = (round(each * n) for each in shift)
     padded = _pad_field(query, n)
@@ -142,7 +145,7 @@ def agreement(query: Array, place: Array, shift: tuple[float, float]) -> float:
     laid = np.stack([padded[:, y : y + n, x : x + n] for y, x in inside])
     of_place = (place**2).sum(axis=0)
     scatter = ((laid**2).sum(axis=1) * of_place).sum(axis=(1, 2))
-    scatter = np.maximum(scatter, _MIN_SCATTER**2 * _strength(query) * of_place.sum())
+    scatter = np.maximum(scatter, _MIN_SCATTER**2 * _measure_strength(query) * of_place.sum())
     found = np.einsum("scij,cij->s", laid, place) / (np.sqrt(scatter + _TINY) * n)
     return float(np.clip(found.max(), 0, 1))
 
@@ -158,20 +161,20 @@ def _compare_fields(grid: Grid, queries: list[Singles], packed: Bytes) -> Single
     asked /= np.sqrt(np.maximum(scatter, np.repeat(least, [len(each) for each in laid])) + _TINY)[:, None]
     best = np.empty((len(packed), len(queries)), np.float32)
     was, kept = None, asked
-    for start in range(0, len(packed), _ROWS_AT_ONCE):
-        part = packed[start : start + _ROWS_AT_ONCE]
+    for start in range(0, len(packed), _ROWS_PER_PRODUCT):
+        part = packed[start : start + _ROWS_PER_PRODUCT]
         # Wide pictures leave the same cells of every place empty.
-        filled = (part != _NOTHING).any(axis=0)
+        filled = (part != _EMPTY_BYTE).any(axis=0)
         if was is None or (filled != was).any():
             was, kept = filled, asked.compress(np.repeat(filled, 2), axis=1)
-        places = np.take(_HALVES, part[:, filled], axis=0).reshape(len(part), -1)
+        places = np.take(_BYTE_NUMBERS, part[:, filled], axis=0).reshape(len(part), -1)
         found = (kept @ places.T).reshape(len(queries), -1, len(part)).max(axis=1)
         strength = np.einsum("nd,nd->n", places, places)
         best[start : start + len(part)] = (found / np.sqrt(strength + _TINY)).T
     return best
 
 
-def _strength(field: Array) -> float:
+def _measure_strength(field: Array) -> float:
     """Return the mean square of the length of the vectors in the cells of a field (C, m, m)."""
     return float((field**2).sum() / field[0].size)
 
@@ -187,23 +190,23 @@ def _pad_field(query: Array, n: int) -> Array:
 def _shift_field(query: Singles, n: int) -> Singles:
     """Return a field (C, m, m) of a query as it lies on a place of `n` x `n` cells under each shift: (S, C n n)."""
     windows = sliding_window_view(_pad_field(query, n), (n, n), axis=(1, 2)).transpose(1, 2, 0, 3, 4)  # (K, K, C, n, n)
-    y, x = _shifts(query.shape[1], n)
+    y, x = _list_shifts(query.shape[1], n)
     return windows[y, x].reshape(len(y), -1)
 
 
 @lru_cache
-def _shifts(m: int, n: int) -> tuple[Ints, Ints]:
+def _list_shifts(m: int, n: int) -> tuple[Ints, Ints]:
     """Return where the windows of `n` cells begin, on a query of `m` cells with a border of n on every side, under
     which the query covers enough of a place: int (S,), int (S,)."""
     first = np.arange(m + n + 1)
     covered = np.minimum(first + n, m + n) - np.maximum(first, n)
-    least = _MIN_OVERLAP[n] if m == n else _MIN_OF_LARGER[n]
+    least = _MIN_OVERLAP[n] if m == n else _MIN_LARGER_OVERLAP[n]
     y, x = np.nonzero(np.outer(covered.clip(0), covered.clip(0)) >= least * n * n)
     return y, x
 
 
 @lru_cache
-def _pooling(side: int, of_place: int, cells: int) -> Singles:
+def _make_pooling(side: int, of_place: int, cells: int) -> Singles:
     """Return the weights, float32 (m, side), by which `side` regions in a row are averaged in m cells with the same
     middle, of which `cells` are as long as the `encode_place` regions of a place."""
     pitch = of_place / cells
@@ -216,14 +219,14 @@ def _pooling(side: int, of_place: int, cells: int) -> Singles:
 
 
 @lru_cache
-def _distance_weights(cells: int, sd: float) -> Singles:
+def _make_distance_weights(cells: int, sd: float) -> Singles:
     """Return Gaussian weights of the distances between cells in a row, float32 (cells, cells)."""
     away = np.subtract.outer(np.arange(cells), np.arange(cells))
     weights: Singles = np.exp(-(away**2) / (2 * sd**2)).astype(np.float32)
     return weights
 
 
-def _both_ways(weights: Singles, values: Array) -> Array:
+def _apply_weights(weights: Singles, values: Array) -> Array:
     """Apply `weights` (m, n) along both sides of `values` (..., n, n): (..., m, m)."""
     summed: Array = weights @ values @ weights.T
     return summed

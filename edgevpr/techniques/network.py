@@ -13,10 +13,10 @@ import numpy as np
 from edgevpr.core.arrays import Doubles, Image, Mask, Singles
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.card import Card, compute_digest
-from edgevpr.techniques.regions import describe, find_regions, region_backbone
+from edgevpr.techniques.regions import describe_regions, find_regions, open_region_backbone
 from edgevpr.techniques.session import Backbone, open_backbone
-from edgevpr.techniques.vectors import NEVER, VectorTechnique
-from edgevpr.techniques.words import compute_sharpness, load_words, local_descriptors, vlad
+from edgevpr.techniques.vectors import UNREACHABLE_MARGIN, VectorTechnique
+from edgevpr.techniques.words import compute_sharpness, compute_vlad, load_words, make_local_descriptors
 
 # Minimum margins in the forms `float`, `8bit` and `1bit`. Beside them the largest margin of a wrong match, with the
 # shipped weights: on corridor and aerial_caliterra (the data sets used for tuning), and with the queries of one of them
@@ -39,7 +39,7 @@ class NetworkVector(VectorTechnique):
     def __init__(self, name: str, backbone: Backbone, head: Head | None, **spec: Any) -> None:
         self._backbone, self._head = backbone, head or np.asarray
         length = len(self._head(np.zeros(backbone.shape, np.float32)))
-        spec = {"margins": _MARGINS.get(name, (NEVER,) * 3), "model_sha256": backbone.sha256, **spec}
+        spec = {"margins": _MARGINS.get(name, (UNREACHABLE_MARGIN,) * 3), "model_sha256": backbone.sha256, **spec}
         super().__init__(name, length, **spec)
 
     def vector(self, image: Image, mask: Mask | None) -> Singles:
@@ -66,7 +66,7 @@ def alexnet(
     if not (8 <= dims <= 65_536 and 0 <= seed < 2**31):
         raise UsageError(f"alexnet cannot use dims={dims}, seed={seed}: dims must be 8 to 65536, seed 0 or more.")
     backbone = open_backbone(model, "features", threads)
-    head = gaussian_projection(int(np.prod(backbone.shape)), dims, seed)
+    head = make_gaussian_projection(int(np.prod(backbone.shape)), dims, seed)
     return NetworkVector("alexnet", backbone, head, parameters={"model": model, "dims": dims, "seed": seed}, form=form)
 
 
@@ -77,13 +77,13 @@ def amosnet(model: str = "calc", form: str = "float", threads: int = 1, levels: 
     Chen et al., "Deep Learning Features at Scale for Visual Place Recognition", ICRA 2017, in the form of thesis 4.2.1:
     `conv5` of a network trained from scratch on the places of SPED (its card is `model`), with spatial pyramid pooling.
     Divided by the sum, more places of the tuning sets are found."""
-    return _pyramid("amosnet", model, form, threads, levels)
+    return _make_pyramid("amosnet", model, form, threads, levels)
 
 
 def hybridnet(model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> NetworkVector:
     """Make `hybridnet`: `amosnet` with other weights, started from CaffeNet (Chen et al., ICRA 2017; thesis 4.2.1).
     Give their card as `model`."""
-    return _pyramid("hybridnet", model, form, threads, levels)
+    return _make_pyramid("hybridnet", model, form, threads, levels)
 
 
 def netvlad(
@@ -102,7 +102,7 @@ def netvlad(
     sharpness = compute_sharpness(learned) if assignment == "soft" else None
 
     def head(features: Singles) -> Singles:
-        return vlad(local_descriptors(features), learned, sharpness)
+        return compute_vlad(make_local_descriptors(features), learned, sharpness)
 
     parameters = {"model": model, "words": words, "assignment": assignment}
     return NetworkVector("netvlad", backbone, head, parameters=parameters, form=form, model_sha256=sha256)
@@ -116,11 +116,11 @@ def region_vlad(
 
     Khaliq et al., "A Holistic Visual Place Recognition Approach Using Lightweight CNNs for Significant ViewPoint and
     Appearance Changes", T-RO 2019, in the form of thesis 4.2.1: 400 regions of `conv4`, 256 words."""
-    backbone = region_backbone("region_vlad", model, threads, regions)
+    backbone = open_region_backbone("region_vlad", model, threads, regions)
     learned, sha256 = load_words(model, "regions", words)
 
     def head(features: Singles) -> Singles:
-        return vlad(describe(features, find_regions(features, regions)), learned)
+        return compute_vlad(describe_regions(features, find_regions(features, regions)), learned)
 
     parameters = {"model": model, "regions": regions, "words": words}
     return NetworkVector("region_vlad", backbone, head, parameters=parameters, form=form, model_sha256=sha256)
@@ -139,12 +139,12 @@ def make_from_card(card: Card, form: str = "float", threads: int = 1) -> Network
     return made
 
 
-def _pyramid(name: str, model: str, form: str, threads: int, levels: int) -> NetworkVector:
+def _make_pyramid(name: str, model: str, form: str, threads: int, levels: int) -> NetworkVector:
     if not 1 <= levels <= 64:
         raise UsageError(f"{name}: levels is {levels}; it must be 1 to 64.")
 
     def head(features: Singles) -> Singles:
-        pooled = pyramid(features, levels)
+        pooled = pool_pyramid(features, levels)
         shares: Singles = pooled / max(float(np.abs(pooled).sum()), 1e-6)
         return shares
 
@@ -154,7 +154,7 @@ def _pyramid(name: str, model: str, form: str, threads: int, levels: int) -> Net
     )
 
 
-def pyramid(features: Singles, levels: int) -> Singles:
+def pool_pyramid(features: Singles, levels: int) -> Singles:
     """Pool the maxima of a spatial pyramid (He et al. 2014, section 2.2): float32 (C, H, W) to float32 (C * sum of
     n^2,), the largest activation of each channel in each cell of one grid of n x n after the other, n = 1 to `levels`.
     Raises ModelError for a feature map smaller than a grid."""
@@ -168,13 +168,13 @@ def pyramid(features: Singles, levels: int) -> Singles:
         [
             features[:, top:bottom, left:right].max(axis=(1, 2))
             for n in range(1, levels + 1)
-            for top, bottom in _cells(height, n)
-            for left, right in _cells(width, n)
+            for top, bottom in _split_cells(height, n)
+            for left, right in _split_cells(width, n)
         ]
     )
 
 
-def gaussian_projection(size: int, length: int, seed: int) -> Callable[[Singles], Singles]:
+def make_gaussian_projection(size: int, length: int, seed: int) -> Callable[[Singles], Singles]:
     """Make a Gaussian random projection of float32 of `size` values in any shape to float32 (length,), which keeps
     angles, and lengths on average. Raises ModelError if `length` is larger than `size`.
 
@@ -185,7 +185,7 @@ def gaussian_projection(size: int, length: int, seed: int) -> Callable[[Singles]
         raise ModelError(
             f"A feature map of {size} values cannot be projected to {length} dimensions: ask for at most {size}."
         )
-    row, signs = gaussian_row(size, seed)
+    row, signs = make_gaussian_row(size, seed)
     spectrum = np.conj(np.fft.rfft(row))  # row j of the matrix is the Gaussian vector shifted by j: a correlation
 
     def projected(features: Singles) -> Singles:
@@ -195,7 +195,7 @@ def gaussian_projection(size: int, length: int, seed: int) -> Callable[[Singles]
     return projected
 
 
-def gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
+def make_gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
     """Make the Gaussian vector float64 (size,) and the signs float32 (size,), +1 or -1, of a seed. They must be the
     same for as long as a map is used, which NumPy promises for the raw numbers of PCG64 only (NEP 19): first two for
     each pair of Gaussian values (Box and Muller 1958), then one for each sign."""
@@ -209,5 +209,5 @@ def gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
     return row, signs
 
 
-def _cells(length: int, count: int) -> list[tuple[int, int]]:
+def _split_cells(length: int, count: int) -> list[tuple[int, int]]:
     return [(i * length // count, -(-(i + 1) * length // count)) for i in range(count)]

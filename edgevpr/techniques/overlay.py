@@ -15,7 +15,9 @@ from edgevpr.core.arrays import Array, Bools, Mask, Singles
 from edgevpr.core.contract import FineMatch
 
 _MIN_STRENGTH = 0.02  # of a region's patterns; weaker ones are noise
-_ROOM, _MISSES, _PEAK = 7, 2, 2  # cells: shifts compared; by which a match may miss; that belong to the same peak
+_MAX_SHIFT_CELLS = 7  # of the shifts that are compared
+_MAX_MISS_CELLS = 2  # by which a match may miss
+_PEAK_RADIUS_CELLS = 2
 _MIN_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
 _TINY = 1e-9
 
@@ -35,43 +37,44 @@ def overlay_query(grey: Array, allowed: Mask, match: FineMatch, cells: int) -> t
     return there, seen.astype(bool)
 
 
-def structure(patterns: Array, seen: Bools, around_cells: float) -> Singles:
+def compute_structure(patterns: Array, seen: Bools, around_cells: float) -> Singles:
     """Return the structure of a picture, float32 (n, n, P), from the patterns of its regions (n * n, P), of which those
     count that are `seen`, bool (n, n). `around_cells` is the standard deviation of what counts as around a region."""
     weight = seen.astype(np.float32)
     values = patterns.reshape(*seen.shape, -1).astype(np.float32) * weight[..., None]
-    near = _sum_around(values, around_cells) / np.maximum(_sum_around(weight, around_cells), _TINY)[..., None]
+    near = _blur_cells(values, around_cells) / np.maximum(_blur_cells(weight, around_cells), _TINY)[..., None]
     values -= near * weight[..., None]
     strength = np.sqrt((values**2).sum(axis=2))
     found: Singles = values / np.sqrt(np.maximum(strength, _MIN_STRENGTH))[..., None]
     return found
 
 
-def stands_out(query: Singles, place: Singles) -> float:
+def measure_prominence(query: Singles, place: Singles) -> float:
     """Return by how much the agreement of two structures (n, n, P), the query's as it lies over the place, stands out
     from that at other shifts, in standard deviations of independent structures."""
-    border = ((_ROOM, _ROOM), (_ROOM, _ROOM))
+    border = ((_MAX_SHIFT_CELLS, _MAX_SHIFT_CELLS), (_MAX_SHIFT_CELLS, _MAX_SHIFT_CELLS))
     common = cv2.matchTemplate(np.pad(query, (*border, (0, 0))), place, cv2.TM_CCORR)
-    of_query, of_place, least = _strengths(query, place)
+    of_query, of_place, least = _measure_strengths(query, place)
     scatter = cv2.matchTemplate(np.pad(of_query, border), of_place, cv2.TM_CCORR)
-    agree = common / np.sqrt(np.maximum(scatter, least) + _TINY)  # at all shifts of up to `_ROOM` cells
-    first, last = _ROOM - _MISSES, _ROOM + _MISSES + 1
+    agree = common / np.sqrt(np.maximum(scatter, least) + _TINY)  # at all shifts of up to `_MAX_SHIFT_CELLS` cells
+    first, last = _MAX_SHIFT_CELLS - _MAX_MISS_CELLS, _MAX_SHIFT_CELLS + _MAX_MISS_CELLS + 1
     at_y, at_x = np.divmod(int(agree[first:last, first:last].argmax()), last - first)
     y, x = at_y + first, at_x + first
     peak = float(agree[y, x])
-    agree[max(0, y - _PEAK) : y + _PEAK + 1, max(0, x - _PEAK) : x + _PEAK + 1] = -np.inf
+    top, left = (max(0, middle - _PEAK_RADIUS_CELLS) for middle in (y, x))
+    agree[top : y + _PEAK_RADIUS_CELLS + 1, left : x + _PEAK_RADIUS_CELLS + 1] = -np.inf
     return peak - float(agree.max())
 
 
-def agreement(query: Singles, place: Singles, shift_cells: tuple[float, float]) -> float:
+def compute_agreement(query: Singles, place: Singles, shift_cells: tuple[float, float]) -> float:
     """Return the agreement of two structures (n, n, P), in standard deviations of independent ones, with the query's
     middle at the shift (dx, dy) from that of the place, or up to two cells beside."""
     n = len(place)
-    of_query, of_place, least = _strengths(query, place)
-    x, y = (min(max(round(each), _MISSES - n), n - _MISSES) for each in shift_cells)
+    of_query, of_place, least = _measure_strengths(query, place)
+    x, y = (min(max(round(each), _MAX_MISS_CELLS - n), n - _MAX_MISS_CELLS) for each in shift_cells)
     best = 0.0
-    for dy in range(y - _MISSES, y + _MISSES + 1):
-        for dx in range(x - _MISSES, x + _MISSES + 1):
+    for dy in range(y - _MAX_MISS_CELLS, y + _MAX_MISS_CELLS + 1):
+        for dx in range(x - _MAX_MISS_CELLS, x + _MAX_MISS_CELLS + 1):
             asked = np.s_[max(0, -dy) : n - max(0, dy), max(0, -dx) : n - max(0, dx)]
             known = np.s_[max(0, dy) : n + min(0, dy), max(0, dx) : n + min(0, dx)]
             scatter = max(float(np.einsum("ij,ij", of_query[asked], of_place[known])), least)
@@ -79,11 +82,11 @@ def agreement(query: Singles, place: Singles, shift_cells: tuple[float, float]) 
     return best
 
 
-def _strengths(query: Singles, place: Singles) -> tuple[Singles, Singles, float]:
+def _measure_strengths(query: Singles, place: Singles) -> tuple[Singles, Singles, float]:
     """Return the squared strengths of two structures in each cell, (n, n), and the least scatter of their agreement."""
     of_query, of_place = (query**2).sum(axis=2), (place**2).sum(axis=2)
     return of_query, of_place, _MIN_SCATTER**2 * float(of_query.sum()) * float(of_place.sum()) / of_place.size
 
 
-def _sum_around(values: Singles, cells: float) -> Singles:
+def _blur_cells(values: Singles, cells: float) -> Singles:
     return np.asarray(cv2.GaussianBlur(values, (0, 0), cells, borderType=cv2.BORDER_CONSTANT))

@@ -10,11 +10,11 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Doubles
 
-_ROUNDS = 10
-_WITHIN_CELLS = 1.5  # largest distance of an agreeing region from the fit
+_FIT_ROUNDS = 10
+_MAX_RESIDUAL_CELLS = 1.5  # largest distance of an agreeing region from the fit
 _MIN_PAIRS = 12
-_PRIOR_SD = 0.17  # of the change of scale from cell to cell: far more than a picture that is taken bears
-_ALIKE = 5.0  # neighbouring regions share pixels and relief: so many count as one
+_SLOPE_PRIOR_SD = 0.17  # of the change of scale from cell to cell: far more than a picture that is taken bears
+_CORRELATED_REGIONS = 5.0  # neighbouring regions share pixels and relief: so many count as one
 _MIN_SCALE = 0.05  # nearer to the horizon of a homography, nothing lies anywhere
 
 
@@ -27,8 +27,8 @@ def fit_perspective(
     if fewer than 12 do."""
     way = np.array([turn_scale.real, -turn_scale.imag, shift.real, turn_scale.imag, turn_scale.real, shift.imag, 0, 0])
     normal = np.eye(8)
-    for _ in range(_ROUNDS):
-        agrees, _ = _compare(way, asked, known)
+    for _ in range(_FIT_ROUNDS):
+        agrees, _ = _compute_residuals(way, asked, known)
         if np.count_nonzero(agrees) < _MIN_PAIRS:
             return None
         (x, y), (to_x, to_y) = ((points[agrees].real, points[agrees].imag) for points in (asked, known))
@@ -41,23 +41,23 @@ def fit_perspective(
         )
         weight = np.tile(1 / (1 + way[6] * x + way[7] * y), 2)
         looks *= weight[:, None]
-        normal = looks.T @ looks + np.diag([0.0] * 6 + [_PRIOR_SD**-2] * 2)
+        normal = looks.T @ looks + np.diag([0.0] * 6 + [_SLOPE_PRIOR_SD**-2] * 2)
         way = np.linalg.solve(normal, looks.T @ (weight * np.concatenate([to_x, to_y])))
-    agrees, off = _compare(way, asked, known)
+    agrees, off = _compute_residuals(way, asked, known)
     if np.count_nonzero(agrees) < _MIN_PAIRS:
         return None
     # A region is matched to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
     variance = float((np.abs(off[agrees]) ** 2).mean()) / 2 + 1 / 12
-    covariance = _ALIKE * variance * np.linalg.inv(normal)[6:, 6:]
+    covariance = _CORRELATED_REGIONS * variance * np.linalg.inv(normal)[6:, 6:]
     homography = np.append(way, 1.0).reshape(3, 3)
     return homography, float(np.sqrt(np.trace(covariance) / 2)), int(np.count_nonzero(agrees))
 
 
-def _compare(way: Doubles, asked: Array, known: Array) -> tuple[Bools, Array]:
+def _compute_residuals(way: Doubles, asked: Array, known: Array) -> tuple[Bools, Array]:
     """Return which regions agree with a homography, bool (n,), and by how much each misses, complex (n,)."""
     x, y = asked.real, asked.imag
     scale = 1 + way[6] * x + way[7] * y
     there = (way[0] * x + way[1] * y + way[2] + 1j * (way[3] * x + way[4] * y + way[5])) / np.maximum(scale, _MIN_SCALE)
     off = known - there
-    agrees: Bools = (np.maximum(np.abs(off.real), np.abs(off.imag)) <= _WITHIN_CELLS) & (scale > _MIN_SCALE)
+    agrees: Bools = (np.maximum(np.abs(off.real), np.abs(off.imag)) <= _MAX_RESIDUAL_CELLS) & (scale > _MIN_SCALE)
     return agrees, off

@@ -10,95 +10,95 @@ from functools import lru_cache
 import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Bytes, Floats, Ints, Singles
-from edgevpr.techniques.gradients import waves
+from edgevpr.techniques.gradients import make_waves
 
 SIDE = 12  # cells along one side
-_SAMPLES = 3  # along one side of a cell: about one per block, for 31 blocks
+_SAMPLES_PER_SIDE = 3  # along one side of a cell: about one per block, for 31 blocks
 _MIN_OVERLAP = 0.5  # a smaller overlap costs more shifts, and found no further place on any data set
-_LOOKED_CLOSER = 500  # places compared under all shifts: a tenth of the time of a scan of 10 000
-_BITS_AT_ONCE = 1 << 19  # of places: 2 MB as float32
+_FULL_SCAN_PLACES = 500  # places compared under all shifts: a tenth of the time of a scan of 10 000
+_BITS_PER_PRODUCT = 1 << 19  # of places: 2 MB as float32
 
 # Each byte as its eight bits, first bit first, +1 or -1: one look-up instead of `unpackbits`, conversion and offset.
-_SIGNS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32) * 2 - 1
+_BYTE_SIGNS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32) * 2 - 1
 
 
 _DY, _DX = np.mgrid[1 - SIDE : SIDE, 1 - SIDE : SIDE]
-_ENOUGH = (SIDE - abs(_DX)) * (SIDE - abs(_DY)) >= _MIN_OVERLAP * SIDE**2
+_HAS_OVERLAP = (SIDE - abs(_DX)) * (SIDE - abs(_DY)) >= _MIN_OVERLAP * SIDE**2
 # int8 (S, 2): every shift (dx, dy) in cells under which two grids overlap by at least half.
-SHIFTS = np.stack([_DX[_ENOUGH], _DY[_ENOUGH]], axis=1).astype(np.int8)
+SHIFTS = np.stack([_DX[_HAS_OVERLAP], _DY[_HAS_OVERLAP]], axis=1).astype(np.int8)
 
 
-def grid(blocks: Singles, seen: Bools, counted: Bools) -> tuple[Singles, Bools]:
+def make_grid(blocks: Singles, seen: Bools, counted: Bools) -> tuple[Singles, Bools]:
     """Make the grid of a picture from its blocks float32 (n, n, 4 L), each of L orientations for its 2x2 cells: from
     the middle square, at least 12 wide, of those `seen`, bool (n, n), so that it holds no border of the picture. The
     blocks `counted`, bool (n, n), are averaged in each of 12x12 larger cells, which has length 1, so that contrast and
     haze do not count. Returns the grid float32 (12, 12, L), and bool (12, 12), True where at least half of the cell is
     counted."""
     n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), SIDE)
-    middle, at = slice((len(seen) - n) // 2, (len(seen) + n) // 2), _sources(n)
+    middle, at = slice((len(seen) - n) // 2, (len(seen) + n) // 2), _list_blocks(n)
     per_block, counts = blocks[middle, middle].reshape(n * n, 4, -1).mean(axis=1), counted[middle, middle].ravel()
     cells = (per_block * counts[:, None])[at].mean(axis=1)
     cells /= np.maximum(np.linalg.norm(cells, axis=-1, keepdims=True), 1e-6)
     return cells.reshape(SIDE, SIDE, -1), (counts[at].mean(axis=1) >= 0.5).reshape(SIDE, SIDE)
 
 
-def special(grids: Floats, mean: Floats) -> Array:
+def compute_deviations(grids: Floats, mean: Floats) -> Array:
     """Subtract the map's mean (12, 12, L) from `grids` (..., 12, 12, L) and write the orientations of each cell as a
     Fourier series: float32 of the shape of `grids`."""
-    apart: Array = (np.asarray(grids, np.float32) - mean) @ waves(grids.shape[-1]).T
+    apart: Array = (np.asarray(grids, np.float32) - mean) @ make_waves(grids.shape[-1]).T
     return apart
 
 
-def pack(grids: Floats, mean: Floats) -> Bytes:
+def pack_grids(grids: Floats, mean: Floats) -> Bytes:
     """Make the rows of the index from `grids` (N, 12, 12, L) and the map's mean (12, 12, L): uint8 (N, 18 L), the sign
-    of each number of `special` as one bit."""
-    return np.packbits((special(grids, mean) >= 0).reshape(len(grids), -1), axis=1)
+    of each number of `compute_deviations` as one bit."""
+    return np.packbits((compute_deviations(grids, mean) >= 0).reshape(len(grids), -1), axis=1)
 
 
-def hypotheses(grid: Singles, seen: Bools, mean: Floats) -> Singles:
-    """Make the hypotheses of a query, float32 (S, 144 L), from its `grid` and `seen` (see `grid`) and the map's
+def make_hypotheses(grid: Singles, seen: Bools, mean: Floats) -> Singles:
+    """Make the hypotheses of a query, float32 (S, 144 L), from its `grid` and `seen` (see `make_grid`) and the map's
     mean (12, 12, L). Row s is the signs of the query (0 where nothing is seen), moved by shift s of `SHIFTS`."""
-    signs = np.where(special(grid, mean) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
+    signs = np.where(compute_deviations(grid, mean) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
     asked = np.zeros((len(SHIFTS), *signs.shape), np.float32)
     for at, (dx, dy) in enumerate(SHIFTS.tolist()):
-        asked[at, _target_slice(dy), _target_slice(dx)] = signs[_target_slice(-dy), _target_slice(-dx)]
+        asked[at, _slice_target(dy), _slice_target(dx)] = signs[_slice_target(-dy), _slice_target(-dx)]
     return asked.reshape(len(SHIFTS), -1)
 
 
-def scan(asked: Singles, codes: Bytes) -> Singles:
+def scan_codes(asked: Singles, codes: Bytes) -> Singles:
     """Compare every hypothesis, `asked` float32 (S, 8 B), with every place, `codes` uint8 (N, B). Returns the best
     score of each place, float32 (N,): the share of equal bits less that of different ones (1: the same picture, 0:
     chance)."""
     by_bit = asked.T
     best = np.empty(len(codes), np.float32)
-    at_once = max(1, _BITS_AT_ONCE // asked.shape[1])
+    at_once = max(1, _BITS_PER_PRODUCT // asked.shape[1])
     bits = np.empty((at_once, codes.shape[1], 8), np.float32)
     scores = np.empty((at_once, len(asked)), np.float32)
     for start in range(0, len(codes), at_once):
         part = codes[start : start + at_once]
         count = len(part)
-        np.take(_SIGNS, part, axis=0, out=bits[:count], mode="clip")
+        np.take(_BYTE_SIGNS, part, axis=0, out=bits[:count], mode="clip")
         np.matmul(bits[:count].reshape(count, -1), by_bit, out=scores[:count])
         np.max(scores[:count], axis=1, out=best[start : start + count])
     best /= asked.shape[1]
     return best
 
 
-def scan_ahead(asked: Singles, codes: Bytes) -> Singles:
-    """Compare as `scan` does, but faster: all places under a quarter of the shifts, each averaged with the shifts
+def scan_in_two_steps(asked: Singles, codes: Bytes) -> Singles:
+    """Compare as `scan_codes` does, but faster: all places under a quarter of the shifts, each averaged with the shifts
     around it, then only the best 500 places under all shifts."""
-    if len(codes) <= _LOOKED_CLOSER:
-        return scan(asked, codes)
-    scores = scan(_blur_weights() @ asked, codes)
-    best = np.argpartition(-scores, _LOOKED_CLOSER)[:_LOOKED_CLOSER]
-    scores[best] = scan(asked, codes[best])
+    if len(codes) <= _FULL_SCAN_PLACES:
+        return scan_codes(asked, codes)
+    scores = scan_codes(_make_blur_weights() @ asked, codes)
+    best = np.argpartition(-scores, _FULL_SCAN_PLACES)[:_FULL_SCAN_PLACES]
+    scores[best] = scan_codes(asked, codes[best])
     return scores
 
 
 @lru_cache
-def _blur_weights() -> Singles:
-    """Return the weights, float32 (E, S), by which `scan_ahead` averages: row e has the weight of each of all S shifts
-    in the mean around the e-th of the E shifts whose dx and dy are even."""
+def _make_blur_weights() -> Singles:
+    """Return the weights, float32 (E, S), by which `scan_in_two_steps` averages: row e has the weight of each of all S
+    shifts in the mean around the e-th of the E shifts whose dx and dy are even."""
     kept = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
     weight = np.maximum(1 - abs(kept[:, None] - SHIFTS) / 2, 0).prod(axis=2)
     weights: Singles = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -106,15 +106,15 @@ def _blur_weights() -> Singles:
 
 
 @lru_cache(maxsize=8)
-def _sources(n: int) -> Ints:
+def _list_blocks(n: int) -> Ints:
     """Return the blocks that are averaged in each of the 12x12 cells of a grid, 9 for a cell (some may be equal), by
     their numbers, row by row, in the picture's n x n blocks: int (144, 9)."""
-    at = np.floor((np.arange(SIDE * _SAMPLES) + 0.5) / (SIDE * _SAMPLES) * n).astype(np.intp)
-    numbers = np.add.outer(at * n, at).reshape(SIDE, _SAMPLES, SIDE, _SAMPLES)
-    return numbers.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES**2)
+    at = np.floor((np.arange(SIDE * _SAMPLES_PER_SIDE) + 0.5) / (SIDE * _SAMPLES_PER_SIDE) * n).astype(np.intp)
+    numbers = np.add.outer(at * n, at).reshape(SIDE, _SAMPLES_PER_SIDE, SIDE, _SAMPLES_PER_SIDE)
+    return numbers.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES_PER_SIDE**2)
 
 
-def _target_slice(step: int) -> slice:
+def _slice_target(step: int) -> slice:
     """Return the slice of one axis of the grid to which cells are copied when the grid is moved by `step` cells along
-    it; they are copied from the slice `_to(-step)`."""
+    it; they are copied from that of `-step`."""
     return slice(max(0, step), SIDE + min(0, step))

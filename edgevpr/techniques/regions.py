@@ -17,12 +17,12 @@ from edgevpr.core.contract import Descriptor, FineMatch, PartSpec
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.session import Backbone, open_backbone
 from edgevpr.techniques.vectors import VectorTechnique
-from edgevpr.techniques.words import bag_of_words, load_words, unit
+from edgevpr.techniques.words import compute_bag_of_words, load_words, normalise_rows
 
 _TINY = 1e-12
 Describe = Callable[[Singles], tuple[Singles, Singles]]
 Square = tuple[int, int, int]  # top, left, side, in cells of a feature map
-_RMAC_OVERLAP = 0.4  # wanted, of neighbouring squares (Tolias et al. 2016, section 3.2)
+_RMAC_OVERLAP_SHARE = 0.4  # wanted, of neighbouring squares (Tolias et al. 2016, section 3.2)
 _RMAC_SCALES = 3
 
 
@@ -54,9 +54,9 @@ class RegionTechnique(VectorTechnique):
         )
 
     def match(self, query: Descriptor, fine: Array, hypotheses: None = None) -> FineMatch:
-        """Score a place by its stored regions `fine`, int8 (N, C), from 0 to 1 (see `mutual_score`). A descriptor that
-        was read from a map has no float regions, and scores 0."""
-        return FineMatch(0.0 if query.regions is None else mutual_score(query.regions, from_bytes(fine)))
+        """Score a place by its stored regions `fine`, int8 (N, C), from 0 to 1 (see `score_mutual_pairs`). A descriptor
+        that was read from a map has no float regions, and scores 0."""
+        return FineMatch(0.0 if query.regions is None else score_mutual_pairs(query.regions, from_bytes(fine)))
 
 
 def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTechnique:
@@ -68,11 +68,11 @@ def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTe
     geometry. The coarse part is the sum of the squares' vectors, the quality the share of squares with any
     activation."""
     backbone = open_backbone(model, "features", threads)
-    squares = square_regions(*backbone.shape[1:])
+    squares = make_square_regions(*backbone.shape[1:])
 
     def described(features: Singles) -> tuple[Singles, Singles]:
-        vectors = regional_vectors(features, squares)
-        return unit(vectors.sum(axis=0)), vectors
+        vectors = pool_squares(features, squares)
+        return normalise_rows(vectors.sum(axis=0)), vectors
 
     # With the shipped weights every wrong match had a margin below 0.147 (see `network`).
     spec = {"name": "rmac", "parameters": {"model": model}, "model_sha256": backbone.sha256}
@@ -88,14 +88,14 @@ def cross_region_bow(
     Chen, Maffra, Sa and Chli, "Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place Recognition",
     IROS 2017, in the form of thesis 4.2.1, with one feature map where the paper finds regions in `conv5_3` of VGG-16
     and describes them from `conv5_2`."""
-    backbone = region_backbone("cross_region_bow", model, threads, regions)
+    backbone = open_region_backbone("cross_region_bow", model, threads, regions)
     learned, sha256 = load_words(model, "bow", words)
 
     def described(features: Singles) -> tuple[Singles, Singles]:
-        found = describe(features, find_regions(features, regions))
+        found = describe_regions(features, find_regions(features, regions))
         padded = np.zeros((regions, len(features)), np.float32)
         padded[: len(found)] = found
-        return bag_of_words(found, learned), padded
+        return compute_bag_of_words(found, learned), padded
 
     # With the shipped weights every wrong match had a margin below 0.056 in every form (see `network`).
     parameters = {"model": model, "regions": regions, "words": words}
@@ -103,7 +103,7 @@ def cross_region_bow(
     return RegionTechnique(backbone, described, np.any, **spec, form=form, margins=(0.07,) * 3)
 
 
-def region_backbone(technique: str, model: str, threads: int, regions: int) -> Backbone:
+def open_region_backbone(technique: str, model: str, threads: int, regions: int) -> Backbone:
     """Open the network of the card `model` for a `technique` that finds `regions` regions in its feature map. Raises
     UsageError for a number of regions outside 1 to 10 000."""
     if not 1 <= regions <= 10_000:
@@ -111,7 +111,7 @@ def region_backbone(technique: str, model: str, threads: int, regions: int) -> B
     return open_backbone(model, "features", threads)
 
 
-def square_regions(height: int, width: int) -> list[Square]:
+def make_square_regions(height: int, width: int) -> list[Square]:
     """Return the squares of R-MAC at three scales over a feature map (Tolias et al. 2016, section 3.2): at scale l they
     are 2 min(H, W) / (l + 1) wide, evenly spaced, l along the short side and l + m - 1 along the long one, with the m
     that brings the overlap at the first scale closest to 40 %. Raises ModelError for a feature map less than 2 wide."""
@@ -124,24 +124,28 @@ def square_regions(height: int, width: int) -> list[Square]:
     m = (
         1
         if long == short
-        else min(range(2, 8), key=lambda n: abs(1 - (long - short) / (n - 1) / short - _RMAC_OVERLAP))
+        else min(range(2, 8), key=lambda n: abs(1 - (long - short) / (n - 1) / short - _RMAC_OVERLAP_SHARE))
     )
     regions = []
     for scale in range(1, _RMAC_SCALES + 1):
         side = 2 * short // (scale + 1)
         down, across = (scale, scale + m - 1) if height <= width else (scale + m - 1, scale)
-        regions += [(top, left, side) for top in _starts(height, side, down) for left in _starts(width, side, across)]
+        regions += [
+            (top, left, side)
+            for top in _space_evenly(height, side, down)
+            for left in _space_evenly(width, side, across)
+        ]
     return regions
 
 
-def regional_vectors(features: Singles, regions: list[Square]) -> Singles:
+def pool_squares(features: Singles, regions: list[Square]) -> Singles:
     """Return the largest activation of each channel in each of R squares, as signed square root (the power
     normalisation of thesis 4.2), of length 1: (C, H, W) to float32 (R, C)."""
     vectors = np.stack([features[:, y : y + side, x : x + side].max(axis=(1, 2)) for y, x, side in regions])
-    return unit(np.sign(vectors) * np.sqrt(np.abs(vectors)))
+    return normalise_rows(np.sign(vectors) * np.sqrt(np.abs(vectors)))
 
 
-def _starts(length: int, side: int, count: int) -> list[int]:
+def _space_evenly(length: int, side: int, count: int) -> list[int]:
     return [i * (length - side) // max(count - 1, 1) for i in range(count)]
 
 
@@ -163,7 +167,7 @@ def find_regions(features: Singles, count: int) -> Ints:
     return np.stack([row, left, row + high, left + wide], axis=1)[best]
 
 
-def describe(features: Singles, boxes: Ints) -> Singles:
+def describe_regions(features: Singles, boxes: Ints) -> Singles:
     """Describe the regions of a feature map (C, H, W) in `boxes`, int (N, 4) (see `find_regions`), by the sums of
     activations by channel, of length 1: float32 (N, C)."""
     channels, height, width = features.shape
@@ -178,7 +182,7 @@ def describe(features: Singles, boxes: Ints) -> Singles:
     return regions
 
 
-def mutual_score(query: Singles, place: Singles) -> float:
+def score_mutual_pairs(query: Singles, place: Singles) -> float:
     """Score two sets of regions of length 1, `query` (N, D) and `place` (M, D), from 0 to 1: the sum of the cosines of
     the pairs of which each is the other's best match, over the larger number of regions (by which the papers do not
     divide). Negative cosines count 0; all-zero rows are not regions."""

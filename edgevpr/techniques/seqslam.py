@@ -14,11 +14,11 @@ from edgevpr.core.arrays import Array, Doubles, Image, Mask, Singles
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import UsageError
 
-_SEQUENCE = 10  # queries that are matched together, unless the configuration sets another number
-_WINDOW = 10  # R_window of the paper: five places before and five after
-_GREYEST = 128  # a pixel as bright as the mean of its patch
-_STEPS = 28  # levels per standard deviation: eight bits reach 4.5 of them either way
-_MIN_SPREAD = 1.0  # grey levels: a patch with a smaller standard deviation does not describe the place
+_SEQUENCE_QUERIES = 10  # queries that are matched together, unless the configuration sets another number
+_WINDOW_PLACES = 10  # R_window of the paper: five places before and five after
+_MEAN_LEVEL = 128  # a pixel as bright as the mean of its patch
+_LEVELS_PER_SD = 28  # levels per standard deviation: eight bits reach 4.5 of them either way
+_MIN_PATCH_SD_LEVELS = 1.0  # grey levels: a patch with a smaller standard deviation does not describe the place
 
 
 class SeqSlam:
@@ -41,7 +41,7 @@ class SeqSlam:
             name="seqslam",
             parameters={"width": width, "height": height, "patch": patch},
             coarse=PartSpec((width * height,), "|u1"),
-            sequence=_SEQUENCE,
+            sequence=_SEQUENCE_QUERIES,
         )
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
@@ -54,10 +54,10 @@ class SeqSlam:
         pixels = self._patches(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
         allowed = self._patches(cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST))
         z, spread = normalise_patches(pixels, allowed)
-        levels = np.clip(np.rint(_STEPS * z) + _GREYEST, 0, 255).astype(np.uint8)
+        levels = np.clip(np.rint(_LEVELS_PER_SD * z) + _MEAN_LEVEL, 0, 255).astype(np.uint8)
         rows, columns = self._height // self._patch, self._width // self._patch
         coarse = levels.reshape(rows, columns, self._patch, self._patch).swapaxes(1, 2).ravel()
-        return Descriptor(coarse=coarse, quality=float(np.mean(spread >= _MIN_SPREAD)))
+        return Descriptor(coarse=coarse, quality=float(np.mean(spread >= _MIN_PATCH_SD_LEVELS)))
 
     def _patches(self, picture: Array) -> Singles:
         """Cut a picture into patches: (height, width) to float32 (patches, patch * patch)."""
@@ -73,7 +73,9 @@ class SeqSlam:
         # With one query, the nearest neighbour of each row is that query: K=1 is the fastest way to all sums of
         # absolute differences.
         differences = cv2.batchDistance(rows, query.coarse[None], cv2.CV_32S, normType=cv2.NORM_L1, K=1)[0][:, 0]
-        most = _WINDOW / math.sqrt(_WINDOW + 1)  # (n - 1) / sqrt(n): none of n values is farther from their mean
+        most = _WINDOW_PLACES / math.sqrt(
+            _WINDOW_PLACES + 1
+        )  # (n - 1) / sqrt(n): none of n values is farther from their mean
         return (0.5 - enhance_contrast(differences) / (2 * most)).astype(np.float32), None
 
 
@@ -92,8 +94,8 @@ def enhance_contrast(differences: Array) -> Doubles:
     From each difference the mean of those up to five places away is subtracted, and the rest is divided by their
     (sample) standard deviation; 0 where they are all equal. Sums of whole numbers keep a long map precise."""
     whole = differences.astype(np.int64)
-    first = np.maximum(np.arange(len(whole)) - _WINDOW // 2, 0)
-    last = np.minimum(np.arange(len(whole)) + _WINDOW // 2 + 1, len(whole))
+    first = np.maximum(np.arange(len(whole)) - _WINDOW_PLACES // 2, 0)
+    last = np.minimum(np.arange(len(whole)) + _WINDOW_PLACES // 2 + 1, len(whole))
     count = last - first
     sums, squares = (np.concatenate(([0], np.cumsum(values))) for values in (whole, whole**2))
     total = sums[last] - sums[first]

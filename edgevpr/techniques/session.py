@@ -15,12 +15,12 @@ from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.core.files import compute_sha256, read_file
 from edgevpr.techniques.card import Card, InputRule, load_card
 
-_FORMS = {"descriptor": (2, "(1, D)"), "features": (4, "(1, C, H, W)")}
-_SEED = 7
+_OUTPUT_SHAPES = {"descriptor": (2, "(1, D)"), "features": (4, "(1, C, H, W)")}
+_NOISE_SEED = 7
 MAX_FILE_BYTES = 2**31  # protobuf, in which ONNX files are written, allows no more
 _MAX_THREADS = 256
-_LARGEST = 1e12  # with much larger numbers the length of a vector overflows float32, and the unit vector is zero
-_RESIZE = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR_EXACT, "cubic": cv2.INTER_CUBIC}
+_MAX_VALUE = 1e12  # with much larger numbers the length of a vector overflows float32, and the unit vector is zero
+_INTERPOLATIONS = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR_EXACT, "cubic": cv2.INTER_CUBIC}
 
 
 class Backbone:
@@ -41,16 +41,16 @@ class Backbone:
         self.card, self.output, self.sha256 = card, output, card.fingerprint
         self.session = open_session(card, threads)
         # Noise, not a uniform picture: many a correct network gives only zeros for that.
-        noise = np.random.default_rng(_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
+        noise = np.random.default_rng(_NOISE_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
         self.shape = self.run(noise).shape
 
     def run(self, image: Image, mask: Mask | None = None) -> Singles:
         """Run the network on uint8 (H, W[, 3]); returns float32 of `shape`. Pixels where bool (H, W) `mask` is False
         get the mean of the others. Raises ModelError for results with NaN, numbers beyond 1e12, or zeros only."""
         card, name = self.card, getattr(self.card.outputs, self.output)
-        prepared = prepare(drop_masked(image, mask), card.input)
+        prepared = prepare_input(fill_masked(image, mask), card.input)
         (result,) = run_outputs(card, self.session, [name], prepared)
-        rank, form = _FORMS[self.output]
+        rank, form = _OUTPUT_SHAPES[self.output]
         if result.ndim != rank or len(result) != 1 or not result.size:
             raise ModelError(
                 f"{card.file_path}: its output `{name}` is {result.shape} and `{self.output}` must be {form}: correct "
@@ -75,10 +75,10 @@ def open_session(card: Card, threads: int = 1) -> Any:
     and outputs are not yet compared with the card."""
     if not 1 <= threads <= _MAX_THREADS:
         raise UsageError(f"{card.name} cannot run with threads={threads}: give 1 to {_MAX_THREADS}.")
-    return _session(card.file_path, card.sha256, threads)
+    return _load_session(card.file_path, card.sha256, threads)
 
 
-def file_sha256(path: Path) -> str:
+def hash_model_file(path: Path) -> str:
     """Compute the SHA-256 of a model file, 64 hexadecimal digits. Raises ModelError if it cannot be read."""
     try:
         return compute_sha256(path, MAX_FILE_BYTES)
@@ -89,9 +89,9 @@ def file_sha256(path: Path) -> str:
 
 
 @cache
-def _session(path: Path, sha256: str, threads: int) -> Any:
+def _load_session(path: Path, sha256: str, threads: int) -> Any:
     """Check the hash of a network's file and open its session, one in the process for all techniques that use it."""
-    found = file_sha256(path)
+    found = hash_model_file(path)
     if found != sha256:
         raise ModelError(
             f"{path} is not the file of its card: its SHA-256 is {found} and the card says {sha256}; get the right "
@@ -142,9 +142,9 @@ def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -
         if result.dtype.kind != "f":
             raise ModelError(f"{card.file_path}: its output `{name}` is {result.dtype}: it must be float.")
         # Written with `not`, so that NaN is refused as well.
-        if result.size and not max(result.max(), -result.min()) <= _LARGEST:
+        if result.size and not max(result.max(), -result.min()) <= _MAX_VALUE:
             raise ModelError(
-                f"{card.file_path} gives numbers that are not finite, or beyond {_LARGEST:g}, for `{name}`: its "
+                f"{card.file_path} gives numbers that are not finite, or beyond {_MAX_VALUE:g}, for `{name}`: its "
                 "weights or `input` of its card are wrong."
             )
     return results
@@ -154,7 +154,7 @@ def _join_lines(error: Exception) -> str:
     return " ".join((str(error) or type(error).__name__).split())[:200]
 
 
-def prepare(image: Array, rule: InputRule) -> Singles:
+def prepare_input(image: Array, rule: InputRule) -> Singles:
     """Convert a picture, uint8 (H, W) grey or (H, W, 3) BGR, to the input that `rule` describes: float32 (1, C, height,
     width). Histogram equalisation is that of CALC: of Y of the picture as YUV, before it is made grey and smaller."""
     if rule.equalise and image.ndim == 2:
@@ -169,9 +169,9 @@ def prepare(image: Array, rule: InputRule) -> Singles:
         image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     elif rule.colour == "rgb":
         image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    across, down = shares(image, rule)
+    across, down = compute_fill_shares(image, rule)
     width, height = round(across * rule.width), round(down * rule.height)
-    image = cv2.resize(image, (width, height), interpolation=_RESIZE[rule.resize])
+    image = cv2.resize(image, (width, height), interpolation=_INTERPOLATIONS[rule.resize])
     if rule.pad is not None:
         border = (0, rule.height - height, 0, rule.width - width)
         image = cv2.copyMakeBorder(image, *border, cv2.BORDER_CONSTANT, value=(rule.pad,) * 3)
@@ -182,9 +182,9 @@ def prepare(image: Array, rule: InputRule) -> Singles:
     return np.ascontiguousarray(values.transpose(2, 0, 1)[None])
 
 
-def shares(image: Array, rule: InputRule) -> tuple[float, float]:
-    """Return the shares, 0..1, of the network input's width and of its height that `prepare` fills with the picture;
-    the rest is padding."""
+def compute_fill_shares(image: Array, rule: InputRule) -> tuple[float, float]:
+    """Return the shares, 0..1, of the network input's width and of its height that `prepare_input` fills with the
+    picture; the rest is padding."""
     if rule.pad is None:
         return 1.0, 1.0
     height, width = image.shape[:2]
@@ -192,7 +192,7 @@ def shares(image: Array, rule: InputRule) -> tuple[float, float]:
     return max(1, round(width * scale)) / rule.width, max(1, round(height * scale)) / rule.height
 
 
-def drop_masked(image: Image, mask: Mask | None) -> Array:
+def fill_masked(image: Image, mask: Mask | None) -> Array:
     """Set every pixel where the bool (H, W) `mask` is False to the mean of the others (128 if there are none): a
     uniform patch adds the least to what a network gives."""
     if mask is None or mask.all():

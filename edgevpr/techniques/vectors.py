@@ -12,18 +12,18 @@ from edgevpr.core.arrays import Array, Bytes, Image, Ints, Mask, Singles
 from edgevpr.core.config import FORMS
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
-from edgevpr.techniques.gradients import grey_square, mask_square, normalise_blocks, orient_cells
+from edgevpr.techniques.gradients import make_grey_square, make_mask_square, normalise_blocks, orient_cells
 
 # A margin that no match can reach. The margins of wrong matches are known for the weights that edgevpr ships. With
 # other weights no match is accepted until the configuration sets a minimum margin.
-NEVER = 2.0
-_SHIPPED = "calc"
+UNREACHABLE_MARGIN = 2.0
+_SHIPPED_MODEL = "calc"
 _TINY = 1e-6
-_BYTES_AT_ONCE = 4 << 20  # of places converted to float32 together
-_MIN_AT_ONCE = 16
-_BESIDE_BYTES = 8  # at the end of a row in 8 bits: its step and its length, both float32
+_BLOCK_BYTES = 4 << 20  # of places converted to float32 together
+_MIN_BLOCK_PLACES = 16
+_SUFFIX_BYTES = 8  # at the end of a row in 8 bits: its step and its length, both float32
 _WORD_BITS = 64  # a row in 1 bit is padded to whole words, whose bits are counted at once
-_CODE_BYTES_AT_ONCE = 1 << 20  # of binary vectors compared together: about a second-level cache
+_CODE_BLOCK_BYTES = 1 << 20  # of binary vectors compared together: about a second-level cache
 
 
 class VectorTechnique:
@@ -53,13 +53,13 @@ class VectorTechnique:
         if form not in FORMS:
             raise UsageError(f"{name} has no form `{form}`: use {', '.join(FORMS[:-1])} or {FORMS[-1]}.")
         parameters = parameters or {}
-        is_measured = parameters.get("model", _SHIPPED) == _SHIPPED
-        self.min_margin = margins[FORMS.index(form)] if is_measured else NEVER
+        is_measured = parameters.get("model", _SHIPPED_MODEL) == _SHIPPED_MODEL
+        self.min_margin = margins[FORMS.index(form)] if is_measured else UNREACHABLE_MARGIN
         self._similarity, self._length = similarity, length
-        self._at_once = max(_BYTES_AT_ONCE // (4 * length), _MIN_AT_ONCE)
+        self._at_once = max(_BLOCK_BYTES // (4 * length), _MIN_BLOCK_PLACES)
         packed = {
             "float": None,
-            "8bit": PartSpec((length + _BESIDE_BYTES,), "|i1"),
+            "8bit": PartSpec((length + _SUFFIX_BYTES,), "|i1"),
             "1bit": PartSpec((-(-length // _WORD_BITS) * _WORD_BITS // 8,), "|u1"),
         }
         self.spec = TechniqueSpec(
@@ -137,7 +137,7 @@ class VectorTechnique:
         asked, places = code.view(np.uint64), np.ascontiguousarray(rows).view(np.uint64)
         different: Ints = np.empty(len(rows), np.uint16 if 8 * len(code) < 1 << 16 else np.uint32)
         ones = np.ones(len(asked), np.float32)  # a product is the fastest sum, and exact for whole numbers below 2^24
-        at_once = max(1, _CODE_BYTES_AT_ONCE // len(code))
+        at_once = max(1, _CODE_BLOCK_BYTES // len(code))
         for start in range(0, len(rows), at_once):
             block = slice(start, start + at_once)
             different[block] = np.bitwise_count(places[block] ^ asked).astype(np.float32) @ ones
@@ -180,7 +180,7 @@ class Hog(VectorTechnique):
 
     def vector(self, image: Image, mask: Mask | None) -> Singles:
         """Encode uint8 (H, W[, 3]) to float32 (length,); gradients where `mask` bool (H, W) is False are left out."""
-        grey = grey_square(image, self._w1)
-        allowed = mask_square(mask, self._w1)
+        grey = make_grey_square(image, self._w1)
+        allowed = make_mask_square(mask, self._w1)
         cells = orient_cells(grey, self._cell, self._bins, signed=False, allowed=allowed)
         return normalise_blocks(cells).ravel()

@@ -19,9 +19,9 @@ from edgevpr.techniques.layout import ROTATIONS
 # Each is about 1.4 times the one before: the votes of a view still agree where the height is 1.2 times off.
 HEIGHT_RATIOS = (0.5, 0.7, 1.0, 1.42, 2.0)
 QUARTERS = 4
-WITHIN_QUARTER = ROTATIONS // QUARTERS
-_BY_CHANCE = 0.72  # the share that agrees by chance falls with this power of the number of regions
-_LARGER_BY_CHANCE = {1.42: 0.87, 2.0: 0.8}  # a larger view has more places to agree on
+STEPS_PER_QUARTER = ROTATIONS // QUARTERS
+_CHANCE_EXPONENT = 0.72  # the share that agrees by chance falls with this power of the number of regions
+_LARGER_VIEW_FACTORS = {1.42: 0.87, 2.0: 0.8}  # a larger view has more places to agree on
 
 # Encodes a square picture, float32 (side, side), with its allowed pixels, bool of the same shape or None, in cells of a
 # number of pixels. Returns blocks float32 (n, n, 4 bins), and which of them are good, bool (n, n).
@@ -41,12 +41,12 @@ class ViewRegions:
     worth: float
 
 
-def hypothesis(number: int) -> tuple[float, int]:
+def decode_hypothesis(number: int) -> tuple[float, int]:
     """Return the height ratio of the hypothesis `number`, and its rotation in steps of 15 degrees."""
     return HEIGHT_RATIOS[number // ROTATIONS], number % ROTATIONS
 
 
-def cells_along(cells: int, ratio: float) -> int:
+def count_cells(cells: int, ratio: float) -> int:
     """Return the number of cells along one side of a view of height ratio `ratio`, for a place with `cells` along one
     side. The two differ by an even number, so that the middle region of the view lies on that of the place."""
     return cells + 2 * round(cells * (ratio - 1) / 2)
@@ -55,10 +55,10 @@ def cells_along(cells: int, ratio: float) -> int:
 def compute_scale(cells: int, ratio: float) -> float:
     """Return the exact height ratio of a view: its number of cells along one side, which is whole, over the number
     `cells` of a place."""
-    return cells_along(cells, ratio) / cells
+    return count_cells(cells, ratio) / cells
 
 
-class Views:
+class QueryViews:
     """The views of one query, each made when it is first asked for. `square` is the unchanged view: its blocks float32
     (n, n, 4 bins), and bool (n, n), True for good blocks. `encode` makes such a pair of another view, with cells of
     `cell_px` pixels. Views beyond a quarter turn have the same cells, turned. `seen` bool (n, n) is True for blocks of
@@ -77,13 +77,13 @@ class Views:
         """Forget the views of other height ratios than this, but for the unchanged one: they take megabytes."""
         self._encoded = {key: view for key, view in self._encoded.items() if key[0] == ratio or key == (1.0, 0)}
         self._scaled = {each: picture for each, picture in self._scaled.items() if each == ratio}
-        self._regions = {key: view for key, view in self._regions.items() if hypothesis(key[0])[0] == ratio}
-        self.fields = {key: field for key, field in self.fields.items() if hypothesis(key[0])[0] == ratio}
+        self._regions = {key: view for key, view in self._regions.items() if decode_hypothesis(key[0])[0] == ratio}
+        self.fields = {key: field for key, field in self.fields.items() if decode_hypothesis(key[0])[0] == ratio}
 
     def blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
         """Return the view of the height ratio `ratio` and the rotation `turn`, in steps of 15 degrees: its blocks,
         float32 (n, n, 4 bins), and bool (n, n), True for good blocks."""
-        quarters, within = divmod(turn, WITHIN_QUARTER)
+        quarters, within = divmod(turn, STEPS_PER_QUARTER)
         if (ratio, within) not in self._encoded:
             self._encoded[ratio, within] = self._encode(*self._warp_picture(ratio, within))
         blocks, good = self._encoded[ratio, within]
@@ -93,14 +93,14 @@ class Views:
         """Return all good regions of the view of the hypothesis `number`. `described` converts blocks float32 (G, 4
         bins) to the vectors (G, P) that are compared."""
         if (number, described) not in self._regions:
-            ratio, turn = hypothesis(number)
+            ratio, turn = decode_hypothesis(number)
             blocks, good = self.blocks(ratio, turn)
-            side = max(cells_along(self._side + 1, ratio) - 1, self._side)  # regions along a side, at least a place's
+            side = max(count_cells(self._side + 1, ratio) - 1, self._side)  # regions along a side, at least a place's
             if ratio > 1:
                 ground = compute_scale(self._side + 1, ratio) ** 2  # over that of the place
-                worth = ground * _LARGER_BY_CHANCE[ratio]  # no more than one in `ground` of the votes can agree
+                worth = ground * _LARGER_VIEW_FACTORS[ratio]  # no more than one in `ground` of the votes can agree
             else:
-                worth = 1.0 if ratio == 1 else min(1.0, (int(good.sum()) / self._good) ** _BY_CHANCE)
+                worth = 1.0 if ratio == 1 else min(1.0, (int(good.sum()) / self._good) ** _CHANCE_EXPONENT)
             self._regions[number, described] = ViewRegions(
                 numbers=np.flatnonzero(np.pad(good, (side - len(good)) // 2)),  # on a grid with the same middle
                 regions=described(blocks[good]),
@@ -131,7 +131,7 @@ class Views:
         """Return the picture of the view of the height ratio `ratio`, rotated by `within` steps of 15 degrees, as three
         things: grey float32 (side, side); bool (side, side), True for allowed pixels; and a cell's side in pixels."""
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
-        side = cells_along(self._side + 1, ratio) * cell_px
+        side = count_cells(self._side + 1, ratio) * cell_px
         if ratio not in self._scaled:
             self._scaled[ratio] = self._resize(side)
         grey, allowed = self._scaled[ratio]

@@ -45,35 +45,35 @@ def load_words(model: str, kind: str, count: int) -> tuple[Singles, str]:
     return words, sha256
 
 
-def unit(vectors: Array) -> Array:
+def normalise_rows(vectors: Array) -> Array:
     """Scale rows (or a single vector) to length 1; a zero vector stays zero."""
     unit_vectors: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), _TINY)
     return unit_vectors
 
 
-def local_descriptors(features: Singles) -> Singles:
+def make_local_descriptors(features: Singles) -> Singles:
     """Return the activations at each position, row by row, as descriptors of length 1 (Arandjelović et al. 2016,
     section 3.1): (C, H, W) to float32 (H * W, C)."""
-    return unit(features.reshape(len(features), -1).T)
+    return normalise_rows(features.reshape(len(features), -1).T)
 
 
-def vlad(local: Singles, words: Singles, sharpness: float | None = None) -> Singles:
+def compute_vlad(local: Singles, words: Singles, sharpness: float | None = None) -> Singles:
     """Compute VLAD of the descriptors `local` (N, D) about `words` (K, D): float32 (K * D,). The part of word k is the
     sum over descriptors x of a_k(x) (x - c_k) (Arandjelović et al. 2016, equation 1), scaled to length 1 (Arandjelović
     and Zisserman 2013), as is the whole. The weight a_k is 1 for the word nearest to x and 0 for the others
-    (`sharpness` None), or that of `soft_weights`."""
+    (`sharpness` None), or that of `compute_soft_weights`."""
     if sharpness is None:
         weights = np.zeros((len(local), len(words)), np.float32)
         weights[np.arange(len(local)), find_nearest(local, words)] = 1
     else:
-        weights = soft_weights(local, words, sharpness)
-    return unit(unit(weights.T @ local - weights.sum(axis=0)[:, None] * words).ravel())
+        weights = compute_soft_weights(local, words, sharpness)
+    return normalise_rows(normalise_rows(weights.T @ local - weights.sum(axis=0)[:, None] * words).ravel())
 
 
-def soft_weights(local: Singles, words: Singles, sharpness: float) -> Singles:
+def compute_soft_weights(local: Singles, words: Singles, sharpness: float) -> Singles:
     """Compute the softmax over the words c of -sharpness |x - c|^2 for each descriptor x (Arandjelović et al. 2016,
     equation 2): `local` (N, D), `words` (K, D) to float32 (N, K)."""
-    closeness = sharpness * _closeness(local, words)
+    closeness = sharpness * _compute_closeness(local, words)
     closeness -= closeness.max(axis=1, keepdims=True)
     weights: Singles = np.exp(closeness, out=closeness)
     weights /= weights.sum(axis=1, keepdims=True)
@@ -81,30 +81,30 @@ def soft_weights(local: Singles, words: Singles, sharpness: float) -> Singles:
 
 
 def compute_sharpness(words: Singles) -> float:
-    """Compute the sharpness for `soft_weights` with which a descriptor equal to a word gives it, on average, 100 times
-    the weight of the next word. NetVLAD (section 5, "Training") asks that of the training descriptors."""
+    """Compute the sharpness for `compute_soft_weights` with which a descriptor equal to a word gives it, on average,
+    100 times the weight of the next word. NetVLAD (section 5, "Training") asks that of the training descriptors."""
     squares = np.einsum("kd,kd->k", words, words)
     apart = squares[:, None] + squares - 2 * words @ words.T
     np.fill_diagonal(apart, np.inf)
     return float(np.log(100) / max(apart.min(axis=1).mean(), _TINY)) if len(words) > 1 else 1.0
 
 
-def bag_of_words(local: Singles, words: Singles) -> Singles:
+def compute_bag_of_words(local: Singles, words: Singles) -> Singles:
     """Return 1 for each of `words` (K, D) that is nearest to any descriptor of `local` (N, D) and 0 for the others,
     L2-normalised: float32 (K,). Counts find fewer places: many channels mark the same part of a picture."""
     present = np.zeros(len(words), np.float32)
     present[find_nearest(local, words)] = 1
-    return unit(present)
+    return normalise_rows(present)
 
 
 def find_nearest(local: Singles, words: Singles) -> Ints:
     """Return the number of the word nearest to each descriptor, the first of equally near ones: (N, D), (K, D) to int
     (N,)."""
-    numbers: Ints = _closeness(local, words).argmax(axis=1)
+    numbers: Ints = _compute_closeness(local, words).argmax(axis=1)
     return numbers
 
 
-def _closeness(local: Singles, words: Singles) -> Singles:
+def _compute_closeness(local: Singles, words: Singles) -> Singles:
     """Compute -|x - c|^2, plus a constant for each descriptor x: (N, D) and words (K, D) to float32 (N, K)."""
     closeness: Singles = 2 * local @ words.T - np.einsum("kd,kd->k", words, words)
     return closeness

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from edgevpr.core.errors import UsageError
-from edgevpr.frames.positions import ALT_M, GeoTag, Track, position_or_none
+from edgevpr.frames.positions import ALT_LIMITS_M, GeoTag, Track, make_position
 
 _STILL_S = 1.0  # while nothing moves, a track keeps a line each second
 Attitude = tuple[float | None, float | None, float | None]  # heading, roll and pitch, degrees
@@ -63,11 +63,11 @@ def make_tag(
     """Make a tag of what a recording says. None and what is impossible, NaN too, are unknown."""
     heading_deg, roll_deg, pitch_deg = attitude or _UNKNOWN
     alt_m, height_m = (
-        each if each is not None and ALT_M[0] <= each <= ALT_M[1] else None for each in (alt_m, height_m)
+        each if each is not None and ALT_LIMITS_M[0] <= each <= ALT_LIMITS_M[1] else None for each in (alt_m, height_m)
     )
     position = None
     if lat_deg is not None and lon_deg is not None and abs(lat_deg) <= 90 and abs(lon_deg) <= 180:
-        position = position_or_none(float(lat_deg), float(lon_deg), alt_m)
+        position = make_position(float(lat_deg), float(lon_deg), alt_m)
     return GeoTag(
         position=position,
         heading_deg=None if heading_deg is None else heading_deg % 360,

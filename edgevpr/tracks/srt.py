@@ -7,7 +7,7 @@ from pathlib import Path
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
-from edgevpr.frames.exif import from_straight_down
+from edgevpr.frames.exif import to_nadir_angles
 from edgevpr.frames.positions import GeoTag
 from edgevpr.tracks.record import Attitude, Record, make_tag, make_track
 
@@ -59,5 +59,5 @@ def _parse_block(block: str) -> GeoTag:
         gimbal = list(map(float, told.groups()))
     if len(gimbal) == 3 and any(gimbal):
         pitch, roll, yaw = gimbal
-        attitude = from_straight_down(yaw, pitch, roll)
+        attitude = to_nadir_angles(yaw, pitch, roll)
     return make_tag(lat_deg, lon_deg, named.get("abs_alt", named.get("altitude")), attitude, height_m)

@@ -10,7 +10,7 @@ from pathlib import Path, PureWindowsPath
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
-from edgevpr.frames.exif import from_straight_down
+from edgevpr.frames.exif import to_nadir_angles
 from edgevpr.frames.images import is_image
 from edgevpr.frames.positions import GeoTag, parse_time
 from edgevpr.tracks.record import Attitude, Record, make_tag
@@ -107,7 +107,7 @@ def _parse_row(cells: Mapping[str, str]) -> GeoTag:
     number = {part: _angle(text) for part, text in cells.items() if text and part not in ("file", "time")}
     attitude: Attitude = (number.get("nose"), None, None)
     if {"yaw", "pitch", "roll"} <= number.keys():
-        attitude = from_straight_down(number["yaw"], number["pitch"], number["roll"])
+        attitude = to_nadir_angles(number["yaw"], number["pitch"], number["roll"])
     tag = make_tag(number.get("lat"), number.get("lon"), number.get("alt"), attitude, number.get("height"))
     with suppress(KeyError, ValueError, OverflowError):  # no time, or none that can be read
         return replace(tag, t_utc_s=parse_time(cells["time"]))

@@ -19,9 +19,9 @@ from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.files import own_models
 from edgevpr.core.text import progress
 from edgevpr.frames.images import list_images
-from edgevpr.techniques.regions import describe, find_regions
+from edgevpr.techniques.regions import describe_regions, find_regions
 from edgevpr.techniques.session import Backbone, open_backbone
-from edgevpr.techniques.words import find_nearest, local_descriptors
+from edgevpr.techniques.words import find_nearest, make_local_descriptors
 
 REGIONS = {"regions": 400, "bow": 200}  # regions per picture, as in `region_vlad` and `cross_region_bow`
 _POINTS = 60_000  # the fewest local descriptors to learn words from, if there are as many ...
@@ -72,8 +72,8 @@ def _descriptors(
     def described(picture: Image) -> Singles:
         features = backbone.run(picture)
         if kind == "vlad":
-            return local_descriptors(features)
-        return describe(features, find_regions(features, REGIONS[kind]))
+            return make_local_descriptors(features)
+        return describe_regions(features, find_regions(features, REGIONS[kind]))
 
     share = -(-max(_POINTS, _POINTS_PER_WORD * count) // sum(len(list_images(name)) for name in folders))
     points = []

@@ -15,7 +15,7 @@ import torch
 from edgevpr.core.arrays import Singles
 from edgevpr.core.errors import EdgevprError
 from edgevpr.techniques.card import InputRule
-from edgevpr.techniques.session import file_sha256
+from edgevpr.techniques.session import hash_model_file
 
 LARGEST_DIFFERENCE = 1e-4
 _OPSET, _IR_VERSION = 18, 8  # that every onnxruntime since 1.17 reads
@@ -53,7 +53,7 @@ def write_model(file: ModelFile, network: torch.nn.Module, samples: Sequence[Sin
     values = {
         "title": file.title,
         "file": file.path.name,
-        "sha256": file_sha256(file.path),
+        "sha256": hash_model_file(file.path),
         "licence": "MIT",
         "source": file.source,
         "input": {key: value for key, value in asdict(file.rule).items() if value is not None},

@@ -40,7 +40,7 @@ def tried(monkeypatch):
                 yield replace(offer, costs=HOG if offer.name == "hog" else COSTS)
 
     monkeypatch.setattr(trial, "try_each", answer)
-    monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog", "seqslam", "calc"))
+    monkeypatch.setattr(techniques, "list_techniques", lambda: ("cohog", "hog", "seqslam", "calc"))
     counts = {"sets": 2, "queries": 90, "asked": 90, "accepted": 9, "accepted_wrong": 0, "accepted_elsewhere": 0}
     recalls = {"cohog": 0.9, "hog": 0.4, "hog 8bit": 0.4, "hog 1bit": 0.3, "seqslam": 0.5}
     table = {label: {"recall_at_1": recall, **counts} for label, recall in recalls.items()}
@@ -74,7 +74,7 @@ def a_map(tmp_path, technique="hog"):
 @pytest.mark.process
 @pytest.mark.slow
 def test_profile_tries_the_real_techniques(capsys, monkeypatch):
-    monkeypatch.setattr(techniques, "names", lambda: ("cohog", "hog"))
+    monkeypatch.setattr(techniques, "list_techniques", lambda: ("cohog", "hog"))
     found = json.loads(run(capsys, "--board", "rpi-zero-2w", "--places", 10_000, "--json").out)
     rows = {row["option"]["label"]: row for row in found["techniques"]}
     assert list(rows) == ["cohog", "hog", "hog 8bit", "hog 1bit"]

@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from edgevpr.core.errors import ImageError
-from edgevpr.frames.decoding import WholePictures, open_pictures
+from edgevpr.frames.decoding import VideoDecoder, open_decoder
 from edgevpr.frames.depth import DepthRange
 from edgevpr.frames.devices import DeviceCapture
 from edgevpr.frames.images import read_image
@@ -57,8 +57,8 @@ def thermal_flight() -> list[np.ndarray]:
     return [as_counts(np.roll(SCENE, 8 * step, 1)) for step in range(12)]
 
 
-def decoded(path: Path) -> tuple[WholePictures, list[av.VideoFrame]]:
-    whole = open_pictures(str(path), {})
+def decoded(path: Path) -> tuple[VideoDecoder, list[av.VideoFrame]]:
+    whole = open_decoder(str(path), {})
     return whole, [picture for fetched in iter(whole.fetch, None) for picture in whole.decode(fetched)]
 
 

@@ -9,8 +9,8 @@ from fakes import FakeClock
 from loopback import PATIENCE_S
 
 from edgevpr.frames import streams
-from edgevpr.frames.decoding import Fetched
-from edgevpr.frames.streams import Arrivals
+from edgevpr.frames.decoding import TimedPacket
+from edgevpr.frames.streams import PacketQueue
 
 
 class Sender:
@@ -21,7 +21,7 @@ class Sender:
         self.has_ended, self.is_closed = threading.Event(), threading.Event()
 
     def send(self, t_mono_s, is_keyframe=False, size=1000):
-        self._sent.put((Fetched(SimpleNamespace(is_keyframe=is_keyframe, size=size)), t_mono_s))
+        self._sent.put((TimedPacket(SimpleNamespace(is_keyframe=is_keyframe, size=size)), t_mono_s))
 
     def end(self, error=None):
         self._sent.put((error, 1.0))
@@ -42,7 +42,7 @@ def sender():
 
 @pytest.fixture
 def arrivals(sender):
-    found = Arrivals(sender.fetch, sender._clock, sender.is_closed.set)
+    found = PacketQueue(sender.fetch, sender._clock, sender.is_closed.set)
     yield found
     sender.end()
     found.close()
@@ -71,7 +71,7 @@ def test_arrivals_take_a_failure_while_fetching_for_the_loss_of_the_stream(sende
     assert [failure.exc_type for failure in failures] == [MemoryError]
 
 
-@pytest.mark.parametrize(("limit", "size"), [("_WAITING_BYTES", 100_000), ("_WAITING_PACKETS", 1)])
+@pytest.mark.parametrize(("limit", "size"), [("_MAX_QUEUED_BYTES", 100_000), ("_MAX_QUEUED_PACKETS", 1)])
 def test_arrivals_are_bounded_and_go_on_with_a_key_frame(sender, arrivals, monkeypatch, limit, size):
     """A decoder that hangs, or is too slow for long."""
     monkeypatch.setattr(streams, limit, 100 * size)

@@ -242,8 +242,8 @@ def test_picture_that_is_older_than_the_one_before_is_refused(live):
 @pytest.mark.slow
 @pytest.mark.parametrize("step", ["open", "read", "pixels", "release"])
 def test_call_that_hangs_is_given_up_and_holds_nobody(step, monkeypatch, live):
-    monkeypatch.setattr(live_module, "_OPENING_S", 1.0)
-    monkeypatch.setattr(liveness, "_UNKNOWN_RATE_S", 1.0)
+    monkeypatch.setattr(live_module, "_OPENING_TIMEOUT_S", 1.0)
+    monkeypatch.setattr(liveness, "_UNKNOWN_RATE_TIMEOUT_S", 1.0)
     shots = map(shot, range(3)) if step == "release" else map(shot, itertools.count())
     hanging = Camera(itertools.chain(paced(shots), [None]), step)
     hanging.is_cancelled.set()  # it is lost, rather than silent
@@ -258,7 +258,7 @@ def test_call_that_hangs_is_given_up_and_holds_nobody(step, monkeypatch, live):
 
 
 def test_source_that_hangs_each_time_takes_no_more_than_three_threads(monkeypatch):
-    monkeypatch.setattr(live_module, "_OPENING_S", 0.2)
+    monkeypatch.setattr(live_module, "_OPENING_TIMEOUT_S", 0.2)
     monkeypatch.setattr(live_module, "_FIRST_WAIT_S", 0.01)
     opened, go = [], threading.Event()
     source = LiveSource(lambda: opened.append(1) or (go.wait(PATIENCE_S) and Camera()), time.monotonic)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edgevpr.frames.shot import Newness, Refusal, coarse
+from edgevpr.frames.shot import Refusal, RepeatDetector, make_thumbnail
 
 HEIGHT, WIDTH = 240, 320
 _NOISE = np.random.default_rng(3).normal(128, 400, (900, 1200))
@@ -17,8 +17,8 @@ def view(number):
 
 
 def refusals(pictures):
-    newness = Newness()
-    return [newness.refusal(coarse(picture)) for picture in pictures]
+    newness = RepeatDetector()
+    return [newness.refusal(make_thumbnail(picture)) for picture in pictures]
 
 
 NOISY = [

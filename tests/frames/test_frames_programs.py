@@ -82,7 +82,7 @@ def test_ribbon_camera_that_starts_slowly_is_waited_for(rpicam, monkeypatch):
 
 
 def test_program_that_gives_no_picture_for_long_is_ended(rpicam, monkeypatch):
-    monkeypatch.setattr(programs, "_FIRST_PICTURE_S", 1.0)
+    monkeypatch.setattr(programs, "_FIRST_PICTURE_TIMEOUT_S", 1.0)
     monkeypatch.setenv("FAKE_RPICAM", "slow")
     source = rpicam()
     wait_until(lambda: source.state.startswith("no picture from rpicam-vid in 1 s, reopening in "))

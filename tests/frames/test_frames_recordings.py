@@ -12,7 +12,7 @@ from numbered_pictures import HEIGHT, WIDTH, picture
 
 from edgevpr.core.errors import SourceError, UsageError
 from edgevpr.core.types import Position
-from edgevpr.frames.source import open_source, read_to_end, recorded_intervals
+from edgevpr.frames.source import open_source, read_intervals, read_to_end
 
 RATE_HZ = 10
 SHADES = range(0, 250, 10)  # of the frames of the test video: 2.5 s
@@ -105,7 +105,7 @@ def test_recorded_steps_need_a_time_of_each_image_in_order(folder, times, steps_
     (folder / "positions.csv").write_text("\n".join(["file,lat,lon,time", *rows]))
     for number in range(len(times)):
         write_picture(folder / f"{number}.jpg")
-    assert recorded_intervals(str(folder)) == steps_s
+    assert read_intervals(str(folder)) == steps_s
     source = open_source(str(folder), live=True, steps_s=steps_s)
     told = [source.step_s for _ in times if source.read(1.0)]
     assert told == [*steps_s, *[None] * (len(times) - len(steps_s))]

@@ -11,7 +11,7 @@ from distorted_cameras import SIZE_PX, DistortedCamera, fisheye, wide
 
 from edgevpr.core.errors import ConfigError, ImageError
 from edgevpr.core.types import Frame
-from edgevpr.frames.lens import CalibratedLens, line_of_sight, read_lens
+from edgevpr.frames.lens import CalibratedLens, compute_lens_view, read_lens
 from edgevpr.frames.level import UNKNOWN_VIEW, Lens, level_image, undistort_frame
 
 PINHOLE = 400.0, 410.0, 322.0, 238.0
@@ -163,7 +163,7 @@ CAMERAS = pytest.mark.parametrize("camera", [wide(), fisheye()], ids=["wide", "f
 def test_a_straightened_picture_is_that_of_a_camera_without_distortion(camera, ground):
     lens, frame = lens_of(camera), taken(camera, ground)
     found = undistort_frame(frame.image, None, UNKNOWN_VIEW, lens)
-    sight = line_of_sight(lens, SIZE_PX)
+    sight = compute_lens_view(lens, SIZE_PX)
     height, width = found.image.shape[:2]
     assert (width, height) == sight.straight_px
     assert max(width, height) == max(SIZE_PX)
@@ -189,7 +189,7 @@ def test_a_picture_is_levelled_and_straightened_in_one_warp(camera, ground, pose
     found = level_image(
         taken(camera, ground, **pose),
         None,
-        Lens(line_of_sight(lens, SIZE_PX).fov_deg, 0.0, lens),
+        Lens(compute_lens_view(lens, SIZE_PX).fov_deg, 0.0, lens),
         footprint_m,
         below=True,
     )
@@ -218,7 +218,7 @@ def test_what_lies_beyond_the_lens_shows_no_ground(ground):
     camera = DistortedCamera(512.0, (-0.3, 0, 0, 0))
     lens = lens_of(camera)
     picture = level_image(
-        taken(camera, ground, pitch_deg=30.0), None, Lens(line_of_sight(lens, SIZE_PX).fov_deg, 0.0, lens), 250.0
+        taken(camera, ground, pitch_deg=30.0), None, Lens(compute_lens_view(lens, SIZE_PX).fov_deg, 0.0, lens), 250.0
     )
     assert picture.mask is not None
     outline = cv2.findContours(picture.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]

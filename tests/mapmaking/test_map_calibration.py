@@ -11,7 +11,7 @@ from walks import map_of, query_meter
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import UsageError
 from edgevpr.core.types import Frame, Position
-from edgevpr.frames.level import UNKNOWN_VIEW, Lens, Levelled
+from edgevpr.frames.level import UNKNOWN_VIEW, Lens, LevelledImage
 from edgevpr.mapmaking import calibrate as calibrating
 from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, ask, calibrate, fit_logistic
 from edgevpr.mapmaking.changes import change_picture
@@ -68,7 +68,7 @@ def calibrated(place_map, pictures, technique=AHEAD, **more):
 
 def test_a_map_is_asked_for_each_picture_in_three_ways(place_map):
     index, rule = load_index(place_map, AHEAD, 10**6), accept_rule(AHEAD, CONFIG)
-    pictures = [(number + 1, Levelled(frame(number).image, None, UNKNOWN_VIEW)) for number in range(3)]
+    pictures = [(number + 1, LevelledImage(frame(number).image, None, UNKNOWN_VIEW)) for number in range(3)]
     answers = list(ask(AHEAD, place_map, index, rule, query_meter(), [*pictures, (99, pictures[0][1])]))
     assert Counter(each.way for each in answers) == {THERE: 3, LEFT_OUT: 3, MIRRORED: 3}
     assert [each.place_id for each in answers] == [1, 1, 1, 2, 2, 2, 3, 3, 3]

@@ -11,7 +11,7 @@ from fakes import receiver_at, vehicle_at
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import FRAME_TIME_SD_S, Candidate, Frame, Place, Position, QueryCost, Steps, Vehicle
-from edgevpr.frames.level import Levelled, View
+from edgevpr.frames.level import LevelledImage, View
 from edgevpr.mavlink.conversation import BETWEEN_S
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
@@ -41,7 +41,7 @@ def match_at(
     return Recognition(
         frame=Frame(image=_PICTURE, name=f"{t_s:.1f} s", t_mono_s=t_s),
         vehicle=vehicle,
-        picture=view and Levelled(_PICTURE, None, view),
+        picture=view and LevelledImage(_PICTURE, None, view),
         best=Candidate(Place(place_id=places[0] if places else 1, source_image="", position=position), FineMatch(0.5)),
         accepted=True,
         located=Located(position=position, covariance_m2=(sd_m**2, 0.0, sd_m**2), places=tuple(places), lean=lean),
@@ -184,7 +184,7 @@ class Air:
         frame = replace(event.frame, t_sd_s=self.t_sd_s)
         event = replace(event, frame=frame, stride=self._stride(step))
         if self.shows_turn:
-            picture = Levelled(_PICTURE, None, replace(event.view, up_deg=0.0))
+            picture = LevelledImage(_PICTURE, None, replace(event.view, up_deg=0.0))
             located = replace(event.located, heading_deg=-math.degrees(self.turn))
             event = replace(event, picture=picture, located=located)
         self.events.append(event)

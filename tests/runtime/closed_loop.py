@@ -13,7 +13,7 @@ from simulated.motion import Hover, displacement_m
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Frame, Position
-from edgevpr.frames.level import Levelled, View
+from edgevpr.frames.level import LevelledImage, View
 from edgevpr.lab.simulate.generated import ORIGIN
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.messages import Health
@@ -154,7 +154,7 @@ class ClosedLoop:
             event = match_at(place, t_s, vehicle, _MATCH_SD_M, (self._steps,), _VIEW, error)
         else:
             frame = Frame(image=_PICTURE, name="", t_mono_s=t_s)
-            event = Recognition(frame=frame, vehicle=vehicle, picture=Levelled(_PICTURE, None, _VIEW))
+            event = Recognition(frame=frame, vehicle=vehicle, picture=LevelledImage(_PICTURE, None, _VIEW))
         self._waiting.append(replace(event, stride=self._stride(truth, t_s)))
 
     def _stride(self, truth, t_s):

@@ -15,7 +15,7 @@ import pytest
 
 from edgevpr.techniques import create
 from edgevpr.techniques.card import InputRule
-from edgevpr.techniques.session import prepare
+from edgevpr.techniques.session import prepare_input
 
 # What NumPy, OpenCV and OpenBLAS take this one for; a name that one of them does not know changes nothing.
 _PROCESSORS = {
@@ -72,7 +72,7 @@ def tell():
     picture, forward = whole_numbers(), create("cohog")
     report("packed", forward.pack(forward.encode(picture).coarse[None], np.full((12, 12, 8), 90.0, np.float32)))
     rule = {"layout": "NCHW", "height": 512, "width": 512, "colour": "grey", "equalise": False, "resize": "linear"}
-    report("seen by a network", prepare(picture, InputRule(**rule, scale=1.0, mean=[0.0])).astype(np.uint8))
+    report("seen by a network", prepare_input(picture, InputRule(**rule, scale=1.0, mean=[0.0])).astype(np.uint8))
 
 
 def report(what, *parts):

@@ -78,8 +78,8 @@ def test_a_missing_key_and_a_missing_card_are_said(models):
 
 def test_a_card_makes_a_technique_of_its_name(models):
     write_network(models, "mine")
-    assert "mine" in techniques.names()
-    assert techniques.parameters("mine") == {"form": "float", "threads": 1}
+    assert "mine" in techniques.list_techniques()
+    assert techniques.read_parameters("mine") == {"form": "float", "threads": 1}
     technique = techniques.create("mine")
     assert (technique.spec.name, technique.spec.parameters) == ("mine", {})
     image = textured(1)
@@ -94,8 +94,8 @@ def test_a_backbone_is_no_technique_and_a_broken_card_hides_nothing_else(models)
     write_network(models, "mine", card={"outputs": {"features": "features"}})
     write_card(models / "broken.yaml", {"sha256": "no"})
     write_network(models, "good")
-    assert {"mine", "broken"}.isdisjoint(techniques.names())
-    assert "good" in techniques.names()
+    assert {"mine", "broken"}.isdisjoint(techniques.list_techniques())
+    assert "good" in techniques.list_techniques()
     with pytest.raises(UsageError, match="`mine`"):
         techniques.create("mine")
     with pytest.raises(ModelError, match=r"broken\.yaml"):
@@ -104,5 +104,5 @@ def test_a_backbone_is_no_technique_and_a_broken_card_hides_nothing_else(models)
 
 def test_a_card_may_be_called_like_a_technique(models):
     write_network(models, "calc")
-    assert techniques.names().count("calc") == 1
+    assert techniques.list_techniques().count("calc") == 1
     assert techniques.create("calc").spec.parameters == {"model": "calc"}

@@ -6,7 +6,7 @@ from pictures import textured
 
 from edgevpr.techniques import create
 from edgevpr.techniques.contrast import stretch_contrast
-from edgevpr.techniques.gradients import grey_square
+from edgevpr.techniques.gradients import make_grey_square
 
 CAMERAS = ("forward", "nadir")
 WORSE = {"dark": lambda picture: 0.15 * picture, "fog": lambda picture: 0.15 * picture + 170}
@@ -59,7 +59,7 @@ def test_a_picture_is_stretched_the_more_the_less_it_holds_and_without_a_jump():
 
 
 def test_what_is_masked_changes_nothing_of_what_is_not():
-    dim = grey_square(noisy(0.15 * textured(1, 480, 640), 1), 512)
+    dim = make_grey_square(noisy(0.15 * textured(1, 480, 640), 1), 512)
     allowed = np.ones((512, 512), bool)
     allowed[200:300, 100:400] = False
     changed = np.where(allowed, dim, np.float32(255))

@@ -8,7 +8,7 @@ from pictures import textured
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.techniques import create
-from edgevpr.techniques.displacement import displacement, fit_alignment, support
+from edgevpr.techniques.displacement import find_displacement, fit_alignment, measure_support
 
 
 def count_by_hand(asking, best, side, counts):
@@ -26,13 +26,15 @@ def test_the_share_is_that_of_the_step_with_the_most_votes_about_it(counts):
     rng = np.random.default_rng(len(counts))
     asking = np.sort(rng.choice(49, 40, replace=False))
     best = rng.integers(0, 49, 40)
-    assert displacement(asking, best, (7, 7), counts).score == pytest.approx(count_by_hand(asking, best, 7, counts))
+    assert find_displacement(asking, best, (7, 7), counts).score == pytest.approx(
+        count_by_hand(asking, best, 7, counts)
+    )
 
 
 def test_votes_beside_the_peak_move_it_by_less_than_a_cell():
     asking = np.arange(900)[np.arange(900) % 30 < 25]
     moved = np.where(np.arange(len(asking)) % 4, 1, 2)  # three of four moved by one cell, one by two
-    found = displacement(asking, asking + moved, (30, 30), (1.0, 0.5))
+    found = find_displacement(asking, asking + moved, (30, 30), (1.0, 0.5))
     assert found.score == pytest.approx(0.75 + 0.25 * 0.5, abs=0.01)
     assert found.shift_cells == pytest.approx(((0.75 * 1 + 0.125 * 2) / 0.875, 0), abs=0.01)
     assert found.covariance_cells2[2] == pytest.approx(1 / 12)
@@ -52,7 +54,7 @@ def test_cohog_finds_how_far_a_picture_has_moved():
 
 def test_a_region_that_many_resemble_agrees_once():
     asking, best = np.arange(20, 27), np.array([120, 121, 121, 121, 121, 121, 150])
-    found = displacement(asking, best, (31, 31), (1.0, 1.0, 1.0, 1.0))
+    found = find_displacement(asking, best, (31, 31), (1.0, 1.0, 1.0, 1.0))
     assert found.coverage == 2 / 31**2, "120 and 121; 150 has moved by another step"
     assert found.score == pytest.approx(6 / 7)
 
@@ -93,7 +95,7 @@ def test_the_support_of_a_step_is_that_of_all_regions(step, asked):
     regions = np.where(rng.random((asked, 1)) < 0.7, np.roll(reference, 11, axis=0)[asking], reference[asking][::-1])
     regions = (regions + rng.integers(-2, 3, regions.shape)).astype(np.float32)
     best = (regions @ reference.T).argmax(axis=1)
-    found = support(asking, regions, reference, best, step)
+    found = measure_support(asking, regions, reference, best, step)
     expected = support_by_hand(asking.tolist(), regions, reference, step)
     assert (found.back, found.likeness, found.log_rank) == pytest.approx(expected, rel=1e-6)
 

@@ -23,32 +23,32 @@ SIGNED = np.random.default_rng(9).normal(size=(5, 7, 9)).astype(np.float32)
 @pytest.mark.parametrize("levels", [1, 4, 7])
 def test_pyramid(levels):
     expected = literal.pyramid(SIGNED, range(1, levels + 1)).astype(np.float32)
-    np.testing.assert_array_equal(network.pyramid(SIGNED, levels), expected)
+    np.testing.assert_array_equal(network.pool_pyramid(SIGNED, levels), expected)
 
 
 def test_what_is_too_small_is_refused():
     with pytest.raises(ModelError, match="R-MAC"):
-        regions.square_regions(1, 30)
+        regions.make_square_regions(1, 30)
 
 
 @pytest.mark.parametrize(("size", "length"), [(60, 20), (61, 61), (2, 1)])
 def test_projection_is_the_product_with_its_matrix(size, length):
     vector = np.random.default_rng(3).normal(size=size).astype(np.float32)
-    row, signs = network.gaussian_row(size, seed=5)
-    project = network.gaussian_projection(size, length, seed=5)
+    row, signs = network.make_gaussian_row(size, seed=5)
+    project = network.make_gaussian_projection(size, length, seed=5)
     expected = literal.projected(vector, row, signs, length)
     np.testing.assert_allclose(project(vector), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_the_gaussian_row_is_the_same_everywhere_and_for_ever():
-    row, signs = network.gaussian_row(5, seed=7)
+    row, signs = network.make_gaussian_row(5, seed=7)
     np.testing.assert_allclose(row, ROW_OF_SEED_7, rtol=1e-12)
     assert signs.tolist() == SIGNS_OF_SEED_7
 
 
 @pytest.mark.parametrize("shape", [(15, 20), (13, 13), (20, 15), (7, 30), (2, 2), (4, 5)])
 def test_rmac_regions(shape):
-    found = regions.square_regions(*shape)
+    found = regions.make_square_regions(*shape)
     assert found == literal.rmac_regions(*shape)
     for top, left, side in found:
         assert side >= 1
@@ -57,32 +57,32 @@ def test_rmac_regions(shape):
 
 
 def test_rmac_vectors_and_aggregate():
-    where = regions.square_regions(7, 9)
-    vectors = regions.regional_vectors(SIGNED, where)
+    where = regions.make_square_regions(7, 9)
+    vectors = regions.pool_squares(SIGNED, where)
     np.testing.assert_allclose(vectors, literal.rmac_vectors(SIGNED, where), rtol=1e-5, atol=1e-6)
     expected = literal.normalised(literal.rmac_vectors(SIGNED, where).sum(axis=0))
-    np.testing.assert_allclose(words.unit(vectors.sum(axis=0)), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(words.normalise_rows(vectors.sum(axis=0)), expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("soft", [None, 3.0, 50.0])
 def test_vlad(soft):
-    local = words.local_descriptors(SIGNED)
+    local = words.make_local_descriptors(SIGNED)
     np.testing.assert_allclose(np.linalg.norm(local, axis=1), 1, rtol=1e-5)
     np.testing.assert_allclose(local[9 + 2], SIGNED[:, 1, 2] / np.linalg.norm(SIGNED[:, 1, 2]), rtol=1e-5)
-    known = words.unit(np.random.default_rng(6).normal(size=(8, 5))).astype(np.float32)
+    known = words.normalise_rows(np.random.default_rng(6).normal(size=(8, 5))).astype(np.float32)
     expected = literal.intra_normalised(literal.vlad(local, known, soft))
-    np.testing.assert_allclose(words.vlad(local, known, soft), expected, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(words.compute_vlad(local, known, soft), expected, rtol=1e-3, atol=1e-4)
 
 
 def test_a_word_that_nothing_falls_to_stays_zero():
     local = np.tile(np.float32([[1, 0]]), (4, 1))
     known = np.float32([[0.9, 0.1], [-1, 0]])
-    np.testing.assert_allclose(words.vlad(local, known), [0.70710678, -0.70710678, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(words.compute_vlad(local, known), [0.70710678, -0.70710678, 0, 0], atol=1e-6)
 
 
 def test_sharpness_gives_a_word_a_hundred_times_the_weight_of_the_next():
     known = np.float32([[0, 0], [3, 0], [0, 3], [3, 3]])
-    weights = words.soft_weights(known, known, words.compute_sharpness(known))
+    weights = words.compute_soft_weights(known, known, words.compute_sharpness(known))
     nearest_two = np.sort(weights, axis=1)[:, :-3:-1]
     np.testing.assert_allclose(nearest_two[:, 0] / nearest_two[:, 1], 100, rtol=1e-4)
 
@@ -93,7 +93,7 @@ def test_regions_are_the_most_energetic_connected_activations(dead, count):
     boxes = regions.find_regions(features, count)
     expected = literal.regions(features, count)
     assert len(boxes) == len(expected)
-    described = regions.describe(features, boxes)
+    described = regions.describe_regions(features, boxes)
     assert described.shape == (len(expected), 5)
     for box, vector, (_, pixels, _) in zip(boxes, described, expected, strict=True):
         ys, xs = zip(*pixels, strict=True)
@@ -110,16 +110,16 @@ def test_equal_regions_come_by_channel_and_position():
 
 def test_mutual_score():
     rng = np.random.default_rng(8)
-    query, place = words.unit(rng.normal(size=(6, 4))), words.unit(rng.normal(size=(9, 4)))
-    assert regions.mutual_score(query, place) == pytest.approx(literal.mutual_score(query, place))
-    assert regions.mutual_score(query, query) == pytest.approx(1)
-    assert regions.mutual_score(query, np.zeros((9, 4))) == 0
+    query, place = words.normalise_rows(rng.normal(size=(6, 4))), words.normalise_rows(rng.normal(size=(9, 4)))
+    assert regions.score_mutual_pairs(query, place) == pytest.approx(literal.mutual_score(query, place))
+    assert regions.score_mutual_pairs(query, query) == pytest.approx(1)
+    assert regions.score_mutual_pairs(query, np.zeros((9, 4))) == 0
     padded = np.concatenate([place, np.zeros((5, 4))])
-    assert regions.mutual_score(query, padded) == pytest.approx(regions.mutual_score(query, place))
+    assert regions.score_mutual_pairs(query, padded) == pytest.approx(regions.score_mutual_pairs(query, place))
 
 
 def test_directions_survive_8_bits():
-    vectors = np.concatenate([words.unit(np.random.default_rng(9).normal(size=(20, 64))), np.zeros((1, 64))])
+    vectors = np.concatenate([words.normalise_rows(np.random.default_rng(9).normal(size=(20, 64))), np.zeros((1, 64))])
     back = regions.from_bytes(regions.to_bytes(vectors.astype(np.float32)))
     assert (np.einsum("nd,nd->n", back, vectors)[:20] > 0.9998).all()
     assert not back[20].any()

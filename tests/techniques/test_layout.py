@@ -6,7 +6,7 @@ from pictures import seen_from_above, textured
 
 from edgevpr.techniques import layout
 from edgevpr.techniques.cohog import CoHog
-from edgevpr.techniques.layout import NBYTES
+from edgevpr.techniques.layout import PLACE_BYTES
 
 SIDE_PX = 256
 PLACES = 6
@@ -29,12 +29,12 @@ def test_layouts_agree_on_the_shift_between_them():
     ground = np.random.default_rng(3).normal(size=(12, 20, 20)).astype(np.float32)
     ground /= np.linalg.norm(ground, axis=0)
     place, query = ground[:, 4:16, 4:16], ground[:, 6:18, 3:15]  # the camera is a cell to the left, and two below
-    there = layout.agreement(query, place, (-1 / 12, 2 / 12))
+    there = layout.compute_agreement(query, place, (-1 / 12, 2 / 12))
     assert there == pytest.approx(np.sqrt(11 * 10) / 12), "as many of all cells as are seen"
-    assert layout.agreement(query, place, (0, 2 / 12)) == there  # up to a cell beside
-    assert layout.agreement(query, place, (3 / 12, -2 / 12)) < 0.3
-    assert layout.agreement(query, place, (1.5, 0)) == 0
-    assert layout.agreement(np.zeros_like(query), place, (0, 0)) == 0
+    assert layout.compute_agreement(query, place, (0, 2 / 12)) == there  # up to a cell beside
+    assert layout.compute_agreement(query, place, (3 / 12, -2 / 12)) < 0.3
+    assert layout.compute_agreement(query, place, (1.5, 0)) == 0
+    assert layout.compute_agreement(np.zeros_like(query), place, (0, 0)) == 0
 
 
 @pytest.mark.parametrize("step", range(layout.ROTATIONS))
@@ -80,7 +80,7 @@ def test_in_a_large_map_the_places_in_reach_are_all_scored_and_of_the_others_som
 
 def test_rows_of_any_bytes_have_finite_scores(town):
     technique, _ = town
-    damaged = np.random.default_rng(2).integers(0, 256, (4, NBYTES), np.uint8)
+    damaged = np.random.default_rng(2).integers(0, 256, (4, PLACE_BYTES), np.uint8)
     damaged[1:] = np.array([[0], [255], [NOTHING + 1]])
     scores, by_hypothesis = technique.coarse_scores(technique.encode(view(2)), damaged, None)
     assert np.isfinite(scores).all()
@@ -107,7 +107,7 @@ def possible(by_hypothesis):
 @pytest.mark.slow
 def test_only_the_rotation_expected_and_those_beside_it_are_possible(town):
     technique, rows = town
-    query, rows = technique.encode(view(0)), np.resize(rows, (8, NBYTES))
+    query, rows = technique.encode(view(0)), np.resize(rows, (8, PLACE_BYTES))
     turned_deg = np.array([0, 7, 8, 100, 352, 353, 359.9, np.nan])
     scores, by_rotation = technique.coarse_scores(query, rows, None, turned_deg)
     sets = possible(by_rotation)

@@ -15,7 +15,7 @@ SIDE_PX, CELLS, REGIONS = 256, 32, 31
 ALLOWED = np.ones((SIDE_PX, SIDE_PX), bool)
 SEEN = np.ones((REGIONS, REGIONS), bool)
 
-structure = partial(overlay.structure, around_cells=3.0)
+structure = partial(overlay.compute_structure, around_cells=3.0)
 
 
 def ground_of(seed):
@@ -49,33 +49,35 @@ def test_a_query_is_laid_as_its_match_says(turned_deg, right_px, down_px, height
 
 def test_another_structure_does_not_stand_out():
     place = structure(patterns(0), SEEN)
-    others = [overlay.stands_out(structure(patterns(seed), SEEN), place) for seed in range(1, 41)]
+    others = [overlay.measure_prominence(structure(patterns(seed), SEEN), place) for seed in range(1, 41)]
     assert max(others) < 2
 
 
 def test_what_agrees_when_pushed_along_does_not_stand_out():
     row = patterns(3)[:REGIONS]
     road = structure(np.repeat(row, REGIONS, axis=0), SEEN)  # each row is of one pattern
-    assert overlay.stands_out(road, road) < 2
+    assert overlay.measure_prominence(road, road) < 2
     furrows = structure(np.tile(row[:4], (REGIONS * REGIONS // 4 + 1, 1))[: REGIONS**2], SEEN)
-    assert overlay.stands_out(furrows, furrows) < 3
+    assert overlay.measure_prominence(furrows, furrows) < 3
 
 
 def test_regions_that_are_not_seen_say_nothing():
     some = np.zeros_like(SEEN)
     some[:4, :4] = True
     place = structure(patterns(1), SEEN)
-    assert overlay.stands_out(structure(patterns(1), some), place) < overlay.stands_out(place, place) / 2
-    assert overlay.stands_out(structure(patterns(1), np.zeros_like(SEEN)), place) == 0
+    assert (
+        overlay.measure_prominence(structure(patterns(1), some), place) < overlay.measure_prominence(place, place) / 2
+    )
+    assert overlay.measure_prominence(structure(patterns(1), np.zeros_like(SEEN)), place) == 0
 
 
 def test_structures_agree_only_at_the_shift_that_is_asked_for():
     place = structure(patterns(1), SEEN)
     query = np.roll(place, (3, 9), axis=(0, 1))  # its middle lies to the left of the place's, and above
-    there = overlay.agreement(query, place, (-9.0, -3.0))
-    assert there > 10 > 3 > overlay.agreement(query, place, (9.0, 3.0))
-    assert overlay.agreement(query, place, (-8.0, -1.4)) == pytest.approx(there, rel=0.1)
-    assert overlay.agreement(query, place, (400.0, -400.0)) < 3
+    there = overlay.compute_agreement(query, place, (-9.0, -3.0))
+    assert there > 10 > 3 > overlay.compute_agreement(query, place, (9.0, 3.0))
+    assert overlay.compute_agreement(query, place, (-8.0, -1.4)) == pytest.approx(there, rel=0.1)
+    assert overlay.compute_agreement(query, place, (400.0, -400.0)) < 3
 
 
 def test_a_match_of_changed_ground_stands_out():

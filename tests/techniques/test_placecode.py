@@ -28,13 +28,13 @@ def _blocks(image: np.ndarray) -> np.ndarray:
 def town() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """Twelve grounds, the mean of their grids, and their codes."""
     grounds = [_picture(seed) for seed in range(12)]
-    grids = np.stack([placecode.grid(_blocks(seen_from_above(ground, 512)), ALL, ALL)[0] for ground in grounds])
+    grids = np.stack([placecode.make_grid(_blocks(seen_from_above(ground, 512)), ALL, ALL)[0] for ground in grounds])
     mean = grids.mean(axis=0)
-    return grounds, mean, placecode.pack(grids, mean)
+    return grounds, mean, placecode.pack_grids(grids, mean)
 
 
 def _ask(image: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    return placecode.hypotheses(*placecode.grid(_blocks(image), ALL, ALL), mean)
+    return placecode.make_hypotheses(*placecode.make_grid(_blocks(image), ALL, ALL), mean)
 
 
 def _best_shift(asked: np.ndarray, code: np.ndarray) -> list[int]:
@@ -46,7 +46,7 @@ def _best_shift(asked: np.ndarray, code: np.ndarray) -> list[int]:
 def test_a_moved_camera_finds_the_place_and_how_far_it_moved(town, right, down):
     grounds, mean, codes = town
     asked = _ask(seen_from_above(grounds[5], 512, 0.0, round(_CELL_PX * right), round(_CELL_PX * down)), mean)
-    assert placecode.scan(asked, codes).argmax() == 5
+    assert placecode.scan_codes(asked, codes).argmax() == 5
     # A camera that moved right sees the place to its left: its picture moves right to lie on the place.
     assert _best_shift(asked, codes[5]) == [right, down]
 
@@ -57,9 +57,9 @@ def test_what_a_mask_hides_says_nothing(town):
     image[:, 256:] = 0  # part of the aircraft
     seen = np.zeros((31, 31), bool)
     seen[:, :15] = True
-    grid, in_view = placecode.grid(_blocks(image), ALL, seen)
-    asked = placecode.hypotheses(grid, in_view, mean)
-    assert placecode.scan(asked, codes).argmax() == 2
+    grid, in_view = placecode.make_grid(_blocks(image), ALL, seen)
+    asked = placecode.make_hypotheses(grid, in_view, mean)
+    assert placecode.scan_codes(asked, codes).argmax() == 2
     assert _best_shift(asked, codes[2]) == [0, 0]
     assert abs(asked).sum(axis=1).max() == 1152 / 2
 
@@ -70,7 +70,7 @@ def test_the_scan_is_the_product_spelt_out(town):
     codes = rng.integers(0, 256, (600, 144), dtype=np.uint8)  # a whole block of places and a part
     asked = _ask(seen_from_above(_picture(22), 512), mean)
     signs = np.unpackbits(codes, axis=1) * 2.0 - 1
-    np.testing.assert_allclose(placecode.scan(asked, codes), (signs @ asked.T).max(axis=1) / 1152, atol=1e-6)
+    np.testing.assert_allclose(placecode.scan_codes(asked, codes), (signs @ asked.T).max(axis=1) / 1152, atol=1e-6)
 
 
 @pytest.mark.parametrize(("right", "down"), [(0, 0), (1, 0), (1, 1), (-3, 2), (-1, -3)])
@@ -78,11 +78,11 @@ def test_of_many_places_the_best_are_looked_at_under_every_shift(town, right, do
     grounds, mean, codes = town
     many = np.concatenate([np.random.default_rng(3).integers(0, 256, (5000, 144), dtype=np.uint8), codes])
     asked = _ask(seen_from_above(grounds[5], 512, 0.0, round(_CELL_PX * right), round(_CELL_PX * down)), mean)
-    full, ahead = placecode.scan(asked, many), placecode.scan_ahead(asked, many)
+    full, ahead = placecode.scan_codes(asked, many), placecode.scan_in_two_steps(asked, many)
     assert ahead.shape == full.shape
     assert ahead.argmax() == full.argmax() == 5005
     looked_closer = np.argsort(-ahead)[:100]
     np.testing.assert_array_equal(ahead[looked_closer], full[looked_closer])
     assert (ahead <= full + 1e-6).all()
     assert (ahead < full).mean() > 0.5  # the rest were not
-    np.testing.assert_array_equal(placecode.scan_ahead(asked, codes), placecode.scan(asked, codes))
+    np.testing.assert_array_equal(placecode.scan_in_two_steps(asked, codes), placecode.scan_codes(asked, codes))

@@ -5,10 +5,10 @@ import pytest
 from pictures import textured
 
 from edgevpr.core.errors import UsageError
-from edgevpr.techniques import create, names
+from edgevpr.techniques import create, list_techniques
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", list_techniques())
 def test_an_image_is_most_like_itself(name):
     technique = create(name)
     descriptors = [technique.encode(textured(seed)) for seed in range(4)]
@@ -34,7 +34,9 @@ def test_a_picture_that_says_nothing_scores_nothing():
     assert technique.match(grey_wall, technique.encode(textured(1)).fine).score == 0
 
 
-@pytest.mark.parametrize(("name", "parameters"), [*((name, {}) for name in names()), ("cohog", {"camera": "nadir"})])
+@pytest.mark.parametrize(
+    ("name", "parameters"), [*((name, {}) for name in list_techniques()), ("cohog", {"camera": "nadir"})]
+)
 def test_encode_leaves_out_masked_pixels(name, parameters):
     technique, image = create(name, parameters), textured(5)
     mask = np.ones(image.shape, bool)

@@ -7,7 +7,7 @@ from pictures import seen_from_above
 
 from edgevpr.core.contract import find_nearest_height
 from edgevpr.techniques import create
-from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, hypothesis
+from edgevpr.techniques.views import HEIGHT_RATIOS, ROTATIONS, decode_hypothesis
 
 pytestmark = pytest.mark.slow
 
@@ -33,8 +33,8 @@ def town():
 
 
 def test_a_hypothesis_is_a_height_and_a_rotation():
-    assert hypothesis(0) == (0.5, 0)
-    assert hypothesis(2 * ROTATIONS + 7) == (1.0, 7)
+    assert decode_hypothesis(0) == (0.5, 0)
+    assert decode_hypothesis(2 * ROTATIONS + 7) == (1.0, 7)
     nearest = [find_nearest_height(HEIGHT_RATIOS, ratio) for ratio in (0.1, 0.58, 0.6, 0.9, 1.3, 5)]
     assert nearest == [0.5, 0.5, 0.7, 1.0, 1.42, 2.0]
 

@@ -64,5 +64,5 @@ def test_a_file_that_is_none_is_refused(folder, content):
 def test_bag_of_words():
     rng = np.random.default_rng(2)
     local, known = rng.normal(size=(30, 4)).astype(np.float32), rng.normal(size=(20, 4)).astype(np.float32)
-    np.testing.assert_allclose(words.bag_of_words(local, known), literal.bag_of_words(local, known), rtol=1e-6)
-    assert not words.bag_of_words(np.zeros((0, 4), np.float32), known).any()
+    np.testing.assert_allclose(words.compute_bag_of_words(local, known), literal.bag_of_words(local, known), rtol=1e-6)
+    assert not words.compute_bag_of_words(np.zeros((0, 4), np.float32), known).any()

@@ -45,7 +45,7 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
 from edgevpr.techniques import create, format_name
-from edgevpr.techniques.card import find_weights
+from edgevpr.techniques.card import describe_weights
 
 # Yields the items, of that number, and shows it with a label.
 Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]
@@ -207,7 +207,7 @@ def summarise(
     cost = query_cost(encoding, matching, board, parse_pack(battery.pack), efficiency, rss_mb=0.0)
     return metrics.TechniqueResult(
         technique=format_name(technique.spec.name, technique.spec.form),
-        weights=find_weights(technique.spec),
+        weights=describe_weights(technique.spec),
         parameters=technique.spec.parameters,
         references=references,
         unscored=dataset.unscored,

@@ -11,7 +11,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import UsageError
-from edgevpr.frames.images import counting_order
+from edgevpr.frames.images import make_sort_key
 from edgevpr.lab.evaluate.dataset import GroundTruth
 from edgevpr.lab.evaluate.metrics import Quality, compute_both, rank_first_right
 
@@ -43,7 +43,7 @@ def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequenc
     queries of `truth`, in its order, and columns `references` (None: all that `truth` names, in counting order). Raises
     UsageError where the counts do not fit."""
     named = frozenset[str]().union(*(names for judged in truth.values() for names in judged or ()))
-    names = list(references or sorted(named, key=counting_order))
+    names = list(references or sorted(named, key=make_sort_key))
     if scores.shape != (len(truth), len(names)) or not named <= set(names):
         raise UsageError(
             f"{label} has scores of {scores.shape[0]} queries and {scores.shape[1]} references, and the ground truth "

@@ -13,7 +13,7 @@ from edgevpr.core.errors import ImageError
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import Mount
-from edgevpr.frames.source import recorded_intervals
+from edgevpr.frames.source import read_intervals
 from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.groundlink import GroundLink
@@ -53,7 +53,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
     """Fly, and return the exit code: 1 if any frame failed, else 0. `positions` is a file with the positions of the
     frames of a recording (None: there is none). Raises EdgevprError if the flight cannot start."""
     source = config.source
-    steps_s = recorded_intervals(source.uri, positions)
+    steps_s = read_intervals(source.uri, positions)
     config = replace(config, source=apply_recorded_rate(source, steps_s))
     with open_real_io(config, positions, steps_s) as io:
         try:

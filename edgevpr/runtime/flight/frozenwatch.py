@@ -18,7 +18,7 @@ from edgevpr.core.config import SourceConfig
 from edgevpr.core.geodesy import shorter_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
-from edgevpr.frames.sameness import BLOCKS, CoarsePicture, make_coarse
+from edgevpr.frames.sameness import BLOCK_COUNT, CoarsePicture, make_coarse
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import ToAutopilot
 from edgevpr.runtime.flight.notifier import Notifier
@@ -48,7 +48,7 @@ _HEADING_JUMP_DEG_S = 60.0  # has corrected its heading
 _AXIS_SHARE = 0.36  # root mean square distance of a picture's points from its middle
 _WIDEST_FOV_DEG = 120.0  # of a lens that is unknown
 _SAME_BLOCKS = 0.75  # share of the blocks that must be unmoved
-_MIN_BLOCKS = BLOCKS // 3  # that can be judged
+_MIN_BLOCKS = BLOCK_COUNT // 3  # that can be judged
 _BLOCK_MEMORY = 8  # pictures: time constant of the share of pictures in which a block stays while most others move
 _MAX_STAY = 0.5  # of the blocks, in a picture that says which ones always stay
 _REMEMBERED = 300  # pictures; 4 MB
@@ -122,7 +122,7 @@ class FrozenWatch:
         self._flown_share = 0.0
         self._rotations: deque[tuple[float, float]] = deque()  # of this row: time and share of each
         self._repeats: deque[tuple[float, float]] = deque()
-        self._stays = np.zeros(BLOCKS)  # share of the latest pictures in which a block stayed while others moved
+        self._stays = np.zeros(BLOCK_COUNT)  # share of the latest pictures in which a block stayed while others moved
         self._remembered: deque[TimedPicture] = deque(maxlen=_REMEMBERED)
         self._repeats_in_a_row = self._new_in_a_row = self._new_needed = 0
 

@@ -201,10 +201,10 @@ def list_preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
     if own is not None and not techniques.is_known(own):
         raise ConfigError(
             f"The profile of {board.title} names the technique `{own}`, which is not there: use one of "
-            f"{', '.join(techniques.names())}."
+            f"{', '.join(techniques.list_techniques())}."
         )
-    names = dict.fromkeys((own, *techniques.AUTOMATIC) if own else techniques.AUTOMATIC)
-    return tuple(name for name in names if camera != "nadir" or "camera" in techniques.parameters(name))
+    names = dict.fromkeys((own, *techniques.DEFAULT_TECHNIQUES) if own else techniques.DEFAULT_TECHNIQUES)
+    return tuple(name for name in names if camera != "nadir" or "camera" in techniques.read_parameters(name))
 
 
 def describe_option(board: Board, option: Option, demand: Demand) -> str:

@@ -7,8 +7,8 @@ import numpy as np
 from edgevpr import techniques
 from edgevpr.core.errors import EdgevprError, ModelError
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
-from edgevpr.techniques.card import Card, card_names, load_card
-from edgevpr.techniques.session import Backbone, file_sha256
+from edgevpr.techniques.card import Card, list_cards, load_card
+from edgevpr.techniques.session import Backbone, hash_model_file
 
 _FRAME = (480, 640)
 
@@ -32,7 +32,7 @@ class Listed:
 
 def list_models() -> tuple[Listed, ...]:
     """List the networks of all cards, including those that cannot be used. Each is run once."""
-    return tuple(map(_read_listed, card_names()))
+    return tuple(map(_read_listed, list_cards()))
 
 
 def try_network(card: Card) -> None:
@@ -51,17 +51,17 @@ def try_network(card: Card) -> None:
 def _read_listed(name: str) -> Listed:
     try:
         card = load_card(name)
-        sha256 = file_sha256(card.file_path)
+        sha256 = hash_model_file(card.file_path)
         if sha256 != card.sha256:
             raise ModelError(f"{card.file_path} is not the file of its card: its SHA-256 is {sha256}.")
         try_network(card)
     except EdgevprError as error:
         return Listed(name=name, problem=str(error))
     outputs = tuple(output for output, layer in asdict(card.outputs).items() if layer)
-    users = [card.name] if card.is_technique and not techniques.is_own(card.name) else []
-    for technique in techniques.names():
-        is_of_card = techniques.parameters(technique).get("model") == card.name
-        if is_of_card and techniques.network_output(technique) in outputs:
+    users = [card.name] if card.is_technique and not techniques.is_builtin(card.name) else []
+    for technique in techniques.list_techniques():
+        is_of_card = techniques.read_parameters(technique).get("model") == card.name
+        if is_of_card and techniques.find_network_output(technique) in outputs:
             users.append(technique)
     users += ["salience.detector"] if card.detector else []
     users += ["salience.network"] if card.outputs.memorability else []

@@ -22,7 +22,7 @@ from edgevpr.runtime.preflight.probe import TechniqueCosts, probe, ram_bytes
 from edgevpr.runtime.preflight.scale import compare_speed, count_work, scale_to_board
 from edgevpr.runtime.recognise.opening import make_technique
 from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.techniques.card import find_weights
+from edgevpr.techniques.card import describe_weights
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ def explain_technique(recogniser: Recogniser, is_named: bool) -> str:
     it."""
     spec = recogniser.technique.spec
     parts = ["it was named" if is_named else "the map was built with it"]
-    if weights := find_weights(spec):
+    if weights := describe_weights(spec):
         parts.append(f"weights of {weights}")
     if left_out := len(recogniser.place_map) - len(recogniser.index):
         parts.append(f"{left_out} places are left to the map file")
@@ -98,7 +98,7 @@ def limit_candidates(technique: Technique) -> tuple[int, ...]:
 def camera_setting(name: str, camera: str | None) -> dict[str, str]:
     """Return the setting that tells the technique `name` the direction of the camera; empty if the direction is unknown
     (None) or the technique has no such parameter."""
-    return {"camera": camera} if camera and "camera" in techniques.parameters(name) else {}
+    return {"camera": camera} if camera and "camera" in techniques.read_parameters(name) else {}
 
 
 def _label(spec: TechniqueSpec) -> str:

@@ -19,7 +19,7 @@ from edgevpr.core.config import FORMS
 from edgevpr.core.errors import EdgevprError
 from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
 from edgevpr.runtime.recognise.opening import make_technique
-from edgevpr.techniques.card import find_weights
+from edgevpr.techniques.card import describe_weights
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 _TRIED_S = 0.5  # pictures are tried again for so long; twice as long finds the same. A check has no time for that
@@ -51,7 +51,7 @@ def offers(names: Iterable[str], settings: Mapping[str, Mapping[str, Any]] | Non
     trials = []
     for name in names:
         own = dict((settings or {}).get(name, {}))
-        is_one = "form" in own or "form" not in techniques.parameters(name)
+        is_one = "form" in own or "form" not in techniques.read_parameters(name)
         for chosen in (own,) if is_one else ({**own, "form": form} for form in FORMS):
             trials.append(Trial(label=techniques.format_name(name, chosen.get("form")), name=name, settings=chosen))
     return tuple(trials)
@@ -88,7 +88,7 @@ def _try_here(trials: list[Trial], threads: int) -> list[Trial]:
         technique = make_technique(threads, offer.name, offer.settings)
         costs = probe(technique, tried_s=_TRIED_S)
         spec = technique.spec
-        tried.append(replace(offer, costs=costs, weights=find_weights(spec), parameters=spec.parameters))
+        tried.append(replace(offer, costs=costs, weights=describe_weights(spec), parameters=spec.parameters))
         # What a form has taken is given back, or it would be counted for the next one.
         del technique
         gc.collect()

@@ -11,7 +11,7 @@ import numpy as np
 from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import PlaceError
 from edgevpr.core.types import Candidate
-from edgevpr.frames.level import Levelled
+from edgevpr.frames.level import LevelledImage
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
@@ -93,7 +93,7 @@ class Verifier:
     """Compares the landmarks of one query, which are computed when first needed, with those of places. All methods
     raise PlaceError if the landmarks of a place cannot be read; the place is then left out."""
 
-    def __init__(self, encoder: FrameEncoder, picture: Levelled, index: PlaceIndex, place_map: PlaceMap) -> None:
+    def __init__(self, encoder: FrameEncoder, picture: LevelledImage, index: PlaceIndex, place_map: PlaceMap) -> None:
         self._encoder, self._spec = encoder, encoder.technique.spec
         self._picture, self._index, self._map = picture, index, place_map
 

@@ -8,8 +8,8 @@ from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError, MapError, PlaceError
 from edgevpr.core.reasons import NOT_SEARCHED, Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
-from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, Mount, View, enlarge
-from edgevpr.frames.mask import Mask
+from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage, Mount, View, enlarge_image
+from edgevpr.frames.mask import OverlayMask
 from edgevpr.places.layers import Layers
 from edgevpr.runtime.recognise.landmarks import AHEAD_PX, DOWN_PX, OF_PLACE, Landmarks, describe, pack_bytes
 from edgevpr.runtime.recognise.levelling import Levelling, Straightening
@@ -23,7 +23,7 @@ class EncodedFrame:
 
     frame: Frame
     vehicle: Vehicle | None = None
-    picture: Levelled
+    picture: LevelledImage
     worth: Worth | None = None
     descriptor: Descriptor
 
@@ -40,16 +40,16 @@ class FrameEncoder:
 
     technique: Technique
     levelling: Levelling | Straightening | None = None
-    mask: Mask | None = None
+    mask: OverlayMask | None = None
     gate: Gate | None = None
 
     def prepare(
         self, frame: Frame, vehicle: Vehicle | None = None, *, layers: Layers | None = None, scale: float = 1.0
-    ) -> Levelled:
+    ) -> LevelledImage:
         """Return the levelled picture of a frame, with its mask and view. See `Levelling.prepare` for the rest."""
         mask = self.mask.fitted(frame.image) if self.mask else None
         if self.levelling is None:
-            return enlarge(Levelled(frame.image, mask, UNKNOWN_VIEW), scale)
+            return enlarge_image(LevelledImage(frame.image, mask, UNKNOWN_VIEW), scale)
         return self.levelling.prepare(frame, vehicle, mask, layers=layers, scale=scale)
 
     def encode(
@@ -71,12 +71,12 @@ class FrameEncoder:
             descriptor = self.technique.encode(picture.image, picture.mask)
         return EncodedFrame(frame=frame, vehicle=vehicle, picture=picture, worth=worth, descriptor=descriptor)
 
-    def detect_landmarks(self, picture: Levelled, count: int = OF_PLACE) -> Landmarks:
+    def detect_landmarks(self, picture: LevelledImage, count: int = OF_PLACE) -> Landmarks:
         """Find the `count` best landmarks of a picture, of the size at which those of places are found."""
         longest_px = DOWN_PX if self.technique.spec.looks_down else AHEAD_PX
         return describe(picture.image, picture.mask, count, longest_px)
 
-    def pack_landmarks(self, picture: Levelled) -> bytes | None:
+    def pack_landmarks(self, picture: LevelledImage) -> bytes | None:
         """Return the landmarks to store for a place; None if the technique has no use for them."""
         return pack_bytes(self.detect_landmarks(picture)) if self.technique.spec.cells else None
 

@@ -21,7 +21,7 @@ import numpy as np
 from edgevpr.core.arrays import Floats, Image, Ints, Mask, Singles
 from edgevpr.core.errors import ModelError
 from edgevpr.techniques.card import Card, InputRule
-from edgevpr.techniques.session import open_session, prepare, run_outputs, shares
+from edgevpr.techniques.session import compute_fill_shares, open_session, prepare_input, run_outputs
 
 _CAR_M = 4.5
 _CAR_PX = 24  # least length of a car on the input: small detectors find little that is smaller
@@ -68,7 +68,9 @@ def prepare_crops(image: Image, rule: InputRule) -> Singles:
     """Cut uint8 (H, W[, 3]), at least 5 pixels along each side, into crops, row by row, and prepare them for a network:
     float32 (25, C, height, width)."""
     rows, columns = (np.array_split(np.arange(side), CROPS) for side in image.shape[:2])
-    return np.concatenate([prepare(image[y[0] : y[-1] + 1, x[0] : x[-1] + 1], rule) for y in rows for x in columns])
+    return np.concatenate(
+        [prepare_input(image[y[0] : y[-1] + 1, x[0] : x[-1] + 1], rule) for y in rows for x in columns]
+    )
 
 
 def interpolate_map(matrix: Singles, size_px: tuple[int, int]) -> Singles:
@@ -115,7 +117,7 @@ class Detector:
     def _boxes_px(self, image: Image) -> Ints:
         """Return the boxes of dynamic classes, int (N, 4): left, top, right, bottom, clipped to the picture."""
         rule = self.card.input
-        outputs = run_outputs(self.card, self._session, self._outputs, prepare(image, rule))
+        outputs = run_outputs(self.card, self._session, self._outputs, prepare_input(image, rule))
         try:
             boxes, scores = _DECODERS[self._rule.family](outputs, (rule.height, rule.width))
             scores = scores[:, sorted(self._rule.dynamic.values())].max(axis=1)
@@ -126,7 +128,7 @@ class Detector:
             ) from error
         found = boxes[scores >= self._rule.min_score]
         height, width = image.shape[:2]
-        across, down = shares(image, rule)
+        across, down = compute_fill_shares(image, rule)
         size = np.array([width / across, height / down] * 2)
         least, most = np.floor(found[:, :2] * size[:2]), np.ceil(found[:, 2:] * size[:2])
         return np.hstack([least, most]).clip(0, [width, height] * 2).astype(int)

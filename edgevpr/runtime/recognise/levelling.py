@@ -12,16 +12,16 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import offset_position, picture_axes
 from edgevpr.core.types import Frame, Pose, Position, Vehicle
-from edgevpr.frames.lens import CalibratedLens, line_of_sight, read_lens
+from edgevpr.frames.lens import CalibratedLens, compute_lens_view, read_lens
 from edgevpr.frames.level import (
     STRAIGHT_DOWN,
     UNKNOWN_VIEW,
     Lens,
-    Levelled,
+    LevelledImage,
     Mount,
     View,
     compute_footprint,
-    enlarge,
+    enlarge_image,
     estimate_tilted_view,
     level_image,
     undistort_frame,
@@ -68,7 +68,7 @@ class Levelling:
         *,
         layers: Layers | None = None,
         scale: float = 1.0,
-    ) -> Levelled:
+    ) -> LevelledImage:
         """Level the picture of a frame. `vehicle` is the autopilot's report (None: unknown). `overlay`, bool (H, W), is
         False where the picture shows no ground (None: nowhere). Its longest side is scaled to a length on the ground,
         that of the places to look among by their `layers` (None: no scaling). It shows `scale` times as much ground as
@@ -78,7 +78,9 @@ class Levelling:
         if vehicle and self.on_gimbal:
             vehicle = replace(vehicle, roll_deg=0.0, pitch_deg=0.0)
         if self.lens is None:
-            return enlarge(Levelled(frame.image, overlay, estimate_tilted_view(frame, vehicle, self.mount)), scale)
+            return enlarge_image(
+                LevelledImage(frame.image, overlay, estimate_tilted_view(frame, vehicle, self.mount)), scale
+            )
         own_m = compute_footprint(frame, vehicle, self.lens) if layers else None
         footprint_m = layers.fitting(own_m and scale * own_m) if layers else None
         picture = level_image(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self.below, scale=scale)
@@ -94,7 +96,7 @@ class Straightening:
 
     lens: CalibratedLens
 
-    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, **_: object) -> Levelled:
+    def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, **_: object) -> LevelledImage:
         """Straighten the picture of a frame, which has no scale; as `Levelling.prepare`."""
         return undistort_frame(frame.image, overlay, UNKNOWN_VIEW, self.lens)
 
@@ -119,7 +121,7 @@ def make_levelling(
 def read_camera_lens(config: SourceConfig) -> Lens | None:
     """Return the lens of a configuration's camera; None if it is unknown. Raises as `make_levelling`."""
     calibrated = load_calibrated_lens(config)
-    fov_deg = line_of_sight(calibrated, calibrated.size_px).fov_deg if calibrated else config.fov_deg
+    fov_deg = compute_lens_view(calibrated, calibrated.size_px).fov_deg if calibrated else config.fov_deg
     return None if fov_deg is None else Lens(fov_deg, config.up_deg, calibrated, read_mount(config))
 
 
@@ -133,7 +135,7 @@ def load_calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
     if config.lens is None:
         return None
     lens = read_lens(config.lens)
-    field_deg = line_of_sight(lens, lens.size_px).field_deg
+    field_deg = compute_lens_view(lens, lens.size_px).field_deg
     if config.fov_deg is not None and abs(config.fov_deg - field_deg) > _FIELDS_AGREE_DEG:
         raise UsageError(
             f"`source.fov_deg` is {config.fov_deg:g}, and {config.lens} says {field_deg:.0f} degrees: leave `fov_deg` "

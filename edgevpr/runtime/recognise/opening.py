@@ -8,7 +8,7 @@ from edgevpr import techniques
 from edgevpr.core.config import Config, SalienceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ConfigError, MapError, UsageError
-from edgevpr.frames.mask import Mask, load_mask
+from edgevpr.frames.mask import OverlayMask, load_mask
 from edgevpr.frames.source import is_live
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
@@ -120,7 +120,7 @@ def open_salience_gate(config: SalienceConfig, threads: int = 1) -> Gate | None:
 
 def make_technique(threads: int | None, name: str, settings: Settings | None = None) -> Technique:
     """Make the technique `name`; its network gets `threads` (None: one) unless `settings` give a number."""
-    own = {"threads": threads} if threads and "threads" in techniques.parameters(name) else {}
+    own = {"threads": threads} if threads and "threads" in techniques.read_parameters(name) else {}
     return techniques.create(name, {**own, **(settings or {})})
 
 
@@ -137,7 +137,7 @@ def create_technique(
         raise MapError(
             f"{place_map.path} was built with `{built_with.name}`, which this edgevpr does not have: update edgevpr, "
             "copy its network and card to your models folder (`edgevpr models list` says where), or build the map with "
-            f"one of {', '.join(techniques.names())}."
+            f"one of {', '.join(techniques.list_techniques())}."
         )
     if name in (None, built_with.name):
         try:
@@ -154,7 +154,7 @@ def create_technique(
     return technique
 
 
-def warn_of_other_pictures(place_map: PlaceMap, mask: Mask | None, lens: str | None) -> None:
+def warn_of_other_pictures(place_map: PlaceMap, mask: OverlayMask | None, lens: str | None) -> None:
     """Warn if the places of a map, which remain usable, were made with another `mask`, or if their pictures were
     straightened by a calibration and those to come are not (`lens` None)."""
     if not len(place_map):

@@ -6,7 +6,7 @@ from typing import Any
 from edgevpr.core.contract import Descriptor
 from edgevpr.core.reasons import NOT_SEARCHED, Reason
 from edgevpr.core.types import Candidate, FixReport, Frame, Position, QueryCost, Steps, Vehicle
-from edgevpr.frames.level import UNKNOWN_VIEW, Levelled, View
+from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage, View
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.evidence import Evidence
@@ -28,7 +28,7 @@ class Recognition:
 
     frame: Frame | None
     vehicle: Vehicle | None = None  # the autopilot's report when the frame was taken
-    picture: Levelled | None = None  # that was encoded, and how it lies on the ground
+    picture: LevelledImage | None = None  # that was encoded, and how it lies on the ground
     worth: Worth | None = None  # judgement of the salience gate
     descriptor: Descriptor | None = None
     stride: Stride | None = None  # since the frame before

@@ -19,7 +19,7 @@ from edgevpr.core.config import SalienceConfig
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Salience
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability, interpolate_map
-from edgevpr.techniques.entropy import filled_bins
+from edgevpr.techniques.entropy import compute_filled_bins
 
 MAX_ENTROPY = float(np.log2(81) / 8)  # entropy / 8 bits of a disc of 81 pixels, all different
 GAP_FRAMES = 20  # if none of so many frames passes, the thresholds are lowered
@@ -120,5 +120,5 @@ def compute_scores(image: Image, memorability: Memorability | None = None, is_st
     return Salience(
         memorability=None if memorable is None else float((memorable * static).mean()),
         staticity=None if is_static is None else float(is_static.mean()),
-        entropy=float((filled_bins(grey) * static).mean()),
+        entropy=float((compute_filled_bins(grey) * static).mean()),
     )

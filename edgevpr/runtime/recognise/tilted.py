@@ -11,7 +11,7 @@ import numpy as np
 from edgevpr.core.arrays import Array
 from edgevpr.core.contract import FineMatch, Perspective, Technique
 from edgevpr.frames.homography import Homography, cut_polygon
-from edgevpr.frames.level import Levelled
+from edgevpr.frames.level import LevelledImage
 
 _MAX_SIDE_PX = 512
 _MIN_SCALE = 0.1  # of that at the middle: nearer to the horizon of the homography, nothing is shown
@@ -20,7 +20,7 @@ _MIN_LEFT = 2 / 3
 _AT_REST = FineMatch(1.0, shift_cells=(0.0, 0.0), rotation_deg=0.0, height_ratio=1.0)
 
 
-def measure_again(picture: Levelled, technique: Technique, fine: Array, found: Perspective) -> Perspective | None:
+def measure_again(picture: LevelledImage, technique: Technique, fine: Array, found: Perspective) -> Perspective | None:
     """Measure the perspective of a picture over a place, whose fine part is `fine`, again, beginning with the one that
     was `found`. Returns None if that was a chance: fewer regions agree now."""
     height, width = picture.image.shape[:2]

@@ -11,9 +11,9 @@ from pathlib import Path
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.errors import ImageError
 from edgevpr.core.types import FIX_MAX_AGE_S
-from edgevpr.frames.lens import line_of_sight
+from edgevpr.frames.lens import compute_lens_view
 from edgevpr.frames.shot import Condition
-from edgevpr.frames.source import Source, is_by_program, open_source
+from edgevpr.frames.source import Source, is_program_uri, open_source
 from edgevpr.runtime.recognise.levelling import load_calibrated_lens
 from edgevpr.runtime.service.finding import Finding, check_device, fine, run_check, wrong
 from edgevpr.runtime.service.findingcodes import FindingCode
@@ -30,7 +30,7 @@ def check_camera(uri: str, root: Path = Path("/")) -> Iterator[Finding]:
     finding. `root` is the root of the file system with /dev."""
     if uri.startswith("/dev/"):
         yield check_device("camera", uri, root)
-    elif is_by_program(uri):
+    elif is_program_uri(uri):
         yield run_check("camera", lambda what: _check_program(what, uri, root))
 
 
@@ -74,7 +74,7 @@ def check_frame(what: str, config: SourceConfig) -> Finding:
     found: dict[str, float | str | None] = {"width": size[0], "height": size[1], "age_s": age_s}
     found["facts"] = str(facts) if facts else None
     found["lens"] = lens.path if lens else None
-    found["fov_deg"] = line_of_sight(lens, size).fov_deg if lens else None
+    found["fov_deg"] = compute_lens_view(lens, size).fov_deg if lens else None
     return fine(what, FindingCode.FRAME_RECEIVED, uri=config.uri, state=state, **found)
 
 

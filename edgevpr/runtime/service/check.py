@@ -12,7 +12,7 @@ from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.text import show_waiting
 from edgevpr.core.types import FIX_MAX_AGE_S
 from edgevpr.frames.shot import Condition
-from edgevpr.frames.source import is_live, missing_cause, open_source, recorded_intervals
+from edgevpr.frames.source import find_missing_cause, is_live, open_source, read_intervals
 from edgevpr.mavlink.address import parse_links
 from edgevpr.mavlink.asking import Inquiry
 from edgevpr.mavlink.signing import open_signing
@@ -35,7 +35,7 @@ def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
         config = load_config(config_path)
     except EdgevprError as error:
         return [refuse("configuration", error)]
-    source = apply_recorded_rate(config.source, recorded_intervals(config.source.uri))
+    source = apply_recorded_rate(config.source, read_intervals(config.source.uri))
     findings = [fine("configuration", FindingCode.FILE_USABLE, path=str(config_path))]
     try:
         board = resolve_board(load_board(config.board), source, config.memory)
@@ -73,7 +73,7 @@ def _check_source(what: str, settings: SourceConfig, offline: bool) -> Finding:
     if not offline:
         return check_frame(what, settings)
     load_calibrated_lens(settings)
-    if is_live(uri) and (cause := missing_cause(uri)):
+    if is_live(uri) and (cause := find_missing_cause(uri)):
         return wrong(what, FindingCode.CAMERA_ABSENT, problem=cause)
     with closing(open_source(uri, live=True)) as source:
         # Wait until FFmpeg has given up (10 s at most): a capture that returns while Python ends aborts the process.

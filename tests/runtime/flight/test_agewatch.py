@@ -13,7 +13,7 @@ from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import FRAME_TIME_SD_S, Frame, Position
 from edgevpr.frames.age import HIDDEN_DELAY_SD_S
-from edgevpr.frames.level import Levelled
+from edgevpr.frames.level import LevelledImage
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 
@@ -54,7 +54,7 @@ class LateAir(Air):
         seen_m = self.way[true_step] + self.rng.normal(0, self.noise_sd_m, 2)
         where = Position(*offset_position(*HOME, *seen_m))
         event = match_at(where, frame.t_mono_s, vehicle, self.said_sd_m, self.places(true_step))
-        picture = Levelled(_PICTURE, None, replace(event.view, up_deg=self.heading_deg(frame.t_mono_s)))
+        picture = LevelledImage(_PICTURE, None, replace(event.view, up_deg=self.heading_deg(frame.t_mono_s)))
         heading_deg = self.heading_deg(true_step * _STEP_S) + self.rng.normal(0, 1.0)
         event = replace(event, frame=frame, picture=picture, located=replace(event.located, heading_deg=heading_deg))
         self.off_s, self.t_sd_s = frame.t_mono_s - true_step * _STEP_S, frame.t_sd_s

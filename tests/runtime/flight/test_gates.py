@@ -13,7 +13,7 @@ from fakes import receiver_at, vehicle_at
 from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import FRAME_TIME_SD_S, Position
-from edgevpr.frames.level import Levelled, View
+from edgevpr.frames.level import LevelledImage, View
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.consistency import ComparedFix
@@ -239,7 +239,7 @@ def test_frame_claims_an_error_of_the_height_that_pictures_show():
 
 
 CONTINUOUS = Channel.GPS_INPUT
-TILTED = Levelled(np.zeros((8, 8), np.uint8), None, View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 40.0})))
+TILTED = LevelledImage(np.zeros((8, 8), np.uint8), None, View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 40.0})))
 
 
 @pytest.mark.parametrize(

@@ -185,8 +185,8 @@ def test_picked_technique_passes_over_a_network_that_is_not_there(monkeypatch, c
 
 
 def test_list_preferred_begins_with_the_boards_own_technique():
-    assert list_preferred(board(technique=None)) == techniques.AUTOMATIC
-    assert list_preferred(board(technique="seqslam")) == ("seqslam", *techniques.AUTOMATIC)
+    assert list_preferred(board(technique=None)) == techniques.DEFAULT_TECHNIQUES
+    assert list_preferred(board(technique="seqslam")) == ("seqslam", *techniques.DEFAULT_TECHNIQUES)
     assert list_preferred(board(technique="hog"), "forward") == ("hog", "cohog")
     assert (
         list_preferred(board(technique="hog"), "nadir") == list_preferred(board(technique=None), "nadir") == ("cohog",)

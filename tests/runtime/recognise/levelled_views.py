@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from edgevpr.core.types import Frame
-from edgevpr.frames.level import Lens, Levelled, level_image
+from edgevpr.frames.level import Lens, LevelledImage, level_image
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, light_scene, photograph
 from edgevpr.lab.simulate.landscape import make_scene
 
@@ -20,7 +20,7 @@ def lit_ground(east_m: float, north_m: float) -> np.ndarray:
     return light_scene(make_scene(5, east_m, north_m, _METRES_PER_PIXEL), _LIGHT, 5)
 
 
-def view_from(ground: np.ndarray, pose: CameraPose, told: CameraPose | None = None) -> Levelled:
+def view_from(ground: np.ndarray, pose: CameraPose, told: CameraPose | None = None) -> LevelledImage:
     """The levelled picture from a pose; `told` is the pose that the autopilot reports."""
     image = photograph(ground, _METRES_PER_PIXEL, pose, Camera(), _LIGHT, np.random.default_rng(1))
     names = ("heading_deg", "roll_deg", "pitch_deg", "height_m")

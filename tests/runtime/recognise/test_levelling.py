@@ -15,8 +15,8 @@ from edgevpr.core.config import load_config
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
-from edgevpr.frames.level import STRAIGHT_DOWN, UNKNOWN_VIEW, Lens, Levelled, Mount, View, enlarge
-from edgevpr.frames.mask import Mask
+from edgevpr.frames.level import STRAIGHT_DOWN, UNKNOWN_VIEW, Lens, LevelledImage, Mount, View, enlarge_image
+from edgevpr.frames.mask import OverlayMask
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, photograph
 from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
@@ -137,7 +137,7 @@ def test_a_display_is_masked_where_the_warp_puts_it(walk, ground):
     image[:120, :160] = np.random.default_rng(1).integers(0, 256, (120, 160, 3))
     allowed = np.ones(image.shape[:2], bool)
     allowed[:124, :164] = False
-    asked = walk(scaling(), mask=Mask(allowed, ""))
+    asked = walk(scaling(), mask=OverlayMask(allowed, ""))
     covered, clean = asked.step(replace(seen, image=image)), asked.step(seen)
     assert np.array_equal(covered.descriptor.fine, clean.descriptor.fine)
     assert recognised(covered, 1)
@@ -319,7 +319,7 @@ def test_a_height_that_is_told_wrongly_is_found_out_by_the_first_match(walk, gro
 def test_a_picture_is_enlarged_around_its_middle(zoom):
     image = np.zeros((81, 121), np.uint8)
     image[40, 60] = image[40, 60 + 12] = 255
-    picture = enlarge(Levelled(image, None, UNKNOWN_VIEW), zoom)
+    picture = enlarge_image(LevelledImage(image, None, UNKNOWN_VIEW), zoom)
     assert picture.view.zoom == zoom
     assert picture.image[40, 60] == 255
     assert picture.image[40, 60 + round(12 * zoom)] > 100

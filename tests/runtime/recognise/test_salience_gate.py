@@ -9,7 +9,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.contract import Descriptor
 from edgevpr.core.types import Frame, Position, Salience
 from edgevpr.frames.images import cv2
-from edgevpr.frames.level import UNKNOWN_VIEW, Levelled
+from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage
 from edgevpr.mapmaking.mapping import Gaps
 from edgevpr.runtime.recognise.encoder import EncodedFrame
 from edgevpr.runtime.recognise.gate_networks import interpolate_map
@@ -19,7 +19,7 @@ from edgevpr.runtime.recognise.salience_gate import (
     compute_memorability,
     compute_scores,
 )
-from edgevpr.techniques.entropy import filled_bins
+from edgevpr.techniques.entropy import compute_filled_bins
 
 RNG = np.random.default_rng(5)
 
@@ -49,7 +49,7 @@ def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_noth
     assert scores.staticity == pytest.approx(0.75)
     memorable = interpolate_map(Half().matrix(picture), picture.shape)
     assert scores.memorability == pytest.approx(memorable[:, :120].sum() / picture.size, abs=1e-6)
-    assert scores.entropy == pytest.approx(filled_bins(picture)[:, :120].sum() / picture.size, abs=1e-6)
+    assert scores.entropy == pytest.approx(compute_filled_bins(picture)[:, :120].sum() / picture.size, abs=1e-6)
     alone = compute_scores(picture)
     assert (alone.memorability, alone.staticity) == (None, None)
     assert alone.entropy > scores.entropy
@@ -129,7 +129,7 @@ def event(number, short_by=0.0, north_m=None):
     image = np.zeros((8, 8), np.uint8)
     return EncodedFrame(
         frame=Frame(image=image, name=str(number), t_mono_s=float(number), position=position),
-        picture=Levelled(image, None, UNKNOWN_VIEW),
+        picture=LevelledImage(image, None, UNKNOWN_VIEW),
         descriptor=Descriptor(coarse=np.zeros(1)),
         worth=Worth(Salience(None, None, 0.4 - short_by), short_by, lacks, lacks and "not memorable"),
     )

@@ -17,7 +17,7 @@ from walks import map_of, walk_over
 
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
-from edgevpr.frames.mask import Mask
+from edgevpr.frames.mask import OverlayMask
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.decide import Verifier, WalkSettings
@@ -228,7 +228,7 @@ def test_damaged_landmarks_are_a_refusal_and_the_place_is_left_out(mapped, techn
 def test_the_mask_holds_for_landmarks_too(whole, technique, tmp_path):
     allowed = np.ones((240, 320), bool)
     allowed[:, :160] = False
-    path = map_of(tmp_path / "half.gpkg", technique, [frame(1)], mask=Mask(allowed, "half"))
+    path = map_of(tmp_path / "half.gpkg", technique, [frame(1)], mask=OverlayMask(allowed, "half"))
     with PlaceMap.open(path) as place_map:
         there = unpack_bytes(place_map.read_landmarks(1))
     assert len(there) > 30
