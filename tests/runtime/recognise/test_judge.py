@@ -110,8 +110,8 @@ def test_a_match_must_lead_over_the_picture_turned_otherwise(lead, code):
 @pytest.mark.parametrize(
     ("known", "code"),
     [
-        ({"tilt": ShownTilt(math.tan(math.radians(20.1)), 0.0)}, ReasonCode.TILT_SHOWN),
-        ({"tilt": ShownTilt(math.tan(math.radians(19.9)), 0.0)}, ReasonCode.ACCEPTED_BY_SCORE),
+        ({"tilt": ShownTilt(math.tan(math.radians(60.1)), 0.0)}, ReasonCode.TILT_SHOWN),
+        ({"tilt": ShownTilt(math.tan(math.radians(59.9)), 0.0)}, ReasonCode.ACCEPTED_BY_SCORE),
         ({"where": DOUBTED}, ReasonCode.LOW_TEXTURE),
     ],
 )
