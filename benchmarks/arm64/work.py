@@ -18,7 +18,7 @@ from edgevpr.frames.level import View
 from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import NOTHING, Expectation, Query, compare, scan
-from edgevpr.power.speed import pass_round, product_round
+from edgevpr.power.speed import make_pass_round, make_product_round
 from edgevpr.runtime.recognise.landmarks import OF_QUERY, describe
 from edgevpr.runtime.recognise.stride import Strides
 from edgevpr.techniques import create
@@ -31,8 +31,8 @@ def parts(ahead: str, down: str) -> Iterator[tuple[str, Callable[[], object]]]:
     yield from of_camera("ahead", "forward", ahead)
     yield from of_camera("down", "nadir", down)
     yield from of_landmarks(_picture(np.random.default_rng(0)))
-    yield "micro-benchmark: a round of products", product_round()
-    yield "micro-benchmark: a round of passes", pass_round()
+    yield "micro-benchmark: a round of products", make_product_round()
+    yield "micro-benchmark: a round of passes", make_pass_round()
 
 
 def _picture(rng: np.random.Generator) -> Image:

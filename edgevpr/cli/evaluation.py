@@ -141,7 +141,7 @@ def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
     """Return the rows that the flags ask for, as `runs.Plan` has them: each technique in each form. Raises UsageError
     for an unknown form, or a --param of a technique that is not in --techniques."""
     from edgevpr import techniques
-    from edgevpr.runtime.preflight.pick import camera_setting
+    from edgevpr.runtime.preflight.pick import make_camera_setting
 
     wanted = [name.strip() for name in args.techniques.split(",") if name.strip()]
     if not wanted:
@@ -149,7 +149,7 @@ def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
     forms = [form.strip() for form in args.form.split(",")]
     if unknown := [form for form in forms if form not in FORMS]:
         raise UsageError(f"--form names `{unknown[0]}`: use some of {', '.join(FORMS)}.")
-    settings = {name: camera_setting(name, parse_value(args, "source.camera")) for name in wanted}
+    settings = {name: make_camera_setting(name, parse_value(args, "source.camera")) for name in wanted}
     for key, value in parse_parameters(args.param).items():
         name, _, parameter = key.partition(".")
         if name not in settings or not parameter:

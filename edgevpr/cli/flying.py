@@ -138,21 +138,21 @@ def run_flight(args: Namespace) -> int:
 
 def run_check(args: Namespace) -> int:
     """Run `check`: check whether a flight can start with a configuration, and print the findings."""
-    from edgevpr.runtime.service.check import check
+    from edgevpr.runtime.service.check import check_configuration
 
-    return _show_findings(check(args.config, offline=args.offline), args.json)
+    return _show_findings(check_configuration(args.config, offline=args.offline), args.json)
 
 
 def run_doctor(args: Namespace) -> int:
     """Run `doctor`: examine flight controller and board, and print what is fine, what is wrong, and what to change."""
     from edgevpr.mavlink.address import parse_link
-    from edgevpr.runtime.service.doctor import doctor
+    from edgevpr.runtime.service.doctor import check_setup
 
     config = load_command_config(args, args.config)
     if config.mavlink.link is None:
         raise UsageError("There is no link to the flight controller: name one with --link, or in --config.")
     address = parse_link(config.mavlink.link)
-    findings, reading = doctor(config, address)
+    findings, reading = check_setup(config, address)
     return _show_findings(findings, args.json, link=str(address), reading=reading and asdict(reading))
 
 

@@ -35,24 +35,24 @@ def add(commands: Any) -> None:
 
 def profile(args: Namespace) -> int:
     """Run `profile`: estimate what techniques cost in a flight, or list the boards that have a profile."""
-    from edgevpr.power.boards import board_names, load_board, resolve_board
+    from edgevpr.power.boards import list_boards, load_board, resolve_board
     from edgevpr.runtime.preflight.choose import list_preferred
-    from edgevpr.runtime.preflight.estimate import estimate
+    from edgevpr.runtime.preflight.estimate import estimate_flight
     from edgevpr.runtime.preflight.presentation import format_table
     from edgevpr.runtime.preflight.scale import compare_speed
-    from edgevpr.runtime.preflight.trial import try_each
+    from edgevpr.runtime.preflight.trial import run_trials
 
     if args.list:
-        for name in ("this", *board_names()):
+        for name in ("this", *list_boards()):
             print(f"{name:<20} {load_board(name).title}")
         return 0
     config = load_command_config(args)
     board = resolve_board(load_board(args.board), config.source, config.memory)
     list_preferred(board)  # raises if the profile names a technique that is not there
-    plan, wanted = _plan(args, config, board)
-    trials = progress(try_each(wanted, board.threads), len(wanted), "trying techniques")
-    found = estimate(board, compare_speed(board), trials, plan)
-    show(found, args.json, format_table(found))
+    plan, trials = _plan(args, config, board)
+    results = progress(run_trials(trials, board.threads), len(trials), "trying techniques")
+    estimate = estimate_flight(board, compare_speed(board), results, plan)
+    show(estimate, args.json, format_table(estimate))
     return 0
 
 
@@ -63,18 +63,19 @@ def _plan(args: Namespace, config: Config, board: "Board") -> "tuple[FlightPlan,
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.equations import parse_pack
     from edgevpr.runtime.preflight.estimate import FlightPlan
-    from edgevpr.runtime.preflight.pick import camera_setting
-    from edgevpr.runtime.preflight.trial import offers
+    from edgevpr.runtime.preflight.pick import make_camera_setting
+    from edgevpr.runtime.preflight.trial import list_trials
 
     places, camera = args.places, config.source.camera
     if args.map:
         with PlaceMap.open(args.map) as place_map:
             places, spec = len(place_map), place_map.spec
         camera = str(spec.parameters["camera"]) if "camera" in spec.parameters else camera
-        wanted = offers((spec.name,), settings={spec.name: spec.parameters})
+        trials = list_trials((spec.name,), settings={spec.name: spec.parameters})
     else:
-        wanted = offers(
-            techniques.list_techniques(), settings={n: camera_setting(n, camera) for n in techniques.list_techniques()}
+        trials = list_trials(
+            techniques.list_techniques(),
+            settings={n: make_camera_setting(n, camera) for n in techniques.list_techniques()},
         )
     plan = FlightPlan(
         places=places,
@@ -85,4 +86,4 @@ def _plan(args: Namespace, config: Config, board: "Board") -> "tuple[FlightPlan,
         budget_mb=board.budget_mb,
         camera=camera,
     )
-    return plan, wanted
+    return plan, trials

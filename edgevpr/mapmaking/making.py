@@ -23,7 +23,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import map_path, remove
 from edgevpr.places.mapinfo import describe_map
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.preflight.pick import camera_setting, pick_technique
+from edgevpr.runtime.preflight.pick import make_camera_setting, pick_technique
 from edgevpr.runtime.recognise.calibration import MapCalibration
 from edgevpr.runtime.recognise.evidence import list_evidence_kinds
 from edgevpr.runtime.recognise.levelling import read_camera_lens, read_mount
@@ -156,12 +156,12 @@ def _open_flown(
     source, settings, camera = pictures.open(), order.parameters, flown.camera
     name = order.technique or (place_map.spec.name if place_map is not None else None)
     asks_camera = camera is None and place_map is None and "camera" not in settings
-    if asks_camera and (not name or camera_setting(name, "nadir")):
+    if asks_camera and (not name or make_camera_setting(name, "nadir")):
         advice.require_ahead(pictures, mask)
     if name is None:
         with show_elapsed("choosing a technique"):
             name = pick_technique(order.board, source.total or 1, camera)
-        settings = settings | camera_setting(name, camera)
+        settings = settings | make_camera_setting(name, camera)
     elif camera:  # a technique that knows no camera refuses one that was asked for
         settings = settings | {"camera": camera}
     technique = _make_technique(order, place_map, name, settings)
@@ -180,7 +180,7 @@ def _open_cuttings(
     if camera not in (None, "nadir"):
         raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
     name = order.technique or (place_map.spec.name if place_map is not None else _OF_ORTHOPHOTOS)
-    settings = order.parameters | camera_setting(name, "nadir")
+    settings = order.parameters | make_camera_setting(name, "nadir")
     return pictures.open(), _make_technique(order, place_map, name, settings)
 
 

@@ -22,7 +22,7 @@ from edgevpr.core.text import suggest
 from edgevpr.core.yamlfile import read_yaml
 from edgevpr.power import machine, thermal
 
-_ANY_MACHINE = "generic-x86"
+_FALLBACK_BOARD = "generic-x86"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,24 +76,24 @@ class Board:
 
     def is_this_machine(self, root: Path = Path("/")) -> bool:
         """Return True if the profile is that of the machine this runs on."""
-        return self.name == _this_machine(root).name or _matches(self, root)
+        return self.name == _detect_board(root).name or _is_model_of(self, root)
 
 
-def board_names() -> tuple[str, ...]:
+def list_boards() -> tuple[str, ...]:
     """Return the names of the boards that come with edgevpr."""
     return tuple(sorted(path.stem for path in find_shipped("profiles").glob("*.yaml")))
 
 
 def load_board(name: str, root: Path = Path("/")) -> Board:
-    """Load the profile called `name`: "this" (the machine itself), one of `board_names()`, or the path of a YAML file.
+    """Load the profile called `name`: "this" (the machine itself), one of `list_boards()`, or the path of a YAML file.
     Raises ConfigError if there is no such board, or if the file is incomplete or invalid."""
     if name == "this":
-        return _this_machine(root)
+        return _detect_board(root)
     if name.endswith((".yaml", ".yml")) or "/" in name:
-        return _read(Path(name))
-    if name in board_names():
-        return _read_shipped(name)
-    names = ["this", *board_names()]
+        return _read_board(Path(name))
+    if name in list_boards():
+        return _read_shipped_board(name)
+    names = ["this", *list_boards()]
     hint = suggest(name, names, f"use {', '.join(names)}, or the path of a YAML file.")
     raise ConfigError(f"There is no board `{name}`: {hint}")
 
@@ -103,17 +103,17 @@ def resolve_board(board: Board, source: SourceConfig, memory: MemoryConfig) -> B
     return replace(board, rate_hz=source.rate_hz or board.rate_hz, budget_mb=memory.budget_mb or board.budget_mb)
 
 
-def _matches(board: Board, root: Path) -> bool:
+def _is_model_of(board: Board, root: Path) -> bool:
     """Return True if the model of the machine below `root` contains the text that `board` is recognised by."""
-    model = machine.model(root)
+    model = machine.read_model(root)
     return bool(model and board.recognised_by and board.recognised_by.lower() in model.lower())
 
 
-def _read_shipped(name: str) -> Board:
-    return _read(find_shipped("profiles") / f"{name}.yaml")
+def _read_shipped_board(name: str) -> Board:
+    return _read_board(find_shipped("profiles") / f"{name}.yaml")
 
 
-def _read(path: Path) -> Board:
+def _read_board(path: Path) -> Board:
     board = build(Board, {"name": path.stem, **read_yaml(path)}, str(path))
     if board.full_w < board.idle_w:
         raise ConfigError(
@@ -127,29 +127,29 @@ def _read(path: Path) -> Board:
     return board
 
 
-def _this_machine(root: Path) -> Board:
-    """Return the profile of this machine's board, else generic-x86, with the cores and memory that are really there."""
-    model = machine.model(root)
+def _detect_board(root: Path) -> Board:
+    """Return the profile of this machine's board, else generic-x86, with the machine's own cores and memory."""
+    model = machine.read_model(root)
     recognised = next(
-        (board for board in map(_read_shipped, board_names() if model else ()) if _matches(board, root)), None
+        (board for board in map(_read_shipped_board, list_boards() if model else ()) if _is_model_of(board, root)), None
     )
-    profile = recognised or _read_shipped(_ANY_MACHINE)
+    profile = recognised or _read_shipped_board(_FALLBACK_BOARD)
     title = profile.title
     if model and not recognised:
-        title = f"{model}, which has no profile: the figures of {_ANY_MACHINE}"
-    ram_mb = machine.ram_mb(root)
+        title = f"{model}, which has no profile: the figures of {_FALLBACK_BOARD}"
+    ram_mb = machine.read_ram_mb(root)
     # Keep the profile's shares, but of the memory that the machine really has; a control group may allow less.
-    memory_max_mb = min(profile.memory_max_mb / profile.ram_mb * ram_mb, machine.ram_limit_mb(root))
+    memory_max_mb = min(profile.memory_max_mb / profile.ram_mb * ram_mb, machine.read_ram_limit_mb(root))
     # The power model counts all cores of the machine, so a CPU quota lowers `cpu_share` and not the number of cores.
-    cores = machine.cores_online(root)
-    cpu_share = min(profile.cpu_share, machine.cores(root) / cores)
+    cores = machine.count_cores_online(root)
+    cpu_share = min(profile.cpu_share, machine.count_usable_cores(root) / cores)
     return replace(
         profile,
         title=f"this machine ({title})",
         ram_mb=ram_mb,
         cores=cores,
         cpu_share=cpu_share,
-        thermal_limit_c=profile.thermal_limit_c or thermal.limit_c(root),
+        thermal_limit_c=profile.thermal_limit_c or thermal.read_limit_c(root),
         threads=max(1, min(profile.threads, round(cpu_share * cores))),
         budget_mb=memory_max_mb * profile.budget_mb / profile.memory_max_mb,
         memory_max_mb=memory_max_mb,

@@ -28,9 +28,9 @@ class Pack:
 
 def parse_pack(text: str) -> Pack:
     """Read "4S5200": four cells in series, 5200 mAh. Raises ConfigError for anything else."""
-    found = re.fullmatch(r"([0-9]{1,2})S([0-9]{1,6})", text.strip(), re.IGNORECASE)
-    if found:
-        pack = Pack(int(found[1]), int(found[2]))
+    match = re.fullmatch(r"([0-9]{1,2})S([0-9]{1,6})", text.strip(), re.IGNORECASE)
+    if match:
+        pack = Pack(int(match[1]), int(match[2]))
         if 1 <= pack.cells <= 24 and pack.capacity_mah >= 1:
             return pack
     raise ConfigError(

@@ -14,37 +14,37 @@ _ROOT = Path("/")
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
-def model(root: Path = _ROOT) -> str | None:
+def read_model(root: Path = _ROOT) -> str | None:
     """Return the machine's name by its maker, from the device tree ("Raspberry Pi 4 Model B Rev 1.4") or, of an x86
     machine, the firmware (DMI); None if neither says one."""
-    names = (text(root / "sys/class/dmi/id" / name) for name in ("sys_vendor", "product_name"))
-    return text(root / "proc/device-tree/model") or " ".join(filter(None, names)) or None
+    names = (read_text(root / "sys/class/dmi/id" / name) for name in ("sys_vendor", "product_name"))
+    return read_text(root / "proc/device-tree/model") or " ".join(filter(None, names)) or None
 
 
-def cores_online(root: Path = _ROOT) -> int:
+def count_cores_online(root: Path = _ROOT) -> int:
     """Count the cores of the machine that are switched on, including those that this process may not use."""
-    spans = re.findall(r"(\d+)(?:-(\d+))?", text(root / "sys/devices/system/cpu/online") or "")
+    spans = re.findall(r"(\d+)(?:-(\d+))?", read_text(root / "sys/devices/system/cpu/online") or "")
     return sum(int(last or first) - int(first) + 1 for first, last in spans) or os.cpu_count() or 1
 
 
-def cores(root: Path = _ROOT) -> float:
+def count_usable_cores(root: Path = _ROOT) -> float:
     """Return how many cores this process may use, by CPU affinity and the quotas (cpu.max) of its control groups."""
-    quotas = (int(quota_us) / int(period_us) for quota_us, period_us in _cgroup_limits("cpu.max", root))
+    quotas = (int(quota_us) / int(period_us) for quota_us, period_us in _read_cgroup_limits("cpu.max", root))
     return min([float(len(os.sched_getaffinity(0))), *quotas])
 
 
-def ram_mb(root: Path = _ROOT) -> float:
+def read_ram_mb(root: Path = _ROOT) -> float:
     """Return the RAM of the machine in MB."""
-    return _kib_line(root / "proc/meminfo", "MemTotal:")
+    return _read_kib_line(root / "proc/meminfo", "MemTotal:")
 
 
-def ram_limit_mb(root: Path = _ROOT) -> float:
+def read_ram_limit_mb(root: Path = _ROOT) -> float:
     """Return the RAM in MB that this process may use: the machine's, or the lowest limit (memory.max) of its control
     groups."""
-    return min([ram_mb(root), *(int(limit) / 1e6 for (limit,) in _cgroup_limits("memory.max", root))])
+    return min([read_ram_mb(root), *(int(limit) / 1e6 for (limit,) in _read_cgroup_limits("memory.max", root))])
 
 
-def rss_mb(root: Path = _ROOT) -> float:
+def read_rss_mb(root: Path = _ROOT) -> float:
     """Return the resident memory (RSS) of this process in MB, including pages that it shares with other processes."""
     # Called twice per query: `read_text` would take three times as long.
     with open(f"{root}/proc/self/statm", "rb", buffering=0) as statm:
@@ -52,19 +52,19 @@ def rss_mb(root: Path = _ROOT) -> float:
     return resident_pages * _PAGE_BYTES / 1e6
 
 
-def forget_peak(root: Path = _ROOT) -> bool:
-    """Reset the peak that `peak_mb` returns to what is resident now. Returns False if the kernel does not allow it."""
+def reset_peak(root: Path = _ROOT) -> bool:
+    """Reset the peak of `read_peak_mb` to the memory resident now. Returns False if the kernel does not allow it."""
     with suppress(OSError):
         return bool((root / "proc/self/clear_refs").write_text("5"))
     return False
 
 
-def peak_mb(root: Path = _ROOT) -> float:
-    """Return the largest resident memory that this process has had, in MB, since it started or since `forget_peak`."""
-    return _kib_line(root / "proc/self/status", "VmHWM:")
+def read_peak_mb(root: Path = _ROOT) -> float:
+    """Return the largest resident memory that this process has had, in MB, since it started or since `reset_peak`."""
+    return _read_kib_line(root / "proc/self/status", "VmHWM:")
 
 
-def text(path: Path) -> str | None:
+def read_text(path: Path) -> str | None:
     """Read a small file and strip zero bytes, line ends and blanks from both ends; None if it cannot be read."""
     try:
         return path.read_text(errors="replace").strip("\0\n ")
@@ -72,18 +72,18 @@ def text(path: Path) -> str | None:
         return None
 
 
-def _kib_line(path: Path, label: str) -> float:
+def _read_kib_line(path: Path, label: str) -> float:
     """Return the number of the line "LABEL 1234 kB" of a file, converted to MB."""
     line = next(line for line in path.read_text().splitlines() if line.startswith(label))
     return int(line.split()[1]) * 1024 / 1e6
 
 
-def _cgroup_limits(name: str, root: Path) -> Iterator[list[str]]:
+def _read_cgroup_limits(name: str, root: Path) -> Iterator[list[str]]:
     """Yield the fields of the limit file `name` (cgroup v2) of this process's control group and all above it."""
-    memberships = (text(root / "proc/self/cgroup") or "").splitlines()
+    memberships = (read_text(root / "proc/self/cgroup") or "").splitlines()
     for group in (PurePosixPath(line.removeprefix("0::")) for line in memberships if line.startswith("0::")):
         for level in (group, *group.parents):
             # The root group has no limit files, and not every kernel has every controller.
-            words = (text(root / "sys/fs/cgroup" / level.relative_to("/") / name) or "max").split()
+            words = (read_text(root / "sys/fs/cgroup" / level.relative_to("/") / name) or "max").split()
             if words[0] != "max":
                 yield words

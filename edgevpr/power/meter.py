@@ -19,7 +19,7 @@ from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, parse_pack, stage_energy_j
 
 Clock = Callable[[], float]
-_KEPT_WAITING = 0.15  # of busy time; a thread off the CPU for more was kept waiting by other programs
+_MIN_WAITING_SHARE = 0.15  # of the time of the work; a thread off the CPU for more waited for other programs
 
 
 @dataclass(slots=True)
@@ -30,7 +30,7 @@ class Stage:
 
 
 @contextmanager
-def stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process_time) -> Iterator[Stage]:
+def meter_stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process_time) -> Iterator[Stage]:
     """Meter a block of code: `with stage() as encoding: ...`, then read `encoding.cost`. It counts the CPU time of all
     threads."""
     metered = Stage()
@@ -53,7 +53,7 @@ class QueryMeter:
         *,
         wall_clock: Clock = time.perf_counter,
         cpu_clock: Clock = time.process_time,
-        memory_mb: Callable[[], float] = machine.rss_mb,
+        memory_mb: Callable[[], float] = machine.read_rss_mb,
     ) -> None:
         self.board = board
         battery = battery or BatteryConfig()
@@ -71,7 +71,7 @@ class QueryMeter:
         """Meter a step of the query (a field of `Steps`): `with meter.step("encode"): ...`. A repeated step adds up."""
         metered = Stage()
         try:
-            with stage(self._wall_clock, self._cpu_clock) as metered:
+            with meter_stage(self._wall_clock, self._cpu_clock) as metered:
                 yield
         finally:
             self._taken[name] = self._taken.get(name, NO_COST) + metered.cost
@@ -83,10 +83,12 @@ class QueryMeter:
     def cost(self) -> QueryCost:
         """Return the cost of the query so far."""
         steps, efficiency = self.steps(), self._regulator_efficiency
-        return query_cost(steps.encoding, steps.match, self.board, self._pack, efficiency, rss_mb=self._memory_mb())
+        return compute_query_cost(
+            steps.encoding, steps.match, self.board, self._pack, efficiency, rss_mb=self._memory_mb()
+        )
 
 
-def query_cost(
+def compute_query_cost(
     encode: StageCost,
     match: StageCost,
     board: Board,
@@ -97,7 +99,7 @@ def query_cost(
 ) -> QueryCost:
     """Compute the cost of one query by equations 5.1-5.6; the energies of both stages are added. Charges are drawn from
     the pack: `used_mah` is (a + s U) t, and `marginal_mah` is s U t, what is added to an idle board."""
-    stages = [(each.utilisation(board.cores), each.wall_s) for each in (encode, match)]
+    stages = [(cost.utilisation(board.cores), cost.wall_s) for cost in (encode, match)]
     used_j = sum(stage_energy_j(board.idle_w, board.full_w, u, t_s) for u, t_s in stages)
     marginal_j = sum(marginal_energy_j(board.idle_w, board.full_w, u, t_s) for u, t_s in stages)
     return QueryCost(
@@ -112,7 +114,7 @@ def query_cost(
     )
 
 
-class RunningEnergy:
+class FlightEnergy:
     """Adds up the stages of a flight, from the creation of this object on: `marginal_j`, the energy that they added, in
     joules at the board's input, and `stages_cpu_s`, their CPU-seconds. `cpu_clock` counts all threads."""
 
@@ -128,14 +130,14 @@ class RunningEnergy:
             self.marginal_j += marginal_energy_j(self._board.idle_w, self._board.full_w, u, stage.wall_s)
             self.stages_cpu_s += stage.cpu_s
 
-    def process(self) -> StageCost:
+    def measure_process(self) -> StageCost:
         """Return the wall seconds since the creation of this object, and the whole process's CPU-seconds since."""
         return StageCost(self._clock() - self._start_s, self._cpu_clock() - self._cpu_start_s)
 
 
 @dataclass(frozen=True, slots=True)
 class MachineLoad:
-    """Load of the machine: the busy share of each core, 0..1, since the last call of `machine_load`, and RAM in
+    """Load of the machine: the busy share of each core, 0..1, since the last call of `measure_machine_load`, and RAM in
     bytes."""
 
     core_shares: tuple[float, ...]
@@ -143,39 +145,39 @@ class MachineLoad:
     ram_total_bytes: int
 
 
-def machine_load() -> MachineLoad:
+def measure_machine_load() -> MachineLoad:
     """Measure the load of the machine. The first call has no earlier one to compare with and reports idle cores."""
     memory, percents = psutil.virtual_memory(), psutil.cpu_percent(percpu=True)
-    return MachineLoad(tuple(each / 100 for each in percents), memory.total - memory.available, memory.total)
+    return MachineLoad(tuple(percent / 100 for percent in percents), memory.total - memory.available, memory.total)
 
 
-class OwnLoad:
-    """Measures two shares between two calls of `look`: how much of all `cores` this process uses, and for how much of
-    the time other programs keep its work waiting. `cpu_clock` counts all threads of this process."""
+class ProcessLoad:
+    """Measures how much of all `cores` this process uses, and for how much of the time other programs keep its work
+    waiting, between two calls of `measure`. `cpu_clock` counts all threads of this process."""
 
     def __init__(self, cores: int, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
         self._cores, self._clock, self._cpu_clock = cores, clock, cpu_clock
         self._busy_s = self._ran_s = 0.0
-        self._looked_s, self._cpu_s = clock(), cpu_clock()
+        self._measured_s, self._cpu_s = clock(), cpu_clock()
 
     @property
     def age_s(self) -> float:
-        """Seconds since the last call of `look`."""
-        return self._clock() - self._looked_s
+        """Seconds since the last call of `measure`."""
+        return self._clock() - self._measured_s
 
-    def busy(self, work: StageCost) -> None:
-        """Record a piece of work, for `look`. Its `cpu_s` is that of the one thread (`time.thread_time`) that did the
-        work or waited for it."""
+    def add_work(self, work: StageCost) -> None:
+        """Add a piece of work. Its `cpu_s` is that of the one thread (`time.thread_time`) that did the work or waited
+        for it."""
         self._busy_s += work.wall_s
         self._ran_s += work.cpu_s
 
-    def look(self) -> tuple[float, float]:
+    def measure(self) -> tuple[float, float]:
         """Return two shares of the time since the last call, 0..1: that of all cores that this process used, and that
         of the recorded work if other programs kept it waiting, else 0."""
         now_s, cpu_s = self._clock(), self._cpu_clock()
-        span = StageCost(now_s - self._looked_s, cpu_s - self._cpu_s)
-        waited = self._ran_s < (1 - _KEPT_WAITING) * self._busy_s
+        span = StageCost(now_s - self._measured_s, cpu_s - self._cpu_s)
+        waited = self._ran_s < (1 - _MIN_WAITING_SHARE) * self._busy_s
         late_share = min(1.0, self._busy_s / span.wall_s) if waited and span.wall_s > 0 else 0.0
-        self._looked_s, self._cpu_s = now_s, cpu_s
+        self._measured_s, self._cpu_s = now_s, cpu_s
         self._busy_s = self._ran_s = 0.0
         return span.utilisation(self._cores), late_share

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 # Rounds per second of one core of the reference machine, an AMD EPYC (Zen 4) in a virtual machine. Measured by
-# `_round_times_s` with OPENBLAS_NUM_THREADS=1, Python 3.11 and NumPy 2.4 (OpenBLAS 0.3.31).
+# `_time_rounds_s` with OPENBLAS_NUM_THREADS=1, Python 3.11 and NumPy 2.4 (OpenBLAS 0.3.31).
 REFERENCE_PRODUCTS_HZ = 1585.0
 REFERENCE_PASSES_HZ = 1960.0
 
@@ -28,17 +28,17 @@ class Speed:
     passes: float
 
 
-def micro_benchmark() -> Speed:
+def run_micro_benchmark() -> Speed:
     """Measure the speed of this machine relative to the reference, in about a second (longer on a slow board). Nothing
     else should run. NumPy's library must have one thread (OPENBLAS_NUM_THREADS=1, which edgevpr's command line sets
     before NumPy is imported)."""
     return Speed(
-        products=1 / min(_round_times_s(product_round())) / REFERENCE_PRODUCTS_HZ,
-        passes=1 / min(_round_times_s(pass_round())) / REFERENCE_PASSES_HZ,
+        products=1 / min(_time_rounds_s(make_product_round())) / REFERENCE_PRODUCTS_HZ,
+        passes=1 / min(_time_rounds_s(make_pass_round())) / REFERENCE_PASSES_HZ,
     )
 
 
-def product_round() -> Callable[[], object]:
+def make_product_round() -> Callable[[], object]:
     """Return a function that computes one float32 product of 961 x 32 by 32 x 961, which compares the regions of a
     query with those of a place."""
     random = np.random.default_rng(1)
@@ -47,7 +47,7 @@ def product_round() -> Callable[[], object]:
     return lambda: np.matmul(query, place.T, out=out)
 
 
-def pass_round() -> Callable[[], object]:
+def make_pass_round() -> Callable[[], object]:
     """Return a function that computes gradient magnitudes of a 512 x 512 picture, and scans 4096 codes of 512 bits for
     two queries."""
     random = np.random.default_rng(2)
@@ -66,7 +66,7 @@ def pass_round() -> Callable[[], object]:
     return work
 
 
-def _round_times_s(work: Callable[[], object]) -> list[float]:
+def _time_rounds_s(work: Callable[[], object]) -> list[float]:
     """Call `work` again and again, and return the seconds of each call. A first call is not counted. Of them the least
     counts: a slower round was disturbed by something else."""
     work()

@@ -10,21 +10,21 @@ from pathlib import Path
 
 from edgevpr.power import machine
 
-_UNKNOWN_LIMIT_C = 80.0  # a Raspberry Pi's firmware slows the board down from here; cautious for other boards
+_DEFAULT_LIMIT_C = 80.0  # a Raspberry Pi's firmware slows the board down from here; cautious for other boards
 _CPU_ZONE = re.compile(r"cpu|soc|pkg|tj|acpitz|bigcore|littlecore", re.IGNORECASE)
-# Bits of the firmware's answer that tell the present state. 16 places higher they tell it for any time since start.
-_BITS = ((1, "under-voltage"), (2, "frequency capped"), (4, "throttled"), (8, "soft temperature limit"))
-_UNDER_VOLTAGE = 1
-_SLOWS = 2 | 4 | 8
-_HOT = 8
+# Bits of the firmware's answer for the present state. Shifted by 16, they hold for any time since start.
+_FIRMWARE_BITS = ((1, "under-voltage"), (2, "frequency capped"), (4, "throttled"), (8, "soft temperature limit"))
+_UNDER_VOLTAGE_BIT = 1
+_SLOWDOWN_BITS = 2 | 4 | 8
+_SOFT_LIMIT_BIT = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ThermalState:
     """State at one reading: `temperature_c` of the hottest CPU sensor, `frequency_mhz` of the fastest cluster of cores
-    (None: unknown), `throttled`, True if the machine slows itself down now (None: it cannot tell), and `why`, the signs
-    that it does or did, as text ("": none). `under_voltage`: the supply is too low, or was since the reading before.
-    `hot`: the temperature at which it begins to slow down is reached (None each: it cannot tell)."""
+    (None: unknown), `throttled`, True if the machine slows itself down now, and `why`, the signs that it does or did,
+    as text ("": none). `under_voltage`: the supply is too low, or was since the reading before. `hot`: the temperature
+    at which it begins to slow down is reached. None: unknown."""
 
     temperature_c: float | None
     frequency_mhz: float | None
@@ -36,61 +36,65 @@ class ThermalState:
 
 class ThermalWatch:
     """Reader of the sensors of temperature, frequency and supply, which are searched for once, when it is created.
-    `hot_c` is the temperature in degrees Celsius that counts as hot (None: `limit_c` of the machine)."""
+    `hot_c` is the temperature in degrees Celsius that counts as hot (None: `read_limit_c` of the machine)."""
 
     def __init__(self, root: Path = Path("/"), hot_c: float | None = None) -> None:
-        self._temperatures = [zone / "temp" for zone in _cpu_zones(root)]
-        self._limit_c = limit_c(root)
+        self._temperatures = [zone / "temp" for zone in _find_cpu_zones(root)]
+        self._limit_c = read_limit_c(root)
         self._hot_c = self._limit_c if hot_c is None else hot_c
         policies = sorted((root / "sys/devices/system/cpu/cpufreq").glob("policy*"))
-        self._policy = max(policies, key=lambda policy: _number(policy / "cpuinfo_max_freq") or 0, default=None)
-        self._top_khz = (self._policy and _number(self._policy / "cpuinfo_max_freq")) or 0
+        self._policy = max(policies, key=lambda policy: _read_number(policy / "cpuinfo_max_freq") or 0, default=None)
+        self._top_khz = (self._policy and _read_number(self._policy / "cpuinfo_max_freq")) or 0
         self._allowed_khz = 0
         self._firmware = next((root / "sys/devices/platform").glob("soc*/*firmware/get_throttled"), None)
         # Driver of the Raspberry Pi. Its alarm holds for 2 s, so that a dip between two readings is not missed.
-        volts = (name.parent for name in (root / "sys/class/hwmon").glob("*/name") if machine.text(name) == "rpi_volt")
+        volts = (
+            name.parent for name in (root / "sys/class/hwmon").glob("*/name") if machine.read_text(name) == "rpi_volt"
+        )
         self._alarm = next((folder / "in0_lcrit_alarm" for folder in volts), None)
         self._bits_before: int | None = None
 
-    def look(self) -> ThermalState:
+    def read(self) -> ThermalState:
         """Read the sensors. Never raises: a value that cannot be read, or is impossible, becomes None."""
-        degrees = [value / 1000 for value in map(_number, self._temperatures) if value is not None]
+        degrees = [value / 1000 for value in map(_read_number, self._temperatures) if value is not None]
         temperature_c = max((value for value in degrees if -40 <= value <= 150), default=None)
-        khz = _number(self._policy / "scaling_cur_freq") if self._policy else None
+        khz = _read_number(self._policy / "scaling_cur_freq") if self._policy else None
         frequency_mhz = khz / 1000 if khz is not None and khz > 0 else None
-        bits = _number(self._firmware, 16) if self._firmware else None
-        reasons = list(self._reasons(bits or 0, temperature_c, khz))
+        bits = _read_number(self._firmware, 16) if self._firmware else None
+        signs = list(self._find_slowdown_signs(bits or 0, temperature_c, khz))
         can_tell = bits is not None or self._top_khz > 0
         is_hot = temperature_c is not None and temperature_c >= self._hot_c
         return ThermalState(
             temperature_c=temperature_c,
             frequency_mhz=frequency_mhz,
-            throttled=any(slows for slows, _ in reasons) if can_tell else None,
-            why="; ".join(why for _, why in reasons),
+            throttled=any(slows for slows, _ in signs) if can_tell else None,
+            why="; ".join(why for _, why in signs),
             under_voltage=self._is_under_voltage(bits),
-            hot=None if temperature_c is None and bits is None else is_hot or bool((bits or 0) & _HOT),
+            hot=None if temperature_c is None and bits is None else is_hot or bool((bits or 0) & _SOFT_LIMIT_BIT),
         )
 
     def _is_under_voltage(self, bits: int | None) -> bool | None:
         """Return True if the supply is too low by the `bits` of the firmware or the driver's alarm, or if the firmware
-        has noted since the last call that it was (None: nobody can tell)."""
-        alarm = _number(self._alarm) if self._alarm else None
+        has recorded since the last call that it was (None: unknown)."""
+        alarm = _read_number(self._alarm) if self._alarm else None
         if bits is None:
             return None if alarm is None else alarm > 0
-        known = bits if self._bits_before is None else self._bits_before
+        before = bits if self._bits_before is None else self._bits_before
         self._bits_before = bits
-        return bool((alarm or 0) > 0 or bits & _UNDER_VOLTAGE or (bits & ~known) >> 16 & _UNDER_VOLTAGE)
+        return bool((alarm or 0) > 0 or bits & _UNDER_VOLTAGE_BIT or (bits & ~before) >> 16 & _UNDER_VOLTAGE_BIT)
 
-    def _reasons(self, bits: int, temperature_c: float | None, khz: int | None) -> Iterator[tuple[bool, str]]:
+    def _find_slowdown_signs(
+        self, bits: int, temperature_c: float | None, khz: int | None
+    ) -> Iterator[tuple[bool, str]]:
         """Yield a pair for each sign that the machine slows down: True if it does so now (False: it is only a warning,
         or over), and a text. `bits` are the flags of the firmware (0: none), `khz` is the CPU's frequency now."""
-        if now := [word for bit, word in _BITS if bits & bit]:
-            yield bool(bits & _SLOWS), f"{', '.join(now)} now"
-        if before := [word for bit, word in _BITS if bits >> 16 & bit and not bits & bit]:
+        if now := [word for bit, word in _FIRMWARE_BITS if bits & bit]:
+            yield bool(bits & _SLOWDOWN_BITS), f"{', '.join(now)} now"
+        if before := [word for bit, word in _FIRMWARE_BITS if bits >> 16 & bit and not bits & bit]:
             yield False, f"{', '.join(before)} since start"
         if self._policy:
             # The kernel lowers this limit to cool the CPU. A power mode may keep it low, so the highest seen is normal.
-            allowed_khz = _number(self._policy / "scaling_max_freq") or 0
+            allowed_khz = _read_number(self._policy / "scaling_max_freq") or 0
             self._allowed_khz = max(self._allowed_khz, allowed_khz)
             normal_khz = self._allowed_khz or self._top_khz
             hot = temperature_c is not None and temperature_c >= self._limit_c
@@ -101,27 +105,27 @@ class ThermalWatch:
                 yield True, f"{khz / 1000:g} of {normal_khz / 1000:g} MHz at {temperature_c:g} degrees"
 
 
-def limit_c(root: Path = Path("/")) -> float:
+def read_limit_c(root: Path = Path("/")) -> float:
     """Return the degrees Celsius at which this machine begins to slow down: the lowest passive trip point of its CPU.
     If the kernel has none (Raspberry Pi), it is 80 degrees, or 10 below the point where the machine switches off."""
     trips: dict[str, list[float]] = {}
-    for zone in _cpu_zones(root):
+    for zone in _find_cpu_zones(root):
         for path in zone.glob("trip_point_*_type"):
-            value = _number(path.with_name(path.name.replace("_type", "_temp")))
+            value = _read_number(path.with_name(path.name.replace("_type", "_temp")))
             if value is not None and 40_000 <= value <= 125_000:
-                trips.setdefault(machine.text(path) or "", []).append(value / 1000)
+                trips.setdefault(machine.read_text(path) or "", []).append(value / 1000)
     if "passive" in trips:
         return min(trips["passive"])
-    return min([_UNKNOWN_LIMIT_C, *(value - 10 for value in trips.get("critical", []))])
+    return min([_DEFAULT_LIMIT_C, *(value - 10 for value in trips.get("critical", []))])
 
 
-def _cpu_zones(root: Path) -> list[Path]:
+def _find_cpu_zones(root: Path) -> list[Path]:
     zones = sorted((root / "sys/class/thermal").glob("thermal_zone*"))
-    return [zone for zone in zones if _CPU_ZONE.search(machine.text(zone / "type") or "")] or zones
+    return [zone for zone in zones if _CPU_ZONE.search(machine.read_text(zone / "type") or "")] or zones
 
 
-def _number(path: Path, base: int = 10) -> int | None:
+def _read_number(path: Path, base: int = 10) -> int | None:
     try:
-        return int(machine.text(path) or "", base)
+        return int(machine.read_text(path) or "", base)
     except ValueError:
         return None

@@ -12,7 +12,7 @@ from edgevpr import techniques
 from edgevpr.cli.main import main
 from edgevpr.core.types import StageCost
 from edgevpr.power import speed
-from edgevpr.power.boards import board_names
+from edgevpr.power.boards import list_boards
 from edgevpr.runtime.preflight import choose, trial
 
 COSTS = replace(REGIONS, disk_bytes_per_place=31_776, candidates=40, scan_per_place=StageCost(1e-6, 1e-6))
@@ -39,12 +39,12 @@ def tried(monkeypatch):
             elif offer.name != "calc":
                 yield replace(offer, costs=HOG if offer.name == "hog" else COSTS)
 
-    monkeypatch.setattr(trial, "try_each", answer)
+    monkeypatch.setattr(trial, "run_trials", answer)
     monkeypatch.setattr(techniques, "list_techniques", lambda: ("cohog", "hog", "seqslam", "calc"))
     counts = {"sets": 2, "queries": 90, "asked": 90, "accepted": 9, "accepted_wrong": 0, "accepted_elsewhere": 0}
     recalls = {"cohog": 0.9, "hog": 0.4, "hog 8bit": 0.4, "hog 1bit": 0.3, "seqslam": 0.5}
     table = {label: {"recall_at_1": recall, **counts} for label, recall in recalls.items()}
-    monkeypatch.setattr(choose, "_accuracies", lambda: {"forward": table, "nadir": {}})
+    monkeypatch.setattr(choose, "_read_accuracies", lambda: {"forward": table, "nadir": {}})
     return asked
 
 
@@ -95,7 +95,7 @@ def test_profile_recommends_first_and_lists_every_technique(capsys, tried):
 
 def test_profile_list_names_every_board_and_this_machine(capsys):
     said = [line.split()[0] for line in run(capsys, "--list").out.splitlines()]
-    assert said == ["this", *board_names()]
+    assert said == ["this", *list_boards()]
 
 
 def test_profile_of_a_map_tries_only_its_forms(capsys, tmp_path, tried):

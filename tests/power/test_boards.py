@@ -7,7 +7,7 @@ import pytest
 
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.files import find_shipped
-from edgevpr.power.boards import board_names, load_board
+from edgevpr.power.boards import list_boards, load_board
 
 PROFILE = (find_shipped("profiles") / "rpi-4b.yaml").read_text()
 
@@ -30,7 +30,7 @@ def machine(tree, model=None, ram_kb=4_000_000, **limits):
     return tree(files | ({"proc/device-tree/model": model + "\0"} if model else {}))
 
 
-@pytest.mark.parametrize("name", board_names())
+@pytest.mark.parametrize("name", list_boards())
 def test_load_board_gives_a_whole_profile_with_its_sources(name):
     board = load_board(name)
     assert board.name == name

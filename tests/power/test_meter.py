@@ -8,7 +8,7 @@ from fakes import FakeClock
 
 from edgevpr.core.types import NO_COST, StageCost
 from edgevpr.power.boards import load_board
-from edgevpr.power.meter import OwnLoad, QueryMeter, stage
+from edgevpr.power.meter import ProcessLoad, QueryMeter, meter_stage
 
 
 def test_stage_counts_the_cpu_time_of_other_threads():
@@ -19,7 +19,7 @@ def test_stage_counts_the_cpu_time_of_other_threads():
             pass
         own_s.append(time.thread_time())
 
-    with stage() as metered:
+    with meter_stage() as metered:
         thread = threading.Thread(target=spin)
         thread.start()
         thread.join()
@@ -53,12 +53,12 @@ class Working(FakeClock):
 
     def __init__(self):
         super().__init__()
-        self.load = OwnLoad(4, self, lambda: self.cpu_s)
+        self.load = ProcessLoad(4, self, lambda: self.cpu_s)
 
     def work(self, wall_s, ran_s):
         """Work of one thread that ran for `ran_s` of `wall_s`."""
         super().work(wall_s, ran_s / wall_s)
-        self.load.busy(StageCost(wall_s, ran_s))
+        self.load.add_work(StageCost(wall_s, ran_s))
 
 
 def test_own_load_counts_what_no_recorded_work_explains_too():
@@ -67,17 +67,17 @@ def test_own_load_counts_what_no_recorded_work_explains_too():
     clocks.now_s += 1.5
     clocks.cpu_s += 0.3  # another thread decodes a stream
     assert clocks.load.age_s == 2.0
-    assert clocks.load.look() == (pytest.approx(0.8 / 2 / 4), 0.0)
+    assert clocks.load.measure() == (pytest.approx(0.8 / 2 / 4), 0.0)
     assert clocks.load.age_s == 0.0
     clocks.now_s += 1.0
-    assert clocks.load.look() == (0.0, 0.0), "since the last look"
+    assert clocks.load.measure() == (0.0, 0.0), "since the last look"
 
 
 def test_own_load_is_late_only_where_its_thread_was_kept_waiting():
     clocks = Working()
     clocks.work(0.99, 0.97)
     clocks.now_s += 0.01
-    assert clocks.load.look()[1] == 0.0, "it takes all the time, and nobody else does"
+    assert clocks.load.measure()[1] == 0.0, "it takes all the time, and nobody else does"
     clocks.work(0.9, 0.5)
     clocks.now_s += 0.1
-    assert clocks.load.look()[1] == pytest.approx(0.9)
+    assert clocks.load.measure()[1] == pytest.approx(0.9)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from edgevpr.power.thermal import ThermalState, ThermalWatch, limit_c
+from edgevpr.power.thermal import ThermalState, ThermalWatch, read_limit_c
 
 ZONE = "sys/class/thermal/thermal_zone"
 CPU = "sys/devices/system/cpu"
@@ -39,7 +39,7 @@ def state(temperature_c, frequency_mhz, throttled, why="", **more):
     ],
 )
 def test_look_reads_temperature_frequency_and_throttling(tree, files, expected):
-    assert ThermalWatch(tree(PI | files)).look() == expected
+    assert ThermalWatch(tree(PI | files)).read() == expected
 
 
 @pytest.mark.parametrize("nonsense", ["hot\n", "999999999\n", "-300000\n", "\udcff"])
@@ -48,21 +48,21 @@ def test_look_takes_nonsense_as_unknown(tree, nonsense):
     (root / f"{ZONE}0/temp").write_bytes(nonsense.encode(errors="surrogateescape"))
     (root / f"{POLICY}/scaling_cur_freq").write_bytes(b"-1\n")
     watch = ThermalWatch(root)
-    assert watch.look() == state(None, None, False)
+    assert watch.read() == state(None, None, False)
     for name in PI:
         (root / name).unlink()
-    assert watch.look() == state(None, None, False), "where sensors disappear too"
+    assert watch.read() == state(None, None, False), "where sensors disappear too"
 
 
 def test_look_takes_a_sinking_frequency_limit_as_throttling(tree):
     root = tree(PI)
     watch = ThermalWatch(root)
-    assert watch.look().throttled is False
+    assert watch.read().throttled is False
     tree({f"{POLICY}/scaling_max_freq": "1200000\n"})
-    seen = watch.look()
+    seen = watch.read()
     assert (seen.throttled, seen.why) == (True, "frequency limited to 1200 of 1800 MHz")
     tree({f"{POLICY}/scaling_max_freq": "1800000\n"})
-    assert watch.look().throttled is False
+    assert watch.read().throttled is False
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_look_takes_a_sinking_frequency_limit_as_throttling(tree):
 )
 def test_look_reads_the_flags_of_the_firmware(tree, answer, throttled, why, under_voltage, hot):
     expected = state(48.312, 600.0, throttled, why=why, under_voltage=under_voltage, hot=hot)
-    assert ThermalWatch(tree(PI | {FIRMWARE: answer})).look() == expected
+    assert ThermalWatch(tree(PI | {FIRMWARE: answer})).read() == expected
 
 
 def test_look_sees_an_under_voltage_between_two_readings_once(tree):
@@ -86,7 +86,7 @@ def test_look_sees_an_under_voltage_between_two_readings_once(tree):
     seen = []
     for answer in ("0\n", "10000\n", "10000\n", "50000\n"):
         tree({FIRMWARE: answer})
-        seen.append(watch.look().under_voltage)
+        seen.append(watch.read().under_voltage)
     assert seen == [False, True, False, False]
 
 
@@ -95,16 +95,16 @@ def test_look_takes_the_alarm_of_the_driver_as_under_voltage(tree, more):
     other = {f"{HWMON}0/name": "cpu_thermal\n", f"{HWMON}0/in0_lcrit_alarm": "1\n"}
     alarm = f"{HWMON}1/in0_lcrit_alarm"
     watch = ThermalWatch(tree(PI | more | other | {f"{HWMON}1/name": "rpi_volt\n", alarm: "0\n"}))
-    assert watch.look().under_voltage is False
+    assert watch.read().under_voltage is False
     tree({alarm: "1\n"})
-    assert watch.look().under_voltage is True
+    assert watch.read().under_voltage is True
     tree({alarm: "what\n"})
-    assert watch.look().under_voltage is (False if more else None)
+    assert watch.read().under_voltage is (False if more else None)
 
 
 @pytest.mark.parametrize(("hot_c", "hot"), [(None, False), (70.0, True), (76.0, False)])
 def test_look_is_hot_at_the_temperature_of_the_profile(tree, hot_c, hot):
-    assert ThermalWatch(tree(PI | {f"{ZONE}0/temp": "75000\n"}), hot_c).look().hot is hot
+    assert ThermalWatch(tree(PI | {f"{ZONE}0/temp": "75000\n"}), hot_c).read().hot is hot
 
 
 def trips(**points):
@@ -126,4 +126,4 @@ def trips(**points):
     ],
 )
 def test_limit_c_is_the_first_point_where_the_kernel_slows_down(tree, points, expected_c):
-    assert limit_c(tree({f"{ZONE}0/type": "x86_pkg_temp\n"} | trips(**points))) == expected_c
+    assert read_limit_c(tree({f"{ZONE}0/type": "x86_pkg_temp\n"} | trips(**points))) == expected_c

@@ -33,8 +33,8 @@ from edgevpr.places.retrieve import outside_neighbourhood
 from edgevpr.places.sequence import make_sequence_search, sequence_length
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack, queries_ah
-from edgevpr.power.meter import QueryMeter, query_cost
-from edgevpr.runtime.preflight.probe import disk_bytes, ram_bytes
+from edgevpr.power.meter import QueryMeter, compute_query_cost
+from edgevpr.runtime.preflight.probe import compute_disk_bytes, compute_ram_bytes
 from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
@@ -204,7 +204,7 @@ def summarise(
         sum(costs, start=NO_COST) * (1 / queries)
         for costs in ([answer.encoding for answer in answers], [answer.matching for answer in answers])
     )
-    cost = query_cost(encoding, matching, board, parse_pack(battery.pack), efficiency, rss_mb=0.0)
+    cost = compute_query_cost(encoding, matching, board, parse_pack(battery.pack), efficiency, rss_mb=0.0)
     return metrics.TechniqueResult(
         technique=format_name(technique.spec.name, technique.spec.form),
         weights=describe_weights(technique.spec),
@@ -222,8 +222,8 @@ def summarise(
         t_encode_s=cost.t_encode_s,
         t_match_s=cost.t_match_s,
         t_match_per_ref_s=cost.t_match_s / references,
-        descriptor_bytes=ram_bytes(technique.spec, sequence),
-        fine_bytes=disk_bytes(technique.spec),
+        descriptor_bytes=compute_ram_bytes(technique.spec, sequence),
+        fine_bytes=compute_disk_bytes(technique.spec),
         u_encode=cost.u_encode,
         u_match=cost.u_match,
         ah_total=queries_ah(queries, cost.used_mah / 1000),

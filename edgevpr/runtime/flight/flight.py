@@ -41,7 +41,7 @@ from edgevpr.runtime.flight.startup import (
 from edgevpr.runtime.flight.stop import StopNow
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import MapWatch, Sight, Surveyor, Tally
-from edgevpr.runtime.preflight.pick import limit_candidates
+from edgevpr.runtime.preflight.pick import list_safe_candidates
 from edgevpr.runtime.recognise.recognition import Recognition, to_fields
 
 _MAX_WAIT_S = 0.2  # a pass of the loop waits no longer than this for a frame
@@ -137,7 +137,7 @@ class Flight:
                 meter=FlightMeter(config.battery, io.board, io.clock, machine=io.machine),
                 io=io,
             )
-            fewer = () if config.match.candidates else limit_candidates(recogniser.technique)
+            fewer = () if config.match.candidates else list_safe_candidates(recogniser.technique)
             flight = cls(parts, camera, min_accuracy_m=settings.min_accuracy_m, fewer_candidates=fewer)
             flight._opened = stack.pop_all()
         systemd.notify(READY=1)
@@ -189,7 +189,7 @@ class Flight:
             except ImageError as error:
                 frame = error
         if not source.is_live:  # of a live source, reading is mostly waiting
-            meter.load.busy(reading.cost)
+            meter.load.add_work(reading.cost)
         if frame is None:
             return
         if is_query:
@@ -205,7 +205,7 @@ class Flight:
             elif self._parts.autopilot:
                 meter.count(event)
                 self._parts.autopilot.add_motion(event)
-        meter.load.busy(work.cost)
+        meter.load.add_work(work.cost)
         self._governing.update()  # here, so that each reading covers a whole number of queries
 
     def _recognise(self, frame: Frame | ImageError, is_query: bool) -> Recognition:

@@ -1,9 +1,9 @@
 """This computer as a flight asks it: heat, load, memory, and what its disk takes."""
 
 from edgevpr.power.boards import Board
-from edgevpr.power.machine import rss_mb
-from edgevpr.power.meter import MachineLoad, machine_load
-from edgevpr.power.thermal import ThermalState, ThermalWatch, limit_c
+from edgevpr.power.machine import read_rss_mb
+from edgevpr.power.meter import MachineLoad, measure_machine_load
+from edgevpr.power.thermal import ThermalState, ThermalWatch, read_limit_c
 from edgevpr.runtime.flight.flightlog import FlightLog
 
 
@@ -16,19 +16,19 @@ class Machine:
 
     def limit_c(self) -> float:
         """Return the temperature at which this computer slows itself down, degrees Celsius."""
-        return limit_c()
+        return read_limit_c()
 
     def measure_heat(self) -> ThermalState:
         """Measure temperature, frequency and supply."""
-        return self._watch.look()
+        return self._watch.read()
 
     def measure_load(self) -> MachineLoad:
         """Measure the load of all cores since the last call, and the RAM."""
-        return machine_load()
+        return measure_machine_load()
 
     def rss_mb(self) -> float:
         """Return the memory that this process takes, MB."""
-        return rss_mb()
+        return read_rss_mb()
 
     def is_written(self, flight_log: FlightLog) -> bool:
         """Return True if the disk took the last line of a flight log."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from edgevpr.core.config import BatteryConfig
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import marginal_energy_j, pack_ah, parse_pack
-from edgevpr.power.meter import MachineLoad, OwnLoad, RunningEnergy, Stage, stage
+from edgevpr.power.meter import FlightEnergy, MachineLoad, ProcessLoad, Stage, meter_stage
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.machine import Machine
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -40,8 +40,8 @@ class FlightMeter:
     ) -> None:
         self._board, self._clock, self._machine = board, clock, machine or Machine(board)
         self._pack, self._regulator_efficiency = parse_pack(battery.pack), battery.regulator_efficiency
-        self.energy = RunningEnergy(board, clock.mono_s, clock.process_cpu_s)
-        self.load = OwnLoad(board.cores, clock.mono_s, clock.process_cpu_s)
+        self.energy = FlightEnergy(board, clock.mono_s, clock.process_cpu_s)
+        self.load = ProcessLoad(board.cores, clock.mono_s, clock.process_cpu_s)
         self.measure_heat()
         self.limit_c = self._machine.limit_c() if board.thermal_limit_c is None else board.thermal_limit_c
         self.queries_throttled = 0
@@ -49,7 +49,7 @@ class FlightMeter:
     def measure_cost(self, thread_only: bool = False) -> AbstractContextManager[Stage]:
         """Return a context manager that measures time and CPU time: of all threads or, with `thread_only`, of this
         one."""
-        return stage(self._clock.mono_s, self._clock.thread_cpu_s if thread_only else self._clock.process_cpu_s)
+        return meter_stage(self._clock.mono_s, self._clock.thread_cpu_s if thread_only else self._clock.process_cpu_s)
 
     def count(self, event: Recognition) -> None:
         """Add the cost of a frame: reading, encoding and matching."""
@@ -61,7 +61,7 @@ class FlightMeter:
         process (`process_mah`, `process_cpu_s`), and of it that of queries: reading, recognising, reporting
         (`marginal_mah`, `stages_cpu_s`); `queries_throttled`, the number of those while the board slowed itself
         down."""
-        process, board = self.energy.process(), self._board
+        process, board = self.energy.measure_process(), self._board
         process_j = marginal_energy_j(board.idle_w, board.full_w, process.utilisation(board.cores), process.wall_s)
         return {
             "queries_throttled": self.queries_throttled,
@@ -87,7 +87,7 @@ class FlightMeter:
 
     def reading(self) -> LoadReading:
         """Return a measurement for the governor: the load since the last one, and the present memory and heat."""
-        cpu_share, late_share = self.load.look()
+        cpu_share, late_share = self.load.measure()
         return LoadReading(
             cpu_share=cpu_share,
             late_share=late_share,

@@ -23,7 +23,7 @@ from edgevpr.power.boards import Board
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
 ACCURACY_PATH = Path(__file__).with_name("accuracy.json")
-_MAX_OBJECTIONS = 3  # that are named where nothing can be chosen
+_MAX_OBJECTIONS = 3  # named if nothing can be chosen
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,11 +104,11 @@ class Option:
         if self.fit.misfit:
             return self.fit.misfit
         if self.accuracy is None:
-            return "was never measured: name it to use it"
+            return "was never measured: set it by name to use it"
         if self.accuracy.accepted_elsewhere:
-            return f"accepted {self.accuracy.accepted_elsewhere} wrong places: name it to use it"
+            return f"accepted {self.accuracy.accepted_elsewhere} wrong places: set it by name to use it"
         if self.costs.sequence > 1:
-            return "needs a flight along the mapped way: name it to use it"
+            return "needs a flight along the mapped way: set it by name to use it"
         return None
 
 
@@ -129,13 +129,13 @@ def find_accuracy(label: str, camera: str | None, candidates: int | None = None)
     `camera`: "nadir" (looks down) or "forward" (None: forward). `candidates`: number of places compared with a query,
     if fewer than the technique's default (None: the default).
     """
-    figures = _accuracies()[camera or "forward"].get(_label(label, candidates))
+    figures = _read_accuracies()[camera or "forward"].get(_format_label(label, candidates))
     return Accuracy(**figures) if figures else None
 
 
 def list_fewer_candidates(label: str, camera: str | None) -> tuple[int, ...]:
     """Return the numbers of candidates, below the default, with which a technique was measured, largest first."""
-    names = _accuracies()[camera or "forward"]
+    names = _read_accuracies()[camera or "forward"]
     matches = (re.fullmatch(rf"{re.escape(label)}, (\d+) candidates", name) for name in names)
     return tuple(sorted((int(match[1]) for match in matches if match), reverse=True))
 
@@ -145,17 +145,17 @@ def choose_best(options: Sequence[Option], board: Board) -> Option | None:
     board's own technique (`board.technique`) go before all others, even if none was measured, since the profile names
     it. Returns None if no option is suitable."""
     sound = [option for option in options if option.objection is None]
-    own = [option for option in sound if option.name == board.technique]
+    preferred = [option for option in sound if option.name == board.technique]
     unmeasured = (option for option in options if not (option.accuracy or option.fit.misfit))
-    if not own and (named := next((option for option in unmeasured if option.name == board.technique), None)):
+    if not preferred and (named := next((option for option in unmeasured if option.name == board.technique), None)):
         return named
-    return max(own or sound, key=lambda option: (_recall(option), -option.fit.cpu_s), default=None)
+    return max(preferred or sound, key=lambda option: (_get_recall(option), -option.fit.cpu_s), default=None)
 
 
 def explain_no_choice(options: Sequence[Option], board: Board) -> str:
     """Return the reason why `choose_best` returned None."""
     objections = (f"{option.label} {option.objection}" for option in options[:_MAX_OBJECTIONS])
-    return f"nothing is chosen for {board.title} by itself: {', and '.join(objections)}"
+    return f"no technique suits {board.title}: {', and '.join(objections)}"
 
 
 def check_fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
@@ -197,13 +197,13 @@ def list_preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
     For a `camera` that looks down ("nadir"), only techniques with a parameter `camera` are listed. Raises ConfigError
     if the board's profile names a technique that does not exist.
     """
-    own = board.technique
-    if own is not None and not techniques.is_known(own):
+    preferred = board.technique
+    if preferred is not None and not techniques.is_known(preferred):
         raise ConfigError(
-            f"The profile of {board.title} names the technique `{own}`, which is not there: use one of "
+            f"The profile of {board.title} names the unknown technique `{preferred}`: use one of "
             f"{', '.join(techniques.list_techniques())}."
         )
-    names = dict.fromkeys((own, *techniques.DEFAULT_TECHNIQUES) if own else techniques.DEFAULT_TECHNIQUES)
+    names = dict.fromkeys((preferred, *techniques.DEFAULT_TECHNIQUES) if preferred else techniques.DEFAULT_TECHNIQUES)
     return tuple(name for name in names if camera != "nadir" or "camera" in techniques.read_parameters(name))
 
 
@@ -218,16 +218,16 @@ def describe_option(board: Board, option: Option, demand: Demand) -> str:
     return f"{figures}; it {fit.misfit}" if fit.misfit else figures
 
 
-def _recall(option: Option) -> float:
+def _get_recall(option: Option) -> float:
     return option.accuracy.recall_at_1 if option.accuracy else 0.0
 
 
-def _label(label: str, candidates: int | None) -> str:
+def _format_label(label: str, candidates: int | None) -> str:
     return label if candidates is None else f"{label}, {candidates} candidates"
 
 
 @cache
-def _accuracies() -> dict[str, dict[str, dict[str, Any]]]:
+def _read_accuracies() -> dict[str, dict[str, dict[str, Any]]]:
     content: dict[str, dict[str, dict[str, Any]]] = json.loads(ACCURACY_PATH.read_text("utf-8"))
     return content
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from edgevpr.core.types import QueryCost
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, pack_ah, queries_ah
-from edgevpr.power.meter import query_cost
+from edgevpr.power.meter import compute_query_cost
 from edgevpr.power.speed import Speed
 from edgevpr.runtime.preflight.choose import Demand, Option, choose_best, explain_no_choice, make_option
 from edgevpr.runtime.preflight.scale import SAME_MACHINE, count_work, scale_to_board
@@ -69,7 +69,7 @@ class FlightEstimate:
     unusable: dict[str, str]
 
 
-def estimate(board: Board, ratio: Speed | None, trials: Iterable[Trial], plan: FlightPlan) -> FlightEstimate:
+def estimate_flight(board: Board, ratio: Speed | None, trials: Iterable[Trial], plan: FlightPlan) -> FlightEstimate:
     """Estimate every technique of `trials`, which were made on this machine, for a flight of `board`, whose speed is
     `ratio` of this machine's (see `compare_speed`)."""
     trials = list(trials)
@@ -96,7 +96,9 @@ def estimate(board: Board, ratio: Speed | None, trials: Iterable[Trial], plan: F
 
 def _estimate_option(option: Option, board: Board, plan: FlightPlan) -> TechniqueEstimate:
     costs, match = option.costs, option.costs.match(plan.places)
-    query = query_cost(costs.encode, match, board, plan.pack, plan.regulator_efficiency, rss_mb=costs.process_mb)
+    query = compute_query_cost(
+        costs.encode, match, board, plan.pack, plan.regulator_efficiency, rss_mb=costs.process_mb
+    )
     flight_s = 60 * plan.flight_min
     marginal_mah = queries_ah(min(plan.rate_hz, option.fit.reachable_hz) * flight_s, query.marginal_mah)
     # Equation 5.7 leaves out the idle power between two queries, which the pack supplies too.
@@ -121,11 +123,11 @@ def _recommend(rows: list[TechniqueEstimate], board: Board, plan: FlightPlan) ->
     row, fit = rows[options.index(chosen)], chosen.fit
     why = "the board's profile names it, and it was never measured"
     if chosen.accuracy:
-        why = f"nothing that fits finds more: {chosen.accuracy}"
+        why = f"the most accurate that fits: {chosen.accuracy}"
     return chosen.label, (
         f"{chosen.label}: {why}; {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
-        f"{fit.reachable_hz:.3g} Hz where {plan.rate_hz:g} are asked, {fit.cpu_s / fit.t_query_s / board.cores:.0%} of "
-        f"the CPU during a query, and {row.flight_marginal_mah:.3g} mAh a flight beside the "
+        f"{fit.reachable_hz:.3g} Hz ({plan.rate_hz:g} needed), {fit.cpu_s / fit.t_query_s / board.cores:.0%} of "
+        f"the CPU during a query, and {row.flight_marginal_mah:.3g} mAh a flight in addition to "
         f"{row.flight_mah - row.flight_marginal_mah:.3g} of the idle board."
     )
 
@@ -138,10 +140,10 @@ def _list_notes(board: Board, ratio: Speed | None) -> Iterator[str]:
             f"({score.source})."
         )
     elif ratio != SAME_MACHINE:
-        doubt = "" if score.verified else "unverified; "
+        unverified = "" if score.verified else "unverified; "
         yield (
             f"The times are scaled from this machine, not measured on this board: networks and full comparisons to "
-            f"{ratio.products:.2g} of its speed, everything else to {ratio.passes:.2g} ({doubt}the board by "
+            f"{ratio.products:.2g} of its speed, everything else to {ratio.passes:.2g} ({unverified}the board by "
             f"{score.source}; this machine by edgevpr's micro-benchmark)."
         )
         if score.arm64_mips:

@@ -10,11 +10,11 @@ from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
 from edgevpr.techniques.card import Card, list_cards, load_card
 from edgevpr.techniques.session import Backbone, hash_model_file
 
-_FRAME = (480, 640)
+_FRAME_SHAPE = (480, 640)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Listed:
+class ModelEntry:
     """One line of the list of networks: the card called `name`. `problem`: why the card or its network file cannot be
     used, in a sentence (None: both can); if it is set, all other fields except `name` are empty. `file`: path of the
     network file. `outputs`: kinds of output that the network has. `techniques`: the techniques and settings that use
@@ -30,15 +30,15 @@ class Listed:
     techniques: tuple[str, ...] = ()
 
 
-def list_models() -> tuple[Listed, ...]:
+def list_models() -> tuple[ModelEntry, ...]:
     """List the networks of all cards, including those that cannot be used. Each is run once."""
-    return tuple(map(_read_listed, list_cards()))
+    return tuple(map(_check_model, list_cards()))
 
 
 def try_network(card: Card) -> None:
     """Load the network of a card, and run each of its outputs on a random picture. Raises ModelError for anything that
     would prevent its use in flight."""
-    frame = np.random.default_rng(0).integers(0, 256, _FRAME, np.uint8)
+    frame = np.random.default_rng(0).integers(0, 256, _FRAME_SHAPE, np.uint8)
     for output in ("descriptor", "features"):
         if getattr(card.outputs, output):
             Backbone(card, output).run(frame)
@@ -48,7 +48,7 @@ def try_network(card: Card) -> None:
         Memorability(card).matrix(frame)
 
 
-def _read_listed(name: str) -> Listed:
+def _check_model(name: str) -> ModelEntry:
     try:
         card = load_card(name)
         sha256 = hash_model_file(card.file_path)
@@ -56,7 +56,7 @@ def _read_listed(name: str) -> Listed:
             raise ModelError(f"{card.file_path} is not the file of its card: its SHA-256 is {sha256}.")
         try_network(card)
     except EdgevprError as error:
-        return Listed(name=name, problem=str(error))
+        return ModelEntry(name=name, problem=str(error))
     outputs = tuple(output for output, layer in asdict(card.outputs).items() if layer)
     users = [card.name] if card.is_technique and not techniques.is_builtin(card.name) else []
     for technique in techniques.list_techniques():
@@ -65,7 +65,7 @@ def _read_listed(name: str) -> Listed:
             users.append(technique)
     users += ["salience.detector"] if card.detector else []
     users += ["salience.network"] if card.outputs.memorability else []
-    return Listed(
+    return ModelEntry(
         name=name,
         title=card.title,
         licence=card.licence,

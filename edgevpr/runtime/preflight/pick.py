@@ -18,7 +18,7 @@ from edgevpr.runtime.preflight.choose import (
     list_preferred,
     make_option,
 )
-from edgevpr.runtime.preflight.probe import TechniqueCosts, probe, ram_bytes
+from edgevpr.runtime.preflight.probe import TechniqueCosts, compute_ram_bytes, measure_costs
 from edgevpr.runtime.preflight.scale import compare_speed, count_work, scale_to_board
 from edgevpr.runtime.recognise.opening import make_technique
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -39,18 +39,18 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
     options: list[Option] = []
     for name in list_preferred(board, camera):
         try:
-            technique = make_technique(board.threads, name, camera_setting(name, camera))
+            technique = make_technique(board.threads, name, make_camera_setting(name, camera))
         except ModelError as error:
-            _log.warning("technique %s is passed over: %s", name, error)
+            _log.warning("technique %s cannot be used: %s", name, error)
             continue
-        options.append(make_option(board, _label(technique.spec), name, _measure_costs(technique, board), demand))
+        options.append(make_option(board, _make_label(technique.spec), name, _measure_costs(technique, board), demand))
     if not options:
         raise ModelError("No technique can be used here (see above): correct what it names, or name another one.")
     chosen = choose_best(options, board)
     if chosen is None:
-        _log.warning("technique %s is taken all the same: %s", options[0].name, explain_no_choice(options, board))
+        _log.warning("technique %s is used nevertheless: %s", options[0].name, explain_no_choice(options, board))
         return options[0].name
-    others = [f"{each.label} {each.objection}" for each in options if each.name != chosen.name and each.objection]
+    others = [f"{other.label} {other.objection}" for other in options if other.name != chosen.name and other.objection]
     _log.info("technique %s: %s", chosen.label, "; ".join([describe_option(board, chosen, demand), *others]))
     return chosen.name
 
@@ -59,12 +59,12 @@ def explain_technique(recogniser: Recogniser, is_named: bool) -> str:
     """Return the technique that a flight uses, and why, in one line for the log. `is_named`: the configuration names
     it."""
     spec = recogniser.technique.spec
-    parts = ["it was named" if is_named else "the map was built with it"]
+    parts = ["configured" if is_named else "the map was built with it"]
     if weights := describe_weights(spec):
         parts.append(f"weights of {weights}")
     if left_out := len(recogniser.place_map) - len(recogniser.index):
-        parts.append(f"{left_out} places are left to the map file")
-    return f"technique {_label(spec)}: {'; '.join(parts)}"
+        parts.append(f"{left_out} places of the map are not loaded")
+    return f"technique {_make_label(spec)}: {'; '.join(parts)}"
 
 
 def measure_flight(recogniser: Recogniser) -> tuple[float, str]:
@@ -74,45 +74,47 @@ def measure_flight(recogniser: Recogniser) -> tuple[float, str]:
     costs = _measure_costs(recogniser.technique, board)
     costs = replace(
         costs,
-        ram_bytes_per_place=ram_bytes(spec, recogniser.sequence),
+        ram_bytes_per_place=compute_ram_bytes(spec, recogniser.sequence),
         candidates=recogniser.candidates if spec.fine else costs.candidates,
     )
     demand = Demand(
         places=len(recogniser.index),
         rate_hz=board.rate_hz,
         budget_mb=board.budget_mb,
-        camera=_camera(spec),
+        camera=_read_camera(spec),
     )
-    option = make_option(board, _label(spec), spec.name, costs, demand)
+    option = make_option(board, _make_label(spec), spec.name, costs, demand)
     return option.fit.t_query_s, describe_option(board, option, demand)
 
 
-def limit_candidates(technique: Technique) -> tuple[int, ...]:
+def list_safe_candidates(technique: Technique) -> tuple[int, ...]:
     """Return the numbers of candidates, below the technique's default, with which it accepted no query as a place far
     from the right one on the image sets, largest first."""
-    label, camera = _label(technique.spec), _camera(technique.spec)
+    label, camera = _make_label(technique.spec), _read_camera(technique.spec)
     measured = ((count, find_accuracy(label, camera, count)) for count in list_fewer_candidates(label, camera))
     return tuple(count for count, accuracy in measured if accuracy and not accuracy.accepted_elsewhere)
 
 
-def camera_setting(name: str, camera: str | None) -> dict[str, str]:
+def make_camera_setting(name: str, camera: str | None) -> dict[str, str]:
     """Return the setting that tells the technique `name` the direction of the camera; empty if the direction is unknown
     (None) or the technique has no such parameter."""
     return {"camera": camera} if camera and "camera" in techniques.read_parameters(name) else {}
 
 
-def _label(spec: TechniqueSpec) -> str:
+def _make_label(spec: TechniqueSpec) -> str:
     """Return the name and form of a technique. If it matches in a way that was not measured, the label says so too."""
-    return techniques.format_name(spec.name, spec.form) + ("" if spec.name != "cohog" or _votes(spec) else ", thesis")
+    return techniques.format_name(spec.name, spec.form) + (
+        "" if spec.name != "cohog" or _uses_vote(spec) else ", thesis"
+    )
 
 
-def _votes(spec: TechniqueSpec) -> bool:
-    """Return True if a technique is `cohog` with the vote, whose costs and accuracy were measured: only then it has a
-    glance, looking ahead, or several heights, looking down."""
+def _uses_vote(spec: TechniqueSpec) -> bool:
+    """Return True if a technique is `cohog` with the vote, whose costs and accuracy were measured: only then it scores
+    quickly, looking ahead, or has several heights, looking down."""
     return bool(spec.in_full or spec.height_ratios)
 
 
-def _camera(spec: TechniqueSpec) -> str | None:
+def _read_camera(spec: TechniqueSpec) -> str | None:
     """Return the camera direction that a technique is set to, "nadir" or "forward"; None if it has no such setting."""
     camera = spec.parameters.get("camera")
     return None if camera is None else str(camera)
@@ -121,5 +123,5 @@ def _camera(spec: TechniqueSpec) -> str | None:
 def _measure_costs(technique: Technique, board: Board) -> TechniqueCosts:
     """Measure the costs of a technique here, and convert them to `board`."""
     spec = technique.spec
-    work = count_work(spec.name, spec.parameters) if _votes(spec) else None
-    return scale_to_board(probe(technique), board, compare_speed(board), work)
+    work = count_work(spec.name, spec.parameters) if _uses_vote(spec) else None
+    return scale_to_board(measure_costs(technique), board, compare_speed(board), work)

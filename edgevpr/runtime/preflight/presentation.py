@@ -4,9 +4,9 @@ from edgevpr.core.text import align_table, wrap_sentence
 from edgevpr.runtime.preflight.estimate import FlightEstimate, TechniqueEstimate
 
 # The columns of the two tables: what each technique needs and draws, and what it finds.
-_NEEDS = ("technique", "fits", "map MB", "RAM MB", "t_e s", "t_m s", "U_e", "U_m", "Hz")
-_DRAWS = ("mAh/query", "mAh/flight", "marginal", "of pack")
-_FINDS = ("technique", "recall@1", "accepted", "wrong", "sets", "queries", "chosen by itself")
+_NEEDS_COLUMNS = ("technique", "fits", "map MB", "RAM MB", "t_e s", "t_m s", "U_e", "U_m", "Hz")
+_DRAWS_COLUMNS = ("mAh/query", "mAh/flight", "marginal", "of pack")
+_FINDS_COLUMNS = ("technique", "recall@1", "accepted", "wrong", "sets", "queries", "automatic choice")
 
 
 def format_table(estimate: FlightEstimate) -> str:
@@ -18,8 +18,11 @@ def format_table(estimate: FlightEstimate) -> str:
         f"{plan.pack.capacity_mah} at {plan.regulator_efficiency:.0%} regulator efficiency; times measured"
         + {"measured": "", "scaled": ", scaled", "unscaled": " here, unscaled"}[estimate.times]
     )
-    needs = align_table([_NEEDS + _DRAWS, *map(_needs, rows), *([name, "n/a"] for name in estimate.unusable)], left=2)
-    finds = align_table([_FINDS, *(_finds(row, estimate.recommended) for row in rows)])
+    needs = align_table(
+        [_NEEDS_COLUMNS + _DRAWS_COLUMNS, *map(_make_needs_row, rows), *([name, "n/a"] for name in estimate.unusable)],
+        left=2,
+    )
+    finds = align_table([_FINDS_COLUMNS, *(_make_finds_row(row, estimate.recommended) for row in rows)])
     notes = [f"{row.option.label} {row.option.fit.misfit}." for row in rows if row.option.fit.misfit]
     for why in dict.fromkeys(estimate.unusable.values()):
         names = [name for name, problem in estimate.unusable.items() if problem == why]
@@ -30,7 +33,7 @@ def format_table(estimate: FlightEstimate) -> str:
     return "\n".join([*answer, "", heading, "", *needs, "", *finds, "", *text])
 
 
-def _needs(row: TechniqueEstimate) -> list[str]:
+def _make_needs_row(row: TechniqueEstimate) -> list[str]:
     option, fit, query = row.option, row.option.fit, row.query
     return [
         option.label,
@@ -49,7 +52,7 @@ def _needs(row: TechniqueEstimate) -> list[str]:
     ]
 
 
-def _finds(row: TechniqueEstimate, recommended: str | None) -> list[str]:
+def _make_finds_row(row: TechniqueEstimate, recommended: str | None) -> list[str]:
     option, accuracy = row.option, row.option.accuracy
     if accuracy is None:
         return [option.label, "?", "?", "?", "", "", "never measured"]

@@ -29,13 +29,13 @@ from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
-_PICTURES = 2
-_PLACES = 6
-_TRIES = 5  # of each picture, at most
+_TRIAL_PICTURES = 2
+_TRIAL_PLACES = 6
+_MAX_TRIES = 5  # of each picture, at most
 _STEPS = ("encode", "scan", "compare", "verify")
-_SCANNED = 4096
-_SCANNED_BYTES = 8 << 20  # at most: a small board has no more to spare before the map is loaded
-_LINK_MB = 12.0  # what importing pymavlink adds to the resident memory (measured on x86-64)
+_SCANNED_PLACES = 4096
+_MAX_SCANNED_BYTES = 8 << 20  # a small board has no more free before the map is loaded
+_PYMAVLINK_MB = 12.0  # what importing pymavlink adds to the resident memory (measured on x86-64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,33 +76,33 @@ class TechniqueCosts:
         return self.scan_once + full + self.match_per_place * compared + self.scan_per_place * places
 
 
-def ram_bytes(spec: TechniqueSpec, sequence: int) -> int:
+def compute_ram_bytes(spec: TechniqueSpec, sequence: int) -> int:
     """Return the bytes of RAM that a place takes in a flight that matches `sequence` queries together."""
     return bytes_per_place(spec) + bytes_beside_place(sequence)
 
 
-def disk_bytes(spec: TechniqueSpec) -> int:
+def compute_disk_bytes(spec: TechniqueSpec) -> int:
     """Return the bytes that a place takes in the map file, with the most landmarks that it may have."""
     return spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + (MAX_LANDMARK_BYTES if spec.cells else 0)
 
 
-def probe(technique: Technique, *, tried_s: float = 0.0, meter: QueryMeter | None = None) -> TechniqueCosts:
+def measure_costs(technique: Technique, *, repeat_s: float = 0.0, meter: QueryMeter | None = None) -> TechniqueCosts:
     """Measure the costs of a technique on this machine. Pictures of noise, whose every region has structure and so
     costs the most to match, go through the steps of a query, first with an empty map, then with a small map on disk,
     then with a large index.
 
-    Each picture is tried again for about `tried_s` seconds per map, and the least CPU time counts, since the time of
+    Each picture is tried again for about `repeat_s` seconds per map, and the least CPU time counts, since the time of
     other programs is no cost of the technique. Raises ModelError for a technique that fails on a picture.
     """
-    bench = _Bench(technique, meter or QueryMeter(load_board("this")), tried_s)
+    bench = _Bench(technique, meter or QueryMeter(load_board("this")), repeat_s)
     spec, candidates = technique.spec, technique.candidates
     with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", spec) as trial_map:
-        peak_is_new = machine.forget_peak()
+        peak_is_new = machine.reset_peak()
         bench.fill(trial_map)
-        index = load_index(trial_map, technique, _PLACES * bytes_per_place(spec))
-        # Of a technique with one stage the small map shows only how much memory a query takes.
-        small = bench.try_map(trial_map, index, 1, _TRIES if spec.fine else 1)
-        process_mb = machine.peak_mb() if peak_is_new else machine.rss_mb()
+        index = load_index(trial_map, technique, _TRIAL_PLACES * bytes_per_place(spec))
+        # For a technique with one stage the small map shows only how much memory a query takes.
+        small = bench.try_map(trial_map, index, 1, _MAX_TRIES if spec.fine else 1)
+        process_mb = machine.read_peak_mb() if peak_is_new else machine.read_rss_mb()
         large_index = _repeat_places(technique, index)
         times = times_as_many(bool(spec.height_ratios), len(large_index))
         most, fewer = (round(count / times) for count in (candidates, max(spec.in_full or 1, candidates // 2)))
@@ -115,7 +115,7 @@ def probe(technique: Technique, *, tried_s: float = 0.0, meter: QueryMeter | Non
     compare, part = (_find_least([steps.compare for steps in tries]) for tries in (large, half))
     if spec.in_full:
         one_more = _subtract(compare, part) * (1 / max(1, times * (most - fewer)))
-        # Only a query that is found is verified: of the pictures of noise, the one that is in the map.
+        # Only an accepted query is verified: of the pictures of noise, the one that is in the map.
         verify = max((steps.verify for steps in large), key=lambda cost: cost.wall_s)
         compare_once = _subtract(compare, one_more * candidates) + verify
     else:
@@ -126,9 +126,9 @@ def probe(technique: Technique, *, tried_s: float = 0.0, meter: QueryMeter | Non
         compare_once=compare_once,
         in_full=spec.in_full or 1,
         tries_rotations=bool(spec.height_ratios),
-        ram_bytes_per_place=ram_bytes(spec, bench.sequence),
-        disk_bytes_per_place=disk_bytes(spec),
-        process_mb=process_mb + (0.0 if "pymavlink" in sys.modules else _LINK_MB),
+        ram_bytes_per_place=compute_ram_bytes(spec, bench.sequence),
+        disk_bytes_per_place=compute_disk_bytes(spec),
+        process_mb=process_mb + (0.0 if "pymavlink" in sys.modules else _PYMAVLINK_MB),
         candidates=candidates if spec.fine else None,
         scan_per_place=scan if spec.fine else NO_COST,
         scan_once=once,
@@ -138,14 +138,14 @@ def probe(technique: Technique, *, tried_s: float = 0.0, meter: QueryMeter | Non
 
 
 class _Bench:
-    """Lets a technique recognise the same pictures of noise again and again, and returns what each step cost.
-    `sequence`: number of queries that the technique matches together. `tried_s`: seconds for the repetitions."""
+    """Measures the steps of a technique on the same pictures of noise, again and again. `sequence`: number of queries
+    that the technique matches together. `repeat_s`: seconds for the repetitions."""
 
-    def __init__(self, technique: Technique, meter: QueryMeter, tried_s: float) -> None:
+    def __init__(self, technique: Technique, meter: QueryMeter, repeat_s: float) -> None:
         self.sequence = sequence_length(technique.spec, None)
-        self._technique, self._meter, self._tried_s = technique, meter, tried_s
+        self._technique, self._meter, self._repeat_s = technique, meter, repeat_s
         rng = Random(0)  # not NumPy's: it takes 2.5 MB, and a flight needs it for nothing else
-        pictures = [np.frombuffer(rng.randbytes(480 * 640), np.uint8) for _ in range(_PICTURES)]
+        pictures = [np.frombuffer(rng.randbytes(480 * 640), np.uint8) for _ in range(_TRIAL_PICTURES)]
         self._images = [picture.reshape(480, 640) for picture in pictures]
 
     def fill(self, trial_map: PlaceMap) -> None:
@@ -156,23 +156,25 @@ class _Bench:
             first = encoder.encode(frame)
         except Exception as error:
             raise ModelError(str(explain_failure(error))) from error
-        for _ in range(_PLACES):
+        for _ in range(_TRIAL_PLACES):
             trial_map.add(frame, first.descriptor, landmarks=encoder.pack_landmarks(first.picture))
 
-    def try_map(self, place_map: PlaceMap, index: PlaceIndex, candidates: int, most: int = _TRIES) -> list[Steps]:
-        """Match each picture several times (`most` at most) with `place_map`, of which `index` is in RAM and
+    def try_map(
+        self, place_map: PlaceMap, index: PlaceIndex, candidates: int, max_tries: int = _MAX_TRIES
+    ) -> list[Steps]:
+        """Match each picture several times (`max_tries` at most) with `place_map`, of which `index` is in RAM and
         `candidates` places are compared. Returns one `Steps` per picture: the least cost of every step."""
         recogniser = self._open_recogniser(place_map, index, candidates)
         times_s = (0.1 * number for number in itertools.count())
 
-        def ask() -> list[Steps]:
-            return [_recognise(recogniser, image, next(times_s)).steps for image in self._images]
+        def match_pictures() -> list[Steps]:
+            return [_match_picture(recogniser, image, next(times_s)).steps for image in self._images]
 
         for _ in range(math.ceil((self.sequence - 1) / len(self._images))):
-            ask()  # the frames of the first rounds fill the sequence
-        end_s, rounds = time.monotonic() + self._tried_s, [ask()]
-        while len(rounds) < most and time.monotonic() < end_s:
-            rounds.append(ask())
+            match_pictures()  # the frames of the first rounds fill the sequence
+        end_s, rounds = time.monotonic() + self._repeat_s, [match_pictures()]
+        while len(rounds) < max_tries and time.monotonic() < end_s:
+            rounds.append(match_pictures())
         return [
             Steps(**{name: _find_least([getattr(steps, name) for steps in tries]) for name in _STEPS})
             for tries in zip(*rounds, strict=True)
@@ -181,14 +183,12 @@ class _Bench:
     def _open_recogniser(self, place_map: PlaceMap, index: PlaceIndex, candidates: int) -> Recogniser:
         technique = self._technique
         rule = AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0)
-        matcher, settings = (
-            Matcher(index, rule, make_sequence_search(self.sequence)),
-            WalkSettings(candidates=candidates),
-        )
+        matcher = Matcher(index, rule, make_sequence_search(self.sequence))
+        settings = WalkSettings(candidates=candidates)
         return Recogniser(FrameEncoder(technique=technique), place_map, matcher, self._meter, settings=settings)
 
 
-def _recognise(recogniser: Recogniser, image: Image, t_mono_s: float) -> Recognition:
+def _match_picture(recogniser: Recogniser, image: Image, t_mono_s: float) -> Recognition:
     event = recogniser.step(Frame(image=image, name=f"trial {t_mono_s:.1f}", t_mono_s=t_mono_s))
     if event.failed:
         raise ModelError(str(event.reason))
@@ -197,7 +197,7 @@ def _recognise(recogniser: Recogniser, image: Image, t_mono_s: float) -> Recogni
 
 def _repeat_places(technique: Technique, index: PlaceIndex) -> PlaceIndex:
     """Return an index of some thousand places without positions, by repeating the places of `index`."""
-    count = max(_PLACES, min(_SCANNED, _SCANNED_BYTES // technique.spec.row.nbytes))
+    count = max(_TRIAL_PLACES, min(_SCANNED_PLACES, _MAX_SCANNED_BYTES // technique.spec.row.nbytes))
     unknown = np.full(count, np.nan)
     return PlaceIndex(
         place_ids=np.resize(index.place_ids, count),

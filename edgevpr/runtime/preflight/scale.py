@@ -15,7 +15,7 @@ from typing import Any
 
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import Board, MachineSpeed
-from edgevpr.power.speed import REFERENCE_PASSES_HZ, REFERENCE_PRODUCTS_HZ, Speed, micro_benchmark
+from edgevpr.power.speed import REFERENCE_PASSES_HZ, REFERENCE_PRODUCTS_HZ, Speed, run_micro_benchmark
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
 SAME_MACHINE = Speed(1.0, 1.0)
@@ -40,10 +40,10 @@ def compare_speed(board: Board) -> Speed | None:
     if the speed of the board is unknown."""
     if board.is_this_machine():
         return SAME_MACHINE
-    speed = _board_speed(board.benchmark_score)
+    speed = _compute_board_speed(board.benchmark_score)
     if speed is None:
         return None
-    here = micro_benchmark()
+    here = run_micro_benchmark()
     return Speed(products=speed.products / here.products, passes=speed.passes / here.passes)
 
 
@@ -63,15 +63,15 @@ def scale_to_board(
     match_by = ratio.passes if costs.candidates is None else ratio.products
     return replace(
         costs,
-        encode=_scale(costs.encode, encode_by, threads),
-        match_per_place=_scale(costs.match_per_place, match_by, board.cores),
-        compare_once=_scale(costs.compare_once, ratio.products, board.cores),
-        scan_per_place=_scale(costs.scan_per_place, ratio.passes, board.cores),
-        scan_once=_scale(costs.scan_once, ratio.passes, board.cores),
+        encode=_scale_cost(costs.encode, encode_by, threads),
+        match_per_place=_scale_cost(costs.match_per_place, match_by, board.cores),
+        compare_once=_scale_cost(costs.compare_once, ratio.products, board.cores),
+        scan_per_place=_scale_cost(costs.scan_per_place, ratio.passes, board.cores),
+        scan_once=_scale_cost(costs.scan_once, ratio.passes, board.cores),
     )
 
 
-def _board_speed(score: MachineSpeed) -> Speed | None:
+def _compute_board_speed(score: MachineSpeed) -> Speed | None:
     """Return the speed of a board relative to the reference (None: unknown). That of an aarch64 board follows from
     `arm64_mips` and the instructions counted for a round of the micro-benchmark, unless its `products` are known. Of
     others `single` is that at passes, and a modest share of it that at products."""
@@ -83,7 +83,7 @@ def _board_speed(score: MachineSpeed) -> Speed | None:
     return None
 
 
-def _scale(cost: StageCost, ratio: float, threads: int) -> StageCost:
+def _scale_cost(cost: StageCost, ratio: float, threads: int) -> StageCost:
     """Return the cost of a stage where a thread is `ratio` times as fast and the stage may use at most `threads`
     threads."""
     busy_cores = cost.cpu_s / cost.wall_s if cost.wall_s else 0.0

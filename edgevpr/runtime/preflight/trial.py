@@ -17,20 +17,19 @@ from typing import Any
 from edgevpr import techniques
 from edgevpr.core.config import FORMS
 from edgevpr.core.errors import EdgevprError
-from edgevpr.runtime.preflight.probe import TechniqueCosts, probe
+from edgevpr.runtime.preflight.probe import TechniqueCosts, measure_costs
 from edgevpr.runtime.recognise.opening import make_technique
 from edgevpr.techniques.card import describe_weights
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
-_TRIED_S = 0.5  # pictures are tried again for so long; twice as long finds the same. A check has no time for that
+_REPEAT_S = 0.5  # of each picture; twice as long gives the same figures
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """A technique to try (an offer), or that was tried, with its settings, one of which may be its form. `label` is its
-    unique name.
+    """A trial of a technique in one form, to be run or done. `label` is its unique name.
 
-    Once it was tried, it has its `costs`, or the `problem`, a sentence that says why it cannot be used here.
+    When it is done, it has the `costs`, or the `problem`, a sentence that says why the technique cannot be used here.
     `parameters`: all parameters of the technique when it was tried. `weights`: name of its network's weights (None: no
     network).
     """
@@ -44,32 +43,32 @@ class Trial:
     parameters: dict[str, Any] = field(default_factory=dict)
 
 
-def offers(names: Iterable[str], settings: Mapping[str, Mapping[str, Any]] | None = None) -> tuple[Trial, ...]:
-    """Return the trials to make, not yet made: one for each technique of `names` in each of its forms, or only one if
-    it has no forms or its settings name one. `settings` are by technique name. Raises UsageError for an unknown name,
-    ModelError for a card that is incomplete."""
+def list_trials(names: Iterable[str], settings: Mapping[str, Mapping[str, Any]] | None = None) -> tuple[Trial, ...]:
+    """Return the trials to run: one for each technique of `names` in each of its forms, or only one if it has no forms
+    or its settings name one. `settings` are by technique name. Raises UsageError for an unknown name, ModelError for a
+    card that is incomplete."""
     trials = []
     for name in names:
-        own = dict((settings or {}).get(name, {}))
-        is_one = "form" in own or "form" not in techniques.read_parameters(name)
-        for chosen in (own,) if is_one else ({**own, "form": form} for form in FORMS):
-            trials.append(Trial(label=techniques.format_name(name, chosen.get("form")), name=name, settings=chosen))
+        given = dict((settings or {}).get(name, {}))
+        is_one = "form" in given or "form" not in techniques.read_parameters(name)
+        for variant in (given,) if is_one else ({**given, "form": form} for form in FORMS):
+            trials.append(Trial(label=techniques.format_name(name, variant.get("form")), name=name, settings=variant))
     return tuple(trials)
 
 
-def try_each(wanted: Sequence[Trial], threads: int) -> Iterator[Trial]:
-    """Make the `wanted` trials, those of a technique in one child process, and yield each with its result. A technique
+def run_trials(trials: Sequence[Trial], threads: int) -> Iterator[Trial]:
+    """Run `trials`, those of one technique in one child process, and yield each with its result. A technique
     that cannot be used has one result, labelled with its name. `threads`: number of threads for networks."""
-    for name, forms in groupby(wanted, lambda trial: trial.name):
-        trials = list(forms)
+    for name, forms in groupby(trials, lambda trial: trial.name):
+        variants = list(forms)
         with ProcessPoolExecutor(1, get_context("spawn"), _begin_child, (os.getpid(),)) as pool:
             try:
-                yield from pool.submit(_try_here, trials, threads).result()
+                yield from pool.submit(_run_in_child, variants, threads).result()
             except EdgevprError as error:
-                yield replace(trials[0], label=name, problem=str(error))
+                yield replace(variants[0], label=name, problem=str(error))
             except BrokenProcessPool:
                 why = f"Trying {name} ended its process: memory ran out, or a library does not suit this processor."
-                yield replace(trials[0], label=name, problem=why)
+                yield replace(variants[0], label=name, problem=why)
 
 
 def _begin_child(parent_pid: int) -> None:
@@ -82,16 +81,16 @@ def _begin_child(parent_pid: int) -> None:
     os.dup2(2, 1)  # what a library prints does not go into the answer of the program
 
 
-def _try_here(trials: list[Trial], threads: int) -> list[Trial]:
-    tried = []
-    for offer in trials:
-        technique = make_technique(threads, offer.name, offer.settings)
-        costs = probe(technique, tried_s=_TRIED_S)
+def _run_in_child(trials: list[Trial], threads: int) -> list[Trial]:
+    results = []
+    for trial in trials:
+        technique = make_technique(threads, trial.name, trial.settings)
+        costs = measure_costs(technique, repeat_s=_REPEAT_S)
         spec = technique.spec
-        tried.append(replace(offer, costs=costs, weights=describe_weights(spec), parameters=spec.parameters))
-        # What a form has taken is given back, or it would be counted for the next one.
+        results.append(replace(trial, costs=costs, weights=describe_weights(spec), parameters=spec.parameters))
+        # Memory that this form took is released, or it would be counted for the next one.
         del technique
         gc.collect()
         if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # musl has none
             trim(0)
-    return tried
+    return results

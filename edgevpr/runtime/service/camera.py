@@ -15,19 +15,19 @@ from edgevpr.frames.lens import compute_lens_view
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source, is_program_uri, open_source
 from edgevpr.runtime.recognise.levelling import load_calibrated_lens
-from edgevpr.runtime.service.finding import Finding, check_device, fine, run_check, wrong
+from edgevpr.runtime.service.finding import Finding, check_device, report_fault, report_ok, run_check
 from edgevpr.runtime.service.findingcodes import FindingCode
 
 FRAME_WAIT_S = 65.0  # longer than any source takes to report that it is lost; a pipeline that starts slowly takes most
-_WITHOUT_FRAMES = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED, Condition.LATE)
-_LIST_S = 10.0  # for the program to list the cameras
-_LISTED = re.compile(r"(?m)^\s*(\d+) : (\S+)")
+_FRAMELESS_CONDITIONS = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED, Condition.LATE)
+_LIST_TIMEOUT_S = 10.0  # for the program to list the cameras
+_CAMERA_LINE = re.compile(r"(?m)^\s*(\d+) : (\S+)")
 _LIBCAMERA_DEVICES = ("media*", "video*", "dma_heap/*")  # below /dev
 
 
 def check_camera(uri: str, root: Path = Path("/")) -> Iterator[Finding]:
-    """Check what a live source is read with: its device, or the program and what that needs. Other sources have no
-    finding. `root` is the root of the file system with /dev."""
+    """Check the device or the program by which a live source is read. Other sources have no finding. `root` is the root
+    of the file system with /dev."""
     if uri.startswith("/dev/"):
         yield check_device("camera", uri, root)
     elif is_program_uri(uri):
@@ -41,21 +41,21 @@ def _check_program(what: str, uri: str, root: Path) -> Finding:
 
     program = require_program(uri)
     if uri.startswith("gst:"):
-        return fine(what, FindingCode.FILE_USABLE, path=program)
+        return report_ok(what, FindingCode.FILE_USABLE, path=program)
     for pattern in _LIBCAMERA_DEVICES:
         for file in sorted((root / "dev").glob(pattern)):
             device = check_device(what, f"/{file.relative_to(root)}", root)
             if not device.ok:
                 return device
     try:
-        listing = subprocess.run([program, "--list-cameras"], capture_output=True, text=True, timeout=_LIST_S)
+        listing = subprocess.run([program, "--list-cameras"], capture_output=True, text=True, timeout=_LIST_TIMEOUT_S)
     except subprocess.TimeoutExpired:
-        return wrong(what, FindingCode.CAMERA_LIST_HANGS, program=program)
-    cameras = dict(_LISTED.findall(listing.stdout + listing.stderr))
+        return report_fault(what, FindingCode.CAMERA_LIST_HANGS, program=program)
+    cameras = dict(_CAMERA_LINE.findall(listing.stdout + listing.stderr))
     if name := cameras.get(uri.partition(":")[2] or "0"):
-        return fine(what, FindingCode.CAMERA_LISTED, uri=uri, camera=name, program=program)
-    listed = ", ".join(cameras) or "none"
-    return wrong(what, FindingCode.CAMERA_NOT_LISTED, uri=uri, program=program, cameras=listed)
+        return report_ok(what, FindingCode.CAMERA_LISTED, uri=uri, camera=name, program=program)
+    names = ", ".join(cameras) or "none"
+    return report_fault(what, FindingCode.CAMERA_NOT_LISTED, uri=uri, program=program, cameras=names)
 
 
 def check_frame(what: str, config: SourceConfig) -> Finding:
@@ -68,14 +68,14 @@ def check_frame(what: str, config: SourceConfig) -> Finding:
         facts, age_s = source.facts, source.latency_s
     if size is None:
         waited_s = time.monotonic() - begin_s
-        return wrong(what, FindingCode.NO_FRAME, uri=config.uri, state=state, waited_s=waited_s)
+        return report_fault(what, FindingCode.NO_FRAME, uri=config.uri, state=state, waited_s=waited_s)
     if age_s is not None and age_s > FIX_MAX_AGE_S:
-        return wrong(what, FindingCode.FRAMES_LATE, uri=config.uri, age_s=age_s, limit_s=FIX_MAX_AGE_S)
-    found: dict[str, float | str | None] = {"width": size[0], "height": size[1], "age_s": age_s}
-    found["facts"] = str(facts) if facts else None
-    found["lens"] = lens.path if lens else None
-    found["fov_deg"] = compute_lens_view(lens, size).fov_deg if lens else None
-    return fine(what, FindingCode.FRAME_RECEIVED, uri=config.uri, state=state, **found)
+        return report_fault(what, FindingCode.FRAMES_LATE, uri=config.uri, age_s=age_s, limit_s=FIX_MAX_AGE_S)
+    frame: dict[str, float | str | None] = {"width": size[0], "height": size[1], "age_s": age_s}
+    frame["facts"] = str(facts) if facts else None
+    frame["lens"] = lens.path if lens else None
+    frame["fov_deg"] = compute_lens_view(lens, size).fov_deg if lens else None
+    return report_ok(what, FindingCode.FRAME_RECEIVED, uri=config.uri, state=state, **frame)
 
 
 def _read_size(source: Source) -> tuple[int, int] | None:
@@ -83,7 +83,7 @@ def _read_size(source: Source) -> tuple[int, int] | None:
     begin_s = time.monotonic()
     is_hopeless = False
     while not (is_hopeless or source.ended) and time.monotonic() < begin_s + FRAME_WAIT_S:
-        is_hopeless = source.condition in _WITHOUT_FRAMES  # asked before the frame is read: a last one may wait
+        is_hopeless = source.condition in _FRAMELESS_CONDITIONS  # asked before the frame is read: a last one may wait
         try:
             frame = source.read(0.25)
         except ImageError:

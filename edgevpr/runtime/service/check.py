@@ -24,25 +24,25 @@ from edgevpr.runtime.recognise.levelling import load_calibrated_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.service.camera import FRAME_WAIT_S, check_frame
 from edgevpr.runtime.service.doctor import explain_silence
-from edgevpr.runtime.service.finding import Finding, check_log, fine, refuse, run_check, wrong
+from edgevpr.runtime.service.finding import Finding, check_log, report_error, report_fault, report_ok, run_check
 from edgevpr.runtime.service.findingcodes import FindingCode
 
 
-def check(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
+def check_configuration(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
     """Check everything that a flight needs, and return a finding for each part. It waits for a frame of the source and
     a heartbeat of the autopilot, unless `offline`: then it is enough that source and link can be opened."""
     try:
         config = load_config(config_path)
     except EdgevprError as error:
-        return [refuse("configuration", error)]
+        return [report_error("configuration", error)]
     source = apply_recorded_rate(config.source, read_intervals(config.source.uri))
-    findings = [fine("configuration", FindingCode.FILE_USABLE, path=str(config_path))]
+    findings = [report_ok("configuration", FindingCode.FILE_USABLE, path=str(config_path))]
     try:
         board = resolve_board(load_board(config.board), source, config.memory)
-        findings.append(fine("board", FindingCode.BOARD_KNOWN, board=board.title, memory_mb=board.memory_max_mb))
+        findings.append(report_ok("board", FindingCode.BOARD_KNOWN, board=board.title, memory_mb=board.memory_max_mb))
         findings.append(run_check("map", lambda what: _check_map(what, config, board)))
-    except ConfigError as error:  # then nothing is known of what the map would take
-        findings.append(refuse("board", error))
+    except ConfigError as error:  # without a board the cost of the map is unknown
+        findings.append(report_error("board", error))
     show_waiting("opening the source" if offline else f"waiting for a frame of the source, {FRAME_WAIT_S:g} s at most")
     findings.append(run_check("source", lambda what: _check_source(what, source, offline)))
     show_waiting("waiting for the flight controller")
@@ -61,31 +61,31 @@ def _check_map(what: str, config: Config, board: Board) -> Finding:
             confidence = calibration.described() if calibration else not_calibrated(len(place_map))
     settings = config.mavlink
     if settings.link and settings.send_fixes and t_query_s > FIX_MAX_AGE_S:
-        return wrong(what, FindingCode.QUERY_TOO_SLOW, t_query_s=t_query_s, limit_s=FIX_MAX_AGE_S)
-    found = {"technique": technique, "cost": cost, "confidence": confidence}
-    return fine(what, FindingCode.MAP_READY, path=config.map, t_query_s=t_query_s, **found)
+        return report_fault(what, FindingCode.QUERY_TOO_SLOW, t_query_s=t_query_s, limit_s=FIX_MAX_AGE_S)
+    facts = {"technique": technique, "cost": cost, "confidence": confidence}
+    return report_ok(what, FindingCode.MAP_READY, path=config.map, t_query_s=t_query_s, **facts)
 
 
 def _check_source(what: str, settings: SourceConfig, offline: bool) -> Finding:
     uri = settings.uri
     if uri is None:
-        return replace(wrong(what, FindingCode.NO_SOURCE), exit_code=UsageError.exit_code)
+        return replace(report_fault(what, FindingCode.NO_SOURCE), exit_code=UsageError.exit_code)
     if not offline:
         return check_frame(what, settings)
     load_calibrated_lens(settings)
     if is_live(uri) and (cause := find_missing_cause(uri)):
-        return wrong(what, FindingCode.CAMERA_ABSENT, problem=cause)
+        return report_fault(what, FindingCode.CAMERA_ABSENT, problem=cause)
     with closing(open_source(uri, live=True)) as source:
         # Wait until FFmpeg has given up (10 s at most): a capture that returns while Python ends aborts the process.
         while source.condition is Condition.OPENING:
             time.sleep(0.05)
-        return fine(what, FindingCode.SOURCE_OPENED, uri=uri, state=source.state)
+        return report_ok(what, FindingCode.SOURCE_OPENED, uri=uri, state=source.state)
 
 
 def _check_link(what: str, settings: MavlinkConfig, offline: bool) -> Finding:
     address, ground = parse_links(settings)
     if address is None:
-        return fine(what, ReasonCode.NO_LINK)
+        return report_ok(what, ReasonCode.NO_LINK)
     signing = open_signing(settings, to_ask=True)
     with Inquiry(address, settings.component_id, settings.system_id, signing) as inquiry:
         if not offline and inquiry.heartbeat() is None:
@@ -95,5 +95,5 @@ def _check_link(what: str, settings: MavlinkConfig, offline: bool) -> Finding:
             pass  # it can be opened
     code = FindingCode.LINK_OPENED if settings.send_fixes else FindingCode.LINK_OPENED_DRY
     system = None if offline else inquiry.system_id
-    others = {"ground": str(ground) if ground else None, "key": settings.signing_key}
-    return fine(what, code, address=str(address), system=system, **others)
+    extras = {"ground": str(ground) if ground else None, "key": settings.signing_key}
+    return report_ok(what, code, address=str(address), system=system, **extras)

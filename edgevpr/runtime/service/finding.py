@@ -20,8 +20,8 @@ from edgevpr.power import machine
 from edgevpr.power.boards import Board
 from edgevpr.runtime.service.findingcodes import FindingCode
 
-LOG_ROOM_MB = 10  # some hours of queries
-_SYSTEM_GROUPS = ("root", "tty")  # no user is to join them: a login shell holds the device, or a udev rule is missing
+MIN_LOG_SPACE_MB = 10  # some hours of queries
+_SYSTEM_GROUPS = ("root", "tty")  # not for users: a login shell holds the device, or a udev rule is missing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,23 +38,29 @@ class Finding:
 
     def fields(self) -> dict[str, Any]:
         """Return the finding as fields of JSON."""
-        found = {"what": self.what, "level": "ok" if self.ok else "wrong", **self.reason.fields()}
-        return {**found, "changes": self.changes, "exit_code": self.exit_code}
+        level = "ok" if self.ok else "wrong"
+        return {
+            "what": self.what,
+            "level": level,
+            **self.reason.fields(),
+            "changes": self.changes,
+            "exit_code": self.exit_code,
+        }
 
 
-def fine(what: str, code: Code, **parameters: float | str | None) -> Finding:
+def report_ok(what: str, code: Code, **parameters: float | str | None) -> Finding:
     """Return a finding with nothing to change."""
     return Finding(what=what, ok=True, reason=Reason(code, parameters))
 
 
-def wrong(what: str, code: Code, *changes: str, **parameters: float | str | None) -> Finding:
+def report_fault(what: str, code: Code, *changes: str, **parameters: float | str | None) -> Finding:
     """Return a finding with something wrong, which `changes` put right."""
     return Finding(what=what, ok=False, reason=Reason(code, parameters), changes=changes, exit_code=1)
 
 
-def refuse(what: str, error: EdgevprError) -> Finding:
+def report_error(what: str, error: EdgevprError) -> Finding:
     """Return the finding of an error that would end a flight."""
-    return replace(wrong(what, ReasonCode.UNUSABLE, problem=str(error)), exit_code=error.exit_code)
+    return replace(report_fault(what, ReasonCode.UNUSABLE, problem=str(error)), exit_code=error.exit_code)
 
 
 def run_check(what: str, check: Callable[[str], Finding]) -> Finding:
@@ -62,9 +68,9 @@ def run_check(what: str, check: Callable[[str], Finding]) -> Finding:
     try:
         return check(what)
     except EdgevprError as error:
-        return refuse(what, error)
+        return report_error(what, error)
     except OSError as error:
-        return wrong(what, FindingCode.FILE_UNUSABLE, path=str(error.filename), problem=error.strerror)
+        return report_fault(what, FindingCode.FILE_UNUSABLE, path=str(error.filename), problem=error.strerror)
 
 
 def format_findings(findings: Iterable[Finding]) -> Iterator[str]:
@@ -92,60 +98,62 @@ def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
     try:
         status, port = file.stat(), file.resolve()
     except OSError as error:
-        return wrong(what, FindingCode.DEVICE_ABSENT, path=path, problem=error.strerror)
+        return report_fault(what, FindingCode.DEVICE_ABSENT, path=path, problem=error.strerror)
     if not stat.S_ISCHR(status.st_mode):
-        return wrong(what, FindingCode.NOT_A_DEVICE, path=path)
+        return report_fault(what, FindingCode.NOT_A_DEVICE, path=path)
     is_serial, no_login = what == "serial", f"sudo systemctl disable --now serial-getty@{port.name}"
     if is_serial and (console := _find_console(port, root)):
-        return wrong(what, FindingCode.PORT_IS_CONSOLE, no_login, path=path, console=console)
+        return report_fault(what, FindingCode.PORT_IS_CONSOLE, no_login, path=path, console=console)
     program, is_login = _find_program(port, root)
     if program:
-        return wrong(what, FindingCode.DEVICE_IN_USE, *([no_login] if is_login else []), path=path, program=program)
+        return report_fault(
+            what, FindingCode.DEVICE_IN_USE, *([no_login] if is_login else []), path=path, program=program
+        )
     group = str(status.st_gid)
     with suppress(KeyError):
         group = grp.getgrgid(status.st_gid).gr_name
     access = {"path": path, "group": group, "mode": f"{stat.S_IMODE(status.st_mode):04o}"}
     if os.access(file, os.R_OK | os.W_OK):
-        return fine(what, FindingCode.DEVICE_READY, **access)
+        return report_ok(what, FindingCode.DEVICE_READY, **access)
     changes = [f"sudo usermod --append --groups {group} USER", f"docker run --group-add {status.st_gid}"]
     if group in _SYSTEM_GROUPS:
         rules = find_shipped("deploy") / "99-edgevpr.rules"
         changes = [no_login if is_serial else f"sudo install -D -m 644 -t /etc/udev/rules.d {rules}"]
-    return wrong(what, FindingCode.DEVICE_DENIED, *changes, user=os.getuid(), **access)
+    return report_fault(what, FindingCode.DEVICE_DENIED, *changes, user=os.getuid(), **access)
 
 
 def check_log(what: str, file: str | None) -> Finding:
     """Check that the flight log `file` can be written, if there is one."""
     if not file:
-        return fine(what, FindingCode.NO_LOG)
+        return report_ok(what, FindingCode.NO_LOG)
     # A log is not opened for the check: if root checked, it would leave a file that the service may not write.
     path = Path(file).absolute()
     if path.is_dir() or not path.parent.is_dir():
-        return wrong(what, FindingCode.LOG_NOT_A_FILE, path=str(path))
+        return report_fault(what, FindingCode.LOG_NOT_A_FILE, path=str(path))
     if not os.access(path if path.exists() else path.parent, os.W_OK):
-        return wrong(what, FindingCode.LOG_NOT_WRITABLE, path=str(path))
+        return report_fault(what, FindingCode.LOG_NOT_WRITABLE, path=str(path))
     free_mb = shutil.disk_usage(path.parent).free / 1e6
-    if free_mb < LOG_ROOM_MB:
-        return wrong(what, FindingCode.DISK_FULL, path=str(path), free_mb=free_mb, needed_mb=LOG_ROOM_MB)
-    return fine(what, FindingCode.FILE_USABLE, path=str(path))
+    if free_mb < MIN_LOG_SPACE_MB:
+        return report_fault(what, FindingCode.DISK_FULL, path=str(path), free_mb=free_mb, needed_mb=MIN_LOG_SPACE_MB)
+    return report_ok(what, FindingCode.FILE_USABLE, path=str(path))
 
 
 def _check_memory(needed_mb: float, root: Path) -> Finding:
-    limit_mb, ram_mb = machine.ram_limit_mb(root), machine.ram_mb(root)
-    controllers = machine.text(root / "sys/fs/cgroup/cgroup.controllers")
+    limit_mb, ram_mb = machine.read_ram_limit_mb(root), machine.read_ram_mb(root)
+    controllers = machine.read_text(root / "sys/fs/cgroup/cgroup.controllers")
     if controllers is not None and "memory" not in controllers.split():
-        return wrong("memory", FindingCode.MEMORY_LIMIT_IGNORED)
+        return report_fault("memory", FindingCode.MEMORY_LIMIT_IGNORED)
     if limit_mb < needed_mb:
         change = f"MemoryMax={1e6 * needed_mb:.0f}"
         low = FindingCode.MEMORY_LIMIT_LOW
-        return wrong("memory", low, change, limit_mb=limit_mb, ram_mb=ram_mb, needed_mb=needed_mb)
-    return fine("memory", FindingCode.MEMORY_LIMIT, limit_mb=limit_mb, ram_mb=ram_mb)
+        return report_fault("memory", low, change, limit_mb=limit_mb, ram_mb=ram_mb, needed_mb=needed_mb)
+    return report_ok("memory", FindingCode.MEMORY_LIMIT, limit_mb=limit_mb, ram_mb=ram_mb)
 
 
 def _find_console(port: Path, root: Path) -> str | None:
     """Return the name of a port as the kernel's console, now or after the next start, e.g. "ttyS0"; None if the kernel
     has no console on it."""
-    texts = (machine.text(root / name) or "" for name in ("proc/cmdline", "boot/firmware/cmdline.txt"))
+    texts = (machine.read_text(root / name) or "" for name in ("proc/cmdline", "boot/firmware/cmdline.txt"))
     words = " ".join(texts).split()
     consoles = (word.removeprefix("console=").split(",")[0] for word in words if word.startswith("console="))
     return next((console for console in consoles if (root / "dev" / console).resolve() == port), None)
@@ -160,7 +168,7 @@ def _find_program(port: Path, root: Path) -> tuple[str | None, bool]:
     for process in sorted((root / "proc").glob("[0-9]*"), key=lambda folder: int(folder.name)):
         if process.name == str(os.getpid()):
             continue
-        start, _, stat_fields = (machine.text(process / "stat") or "").rpartition(")")
+        start, _, stat_fields = (machine.read_text(process / "stat") or "").rpartition(")")
         name = f"{start.partition('(')[2]} (process {process.name})"
         if stat_fields.split()[4:5] == [terminal]:
             return name, True

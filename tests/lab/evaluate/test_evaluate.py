@@ -14,7 +14,7 @@ from edgevpr.lab.evaluate.evaluate import evaluate
 from edgevpr.lab.evaluate.metrics import compare, from_json
 from edgevpr.lab.evaluate.tables import results_text
 from edgevpr.mapmaking import finishing
-from edgevpr.runtime.preflight.probe import probe
+from edgevpr.runtime.preflight.probe import measure_costs
 from edgevpr.techniques import create
 
 HOG = {"w1": 64}
@@ -89,5 +89,5 @@ def test_from_json_gives_the_same_tables(folder):
 
 @pytest.mark.parametrize(("name", "settings"), [("hog", {"form": "1bit"}), ("cohog", {"camera": "nadir", "w1": 208})])
 def test_evaluate_counts_as_many_bytes_a_place_as_probe(folder, name, settings):
-    result, costs = evaluate(name, load(folder), settings), probe(create(name, settings))
+    result, costs = evaluate(name, load(folder), settings), measure_costs(create(name, settings))
     assert (result.descriptor_bytes, result.fine_bytes) == (costs.ram_bytes_per_place, costs.disk_bytes_per_place)

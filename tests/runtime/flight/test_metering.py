@@ -57,7 +57,7 @@ def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(make_
     cool = ThermalState(temperature_c=61.0, frequency_mhz=1800.0, throttled=False, why="")
     hot = ThermalState(temperature_c=84.0, frequency_mhz=600.0, throttled=True, why="throttled now", under_voltage=True)
     flight = make_flight("hog")
-    watch = SimpleNamespace(look=chain([cool] * 3, repeat(hot)).__next__, close=lambda: None)
+    watch = SimpleNamespace(read=chain([cool] * 3, repeat(hot)).__next__, close=lambda: None)
     meter = flight_meter(flight, machine=Machine(flight.board, watch))
     lines = flight.fly(FakeSource([PICTURE] * 6, clock), meter)
     boards = [line["board"] for line in of_kind(lines, "query")]

@@ -27,7 +27,7 @@ from edgevpr.runtime.preflight.choose import (
     list_preferred,
     make_option,
 )
-from edgevpr.runtime.preflight.probe import probe
+from edgevpr.runtime.preflight.probe import measure_costs
 
 COSTS = {"regions": REGIONS, "vector": VECTOR}
 
@@ -36,7 +36,7 @@ COSTS = {"regions": REGIONS, "vector": VECTOR}
 def accuracies(monkeypatch):
     """Regions find more than vectors; a test may change it."""
     table = {"regions": found(0.9), "vector": found(0.5)}
-    monkeypatch.setattr(choosing, "_accuracies", lambda: {"forward": table, "nadir": {}})
+    monkeypatch.setattr(choosing, "_read_accuracies", lambda: {"forward": table, "nadir": {}})
     return table
 
 
@@ -86,7 +86,7 @@ class TinyTechnique:
 
 def test_probe_tries_a_technique_on_frames_of_a_camera_and_a_map_on_disk():
     technique = TinyTechnique(fine=True)
-    costs = probe(technique)
+    costs = measure_costs(technique)
     assert technique.shapes == {((480, 640), np.dtype(np.uint8))}
     assert technique.matched >= 6
     assert costs.ram_bytes_per_place == 4 * 4 + 26  # its row, and id, latitude, longitude and heading
@@ -106,7 +106,7 @@ def test_probe_does_not_count_what_other_programs_take():
 
     technique.encode = encode_slowly
     clocks = {"wall_clock": lambda: now["wall"], "cpu_clock": lambda: now["cpu"]}
-    costs = probe(technique, tried_s=0.2, meter=QueryMeter(board(), **clocks))
+    costs = measure_costs(technique, repeat_s=0.2, meter=QueryMeter(board(), **clocks))
     assert costs.encode == StageCost(pytest.approx(0.1), pytest.approx(0.1))
 
 
@@ -170,7 +170,7 @@ def test_check_fit_refuses_any_rate_where_no_fix_could_be_sent_in_time():
 @pytest.mark.slow
 def test_picked_technique_passes_over_a_network_that_is_not_there(monkeypatch, caplog, accuracies):
     accuracies["cohog"] = found(0.9)
-    really = pick.made_for
+    really = pick.make_technique
 
     def made_for(threads, name, settings=None):
         if name == "netvlad":
@@ -195,12 +195,12 @@ def test_list_preferred_begins_with_the_boards_own_technique():
 
 def test_picked_technique_is_the_best_where_nothing_fits_and_the_log_says_why(monkeypatch, caplog):
     slow = dataclasses.replace(REGIONS, encode=StageCost(30.0, 30.0))
-    monkeypatch.setattr(pick, "probe", lambda technique: slow)
+    monkeypatch.setattr(pick, "measure_costs", lambda technique: slow)
     for camera, knows in (("nadir", {"camera": "nadir"}), ("forward", {"camera": "forward"}), (None, {})):
         assert pick.pick_technique("this", 10, camera) == "cohog"
-        assert pick.camera_setting("cohog", camera) == knows
-        assert pick.camera_setting("hog", camera) == {}
-    said = [record.message for record in caplog.records if "all the same" in record.message]
+        assert pick.make_camera_setting("cohog", camera) == knows
+        assert pick.make_camera_setting("hog", camera) == {}
+    said = [record.message for record in caplog.records if "used nevertheless" in record.message]
     assert len(said) == 3
     assert "takes 30.0 s" in said[0]
 

@@ -12,7 +12,7 @@ from edgevpr.power.equations import parse_pack
 from edgevpr.power.speed import Speed
 from edgevpr.runtime.preflight import choose
 from edgevpr.runtime.preflight.estimate import FlightPlan
-from edgevpr.runtime.preflight.estimate import estimate as estimate_of
+from edgevpr.runtime.preflight.estimate import estimate_flight as estimate_of
 from edgevpr.runtime.preflight.scale import SAME_MACHINE
 from edgevpr.runtime.preflight.trial import Trial
 
@@ -29,7 +29,7 @@ SLOWER = Speed(products=0.056, passes=0.2)
 def accuracies(monkeypatch):
     recalls = {"regions": 0.9, "vector": 0.5, "cohog": 0.9, "hog": 0.4, "hog 1bit": 0.2}
     table = {label: found(recall) for label, recall in recalls.items()}
-    monkeypatch.setattr(choose, "_accuracies", lambda: {"forward": table, "nadir": {}})
+    monkeypatch.setattr(choose, "_read_accuracies", lambda: {"forward": table, "nadir": {}})
     return table
 
 
@@ -87,5 +87,5 @@ def test_estimate_recommends_the_most_accurate_that_fits_and_says_why():
     forms = {"cohog": COSTS["regions"], "hog": COSTS["vector"], "hog 1bit": COSTS["vector"]}
     estimated = estimate(forms, board=replace(PI, technique=None))
     assert estimated.recommended == "cohog"
-    assert estimated.reason.startswith("cohog: nothing that fits finds more: recall@1 0.90 on 2 image sets")
+    assert estimated.reason.startswith("cohog: the most accurate that fits: recall@1 0.90 on 2 image sets")
     assert estimate({"netvlad": VECTOR}).recommended is None

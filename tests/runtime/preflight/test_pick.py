@@ -9,7 +9,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight import pick
-from edgevpr.runtime.preflight.pick import limit_candidates, measure_flight
+from edgevpr.runtime.preflight.pick import list_safe_candidates, measure_flight
 from edgevpr.runtime.recognise.opening import open_recogniser
 
 COSTS = replace(REGIONS, match_per_place=StageCost(0.01, 0.01), candidates=42)
@@ -18,7 +18,7 @@ COSTS = replace(REGIONS, match_per_place=StageCost(0.01, 0.01), candidates=42)
 @pytest.fixture
 def measure_at(recording, monkeypatch):
     def found(rate_hz, costs=COSTS, **settings):
-        monkeypatch.setattr(pick, "probe", lambda technique: costs)
+        monkeypatch.setattr(pick, "measure_costs", lambda technique: costs)
         monkeypatch.setattr(pick, "scale_to_board", lambda costs, *_: costs)
         config = load_config(None, {"map": str(recording / "cohog.gpkg"), **settings})
         board = replace(load_board("this"), cores=4, cpu_share=0.5, rate_hz=rate_hz)
@@ -43,13 +43,13 @@ def test_trusted_candidates_accepted_nothing_wrong(recording, monkeypatch):
     config = load_config(None, {"map": str(recording / "cohog.gpkg")})
     recogniser = open_recogniser(config, load_board("this"))
     with recogniser.place_map:
-        assert limit_candidates(recogniser.technique) == (20, 10)
+        assert list_safe_candidates(recogniser.technique) == (20, 10)
         measured = pick.find_accuracy
         with monkeypatch.context() as changed:
             wrong = replace(measured("cohog", "forward", 10), accepted_elsewhere=1)
             changed.setattr(pick, "find_accuracy", lambda *asked: wrong if asked[-1] == 10 else measured(*asked))
-            assert limit_candidates(recogniser.technique) == (20,)
+            assert list_safe_candidates(recogniser.technique) == (20,)
     config = load_config(None, {"map": str(recording / "cohog.gpkg"), "match.matching": "thesis"})
     recogniser = open_recogniser(config, load_board("this"))
     with recogniser.place_map:
-        assert limit_candidates(recogniser.technique) == (), "which was never measured so"
+        assert list_safe_candidates(recogniser.technique) == (), "which was never measured so"

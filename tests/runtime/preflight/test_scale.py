@@ -22,7 +22,7 @@ SLOWER = Speed(products=0.05, passes=0.2)
 @pytest.fixture(autouse=True)
 def reference(monkeypatch):
     """This machine is as fast as the reference."""
-    monkeypatch.setattr(scale, "micro_benchmark", lambda: Speed(1.0, 1.0))
+    monkeypatch.setattr(scale, "run_micro_benchmark", lambda: Speed(1.0, 1.0))
 
 
 def test_on_board_scales_products_and_passes_apart_and_no_memory():
@@ -45,10 +45,10 @@ def test_compare_speed_of_an_arm_board_follows_from_the_counted_instructions():
 
 def test_compare_speed_measures_this_machine_for_other_boards(monkeypatch):
     ours = compare_speed(PI)
-    monkeypatch.setattr(scale, "micro_benchmark", lambda: Speed(0.5, 0.25))
+    monkeypatch.setattr(scale, "run_micro_benchmark", lambda: Speed(0.5, 0.25))
     assert compare_speed(PI) == Speed(pytest.approx(ours.products / 0.5), pytest.approx(ours.passes / 0.25))
     assert compare_speed(load_board("odroid-xu4")) == Speed(0.15 * 0.35 / 0.5, 0.35 / 0.25), "of 7-zip alone"
-    monkeypatch.setattr(scale, "micro_benchmark", None)
+    monkeypatch.setattr(scale, "run_micro_benchmark", None)
     assert compare_speed(load_board("this")) == SAME_MACHINE
     assert compare_speed(load_board("thesis-xeon")) is None, "nobody has measured it"
 

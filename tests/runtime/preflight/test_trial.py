@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from edgevpr.runtime.preflight import trial
-from edgevpr.runtime.preflight.trial import offers, try_each
+from edgevpr.runtime.preflight.trial import list_trials, run_trials
 
 
 @pytest.fixture(autouse=True)
@@ -22,8 +22,8 @@ def die_of_hog(trials, threads):
 
 @pytest.mark.process
 def test_try_each_reports_a_process_that_dies_and_goes_on(monkeypatch):
-    monkeypatch.setattr(trial, "_try_here", die_of_hog)
-    found = list(try_each([*offers(["hog"]), *offers(["seqslam"])], threads=1))
+    monkeypatch.setattr(trial, "_run_in_child", die_of_hog)
+    found = list(run_trials([*list_trials(["hog"]), *list_trials(["seqslam"])], threads=1))
     assert [each.label for each in found] == ["hog", "seqslam"], "one row for all forms of what cannot be used"
     assert "ended its process" in found[0].problem
     assert (found[0].costs, found[1].problem) == (None, None)

@@ -19,7 +19,7 @@ from edgevpr.core.types import Frame, StageCost
 from edgevpr.mavlink.address import parse_link
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.preflight import pick
-from edgevpr.runtime.service.check import Finding, check
+from edgevpr.runtime.service.check import Finding, check_configuration
 from edgevpr.runtime.service.findingcodes import FindingCode
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -61,14 +61,16 @@ def config_file(tmp_path) -> Path:
 def wrong(config_file: Path, settings: dict) -> list[Finding]:
     """What `check` finds wrong without an autopilot and without waiting for a frame."""
     config_file.write_text(yaml.safe_dump(settings))
-    findings = check(config_file, offline=True)
+    findings = check_configuration(config_file, offline=True)
     assert [finding.what for finding in findings] == ITEMS
     return [finding for finding in findings if not finding.ok]
 
 
 def test_check_finds_a_query_too_slow_for_any_fix_unless_it_is_a_dry_run(settings, config_file, monkeypatch):
-    probe = pick.probe
-    monkeypatch.setattr(pick, "probe", lambda technique: replace(probe(technique), encode=StageCost(6.0, 6.0)))
+    measure_costs = pick.measure_costs
+    monkeypatch.setattr(
+        pick, "measure_costs", lambda technique: replace(measure_costs(technique), encode=StageCost(6.0, 6.0))
+    )
     settings["board"] = "this"
     (finding,) = wrong(config_file, settings)
     assert (finding.what, finding.reason.code) == ("map", FindingCode.QUERY_TOO_SLOW)
@@ -102,7 +104,7 @@ def test_check_leaves_nothing_behind(settings, config_file, tmp_path, flight_fol
 def test_check_stops_at_a_configuration_that_cannot_be_read(config_file, text):
     if text is not None:
         config_file.write_text(text)
-    (finding,) = check(config_file)
+    (finding,) = check_configuration(config_file)
     assert (finding.what, finding.ok) == ("configuration", False)
     assert str(config_file) in finding.reason.parameters["problem"]
 
@@ -130,7 +132,7 @@ def test_check_finds_what_is_wrong_offline(settings, config_file, changes, wrong
 
 def test_check_of_an_unknown_board_does_not_open_the_map(settings, config_file):
     config_file.write_text(yaml.safe_dump(settings | {"board": "rpi-zero-2"}))
-    findings = {finding.what: finding.ok for finding in check(config_file, offline=True)}
+    findings = {finding.what: finding.ok for finding in check_configuration(config_file, offline=True)}
     assert not findings["board"]
     assert "map" not in findings
 
@@ -144,8 +146,8 @@ def test_check_reports_places_beyond_the_budget(settings, config_file):
         while len(place_map) * technique.spec.coarse.nbytes < 1e6:
             place_map.add(frame, descriptor)
     config_file.write_text(yaml.safe_dump(settings | {"map": str(big), "memory": {"budget_mb": 1}}))
-    (finding,) = (each for each in check(config_file, offline=True) if each.what == "map")
-    assert "places are left" in finding.reason.parameters["technique"]
+    (finding,) = (each for each in check_configuration(config_file, offline=True) if each.what == "map")
+    assert "are not loaded" in finding.reason.parameters["technique"]
 
 
 def test_check_finds_a_port_that_another_program_has(settings, config_file):
@@ -167,7 +169,7 @@ def test_check_opens_a_serial_port(settings, config_file):
 def wrong_online(config_file: Path, settings: dict) -> list[Finding]:
     """What `check` finds wrong when it waits for a frame and a heartbeat."""
     config_file.write_text(yaml.safe_dump(settings))
-    return [finding for finding in check(config_file) if not finding.ok]
+    return [finding for finding in check_configuration(config_file) if not finding.ok]
 
 
 def autopilot_of(settings: dict, **how) -> AnsweringAutopilot:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from edgevpr.core.errors import UsageError
-from edgevpr.power.boards import board_names, load_board
+from edgevpr.power.boards import list_boards, load_board
 from edgevpr.runtime.service.unit import render_unit
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
@@ -37,7 +37,7 @@ def directives(text: str) -> dict[str, str]:
 @pytest.mark.slow
 @needs_systemd
 def test_render_unit_passes_systemds_verification(tmp_path):
-    for name in board_names():
+    for name in list_boards():
         assert verify(render_unit(load_board(name)), tmp_path) == ""
 
 
