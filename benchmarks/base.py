@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.text import markdown
+from edgevpr.core.text import format_markdown_table
 from edgevpr.lab.evaluate import provenance
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -47,7 +47,11 @@ def run(main: Callable[[], object], opencv_threads: int | None = 1) -> None:
 def made_by() -> Row:
     """Return the date, the commit and the machine of a measurement."""
     versions = {"python": platform.python_version(), "numpy": np.__version__, "opencv": cv2.__version__}
-    return {"date": provenance.today(), "commit": commit(), "machine": {**provenance.machine(), **versions}}
+    return {
+        "date": provenance.format_date(),
+        "commit": commit(),
+        "machine": {**provenance.describe_machine(), **versions},
+    }
 
 
 @cache
@@ -124,7 +128,7 @@ def rounded(value: Any) -> Any:
 
 def made_line(found: Row, command: str) -> str:
     """Return the sentence that ends a page."""
-    return f"Commit {found['commit']}, {found['date']}, {found['machine']['cpu']}. Made by `{command}`."
+    return f"Commit {found['commit']}, {found['date']}, {found['describe_machine']['cpu']}. Made by `{command}`."
 
 
 def told(doc: str, until: str | None = None) -> str:
@@ -136,7 +140,7 @@ def told(doc: str, until: str | None = None) -> str:
 def table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, str], left: int = 1) -> str:
     """Return rows as a Markdown table. A column is its heading and a template such as "{error[median_m]:.1f}"; what a
     row lacks, or has as None, is "-"."""
-    return markdown(list(columns), [[cell(each, row) for each in columns.values()] for row in rows], left)
+    return format_markdown_table(list(columns), [[cell(each, row) for each in columns.values()] for row in rows], left)
 
 
 def cell(template: str, row: Mapping[str, Any]) -> str:

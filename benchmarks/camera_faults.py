@@ -36,7 +36,7 @@ from edgevpr.lab.simulate.camera import Camera, CameraPose, light_scene, photogr
 from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
     SCENE_WIDTH_M,
-    mapping_flight,
+    plan_mapping_flight,
     to_metres,
     to_position,
     write_flight,
@@ -191,7 +191,7 @@ class Lap:
 def fly(seconds: float, folder: Path) -> base.Row:
     """Make the map, fly, and return what was seen."""
     scene = make_scene(SEED, SCENE_WIDTH_M, SCENE_DEPTH_M)
-    flight = replace(mapping_flight(SEED), camera=CAMERA)
+    flight = replace(plan_mapping_flight(SEED), camera=CAMERA)
     list(write_flight(folder, scene, flight))
     fov_deg = math.degrees(2 * math.atan(CAMERA.width / 2 / CAMERA.focal_px))
     look = ("--camera", "nadir", "--fov-deg", f"{fov_deg:.2f}")

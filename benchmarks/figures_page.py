@@ -9,7 +9,7 @@ import base
 import sets_page
 from base import REPOSITORY, RESULTS
 
-from edgevpr.core.text import markdown
+from edgevpr.core.text import format_markdown_table
 
 BEGIN, END = "<!-- figures: made by benchmarks/figures_page.py -->\n", "<!-- end of figures -->"
 
@@ -63,7 +63,7 @@ def speed() -> str:
     rows += [[row["what"], f"{row['value']:.3g} {row['unit']}", "10 000 places"] for row in content["flight"]]
     return (
         f"Speed and memory on one thread of an {machine['cpu']}, made by `make bench`:\n\n"
-        f"{markdown(('what', 'measured', 'beside'), rows)}"
+        f"{format_markdown_table(('what', 'measured', 'beside'), rows)}"
     )
 
 

@@ -17,7 +17,7 @@ from mosaics import Ground, ground_of, laid, make_mosaic, write_tif
 from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light
-from edgevpr.lab.simulate.overflight import photograph_from
+from edgevpr.lab.simulate.overflight import photograph_ground
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 # Sets without positions, or too few of them: metres of a pixel and a place on the Earth are assumed.
@@ -128,7 +128,7 @@ def _rows(of: Path, folder: Path) -> Site:
             at = Position(*offset_position(photo.middle.lat_deg, photo.middle.lon_deg, float(east), float(north_m)))
             up_deg = 90.0 if lane % 2 == 0 else 270.0
             pose = CameraPose(east_m=0, north_m=0, height_m=_height_m(_ROWS_FOOTPRINT_M), heading_deg=up_deg)
-            image = photograph_from(photo, at, pose, camera, light, rng)
+            image = photograph_ground(photo, at, pose, camera, light, rng)
             if image is not None:
                 file = f"{len(positions):04d}.jpg"
                 cv2.imwrite(str(folder / "images" / file), image)

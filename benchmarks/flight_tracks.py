@@ -13,8 +13,8 @@ from flight_sites import Site
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Vehicle
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light
-from edgevpr.lab.simulate.generated import wander
-from edgevpr.lab.simulate.overflight import photograph_from
+from edgevpr.lab.simulate.generated import make_oscillation
+from edgevpr.lab.simulate.overflight import photograph_ground
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 QUERIES = 40
@@ -121,7 +121,7 @@ def _beside(site: Site, places: np.ndarray, rng: np.random.Generator) -> np.ndar
     """Return points beside the mapped way, as far aside as another flight would be."""
     numbers = np.arange(len(site.way))
     points = np.column_stack([np.interp(places, numbers, site.way[:, axis]) for axis in (0, 1)])
-    aside = np.column_stack([wander(rng, len(places)) for _ in range(2)]) * _ASIDE * site.footprint_m
+    aside = np.column_stack([make_oscillation(rng, len(places)) for _ in range(2)]) * _ASIDE * site.footprint_m
     still = np.append(False, np.diff(places) == 0)
     for at in np.flatnonzero(still):  # hovering, it stays within a fiftieth of a picture
         aside[at] = aside[at - 1] + rng.normal(0, 0.005, 2) * site.footprint_m
@@ -156,7 +156,7 @@ def _headings(at: np.ndarray, jumped: np.ndarray, rng: np.random.Generator) -> n
         if not jumped[number] and np.hypot(east, north) > 1.0:
             known = np.degrees(np.arctan2(east, north))
         course[number] = known
-    return (course + rng.uniform(0, 360) + 5.0 * wander(rng, len(at))) % 360
+    return (course + rng.uniform(0, 360) + 5.0 * make_oscillation(rng, len(at))) % 360
 
 
 def _footprints(site: Site, other: Site, over: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -164,7 +164,7 @@ def _footprints(site: Site, other: Site, over: np.ndarray, seen: np.ndarray, rng
     over, as seen from up to a fifth lower or higher, and lower where there is not so much ground."""
     nearest = np.argmin(((seen[:, None] - site.way[None]) ** 2).sum(axis=2), axis=1)
     own = np.convolve(np.pad(site.footprints_m[nearest], 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    higher = rng.uniform(0.8, 1.2) * (1 + 0.03 * wander(rng, len(seen)))
+    higher = rng.uniform(0.8, 1.2) * (1 + 0.03 * make_oscillation(rng, len(seen)))
     at_home = over == site.name
     widest_m = np.where(at_home, site.widest_m.at(seen), other.widest_m.at(seen))
     return np.minimum(np.where(at_home, own, other.footprint_m) * higher, widest_m)
@@ -176,7 +176,7 @@ def reports(track: Track, site: Site, how: str, rng: np.random.Generator) -> lis
     step_s = np.diff(track.t_s, prepend=track.t_s[0] - 1)[:, None]
     true = np.diff(track.at, axis=0, prepend=track.at[:1]) / step_s
     true[track.jumped] = 0
-    bias = _BIAS_M_S * np.column_stack([wander(rng, len(true)) for _ in range(2)])
+    bias = _BIAS_M_S * np.column_stack([make_oscillation(rng, len(true)) for _ in range(2)])
     told = true * rng.normal(1, _SCALE_SD) + bias + rng.normal(0, _NOISE_M_S, true.shape)
     from_here = len(true) // 3
     told[from_here:] *= {"doubles": 2.0, "halves": 0.5}.get(how, 1.0)
@@ -218,7 +218,7 @@ def photographs(
     )
     camera = replace(Camera(), noise_sigma=rng.uniform(1, 5), blur_px=rng.uniform(0, 2.5))
     quality = (cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(70, 95)))
-    roll, pitch = (_SWAY_DEG * wander(rng, len(track.at)) for _ in range(2))
+    roll, pitch = (_SWAY_DEG * make_oscillation(rng, len(track.at)) for _ in range(2))
     for number, name in enumerate(track.over):
         pose = CameraPose(
             east_m=0.0,
@@ -228,5 +228,5 @@ def photographs(
             roll_deg=float(roll[number]),
             pitch_deg=float(pitch[number]),
         )
-        image = photograph_from(photos[name], sites[name].position(track.seen[number]), pose, camera, light, rng)
+        image = photograph_ground(photos[name], sites[name].position(track.seen[number]), pose, camera, light, rng)
         yield image if image is None else cv2.imdecode(cv2.imencode(".jpg", image, quality)[1], cv2.IMREAD_COLOR)

@@ -34,7 +34,7 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import GeoTag
 from edgevpr.lab.simulate.camera import Camera, Light
-from edgevpr.lab.simulate.overflight import make_poses, photograph_from
+from edgevpr.lab.simulate.overflight import make_poses, photograph_ground
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser
@@ -113,7 +113,7 @@ def flown(raster: Path, fov_deg: float = FOV_DEG, tilt_deg: float = 0.0) -> Iter
             if tilt_deg:
                 shots[-1] = replace(shots[-1], roll_deg=0.0, pitch_deg=tilt_deg)
     for number, (shot, pose) in enumerate(zip(shots, make_poses(shots, _SEED), strict=True)):
-        image = photograph_from(photo, shot.position, pose, camera, _LIGHT, rng)
+        image = photograph_ground(photo, shot.position, pose, camera, _LIGHT, rng)
         if image is None and tilt_deg:
             continue  # a tilted view reaches far
         if image is None:

@@ -27,8 +27,8 @@ from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.evaluate import provenance
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
-from edgevpr.lab.evaluate.evaluate import MatchOptions, evaluate, read_known
-from edgevpr.lab.evaluate.metrics import compare
+from edgevpr.lab.evaluate.evaluate import MatchOptions, evaluate, read_prior
+from edgevpr.lab.evaluate.metrics import add_pcu
 from edgevpr.runtime.preflight.choose import ACCURACY_PATH as ACCURACY
 from edgevpr.techniques import create
 from edgevpr.techniques.session import hash_model_file
@@ -181,10 +181,10 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
         rows[variant.label] = asdict(replace(result, technique=variant.label)) | {
             "precision_recall": thinned(result.precision_recall) if sets_page.is_drawn(variant.label) else [],
             "commit": base.commit(),
-            "cpu": provenance.cpu_model(),
+            "cpu": provenance.read_cpu_model(),
         }
     in_order = [rows[variant.label] for variant in VARIANTS if variant.label in rows]
-    for row, each in zip(in_order, compare(sets_page.result(row) for row in in_order), strict=True):
+    for row, each in zip(in_order, add_pcu(sets_page.result(row) for row in in_order), strict=True):
         row |= asdict(each)  # the slowest encoder of all may be another now
     made = base.made_by()
     content = {"set": folder.name, "use": base.use_of(folder.name), "date": made["date"], "machine": made["machine"]}
@@ -199,7 +199,7 @@ def can_be_asked(variant: Variant, folder: Path, dataset: Dataset) -> bool:
         return True
     spec = create(variant.technique, settings(variant, folder)).spec
     try:
-        read_known(variant.options.known, dataset, spec, variant.options.sequence)
+        read_prior(variant.options.known, dataset, spec, variant.options.sequence)
     except UsageError:
         return False
     return True

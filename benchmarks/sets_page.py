@@ -6,13 +6,13 @@ from typing import Any
 
 import base
 
-from edgevpr.core.text import markdown
+from edgevpr.core.text import format_markdown_table
 from edgevpr.lab.evaluate import tables
-from edgevpr.lab.evaluate.metrics import Quality, TechniqueResult, from_json
+from edgevpr.lab.evaluate.metrics import Quality, TechniqueResult, read_result
 
 CURVES = "curves.png"
 _PANELS_A_ROW = 3
-_REACHED = (*tables.RECALLS, *tables.CURVE, *tables.DECIDED)
+_REACHED = (*tables.RECALLS, *tables.CURVE, *tables.DECISIONS)
 _PAID = ("grief_stromovka_seasons", "aerial_swindale")  # whose costs are shown: ahead, and down
 # More than ten colours cannot be told apart: after ten curves the line style changes.
 _LINES = ("-", "--", ":", "-.")
@@ -49,7 +49,7 @@ beside this page hold every figure.
 
 def result(row: dict[str, Any]) -> TechniqueResult:
     """Return a row of a file as what it was."""
-    return from_json(row)
+    return read_result(row)
 
 
 def read_sets(folder: Path) -> list[dict[str, Any]]:
@@ -129,7 +129,7 @@ def _page(contents: list[dict[str, Any]], results: dict[str, list[TechniqueResul
 Made by `make results` with {machine["cores"]} cores, BLAS threads: {machine["blas_threads"]}; the table of costs names
 the machine of each row. Python {machine["python"]}, NumPy {machine["numpy"]}, OpenCV {machine["opencv"]}.
 
-{markdown(("set", "use", "date", "commit"), made)}
+{format_markdown_table(("set", "use", "date", "commit"), made)}
 
 {_ABOUT}
 Weights in use:
@@ -146,7 +146,7 @@ Of the queries whose place is in the map:
 
 ## Recognition
 
-{markdown(("set", *tables.list_headings(_REACHED)), reached)}
+{format_markdown_table(("set", *tables.list_headings(_REACHED)), reached)}
 
 Rows are of all queries; where some have no place in the map, those called *in map* are of the others alone. Measured
 before these were counted, so that they were not asked: {", ".join(old) or "none"}.
@@ -161,7 +161,7 @@ before these were counted, so that they were not asked: {", ".join(old) or "none
 
 ## Costs
 
-{markdown(("set", *tables.list_headings(tables.COSTS), "machine"), paid)}
+{format_markdown_table(("set", *tables.list_headings(tables.COSTS), "machine"), paid)}
 
 * Means over the queries; t_m is for all references. U: share of all cores. Of the other sets the JSON files have them.
 * mAh: {contents[0]["ah_assumes"]}.
@@ -184,7 +184,7 @@ def overview(contents: list[dict[str, Any]], wanted: Callable[[str], bool] = lam
         rows.append([label, " or ".join(map(str, sizes)), *recalls])
     queries = [of_matches(_rows(content)[0])["queries"] for content in contents]
     heads = [f"{each['set']} ({each['use']}, {count})" for each, count in zip(contents, queries, strict=True)]
-    return markdown(("technique", "RAM B/place", *heads), rows)
+    return format_markdown_table(("technique", "RAM B/place", *heads), rows)
 
 
 def _rows(content: dict[str, Any]) -> list[dict[str, Any]]:

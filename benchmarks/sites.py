@@ -32,7 +32,7 @@ from foreign_places import MIRRORED, foreign
 from run_sets import join
 
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
-from edgevpr.lab.evaluate.metrics import interval
+from edgevpr.lab.evaluate.metrics import wilson_interval
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.examine import examine
 from edgevpr.places.index import bytes_per_place
@@ -191,7 +191,7 @@ def measured(camera: str, count: int) -> Row:
         "of_sites": sum(name in set(dataset.references) for name in names),
         "queries": len(hits),
         "recall_at_1": round(float(np.mean(hits)), 4),
-        "recall_at_1_interval": interval(np.array(hits)),
+        "recall_at_1_interval": wilson_interval(np.array(hits)),
         "accepted_right": int(accepted) - beside - len(wrong),
         "accepted_beside": beside,
         "accepted_wrong": len(wrong),

@@ -15,7 +15,7 @@ from thesis_values import (
     total_ah,
 )
 
-from edgevpr.core.text import markdown
+from edgevpr.core.text import format_markdown_table
 
 FLOAT_BYTES = 4
 
@@ -35,7 +35,7 @@ def charge() -> str:
 t_e and t_m. The inputs are printed with two to four digits; the last column says whether numbers that are printed so
 give the printed Ah_t.
 
-{markdown(("technique", "thesis, Ah", "here, Ah", "difference", "within the printed digits"), rows)}
+{format_markdown_table(("technique", "thesis, Ah", "here, Ah", "difference", "within the printed digits"), rows)}
 
 Equation 5.3 adds the powers of encoding and matching, which follow one another. Their energies add, as 5.6 has it, and
 so it is here.
@@ -76,7 +76,7 @@ t_e: table 6.1, page 103. t_m: table 5.2, page 87, over its {power["references"]
 6.3.2. *Author's*: the times that he published with his matrices of corridor. Here: corridor, wall time, one thread, on
 {" and ".join(cpus)}, and for networks small ones. The thesis ran on an Intel Xeon Gold 6134 with 32 logical CPUs.
 
-{markdown(heads, rows)}
+{format_markdown_table(heads, rows)}
 
 CoHOG's t_m of {1e6 * float(THESIS["cohog"]["t_match_per_ref_s"]):.0f} µs is the product of {min(regions)} to
 {max(regions)} good regions with {many} regions of {numbers} numbers, {products / 1e6:.0f} million multiplications: more
@@ -120,7 +120,7 @@ s); the figure itself prints no numbers. Beside them the PCU of the author's mat
 slowest technique: across columns only the order tells something. Here even the slowest network is a small one, so that
 what CoHOG gains by its speed is small. *seasons*: grief_stromovka_seasons.
 
-{markdown(heads, rows)}
+{format_markdown_table(heads, rows)}
 
 CoHOG and the best of the other techniques, on each set of the thesis: {"; ".join(best)}. So the thesis's sentence that
 CoHOG has the best PCU on all five sets holds. On Cross-Seasons CoHOG's own best 400 regions have more. By the
@@ -152,7 +152,7 @@ figures have no numbers. Here CoHOG keeps a place code in RAM and its regions, 8
 Cross-Region-BoW keeps its words, and its regions on disk; Region-VLAD keeps half precision, and the small network's
 map has fewer channels.
 
-{markdown(heads, rows)}
+{format_markdown_table(heads, rows)}
 """
 
 

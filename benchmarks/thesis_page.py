@@ -6,7 +6,7 @@ import thesis_costs as costs
 import thesis_quality as quality
 from thesis_values import ROWS, THESIS, Results, total_ah
 
-from edgevpr.core.text import markdown
+from edgevpr.core.text import format_markdown_table
 
 
 def answers(results: Results) -> list[list[str]]:
@@ -42,11 +42,11 @@ thesis's values stand in [thesis.yaml](../benchmarks/thesis.yaml), each with its
 [thesis.json](../benchmarks/results/thesis.json), from the results of `make results` and `make bench`, and from the
 thesis's own inputs.
 
-{markdown(("thesis", "how", "what came out", "section"), answers(results))}
+{format_markdown_table(("thesis", "how", "what came out", "section"), answers(results))}
 """
     tail = f"""## What cannot be reproduced
 
-{markdown(("what", "why"), missing)}
+{format_markdown_table(("what", "why"), missing)}
 """
     sections = (
         costs.charge(),

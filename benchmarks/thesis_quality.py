@@ -2,7 +2,7 @@
 
 from thesis_values import MATRICES, ROWS, THESIS, Results, measured_rows, sentence
 
-from edgevpr.core.text import markdown
+from edgevpr.core.text import format_markdown_table
 
 # What is different here from the author's techniques.
 SMALL = "the small network that is shipped stands in for a large one trained for places or ImageNet"
@@ -45,11 +45,11 @@ matrices of eight techniques on it with his later benchmark, VPR-Bench. Here bot
 through that of `edgevpr eval --similarity`, the techniques through `edgevpr eval` (`cohog` as in the thesis, with
 `matching=thesis` and `--exact`). One query is {1 / flown["queries"]:.3f}.
 
-{markdown(found_heads, found)}
+{format_markdown_table(found_heads, found)}
 
 AUC is from recall 0, as VPR-Bench and scikit-learn compute it; the thesis's own is by equation 2.3.
 
-{markdown(shaped_heads, shaped)}
+{format_markdown_table(shaped_heads, shaped)}
 
 AMOSNet and HybridNet differ by their weights alone, and so not at all on the same small network. CALC is the only
 network of which the author's own weights are at hand, and comes out the same. `cohog` as it flies
@@ -76,7 +76,7 @@ and the most that the thesis has on them, the others are other places, and no di
 compared is the order of the techniques on the same set. Networks here are small ones in the place of large ones; in
 the sets from the air `cohog` as it flies looks down and turns, and the thesis's CoHOG does not.
 
-{markdown(("technique", "thesis, five sets", *sets), rows)}
+{format_markdown_table(("technique", "thesis, five sets", *sets), rows)}
 """
 
 
@@ -108,7 +108,7 @@ AUC with the gate, what it discards, and the size of the map, on the sets here, 
 discards any query ([salience.md](../benchmarks/results/salience.md): networks that have not seen the set, and a
 memorability threshold of their own; the thesis's are {", ".join(limits.values())}):
 
-{markdown(gate_heads, gate)}
+{format_markdown_table(gate_heads, gate)}
 
 The thesis found a larger AUC for every technique on every set (figure 3.12), and a larger share of the wrong matches
 discarded than of the right ones (figure 3.21). Here the AUC is larger in {larger} of {len(gate)} rows, and the share in

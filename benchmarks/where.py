@@ -28,7 +28,7 @@ from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Place
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
-from edgevpr.lab.simulate.generated import fly_and_write
+from edgevpr.lab.simulate.generated import write_generated_flight
 from edgevpr.mapmaking.graph import Solved, Ties, solve
 from edgevpr.places.mapfile import PlaceMap
 
@@ -167,7 +167,7 @@ def generated(work: Path, what: str, lens: tuple[str, ...]) -> Row:
     for seed in SEEDS:
         folder = work / f"seed{seed}{len(lens)}"
         for which in ("map", "query"):
-            fly_and_write(folder / which, which, seed)
+            write_generated_flight(folder / which, which, seed)
         _add_noise(folder / "map" / "positions.csv", seed)
         true = {name: tag.position for name, tag in read_positions(folder / "query" / "positions.csv").items()}
         for how, flags in HOWS.items():

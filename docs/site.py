@@ -18,7 +18,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from edgevpr.cli.main import EXIT_CODES, command_line
+from edgevpr.cli.main import EXIT_CODES, make_parser
 from edgevpr.core.config import Config, Key, list_keys
 from edgevpr.core.reasons import Code, ReasonCode
 from edgevpr.mavlink.channel import Channel
@@ -156,7 +156,7 @@ def commands() -> str:
     lines = ["# Command line", "", "Made from the program's own help. `--debug` shows the traceback of an error.", ""]
     lines += ["## Exit codes", "", "| code | meaning |", "|---|---|"]
     lines += [*(f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items()), ""]
-    for parser in parsers(command_line()):
+    for parser in parsers(make_parser()):
         lines += [f"## {parser.prog}", "", parser.description or "", ""]
         lines += ["```text", re.sub(r"^usage: ", "", parser.format_usage()).rstrip(), "```", ""]
         rows = [(named(each), each.help) for each in parser._actions if each.help not in (None, argparse.SUPPRESS)]

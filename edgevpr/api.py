@@ -214,7 +214,7 @@ def build(
         path=_to_path(path), pictures=pictures, technique=technique, parameters={}, refine=refine, calibrate=calibrate
     )
     settings = load_config(config, {"source.camera": camera})
-    shown = text.progress if progress is None else _reported_to(progress)
+    shown = text.progress if progress is None else _wrap_progress(progress)
     with ThreadpoolController().limit(limits=1, user_api="blas"):
         made = make_map(order, settings, lambda error: _log.warning("%s", error), shown)
     for sentence in made.not_done:
@@ -222,7 +222,7 @@ def build(
     return made
 
 
-def _reported_to(progress: Progress) -> Any:
+def _wrap_progress(progress: Progress) -> Any:
     def shown(items: Iterable[T], total: int, label: str) -> Iterator[T]:
         for done, item in enumerate(items, 1):
             yield item

@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import (
+    add_command,
     add_json,
     add_keys,
     add_known,
     add_parameters,
-    command,
     load_command_config,
     parse_parameters,
+    parse_positive,
     parse_value,
-    positive,
-    report,
-    show,
+    print_notes,
+    print_result,
     to_path,
 )
 from edgevpr.core.config import FORMS
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     """Add the command and its flags."""
-    parser = command(commands, "eval", evaluate, "evaluate techniques on data sets with ground truth")
+    parser = add_command(commands, "eval", run_eval, "evaluate techniques on data sets with ground truth")
     parser.add_argument("--data", nargs="+", default=[], metavar="FOLDER", help="data sets in any known layout")
     parser.add_argument("--query", metavar="FOLDER", help="folder of query images")
     parser.add_argument("--ref", metavar="FOLDER", help="folder of reference images")
     parser.add_argument("--ground-truth", metavar="FILE", help="CSV: query_file,ref_files (else: what is near)")
     parser.add_argument(
         "--within-m",
-        type=positive,
+        type=parse_positive,
         default=25.0,
         metavar="M",
         help="distance in metres that counts as near (default: 25)",
@@ -63,14 +63,13 @@ def add(commands: Any) -> None:
     add_json(parser)
 
 
-def evaluate(args: Namespace) -> int:
+def run_eval(args: Namespace) -> int:
     """Run `eval`: measure stored similarities, or rows on data sets, and print the results. With --out they are written
     there, and rows that an earlier run measured are reused."""
     if args.similarity:
         return _measure_similarities(args)
     from edgevpr.lab.evaluate.evaluate import MatchOptions
     from edgevpr.lab.evaluate.runs import Plan, measure, write_results
-    from edgevpr.lab.evaluate.tables import results_text
 
     config, rows, sets = load_command_config(args, args.config), _list_rows(args), _open_sets(args)
     options = MatchOptions(
@@ -90,12 +89,12 @@ def evaluate(args: Namespace) -> int:
     elif len(sets) == 1:
         content["techniques"] = {row["row"]: row for row in content.pop("results")}
     tables = [
-        f"{sanitize(name)}\n\n{results_text([row.result for row in measured])}\n"
+        f"{sanitize(name)}\n\n{format_results([row.result for row in measured])}\n"
         for name, measured in outcome.found.items()
         if measured
     ]
-    show(content, args.json, "\n".join(tables))
-    report(*(f"{name}, {row} was not measured: {error}" for (name, row), error in outcome.failed.items()))
+    print_result(content, args.json, "\n".join(tables))
+    print_notes(*(f"{name}, {row} was not measured: {error}" for (name, row), error in outcome.failed.items()))
     return 1 if outcome.failed else 0
 
 
@@ -103,7 +102,7 @@ def _measure_similarities(args: Namespace) -> int:
     from edgevpr.lab.evaluate.dataset import list_names, read_truth
     from edgevpr.lab.evaluate.provenance import describe_origin
     from edgevpr.lab.evaluate.similarity import add_unscored, measure, read_similarities
-    from edgevpr.lab.evaluate.tables import results_text
+    from edgevpr.lab.evaluate.tables import format_results
 
     if not args.ground_truth:
         raise UsageError("Name the ground truth of the stored similarities with --ground-truth.")
@@ -113,7 +112,7 @@ def _measure_similarities(args: Namespace) -> int:
     references = list_names(args.ref) if args.ref else None
     results = [measure(Path(file).stem, read_similarities(file), truth, references) for file in args.similarity]
     measured = {result.technique: asdict(result) for result in results}
-    show({**describe_origin(), "similarities": measured}, args.json, results_text(results))
+    print_result({**describe_origin(), "similarities": measured}, args.json, format_results(results))
     return 0
 
 
@@ -156,7 +155,7 @@ def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
             raise UsageError(f"--param {key}: write TECHNIQUE.KEY=VALUE with a technique of --techniques.")
         settings[name][parameter] = value
     if any("camera" in techniques.read_parameters(name) and "camera" not in settings[name] for name in wanted):
-        report("the camera is taken to look ahead: where it looks straight down, say `--camera nadir`")
+        print_notes("the camera is taken to look ahead: where it looks straight down, say `--camera nadir`")
     rows = {}
     for name in wanted:
         has_forms = "form" in techniques.read_parameters(name) and "form" not in settings[name]

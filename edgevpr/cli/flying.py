@@ -8,20 +8,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli.shared import (
+    add_command,
+    add_group,
     add_json,
     add_keys,
     add_known,
     add_positions,
     add_recording,
-    command,
-    exit_code,
-    group,
-    leave_out,
     load_command_config,
-    show,
+    print_result,
+    report_unusable,
+    skip_image,
     to_path,
 )
-from edgevpr.core.config import place_logs_in
+from edgevpr.core.config import resolve_log_paths
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import progress
 
@@ -39,7 +39,7 @@ _MATCHING_KEYS = (
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    match = command(commands, "match", run_match, "look up images in a map, offline")
+    match = add_command(commands, "match", run_match, "look up images in a map, offline")
     match.add_argument("map", metavar="MAP")
     add_recording(match)
     match.add_argument("--config", metavar="FILE", help="configuration of the flight; flags override it")
@@ -48,23 +48,25 @@ def add(commands: Any) -> None:
     add_known(match)
     add_json(match)
 
-    run = command(commands, "run", run_flight, "recognise places in flight and send positions to the autopilot")
+    run = add_command(commands, "run", run_flight, "recognise places in flight and send positions to the autopilot")
     run.add_argument("--config", metavar="FILE", help="configuration file (YAML); flags override it")
     add_keys(run)
     add_positions(run)
 
-    check = command(commands, "check", run_check, "check a configuration before flight")
+    check = add_command(commands, "check", run_check, "check a configuration before flight")
     check.add_argument("--config", required=True, metavar="FILE")
     check.add_argument("--offline", action="store_true", help="do not wait for a frame or a heartbeat")
     add_json(check)
 
-    services = group(commands, "service", "print the systemd unit")
-    unit = command(services, "print", service_print, "print the systemd unit")
+    services = add_group(commands, "service", "print the systemd unit")
+    unit = add_command(services, "print", run_service_print, "print the systemd unit")
     unit.add_argument(
         "--board", default="this", metavar="NAME", help="board that the unit is for (default: this computer)"
     )
 
-    doctor = command(commands, "doctor", run_doctor, "check the autopilot's parameters and this computer (read-only)")
+    doctor = add_command(
+        commands, "doctor", run_doctor, "check the autopilot's parameters and this computer (read-only)"
+    )
     doctor.add_argument("--config", metavar="FILE", help="configuration of the flight; flags override it")
     add_keys(doctor, "mavlink.link")
     add_json(doctor)
@@ -89,13 +91,13 @@ def run_match(args: Namespace) -> int:
     source = open_source(args.source, positions=to_path(args.positions), live=False)
     if known:
         _require_known(args, known, recogniser)
-    frames = read_to_end(source, lambda error: leave_out(error, unusable))
+    frames = read_to_end(source, lambda error: skip_image(error, unusable))
     place_map = recogniser.place_map
     is_calibrated = place_map.calibration is not None
     for frame in filter(None, progress(frames, source.total, "matching")):
         event = recogniser.step(frame)
         if event.failed:
-            leave_out(ImageError(f"{frame.name}: {event.reason}"), unusable)
+            skip_image(ImageError(f"{frame.name}: {event.reason}"), unusable)
             continue
         found.append(format_match(event) | {"calibrated": is_calibrated})
         if known:
@@ -107,8 +109,8 @@ def run_match(args: Namespace) -> int:
         lines.append(f"Known of each query: {','.join(known)}.")
     if weights := describe_weights(recogniser.technique.spec):
         lines.append(f"Weights of {weights}.")
-    show(found, args.json, "\n".join(lines))
-    return exit_code(unusable)
+    print_result(found, args.json, "\n".join(lines))
+    return report_unusable(unusable)
 
 
 def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recogniser") -> None:
@@ -132,7 +134,7 @@ def run_flight(args: Namespace) -> int:
     from edgevpr.runtime.flight.flight import fly
 
     config = load_command_config(args, args.config)
-    log = place_logs_in(config.log, os.environ.get("LOGS_DIRECTORY", ""))
+    log = resolve_log_paths(config.log, os.environ.get("LOGS_DIRECTORY", ""))
     return fly(replace(config, log=log), to_path(args.positions))
 
 
@@ -161,11 +163,11 @@ def _show_findings(findings: "Sequence[Finding]", as_json: bool, **others: Any) 
     from edgevpr.runtime.service.finding import format_findings
 
     is_ok, fields = all(finding.ok for finding in findings), [finding.fields() for finding in findings]
-    show({**others, "ok": is_ok, "findings": fields}, as_json, format_findings(findings))
+    print_result({**others, "ok": is_ok, "findings": fields}, as_json, format_findings(findings))
     return max(finding.exit_code for finding in findings)
 
 
-def service_print(args: Namespace) -> int:
+def run_service_print(args: Namespace) -> int:
     """Run `service print`: print the systemd unit for a board."""
     from edgevpr.power.boards import load_board
     from edgevpr.runtime.service.unit import render_unit

@@ -32,7 +32,7 @@ def program() -> None:
     if "_ARGCOMPLETE" in os.environ:  # the shell asks how a line may go on
         import argcomplete
 
-        argcomplete.autocomplete(command_line())
+        argcomplete.autocomplete(make_parser())
     code = main()
     if threading.active_count() > 1:
         # A capture thread hangs in a stream that does not answer. In a normal exit FFmpeg would abort Python.
@@ -49,7 +49,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(argv: list[str]) -> int:
-    args, unknown = command_line().parse_known_args(argv)
+    args, unknown = make_parser().parse_known_args(argv)
     if unknown:
         hint = suggest(unknown[0].partition("=")[0], args.parser._option_string_actions, "")
         args.parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint and '; '}{hint}")
@@ -89,7 +89,7 @@ def _report_failure(args: argparse.Namespace, error: Exception, sentence: str, e
 
 
 @cache  # making it takes two thirds of the time of a short command, and one process may run many
-def command_line() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     parser = Parser(prog="edgevpr", description="Visual place recognition for the companion computer of a small drone.")
     parser.add_argument("--version", action="version", version=f"edgevpr {__version__}")

@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING, Any
 
 from edgevpr.cli import subset
 from edgevpr.cli.shared import (
+    add_command,
+    add_group,
     add_json,
     add_keys,
     add_map_images,
     add_parameters,
     add_recording,
-    command,
-    count,
-    exit_code,
-    group,
-    leave_out,
+    check_output,
     load_command_config,
+    parse_count,
     parse_parameters,
-    positive,
-    require_out,
-    show,
+    parse_positive,
+    print_result,
+    report_unusable,
+    skip_image,
     to_path,
-    write_out,
+    write_output,
 )
 from edgevpr.cli.wording import format_build, format_check, format_info, format_move, format_refinement
 from edgevpr.core.errors import ImageError, UsageError
@@ -34,49 +34,49 @@ from edgevpr.core.text import progress
 if TYPE_CHECKING:
     from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
 
-_OF_AN_ORTHOPHOTO = ("footprint_m", "spacing_m", "area", "attribution")
-_OF_A_RECORDING = ("positions", "rate_hz")
+_ORTHOPHOTO_FLAGS = ("footprint_m", "spacing_m", "area", "attribution")
+_RECORDING_FLAGS = ("positions", "rate_hz")
 
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    maps = group(commands, "map", "build, inspect, check, repair, merge and shrink maps")
+    maps = add_group(commands, "map", "build, inspect, check, repair, merge and shrink maps")
 
     def of_map(name: str, run: Callable[[Namespace], int], text: str, more: str | None = None) -> ArgumentParser:
-        parser = command(maps, name, run, text)
+        parser = add_command(maps, name, run, text)
         parser.add_argument("map", metavar="MAP", help=more)
         return parser
 
-    _add_build(of_map("build", map_build, "build a map from images or from an orthophoto", "map to write (.gpkg)"))
-    refine = of_map("refine", map_refine, "refine the positions of the places by matching their images")
+    _add_build(of_map("build", run_map_build, "build a map from images or from an orthophoto", "map to write (.gpkg)"))
+    refine = of_map("refine", run_map_refine, "refine the positions of the places by matching their images")
     refine.add_argument("--images", metavar="DIR", help="images that the map was built from")
     add_json(refine)
-    move = of_map("move", map_move, "shift a map by the offset from GPS that a flight measured")
+    move = of_map("move", run_map_move, "shift a map by the offset from GPS that a flight measured")
     move.add_argument("--by", metavar="LOG", required=True, help="log of a flight with this map and with GPS")
     add_json(move)
-    calibrate = of_map("calibrate", map_calibrate, "calibrate match confidence from the map's own images")
+    calibrate = of_map("calibrate", run_map_calibrate, "calibrate match confidence from the map's own images")
     _add_pictures(calibrate)
     calibrate.add_argument("--config", metavar="FILE", help="configuration of the flight (camera, mask, precision)")
     add_keys(calibrate, "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
     add_json(calibrate)
-    info = of_map("info", map_info, "print what a map contains, or make a page of it")
+    info = of_map("info", run_map_info, "print what a map contains, or make a page of it")
     info.add_argument("--page", metavar="FILE", help="write an HTML page that opens offline")
     add_map_images(info)
     info.add_argument("--config", metavar="FILE", help="configuration of the mapping flight (its lens)")
     add_keys(info, "source.lens", "source.fov_deg", "source.up_deg")
     add_json(info)
-    add_json(of_map("check", map_check, "read the whole map and report what is damaged"))
-    add_json(of_map("repair", map_repair, "remove damaged places; keep the original as MAP.damaged"))
-    merge = command(maps, "merge", map_merge, "merge maps of the same technique")
+    add_json(of_map("check", run_map_check, "read the whole map and report what is damaged"))
+    add_json(of_map("repair", run_map_repair, "remove damaged places; keep the original as MAP.damaged"))
+    merge = add_command(maps, "merge", run_map_merge, "merge maps of the same technique")
     merge.add_argument("out", metavar="OUT", help="map to write")
     merge.add_argument("maps", metavar="MAP", nargs="+")
     add_json(merge)
-    smaller = of_map("shrink", map_shrink, "reduce a map to its best places, spread over its area")
+    smaller = of_map("shrink", run_map_shrink, "reduce a map to its best places, spread over its area")
     smaller.add_argument("out", metavar="OUT", help="map to write")
-    smaller.add_argument("--places", type=count, metavar="N", required=True, help="number of places to keep")
+    smaller.add_argument("--places", type=parse_count, metavar="N", required=True, help="number of places to keep")
     add_json(smaller)
     subset.add(of_map)
-    worth = command(commands, "salience", run_salience, "print how memorable each image is")
+    worth = add_command(commands, "salience", run_salience, "print how memorable each image is")
     worth.add_argument("image", metavar="IMAGE")
     worth.add_argument("--config", metavar="FILE", help="configuration file; its section `salience` is used")
     add_json(worth)
@@ -89,7 +89,7 @@ def _add_build(build: ArgumentParser) -> None:
     build.add_argument("--board", default="this", metavar="NAME", help="board to plan for (default: this computer)")
     build.add_argument("--config", metavar="FILE", help="configuration of the flight (camera, mask, salience)")
     add_keys(build, "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg", "salience.use")
-    build.add_argument("--rate-hz", type=positive, metavar="HZ", help="places per second of a video")
+    build.add_argument("--rate-hz", type=parse_positive, metavar="HZ", help="places per second of a video")
     build.add_argument("--no-refine", dest="refine", action="store_false", help="keep the recorded positions")
     build.add_argument("--no-calibrate", dest="calibrate", action="store_false", help="skip the confidence calibration")
     build.add_argument("--attribution", metavar="TEXT", help="attribution that the orthophoto's licence requires")
@@ -109,7 +109,7 @@ def _add_pictures(parser: ArgumentParser) -> None:
     )
     flags.add_argument(
         "--footprint-m",
-        type=_lengths,
+        type=_parse_lengths,
         metavar="M",
         help="ground along the longest side of an image, in metres; a list for several heights: 75,105,150",
     )
@@ -126,7 +126,7 @@ def _add_pictures(parser: ArgumentParser) -> None:
     )
 
 
-def _lengths(text: str) -> tuple[float, ...]:
+def _parse_lengths(text: str) -> tuple[float, ...]:
     """Read "75,105,150", as the `type` of a flag. Raises ArgumentTypeError for another text."""
     try:
         return tuple(map(float, text.split(",")))
@@ -134,13 +134,13 @@ def _lengths(text: str) -> tuple[float, ...]:
         raise ArgumentTypeError(f"`{text}` is no length in metres, nor several with commas between them") from None
 
 
-def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
+def _parse_pictures(args: Namespace) -> "FlownPictures | Cuttings":
     """Return the pictures that the flags name: those of a recording or of an orthophoto. Raises UsageError."""
     from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
 
     if (args.source is None) == (args.orthophoto is None):
         raise UsageError("Give either --images (pictures of a flight) or --orthophoto: a map is made of one of them.")
-    others = _OF_AN_ORTHOPHOTO if args.orthophoto is None else _OF_A_RECORDING
+    others = _ORTHOPHOTO_FLAGS if args.orthophoto is None else _RECORDING_FLAGS
     if given := [name for name in others if getattr(args, name, None) is not None]:
         source = "--orthophoto" if args.orthophoto is None else "--images"
         raise UsageError(f"--{given[0].replace('_', '-')} goes with {source}: leave it out.")
@@ -149,18 +149,18 @@ def _pictures(args: Namespace) -> "FlownPictures | Cuttings":
         return FlownPictures(source=args.source, positions=to_path(args.positions), rate_hz=rate_hz)
     if args.footprint_m is None or args.spacing_m is None:
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
-    about: dict[str, Any] = {name: getattr(args, name, None) for name in _OF_AN_ORTHOPHOTO}
+    about: dict[str, Any] = {name: getattr(args, name, None) for name in _ORTHOPHOTO_FLAGS}
     return Cuttings(orthophoto=args.orthophoto, **about)
 
 
-def map_build(args: Namespace) -> int:
+def run_map_build(args: Namespace) -> int:
     """Run `map build`: make a map from a recording or an orthophoto, or add to one."""
     from edgevpr.mapmaking.making import MapOrder, make_map
 
     config = load_command_config(args, args.config)
     order = MapOrder(
         path=args.map,
-        pictures=_pictures(args),
+        pictures=_parse_pictures(args),
         technique=args.technique,
         parameters=parse_parameters(args.param),
         board=args.board,
@@ -169,17 +169,19 @@ def map_build(args: Namespace) -> int:
         calibrate=args.calibrate,
     )
     unusable: list[ImageError] = []
-    made = make_map(order, config, lambda error: leave_out(error, unusable), progress)
+    made = make_map(order, config, lambda error: skip_image(error, unusable), progress)
     more: dict[str, Any] = {"covered": asdict(made.covered)} if made.covered else {}
     more |= {"refined": asdict(made.refined)} if made.refined else {}
     more |= {"calibration": made.calibration.figures()} if made.calibration else {}
     more |= {"not_done": made.not_done} if made.not_done else {}
     about = {"map": args.map, "technique": made.technique, "places": made.places}
-    show({**about, **asdict(made.result), **more}, args.json, format_build(args.map, made, args.orthophoto is not None))
-    return exit_code(unusable)
+    print_result(
+        {**about, **asdict(made.result), **more}, args.json, format_build(args.map, made, args.orthophoto is not None)
+    )
+    return report_unusable(unusable)
 
 
-def map_refine(args: Namespace) -> int:
+def run_map_refine(args: Namespace) -> int:
     """Run `map refine`: correct the positions of a map's pictures by comparing them, and print the result."""
     from edgevpr.mapmaking.finishing import refine_map
     from edgevpr.places.mapfile import PlaceMap
@@ -187,36 +189,38 @@ def map_refine(args: Namespace) -> int:
 
     with PlaceMap.open_for_adding(args.map) as place_map:
         refined = refine_map(place_map, create_technique(place_map), args.images, progress)
-    show({"map": args.map, **asdict(refined)}, args.json, format_refinement(args.map, refined))
+    print_result({"map": args.map, **asdict(refined)}, args.json, format_refinement(args.map, refined))
     return 0
 
 
-def map_move(args: Namespace) -> int:
+def run_map_move(args: Namespace) -> int:
     """Run `map move`: move the places of a map by the offset from GPS that a flight has found, and print the move."""
     from edgevpr.mapmaking.moving import move_map
     from edgevpr.places.mapfile import PlaceMap
 
     with PlaceMap.open_for_adding(args.map) as place_map:
         done = move_map(place_map, args.by)
-    show({"map": args.map, **asdict(done)}, args.json, format_move(args.map, done))
+    print_result({"map": args.map, **asdict(done)}, args.json, format_move(args.map, done))
     return 0
 
 
-def map_calibrate(args: Namespace) -> int:
+def run_map_calibrate(args: Namespace) -> int:
     """Run `map calibrate`: calibrate the confidence of matches in a map, and print what to expect of the map."""
     from edgevpr.mapmaking.finishing import calibrate_map, make_encoder
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.runtime.recognise.opening import create_technique
 
-    config, pictures = load_command_config(args, args.config), _pictures(args)
+    config, pictures = load_command_config(args, args.config), _parse_pictures(args)
     with PlaceMap.open_for_adding(args.map) as place_map:
         encoder = make_encoder(config.source, pictures, create_technique(place_map))
         found = calibrate_map(place_map, encoder, config.match, pictures, progress)
-    show({"map": args.map, "calibration": found.figures()}, args.json, [f"{args.map}: calibrated: {found.described()}"])
+    print_result(
+        {"map": args.map, "calibration": found.figures()}, args.json, [f"{args.map}: calibrated: {found.described()}"]
+    )
     return 0
 
 
-def map_info(args: Namespace) -> int:
+def run_map_info(args: Namespace) -> int:
     """Run `map info`: print what a map holds, and what it takes on disk and in RAM; with --page, make a page of it."""
     from edgevpr.places.index import bytes_per_place
     from edgevpr.places.mapfile import PlaceMap
@@ -225,7 +229,7 @@ def map_info(args: Namespace) -> int:
     from edgevpr.techniques import CONFIDENCE_TECHNIQUE
 
     if args.page:
-        require_out(args.page, args.map)
+        check_output(args.page, args.map)
     with PlaceMap.open(args.map) as place_map:
         info, calibration = describe_map(place_map), read_calibration_for(place_map)
     each_bytes = bytes_per_place(info.spec)
@@ -236,7 +240,7 @@ def map_info(args: Namespace) -> int:
     ram_mb = info.places * each_bytes / 1e6
     known = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": each_bytes}
     said = list(format_info(info, confidence, ram_mb))
-    show({**asdict(info), **known, "ram_mb": ram_mb}, args.json, said)
+    print_result({**asdict(info), **known, "ram_mb": ram_mb}, args.json, said)
     if args.page:
         _write_page(args, said, calibration.recognisable if calibration else {})
     return 0
@@ -246,35 +250,35 @@ def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, flo
     """Write the page of a map. `said` are the lines of `map info`."""
     from edgevpr.mapmaking.look_alikes import find_look_alikes
     from edgevpr.places.mapfile import PlaceMap
-    from edgevpr.review.album import album_of_map
-    from edgevpr.review.mappage import MAX_ASKED, make_map_page
+    from edgevpr.review.album import make_map_album
+    from edgevpr.review.mappage import MAX_QUERIES, make_map_page
     from edgevpr.runtime.recognise.levelling import read_camera_lens
 
     lens = read_camera_lens(load_command_config(args, args.config).source)
     with PlaceMap.open(args.map) as place_map:
         places = list(place_map.places())
-        pictures = album_of_map(args.map_images, places)
-        asked = places[:: -(-len(places) // MAX_ASKED) or 1] if pictures else []
+        pictures = make_map_album(args.map_images, places)
+        asked = places[:: -(-len(places) // MAX_QUERIES) or 1] if pictures else []
         level = ((place.place_id, pictures.level(place, lens)) for place in progress(asked, len(asked), "look-alikes"))
         found = find_look_alikes(place_map, ((place_id, each.image, each.mask) for place_id, each in level if each))
         alike = list(found)
     name = Path(args.map).name
     page = make_map_page(name, said, places, recognisable, alike, pictures, lens)
-    write_out(args.page, args.map, lambda out: out.write(page))
+    write_output(args.page, args.map, lambda out: out.write(page))
     if not args.json:
         print(f"{args.page}: {len(places)} places of {args.map}")
 
 
-def map_check(args: Namespace) -> int:
+def run_map_check(args: Namespace) -> int:
     """Run `map check`: read everything in a map and print what is damaged. The exit code is 1 if anything is."""
     from edgevpr.places.examine import check
 
     found = check(args.map, progress)
-    show({**asdict(found), "is_whole": found.is_whole}, args.json, format_check(found))
+    print_result({**asdict(found), "is_whole": found.is_whole}, args.json, format_check(found))
     return 0 if found.is_whole else 1
 
 
-def map_repair(args: Namespace) -> int:
+def run_map_repair(args: Namespace) -> int:
     """Run `map repair`: drop what is damaged in a map, and keep the original file."""
     from edgevpr.places.examine import check, repair
 
@@ -284,11 +288,11 @@ def map_repair(args: Namespace) -> int:
     done = {"path": args.map, "kept": found.places, "dropped": dropped, "original": original and str(original)}
     last = f"{args.map}: repaired, {found.places} places kept, {dropped} dropped; the original is {original}"
     text = "nothing is damaged: the map is as it was" if original is None else last
-    show(done, args.json, [*format_check(found), text])
+    print_result(done, args.json, [*format_check(found), text])
     return 0
 
 
-def map_merge(args: Namespace) -> int:
+def run_map_merge(args: Namespace) -> int:
     """Run `map merge`: make one map of several."""
     from edgevpr.places.examine import merge
     from edgevpr.places.mapfiles import map_path
@@ -303,17 +307,17 @@ def map_merge(args: Namespace) -> int:
     text.append(f"{args.out}: {merged['places']} places")
     if were_calibrated:
         text.append(f"  not calibrated: how sure the maps were does not hold for it: edgevpr map calibrate {args.out}")
-    show({**merged, "lost_calibration": were_calibrated}, args.json, text)
+    print_result({**merged, "lost_calibration": were_calibrated}, args.json, text)
     return 0
 
 
-def map_shrink(args: Namespace) -> int:
+def run_map_shrink(args: Namespace) -> int:
     """Run `map shrink`: make a smaller map of the most useful places of a map."""
     from edgevpr.places.examine import shrink
     from edgevpr.places.mapfiles import map_path
 
     kept, places = shrink(args.map, map_path(args.out), args.places, progress)
-    show({"map": args.out, "kept": kept, "of": places}, args.json, f"{args.out}: {kept} of {places} places")
+    print_result({"map": args.out, "kept": kept, "of": places}, args.json, f"{args.out}: {kept} of {places} places")
     return 0
 
 
@@ -327,5 +331,5 @@ def run_salience(args: Namespace) -> int:
     assert gate is not None  # salience.use is set
     worth = compute_memorability(gate.scores(read_image(Path(args.image))), gate.config)
     known = {"kept": worth.reason is None, "reason": worth.reason and worth.reason.fields()}
-    show({"image": args.image, **asdict(worth.salience), **known}, args.json)
+    print_result({"image": args.image, **asdict(worth.salience), **known}, args.json)
     return 0

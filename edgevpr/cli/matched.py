@@ -48,19 +48,19 @@ def format_matches(found: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield the table of the queries `found` (see `format_match`), and its summary."""
     sure = "confidence" if any("confidence" in each for each in found) else "score"
     rows = align_table(
-        [("query", "accepted", sure, "place, picture"), *(_format_found(each, sure) for each in found)], left=4
+        [("query", "accepted", sure, "place, picture"), *(_format_place(each, sure) for each in found)], left=4
     )
     fixes = [each for each in found if each["position"]]
     headings = _FIX_HEADINGS if any(each["from_gps_tag_m"] is not None for each in fixes) else _FIX_HEADINGS[:3]
-    heading, *where = align_table([headings, *map(_fix, fixes)], left=0) if fixes else [""]
+    heading, *where = align_table([headings, *map(_format_fix, fixes)], left=0) if fixes else [""]
     width, at = max(map(len, rows)), iter(where)
     yield f"{rows[0]:<{width}}  {heading}".rstrip()
     for row, each in zip(rows[1:], found, strict=True):
-        yield f"{row:<{width}}  {next(at) if each['position'] else _why(each)}".rstrip()
-    yield from _summary(found, fixes)
+        yield f"{row:<{width}}  {next(at) if each['position'] else _format_refusal(each)}".rstrip()
+    yield from _summarise(found, fixes)
 
 
-def _format_found(match: dict[str, Any], sure: str) -> tuple[str, ...]:
+def _format_place(match: dict[str, Any], sure: str) -> tuple[str, ...]:
     """Return the left part of a row: the query, and the place that was found."""
     place, by = match["place"], match.get(sure)
     certain = "-" if by is None else format_probability(by) if sure == "confidence" else f"{by:.3f}"
@@ -68,14 +68,14 @@ def _format_found(match: dict[str, Any], sure: str) -> tuple[str, ...]:
     return _shorten_name(match["query"]), "yes" if match["accepted"] else "no", certain, named
 
 
-def _fix(match: dict[str, Any]) -> tuple[str, ...]:
+def _format_fix(match: dict[str, Any]) -> tuple[str, ...]:
     """Return the right part of a row with a fix; a star marks one that is the place's own position."""
     fix, away_m = match["position"], match["from_gps_tag_m"]
     accuracy = f"{fix['accuracy_m']:.1f}{'*' if fix['of_place'] else ' '}"
     return f"{fix['lat_deg']:.6f}", f"{fix['lon_deg']:.6f}", accuracy, "-" if away_m is None else f"{away_m:.1f}"
 
 
-def _why(match: dict[str, Any]) -> str:
+def _format_refusal(match: dict[str, Any]) -> str:
     """Return the right part of a row without a fix: the reason in a few words."""
     words = "its place has no position" if match["accepted"] else ReasonCode[match["reason"]["code"]].summary
     return textwrap.shorten(words, _REASON_COLUMNS, placeholder=" ...")
@@ -87,7 +87,7 @@ def _shorten_name(name: str) -> str:
     return name if len(name) <= _NAME_COLUMNS else f"...{name[3 - _NAME_COLUMNS :]}"
 
 
-def _summary(found: Sequence[dict[str, Any]], fixes: Sequence[dict[str, Any]]) -> Iterator[str]:
+def _summarise(found: Sequence[dict[str, Any]], fixes: Sequence[dict[str, Any]]) -> Iterator[str]:
     refused = Counter(ReasonCode[each["reason"]["code"]] for each in found if not each["accepted"])
     counts = ", ".join(f"{count} {code.summary}" for code, count in refused.most_common())
     why = f"; refused: {counts}" if refused else ""

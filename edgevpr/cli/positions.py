@@ -4,13 +4,13 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from edgevpr.cli.shared import add_json, command, show
+from edgevpr.cli.shared import add_command, add_json, print_result
 
 
 def add(commands: Any) -> None:
     """Add the command and its flags."""
     text = "geotag images from an autopilot log, a GPS track, subtitles or a table"
-    parser = command(commands, "positions", positions, text)
+    parser = add_command(commands, "positions", run_positions, text)
     parser.add_argument(
         "record",
         metavar="RECORD",
@@ -36,12 +36,12 @@ def add(commands: Any) -> None:
     add_json(parser)
 
 
-def positions(args: Namespace) -> int:
-    """Run `positions`: write the table that all other commands find beside the pictures."""
+def run_positions(args: Namespace) -> int:
+    """Run `run_positions`: write the table that all other commands find beside the pictures."""
     from edgevpr.core.errors import UsageError
     from edgevpr.core.text import show_elapsed
     from edgevpr.frames.positions import write_positions, write_track
-    from edgevpr.tracks.placing import place_pictures, place_video, round_metres
+    from edgevpr.tracks.placing import find_rounding_m, place_pictures, place_video
     from edgevpr.tracks.record import read_record
 
     source, is_folder = Path(args.images), Path(args.images).is_dir()
@@ -66,8 +66,8 @@ def positions(args: Namespace) -> int:
         "offset_s": placed.offset_s,
         "placed": len(placed.track.t_s) if placed.track else sum(bool(tag.position) for tag in placed.tags.values()),
         "of": None if placed.track else placed.pictures,
-        "rounded_m": round_metres(placed),
+        "rounded_m": find_rounding_m(placed),
         "out": str(out),
     }
-    show(found, args.json)
+    print_result(found, args.json)
     return 0

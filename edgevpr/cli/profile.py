@@ -3,7 +3,15 @@
 from argparse import Namespace
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import add_json, add_keys, command, count, load_command_config, positive, show
+from edgevpr.cli.shared import (
+    add_command,
+    add_json,
+    add_keys,
+    load_command_config,
+    parse_count,
+    parse_positive,
+    print_result,
+)
 from edgevpr.core.config import Config
 from edgevpr.core.text import progress
 
@@ -15,11 +23,11 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     """Add the command and its flags."""
-    parser = command(commands, "profile", profile, "estimate memory, rate and battery use before take-off")
+    parser = add_command(commands, "profile", profile, "estimate memory, rate and battery use before take-off")
     asked = parser.add_mutually_exclusive_group(required=True)
     asked.add_argument("--list", action="store_true", help="list the boards")
     asked.add_argument("--map", metavar="MAP", help="map of the flight: estimate its technique")
-    asked.add_argument("--places", type=count, metavar="N", help="number of places: estimate every technique")
+    asked.add_argument("--places", type=parse_count, metavar="N", help="number of places: estimate every technique")
     parser.add_argument(
         "--board",
         default="this",
@@ -27,7 +35,11 @@ def add(commands: Any) -> None:
         help="board; see --list (default: this computer)",
     )
     parser.add_argument(
-        "--flight-min", type=positive, default=20.0, metavar="MIN", help="length of the flight in minutes (default: 20)"
+        "--flight-min",
+        type=parse_positive,
+        default=20.0,
+        metavar="MIN",
+        help="length of the flight in minutes (default: 20)",
     )
     add_keys(parser, "source.camera", "source.rate_hz", "memory.budget_mb", "battery.pack")
     add_json(parser)
@@ -52,7 +64,7 @@ def profile(args: Namespace) -> int:
     plan, trials = _plan(args, config, board)
     results = progress(run_trials(trials, board.threads), len(trials), "trying techniques")
     estimate = estimate_flight(board, compare_speed(board), results, plan)
-    show(estimate, args.json, format_table(estimate))
+    print_result(estimate, args.json, format_table(estimate))
     return 0
 
 

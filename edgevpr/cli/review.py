@@ -5,7 +5,7 @@ from argparse import Namespace
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import add_json, add_map_images, command, show, write_out
+from edgevpr.cli.shared import add_command, add_json, add_map_images, print_result, write_output
 from edgevpr.cli.wording import format_replay
 from edgevpr.core.errors import EdgevprError
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    report = command(commands, "report", run_report, "make an HTML page of a flight from its log")
+    report = add_command(commands, "report", run_report, "make an HTML page of a flight from its log")
     report.add_argument("log", metavar="LOG")
     report.add_argument("--out", required=True, metavar="FILE", help="page to write (.html)")
     report.add_argument("--map", metavar="MAP", help="map to draw on (default: the map of the flight)")
@@ -27,7 +27,7 @@ def add(commands: Any) -> None:
         help="folder of frames of this flight (repeatable), or its video; not needed with a recording",
     )
     add_map_images(report)
-    replay = command(commands, "replay", run_replay, "replay a recorded flight, and compare every line and packet")
+    replay = add_command(commands, "replay", run_replay, "replay a recorded flight, and compare every line and packet")
     replay.add_argument("log", metavar="LOG", help="flight log; its last flight is replayed")
     replay.add_argument("--map", metavar="MAP", help="map of the flight (default: at its recorded path)")
     add_json(replay)
@@ -35,41 +35,41 @@ def add(commands: Any) -> None:
 
 def run_report(args: Namespace) -> int:
     """Run `report`: write the HTML page of a flight."""
-    from edgevpr.review.album import album_of_map, make_album
-    from edgevpr.review.logged import read_flight, text
+    from edgevpr.review.album import make_album, make_map_album
+    from edgevpr.review.logged import get_text, read_flight
     from edgevpr.review.page import make_flight_page
     from edgevpr.review.webpage import read_ground
     from edgevpr.runtime.flight.recording import list_frames, open_recording
 
     flight = read_flight(args.log)
-    folder = open_recording(text(flight.start, "recording"), args.log)
+    folder = open_recording(get_text(flight.start, "recording"), args.log)
     frames = make_album(args.images, list_frames(folder) if folder else {})
     ground: list[Place] = []
     no_ground = "The log does not name a map: give it with --map."
-    if path := args.map or text(flight.start, "map"):
+    if path := args.map or get_text(flight.start, "map"):
         try:
             ground, no_ground = read_ground(path), ""
         except EdgevprError as error:
             if args.map:
                 raise
             no_ground = f"The map of the flight is not drawn: {error} Its place can be given with --map."
-    references = album_of_map(args.map_images, ground)
+    references = make_map_album(args.map_images, ground)
     page = make_flight_page(flight, ground, frames, references, no_ground)
-    write_out(args.out, args.log, lambda out: out.write(page))
+    write_output(args.out, args.log, lambda out: out.write(page))
     print(f"{args.out}: {len(flight.queries)} queries of {args.log}")
     return 0
 
 
 def run_replay(args: Namespace) -> int:
     """Run `replay`: fly a recorded flight again, and print the comparison. The exit code is 1 if anything differs."""
-    from edgevpr.review.compare import compare
+    from edgevpr.review.compare import compare_lines
     from edgevpr.review.replay import replay
 
     again = replay(args.log, args.map)
     end = {"guessed": again.guessed, "why_ended": again.why_ended}
-    lines, packets = compare(again.flown, again.lines), again.packets
+    lines, packets = compare_lines(again.flown, again.lines), again.packets
     has_all = not lines.after or again.why_ended is not None
     is_same = has_all and not (lines.others or packets.others)
     value = {"lines": asdict(lines), "packets": asdict(packets), **end, "is_same": is_same}
-    show(value, args.json, format_replay(again, lines, packets))
+    print_result(value, args.json, format_replay(again, lines, packets))
     return 0 if is_same else 1

@@ -9,13 +9,13 @@ from typing import TextIO
 
 from edgevpr.core.text import sanitize
 
-_LAYOUT = "\n\r\t"  # control characters that pass: tables and progress lines need them
+_LAYOUT_CHARACTERS = "\n\r\t"  # control characters that pass: tables and progress lines need them
 
 
 @contextmanager
 def guard_output() -> Iterator[None]:
     """Context manager: all that is written to stdout and stderr inside it passes through `core.text.shown`."""
-    with redirect_stdout(_Guarded(sys.stdout)), redirect_stderr(_Guarded(sys.stderr)):
+    with redirect_stdout(_GuardedStream(sys.stdout)), redirect_stderr(_GuardedStream(sys.stderr)):
         yield
 
 
@@ -26,14 +26,14 @@ class LineFormatter(logging.Formatter):
         return sanitize(super().formatMessage(record))
 
 
-class _Guarded(io.TextIOBase):
+class _GuardedStream(io.TextIOBase):
     """Text stream that passes what is written through `sanitize`, then to `stream`, for `print` and progress lines."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        safe = sanitize(text, keep=_LAYOUT)
+        safe = sanitize(text, keep=_LAYOUT_CHARACTERS)
         try:
             self._stream.write(safe)
         except UnicodeEncodeError:  # a terminal that is not set to UTF-8

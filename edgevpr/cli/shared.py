@@ -16,7 +16,7 @@ from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import sanitize, suggest
 
 T = TypeVar("T")
-_KEY = "key "  # prefix of the attribute names of `Namespace` that hold keys of the configuration
+_KEY_PREFIX = "key "  # prefix of the attribute names of `Namespace` that hold keys of the configuration
 _HELP_COLUMNS = 78
 _UNITS = {
     "s": " s", "ms": " ms", "m": " m", "mb": " MB", "bytes": " bytes", "c": " °C", "deg": "°", "mah": " mAh", "w": " W"
@@ -37,22 +37,22 @@ class Parser(ArgumentParser):
         super()._check_value(action, value)
 
 
-def command(commands: Any, name: str, run: Callable[[Namespace], int], text: str) -> ArgumentParser:
+def add_command(commands: Any, name: str, run: Callable[[Namespace], int], text: str) -> ArgumentParser:
     """Add a command that calls `run` with the parsed arguments, and return its parser. `text` is its help; `run`
     returns the exit code."""
-    parser = _parser(commands, name, text)
+    parser = _add_parser(commands, name, text)
     parser.set_defaults(run=run, parser=parser)
     parser.epilog = format_examples(parser.prog.partition(" ")[2])
     parser.formatter_class = RawDescriptionHelpFormatter
     return parser
 
 
-def group(commands: Any, name: str, text: str) -> Any:
+def add_group(commands: Any, name: str, text: str) -> Any:
     """Add a command that has subcommands, such as `map`, and return the object that those are added to."""
-    return _parser(commands, name, text).add_subparsers(title="commands", required=True, metavar="COMMAND")
+    return _add_parser(commands, name, text).add_subparsers(title="commands", required=True, metavar="COMMAND")
 
 
-def _parser(commands: Any, name: str, text: str) -> ArgumentParser:
+def _add_parser(commands: Any, name: str, text: str) -> ArgumentParser:
     description = "\n".join(wrap(text[0].upper() + text[1:] + ".", _HELP_COLUMNS))
     parser: ArgumentParser = commands.add_parser(name, help=text, description=description)
     # Accepted after the command too, where users type it.
@@ -125,18 +125,18 @@ def add_keys(parser: ArgumentParser, *names: str) -> None:
         form: dict[str, Any] = {"type": key.kind, "metavar": key.metavar, "choices": key.choices or None}
         if key.kind is bool:
             form = {"action": "store_const", "const": key.sets}
-        parser.add_argument(*key.flags, dest=_KEY + key.name, help=key.text, **form)
+        parser.add_argument(*key.flags, dest=_KEY_PREFIX + key.name, help=key.text, **form)
 
 
 def parse_value(args: Namespace, name: str) -> Any:
     """Return the value that the flags give for the configuration key `name`; None if they give none."""
-    return getattr(args, _KEY + name)
+    return getattr(args, _KEY_PREFIX + name)
 
 
 def load_command_config(args: Namespace, path: str | None = None, **others: Any) -> Config:
     """Make the configuration from the file `path` (None: the defaults). Flags override the file, and the values
     `others`, by configuration key, override both."""
-    said = {name.removeprefix(_KEY): value for name, value in vars(args).items() if name.startswith(_KEY)}
+    said = {name.removeprefix(_KEY_PREFIX): value for name, value in vars(args).items() if name.startswith(_KEY_PREFIX)}
     return load_config(path, said | others)
 
 
@@ -153,20 +153,20 @@ def to_path(text: str | None) -> Path | None:
     return Path(text) if text else None
 
 
-def leave_out(error: ImageError, unusable: list[ImageError]) -> None:
+def skip_image(error: ImageError, unusable: list[ImageError]) -> None:
     """Report that an image cannot be used, and add the error to the list `unusable`; the command goes on without it."""
-    report(str(error))
+    print_notes(str(error))
     unusable.append(error)
 
 
-def exit_code(unusable: list[ImageError]) -> int:
+def report_unusable(unusable: list[ImageError]) -> int:
     """Return the exit code: 1 if any image could not be used, and then print how many; else 0."""
     if unusable:
-        report(f"{sum(error.count for error in unusable)} images could not be used (named above).")
+        print_notes(f"{sum(error.count for error in unusable)} images could not be used (named above).")
     return 1 if unusable else 0
 
 
-def show(value: Any, as_json: bool, text: str | Iterable[str] | None = None) -> None:
+def print_result(value: Any, as_json: bool, text: str | Iterable[str] | None = None) -> None:
     """Print a result, a dataclass or a dictionary: as JSON for programs, or for people as `text`, whole or in lines of
     which control characters are escaped (None: a line for each field)."""
     fields = asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
@@ -205,13 +205,13 @@ def _format_value(value: Any) -> str:
     return str(value)
 
 
-def report(*sentences: str) -> None:
+def print_notes(*sentences: str) -> None:
     """Print sentences to stderr, each after the name of the program."""
     for sentence in sentences:
         print(f"edgevpr: {sanitize(sentence)}", file=sys.stderr)
 
 
-def positive(text: str) -> float:
+def parse_positive(text: str) -> float:
     """Read a finite number above zero, as the `type` of a flag. Raises ValueError for other texts."""
     value = float(text)
     if not 0 < value < float("inf"):
@@ -219,7 +219,7 @@ def positive(text: str) -> float:
     return value
 
 
-def count(text: str) -> int:
+def parse_count(text: str) -> int:
     """Read a whole number above zero, as the `type` of a flag. Raises ValueError for other texts."""
     value = int(text)
     if value < 1:
@@ -227,7 +227,7 @@ def count(text: str) -> int:
     return value
 
 
-def require_out(target: str, source: str) -> Path:
+def check_output(target: str, source: str) -> Path:
     """Return the path of the file `target`, to be written. Raises UsageError if it is the file `source`, which is read,
     or if its folder does not exist."""
     from edgevpr.core.files import require_folder
@@ -239,15 +239,15 @@ def require_out(target: str, source: str) -> Path:
     return path
 
 
-def write_out(target: str, source: str, write: Callable[[TextIO], T]) -> T:
+def write_output(target: str, source: str, write: Callable[[TextIO], T]) -> T:
     """Write the file `target`, whole or not at all: call `write` with the open text file, and return its result. Raises
-    as `require_out` does."""
-    from edgevpr.core.files import write_whole
+    as `check_output` does."""
+    from edgevpr.core.files import write_atomically
 
-    path = require_out(target, source)
+    path = check_output(target, source)
 
     def written(unfinished: Path) -> T:
         with open(unfinished, "w", encoding="utf-8", errors="backslashreplace", newline="") as out:
             return write(out)
 
-    return write_whole(path, written)
+    return write_atomically(path, written)

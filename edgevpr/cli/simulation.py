@@ -5,11 +5,11 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from edgevpr.cli.shared import command, group
+from edgevpr.cli.shared import add_command, add_group
 from edgevpr.core.errors import UsageError
 
 # Number flags of a flight over an orthophoto: (default, least, greatest, help text).
-_NUMBERS: dict[str, tuple[float | None, float, float, str]] = {
+_NUMBER_FLAGS: dict[str, tuple[float | None, float, float, str]] = {
     "height_m": (None, 1.0, 10_000.0, "height above ground in metres (default: that of the track)"),
     "every_m": (20.0, 1.0, 1e6, "distance between images of a mission in metres (default: 20)"),
     "fov_deg": (66.0, 5.0, 120.0, "field of view across the image in degrees (default: 66)"),
@@ -18,55 +18,55 @@ _NUMBERS: dict[str, tuple[float | None, float, float, str]] = {
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    simulations = group(commands, "simulate", "generate the images of flights")
+    simulations = add_group(commands, "simulate", "generate the images of flights")
     text = "generate the images and positions.csv of a flight"
-    flight = command(simulations, "flight", simulate_flight, text)
+    flight = add_command(simulations, "flight", run_simulate_flight, text)
     flight.add_argument("out", metavar="DIR")
     flight.add_argument(
         "--which", choices=("map", "query"), help="map: the mapping flight (default); query: a later flight"
     )
     flight.add_argument(
-        "--seed", type=_seed, default=1, metavar="N", help="random seed of landscape and motion (default: 1)"
+        "--seed", type=_parse_seed, default=1, metavar="N", help="random seed of landscape and motion (default: 1)"
     )
     over = flight.add_argument_group("over an orthophoto")
     over.add_argument("--orthophoto", metavar="FILE", help="orthophoto, as for `map build` (needs rasterio)")
     over.add_argument(
         "--track", metavar="FILE", help="mission, or positions.csv with height_m[, yaw_deg, roll_deg, pitch_deg]"
     )
-    for name, (*_, text) in _NUMBERS.items():
+    for name, (*_, text) in _NUMBER_FLAGS.items():
         over.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
-    demo = command(commands, "demo", run_demo, "map and match a generated flight, and draw a picture of it")
+    demo = add_command(commands, "demo", run_demo, "map and match a generated flight, and draw a picture of it")
     demo.add_argument("--out", default="demo_out", metavar="DIR", help="folder to write (default: demo_out)")
 
 
-def _seed(text: str) -> int:
+def _parse_seed(text: str) -> int:
     if (value := int(text)) < 0:
         raise ValueError
     return value
 
 
-def simulate_flight(args: Namespace) -> int:
+def run_simulate_flight(args: Namespace) -> int:
     """Run `simulate flight`: write images and positions.csv of a flight over generated ground or an orthophoto."""
     if args.orthophoto is None:
-        if said := [name for name in ("track", *_NUMBERS) if getattr(args, name) is not None]:
+        if said := [name for name in ("track", *_NUMBER_FLAGS) if getattr(args, name) is not None]:
             raise UsageError(f"--{said[0].replace('_', '-')} goes with --orthophoto: leave it out.")
-        from edgevpr.lab.simulate.generated import fly_and_write
+        from edgevpr.lab.simulate.generated import write_generated_flight
 
-        print(fly_and_write(Path(args.out), args.which or "map", args.seed))
+        print(write_generated_flight(Path(args.out), args.which or "map", args.seed))
         return 0
     if args.track is None or args.which is not None:
         raise UsageError("A flight over an orthophoto needs its --track, and has no --which.")
     from edgevpr.core.text import progress
-    from edgevpr.lab.simulate.overflight import ground_under, read_shots, write_overflight
+    from edgevpr.lab.simulate.overflight import compute_ground, read_shots, write_overflight
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
     numbers: dict[str, Any] = {}
-    for name, (usual, least, most, _) in _NUMBERS.items():
+    for name, (usual, least, most, _) in _NUMBER_FLAGS.items():
         numbers[name] = value = usual if getattr(args, name) is None else getattr(args, name)
         if value is not None and not least <= value <= most:  # false for NaN
             raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {least:g} to {most:g}.")
     shots = read_shots(args.track, numbers["height_m"], numbers["every_m"])
-    orthophoto = Orthophoto(args.orthophoto, ground_under(shots, numbers["fov_deg"]))
+    orthophoto = Orthophoto(args.orthophoto, compute_ground(shots, numbers["fov_deg"]))
     taken = write_overflight(Path(args.out), orthophoto, shots, numbers["fov_deg"], args.seed)
     written = sum(1 for _ in progress(taken, len(shots), "flying"))
     print(f"{args.out}: {written} images in images/, where they were taken in positions.csv")

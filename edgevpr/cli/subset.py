@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edgevpr.cli.shared import add_json, positive, show
+from edgevpr.cli.shared import add_json, parse_positive, print_result
 from edgevpr.core.text import progress
 
 _MARGIN_M = 500.0
@@ -14,7 +14,7 @@ _MARGIN_M = 500.0
 
 def add(of_map: Callable[..., Any]) -> None:
     """Add the command and its flags. `of_map` adds a command that begins with a map."""
-    parser = of_map("subset", map_subset, "cut out the part that a mission needs", "map, or folder of maps")
+    parser = of_map("subset", run_map_subset, "cut out the part that a mission needs", "map, or folder of maps")
     parser.add_argument(
         "--mission",
         metavar="FILE",
@@ -24,16 +24,16 @@ def add(of_map: Callable[..., Any]) -> None:
     parser.add_argument("--out", metavar="MAP", required=True, help="map to write")
     parser.add_argument(
         "--margin-m",
-        type=positive,
+        type=parse_positive,
         metavar="M",
         default=_MARGIN_M,
         help="margin around the mission in metres (default: %(default)g)",
     )
-    parser.add_argument("--mb", type=positive, metavar="MB", help="maximum file size in MB (default: all places)")
+    parser.add_argument("--mb", type=parse_positive, metavar="MB", help="maximum file size in MB (default: all places)")
     add_json(parser)
 
 
-def map_subset(args: Namespace) -> int:
+def run_map_subset(args: Namespace) -> int:
     """Run `map subset`: make the map of a mission, and print what is left out."""
     from edgevpr.mapmaking.missions import read_area
     from edgevpr.mapmaking.subset import subset
@@ -41,5 +41,5 @@ def map_subset(args: Namespace) -> int:
 
     area, out = read_area(args.mission), map_path(args.out)
     found = subset(Path(args.map), area, args.margin_m, out, args.mb and 1e6 * args.mb, progress)
-    show({"map": str(out), **asdict(found)}, args.json)
+    print_result({"map": str(out), **asdict(found)}, args.json)
     return 0

@@ -7,25 +7,28 @@ import time
 from argparse import Namespace
 from typing import Any
 
-from edgevpr.cli.shared import add_json, command, show
+from edgevpr.cli.shared import add_command, add_json, print_result
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.reasons import read_reason
-from edgevpr.core.text import format_probability, printable
+from edgevpr.core.text import escape_unprintable, format_probability
 
-_FILE = "/run/edgevpr/status.json"
-_LOOK_S = 1.0  # the flight writes its status once a second
+_STATUS_FILE = "/run/edgevpr/status.json"
+_REFRESH_S = 1.0  # the flight writes its status once a second
 # Age of a status after which the flight is called silent (a slow frame may delay it), and after which --once takes it
 # for the last status of a flight that was killed.
-_SILENT_S, _GONE_S = 2.5, 10.0
-_LONG_S = 3.0  # age of a picture from which on seconds are enough
+_LATE_STATUS_S = 2.5
+_STALE_STATUS_S = 10.0
+_COARSE_AGE_S = 3.0  # age of a picture from which on seconds are enough
 _CLEAR = "\x1b[H\x1b[J"
 _CHANNELS = {"COMMAND": "command 43003", "SENSOR": "message 296"}  # other channels are shown by their own names
 
 
 def add(commands: Any) -> None:
     """Add the command and its flags."""
-    parser = command(commands, "top", run_top, "show the running flight")
-    parser.add_argument("--file", default=_FILE, metavar="PATH", help=f"the flight's status.file ({_FILE})")
+    parser = add_command(commands, "top", run_top, "show the running flight")
+    parser.add_argument(
+        "--file", default=_STATUS_FILE, metavar="PATH", help=f"the flight's status.file ({_STATUS_FILE})"
+    )
     parser.add_argument("--once", action="store_true", help="print the status once")
     add_json(parser)
 
@@ -36,26 +39,26 @@ def run_top(args: Namespace) -> int:
 
     if args.once or args.json or not sys.stdout.isatty():
         found = read_status(args.file)
-        if found is None or found[1] > _GONE_S:
-            raise EdgevprError(" ".join(_no_flight(args.file)))
-        show(found[0], args.json, format_status(found[0]))
+        if found is None or found[1] > _STALE_STATUS_S:
+            raise EdgevprError(" ".join(_explain_no_flight(args.file)))
+        print_result(found[0], args.json, format_status(found[0]))
         return 0
     try:
         while True:
             found = read_status(args.file)
-            lines = format_status(found[0]) if found else list(_no_flight(args.file))
-            if found and found[1] > _SILENT_S:
+            lines = format_status(found[0]) if found else list(_explain_no_flight(args.file))
+            if found and found[1] > _LATE_STATUS_S:
                 lines.insert(0, f"the flight has said nothing for {found[1]:.0f} s")
             columns, height = shutil.get_terminal_size()
             sys.__stdout__.write(_CLEAR)  # type: ignore[union-attr]  # past the guard, which lets no escapes through
             rows = lines if found else [row for line in lines for row in textwrap.wrap(line, columns - 1)]
             print("\n".join(row[: columns - 1] for row in rows[: height - 1]), flush=True)
-            time.sleep(_LOOK_S)
+            time.sleep(_REFRESH_S)
     except KeyboardInterrupt:
         return 0
 
 
-def _no_flight(file: str) -> tuple[str, str]:
+def _explain_no_flight(file: str) -> tuple[str, str]:
     """Return what to say, in two lines, where no flight tells its status in `file`."""
     return (
         f"No running flight writes its status to {file}:",
@@ -65,8 +68,10 @@ def _no_flight(file: str) -> tuple[str, str]:
 
 def format_status(status: dict[str, Any]) -> list[str]:
     """Return the status of a flight (see `runtime.flight.vitals`) for people, as lines of a label and a text."""
-    age_s, heat = status["latency_s"], _format_known("{:.0f} °C", status["temperature_c"])
-    latency = _format_known(", {:.2f} s old" if (age_s or 0) < _LONG_S else ", newest picture {:.0f} s old", age_s)
+    age_s, heat = status["latency_s"], _format_optional("{:.0f} °C", status["temperature_c"])
+    latency = _format_optional(
+        ", {:.2f} s old" if (age_s or 0) < _COARSE_AGE_S else ", newest picture {:.0f} s old", age_s
+    )
     hot, throttled = ", hot" * bool(status["hot"]), ", the board slows itself down" * bool(status["throttled"])
     ram = f"{status['machine_ram_mb']:.0f} of {status['machine_ram_total_mb']:.0f} MB by all programs"
     rows = [
@@ -84,10 +89,10 @@ def format_status(status: dict[str, Any]) -> list[str]:
         *(_format_link(status["link"]) if status["link"] else [("link", "none")]),
         *(("remark", remark) for remark in status["remarks"]),
     ]
-    return [f"{label:<11} {printable(text)}" for label, text in rows]
+    return [f"{label:<11} {escape_unprintable(text)}" for label, text in rows]
 
 
-def _format_known(form: str, value: float | None) -> str:
+def _format_optional(form: str, value: float | None) -> str:
     return "" if value is None else form.format(value)
 
 
@@ -98,16 +103,16 @@ def _format_query(query: dict[str, Any] | None, now_s: float) -> str:
     if not query["accepted"]:
         return f"{ago}, refused: {read_reason(query['reason']) or 'unknown'}"
     sure = "" if query["confidence"] is None else f", confidence {format_probability(query['confidence'])}"
-    sure += _format_known(", score {:.3f}", query["score"])
-    good = _format_known(", good to {:.0f} m", query["accuracy_m"])
+    sure += _format_optional(", score {:.3f}", query["score"])
+    good = _format_optional(", good to {:.0f} m", query["accuracy_m"])
     return f"{ago}, place {query['place']} ({query['reference_image']}){sure}{good}"
 
 
 def _format_link(link: dict[str, Any]) -> list[tuple[str, str]]:
     channel = _CHANNELS.get(link["channel"], link["channel"])
-    heard = _format_known(f"flight controller {{:.0f}}, told by {channel}", link["autopilot"])
+    heard = _format_optional(f"flight controller {{:.0f}}, told by {channel}", link["autopilot"])
     return [
         ("link", f"{link['trouble'] or 'open'}, {heard or 'no flight controller is heard'}"),
         ("fixes", link["fixes"]),
-        ("navigation", _format_known("position known to {:.1f} m", link["accuracy_m"]) or "position unknown"),
+        ("navigation", _format_optional("position known to {:.1f} m", link["accuracy_m"]) or "position unknown"),
     ]

@@ -12,21 +12,21 @@ if TYPE_CHECKING:
     from edgevpr.mapmaking.refine import Refined
     from edgevpr.places.examine import MapCheck
     from edgevpr.places.mapinfo import MapInfo
-    from edgevpr.review.compare import Lines, Packets
-    from edgevpr.review.replay import Replayed
+    from edgevpr.review.compare import LineComparison, PacketComparison
+    from edgevpr.review.replay import ReplayResult
 
-WITHOUT_POSITIONS = (
+NO_POSITIONS_NOTE = (
     "no place has a position, and a map without positions sends no fixes: it only says which place is recognised. Give "
     "pictures with GPS in their EXIF data, or a positions.csv beside them (file,lat,lon[,alt,...], --positions); of a "
     "video, give --positions with time,lat,lon, in seconds from its first frame"
 )
 # By benchmarks/results/from_space.md, a raster of half a metre a pixel.
-_OTHER_DAY = (
+_OTHER_SEASON_NOTE = (
     "of another day fewer are: of pictures months and an earthquake later 48 % were accepted alone, with heading and "
     "height known (3 to 8 of twelve in a line), and 23 % without (0 to 6); `match` of pictures that `simulate flight` "
     "takes of another orthophoto says it of this ground"
 )
-_SHOWN = 20  # differences of a replay at most
+_MAX_DIFFERENCES = 20  # differences of a replay at most
 
 
 def format_build(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
@@ -50,10 +50,10 @@ def format_build(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
     if made.calibration:
         yield f"expect: {made.calibration.described()}"
         if is_cut:
-            yield f"  {_OTHER_DAY}"
+            yield f"  {_OTHER_SEASON_NOTE}"
     yield from (f"  {sentence}" for sentence in made.not_done)
     if made.places and not made.with_position:
-        yield f"{path}: {WITHOUT_POSITIONS}"
+        yield f"{path}: {NO_POSITIONS_NOTE}"
 
 
 def format_refinement(path: str, refined: "Refined") -> Iterator[str]:
@@ -116,9 +116,9 @@ def format_check(found: "MapCheck") -> Iterator[str]:
     yield from (f"  SQLite      {fault}" for fault in found.faults or ("the file is sound",))
 
 
-def format_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iterator[str]:
+def format_replay(again: "ReplayResult", lines: "LineComparison", packets: "PacketComparison") -> Iterator[str]:
     """Yield how a replay differs from its flight: in the `lines` of the log, in the `packets` sent, and in its end."""
-    yield from _first([*map(_format_difference, lines.others), *packets.others])
+    yield from _limit_differences([*map(_format_difference, lines.others), *packets.others])
     yield from (f"The program differs: {name} was {then}, is {now}" for name, (then, now) in lines.program.items())
     yield f"{sum(line.get('kind') == 'query' for line in again.lines)} queries flown again"
     yield f"log      {lines.alike} lines are the same, {len(lines.others)} differ"
@@ -131,9 +131,9 @@ def format_replay(again: "Replayed", lines: "Lines", packets: "Packets") -> Iter
         yield f"{lines.after} lines of the flight are missing in the replay."
 
 
-def _first(texts: list[str]) -> list[str]:
-    more = [f"... and {len(texts) - _SHOWN} more (--json has all)"] if len(texts) > _SHOWN else []
-    return texts[:_SHOWN] + more
+def _limit_differences(texts: list[str]) -> list[str]:
+    more = [f"... and {len(texts) - _MAX_DIFFERENCES} more (--json has all)"] if len(texts) > _MAX_DIFFERENCES else []
+    return texts[:_MAX_DIFFERENCES] + more
 
 
 def _format_difference(difference: dict[str, Any]) -> str:

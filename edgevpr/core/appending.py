@@ -16,9 +16,9 @@ from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
 
-MODE = 0o640  # whatever the umask: positions are private, but the group that reads logs may read them
+LOG_FILE_MODE = 0o640  # whatever the umask: positions are private, but the group that reads logs may read them
 _MAX_NUMBER = 999_999  # a file name with eight digits has a date, and is not one of these
-_NUMBERED = re.compile(r"(.+)-(\d{4,6})", re.DOTALL)
+_NUMBERED_NAME = re.compile(r"(.+)-(\d{4,6})", re.DOTALL)
 
 
 def open_appending(path: str | Path) -> FileIO:
@@ -26,23 +26,23 @@ def open_appending(path: str | Path) -> FileIO:
     The result has no buffer: a write that has returned is safe even if this process is killed next."""
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
     try:
-        descriptor, is_new = os.open(path, flags | os.O_EXCL, MODE), True
+        descriptor, is_new = os.open(path, flags | os.O_EXCL, LOG_FILE_MODE), True
     except FileExistsError:  # or a link to a file, which may not be there yet
-        descriptor, is_new = os.open(path, flags, MODE), False
+        descriptor, is_new = os.open(path, flags, LOG_FILE_MODE), False
     try:
         kind = os.fstat(descriptor).st_mode
         if not (stat.S_ISREG(kind) or stat.S_ISCHR(kind)):
             raise OSError(errno.EINVAL, "it is a pipe or a disk and not a file", str(path))
         if is_new:
             with suppress(OSError):  # FAT has no permissions
-                os.fchmod(descriptor, MODE)
+                os.fchmod(descriptor, LOG_FILE_MODE)
         return os.fdopen(descriptor, "r+b", buffering=0)
     except BaseException:
         os.close(descriptor)
         raise
 
 
-def append(file: BinaryIO, data: bytes) -> None:
+def append_bytes(file: BinaryIO, data: bytes) -> None:
     """Append all of `data`. If that fails, cut the file back to its old length, where possible."""
     end = file.seek(0, os.SEEK_END)
     try:
@@ -58,7 +58,7 @@ def append(file: BinaryIO, data: bytes) -> None:
         raise
 
 
-def sync(file: BinaryIO) -> None:
+def sync_file(file: BinaryIO) -> None:
     """Flush a regular file's data from the system's cache to the disk; do nothing for a device."""
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         os.fdatasync(file.fileno())
@@ -87,7 +87,7 @@ def try_lock(file: BinaryIO) -> bool:
     return True
 
 
-def is_still_at(file: BinaryIO, path: str | Path) -> bool:
+def is_same_file(file: BinaryIO, path: str | Path) -> bool:
     """Return True if the open `file` is still the one at `path`: it was not renamed, replaced or deleted."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
@@ -100,27 +100,27 @@ def list_numbered(path: str | Path) -> list[Path]:
     return [file for _, file in _find_numbered(Path(os.path.realpath(path)))]
 
 
-def relatives(path: str | Path) -> list[Path]:
+def list_related(path: str | Path) -> list[Path]:
     """List the numbered files of `path`. If `path` is a numbered file itself, list those of NAME.jsonl as well."""
     path = Path(os.path.realpath(path))
-    match = _NUMBERED.fullmatch(path.stem)
+    match = _NUMBERED_NAME.fullmatch(path.stem)
     return list_numbered(path) + (list_numbered(path.with_name(match[1] + path.suffix)) if match else [])
 
 
-def claim(path: str | Path) -> Path:
+def create_numbered(path: str | Path) -> Path:
     """Create an empty file with the next number, so that no other process takes the number. Return its path."""
     path = Path(os.path.realpath(path))
     for number in range(max((number for number, _ in _find_numbered(path)), default=0) + 1, _MAX_NUMBER + 1):
         claimed = path.with_name(f"{path.stem}-{number:04d}{path.suffix}")
         with suppress(FileExistsError):  # another process was faster
-            os.close(os.open(claimed, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE))
+            os.close(os.open(claimed, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, LOG_FILE_MODE))
             return claimed
     raise OSError(errno.EEXIST, f"there is a file of number {_MAX_NUMBER}", str(path))
 
 
-def set_aside(path: str | Path) -> Path:
+def rotate_file(path: str | Path) -> Path:
     """Rename a file to a numbered file with the next number, and return its new path."""
-    target = claim(path)  # FAT has no hard links, and a plain rename would replace what is there
+    target = create_numbered(path)  # FAT has no hard links, and a plain rename would replace what is there
     try:
         os.replace(os.path.realpath(path), target)
     except OSError:
@@ -130,7 +130,7 @@ def set_aside(path: str | Path) -> Path:
     return target
 
 
-def keep_within(path: str | Path, most_bytes: float) -> bool:
+def delete_oldest(path: str | Path, most_bytes: float) -> bool:
     """Delete the oldest numbered files of `path` until the others take at most `most_bytes` together. A file that a
     process has locked stays. Return True if any was deleted."""
     sizes = {}
@@ -147,7 +147,7 @@ def keep_within(path: str | Path, most_bytes: float) -> bool:
 
 def _find_numbered(path: Path) -> list[tuple[int, Path]]:
     files = map(path.with_name, os.listdir(path.parent))
-    matches = ((_NUMBERED.fullmatch(file.stem), file) for file in files if file.suffix == path.suffix)
+    matches = ((_NUMBERED_NAME.fullmatch(file.stem), file) for file in files if file.suffix == path.suffix)
     return sorted((int(match[2]), file) for match, file in matches if match and match[1] == path.stem)
 
 

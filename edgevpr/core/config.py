@@ -19,20 +19,21 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 FORMS = ("float", "8bit", "1bit")  # number formats of vectors in RAM, from large to small: see techniques.vectors
-LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 0.01, 60.0  # of queries
-BUDGET_MB = (1, 65_536)  # of the index in RAM
-SOURCES = (
+MIN_RATE_HZ = 0.01  # of queries
+MAX_RATE_HZ = 60.0
+BUDGET_RANGE_MB = (1, 65_536)  # of the index in RAM
+SOURCE_HELP = (
     "a folder of images, a video file, a camera (/dev/video0, or rpicam for the ribbon camera of a Raspberry Pi), a "
     "stream (rtsp://, udp://, rtp://, tcp://, http://, FILE.sdp), or gst: and a GStreamer pipeline"
 )
 
-_LARGEST = 2**63
-_SHOWN = 80  # characters of a wrong value in a message
-_UNUSABLE = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")  # no file name can have it; others are bytes, not UTF-8
+_MAX_INTEGER = 2**63
+_MAX_VALUE_CHARS = 80  # characters of a wrong value in a message
+_NOT_IN_NAMES = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")  # no file name has it; other surrogates are raw bytes
 
 T = TypeVar("T", bound="DataclassInstance")
-_WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", list: "a list"}
-_WORDS |= {dict: "a section"}
+_TYPE_NAMES = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", list: "a list"}
+_TYPE_NAMES |= {dict: "a section"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +62,7 @@ def key(default: Any = MISSING, flag: str = "", text: str = "", **rules: Any) ->
     return field(default=default, metadata={"key": Key(flags=flags, metavar=metavar, text=text, **rules)})
 
 
-def bounded(low: float, high: float, default: Any = MISSING) -> Any:
+def bounded_key(low: float, high: float, default: Any = MISSING) -> Any:
     """Make a `key` whose value must be None or within low..high."""
     return key(default, within=(low, high))
 
@@ -71,7 +72,7 @@ _ANY = Key()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceConfig:
-    uri: str | None = key(None, "--images --source SOURCE", SOURCES)
+    uri: str | None = key(None, "--images --source SOURCE", SOURCE_HELP)
     camera: str | None = key(
         None,
         "--camera",
@@ -79,7 +80,7 @@ class SourceConfig:
         choices=("nadir", "forward"),
     )
     rate_hz: float | None = key(
-        None, "--rate-hz HZ", "queries per second (default: the board's)", within=(LOWEST_RATE_HZ, HIGHEST_RATE_HZ)
+        None, "--rate-hz HZ", "queries per second (default: the board's)", within=(MIN_RATE_HZ, MAX_RATE_HZ)
     )
     mask: str | None = key(None, "--mask PNG", "mask image, black where frames show an overlay instead of the ground")
     lens: str | None = key(None, "--lens FILE", "camera calibration (OpenCV, ROS or Kalibr YAML), to undistort images")
@@ -92,8 +93,8 @@ class SourceConfig:
         "direction of the top of the image when the aircraft heads north, in degrees (default: 0)",
         within=(0, 360),
     )
-    mount_ahead_deg: float = bounded(-45, 45, default=0.0)
-    mount_right_deg: float = bounded(-45, 45, default=0.0)
+    mount_ahead_deg: float = bounded_key(-45, 45, default=0.0)
+    mount_right_deg: float = bounded_key(-45, 45, default=0.0)
     gimbal: bool = False
 
 
@@ -126,7 +127,7 @@ class MatchConfig:
         None, "--min-margin M", "minimum lead over the best place elsewhere to accept", within=(0, 1)
     )
     verify: bool = True
-    neighbour_m: float = bounded(0, 10_000, default=50.0)
+    neighbour_m: float = bounded_key(0, 10_000, default=50.0)
     reach_m_s: float | None = key(
         None,
         "--reach-m-s V",
@@ -138,40 +139,40 @@ class MatchConfig:
 @dataclass(frozen=True, slots=True)
 class MemoryConfig:
     budget_mb: float | None = key(
-        None, "--budget-mb MB", "memory limit of the index in MB (default: the board's)", within=BUDGET_MB
+        None, "--budget-mb MB", "memory limit of the index in MB (default: the board's)", within=BUDGET_RANGE_MB
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SalienceConfig:
     use: bool = key(False, "--salience", "store and match only memorable images")
-    memorability: float = bounded(0, 1, default=0.3)
-    staticity: float = bounded(0, 1, default=0.6)
-    entropy: float = bounded(0, 1, default=0.4)
+    memorability: float = bounded_key(0, 1, default=0.3)
+    staticity: float = bounded_key(0, 1, default=0.6)
+    entropy: float = bounded_key(0, 1, default=0.4)
     network: str | None = "matchability"
     detector: str | None = None
-    detect_every: int = bounded(1, 1000, default=1)
-    footprint_m: float | None = bounded(1, 10_000, default=None)
-    gap_frames: int = bounded(1, 10_000, default=20)
-    gap_m: float = bounded(1, 100_000, default=100.0)
+    detect_every: int = bounded_key(1, 1000, default=1)
+    footprint_m: float | None = bounded_key(1, 10_000, default=None)
+    gap_frames: int = bounded_key(1, 10_000, default=20)
+    gap_m: float = bounded_key(1, 100_000, default=100.0)
 
 
 @dataclass(frozen=True, slots=True)
 class SourceSetsConfig:
-    gps: int | None = bounded(1, 3, default=None)
-    no_gps: int | None = bounded(1, 3, default=None)
+    gps: int | None = bounded_key(1, 3, default=None)
+    no_gps: int | None = bounded_key(1, 3, default=None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MavlinkConfig:
     link: str | None = key(None, "--link URL", "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, serial:DEV:BAUD")
-    component_id: int = bounded(1, 255, default=197)
-    system_id: int | None = bounded(1, 255, default=None)
+    component_id: int = bounded_key(1, 255, default=197)
+    system_id: int | None = bounded_key(1, 255, default=None)
     send_fixes: bool = key(
         True, "--dry-run", "send no position; decide, log and announce everything else as in a flight", sets=False
     )
-    max_fix_age_s: float = bounded(0.1, 5, default=1.0)
-    min_accuracy_m: float = bounded(1, 10_000, default=5.0)
+    max_fix_age_s: float = bounded_key(0.1, 5, default=1.0)
+    min_accuracy_m: float = bounded_key(1, 10_000, default=5.0)
     source_sets: SourceSetsConfig = SourceSetsConfig()
     set_origin: bool = False
     ground: str | None = None
@@ -182,9 +183,9 @@ class MavlinkConfig:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogConfig:
     path: str | None = key("edgevpr-flight.jsonl", "--log FILE", "flight log to write (JSON lines)")
-    max_mb: float | None = bounded(1, 1_000_000, default=200.0)
+    max_mb: float | None = bounded_key(1, 1_000_000, default=200.0)
     record: str | None = key(None, "--record FOLDER", "folder for a recording, for `edgevpr replay`")
-    record_mb: float = bounded(10, 1_000_000, default=8000.0)
+    record_mb: float = bounded_key(10, 1_000_000, default=8000.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +196,7 @@ class StatusConfig:
 @dataclass(frozen=True, slots=True)
 class BatteryConfig:
     pack: str = key("4S5200", "--battery PACK", "cells and capacity of the battery, for example 4S5200")
-    regulator_efficiency: float = bounded(0.1, 1, default=0.85)
+    regulator_efficiency: float = bounded_key(0.1, 1, default=0.85)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,7 +221,7 @@ def list_keys(cls: type = Config, prefix: str = "") -> Iterator[Key]:
     each name: the dotted name of the section that `cls` is, such as "source." ("": the whole configuration)."""
     hints = typing.get_type_hints(cls)
     for spec in fields(cls):
-        kind = _kind(hints[spec.name])
+        kind = _get_class(hints[spec.name])
         if is_dataclass(kind):
             yield from list_keys(kind, f"{prefix}{spec.name}.")
         else:
@@ -244,7 +245,7 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
     return build(Config, mapping, "the command line")
 
 
-def place_logs_in(log: LogConfig, folder: str) -> LogConfig:
+def resolve_log_paths(log: LogConfig, folder: str) -> LogConfig:
     """Return settings of logs and recordings whose paths, where relative, are relative to `folder`."""
     path, record = (given and os.path.join(folder, given) for given in (log.path, log.record))
     return replace(log, path=path, record=record)
@@ -259,7 +260,7 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
     known = {f.name: f for f in fields(cls)}
     for key in mapping:
         if key not in known:
-            name = str(key)[:_SHOWN]
+            name = str(key)[:_MAX_VALUE_CHARS]
             hint = suggest(name, known, f"known: {', '.join(sorted(known))}")
             raise ConfigError(f"{where}: unknown key `{prefix}{name}` ({hint}).")
     values = {}
@@ -272,7 +273,7 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
 
 
 def _convert(value: Any, hint: Any, rules: Key, where: str, name: str) -> Any:
-    wanted, what = _kind(hint), f"{where}: `{name}`"
+    wanted, what = _get_class(hint), f"{where}: `{name}`"
     limits: Any = rules.within
     if value is None and isinstance(hint, types.UnionType):
         return None
@@ -282,23 +283,23 @@ def _convert(value: Any, hint: Any, rules: Key, where: str, name: str) -> Any:
         return build(wanted, value, where, f"{name}.")
     if value is None:
         raise ConfigError(f"{what} has no value: write one.")
-    if isinstance(value, int) and abs(value) > _LARGEST:
+    if isinstance(value, int) and abs(value) > _MAX_INTEGER:
         raise ConfigError(f"{what} is a number of too many digits: write a smaller one.")
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
-    if isinstance(value, str) and _UNUSABLE.search(value):
+    if isinstance(value, str) and _NOT_IN_NAMES.search(value):
         raise ConfigError(f"{what} holds a character that no file name can have ({value!a:.60}): write it anew.")
     if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
-        raise ConfigError(f"{what} must be {_WORDS.get(wanted, wanted)}, not {value!r:.{_SHOWN}}.")
+        raise ConfigError(f"{what} must be {_TYPE_NAMES.get(wanted, wanted)}, not {value!r:.{_MAX_VALUE_CHARS}}.")
     if limits and not limits[0] <= value <= limits[1]:
         raise ConfigError(f"{what} is {value:g}; it must be between {limits[0]:g} and {limits[1]:g}.")
     if rules.choices and value not in rules.choices:
         allowed = f"{', '.join(rules.choices[:-1])} or {rules.choices[-1]}"
-        raise ConfigError(f"{what} is `{value:.{_SHOWN}}`: write {allowed}.")
+        raise ConfigError(f"{what} is `{value:.{_MAX_VALUE_CHARS}}`: write {allowed}.")
     return value
 
 
-def _kind(hint: Any) -> type:
+def _get_class(hint: Any) -> type:
     """Return the class of a type hint, without None or parameters: dict for `dict[str, Any] | None`."""
     options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     kind: type = next(option for option in options if option is not type(None))

@@ -24,7 +24,7 @@ def find_shipped(kind: str) -> Path:
     return in_wheel if in_wheel.is_dir() else package.parent / kind
 
 
-def own_models() -> Path:
+def find_own_models() -> Path:
     """Return the folder of the user's own models, which may not exist: the environment variable EDGEVPR_MODELS, else
     edgevpr/models in XDG_DATA_HOME or ~/.local/share."""
     # Without a home folder (a service may have none) "~" is not expanded, and no such folder is found.
@@ -32,14 +32,15 @@ def own_models() -> Path:
     return Path(os.environ.get("EDGEVPR_MODELS") or os.path.join(data, "edgevpr", "models"))
 
 
-def model_folders() -> tuple[Path, ...]:
+def list_model_folders() -> tuple[Path, ...]:
     """Return the folders that are searched for a model, in this order: the user's own, the shipped one."""
-    return own_models(), find_shipped("models")
+    return find_own_models(), find_shipped("models")
 
 
 def find_model(file: str) -> Path | None:
-    """Return the path of `file` in the first of the `model_folders` that has it. None: none has it, or it has a "/"."""
-    return next((folder / file for folder in model_folders() if "/" not in file and (folder / file).is_file()), None)
+    """Return the path of `file` in the first of `list_model_folders` that has it. None: none has it, or it has "/"."""
+    paths = (folder / file for folder in list_model_folders() if "/" not in file)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def open_file(path: str | Path, most_bytes: int) -> BinaryIO:
@@ -83,7 +84,7 @@ def require_folder(path: Path) -> None:
         raise UsageError(f"{path}: there is no such folder: make it first.")
 
 
-def write_whole(path: Path, write: Callable[[Path], T]) -> T:
+def write_atomically(path: Path, write: Callable[[Path], T]) -> T:
     """Write a file completely or not at all: call `write` with the path of a temporary file that it must write, flush
     that to the disk, and rename it to `path`. Return the result of `write`. If anything fails, the temporary file is
     deleted. An existing file is replaced."""

@@ -13,14 +13,14 @@ D = TypeVar("D", float, Doubles, Floats)
 EARTH_RADIUS_M = 6_371_009.0  # mean radius: over a few kilometres a sphere is within 0.5 % of the ellipsoid
 
 
-def shorter_deg(turn_deg: D) -> D:
+def wrap_deg(turn_deg: D) -> D:
     """Return the shorter of the two turns that lead to the same direction, -180..180 (a scalar or an array)."""
     return (turn_deg + 180) % 360 - 180
 
 
 def distance_m(lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: D, other_lon_deg: D) -> D:
     """Return the distance in metres between points (scalars, or arrays that broadcast); NaN where one is NaN."""
-    north_m, turn = _north_m_and_turn(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
+    north_m, turn = _north_m_and_longitude_rad(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
     middle_deg = np.add(lat_deg, other_lat_deg) / 2
     return cast(D, np.hypot(north_m, turn * EARTH_RADIUS_M * np.cos(np.radians(middle_deg))))
 
@@ -28,18 +28,18 @@ def distance_m(lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: D, other_lon_d
 def offset_m(lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: D, other_lon_deg: D) -> tuple[D, D]:
     """Return the offset (east, north) in metres from the first point to the other (scalars, or arrays that broadcast),
     on the plane that touches the Earth at the first point; NaN where one is NaN."""
-    north_m, turn = _north_m_and_turn(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
+    north_m, turn = _north_m_and_longitude_rad(lat_deg, lon_deg, other_lat_deg, other_lon_deg)
     return cast(D, turn * EARTH_RADIUS_M * np.cos(np.radians(lat_deg))), cast(D, north_m)
 
 
-def _north_m_and_turn(
+def _north_m_and_longitude_rad(
     lat_deg: Degrees, lon_deg: Degrees, other_lat_deg: Degrees, other_lon_deg: Degrees
 ) -> tuple[Any, Any]:
     north_m = np.radians(np.subtract(other_lat_deg, lat_deg)) * EARTH_RADIUS_M
-    return north_m, np.radians(shorter_deg(np.subtract(other_lon_deg, lon_deg)))  # also across the date line
+    return north_m, np.radians(wrap_deg(np.subtract(other_lon_deg, lon_deg)))  # also across the date line
 
 
-def metres(lat_deg: Floats, lon_deg: Floats) -> tuple[Floats, Floats]:
+def project_to_metres(lat_deg: Floats, lon_deg: Floats) -> tuple[Floats, Floats]:
     """Project points, float (N,) each, to metres (east, north), float (N,) each, on the plane that touches the Earth at
     the first point that is not NaN. NaN stays NaN."""
     known = np.flatnonzero(~np.isnan(lat_deg))
@@ -52,7 +52,7 @@ def offset_position(lat_deg: float, lon_deg: float, east_m: float, north_m: floa
     `offset_m`."""
     north_deg = math.degrees(north_m / EARTH_RADIUS_M)
     east_deg = math.degrees(east_m / (EARTH_RADIUS_M * max(math.cos(math.radians(lat_deg)), 1e-9)))
-    return lat_deg + north_deg, shorter_deg(lon_deg + east_deg)
+    return lat_deg + north_deg, wrap_deg(lon_deg + east_deg)
 
 
 def compute_extent(points: Iterable[LatLon]) -> Extent:

@@ -33,7 +33,7 @@ class Code(Enum):
     @property
     def parameters(self) -> frozenset[str]:
         """Names of the parameters of the sentence."""
-        return frozenset(name for part in self.parts for name in _names(part))
+        return frozenset(name for part in self.parts for name in _list_names(part))
 
 
 class ReasonCode(Code):
@@ -231,10 +231,10 @@ class Reason:
         return {"code": self.code.name, "parameters": known}
 
     def _fill(self, part: str) -> str:
-        if any(self.parameters.get(name) is None for name in _names(part)):
+        if any(self.parameters.get(name) is None for name in _list_names(part)):
             return ""
         try:
-            return _Sentences().vformat(part, (), {"summary": self.code.summary, **self.parameters})
+            return _SentenceFormatter().vformat(part, (), {"summary": self.code.summary, **self.parameters})
         except (ValueError, TypeError):  # of a log that is damaged
             return ""
 
@@ -242,7 +242,7 @@ class Reason:
 NOT_SEARCHED = Reason(ReasonCode.NOT_SEARCHED)
 
 
-class _Sentences(Formatter):
+class _SentenceFormatter(Formatter):
     """Formats parameters; the format `probability` is that of `format_probability`."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
@@ -263,5 +263,5 @@ def _is_plain(value: object) -> bool:
     return isinstance(value, (int, float, str)) and not isinstance(value, bool)
 
 
-def _names(part: str) -> list[str]:
+def _list_names(part: str) -> list[str]:
     return [name for _, name, _, _ in Formatter().parse(part) if name and name != "summary"]

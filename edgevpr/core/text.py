@@ -23,23 +23,23 @@ T = TypeVar("T")
 _PASSWORD = re.compile(r"(\w:/{1,2}[^\s/:@]*):\S*@")
 # Passwords and keys in the query part of an address, such as ?token=abc, which cameras use too.
 _SECRET = re.compile(r"(?i)([?&](?:password|passwd|passwort|pass|pwd|token|secret|api_?key|key|auth)=)[^&\s#]*")
-_COLUMNS = 120
+_LINE_COLUMNS = 120
 _TERMINAL_COLUMNS = 79
-_FEW_WRONG = 1e-3  # of all matches: fewer are not to be told apart in per cent
+_MAX_ODDS_WRONG = 1e-3  # of all matches: fewer are not to be told apart in per cent
 _MIN_WRONG = 1e-6
-_SILENT_S = 5.0  # a line is written after so long a silence
-_SOON_S = 10.0  # no remaining time is shown if it, or the time since the start, is shorter
+_MAX_SILENCE_S = 5.0  # a line is written after so long a silence
+_MIN_ESTIMATE_S = 10.0  # no remaining time is shown if it, or the time since the start, is shorter
 
 
-def printable(text: str, keep: str = "") -> str:
+def escape_unprintable(text: str, keep: str = "") -> str:
     """Escape characters that a terminal acts on or cannot show: control characters, line breaks, marks that change the
     direction of writing, bytes that are not UTF-8. The characters in `keep` stay as they are."""
     if text.isprintable():  # false if there is any such character
         return text
-    return "".join(char if char.isprintable() or char in keep else _escape(char) for char in text)
+    return "".join(char if char.isprintable() or char in keep else _escape_character(char) for char in text)
 
 
-def _escape(char: str) -> str:
+def _escape_character(char: str) -> str:
     if "\udc80" <= char <= "\udcff":  # a byte that is not UTF-8, as Python hands it over
         return f"\\x{ord(char) - 0xDC00:02x}"
     return char.encode("unicode_escape").decode("ascii")
@@ -53,8 +53,8 @@ def redact_passwords(text: str) -> str:
 
 
 def sanitize(text: str, keep: str = "") -> str:
-    """Make a text fit for messages: see `redact_passwords` and `printable`, which also explains `keep`."""
-    return printable(redact_passwords(text), keep)
+    """Make a text fit for messages: see `redact_passwords` and `escape_unprintable`, which also explains `keep`."""
+    return escape_unprintable(redact_passwords(text), keep)
 
 
 def decode_name(name: str) -> str:
@@ -77,7 +77,7 @@ def align_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
     return ["  ".join(line).rstrip() for line in lines]
 
 
-def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
+def format_markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
     """Return a Markdown table: the first `left` columns flush left, the others flush right."""
     ruler = ["---"] * left + ["---:"] * (len(headings) - left)
     return "\n".join("| " + " | ".join(line) + " |" for line in (headings, ruler, *rows))
@@ -85,10 +85,10 @@ def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int =
 
 def wrap_sentence(text: str) -> list[str]:
     """Break a sentence into lines of at most 120 columns, between words only."""
-    return textwrap.wrap(text, _COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    return textwrap.wrap(text, _LINE_COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
-def json_line(value: Any) -> bytes:
+def format_json_line(value: Any) -> bytes:
     """Write a value as one line of JSON, without passwords. Dataclasses become objects, members of
     an Enum their names, NaN and infinities null."""
     text = json.dumps(_to_json(value), ensure_ascii=False, allow_nan=False)
@@ -146,10 +146,10 @@ def progress(
         if total:
             percent = 100 * done // total
             step = percent if terminal else percent // 10
-            text = f"{label}  {done}/{total}  {percent} %" + _time_left(clock() - began_s, done, total)
+            text = f"{label}  {done}/{total}  {percent} %" + _format_time_left(clock() - began_s, done, total)
         else:
             step, text = done // (1 if terminal else 100), f"{label}  {done}"
-        if step != last_step or clock() - last_s >= _SILENT_S:
+        if step != last_step or clock() - last_s >= _MAX_SILENCE_S:
             last_step, last_s = step, clock()
             # The cursor goes back to the start of the line, so that an error message is written over it.
             stream.write(f"{text:<{width}}\r" if terminal else f"{text}\n")
@@ -165,7 +165,7 @@ def show_elapsed(text: str) -> Iterator[None]:
     stream, ended, began_s = sys.stderr, Event(), time.monotonic()
 
     def report() -> None:
-        while not (is_quiet() or ended.wait(_SILENT_S)):
+        while not (is_quiet() or ended.wait(_MAX_SILENCE_S)):
             print(f"{text}, {time.monotonic() - began_s:.0f} s so far", file=stream, flush=True)
 
     reporter = Thread(target=report, daemon=True)
@@ -177,9 +177,9 @@ def show_elapsed(text: str) -> Iterator[None]:
         reporter.join()
 
 
-def _time_left(passed_s: float, done: int, total: int) -> str:
+def _format_time_left(passed_s: float, done: int, total: int) -> str:
     left_s = passed_s / done * (total - done)
-    if min(passed_s, left_s) < _SOON_S:
+    if min(passed_s, left_s) < _MIN_ESTIMATE_S:
         return ""
     return f", {left_s:.0f} s left" if left_s < 100 else f", {left_s / 60:.0f} min left"
 
@@ -195,7 +195,7 @@ def show_waiting(text: str, stream: TextIO | None = None) -> None:
 def format_probability(probability: float) -> str:
     """Show the probability of being right: "98.1 %" or, from 99.9 % on, "1 in 3,000 wrong", at most 1 in 1,000,000."""
     wrong = max(1 - probability, _MIN_WRONG)
-    if not wrong <= _FEW_WRONG:  # NaN as well
+    if not wrong <= _MAX_ODDS_WRONG:  # NaN as well
         return f"{100 * probability:.1f} %"
     return f"1 in {float(f'{1 / wrong:.1g}'):,.0f} wrong"
 

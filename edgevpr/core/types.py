@@ -9,8 +9,8 @@ from edgevpr.core.contract import FineMatch
 from edgevpr.core.reasons import Reason
 
 # ArduPilot treats an older frame as 5 s old, and would then correct the position by too little: no such fix is sent.
-FIX_MAX_AGE_S = 5.0
-_FRESH_S = 1.0
+MAX_FIX_AGE_S = 5.0
+_MAX_REPORT_AGE_S = 1.0
 FRAME_TIME_SD_S = 0.03  # standard deviation of the time of a frame: what a camera takes to expose and to send varies
 
 
@@ -90,7 +90,7 @@ class Vehicle:
 
     def is_fresh(self, t_mono_s: float) -> bool:
         """Return True if the report came within one second of `t_mono_s`, such as the time of a frame."""
-        return abs(t_mono_s - self.t_heard_s) <= _FRESH_S
+        return abs(t_mono_s - self.t_heard_s) <= _MAX_REPORT_AGE_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -184,7 +184,7 @@ NO_COST = StageCost(0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Steps:
+class StepCosts:
     """Costs of the steps of a query: `read` the picture, `prepare` it (level it), test its salience (`gate`), `encode`
     it, measure the `stride` since the frame before, `scan` all places, `compare` the candidates, `verify` the best one
     by its landmarks, `locate` the aircraft. A step that was not reached has no cost; only flights read and stride."""

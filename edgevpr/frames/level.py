@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Image, Mask
-from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.homography import Homography, cut_polygon
@@ -161,7 +161,7 @@ def level_image(
     zoom = own_m / footprint_m if own_m and footprint_m else scale
     if not _ZOOM_LIMITS[0] <= zoom <= _ZOOM_LIMITS[1]:
         zoom = 1.0
-    turn_deg = abs(shorter_deg(taking.top_deg or 0.0))
+    turn_deg = abs(wrap_deg(taking.top_deg or 0.0))
     if taking.tilt_deg < _MIN_TILT_DEG and turn_deg < _MIN_TURN_DEG and abs(zoom - 1) < _MIN_ZOOM_CHANGE:
         aside, focal = taking.aside(taking.straight, 1.0), taking.focal_px / taking.longest_px
         view = View(up_deg=taking.top_deg, footprint_m=own_m, aside=aside, aside_sd=taking.aside_sd(1.0), focal=focal)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.files import read_file, write_whole
-from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.files import read_file, write_atomically
+from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.types import Position
 
 ALT_LIMITS_M = (-1000.0, 100_000.0)  # plausible altitudes
@@ -95,7 +95,7 @@ def _write_table(csv_path: str | Path, header: Sequence[str], rows: Iterable[Seq
     table = csv.writer(text)
     table.writerow(header)
     table.writerows(rows)
-    write_whole(Path(csv_path), lambda path: path.write_bytes(text.getvalue().encode()))
+    write_atomically(Path(csv_path), lambda path: path.write_bytes(text.getvalue().encode()))
 
 
 def _to_numbers(tag: GeoTag) -> tuple[Any, ...]:
@@ -219,12 +219,12 @@ class Track:
             return GeoTag()
         one, other = (np.array(_to_numbers(tag), float) for tag in self.tags[after - 1 : after + 1])  # NaN: unknown
         way = other - one
-        way[_ANGLE_INDICES] = shorter_deg(way[_ANGLE_INDICES])
+        way[_ANGLE_INDICES] = wrap_deg(way[_ANGLE_INDICES])
         share = (t_s - self.t_s[after - 1]) / (self.t_s[after] - self.t_s[after - 1])
         between: list[Any] = [None if math.isnan(number) else number for number in (one + share * way).tolist()]
         lat_deg, lon_deg, alt_m, heading_deg, roll_deg, pitch_deg, height_m = between
         return GeoTag(
-            position=Position(lat_deg, shorter_deg(lon_deg), alt_m),
+            position=Position(lat_deg, wrap_deg(lon_deg), alt_m),
             heading_deg=None if heading_deg is None else heading_deg % 360,
             roll_deg=roll_deg,
             pitch_deg=pitch_deg,

@@ -12,7 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from edgevpr.core.arrays import Image
-from edgevpr.core.config import SOURCES
+from edgevpr.core.config import SOURCE_HELP
 from edgevpr.core.errors import EdgevprError, ImageError, SourceError, UsageError
 from edgevpr.core.text import decode_name
 from edgevpr.core.types import Frame
@@ -193,7 +193,7 @@ def open_source(
 
         return LiveSource(_make_capture(uri, clock, step_s or _SNAPSHOT_PERIOD_S), clock)
     if not path.is_file():
-        raise SourceError(f"There is nothing at `{uri}`: give {SOURCES}.")
+        raise SourceError(f"There is nothing at `{uri}`: give {SOURCE_HELP}.")
     if path.name.lower().endswith(EXTENSIONS):
         raise SourceError(f"{uri} is a single image: give the folder that holds it.")
     from edgevpr.frames.video import VideoSource  # loads FFmpeg
@@ -255,7 +255,7 @@ def _make_capture(uri: str, clock: Callable[[], float], period_s: float) -> Call
         )
     if "://" in uri and not _ADDRESS_PATTERN.fullmatch(uri):
         raise SourceError(
-            f"{uri} is no address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCES}."
+            f"{uri} is no address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCE_HELP}."
         )
 
     def open_capture() -> Capture:

@@ -21,7 +21,7 @@ from edgevpr.core.arrays import Bools, Image, Singles
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
-from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.text import show_elapsed
 from edgevpr.frames.exif import read_exif, read_fov_deg, read_xmp
 from edgevpr.frames.images import list_images, read_image
@@ -156,7 +156,7 @@ def _compare_neighbours(pictures: FlownPictures, mask: OverlayMask | None) -> tu
             if seen.inliers < PROVEN or seen.shift_share is None or seen.rotation_deg is None or seen.scale is None:
                 continue
             pairs += 1
-            if abs(shorter_deg(seen.rotation_deg)) >= _MIN_TURN_DEG or abs(seen.shift_share[1]) >= _MIN_UP_SHARE:
+            if abs(wrap_deg(seen.rotation_deg)) >= _MIN_TURN_DEG or abs(seen.shift_share[1]) >= _MIN_UP_SHARE:
                 clear += 1
             elif abs(seen.shift_share[0]) >= _MIN_ASIDE_SHARE and abs(seen.scale - 1) <= _MAX_GROWTH_ASIDE:
                 aside += 1

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Array, Doubles
-from edgevpr.core.geodesy import fit_similarity, offset_m, shorter_deg
+from edgevpr.core.geodesy import fit_similarity, offset_m, wrap_deg
 from edgevpr.core.types import Frame
 from edgevpr.frames.level import MAX_TILT_DEG, MAX_TILT_UNLEVELLED_DEG, Lens, compute_level_rotation
 from edgevpr.mapmaking.tilt import FEATURES, Features, detect_features, match_features
@@ -79,6 +79,6 @@ def _lay(points: Doubles, frame: Frame, lens: Lens) -> Array:
 def _set_heading(frame: Frame, before_deg: float | None, after_deg: float | None) -> Frame:
     """Return a frame with the mean of the headings by the motion before and after it, if they agree (None: unknown)."""
     known = [heading_deg for heading_deg in (before_deg, after_deg) if heading_deg is not None]
-    if not known or abs(shorter_deg(known[0] - known[-1])) > _MAX_DIFFERENCE_DEG:
+    if not known or abs(wrap_deg(known[0] - known[-1])) > _MAX_DIFFERENCE_DEG:
         return frame
-    return replace(frame, heading_deg=float(np.mod(known[0] + shorter_deg(known[-1] - known[0]) / 2, 360)))
+    return replace(frame, heading_deg=float(np.mod(known[0] + wrap_deg(known[-1] - known[0]) / 2, 360)))

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from edgevpr.core.errors import ImageError, ModelError
-from edgevpr.core.geodesy import distance_m, metres, offset_position
+from edgevpr.core.geodesy import distance_m, offset_position, project_to_metres
 from edgevpr.core.types import Frame, Position, Salience
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
@@ -104,7 +104,7 @@ def measure_ground(place_map: PlaceMap) -> Covered | None:
     lat_deg, lon_deg = points[~np.isnan(points).any(axis=1)].T
     if len(lat_deg) < 2:
         return None
-    east_m, north_m = metres(lat_deg, lon_deg)
+    east_m, north_m = project_to_metres(lat_deg, lon_deg)
     steps_m = distance_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])
     middle_m = [float(each.max() + each.min()) / 2 for each in (east_m, north_m)]
     middle = offset_position(float(lat_deg[0]), float(lon_deg[0]), *middle_m)

@@ -11,7 +11,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Bools, Doubles, Image
 from edgevpr.core.errors import SourceError, UsageError
-from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.types import Position
 from edgevpr.frames.images import resize
 from edgevpr.mapmaking.georaster import (
@@ -62,7 +62,7 @@ class Orthophoto:
         try:
             columns, rows = np.array([[self._raster.width / 2], [self._raster.height / 2]])
             (lon_deg,), (lat_deg,) = self._to_crs(columns, rows, WGS84)
-            self.middle = Position(lat_deg, shorter_deg(lon_deg))
+            self.middle = Position(lat_deg, wrap_deg(lon_deg))
             lons_deg, lats_deg = self.outline(WGS84)
         except (CPLE_BaseError, RasterioError):
             lats_deg = lons_deg = np.array([np.nan])
@@ -72,7 +72,7 @@ class Orthophoto:
                 f"{self.name}: its coordinate system ({self._raster.crs.to_string()[:60]}) cannot be brought to "
                 "latitude and longitude: export it with another, such as UTM or EPSG:4326."
             )
-        lons_deg = self.middle.lon_deg + shorter_deg(lons_deg - self.middle.lon_deg)
+        lons_deg = self.middle.lon_deg + wrap_deg(lons_deg - self.middle.lon_deg)
         self.extent_deg = (lats_deg.min(), lons_deg.min(), lats_deg.max(), lons_deg.max())
         metre_px = self._pixels(self.middle, np.array([[0, 0], [1, 0], [0, 1]]))
         self.resolution_m = float(1 / np.sqrt(abs(np.linalg.det(metre_px[1:] - metre_px[0]))))

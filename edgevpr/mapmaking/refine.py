@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 from edgevpr.core.arrays import Array, Bools, Complexes, Floats
 from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError, PlaceError
-from edgevpr.core.geodesy import metres, offset_position
+from edgevpr.core.geodesy import offset_position, project_to_metres
 from edgevpr.core.text import decode_name
 from edgevpr.core.types import Place, Pose, Position
 from edgevpr.frames.images import list_images, read_image
@@ -118,7 +118,7 @@ def refine(
     if not placed:
         return result
     recorded_at = [_recorded_position(place) for place in placed]
-    east_m, north_m = metres(*np.array([(position.lat_deg, position.lon_deg) for position in recorded_at]).T)
+    east_m, north_m = project_to_metres(*np.array([(position.lat_deg, position.lon_deg) for position in recorded_at]).T)
     recorded = east_m + 1j * north_m
     look = _looker(place_map, technique, placed, images)
     pairs = _find_likely_pairs(recorded)
@@ -176,7 +176,7 @@ def _is_mirrored(recorded_at: list[Position], recorded: Complexes, ties: Ties, s
     lat_deg, lon_deg = np.array([(position.lat_deg, position.lon_deg) for position in recorded_at[some]]).T
     mirrored = [recorded[some].conj()]
     if abs(lon_deg).max() < 90:  # exchanging lat and lon also changes the proportions of the track
-        east_m, north_m = metres(lon_deg, lat_deg)
+        east_m, north_m = project_to_metres(lon_deg, lat_deg)
         mirrored.append(east_m + 1j * north_m)
     return any(_misses(each, solve(each, fewer), some) < _MIRRORED * misses for each in mirrored)
 

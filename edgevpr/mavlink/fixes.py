@@ -14,7 +14,7 @@ from threading import Event
 
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.core.types import FIX_MAX_AGE_S, Vehicle
+from edgevpr.core.types import MAX_FIX_AGE_S, Vehicle
 from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Fix, Severity
 
@@ -98,10 +98,10 @@ class Fixes:
 
     def put(self, fix: Fix, now_s: float) -> Sending:
         """Queue a fix. It is sent within `max_wait_s` seconds and before its frame is 5 s old, or not at all."""
-        sending = Sending(fix, min(now_s + self._max_wait_s, fix.t_frame_s + FIX_MAX_AGE_S))
+        sending = Sending(fix, min(now_s + self._max_wait_s, fix.t_frame_s + MAX_FIX_AGE_S))
         age_s = now_s - fix.t_frame_s
-        if age_s > FIX_MAX_AGE_S:
-            self._drop(sending, Reason(ReasonCode.FRAME_TOO_OLD, {"age_s": age_s, "limit_s": FIX_MAX_AGE_S}))
+        if age_s > MAX_FIX_AGE_S:
+            self._drop(sending, Reason(ReasonCode.FRAME_TOO_OLD, {"age_s": age_s, "limit_s": MAX_FIX_AGE_S}))
             return sending
         if len(self._waiting) == FIXES_MAX:
             self._drop(self._waiting.popleft(), Reason(ReasonCode.SUPERSEDED))

@@ -18,7 +18,7 @@ from threading import Lock, Thread
 
 from edgevpr.core.config import MavlinkConfig
 from edgevpr.core.errors import ConfigError
-from edgevpr.core.files import open_file, read_file, write_whole
+from edgevpr.core.files import open_file, read_file, write_atomically
 from edgevpr.mavlink.wire import Message, mavlink
 
 TICKS_S = 100_000  # per second: a time stamp counts units of 10 microseconds since the beginning of 2015, UTC
@@ -113,7 +113,7 @@ class TimeStamps:
             return
         try:
             with self._writing:
-                write_whole(self._path, lambda path: path.write_text(f"{self._kept}\n"))
+                write_atomically(self._path, lambda path: path.write_text(f"{self._kept}\n"))
         except OSError as error:
             if may_fail:
                 why = f"the time of signed messages cannot be kept there ({error.strerror})"

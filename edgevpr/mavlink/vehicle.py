@@ -5,7 +5,7 @@ code of ArduPilot 4.7-dev (`setLatLng` of its NavEKF3) and PX4 1.17-alpha (`EKF2
 import math
 from typing import NamedTuple
 
-from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.wire import Message, mavlink
 
@@ -58,7 +58,7 @@ class Attitudes:
         if before is None or after is None:
             return before or after
         step_s = after.t_s - before.t_s
-        changed_deg = [shorter_deg(other - one) for one, other in zip(before[1:4], after[1:4], strict=True)]
+        changed_deg = [wrap_deg(other - one) for one, other in zip(before[1:4], after[1:4], strict=True)]
         share = (t_s - before.t_s) / step_s
         roll, pitch, yaw = (one + share * change for one, change in zip(before[1:4], changed_deg, strict=True))
         return Attitude(t_s, roll, pitch, yaw, math.hypot(*changed_deg[:2]) / step_s)

@@ -14,7 +14,7 @@ import numpy as np
 from edgevpr.core.arrays import Array, Bools, Doubles, Floats, Ints, LatLon, Singles
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import MapError
-from edgevpr.core.geodesy import distance_m, metres
+from edgevpr.core.geodesy import distance_m, project_to_metres
 from edgevpr.core.types import Position
 from edgevpr.places.mapfile import PlaceMap
 
@@ -177,7 +177,7 @@ def best_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: int
     count = len(quality)
     if count <= capacity:
         return np.arange(count)
-    east_m, north_m = metres(lat_deg, lon_deg)
+    east_m, north_m = project_to_metres(lat_deg, lon_deg)
     # If a position is unknown, the median distance of successive places is used instead.
     steps_m = np.hypot(np.diff(east_m), np.diff(north_m))
     usual_m = (float(np.nanmedian(steps_m)) if np.isfinite(steps_m).any() else 0.0) or 1.0

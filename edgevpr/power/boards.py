@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from edgevpr.core.config import (
-    BUDGET_MB,
-    HIGHEST_RATE_HZ,
-    LOWEST_RATE_HZ,
+    BUDGET_RANGE_MB,
+    MAX_RATE_HZ,
+    MIN_RATE_HZ,
     MemoryConfig,
     SourceConfig,
-    bounded,
+    bounded_key,
     build,
 )
 from edgevpr.core.errors import ConfigError
@@ -34,9 +34,9 @@ class MachineSpeed:
     `verified`: True if `source` measured the figures on this very board.
     """
 
-    single: float | None = bounded(0.0001, 100, default=None)
-    products: float | None = bounded(0.0001, 100, default=None)
-    arm64_mips: float | None = bounded(1, 1_000_000, default=None)
+    single: float | None = bounded_key(0.0001, 100, default=None)
+    products: float | None = bounded_key(0.0001, 100, default=None)
+    arm64_mips: float | None = bounded_key(1, 1_000_000, default=None)
     verified: bool
     source: str
 
@@ -59,20 +59,20 @@ class Board:
     name: str
     title: str
     recognised_by: str | None
-    ram_mb: float = bounded(64, 4_000_000)
-    cores: int = bounded(1, 1024)
-    idle_w: float = bounded(0, 1000)
-    full_w: float = bounded(0.01, 1000)
+    ram_mb: float = bounded_key(64, 4_000_000)
+    cores: int = bounded_key(1, 1024)
+    idle_w: float = bounded_key(0, 1000)
+    full_w: float = bounded_key(0.01, 1000)
     verified: bool
     source: str
-    rate_hz: float = bounded(LOWEST_RATE_HZ, HIGHEST_RATE_HZ)
-    cpu_share: float = bounded(0.01, 1)
-    budget_mb: float = bounded(*BUDGET_MB)
-    memory_max_mb: float = bounded(1, 4_000_000)
-    thermal_limit_c: float | None = bounded(30, 125)
+    rate_hz: float = bounded_key(MIN_RATE_HZ, MAX_RATE_HZ)
+    cpu_share: float = bounded_key(0.01, 1)
+    budget_mb: float = bounded_key(*BUDGET_RANGE_MB)
+    memory_max_mb: float = bounded_key(1, 4_000_000)
+    thermal_limit_c: float | None = bounded_key(30, 125)
     benchmark_score: MachineSpeed
     technique: str | None = None
-    threads: int = bounded(1, 64, default=1)
+    threads: int = bounded_key(1, 64, default=1)
 
     def is_this_machine(self, root: Path = Path("/")) -> bool:
         """Return True if the profile is that of the machine this runs on."""

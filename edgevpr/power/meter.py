@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import psutil
 
 from edgevpr.core.config import BatteryConfig
-from edgevpr.core.types import NO_COST, QueryCost, StageCost, Steps
+from edgevpr.core.types import NO_COST, QueryCost, StageCost, StepCosts
 from edgevpr.power import machine
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, parse_pack, stage_energy_j
@@ -68,7 +68,7 @@ class QueryMeter:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Meter a step of the query (a field of `Steps`): `with meter.step("encode"): ...`. A repeated step adds up."""
+        """Meter a step of the query (a field of `StepCosts`): `with meter.step("encode"):`. A repeated step adds up."""
         metered = Stage()
         try:
             with meter_stage(self._wall_clock, self._cpu_clock) as metered:
@@ -76,9 +76,9 @@ class QueryMeter:
         finally:
             self._taken[name] = self._taken.get(name, NO_COST) + metered.cost
 
-    def steps(self) -> Steps:
+    def steps(self) -> StepCosts:
         """Return the cost of every step of the query so far."""
-        return Steps(**self._taken)
+        return StepCosts(**self._taken)
 
     def cost(self) -> QueryCost:
         """Return the cost of the query so far."""

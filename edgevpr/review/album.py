@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from edgevpr.core.arrays import Image, Mask
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
-from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.text import progress
 from edgevpr.core.types import Place
 from edgevpr.frames.positions import GeoTag
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 _SIDES_PX = (480, 320, 240, 160, 112)  # of a small picture: the largest with which it fits is taken
 _MIN_BYTES = 2500  # of a picture of the smallest side, as an address
-_TURNED_DEG = 45.0  # between the tops of a picture and of a place: more is a contradiction
+_MAX_HEADING_ERROR_DEG = 45.0  # between the tops of a picture and of a place: more is a contradiction
 _CUT_PX = 512  # of a picture from an orthophoto, as the map was made of
 
-_FRAME = re.compile(r"frame \d{6} t=(\d+\.\d+) s")  # as `VideoSource` names them
+_FRAME_NAME = re.compile(r"frame \d{6} t=(\d+\.\d+) s")  # as `VideoSource` names them
 
 Key = tuple[str, str]  # which album, and the name of a picture in it
 
@@ -94,7 +94,7 @@ class Album:
         if not tag or tag.heading_deg is None or not place.pose:
             return self.level(place, lens)
         is_raw, is_level = (
-            abs(shorter_deg(place.pose.up_deg - up_deg)) < _TURNED_DEG
+            abs(wrap_deg(place.pose.up_deg - up_deg)) < _MAX_HEADING_ERROR_DEG
             for up_deg in (tag.heading_deg + (lens.up_deg if lens else 0.0), 0.0)
         )
         if lens and is_level:
@@ -105,7 +105,7 @@ class Album:
         return next((picture for finder in self._finders if (picture := finder(name))), None)
 
 
-def _read(path: Path, tag: Callable[[], GeoTag | None] | None = None) -> AlbumPicture | None:
+def _read_picture(path: Path, tag: Callable[[], GeoTag | None] | None = None) -> AlbumPicture | None:
     from edgevpr.frames.images import read_image  # a page without pictures needs no OpenCV
 
     with suppress(ImageError, OSError, ValueError):  # no picture, or a name that no file can have
@@ -115,13 +115,13 @@ def _read(path: Path, tag: Callable[[], GeoTag | None] | None = None) -> AlbumPi
 
 
 def _find_recorded(recorded: Mapping[str, Path], name: str) -> AlbumPicture | None:
-    return _read(recorded[name]) if name in recorded else None
+    return _read_picture(recorded[name]) if name in recorded else None
 
 
 def _find_in_folder(folder: Path, name: str) -> AlbumPicture | None:
     # A log from somebody else may name any file of this machine: show only files in the folder.
     path = folder / Path(name).name
-    return _read(path, lambda: _read_folder_tags(folder).get(path))
+    return _read_picture(path, lambda: _read_folder_tags(folder).get(path))
 
 
 @cache
@@ -133,7 +133,7 @@ def _read_folder_tags(folder: Path) -> Mapping[Path, GeoTag]:
     return {}
 
 
-class _Film:
+class _VideoFinder:
     """Finds the pictures of a film by the names of its frames. Raises EdgevprError for a file that is no film, and for
     an unusable table of positions beside it."""
 
@@ -149,7 +149,7 @@ class _Film:
     def __call__(self, name: str) -> AlbumPicture | None:
         from edgevpr.frames.source import read_to_end
 
-        named = _FRAME.fullmatch(name)
+        named = _FRAME_NAME.fullmatch(name)
         if not named:
             return None
         if name <= self._passed:  # names are in the order of the film, which is read forwards
@@ -188,7 +188,7 @@ def make_album(sources: Sequence[str | Path], recorded: Mapping[str, Path] = Map
     by the names of its frames. Raises EdgevprError for a source that cannot be used."""
     finders: list[Finder] = [partial(_find_recorded, recorded)] if recorded else []
     if len(sources) == 1 and Path(sources[0]).is_file():
-        return Album(*finders, _Film(Path(sources[0])))
+        return Album(*finders, _VideoFinder(Path(sources[0])))
     for folder in map(Path, sources):
         if not folder.is_dir():
             raise UsageError(f"{folder}: there is no such folder: give one that holds pictures, or a film.")
@@ -196,7 +196,7 @@ def make_album(sources: Sequence[str | Path], recorded: Mapping[str, Path] = Map
     return Album(*finders)
 
 
-def album_of_map(sources: Sequence[str | Path], places: Sequence[Place]) -> Album:
+def make_map_album(sources: Sequence[str | Path], places: Sequence[Place]) -> Album:
     """Return the album of a map's pictures. `sources` are folders of pictures, or a film; of a map that was cut from an
     orthophoto, the orthophoto. Raises EdgevprError for one that cannot be used."""
     if sources and any(place.position and place.pose and place.pose.is_surveyed for place in places):
@@ -204,7 +204,7 @@ def album_of_map(sources: Sequence[str | Path], places: Sequence[Place]) -> Albu
     return make_album(sources)
 
 
-def small_pictures(
+def embed_pictures(
     steps: Sequence[Sequence[Key]], albums: Mapping[str, Album], room_bytes: float
 ) -> tuple[dict[Key, str], str]:
     """Load the pictures of all steps as data: addresses, in `room_bytes` together: each as large as its share of them

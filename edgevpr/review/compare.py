@@ -13,11 +13,11 @@ Changes = dict[str, tuple[Any, Any]]  # by name: (value in the flight, value in 
 _SIGNATURE_BYTES = 13
 
 # Fields of a log's first line that describe the program that flew, not the flight.
-_PROGRAM = ("version", "machine", "python", "libraries")
+_PROGRAM_FIELDS = ("version", "machine", "python", "libraries")
 
 
 @dataclass(slots=True)
-class Lines:
+class LineComparison:
     """Comparison of the logs of flight and replay: the number of lines that are `alike`, the `others`, which differ,
     and the number of lines of the flight that come `after` the end of the replay. `program` has those fields of the
     first line that describe the program and differ. Each of the `others` has the `kind` of the line, its time
@@ -30,35 +30,35 @@ class Lines:
     program: Changes = field(default_factory=dict)
 
 
-def compare(then: Iterable[Line], now: Iterable[Line]) -> Lines:
+def compare_lines(then: Iterable[Line], now: Iterable[Line]) -> LineComparison:
     """Compare the lines of a flight's log with those of its replay, one after the other."""
-    then, now, found = list(then), list(now), Lines(after=max(0, len(then) - len(now)))
+    then, now, found = list(then), list(now), LineComparison(after=max(0, len(then) - len(now)))
     for before, after in zip(then, now, strict=False):
-        fields = dict(_differing(before, after))
+        fields = dict(_compare_values(before, after))
         if before.get("kind") == "start":
-            found.program = {name: fields.pop(name) for name in [*fields] if name.partition(".")[0] in _PROGRAM}
+            found.program = {name: fields.pop(name) for name in [*fields] if name.partition(".")[0] in _PROGRAM_FIELDS}
         if fields:
-            found.others.append({**_name_line(before), "fields": fields})
+            found.others.append({**_identify_line(before), "fields": fields})
         else:
             found.alike += 1
-    found.others += [{**_name_line(line), "only_in": "replay"} for line in now[len(then) :]]
+    found.others += [{**_identify_line(line), "only_in": "replay"} for line in now[len(then) :]]
     return found
 
 
-def _name_line(line: Line) -> Line:
+def _identify_line(line: Line) -> Line:
     return {"kind": line.get("kind"), "t_mono_s": line.get("t_mono_s") or 0.0, "query": line.get("query")}
 
 
-def _differing(then: Any, now: Any, name: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
+def _compare_values(then: Any, now: Any, name: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
     if isinstance(then, dict) and isinstance(now, dict):
         for key in then | now:
-            yield from _differing(then.get(key), now.get(key), f"{name}.{key}" if name else key)
+            yield from _compare_values(then.get(key), now.get(key), f"{name}.{key}" if name else key)
     elif then != now or type(then) is not type(now):
         yield name, (then, now)
 
 
 @dataclass(slots=True)
-class Packets:
+class PacketComparison:
     """Comparison of the packets that the flight sent with those that its replay sends: how many are `alike`, and the
     `others`, each in a sentence."""
 

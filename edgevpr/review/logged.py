@@ -14,10 +14,10 @@ from edgevpr.runtime.flight.flightlog import select_last_flight
 _log = logging.getLogger(__name__)
 
 Point = tuple[float, float]  # latitude and longitude, degrees
-_FRESH_S = 1.0  # a report of the autopilot that is further in time from a frame is not used for it
-_REASONS = ("note", "why")  # fields with a reason: the first that a line has is shown
-_TEXTS = ("said", "state", "problem")  # fields with a text for people, else
-_LARGEST = 1e15  # larger numbers are damage; the comparison also excludes NaN, and integers that no float can hold
+_MAX_REPORT_AGE_S = 1.0  # a report of the autopilot that is further in time from a frame is not used for it
+_REASON_FIELDS = ("note", "why")  # fields with a reason: the first that a line has is shown
+_TEXT_FIELDS = ("said", "state", "problem")  # fields with a text for people, else
+_MAX_NUMBER = 1e15  # larger numbers are damage; the comparison also excludes NaN, and integers that no float can hold
 
 
 class FixOutcome(Enum):
@@ -31,7 +31,7 @@ class FixOutcome(Enum):
     KEPT = "fix not sent"
 
 
-SENT = (FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.UNANSWERED)
+SENT_OUTCOMES = (FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.UNANSWERED)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -101,7 +101,7 @@ def read_flight(path: str | Path) -> LoggedFlight:
     lines = select_last_flight(path)
     flight, queries, start_s = LoggedFlight(path=Path(path)), dict[str, LoggedQuery](), None
     for line in lines:
-        t_mono_s, t_s = number(line, "t_mono_s"), flight.span_s
+        t_mono_s, t_s = get_number(line, "t_mono_s"), flight.span_s
         if t_mono_s is not None:
             start_s = t_mono_s if start_s is None else start_s
             t_s = max(0.0, t_mono_s - start_s)
@@ -112,17 +112,17 @@ def read_flight(path: str | Path) -> LoggedFlight:
             case "end":
                 flight.end = line
             case "query":
-                t_frame_s = number(line, "t_frame_s")
+                t_frame_s = get_number(line, "t_frame_s")
                 query = _read_query(line, t_s if t_frame_s is None else max(0.0, t_frame_s - (start_s or 0.0)))
                 queries[query.name] = query
                 flight.queries.append(query)
             case "answer":
-                if (answered := queries.get(text(line, "query") or "")) and answered.fix:
+                if (answered := queries.get(get_text(line, "query") or "")) and answered.fix:
                     _apply_answer(answered.fix, line)
             case "unusable":
                 flight.unusable += 1
             case "between":
-                flight.between += [line] if point(line) else []
+                flight.between += [line] if get_point(line) else []
             case _:
                 flight.remarks.append((t_s, str(kind), _read_text(line)))
     if lines.missing:
@@ -133,47 +133,47 @@ def read_flight(path: str | Path) -> LoggedFlight:
 
 def _apply_answer(fix: LoggedFix, line: dict[str, Any]) -> None:
     """Set outcome and reason of a fix from a log line of kind "answer"."""
-    fix.outcome = _outcome(line, line.get("result"))
+    fix.outcome = _read_outcome(line, line.get("result"))
     fix.why = read_reason(line.get("why")) or fix.why
 
 
 def _read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
     """Read a log line of kind "query"."""
-    t_frame_s = number(line, "t_frame_s")
+    t_frame_s = get_number(line, "t_frame_s")
     accepted = line.get("accepted") is True
     gps_at = _locate_gps(line, t_frame_s)
-    has_link = _is_fresh(number(line, "vehicle", "t_heard_s"), t_frame_s)
-    autopilot_at = point(line, "vehicle") if has_link else None
+    has_link = _is_fresh(get_number(line, "vehicle", "t_heard_s"), t_frame_s)
+    autopilot_at = get_point(line, "vehicle") if has_link else None
     # The confidence by which a match was judged: its own, or that of the flight so far where it is higher.
-    confidences = number(line, "confidence"), number(line, "followed", "confidence")
-    place, fix = number(line, "place"), value(line, "fix")
+    confidences = get_number(line, "confidence"), get_number(line, "followed", "confidence")
+    place, fix = get_number(line, "place"), get_value(line, "fix")
     return LoggedQuery(
         line=line,
-        name=text(line, "query") or "",
+        name=get_text(line, "query") or "",
         t_s=t_s,
         accepted=accepted,
         reason=read_reason(line.get("reason")),
         confidence=max((known for known in confidences if known is not None), default=None),
         place=None if place is None else int(place),
-        reference_image=text(line, "reference_image"),
-        at=point(line, "located") or point(line, "position") if accepted else None,
-        accuracy_m=number(line, "accuracy_m"),
-        place_at=point(line, "position"),
+        reference_image=get_text(line, "reference_image"),
+        at=get_point(line, "located") or get_point(line, "position") if accepted else None,
+        accuracy_m=get_number(line, "accuracy_m"),
+        place_at=get_point(line, "position"),
         autopilot_at=autopilot_at,
         gps_at=gps_at,
         # An autopilot that has GPS knows by how much its receiver lags: at 20 m/s that is metres.
-        true_at=autopilot_at if gps_at and value(line, "vehicle", "has_gps") is True else gps_at,
+        true_at=autopilot_at if gps_at and get_value(line, "vehicle", "has_gps") is True else gps_at,
         fix=_read_fix(fix) if isinstance(fix, dict) else None,
         has_link=has_link if "vehicle" in line else None,
     )
 
 
 def _read_fix(fix: dict[str, Any]) -> LoggedFix:
-    outcome, why = _outcome(fix, fix.get("answer")), read_reason(fix.get("why"))
-    return LoggedFix(outcome=outcome, why=why, at=point(fix), accuracy_m=number(fix, "accuracy_m"))
+    outcome, why = _read_outcome(fix, fix.get("answer")), read_reason(fix.get("why"))
+    return LoggedFix(outcome=outcome, why=why, at=get_point(fix), accuracy_m=get_number(fix, "accuracy_m"))
 
 
-def _outcome(fix: dict[str, Any], answer: object) -> FixOutcome:
+def _read_outcome(fix: dict[str, Any], answer: object) -> FixOutcome:
     if fix.get("sent") is False:
         why = read_reason(fix.get("why"))
         return FixOutcome.CONTINUOUS if why and why.code is ReasonCode.CONTINUOUS else FixOutcome.KEPT
@@ -183,24 +183,24 @@ def _outcome(fix: dict[str, Any], answer: object) -> FixOutcome:
 
 
 def _is_fresh(t_s: float | None, t_frame_s: float | None) -> bool:
-    return t_s is not None and t_frame_s is not None and abs(t_frame_s - t_s) <= _FRESH_S
+    return t_s is not None and t_frame_s is not None and abs(t_frame_s - t_s) <= _MAX_REPORT_AGE_S
 
 
 def _locate_gps(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
     """Return where the GPS receiver was when the frame was taken: its newest position, moved on by the velocity. None
-    if it is unknown or its time is further than `_FRESH_S` from the frame's."""
-    at, t_s = point(line, "vehicle", "gps"), number(line, "vehicle", "gps", "t_s")
+    if it is unknown or its time is further than `_MAX_REPORT_AGE_S` from the frame's."""
+    at, t_s = get_point(line, "vehicle", "gps"), get_number(line, "vehicle", "gps", "t_s")
     if at is None or t_s is None or t_frame_s is None or not _is_fresh(t_s, t_frame_s):
         return None
-    match value(line, "vehicle", "velocity_m_s"):
+    match get_value(line, "vehicle", "velocity_m_s"):
         case [int() | float() as east_m_s, int() | float() as north_m_s]:
             return offset_position(*at, (t_frame_s - t_s) * east_m_s, (t_frame_s - t_s) * north_m_s)
     return at
 
 
 def _read_text(line: dict[str, Any]) -> str:
-    reasons = [str(reason) for key in _REASONS if (reason := read_reason(line.get(key)))]
-    words = next(iter([*reasons, *(known for key in _TEXTS if (known := text(line, key)))]), None)
+    reasons = [str(reason) for key in _REASON_FIELDS if (reason := read_reason(line.get(key)))]
+    words = next(iter([*reasons, *(known for key in _TEXT_FIELDS if (known := get_text(line, key)))]), None)
     match line:
         case {"from": dict() as before, "to": dict() as after}:  # of the governor
             changed = [f"{key} {before.get(key)} to {now}" for key, now in after.items() if before.get(key) != now]
@@ -209,29 +209,29 @@ def _read_text(line: dict[str, Any]) -> str:
     return words or ", ".join(f"{key} {known}" for key, known in line.items() if key not in others)
 
 
-def value(record: Any, *keys: str) -> Any:
+def get_value(record: Any, *keys: str) -> Any:
     """Return the value at `keys` in the nested dictionaries of `record`; None if any of them is missing."""
     for key in keys:
         record = record.get(key) if isinstance(record, dict) else None
     return record
 
 
-def number(record: Any, *keys: str) -> float | None:
-    """Return the number at `keys`, as `value` does; None if it is missing or no plausible number."""
-    found = value(record, *keys)
+def get_number(record: Any, *keys: str) -> float | None:
+    """Return the number at `keys`, as `get_value` does; None if it is missing or no plausible number."""
+    found = get_value(record, *keys)
     is_number = isinstance(found, (int, float)) and not isinstance(found, bool)
-    return float(found) if is_number and -_LARGEST < found < _LARGEST else None
+    return float(found) if is_number and -_MAX_NUMBER < found < _MAX_NUMBER else None
 
 
-def text(record: Any, *keys: str) -> str | None:
-    """Return the text at `keys`, as `value` does; None if it is missing, empty or no text."""
-    found = value(record, *keys)
+def get_text(record: Any, *keys: str) -> str | None:
+    """Return the text at `keys`, as `get_value` does; None if it is missing, empty or no text."""
+    found = get_value(record, *keys)
     return found if isinstance(found, str) and found else None
 
 
-def point(record: Any, *keys: str) -> Point | None:
+def get_point(record: Any, *keys: str) -> Point | None:
     """Return the position (lat_deg, lon_deg) of the object at `keys`; None if it is missing or out of range."""
-    lat_deg, lon_deg = number(record, *keys, "lat_deg"), number(record, *keys, "lon_deg")
+    lat_deg, lon_deg = get_number(record, *keys, "lat_deg"), get_number(record, *keys, "lon_deg")
     if lat_deg is None or lon_deg is None or abs(lat_deg) > 90 or abs(lon_deg) > 180:
         return None
     return lat_deg, lon_deg

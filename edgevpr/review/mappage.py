@@ -12,22 +12,22 @@ from edgevpr.core.types import Place
 from edgevpr.mapmaking.look_alikes import FoundLookAlike
 from edgevpr.review.album import Album
 from edgevpr.review.logged import Point
-from edgevpr.review.webpage import UNKNOWN, Layer, Section, Step, figure, make_layer, make_page, to_point
+from edgevpr.review.webpage import UNKNOWN, Layer, Section, Step, format_number, make_layer, make_page, to_point
 
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
-MAX_ASKED = 100  # pictures of a map that are looked for among the places elsewhere: each takes half a second
-_QUALITIES = {"low": 0.4, "fair": 0.6, "good": 0.8, "best": 1.01}  # below which value it is called so
-_HARD = 0.5  # mean confidence of a place that is hard to recognise
-_TAG_OFF = 4.0  # times the usual distance of a tag from where its picture lies, as in refinement
-_OF_MEDIAN = 1.1774  # of the length of a normally distributed vector, over the standard deviation of an axis
+MAX_QUERIES = 100  # pictures of a map that are looked for among the places elsewhere: each takes half a second
+_QUALITY_CLASSES = {"low": 0.4, "fair": 0.6, "good": 0.8, "best": 1.01}  # below which value it is called so
+_MAX_HARD_CONFIDENCE = 0.5  # mean confidence of a place that is hard to recognise
+_MAX_TAG_SIGMA = 4.0  # times the usual distance of a tag from where its picture lies, as in refinement
+_MEDIAN_PER_SIGMA = 1.1774  # of the length of a normally distributed vector, over the standard deviation of an axis
 _MIN_TAG_OFF_M = 5.0  # less is no more than the receiver's error
-_CELLS = 24  # of a footprint
+_CELLS_PER_FOOTPRINT = 24  # of a footprint
 _MAX_CELLS = 4_000_000  # of the whole ground
-_SURELY_SEEN = 0.75  # of a footprint: the short side of a picture of 4:3
-_THINNEST = 0.15  # footprints: less is no gap
-_WIDEST = 1.0  # footprints: what is wider and open to one side is outside the map
+_COVERED_SHARE = 0.75  # of a footprint: the short side of a picture of 4:3
+_MIN_GAP_FOOTPRINTS = 0.15  # footprints: less is no gap
+_MAX_GAP_FOOTPRINTS = 1.0  # footprints: what is wider and open to one side is outside the map
 _NOTES = (
     "Coverage gaps lie between pictures that do not meet: each picture is assumed to show at least a square of three "
     "quarters of its long side.",
@@ -54,10 +54,10 @@ def make_map_page(
     its camera (None: unknown)."""
     ground = [place for place in places if place.position]
     points = {place.place_id: to_point(place) for place in ground}
-    tags_off_m, alike = find_tags_off(ground), {each.place_id: each for each in look_alikes if each}
-    hard = {place_id for place_id, confidence in recognisable.items() if confidence < _HARD}
+    tags_off_m, alike = find_inconsistent_tags(ground), {each.place_id: each for each in look_alikes if each}
+    hard = {place_id for place_id, confidence in recognisable.items() if confidence < _MAX_HARD_CONFIDENCE}
     gaps, covered_m2, gaps_m2 = find_gaps(ground)
-    steps = list(_steps(places, recognisable, tags_off_m, alike, points))
+    steps = list(_make_steps(places, recognisable, tags_off_m, alike, points))
     pairs = [(points.get(each.place_id), points.get(each.other_id)) for each in alike.values()]
     tags = [(read_recorded_position(place), to_point(place)) for place in ground if place.place_id in tags_off_m]
     layers = [
@@ -65,12 +65,12 @@ def make_map_page(
         Layer("look alike", "alike", [(one, other) for one, other in pairs if one and other], "line"),
         Layer("inconsistent GPS tags", "amiss", tags, "line"),
         make_layer(steps, "hard to recognise", "weak"),
-        *(make_layer(steps, f"{quality} quality", quality) for quality in _QUALITIES),
+        *(make_layer(steps, f"{quality} quality", quality) for quality in _QUALITY_CLASSES),
     ]
     known = {
         "places": str(len(places)),
-        "ground seen": figure(covered_m2 / 1e4 if covered_m2 else None, "ha"),
-        "coverage gaps": figure(gaps_m2 / 1e4 if covered_m2 else None, "ha"),
+        "ground seen": format_number(covered_m2 / 1e4 if covered_m2 else None, "ha"),
+        "coverage gaps": format_number(gaps_m2 / 1e4 if covered_m2 else None, "ha"),
         "inconsistent GPS tags": str(len(tags_off_m)),
         "hard to recognise": str(len(hard)) if recognisable else UNKNOWN,
         "look alike": f"{len(alike)} of {len(look_alikes)}" if look_alikes else UNKNOWN,
@@ -88,11 +88,11 @@ def make_map_page(
     return make_page(head, steps, ground, layers, albums, lens=lens, notes=notes if ground else [], sections=[held])
 
 
-def _quality(place: Place) -> str:
-    return next(name for name, below in _QUALITIES.items() if place.quality < below)
+def _classify_quality(place: Place) -> str:
+    return next(name for name, below in _QUALITY_CLASSES.items() if place.quality < below)
 
 
-def _steps(
+def _make_steps(
     places: Sequence[Place],
     recognisable: Mapping[int, float],
     tags_off_m: Mapping[int, float],
@@ -103,9 +103,9 @@ def _steps(
     for place in places:
         place_id, pose = place.place_id, place.pose
         confidence, twin = recognisable.get(place_id), alike.get(place_id)
-        is_hard, own = confidence is not None and confidence < _HARD, points.get(place_id)
+        is_hard, own = confidence is not None and confidence < _MAX_HARD_CONFIDENCE, points.get(place_id)
         groups = {
-            f"{_quality(place)} quality": True,
+            f"{_classify_quality(place)} quality": True,
             "looks like another place": twin,
             "inconsistent GPS tag": place_id in tags_off_m,
             "hard to recognise": is_hard,
@@ -115,7 +115,11 @@ def _steps(
         }
         sd_m = float(np.sqrt(sum(pose.covariance_m2[::2]) / 2)) if pose else None
         said = [f"quality {place.quality:.2f}: the share of its picture that holds information"]
-        said += [f"known to {figure(sd_m, 'm')}; its picture shows {pose.footprint_m:.3g} m of ground"] if pose else []
+        said += (
+            [f"known to {format_number(sd_m, 'm')}; its picture shows {pose.footprint_m:.3g} m of ground"]
+            if pose
+            else []
+        )
         said += [f"its tag lies {tags_off_m[place_id]:.0f} m from its picture"] if place_id in tags_off_m else []
         said += (
             [] if confidence is None else [f"mean confidence of its altered pictures: {format_probability(confidence)}"]
@@ -130,7 +134,7 @@ def _steps(
             title=f"Place {place_id}: {place.source_image}",
             said=said,
             groups={name: "places" for name, is_so in groups.items() if is_so},
-            at={name: point for name, point in {**at, _quality(place): own}.items() if point},
+            at={name: point for name, point in {**at, _classify_quality(place): own}.items() if point},
             circle_m=sd_m,
             place=place,
             pictures=[picture for picture in pictures if picture[1]],
@@ -143,7 +147,7 @@ def read_recorded_position(place: Place) -> Point:
     return (recorded.lat_deg, recorded.lon_deg) if recorded else to_point(place)
 
 
-def find_tags_off(ground: Sequence[Place]) -> dict[int, float]:
+def find_inconsistent_tags(ground: Sequence[Place]) -> dict[int, float]:
     """Return the places whose recorded position lies far from where their pictures lie, and how far: metres by the
     place's number. Far is more than four standard deviations of an axis, taken from the median of all."""
     moved_m = {
@@ -151,7 +155,7 @@ def find_tags_off(ground: Sequence[Place]) -> dict[int, float]:
         for place in ground
         if place.pose and place.pose.recorded
     }
-    far_m = max(_MIN_TAG_OFF_M, _TAG_OFF * float(np.median(list(moved_m.values()) or [0.0])) / _OF_MEDIAN)
+    far_m = max(_MIN_TAG_OFF_M, _MAX_TAG_SIGMA * float(np.median(list(moved_m.values()) or [0.0])) / _MEDIAN_PER_SIGMA)
     return {place_id: off_m for place_id, off_m in moved_m.items() if off_m > far_m}
 
 
@@ -167,15 +171,15 @@ def find_gaps(ground: Sequence[Place]) -> tuple[list[list[Point]], float, float]
     middles = np.array([offset_m(*origin, *to_point(place)) for place, _ in posed])
     footprint_m = float(np.median([pose.footprint_m for _, pose in posed]))
     low, high = middles.min(axis=0) - 2 * footprint_m, middles.max(axis=0) + 2 * footprint_m
-    cell_m = max(footprint_m / _CELLS, float(np.sqrt(np.prod(high - low) / _MAX_CELLS)))
+    cell_m = max(footprint_m / _CELLS_PER_FOOTPRINT, float(np.sqrt(np.prod(high - low) / _MAX_CELLS)))
     shown = np.zeros(np.ceil((high - low) / cell_m).astype(int)[::-1], np.uint8)
-    square = np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]]) * _SURELY_SEEN / 2
+    square = np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]]) * _COVERED_SHARE / 2
     for middle, (_, pose) in zip(middles, posed, strict=True):
         corners = (middle - low)[:, None] + picture_axes(pose.up_deg) @ square * pose.footprint_m
         cv2.fillConvexPoly(shown, np.rint(corners.T / cell_m).astype(np.int32), (1,))
     thin, wide = (
         cv2.getStructuringElement(cv2.MORPH_ELLIPSE, [max(1, round(share * footprint_m / cell_m))] * 2)
-        for share in (_THINNEST, _WIDEST)
+        for share in (_MIN_GAP_FOOTPRINTS, _MAX_GAP_FOOTPRINTS)
     )
     closed = cv2.morphologyEx(shown, cv2.MORPH_CLOSE, wide)
     around, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

@@ -14,14 +14,14 @@ from edgevpr.core.text import format_probability
 from edgevpr.core.types import Place
 from edgevpr.review.album import Album
 from edgevpr.review.logged import (
-    SENT,
+    SENT_OUTCOMES,
     FixOutcome,
     LoggedFlight,
     LoggedQuery,
-    number,
-    point,
-    text,
-    value,
+    get_number,
+    get_point,
+    get_text,
+    get_value,
 )
 from edgevpr.review.webpage import (
     UNKNOWN,
@@ -30,8 +30,8 @@ from edgevpr.review.webpage import (
     Layer,
     Section,
     Step,
-    clock,
-    figure,
+    format_duration,
+    format_number,
     make_layer,
     make_page,
     to_point,
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
 _MAX_REMARKS = 200
-_FAR_M = 15.0  # from GPS: less is the error of a receiver, and no danger
+_MAX_GPS_ERROR_M = 15.0  # from GPS: less is the error of a receiver, and no danger
 _FIX_COLOURS = {
     FixOutcome.TAKEN: "taken",
     FixOutcome.UNANSWERED: "unanswered",
@@ -49,7 +49,7 @@ _FIX_COLOURS = {
     FixOutcome.CONTINUOUS: "taken",
     FixOutcome.KEPT: "places",
 }
-_KNOWN = (("map", "map"), ("technique", "technique"), ("board", "board"), ("edgevpr", "version"))
+_HEAD_FIELDS = (("map", "map"), ("technique", "technique"), ("board", "board"), ("edgevpr", "version"))
 
 
 def make_flight_page(
@@ -58,34 +58,34 @@ def make_flight_page(
     """Return the whole page. `frames` finds the pictures of the flight, `references` those that the map was made of.
     `no_ground` is a sentence on why there is no `ground`."""
     queries = flight.queries
-    time = text(flight.start, "time") or next((text(query.line, "time") for query in queries), None)
-    start = [f"{name} {known}" for name, key in _KNOWN if (known := text(flight.start, key))]
+    time = get_text(flight.start, "time") or next((get_text(query.line, "time") for query in queries), None)
+    start = [f"{name} {known}" for name, key in _HEAD_FIELDS if (known := get_text(flight.start, key))]
     head = {
         "title": f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time",
-        "known": [f"{clock(flight.span_s)} long", *start, str(flight.path)],
-        "figures": _figures(flight),
-        "warnings": _notes(flight, bool(ground), no_ground),
+        "known": [f"{format_duration(flight.span_s)} long", *start, str(flight.path)],
+        "figures": _compute_figures(flight),
+        "warnings": _list_warnings(flight, bool(ground), no_ground),
         "span_s": flight.span_s,
     }
-    steps = _steps(ground, flight)
+    steps = _make_steps(ground, flight)
     return make_page(
         head,
         steps,
         ground,
-        _layers(ground, flight, steps),
+        _make_layers(ground, flight, steps),
         {"seen": frames, "place": references},
-        lens=_lens(flight.start),
-        charts=_charts(flight),
-        sections=[*_remarks(flight), *_settings(flight)],
+        lens=_read_lens(flight.start),
+        charts=_make_charts(flight),
+        sections=[*_make_remarks(flight), *_make_settings(flight)],
     )
 
 
-def _layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
+def _make_layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
     """Return the layers of the drawing, from the bottom to the top."""
     return [
         Layer("places of the map", "places", [[to_point(place) for place in ground]]),
         make_layer(steps, "places found", "found"),
-        Layer("fixes between matches", "between", [list(filter(None, map(point, flight.between)))]),
+        Layer("fixes between matches", "between", [list(filter(None, map(get_point, flight.between)))]),
         make_layer(steps, "GPS", "gps", "line"),
         make_layer(steps, "autopilot", "autopilot", "line"),
         make_layer(steps, "refused there", "missed"),
@@ -96,14 +96,14 @@ def _layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]
     ]
 
 
-def _steps(ground: Sequence[Place], flight: LoggedFlight) -> list[Step]:
+def _make_steps(ground: Sequence[Place], flight: LoggedFlight) -> list[Step]:
     """Return a step for each query of a flight over the places of `ground`."""
     places = {place.place_id: place for place in ground}
     has_link = any(query.has_link for query in flight.queries)
-    return [_step(query, places.get(query.place or 0), flight.span_s > 0, has_link) for query in flight.queries]
+    return [_make_step(query, places.get(query.place or 0), flight.span_s > 0, has_link) for query in flight.queries]
 
 
-def _step(query: LoggedQuery, place: Place | None, has_times: bool, has_link: bool) -> Step:
+def _make_step(query: LoggedQuery, place: Place | None, has_times: bool, has_link: bool) -> Step:
     """Return the step of a query. `has_times`: its flight lasted. `has_link`: the flight had a link to an autopilot."""
     fix, verdict = query.fix, "accepted" if query.accepted else "refused"
     points = {
@@ -118,17 +118,17 @@ def _step(query: LoggedQuery, place: Place | None, has_times: bool, has_link: bo
     if fix:
         in_short = f": {fix.why.code.summary}" if fix.why else ""
         groups[f"{fix.outcome.value}{in_short}"] = _FIX_COLOURS[fix.outcome]
-        if fix.outcome in SENT:
+        if fix.outcome in SENT_OUTCOMES:
             points[_FIX_COLOURS[fix.outcome]] = fix.at
-    if (query.off_m or 0.0) > _FAR_M:
-        groups[f"match over {_FAR_M:.0f} m from GPS"] = "refused"
+    if (query.off_m or 0.0) > _MAX_GPS_ERROR_M:
+        groups[f"match over {_MAX_GPS_ERROR_M:.0f} m from GPS"] = "refused"
     if has_link and query.has_link is False:
         groups["autopilot silent"] = "refused"
     pictures = [("seen", query.name, f"seen: {query.name}")]
     pictures.append(("place", query.reference_image or "", f"place found: {query.reference_image}"))
     return Step(
-        title=f"{f'{clock(query.t_s)} – ' if has_times else ''}{query.name}: {verdict}",
-        said=[_place_found(query), _position(query), str(query.reason or ""), fixed],
+        title=f"{f'{format_duration(query.t_s)} – ' if has_times else ''}{query.name}: {verdict}",
+        said=[_format_place(query), _format_position(query), str(query.reason or ""), fixed],
         groups=groups,
         at={name: at for name, at in {**points, "accepted": query.at}.items() if at},  # the last has the circle
         circle_m=query.accuracy_m if query.at else None,
@@ -138,26 +138,26 @@ def _step(query: LoggedQuery, place: Place | None, has_times: bool, has_link: bo
     )
 
 
-def _place_found(query: LoggedQuery) -> str:
+def _format_place(query: LoggedQuery) -> str:
     if query.place is None:
         return "no place was found"
-    score = figure(number(query.line, "score"))
+    score = format_number(get_number(query.line, "score"))
     confidence = "" if query.confidence is None else f", confidence {format_probability(query.confidence)}"
     return f"place {query.place} ({query.reference_image or 'without a name'}), score {score}{confidence}"
 
 
-def _position(query: LoggedQuery) -> str:
+def _format_position(query: LoggedQuery) -> str:
     if not query.at:
         return ""
-    accuracy = "" if query.accuracy_m is None else f", accurate to {figure(query.accuracy_m, 'm')}"
-    off = "" if query.off_m is None else f", {figure(query.off_m, 'm')} from GPS"
+    accuracy = "" if query.accuracy_m is None else f", accurate to {format_number(query.accuracy_m, 'm')}"
+    off = "" if query.off_m is None else f", {format_number(query.off_m, 'm')} from GPS"
     return f"position {query.at[0]:.6f}, {query.at[1]:.6f}{accuracy}{off}"
 
 
-def _lens(start: Mapping[str, Any]) -> "Lens | None":
+def _read_lens(start: Mapping[str, Any]) -> "Lens | None":
     """Return the lens of the flight's camera by the first line of its log; None if it is unknown."""
     names = ("fov_deg", "up_deg", "mount_ahead_deg", "mount_right_deg")
-    fov_deg, up_deg, ahead_deg, right_deg = (number(start, "config", "source", name) for name in names)
+    fov_deg, up_deg, ahead_deg, right_deg = (get_number(start, "config", "source", name) for name in names)
     if fov_deg is None or not 0 < fov_deg < 180:
         return None
     from edgevpr.frames.level import Lens, Mount  # with OpenCV
@@ -165,7 +165,7 @@ def _lens(start: Mapping[str, Any]) -> "Lens | None":
     return Lens(fov_deg, up_deg or 0.0, mount=Mount(ahead_deg or 0.0, right_deg or 0.0))
 
 
-def _figures(flight: LoggedFlight) -> dict[str, str]:
+def _compute_figures(flight: LoggedFlight) -> dict[str, str]:
     """Return the figures of a flight, by their names."""
     queries, accepted = flight.queries, [query for query in flight.queries if query.accepted]
     share = f" ({len(accepted) / len(queries):.0%})" if queries else ""
@@ -177,25 +177,25 @@ def _figures(flight: LoggedFlight) -> dict[str, str]:
     return {
         "queries": str(len(queries)),
         "accepted": f"{len(accepted)}{share}",
-        "accuracy, median": figure(median(accuracies_m) if accuracies_m else None, "m"),
-        "from GPS, median": figure(median(off_m) if off_m else None, "m"),
-        "from GPS, most": figure(max(off_m, default=None), "m"),
+        "accuracy, median": format_number(median(accuracies_m) if accuracies_m else None, "m"),
+        "from GPS, median": format_number(median(off_m) if off_m else None, "m"),
+        "from GPS, most": format_number(max(off_m, default=None), "m"),
         "frames not usable": str(flight.unusable) if flight.unusable else UNKNOWN,
-        "longest without a match": figure(max(after_s - t_s for t_s, after_s in pairwise(ends_s)), "s"),
-        "fixes sent": f"{sum(outcomes[outcome] for outcome in SENT)}{between}",
+        "longest without a match": format_number(max(after_s - t_s for t_s, after_s in pairwise(ends_s)), "s"),
+        "fixes sent": f"{sum(outcomes[outcome] for outcome in SENT_OUTCOMES)}{between}",
         "fixes taken": str(outcomes[FixOutcome.TAKEN]),
-        "charge": figure(_highest(flight, "totals", "used_mah"), "mAh"),
-        "RAM, most": figure(_highest(flight, "costs", "rss_mb"), "MB"),
-        "hottest": figure(_highest(flight, "board", "temperature_c"), "°C"),
+        "charge": format_number(_find_highest(flight, "totals", "used_mah"), "mAh"),
+        "RAM, most": format_number(_find_highest(flight, "costs", "rss_mb"), "MB"),
+        "hottest": format_number(_find_highest(flight, "board", "temperature_c"), "°C"),
     }
 
 
-def _highest(flight: LoggedFlight, *keys: str) -> float | None:
-    values = (number(query.line, *keys) for query in flight.queries)
+def _find_highest(flight: LoggedFlight, *keys: str) -> float | None:
+    values = (get_number(query.line, *keys) for query in flight.queries)
     return max((value for value in values if value is not None), default=None)
 
 
-def _notes(flight: LoggedFlight, has_ground: bool, no_ground: str) -> list[str]:
+def _list_warnings(flight: LoggedFlight, has_ground: bool, no_ground: str) -> list[str]:
     queries = flight.queries
     has_places = has_ground or any(query.place_at for query in queries)
     known = [
@@ -212,9 +212,9 @@ def _notes(flight: LoggedFlight, has_ground: bool, no_ground: str) -> list[str]:
     return [sentence for is_there, sentence in known if not is_there]
 
 
-def _charts(flight: LoggedFlight) -> list[Chart]:
+def _make_charts(flight: LoggedFlight) -> list[Chart]:
     def line(name: str, colour: str, factor: float, *keys: str) -> tuple[str, str, Form, list[tuple[float, float]]]:
-        values = [(query.t_s, number(query.line, *keys)) for query in flight.queries]
+        values = [(query.t_s, get_number(query.line, *keys)) for query in flight.queries]
         return name, colour, "line", [(t_s, factor * value) for t_s, value in values if value is not None]
 
     def dots(
@@ -245,17 +245,17 @@ def _charts(flight: LoggedFlight) -> list[Chart]:
     ]  # fmt: skip
 
 
-def _remarks(flight: LoggedFlight) -> list[Section]:
+def _make_remarks(flight: LoggedFlight) -> list[Section]:
     """Return the section of what was reported in flight, as far as there is any."""
-    rows = [(clock(t_s), kind, sentence) for t_s, kind, sentence in flight.remarks[:_MAX_REMARKS]]
+    rows = [(format_duration(t_s), kind, sentence) for t_s, kind, sentence in flight.remarks[:_MAX_REMARKS]]
     left_out = len(flight.remarks) - len(rows)
     lines = [f"{left_out} more lines are in the log."] if left_out else []
     return [Section("What was said", lines, [("time", "of", "said"), *rows])] if rows else []
 
 
-def _settings(flight: LoggedFlight) -> list[Section]:
+def _make_settings(flight: LoggedFlight) -> list[Section]:
     """Return the section of the configuration, if the log has it."""
-    reason, config = text(flight.start, "decided", "reason"), value(flight.start, "config")
+    reason, config = get_text(flight.start, "decided", "reason"), get_value(flight.start, "config")
     if not isinstance(config, dict):
         return []
     return [Section("How it was set", [reason] if reason else [], folded=json.dumps(config, indent=1))]

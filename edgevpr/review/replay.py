@@ -17,7 +17,7 @@ from edgevpr.core.text import show_waiting
 from edgevpr.frames.images import read_image
 from edgevpr.mavlink.signing import NOT_SIGNING
 from edgevpr.power.boards import Board, resolve_board
-from edgevpr.review.compare import Line, Packets
+from edgevpr.review.compare import Line, PacketComparison
 from edgevpr.review.tape import (
     Playback,
     ReplayedDriver,
@@ -38,19 +38,19 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Replayed:
+class ReplayResult:
     """Result of a replay: the lines of the log of the flight, `flown`, and those of its replay, `lines`; the comparison
     of the `packets` of both; `why_ended`, the reason why the replay ended before the flight did (None: it did not); and
     `guessed`, the number of answers that were not on the tape where they were asked for (see `Playback`)."""
 
     flown: list[Line]
     lines: list[Line]
-    packets: Packets
+    packets: PacketComparison
     why_ended: str | None
     guessed: int
 
 
-def replay(log: str | Path, place_map: str | None = None) -> Replayed:
+def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
     """Fly the last flight of `log` again. Its recording is in the folder that the log names, or in one of that name
     beside the log. `place_map` is the path of its map (None: the path that it had). Raises UsageError if there is no
     recording, and EdgevprError if it or the map cannot be opened."""
@@ -60,7 +60,7 @@ def replay(log: str | Path, place_map: str | None = None) -> Replayed:
     if not (note and note[0] == "flight" and isinstance(note[1], dict)):
         raise EdgevprError(f"{folder / TAPE} is no tape of a flight, or was cut in its first line: nothing to replay.")
     header = note[1]
-    config = build(Config, _keep_known(header["config"]), str(folder))
+    config = build(Config, _drop_unknown_settings(header["config"]), str(folder))
     place_map = place_map or config.map
     if place_map and not Path(place_map).exists():
         raise UsageError(f"{place_map}, the map of the flight, is not there: give it with --map.")
@@ -76,7 +76,7 @@ def replay(log: str | Path, place_map: str | None = None) -> Replayed:
             log=replace(config.log, path=again_log, max_mb=None),
             clock=tape_clock(Clock(sleep=playback.sleep), playback),
             machine=tape_machine(Machine(board), playback),
-            open_source=lambda step_s: ReplayedSource(playback, partial(_picture, folder)),
+            open_source=lambda step_s: ReplayedSource(playback, partial(_read_frame, folder)),
             turns=TapedTurns(Clock().mono_s, playback),
             drive=partial(ReplayedDriver, playback),
             signing=ReplayedSigning() if config.mavlink.signing_key else NOT_SIGNING,
@@ -85,12 +85,12 @@ def replay(log: str | Path, place_map: str | None = None) -> Replayed:
             recording=header["recording"],
         )
         try:
-            with _quiet(), closing(Flight.open(config, io)) as again:
+            with _silence_log(), closing(Flight.open(config, io)) as again:
                 again.run()
         except TapeEnded as end:
             why_ended = str(end) or "the recording ends there"
         show_waiting("")
-        return Replayed(
+        return ReplayResult(
             flown=flown,
             lines=list(read_log(again_log)) if again_log else [],
             packets=playback.packets,
@@ -100,7 +100,7 @@ def replay(log: str | Path, place_map: str | None = None) -> Replayed:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _silence_log() -> Iterator[None]:
     """Context manager: of the messages of the replayed flight, which has printed them once, let errors through only;
     all with --debug."""
     logging.disable(logging.NOTSET if _log.isEnabledFor(logging.DEBUG) else logging.WARNING)
@@ -110,7 +110,7 @@ def _quiet() -> Iterator[None]:
         logging.disable(logging.NOTSET)
 
 
-def _picture(folder: Path, number: int) -> Image:
+def _read_frame(folder: Path, number: int) -> Image:
     """Read a recorded frame. Raises TapeEnded for one that cannot be read, for instance after a power cut."""
     show_waiting(f"replaying  {number}")
     try:
@@ -119,7 +119,7 @@ def _picture(folder: Path, number: int) -> Image:
         raise TapeEnded(str(error)) from None
 
 
-def _keep_known(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def _drop_unknown_settings(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return the settings of a recorded flight without those that this edgevpr no longer has, with a warning."""
     kept, known = {}, {key.name for key in list_keys()}
     for name, value in config.items():
@@ -127,7 +127,7 @@ def _keep_known(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         if dotted in known:
             kept[name] = value
         elif isinstance(value, dict):
-            kept |= {name: section} if (section := _keep_known(value, f"{dotted}.")) else {}
+            kept |= {name: section} if (section := _drop_unknown_settings(value, f"{dotted}.")) else {}
         elif value not in (None, False):
             _log.warning("the flight had the setting `%s`, which this edgevpr does not know", dotted)
     return kept

@@ -25,7 +25,7 @@ from edgevpr.mavlink.ports import LOST
 from edgevpr.mavlink.signing import Signing
 from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Message
-from edgevpr.review.compare import Packets
+from edgevpr.review.compare import PacketComparison
 from edgevpr.runtime.flight.boundary import SOURCE_STATE, Tape
 from edgevpr.runtime.flight.stop import StopNow
 
@@ -154,7 +154,7 @@ class Playback(Tape):
 
     def __init__(self, notes: Iterable[Note]) -> None:
         self.links: dict[str, Callable[[float, list[Note]], None]] = {}
-        self.packets = Packets()
+        self.packets = PacketComparison()
         self.guessed = 0
         self.t_s = 0.0  # of the newest turn or look at the clock
         self._notes, self._at = list(notes), 0
@@ -164,35 +164,35 @@ class Playback(Tape):
     def read(self, kind: str, look: Callable[[], Any]) -> Any:
         """Return the flight's answer to a question of `kind`. `look` asks the real machine: it is called only if the
         tape has no answer. Raises StopNow where the flight was stopped, and TapeEnded."""
-        if self._head() == "stopped":
+        if self._peek_kind() == "stopped":
             self._at += 1
             self._is_stopping = True
         # A flight that was stopped may have asked more while it cleaned up: such a question is answered first.
-        if self._is_stopping and self._head() != kind:
+        if self._is_stopping and self._peek_kind() != kind:
             self._is_stopping = False
             raise StopNow
-        if self._head() != kind:
+        if self._peek_kind() != kind:
             self.guessed += 1
-            if not self._comes(kind):
+            if not self._has_answer(kind):
                 return self._guess(kind, look)
-            while self._head() not in (kind, "stopped"):
+            while self._peek_kind() not in (kind, "stopped"):
                 self._at += 1
         head, *values = self._notes[self._at]
         self._at += 1
         if head == "stopped":
             raise StopNow
         found = self._known[kind] = values[0]
-        if _is_moment(kind):
+        if _is_time(kind):
             self.t_s = max(self.t_s, found)
         return found
 
     def sleep(self, seconds: float) -> None:
         """Return at once: the time comes from the tape."""
 
-    def _head(self) -> str:
+    def _peek_kind(self) -> str:
         """Perform the turns of links that come next on the tape, and return the kind of the answer after them. Raises
         TapeEnded."""
-        while note := self._next():
+        while note := self._peek_note():
             perform = self.links.get(note[0])
             if perform is None:
                 return cast(str, note[0])
@@ -201,10 +201,10 @@ class Playback(Tape):
             perform(note[1], note[2])
         raise TapeEnded
 
-    def _next(self) -> Note | None:
+    def _peek_note(self) -> Note | None:
         return self._notes[self._at] if self._at < len(self._notes) else None
 
-    def _comes(self, kind: str) -> bool:
+    def _has_answer(self, kind: str) -> bool:
         """Return True if an answer of `kind`, or the end of the flight, comes before the next frame. For a clock return
         False, since no answers are skipped to read one."""
         until = (kind, "stopped", "frame")
@@ -214,14 +214,14 @@ class Playback(Tape):
     def _guess(self, kind: str, look: Callable[[], Any]) -> Any:
         if kind == "frame":
             raise TapeEnded
-        if _is_moment(kind):
+        if _is_time(kind):
             return self.t_s
         if kind in _CLOCKS:
             return self._known.get(kind, 0.0)
         return self._known[kind] if kind in self._known else look()
 
 
-def _is_moment(kind: str) -> bool:
+def _is_time(kind: str) -> bool:
     """Tell whether answers of `kind` are times on the flight's monotonic clock."""
     return kind == "mono_s" or kind.startswith("turn: ")
 

@@ -17,7 +17,7 @@ from edgevpr.core.geodesy import offset_m
 from edgevpr.core.text import sanitize
 from edgevpr.core.types import Place
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.review.album import Album, AlbumPicture, small_pictures
+from edgevpr.review.album import Album, AlbumPicture, embed_pictures
 from edgevpr.review.logged import Point
 
 if TYPE_CHECKING:
@@ -140,16 +140,16 @@ def make_page(
     colours = {group: colour for step in steps for group, colour in step.groups.items()}
     rest["groups"] = [(group, colours[group], count) for group, count in counts.most_common()]
     numbers = {group: number for number, (group, *_) in enumerate(rest["groups"])}
-    rows = [_describe(step, drawing, numbers) for step in steps]
+    rows = [_serialise_step(step, drawing, numbers) for step in steps]
     if (every := -(-len(_dump(rows)) // _MAX_TEXT_BYTES)) > 1:
         steps, rows = steps[::every], rows[::every]
         notes.append(f"The page would be too large with all steps: one in {every} is shown.")
     laid = ground[:: -(-len(ground) // _MAX_PLACES) or 1]
     wanted = [[picture[:2] for picture in step.pictures] for step in steps]
     wanted += [[("ground", place.source_image)] for place in laid if place.pose]
-    levelled = _level(albums["place"], laid, lens)
+    levelled = _make_ground_album(albums["place"], laid, lens)
     room_bytes = MAX_PAGE_BYTES - _SPARE_BYTES - len(_dump([rest, rows, drawing.layers]))
-    pictures, left_out = small_pictures(wanted, {**albums, "ground": levelled}, room_bytes)
+    pictures, left_out = embed_pictures(wanted, {**albums, "ground": levelled}, room_bytes)
     notes += [left_out] if left_out else []
     if any(place.pose for place in laid) and not any(of == "ground" for of, _ in pictures):
         notes.append(_NO_PICTURE if albums["place"] else _NO_IMAGES)
@@ -157,7 +157,7 @@ def make_page(
     for step, row in zip(steps, rows, strict=True):
         row["pictures"] = [(caption, at[of, name]) for of, name, caption in step.pictures if (of, name) in at]
     squares = [(*square, at.get(("ground", place.source_image))) for place in laid if (square := drawing.square(place))]
-    return _fill({
+    return _render({
         **rest,
         "notes": notes,
         "steps": rows,
@@ -199,7 +199,7 @@ class _Drawing:
         return *self.convert(to_point(place)), round(place.pose.footprint_m, 2), round(place.pose.up_deg, 1)
 
 
-def _describe(step: Step, drawing: _Drawing, numbers: Mapping[str, int]) -> dict[str, Any]:
+def _serialise_step(step: Step, drawing: _Drawing, numbers: Mapping[str, int]) -> dict[str, Any]:
     """Return a step as the script reads it, without its pictures. `numbers` are those of the groups."""
     return {
         "title": step.title,
@@ -212,7 +212,7 @@ def _describe(step: Step, drawing: _Drawing, numbers: Mapping[str, int]) -> dict
     }
 
 
-def _level(album: Album, places: Sequence[Place], lens: "Lens | None") -> Album:
+def _make_ground_album(album: Album, places: Sequence[Place], lens: "Lens | None") -> Album:
     """Return the album of the map's pictures as its poses lay them on the ground, transparent where they show none."""
     by_name = {place.source_image: place for place in places if place.pose}
 
@@ -239,7 +239,7 @@ def _clean(value: Any) -> Any:
     return [_clean(each) for each in value] if isinstance(value, (list, tuple)) else value
 
 
-def _fill(data: Mapping[str, Any]) -> str:
+def _render(data: Mapping[str, Any]) -> str:
     here = Path(__file__)
     script = here.with_name("page.js").read_text("utf-8")
     sha256 = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -247,7 +247,7 @@ def _fill(data: Mapping[str, Any]) -> str:
     return _PAGE.format(policy=_POLICY.format(sha256), style=style, data=_dump(data), script=script)
 
 
-def figure(value: float | None, unit: str = "") -> str:
+def format_number(value: float | None, unit: str = "") -> str:
     """Return a number, with three significant digits, and its unit as text; a dash for None."""
     if value is None:
         return UNKNOWN
@@ -255,7 +255,7 @@ def figure(value: float | None, unit: str = "") -> str:
     return f"{digits} {unit}".strip()
 
 
-def clock(t_s: float) -> str:
+def format_duration(t_s: float) -> str:
     """Return a time in seconds as text: minutes and seconds (2:03), from an hour on with the hours (1:02:03)."""
     minutes, seconds = divmod(round(t_s), 60)
     hours = f"{minutes // 60}:{minutes % 60:02d}" if minutes >= 60 else str(minutes)

@@ -10,10 +10,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from edgevpr.core.config import bounded, build, key
+from edgevpr.core.config import bounded_key, build, key
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import ConfigError, ModelError
-from edgevpr.core.files import find_model, model_folders
+from edgevpr.core.files import find_model, list_model_folders
 from edgevpr.core.text import suggest
 from edgevpr.core.yamlfile import read_yaml
 
@@ -28,15 +28,15 @@ class InputRule:
     the upper left corner, and the rest has that level. `layout`, NCHW, is the order of axes."""
 
     layout: str
-    height: int = bounded(8, 4096)
-    width: int = bounded(8, 4096)
+    height: int = bounded_key(8, 4096)
+    width: int = bounded_key(8, 4096)
     colour: str = key(choices=("grey", "bgr", "rgb"))
     equalise: bool
     resize: str = key(choices=("area", "linear", "cubic"))
-    scale: float = bounded(1e-9, 1e9)
+    scale: float = bounded_key(1e-9, 1e9)
     mean: list[float]
     std: list[float] | None = None
-    pad: int | None = bounded(0, 255, default=None)
+    pad: int | None = bounded_key(0, 255, default=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class DetectorRule:
 
     family: str = key(choices=("yolox", "fastestdet"))
     dynamic: dict[str, int]
-    min_score: float = bounded(0.01, 1)
+    min_score: float = bounded_key(0.01, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +110,7 @@ def _drop_unknown_keys(part: InputRule | Outputs) -> dict[str, Any]:
 
 def list_cards() -> tuple[str, ...]:
     """Return the names of all cards in the user's folder and the shipped one, including cards that cannot be read."""
-    return tuple(sorted({path.stem for folder in model_folders() for path in folder.glob("*.yaml")}))
+    return tuple(sorted({path.stem for folder in list_model_folders() for path in folder.glob("*.yaml")}))
 
 
 def load_card(name: str) -> Card:

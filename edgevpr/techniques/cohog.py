@@ -25,7 +25,7 @@ from edgevpr.core.contract import (
     find_nearest_height,
 )
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.geodesy import wrap_deg
 from edgevpr.techniques import layout, overlay, placecode
 from edgevpr.techniques.contrast import stretch_contrast
 from edgevpr.techniques.displacement import (
@@ -264,7 +264,7 @@ class CoHog:
         """See `Technique.match_rotated`."""
         ratio, at_deg = find_nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0), match.rotation_deg or 0.0
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
-        off_deg = np.abs(shorter_deg(360 * np.arange(ROTATIONS) / ROTATIONS - at_deg))
+        off_deg = np.abs(wrap_deg(360 * np.arange(ROTATIONS) / ROTATIONS - at_deg))
         return self.match(query, fine, (first + np.flatnonzero(off_deg >= _MIN_ROTATED_DEG)).tolist())
 
     def measure_perspective(self, query: Descriptor, fine: Bytes, match: FineMatch) -> Perspective | None:

@@ -14,26 +14,25 @@ import numpy as np
 
 from edgevpr.core.arrays import Complexes, Doubles, Ints
 from edgevpr.core.errors import ImageError
-from edgevpr.core.geodesy import metres
+from edgevpr.core.geodesy import project_to_metres
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import MAX_GAP_S, Track
 from edgevpr.runtime.recognise.agreement import PROVEN, Overlay, measure_agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks, describe
 
-_LANDMARKS = 500
+_MAX_LANDMARKS = 500
 _MAX_OFFSET_S = 180.0  # clocks further off are set wrong, and do not only drift
 _STEP_S = 0.25
 _MAX_CHANGE = 1.0  # a movement that differs by more is wrong in the pictures or in the track
-# The least number of turns (radians) that must agree, and by how much all must agree better than at any clock that is
-# further than `_NEAR_S` away: .83 on aerial_caliterra; of pictures of one flight on the track of another .95 or more.
+# The ratio is 0.83 on aerial_caliterra, and 0.95 or more for pictures of one flight on the track of another.
 _MIN_TURNS = 4
-_TURN_RAD = 0.3
-_NEAR_S = 4.0
+_MIN_TURN_RAD = 0.3
+_MIN_RIVAL_OFFSET_S = 4.0
 _MAX_COST_RATIO = 0.9
 Move = tuple[complex, complex]  # step, and logarithm of scale and turn, as those of a tie in `mapmaking.graph`
 
 
-def clock_offset_s(track: Track, times_s: Sequence[float], paths: Iterable[Path]) -> float | None:
+def estimate_clock_offset_s(track: Track, times_s: Sequence[float], paths: Iterable[Path]) -> float | None:
     """Estimate what is to be added to `times_s`, those of the pictures of `paths` in their order, to get times of the
     track: at most three minutes. None: the pictures do not tell."""
     at, changes = _find_changes(paths)
@@ -41,15 +40,15 @@ def clock_offset_s(track: Track, times_s: Sequence[float], paths: Iterable[Path]
         return None
     offsets_s = np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + _STEP_S, _STEP_S)
     places = _interpolate_track(track, np.array(times_s) + offsets_s[:, None])
-    costs, turning = np.array([_cost(there, at, changes) for there in places]).T
+    costs, turning = np.array([_compute_cost(there, at, changes) for there in places]).T
     best = int(np.argmin(costs))
-    further = abs(offsets_s - offsets_s[best]) > _NEAR_S
+    further = abs(offsets_s - offsets_s[best]) > _MIN_RIVAL_OFFSET_S
     if turning[best] < _MIN_TURNS or costs[best] > _MAX_COST_RATIO * costs[further].min():
         return None
     return float(offsets_s[best])
 
 
-def _cost(there: Complexes, at: Ints, changes: Complexes) -> tuple[float, float]:
+def _compute_cost(there: Complexes, at: Ints, changes: Complexes) -> tuple[float, float]:
     """Return by how much the changes of movement differ, 0..1, and how many turns agree, if the pictures were taken
     `there`, complex (N,). `at`, int (C,), are the numbers of the first of three pictures each."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -59,7 +58,7 @@ def _cost(there: Complexes, at: Ints, changes: Complexes) -> tuple[float, float]
     known = np.isfinite(off)
     return (
         float(np.where(known, np.minimum(off, _MAX_CHANGE), _MAX_CHANGE).mean()),
-        float(np.count_nonzero(known & (abs(expected.imag) > _TURN_RAD) & (off < _MAX_CHANGE / 2))),
+        float(np.count_nonzero(known & (abs(expected.imag) > _MIN_TURN_RAD) & (off < _MAX_CHANGE / 2))),
     )
 
 
@@ -68,7 +67,7 @@ def _interpolate_track(track: Track, t_s: Doubles) -> Complexes:
     and in its gaps."""
     known_s = np.array(track.t_s)
     lat_deg, lon_deg = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in track.tags if tag.position]).T
-    east_m, north_m = metres(lat_deg, lon_deg)
+    east_m, north_m = project_to_metres(lat_deg, lon_deg)
     after = np.clip(np.searchsorted(known_s, t_s), 1, max(len(known_s) - 1, 1))
     is_known = (t_s >= known_s[0]) & (t_s <= known_s[-1]) & (known_s[after] - known_s[after - 1] <= MAX_GAP_S)
     return np.where(is_known, np.interp(t_s, known_s, east_m + 1j * north_m), np.nan)
@@ -77,7 +76,7 @@ def _interpolate_track(track: Track, t_s: Doubles) -> Complexes:
 def _find_changes(paths: Iterable[Path]) -> tuple[Ints, Complexes]:
     """Return, of each three neighbouring pictures that show the same ground, the number of the first, and the logarithm
     of the factor, a complex number, by which the movement changes."""
-    moves = [_move(one, other) for one, other in pairwise(_describe(paths))]
+    moves = [_measure_move(one, other) for one, other in pairwise(_describe_landmarks(paths))]
     changes = {
         number: np.log(second[0] / first[0]) + first[1]
         for number, (first, second) in enumerate(pairwise(moves))
@@ -86,15 +85,15 @@ def _find_changes(paths: Iterable[Path]) -> tuple[Ints, Complexes]:
     return np.array(list(changes), int), np.array(list(changes.values()), complex)
 
 
-def _describe(paths: Iterable[Path]) -> Iterator[Landmarks | None]:
+def _describe_landmarks(paths: Iterable[Path]) -> Iterator[Landmarks | None]:
     for path in paths:
         try:
-            yield describe(read_image(path), None, _LANDMARKS)
+            yield describe(read_image(path), None, _MAX_LANDMARKS)
         except ImageError:
             yield None
 
 
-def _move(one: Landmarks | None, other: Landmarks | None) -> Move | None:
+def _measure_move(one: Landmarks | None, other: Landmarks | None) -> Move | None:
     """Return how the middle moves from picture `one` to the `other`, in the frame of `one`, and how it turns."""
     seen = measure_agreement(other, one) if one is not None and other is not None else None
     if seen is None or seen.inliers < PROVEN or seen.shift_share is None or seen.rotation_deg is None:

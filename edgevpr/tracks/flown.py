@@ -9,9 +9,9 @@ from edgevpr.frames.positions import GeoTag
 from edgevpr.runtime.flight.recording import is_of_camera, list_frames, read_recorded
 from edgevpr.tracks.record import Record, make_tag
 
-_FRESH_S = 1.0
+_MAX_REPORT_AGE_S = 1.0
 # Seconds after a fix that the autopilot took, or perhaps took, in which its position may only repeat that fix.
-_ECHO_S = 10.0
+_FIX_ECHO_S = 10.0
 
 
 def read_flight(path: Path) -> Record:
@@ -28,15 +28,15 @@ def read_flight(path: Path) -> Record:
     for line in lines:
         if line.get("kind") == "query" and (file := files.get(str(line.get("query")))):
             with suppress(KeyError, TypeError):  # a line that is damaged, or has no vehicle
-                if tag := _tag_of(line["vehicle"], line["t_frame_s"]):
+                if tag := _read_tag(line["vehicle"], line["t_frame_s"]):
                     named[file.name] = tag
     return Record(kind="flight log of edgevpr", named=named)
 
 
-def _tag_of(vehicle: dict[str, Any], t_frame_s: float) -> GeoTag | None:
+def _read_tag(vehicle: dict[str, Any], t_frame_s: float) -> GeoTag | None:
     t_fix_s = vehicle["t_fix_s"]
-    is_echo = t_fix_s is not None and t_frame_s - t_fix_s < _ECHO_S
-    if not vehicle["has_gps"] or is_echo or abs(t_frame_s - vehicle["t_heard_s"]) > _FRESH_S:
+    is_echo = t_fix_s is not None and t_frame_s - t_fix_s < _FIX_ECHO_S
+    if not vehicle["has_gps"] or is_echo or abs(t_frame_s - vehicle["t_heard_s"]) > _MAX_REPORT_AGE_S:
         return None
     attitude = vehicle["heading_deg"], vehicle["roll_deg"], vehicle["pitch_deg"]
     return make_tag(vehicle["lat_deg"], vehicle["lon_deg"], vehicle["alt_m"], attitude, vehicle["height_m"])

@@ -4,14 +4,14 @@ from pathlib import Path
 
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import parse_time
-from edgevpr.tracks.record import Record, make_tag, make_track, require
+from edgevpr.tracks.record import Record, make_tag, make_track, require_package
 
 _FIRST_YEAR = 1990  # receivers that have lost the time write others
 
 
 def read_gpx(path: Path) -> Record:
     """Read the points with a time of all tracks of a GPX file; a time without a zone is UTC."""
-    require("gpxpy", "gpxpy", "A GPX file")
+    require_package("gpxpy", "gpxpy", "A GPX file")
     import gpxpy
     from gpxpy.gpx import GPXException
 

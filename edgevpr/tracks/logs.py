@@ -14,7 +14,7 @@ import numpy as np
 from edgevpr.core.arrays import Array
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import GeoTag
-from edgevpr.tracks.record import Attitude, Record, make_tag, make_track, require
+from edgevpr.tracks.record import Attitude, Record, make_tag, make_track, require_package
 
 _FIX_3D = 3  # GPS status from which on a position counts
 _NO_HEADING = 65535  # of GLOBAL_POSITION_INT
@@ -32,7 +32,7 @@ def read_ardupilot(path: Path) -> Record:
     open_log = DFReader.DFReader_text if is_text else DFReader.DFReader_binary
     lines: dict[str, list[tuple[float, GeoTag]]] = {"POS": [], "GPS": [], "CAM": [], "TRIG": []}
     attitude: Attitude | None = None
-    for message in _messages(open_log, path, [*lines, "ATT"]):
+    for message in _read_messages(open_log, path, [*lines, "ATT"]):
         kind = message.get_type()
         if kind == "ATT":
             attitude = message.Yaw, message.Roll, message.Pitch
@@ -55,7 +55,7 @@ def read_telemetry(path: Path) -> Record:
 
     wanted = ["GLOBAL_POSITION_INT", "ATTITUDE", "CAMERA_FEEDBACK"]
     lines, shots, vehicle, attitude = [], [], None, None
-    for message in _messages(mavutil.mavlink_connection, path, wanted):
+    for message in _read_messages(mavutil.mavlink_connection, path, wanted):
         kind, sender = message.get_type(), message.get_srcSystem()
         if kind == "GLOBAL_POSITION_INT":
             vehicle = sender if vehicle is None else vehicle
@@ -75,7 +75,7 @@ def read_telemetry(path: Path) -> Record:
     return Record(kind="telemetry log", track=make_track(path, lines), shots=tuple(shots))
 
 
-def _messages(open_log: Callable[[str], Any], path: Path, kinds: list[str]) -> list[Any]:
+def _read_messages(open_log: Callable[[str], Any], path: Path, kinds: list[str]) -> list[Any]:
     """Return the messages of these kinds to the end of a log, or to where it is damaged."""
     os.environ["PYMAVLINK_FAST_INDEX"] = "0"  # the compiled index prints, past Python, each byte that it skips
     found = []
@@ -97,7 +97,7 @@ def _messages(open_log: Callable[[str], Any], path: Path, kinds: list[str]) -> l
 def read_px4(path: Path) -> Record:
     """Read a log of PX4: its estimate of position, height over the place where it started, attitude, and
     `camera_capture`."""
-    require("pyulog", "pyulog", "A log of PX4")
+    require_package("pyulog", "pyulog", "A log of PX4")
     from pyulog import ULog
 
     try:

@@ -15,17 +15,18 @@ from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import GeoTag, Track
 from edgevpr.frames.video import read_start_s
-from edgevpr.tracks.clock import clock_offset_s
+from edgevpr.tracks.clock import estimate_clock_offset_s
 from edgevpr.tracks.record import Record
 
-_ZONE_S, _MOST_ZONE = 900, 4 * 14  # time zones differ by quarters of an hour, and by 14 hours at most
-_LOOKED_AT = 200  # pictures that are compared to set the clock
-_MIN_SHARE = 0.5  # of the pictures that must lie within the track
-_ROUNDED_DEG = 1e-4  # as subtitles with four decimals
+_ZONE_STEP_S = 900  # time zones differ by quarters of an hour
+_MAX_ZONE_STEPS = 4 * 14  # and by 14 hours at most
+_MAX_COMPARED = 200  # pictures that are compared to set the clock
+_MIN_SHARE_IN_TRACK = 0.5  # of the pictures that must lie within the track
+_ROUNDING_DEG = 1e-4  # as subtitles with four decimals
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Placed:
+class Placement:
     """`how`: in words, how pictures were told apart. `tags`: position and attitude of those of the `pictures` that were
     placed, by name; empty for a video. `track`: that of a video, by its own time. `offset_s`: seconds added to the
     clock of the camera (None: no clock was needed)."""
@@ -37,7 +38,7 @@ class Placed:
     offset_s: float | None = None
 
 
-def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Placed:
+def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Placement:
     """Place the pictures of a folder. `offset_s` is what is to be added to the clock of the camera (None: estimated).
     What the record does not say of a picture is taken from its EXIF data. Raises UsageError if they do not belong
     together."""
@@ -58,7 +59,7 @@ def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Plac
     if not found:
         raise UsageError(f"No picture of {folder} is named there ({record.kind}): give the folder of these pictures.")
     tags = {name: _fill_tag(tag, own[name]) for name, tag in found.items()}
-    return Placed(how=how, tags=tags, pictures=len(own))
+    return Placement(how=how, tags=tags, pictures=len(own))
 
 
 def _match_names(named: Mapping[str, GeoTag], names: list[str]) -> dict[str, GeoTag]:
@@ -69,16 +70,16 @@ def _match_names(named: Mapping[str, GeoTag], names: list[str]) -> dict[str, Geo
     return {name: tag for name, tag in found.items() if tag and tag.position}
 
 
-def _match_times(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s: float | None) -> Placed:
+def _match_times(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s: float | None) -> Placement:
     times = {name: tag.t_utc_s for name, tag in own.items() if tag.t_utc_s is not None}
     if not times:
         raise UsageError("The pictures have no times (EXIF DateTimeOriginal): give those that the camera wrote.")
     how, times_s = "by time", np.array(list(times.values()))
     if offset_s is None:
-        offset_s = _zone_offset_s(track, times_s, "the pictures")
-        looked_at = sorted(times, key=times.__getitem__)[:_LOOKED_AT]
+        offset_s = _estimate_zone_offset_s(track, times_s, "the pictures")
+        looked_at = sorted(times, key=times.__getitem__)[:_MAX_COMPARED]
         paths = progress([folder / name for name in looked_at], len(looked_at), "comparing pictures")
-        fine_s = clock_offset_s(track, [times[name] + offset_s for name in looked_at], paths)
+        fine_s = estimate_clock_offset_s(track, [times[name] + offset_s for name in looked_at], paths)
         offset_s += fine_s or 0.0
         how += ", the camera's clock set by " + ("its time zone" if fine_s is None else "how the pictures move")
     found = {
@@ -86,8 +87,10 @@ def _match_times(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s
     }
     tags = {name: _fill_tag(tag, own[name]) for name, tag in found.items() if tag.position}
     if not tags:
-        raise UsageError(f"No picture lies within the track with --offset-s {offset_s:g}: {_spans(track, times_s)}")
-    return Placed(how=how, tags=tags, pictures=len(own), offset_s=offset_s)
+        raise UsageError(
+            f"No picture lies within the track with --offset-s {offset_s:g}: {_format_spans(track, times_s)}"
+        )
+    return Placement(how=how, tags=tags, pictures=len(own), offset_s=offset_s)
 
 
 def _fill_tag(tag: GeoTag, own: GeoTag) -> GeoTag:
@@ -96,7 +99,7 @@ def _fill_tag(tag: GeoTag, own: GeoTag) -> GeoTag:
     return replace(tag, **{name: getattr(own, name) for name in missing})
 
 
-def place_video(record: Record, video: Path, offset_s: float | None) -> Placed:
+def place_video(record: Record, video: Path, offset_s: float | None) -> Placement:
     """Place the frames of a video. `offset_s` is what is to be added to the clock of the camera (None: estimated), or
     to the time of the video if the record goes by it. Raises UsageError if they do not belong together."""
     if record.track is None:
@@ -106,26 +109,26 @@ def place_video(record: Record, video: Path, offset_s: float | None) -> Placed:
         if began_s is None:
             raise UsageError(f"{video} does not say when it was begun: give a recording that goes by the video's time.")
         if offset_s is None:
-            offset_s = _zone_offset_s(record.track, np.linspace(began_s, began_s + lasts_s, 60), str(video))
+            offset_s = _estimate_zone_offset_s(record.track, np.linspace(began_s, began_s + lasts_s, 60), str(video))
         shift_s, how = -began_s - offset_s, "by time"
     else:
         shift_s, how = -(offset_s or 0.0), "by the time of the video"
     track = replace(record.track, t_s=tuple((np.array(record.track.t_s) + shift_s).tolist()))
     if lasts_s:
         track.require_within(video, lasts_s)
-    return Placed(how=how, track=track, offset_s=offset_s)
+    return Placement(how=how, track=track, offset_s=offset_s)
 
 
-def _zone_offset_s(track: Track, times_s: Doubles, what: str) -> float:
+def _estimate_zone_offset_s(track: Track, times_s: Doubles, what: str) -> float:
     """Estimate what is to be added to the clock of a camera that shows a local time, so that most of its times, float
     (N,), lie within the track: whole hours, else half hours, else quarters."""
-    offsets_s = np.arange(-_MOST_ZONE, _MOST_ZONE + 1) * _ZONE_S
+    offsets_s = np.arange(-_MAX_ZONE_STEPS, _MAX_ZONE_STEPS + 1) * _ZONE_STEP_S
     first_s, last_s = track.t_s[0], track.t_s[-1]
     within = np.array([np.mean((times_s + each >= first_s) & (times_s + each <= last_s)) for each in offsets_s])
-    if within.max() < _MIN_SHARE:
-        raise UsageError(f"No time zone brings {what} into the track: {_spans(track, times_s)}")
+    if within.max() < _MIN_SHARE_IN_TRACK:
+        raise UsageError(f"No time zone brings {what} into the track: {_format_spans(track, times_s)}")
     fitting_s = offsets_s[within == within.max()].tolist()
-    for unit_s in (4 * _ZONE_S, 2 * _ZONE_S, _ZONE_S):
+    for unit_s in (4 * _ZONE_STEP_S, 2 * _ZONE_STEP_S, _ZONE_STEP_S):
         of_unit = sorted((each for each in fitting_s if each % unit_s == 0), key=abs)
         if len(of_unit) > 1:
             some = ", ".join(f"{each:g}" for each in of_unit[:4])
@@ -135,7 +138,7 @@ def _zone_offset_s(track: Track, times_s: Doubles, what: str) -> float:
     raise AssertionError("the smallest unit fits")
 
 
-def _spans(track: Track, times_s: Doubles) -> str:
+def _format_spans(track: Track, times_s: Doubles) -> str:
     """Say from when to when the camera and the track last."""
     ends_s = np.array([times_s.min(), times_s.max(), track.t_s[0], track.t_s[-1]])
     return "the camera says {} to {}, the track lasts from {} to {} (UTC): give --offset-s.".format(
@@ -143,9 +146,9 @@ def _spans(track: Track, times_s: Doubles) -> str:
     )
 
 
-def round_metres(placed: Placed) -> float | None:
+def find_rounding_m(placed: Placement) -> float | None:
     """Return to how many metres all positions are rounded, if it is much (None: not)."""
     tags = placed.track.tags if placed.track else placed.tags.values()
-    parts = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in tags if tag.position]) / _ROUNDED_DEG
+    parts = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in tags if tag.position]) / _ROUNDING_DEG
     is_rounded = np.allclose(parts, np.round(parts), rtol=0, atol=1e-4)
-    return float(np.radians(_ROUNDED_DEG)) * EARTH_RADIUS_M if is_rounded else None
+    return float(np.radians(_ROUNDING_DEG)) * EARTH_RADIUS_M if is_rounded else None

@@ -9,7 +9,7 @@ from pathlib import Path
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import ALT_LIMITS_M, GeoTag, Track, make_position
 
-_STILL_S = 1.0  # while nothing moves, a track keeps a line each second
+_MIN_INTERVAL_S = 1.0  # while nothing moves, a track keeps a line each second
 Attitude = tuple[float | None, float | None, float | None]  # heading, roll and pitch, degrees
 _UNKNOWN: Attitude = (None, None, None)
 
@@ -83,12 +83,12 @@ def make_track(path: Path, lines: Iterable[tuple[float, GeoTag]]) -> Track | Non
     kept: dict[float, GeoTag] = {}
     last_s, last = float("-inf"), GeoTag()
     for t_s, tag in sorted(lines, key=lambda line: line[0]):
-        if tag.position and (tag.position != last.position or t_s - last_s >= _STILL_S):
+        if tag.position and (tag.position != last.position or t_s - last_s >= _MIN_INTERVAL_S):
             kept[t_s], last_s, last = tag, t_s, tag
     return Track(path, tuple(kept), tuple(kept.values())) if kept else None
 
 
-def require(module: str, package: str, what: str) -> None:
+def require_package(module: str, package: str, what: str) -> None:
     """Raise UsageError if the module that reads `what` is not installed; `package` is its name on PyPI."""
     if find_spec(module) is None:
         raise UsageError(f"{what} is read by {package}, which is not here: run `pip install {package}`.")

@@ -12,10 +12,10 @@ from edgevpr.frames.positions import GeoTag
 from edgevpr.tracks.record import Attitude, Record, make_tag, make_track
 
 _MAX_FILE_BYTES = 200_000_000  # an hour at 60 frames a second
-_STARTS = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+_START_TIME = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
 # `[latitude: 50.1]`, `[longtitude : 8.5]` (so misspelt by some), `[rel_alt: 1.2 abs_alt: 230.4]`, `[gb_yaw: 12.0 ...]`.
-_NAMED = re.compile(
+_NAMED_VALUE = re.compile(
     rf"\b(lat|latitude|lon|longitude|longtitude|altitude|rel_alt|abs_alt|gb_\w+|drone_yaw|Yaw)\s*:\s*{_NUMBER}"
 )
 _GPS = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}(M?)\s*\)")
@@ -29,13 +29,13 @@ def read_subtitles(path: Path) -> Record:
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig", errors="replace")
     except OSError as error:
         raise UsageError(f"{path} cannot be read ({error.strerror}): give the subtitles beside the video.") from error
-    track = make_track(path, _lines(text))
+    track = make_track(path, _read_blocks(text))
     return Record(kind="subtitles of a video", track=track, is_utc=False)
 
 
-def _lines(text: str) -> Iterator[tuple[float, GeoTag]]:
+def _read_blocks(text: str) -> Iterator[tuple[float, GeoTag]]:
     """Yield the time of each subtitle in the video, in seconds, and what it says."""
-    starts = list(_STARTS.finditer(text))
+    starts = list(_START_TIME.finditer(text))
     ends = [each.start() for each in starts[1:]] + [len(text)]
     for start, end in zip(starts, ends, strict=False):  # one end more in an empty file
         hours, minutes, seconds, fraction = start.groups()
@@ -44,7 +44,7 @@ def _lines(text: str) -> Iterator[tuple[float, GeoTag]]:
 
 
 def _parse_block(block: str) -> GeoTag:
-    named = {name.lower(): float(number) for name, number in _NAMED.findall(block)}
+    named = {name.lower(): float(number) for name, number in _NAMED_VALUE.findall(block)}
     lat_deg, height_m = named.get("lat", named.get("latitude")), named.get("rel_alt")
     lon_deg = named.get("lon", named.get("longitude", named.get("longtitude")))
     if gps := _GPS.search(block):

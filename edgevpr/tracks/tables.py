@@ -17,9 +17,9 @@ from edgevpr.tracks.record import Attitude, Record, make_tag
 
 _MAX_FILE_BYTES = 100_000_000
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
-_HEAD = 10  # rows among which the names of the columns stand
+_MAX_HEADING_ROWS = 10  # rows among which the names of the columns stand
 # Names of columns, in letters alone; the first that is there counts.
-_COLUMNS = {
+_COLUMN_NAMES = {
     "file": ("sourcefile", "filename", "file", "imagename", "image", "label", "photo", "name"),
     "lat": ("latitude", "lat", "gpslatitude", "ylatitude"),
     "lon": ("longitude", "lon", "lng", "long", "gpslongitude", "xlongitude"),
@@ -31,9 +31,9 @@ _COLUMNS = {
     "roll": ("gimbalrolldegree",),
     "time": ("datetimeoriginal", "time"),
 }
-_NEEDED = ("file", "lat", "lon")
-_WITHOUT_NAMES = ("file", "lat", "lon", "alt")  # as Pix4D orders them
-_OF_OPENDRONEMAP = ("file", "lon", "lat", "alt")
+_REQUIRED_COLUMNS = ("file", "lat", "lon")
+_DEFAULT_COLUMNS = ("file", "lat", "lon", "alt")  # as Pix4D orders them
+_OPENDRONEMAP_COLUMNS = ("file", "lon", "lat", "alt")
 _WGS84 = re.compile(r"epsg:4326|wgs\s?84|\+proj=(longlat|latlong)", re.IGNORECASE)
 _NO_LETTERS = re.compile(r"\[.*?\]|\(.*?\)|[^a-z]")
 _NUMBERS = re.compile(r"[-+]?\d+(?:[.,]\d+)?")
@@ -50,39 +50,41 @@ def read_table(path: Path) -> Record:
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path} is no text that can be read ({error}): save the table as CSV in UTF-8.") from error
-    lines, order = [line for line in text.splitlines() if line.strip(" \t;,")], _WITHOUT_NAMES
+    lines, order = [line for line in text.splitlines() if line.strip(" \t;,")], _DEFAULT_COLUMNS
     if lines and _PROJECTION.match(lines[0]):
         if not _WGS84.match(lines[0]):
             raise UsageError(f"{path} is in `{lines[0]:.40}`: export it in latitude and longitude (WGS 84).")
-        lines, order = lines[1:], _OF_OPENDRONEMAP
+        lines, order = lines[1:], _OPENDRONEMAP_COLUMNS
     for separator, spoken in _SEPARATORS.items():
         rows = list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
-        if layout := _named_columns(rows):
+        if layout := _find_columns(rows):
             columns, first, names = layout
-        elif rows and len(rows[0]) >= len(_NEEDED) and is_image(rows[0][0].strip()):  # without names: the usual order
+        elif (
+            rows and len(rows[0]) >= len(_REQUIRED_COLUMNS) and is_image(rows[0][0].strip())
+        ):  # without names: the usual order
             columns, first, names = {part: column for column, part in enumerate(order)}, 0, order
         else:
             continue
-        needed = ", ".join(f"`{names[column]}`" for part, column in columns.items() if part in _NEEDED)
+        needed = ", ".join(f"`{names[column]}`" for part, column in columns.items() if part in _REQUIRED_COLUMNS)
         return Record(kind=f"table of {needed}, {spoken} between them", named=_read_rows(rows[first:], columns, path))
     raise UsageError(
         f"{path}: no columns of the picture, latitude and longitude were found: name them file, lat and lon in line 1."
     )
 
 
-def _named_columns(rows: Rows) -> Layout | None:
+def _find_columns(rows: Rows) -> Layout | None:
     """Find the row with the names of the columns."""
-    for number, row in enumerate(rows[:_HEAD]):
+    for number, row in enumerate(rows[:_MAX_HEADING_ROWS]):
         names = [_NO_LETTERS.sub("", cell.lower()) for cell in row]
-        found = {part: _column(known, names) for part, known in _COLUMNS.items()}
+        found = {part: _find_column(known, names) for part, known in _COLUMN_NAMES.items()}
         columns = {part: column for part, column in found.items() if column is not None}
         is_split = not any(separator in cell for cell in row for separator in ",;\t")
-        if is_split and columns.keys() >= set(_NEEDED):
+        if is_split and columns.keys() >= set(_REQUIRED_COLUMNS):
             return columns, number + 1, row
     return None
 
 
-def _column(known: Sequence[str], names: Sequence[str]) -> int | None:
+def _find_column(known: Sequence[str], names: Sequence[str]) -> int | None:
     """Return the column of the first `known` name, or of `vehicle latitude` and the like."""
     exact = [names.index(name) for name in known if name in names]
     angles = [at for at, name in enumerate(names) if known[0] in ("latitude", "longitude") and name.endswith(known[0])]
@@ -104,7 +106,7 @@ def _read_rows(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, 
 
 def _parse_row(cells: Mapping[str, str]) -> GeoTag:
     """Make a tag of the cells of a row; an impossible position is unknown. Raises ValueError for what is no number."""
-    number = {part: _angle(text) for part, text in cells.items() if text and part not in ("file", "time")}
+    number = {part: _parse_angle(text) for part, text in cells.items() if text and part not in ("file", "time")}
     attitude: Attitude = (number.get("nose"), None, None)
     if {"yaw", "pitch", "roll"} <= number.keys():
         attitude = to_nadir_angles(number["yaw"], number["pitch"], number["roll"])
@@ -114,7 +116,7 @@ def _parse_row(cells: Mapping[str, str]) -> GeoTag:
     return tag
 
 
-def _angle(text: str) -> float:
+def _parse_angle(text: str) -> float:
     """Convert `50.05`, `50,05`, `50.05 N` or `50 deg 3' 12.30" N`, and heights as `12.3 m`. Raises ValueError."""
     numbers = _NUMBERS.findall(text)
     if not 1 <= len(numbers) <= 3:

@@ -14,7 +14,7 @@ import yaml
 from pictures import textured
 
 from edgevpr.cli.examples import EXAMPLES
-from edgevpr.cli.main import EXIT_CODES, command_line, main
+from edgevpr.cli.main import EXIT_CODES, main, make_parser
 
 
 @pytest.fixture(scope="module")
@@ -229,12 +229,12 @@ def leaves(parser):
 
 
 def test_help_of_every_command_has_examples_that_parse():
-    commands = dict(leaves(command_line()))
+    commands = dict(leaves(make_parser()))
     assert set(commands) == set(EXAMPLES)
     for command, examples in EXAMPLES.items():
         assert all(line in commands[command].format_help() for _, line in examples)
         for _, words in examples:
-            command_line().parse_args([*command.split(), *words.split()])
+            make_parser().parse_args([*command.split(), *words.split()])
 
 
 @pytest.mark.process

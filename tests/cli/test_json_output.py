@@ -7,11 +7,11 @@ import jsonschema
 import pytest
 from documented import require_documented, schema
 
-from edgevpr.cli.main import command_line
+from edgevpr.cli.main import make_parser
 
 
 def commands_with_json(parser=None):
-    parser = parser or command_line()
+    parser = parser or make_parser()
     if "--json" in parser._option_string_actions:
         yield parser.prog
     for each in parser._actions:

@@ -10,7 +10,7 @@ from pictures import textured
 
 from edgevpr.cli.main import main
 from edgevpr.cli.screen import LineFormatter
-from edgevpr.core.text import decode_name, printable, redact_passwords, sanitize
+from edgevpr.core.text import decode_name, escape_unprintable, redact_passwords, sanitize
 
 REDDENING = "\x1b[31m.jpg"  # a name that would make all that follows red
 
@@ -35,7 +35,7 @@ def said(capfd, *words):
     ],
 )
 def test_printable_escapes_what_a_terminal_acts_on(text, printed):
-    assert printable(text) == printed
+    assert escape_unprintable(text) == printed
     printed.encode("utf-8")
 
 

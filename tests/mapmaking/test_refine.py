@@ -17,7 +17,7 @@ from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.images import read_image
 from edgevpr.lab.simulate.camera import Camera, light_scene, photograph
-from edgevpr.lab.simulate.generated import mapping_flight, to_position
+from edgevpr.lab.simulate.generated import plan_mapping_flight, to_position
 from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.mapmaking.refine import refine
 from edgevpr.places.mapfile import PlaceMap
@@ -35,7 +35,7 @@ _DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).parents[3] / "shar
 
 def photographer(seed):
     """Return the function that takes the picture of a pose in the generated flight."""
-    flight, rng = mapping_flight(7), np.random.default_rng(seed)
+    flight, rng = plan_mapping_flight(7), np.random.default_rng(seed)
     scene = make_scene(7, 420.0, 220.0)
     ground = light_scene(scene, flight.light, flight.seed)
     return lambda pose: photograph(ground, scene.metres_per_pixel, pose, Camera(), flight.light, rng), rng
@@ -47,7 +47,7 @@ def flown(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flown")
     (folder / "images").mkdir()
     shot_of, rng = photographer(7)
-    poses = mapping_flight(7).poses[: 14 * LEGS : EVERY]
+    poses = plan_mapping_flight(7).poses[: 14 * LEGS : EVERY]
     with open(folder / "positions.csv", "w", newline="") as handle:
         table = csv.writer(handle)
         table.writerow(("file", "lat", "lon"))

@@ -8,7 +8,7 @@ from rasters import HOME, textured_raster
 
 from edgevpr.core.types import Place, Pose
 from edgevpr.frames.level import Lens
-from edgevpr.review.album import album_of_map, make_album, small_pictures
+from edgevpr.review.album import embed_pictures, make_album, make_map_album
 
 LENS = Lens(60.0)
 
@@ -29,11 +29,11 @@ def test_the_pictures_of_a_map_of_an_orthophoto_are_cut_from_it_again(tmp_path):
     pytest.importorskip("rasterio")
     pose = Pose(up_deg=0.0, footprint_m=60.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
     places = [Place(place_id=1, source_image="town.tif_r000_c000", position=HOME, pose=pose)]
-    album = album_of_map([textured_raster(tmp_path / "town.tif")], places)
+    album = make_map_album([textured_raster(tmp_path / "town.tif")], places)
     assert album.image("town.tif_r000_c000").std() > 10
     assert album.image("town.tif_r000_c001") is None
     assert album.lay(places[0], None).image.std() > 10
-    assert album_of_map([], places).image("town.tif_r000_c000") is None
+    assert make_map_album([], places).image("town.tif_r000_c000") is None
 
 
 def test_pictures_get_smaller_and_then_fewer_until_they_fit(tmp_path):
@@ -41,7 +41,7 @@ def test_pictures_get_smaller_and_then_fewer_until_they_fit(tmp_path):
     albums = {"seen": make_album([tmp_path])}
     sizes = []
     for room_bytes in (1e6, 3e4, 6e3):
-        found, left_out = small_pictures(keys, albums, room_bytes)
+        found, left_out = embed_pictures(keys, albums, room_bytes)
         assert sum(map(len, found.values())) <= room_bytes
         assert bool(left_out) == (len(found) < len(keys))
         sizes.append(len(found))

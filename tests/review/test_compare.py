@@ -1,6 +1,6 @@
 """A flight held against its replay, line by line."""
 
-from edgevpr.review.compare import compare
+from edgevpr.review.compare import compare_lines
 
 START = {"kind": "start", "t_mono_s": 1.0, "version": "1"}
 QUERIES = [{"kind": "query", "t_mono_s": 2.0 + at, "query": f"{at}.png", "fix": {"sent": True}} for at in range(3)]
@@ -8,12 +8,12 @@ QUERIES = [{"kind": "query", "t_mono_s": 2.0 + at, "query": f"{at}.png", "fix": 
 
 def test_compare_names_the_fields_that_differ_and_the_program_apart():
     other = {**QUERIES[1], "fix": {"sent": False}}
-    found = compare([START, *QUERIES], [{**START, "version": "2"}, QUERIES[0], other, QUERIES[2]])
+    found = compare_lines([START, *QUERIES], [{**START, "version": "2"}, QUERIES[0], other, QUERIES[2]])
     assert (found.alike, found.after, found.program) == (3, 0, {"version": ("1", "2")})
     assert found.others == [{"kind": "query", "t_mono_s": 3.0, "query": "1.png", "fields": {"fix.sent": (True, False)}}]
 
 
 def test_compare_counts_lines_that_the_replay_lacks_and_names_those_that_it_adds():
-    assert compare([START, *QUERIES], [START, QUERIES[0]]).after == 2
-    (added,) = compare([START], [START, QUERIES[0]]).others
+    assert compare_lines([START, *QUERIES], [START, QUERIES[0]]).after == 2
+    (added,) = compare_lines([START], [START, QUERIES[0]]).others
     assert (added["query"], added["only_in"]) == ("0.png", "replay")

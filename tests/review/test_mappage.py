@@ -12,7 +12,7 @@ from ground import STEP_M, places_in, position, write_positions
 from edgevpr.cli.main import main
 from edgevpr.core.types import Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.review.mappage import find_gaps, find_tags_off
+from edgevpr.review.mappage import find_gaps, find_inconsistent_tags
 
 TWIN = "twin.png"
 
@@ -92,4 +92,4 @@ def test_find_tags_off_names_those_far_from_their_pictures(tmp_path):
         for at, place in enumerate(places_in(tmp_path))
     ]
     places = [replace(place, position=Position(*position(0.0, 0.0))) for place in places]
-    assert list(find_tags_off(places)) == [5]
+    assert list(find_inconsistent_tags(places)) == [5]

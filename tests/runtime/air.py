@@ -10,7 +10,7 @@ from fakes import receiver_at, vehicle_at
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import offset_m, offset_position
-from edgevpr.core.types import FRAME_TIME_SD_S, Candidate, Frame, Place, Position, QueryCost, Steps, Vehicle
+from edgevpr.core.types import FRAME_TIME_SD_S, Candidate, Frame, Place, Position, QueryCost, StepCosts, Vehicle
 from edgevpr.frames.level import LevelledImage, View
 from edgevpr.mavlink.conversation import BETWEEN_S
 from edgevpr.mavlink.messages import Fix
@@ -46,7 +46,7 @@ def match_at(
         accepted=True,
         located=Located(position=position, covariance_m2=(sd_m**2, 0.0, sd_m**2), places=tuple(places), lean=lean),
         accuracy_m=sd_m,
-        steps=Steps(),
+        steps=StepCosts(),
         cost=_NO_COST,
     )
 

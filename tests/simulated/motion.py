@@ -12,7 +12,7 @@ from pathlib import Path
 
 from edgevpr.core.arrays import LatLon
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import offset_m, offset_position, shorter_deg
+from edgevpr.core.geodesy import offset_m, offset_position, wrap_deg
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import read_positions
 
@@ -172,7 +172,7 @@ def interpolate_track(track: FlownTrack, t_s: float) -> TrueState:
     for name in ("lat_deg", "lon_deg", "alt_m", "height_m", "roll_deg", "pitch_deg", "heading_deg"):
         change = getattr(ahead, name) - getattr(passed, name)
         if not math.isnan(change):
-            values[name] = getattr(passed, name) + share * (shorter_deg(change) if name in _ANGLES else change)
+            values[name] = getattr(passed, name) + share * (wrap_deg(change) if name in _ANGLES else change)
     velocity_m_s = displacement_m(passed.point, ahead.point) / (ahead.t_s - passed.t_s)
     return replace(passed, **values, velocity_m_s=velocity_m_s, t_s=t_s)
 

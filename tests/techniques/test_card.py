@@ -7,7 +7,7 @@ from tiny_networks import CARD, write_card, write_network
 
 from edgevpr import techniques
 from edgevpr.core.errors import EdgevprError, ModelError, UsageError
-from edgevpr.core.files import find_shipped, model_folders
+from edgevpr.core.files import find_shipped, list_model_folders
 from edgevpr.techniques.card import load_card, read_card
 from edgevpr.techniques.session import open_backbone
 
@@ -17,7 +17,7 @@ SHA256 = "0" * 64
 def test_the_users_card_of_a_name_comes_before_the_shipped_one(tmp_path, monkeypatch):
     monkeypatch.delenv("EDGEVPR_MODELS", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    assert model_folders() == (tmp_path / "edgevpr" / "models", find_shipped("models"))
+    assert list_model_folders() == (tmp_path / "edgevpr" / "models", find_shipped("models"))
     write_network(tmp_path / "edgevpr" / "models", "calc", card={"title": "My own"})
     assert load_card("calc").title == "My own"
 

@@ -13,7 +13,7 @@ from recordings import START_S, write_dataflash, write_gpx
 from edgevpr.cli.main import main
 from edgevpr.core.geodesy import offset_position
 from edgevpr.frames.positions import read_positions
-from edgevpr.tracks.clock import clock_offset_s
+from edgevpr.tracks.clock import estimate_clock_offset_s
 from edgevpr.tracks.record import read_record
 
 SIDE_PX, GROUND_PX = 240, 2400
@@ -140,4 +140,4 @@ def test_a_clock_that_is_off_by_seconds_is_set_by_how_the_pictures_move(capsys, 
     write_gpx(straight, [(t, HOME[0] + 1e-5 * t, HOME[1]) for t in range(90)])
     paths = [folder / f"{number}.jpg" for number in range(len(pictures))]
     times = [START_S + 2 * number for number in range(len(pictures))]
-    assert clock_offset_s(read_record(straight).track, times, paths) is None, "another flight sets no clock"
+    assert estimate_clock_offset_s(read_record(straight).track, times, paths) is None, "another flight sets no clock"

@@ -26,7 +26,7 @@ from edgevpr.frames.source import read_tags
 
 _MAX_FILE_BYTES = 100_000_000  # a million queries
 _LAYOUTS = "query/, ref/ and ground_truth.csv or positions.csv; or database/ and queries/"
-_SCORED = ("ok", "novel")  # statuses of a query; novel: its place is not in the map
+_SCORED_STATUSES = ("ok", "novel")  # statuses of a query; novel: its place is not in the map
 # By the file name of each query, in the order of the file: the file names of the references that are right (none: the
 # query is off the map), and of those ignored, where a match counts as neither right nor wrong. None: it is not scored.
 GroundTruth = dict[str, tuple[frozenset[str], frozenset[str]] | None]
@@ -88,7 +88,7 @@ def read_truth(path: str | Path) -> GroundTruth:
     (`ok`, or `novel` for a query off the map; with any other it is not scored). Raises UsageError with file, line,
     value and what to do."""
     truth: GroundTruth = {}
-    for where, row in _rows(Path(path)):
+    for where, row in _read_rows(Path(path)):
         name = row["query_file"]
         if name in truth:
             raise UsageError(f"{where}: the query `{name}` has a row already: keep one, with all its ref_files.")
@@ -96,11 +96,11 @@ def read_truth(path: str | Path) -> GroundTruth:
         status = row.get("status", "ok")
         if right and status == "novel":
             raise UsageError(f"{where}: the query `{name}` is `novel` and has ref_files: drop them, or write `ok`.")
-        truth[name] = (right, loose - right) if status in _SCORED else None
+        truth[name] = (right, loose - right) if status in _SCORED_STATUSES else None
     return truth
 
 
-def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
+def _read_rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield for each row its file and line, for messages, and its values by column, without outer spaces."""
     try:
         reader = csv.DictReader(io.StringIO(read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig"), newline=""))
@@ -160,12 +160,12 @@ def match_positions(query_dir: Path, ref_dir: Path, within_m: float) -> Dataset:
 
 def _read_utm_names(query_dir: Path, ref_dir: Path, within_m: float) -> Dataset:
     queries, references = list_images(query_dir), list_images(ref_dir)
-    query_m, reference_m = (np.array([_utm_m(path) for path in paths]) for paths in (queries, references))
+    query_m, reference_m = (np.array([_parse_utm_m(path) for path in paths]) for paths in (queries, references))
     truth = _find_near(queries, query_m, references, reference_m, within_m)
     return make_dataset(query_dir, ref_dir, truth, query_dir)
 
 
-def _utm_m(path: Path) -> tuple[float, float]:
+def _parse_utm_m(path: Path) -> tuple[float, float]:
     try:
         _, east, north, *_ = path.name.split("@")
         return float(east), float(north)

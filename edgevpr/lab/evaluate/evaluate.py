@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.core.config import BatteryConfig, MatchConfig, SourceConfig, bounded
+from edgevpr.core.config import BatteryConfig, MatchConfig, SourceConfig, bounded_key
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.core.types import NO_COST, Frame, StageCost
@@ -60,8 +60,8 @@ class MatchOptions:
     `known`: what is known of each beside its picture, such as "heading,height" (None: nothing, `hints.RecordedPrior`).
     """
 
-    candidates: int | None = bounded(1, 1_000_000, default=None)
-    sequence: int | None = bounded(1, 100, default=None)
+    candidates: int | None = bounded_key(1, 1_000_000, default=None)
+    sequence: int | None = bounded_key(1, 100, default=None)
     exact: bool = False
     follow: bool = False
     known: str | None = None
@@ -125,7 +125,7 @@ def answer_queries(
     is scored, and what could not be done to the map (see `open_temporary_map`). Raises UsageError where no query has
     what `options.known` asks for, ModelError for a query that fails."""
     spec = technique.spec
-    prior, tags = read_known(options.known, dataset, spec, options.sequence)
+    prior, tags = read_prior(options.known, dataset, spec, options.sequence)
     together = sequence_length(spec, options.sequence)
     source, meter = open_source(str(dataset.ref_dir), live=False), QueryMeter(load_board("this"))
     frames = progress(read_frames(source), source.total, f"{spec.name}: references")
@@ -212,7 +212,7 @@ def summarise(
         references=references,
         unscored=dataset.unscored,
         not_done=not_done,
-        **metrics.compute_both(
+        **metrics.compute_quality(
             *(np.array([getattr(answer, name) for answer in answers]) for name in ("score", "first_right", "has_match"))
         ),
         **{
@@ -236,7 +236,7 @@ def summarise(
     )
 
 
-def read_known(
+def read_prior(
     text: str | None, dataset: Dataset, spec: TechniqueSpec, sequence: int | None
 ) -> tuple[RecordedPrior | None, dict[Path, GeoTag]]:
     """Return what narrows each query of a data set, where `text` says what is known ("heading,height"; None: nothing),

@@ -71,7 +71,7 @@ class TechniqueResult(Quality):
     for all queries, in Ah (5.7), from the battery pack; `ah_assumes` names board, pack and efficiency. `sequence`: how
     many queries were matched together. `known`: that of `evaluate.MatchOptions`. `weights`: origin of the network's
     weights (None: no network). `not_done`: sentences on what `map build` does to a map and could not be done to this
-    one. `pcu`: filled in by `compare`, since it depends on all techniques compared.
+    one. `pcu`: filled in by `add_pcu`, since it depends on all techniques compared.
     """
 
     parameters: dict[str, int | float | str]
@@ -158,7 +158,7 @@ def pcu(precision: float, t_encode_s: float, t_encode_max_s: float) -> float:
     return precision * math.log10(t_encode_max_s / t_encode_s + 9)
 
 
-def interval(hits: np.ndarray) -> Interval:
+def wilson_interval(hits: np.ndarray) -> Interval:
     """Return the 95 % confidence interval of the share of `hits`, bool (N,), by Wilson's score (1927)."""
     share, spread = float(np.mean(hits)), _SIGMAS_95**2 / len(hits)
     half = math.sqrt(spread * (share * (1 - share) + spread / 4))
@@ -171,7 +171,7 @@ def compute_figures(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray
     precision, recall = precision_recall(scores, correct)
     certain = recall_at_100_precision(precision, recall)
     recalls: dict[str, Any] = {f"recall_at_{k}": float(np.mean(ranks < k)) for k in (1, 5, 10)}
-    recalls |= {f"recall_at_{k}_interval": interval(ranks < k) for k in (1, 5, 10)}
+    recalls |= {f"recall_at_{k}_interval": wilson_interval(ranks < k) for k in (1, 5, 10)}
     return Figures(
         queries=len(scores),
         **recalls,
@@ -186,7 +186,7 @@ def compute_figures(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray
     )
 
 
-def compute_both(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray) -> dict[str, Any]:
+def compute_quality(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray) -> dict[str, Any]:
     """Return the fields of a `Quality`, by name, that follow from the answers: the figures of all queries, and of those
     whose place is in the map."""
     every = compute_figures(scores, ranks, has_match)
@@ -198,7 +198,7 @@ def compute_both(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray) -
     }
 
 
-def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
+def add_pcu(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
     """Return the results with the PCU (see `pcu`) filled in. It depends on the slowest encoder among them."""
     results = list(results)
     slowest_s = max((result.t_encode_s for result in results), default=0.0)
@@ -207,7 +207,7 @@ def compare(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
     ]
 
 
-def from_json(row: dict[str, Any]) -> TechniqueResult:
+def read_result(row: dict[str, Any]) -> TechniqueResult:
     """Return the result whose fields are in `row`, as read from JSON. Other keys of `row` are left out."""
     known = {field.name: row[field.name] for field in fields(TechniqueResult) if field.name in row}
     return TechniqueResult(**{**known, "with_match": known.get("with_match") and Figures(**known["with_match"])})

@@ -16,13 +16,13 @@ import edgevpr
 _PACKAGES = {"numpy": "numpy", "opencv": "opencv-python-headless", "onnxruntime": "onnxruntime", "scipy": "scipy"}
 
 
-def today() -> str:
+def format_date() -> str:
     """Return the date in UTC, like 2026-01-31."""
     return datetime.now(timezone.utc).strftime("%Y-%m-%d")
 
 
 @cache
-def versions() -> dict[str, str | None]:
+def read_versions() -> dict[str, str | None]:
     """Return the versions of edgevpr, Python and the libraries that decide a figure; None for one that is missing."""
     found: dict[str, str | None] = {"edgevpr": edgevpr.__version__, "python": platform.python_version()}
     for name, package in _PACKAGES.items():
@@ -33,14 +33,14 @@ def versions() -> dict[str, str | None]:
     return found
 
 
-def machine() -> dict[str, Any]:
+def describe_machine() -> dict[str, Any]:
     """Return the machine: its processor, the cores this process may use, and the threads of NumPy's BLAS library."""
     threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
-    return {"cpu": cpu_model(), "cores": len(os.sched_getaffinity(0)), "blas_threads": threads}
+    return {"cpu": read_cpu_model(), "cores": len(os.sched_getaffinity(0)), "blas_threads": threads}
 
 
 @cache
-def cpu_model() -> str:
+def read_cpu_model() -> str:
     """Return the name of the processor, or its architecture (such as aarch64) if the system gives no name."""
     for line in Path("/proc/cpuinfo").read_text().splitlines():
         if line.startswith(("model name", "Model")):
@@ -50,7 +50,7 @@ def cpu_model() -> str:
 
 def describe_origin() -> dict[str, Any]:
     """Return the date, the machine and the versions, which are stored with a result."""
-    return {"date": today(), "machine": machine(), "versions": versions()}
+    return {"date": format_date(), "machine": describe_machine(), "versions": read_versions()}
 
 
 def hash_parts(*parts: Any) -> str:

@@ -14,13 +14,13 @@ import edgevpr
 from edgevpr.core.config import SalienceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, ImageError, ModelError
-from edgevpr.core.files import write_whole
+from edgevpr.core.files import write_atomically
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import find_positions
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.lab.evaluate.evaluate import MatchOptions, Progress, answer_queries, summarise
-from edgevpr.lab.evaluate.provenance import describe_origin, hash_parts, stamp_file, versions
+from edgevpr.lab.evaluate.provenance import describe_origin, hash_parts, read_versions, stamp_file
 from edgevpr.runtime.recognise.opening import open_salience_gate
 from edgevpr.techniques import create
 
@@ -76,13 +76,13 @@ def measure(plan: Plan, folder: Path | None, progress: Progress) -> Measurements
             except (ModelError, ImageError) as error:  # it stops no other row
                 failed[name, label] = error
             else:
-                result = replace(metrics.from_json(content["result"]), technique=label)
+                result = replace(metrics.read_result(content["result"]), technique=label)
                 found[name].append(MeasuredRow(result=result, made=content["made"]))
-    return Measurements({name: _compare(rows) for name, rows in found.items()}, failed)
+    return Measurements({name: _add_pcu(rows) for name, rows in found.items()}, failed)
 
 
-def _compare(rows: Sequence[MeasuredRow]) -> list[MeasuredRow]:
-    results = metrics.compare(row.result for row in rows)
+def _add_pcu(rows: Sequence[MeasuredRow]) -> list[MeasuredRow]:
+    results = metrics.add_pcu(row.result for row in rows)
     return [replace(row, result=result) for row, result in zip(rows, results, strict=True)]
 
 
@@ -111,7 +111,7 @@ def _hash_row(plan: Plan, dataset: Dataset, technique: Technique) -> str:
     truth = [(query.path.name, sorted(query.right), sorted(query.ignored)) for query in dataset.queries]
     spec = technique.spec
     row = [spec.name, spec.parameters, spec.form, spec.model_sha256, asdict(plan.options), asdict(plan.salience)]
-    return hash_parts(code, versions(), list(map(stamp_file, files)), truth, row)
+    return hash_parts(code, read_versions(), list(map(stamp_file, files)), truth, row)
 
 
 def write_results(folder: Path, outcome: Measurements) -> None:
@@ -134,6 +134,6 @@ def _write(path: Path, text: str) -> None:
     """Write a file whole. Raises EdgevprError where the folder takes no more."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, partial(Path.write_text, data=text, encoding="utf-8", errors="backslashreplace"))
+        write_atomically(path, partial(Path.write_text, data=text, encoding="utf-8", errors="backslashreplace"))
     except OSError as error:
         raise EdgevprError(f"{path} cannot be written ({error.strerror}): make room, and run again.") from error

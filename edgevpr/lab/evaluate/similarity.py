@@ -13,7 +13,7 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.images import make_sort_key
 from edgevpr.lab.evaluate.dataset import GroundTruth
-from edgevpr.lab.evaluate.metrics import Quality, compute_both, rank_first_right
+from edgevpr.lab.evaluate.metrics import Quality, compute_quality, rank_first_right
 
 
 def read_similarities(path: str | Path) -> Doubles:
@@ -61,4 +61,6 @@ def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequenc
     if not answers:
         raise UsageError(f"{label}: the ground truth scores none of its queries: give the one that belongs to it.")
     columns = map(np.array, zip(*answers, strict=True))
-    return Quality(technique=label, references=len(names), unscored=len(truth) - len(answers), **compute_both(*columns))
+    return Quality(
+        technique=label, references=len(names), unscored=len(truth) - len(answers), **compute_quality(*columns)
+    )

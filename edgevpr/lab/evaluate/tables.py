@@ -5,7 +5,7 @@ from typing import Any
 
 from edgevpr.core.text import align_table
 from edgevpr.lab.evaluate.metrics import Figures, Interval, Quality, TechniqueResult
-from edgevpr.lab.evaluate.provenance import versions
+from edgevpr.lab.evaluate.provenance import read_versions
 
 Column = tuple[str, Callable[[Any], str]]  # a heading, and the text of a result's cell
 
@@ -18,15 +18,15 @@ ABOUT_FIGURES = (
 )
 
 
-def share_text(share: float | Interval | None) -> str:
+def format_share(share: float | Interval | None) -> str:
     """Return a share (0..1) or an interval as text; "-" for None, which is unknown."""
     if isinstance(share, Sequence):  # JSON has no tuples
         return f"{share[0]:.2f}-{share[1]:.2f}"
     return "-" if share is None else f"{share:.3f}"
 
 
-def _share(heading: str, field: str) -> Column:
-    return heading, lambda result: share_text(getattr(result, field, None))
+def _make_share_column(heading: str, field: str) -> Column:
+    return heading, lambda result: format_share(getattr(result, field, None))
 
 
 def _count_off_map(result: Figures) -> str:
@@ -41,24 +41,24 @@ def _count_accepted(result: Figures) -> str:
 
 RECALLS: tuple[Column, ...] = (
     ("queries", lambda figures: str(figures.queries)),
-    _share("recall@1", "recall_at_1"),
-    _share("95 %", "recall_at_1_interval"),
-    _share("@5", "recall_at_5"),
-    _share("95 %", "recall_at_5_interval"),
-    _share("@10", "recall_at_10"),
-    _share("95 %", "recall_at_10_interval"),
+    _make_share_column("recall@1", "recall_at_1"),
+    _make_share_column("95 %", "recall_at_1_interval"),
+    _make_share_column("@5", "recall_at_5"),
+    _make_share_column("95 %", "recall_at_5_interval"),
+    _make_share_column("@10", "recall_at_10"),
+    _make_share_column("95 %", "recall_at_10_interval"),
 )
 CURVE: tuple[Column, ...] = (
-    _share("AUC", "auc_from_zero"),
-    _share("AUC 2.3", "auc_2_3"),
-    _share("P@100%R", "precision_at_100_recall"),
-    _share("R@100%P, right", "recall_at_100_precision_vpr_bench"),
-    _share("R@100%P, in map", "recall_at_100_precision_vpr_tutorial"),
-    _share("EP", "ep"),
-    _share("ROC", "roc_auc"),
+    _make_share_column("AUC", "auc_from_zero"),
+    _make_share_column("AUC 2.3", "auc_2_3"),
+    _make_share_column("P@100%R", "precision_at_100_recall"),
+    _make_share_column("R@100%P, right", "recall_at_100_precision_vpr_bench"),
+    _make_share_column("R@100%P, in map", "recall_at_100_precision_vpr_tutorial"),
+    _make_share_column("EP", "ep"),
+    _make_share_column("ROC", "roc_auc"),
 )
-DECIDED: tuple[Column, ...] = (
-    _share("PCU", "pcu"),
+DECISIONS: tuple[Column, ...] = (
+    _make_share_column("PCU", "pcu"),
     ("accepted (wrong)", _count_accepted),
     ("off the map", _count_off_map),
 )
@@ -87,12 +87,12 @@ def list_headings(columns: Sequence[Column]) -> list[str]:
     return ["technique", *(heading for heading, _ in columns)]
 
 
-def results_text(results: Sequence[Quality]) -> str:
+def format_results(results: Sequence[Quality]) -> str:
     """Return the text that `edgevpr eval` prints for a data set: tables, then the notes on them. Results of techniques
     come from `metrics.compare`; those of stored similarities have no costs."""
     has_costs = isinstance(results[0], TechniqueResult)
     texts = []
-    for columns in (RECALLS, (*CURVE, *DECIDED), COSTS) if has_costs else (RECALLS, CURVE):
+    for columns in (RECALLS, (*CURVE, *DECISIONS), COSTS) if has_costs else (RECALLS, CURVE):
         rows = [row for result in results for row in make_rows(result, columns, both=columns is not COSTS)]
         texts.append("\n".join(align_table([list_headings(columns), *rows])) + "\n")
     return "\n".join([*texts, *list_notes(results)])
@@ -109,7 +109,7 @@ def list_notes(results: Sequence[Quality]) -> Iterator[str]:
     techniques = [result for result in results if isinstance(result, TechniqueResult)]
     if techniques:
         yield from _list_notes_on_techniques(techniques)
-    yield "By " + ", ".join(f"{name} {version or '(not installed)'}" for name, version in versions().items()) + "."
+    yield "By " + ", ".join(f"{name} {version or '(not installed)'}" for name, version in read_versions().items()) + "."
 
 
 def _list_notes_on_techniques(results: Sequence[TechniqueResult]) -> Iterator[str]:

@@ -12,7 +12,7 @@ from edgevpr.core.arrays import Array, Doubles, Floats, Image, Singles
 Box = tuple[slice, slice]  # rows, columns
 _GRID_M = 8.0
 BASE_CM = 300  # of open ground, so that a river bed and a furrow lie above zero
-AROUND = ((1, 1), (1, -1), (-1, -1), (-1, 1))  # the corners of a rectangle
+CORNERS = ((1, 1), (1, -1), (-1, -1), (-1, 1))  # the corners of a rectangle
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class Scene:
         self.albedo[box][touched] = np.clip(below + cover[touched][:, None] * (above - below), 0, 255)
 
 
-def noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, octaves: int = 3) -> Singles:
+def make_noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, octaves: int = 3) -> Singles:
     """Make smooth noise, float32 of `shape`, mean 0 and standard deviation 1, of bumps `first_px` wide, half as wide,
     and so on for `octaves`."""
     total = np.zeros(shape, np.float32)
@@ -84,7 +84,7 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, oct
     return total
 
 
-def bgr_mix(low: tuple[int, int, int], high: tuple[int, int, int], share: Array) -> Array:
+def mix_colours(low: tuple[int, int, int], high: tuple[int, int, int], share: Array) -> Array:
     """Mix two colours by `share` (H, W), 0 for `low` and 1 for `high`: float32 (H, W, 3)."""
     first, last = np.asarray(low, np.float32), np.asarray(high, np.float32)
     mixed: Array = first + share[..., None] * (last - first)
@@ -97,12 +97,12 @@ def smooth_step(values: Array, low: float, high: float) -> Array:
     return np.clip((values - low) / (high - low), 0, 1)
 
 
-def roof(
+def paint_building(
     canvas: Scene, centre_m: Doubles, length_m: float, width_m: float, turn_rad: float, wall_m: float, colour: Doubles
 ) -> None:
     """Paint a building with walls `wall_m` high and a gable roof. Its ridge is `turn_rad` anticlockwise from east."""
     along, across = rotate_axes(turn_rad)
-    corners = [centre_m + a * along * length_m / 2 + b * across * width_m / 2 for a, b in AROUND]
+    corners = [centre_m + a * along * length_m / 2 + b * across * width_m / 2 for a, b in CORNERS]
     box = canvas.box(corners, 1.0)
     cover = canvas.polygon(box, corners)
     east_m, north_m = canvas.grid_m(box)
@@ -114,18 +114,18 @@ def roof(
     canvas.height_cm[box] = np.where(cover > 0.5, gable_cm, canvas.height_cm[box])
 
 
-def crown(rng: np.random.Generator, radius_px: int) -> Singles:
+def make_crown(rng: np.random.Generator, radius_px: int) -> Singles:
     """Make the dome of one tree, float32 (D, D), D = 2 `radius_px` + 1: 0..1.2, and 0 outside of its ragged outline."""
     axis = np.arange(-radius_px, radius_px + 1, dtype=np.float32) / radius_px
-    lumps = noise(rng, (len(axis), len(axis)), max(radius_px * 0.7, 2.0), 2)
-    leaves = noise(rng, (len(axis), len(axis)), 2.5, 2)
+    lumps = make_noise(rng, (len(axis), len(axis)), max(radius_px * 0.7, 2.0), 2)
+    leaves = make_noise(rng, (len(axis), len(axis)), 2.5, 2)
     dome = 1 - (axis[None] ** 2 + axis[:, None] ** 2) * (1.2 + 0.2 * lumps + 0.12 * leaves)
     ragged: Singles = np.sqrt(np.clip(dome, 0, 1)) * np.clip(1 + 0.08 * lumps + 0.06 * leaves, 0, 1.2)
     return ragged
 
 
-def stand(canvas: Scene, dome: Singles, centre_m: tuple[float, float], top_m: float, colour: Doubles) -> None:
-    """Paint one tree, a `dome` made by `crown`, `top_m` metres high. Where crowns overlap, the higher one is seen."""
+def paint_tree(canvas: Scene, dome: Singles, centre_m: tuple[float, float], top_m: float, colour: Doubles) -> None:
+    """Paint one tree, a `dome` of `make_crown`, `top_m` metres high. Where crowns overlap, the higher one is seen."""
     radius = len(dome) // 2
     column, row = canvas.pixels([centre_m])[0].astype(int)
     if not (radius <= column < canvas.shape[1] - radius and radius <= row < canvas.shape[0] - radius):
@@ -142,7 +142,9 @@ def rotate_axes(turn_rad: float) -> tuple[Doubles, Doubles]:
     return np.array([np.cos(turn_rad), np.sin(turn_rad)]), np.array([-np.sin(turn_rad), np.cos(turn_rad)])
 
 
-def winding(rng: np.random.Generator, start: tuple[float, float], end: tuple[float, float], swing_m: float) -> Doubles:
+def make_winding(
+    rng: np.random.Generator, start: tuple[float, float], end: tuple[float, float], swing_m: float
+) -> Doubles:
     """Make a line of 200 points from near `start` to near `end` that swings about `swing_m` metres to either side."""
     start_m, end_m = np.asarray(start), np.asarray(end)
     along = (end_m - start_m) / np.linalg.norm(end_m - start_m)
@@ -152,7 +154,7 @@ def winding(rng: np.random.Generator, start: tuple[float, float], end: tuple[flo
     return line_m
 
 
-def parcels(
+def cut_parcels(
     rng: np.random.Generator, width_m: float, depth_m: float, field_m2: float
 ) -> tuple[list[Doubles], list[tuple[int, Doubles]]]:
     """Cut the land by straight lines until every piece has about `field_m2` square metres. Returns the pieces, convex
@@ -167,7 +169,7 @@ def parcels(
         if area_m2 < field_m2 * rng.uniform(0.7, 1.8):
             fields.append(piece)
             continue
-        side = longest_side(piece)
+        side = find_longest_side(piece)
         angle = np.arctan2(side[1], side[0]) + np.pi / 2 + rng.normal(0, 0.16)
         through = piece.mean(axis=0) + rng.uniform(-0.2, 0.2) * side
         halves, line = _cut(piece, through, rotate_axes(angle)[1])
@@ -176,19 +178,19 @@ def parcels(
     return fields, cuts
 
 
-def longest_side(polygon: Doubles) -> Doubles:
+def find_longest_side(polygon: Doubles) -> Doubles:
     """Return the longest side of a polygon (N, 2) as a vector (2,)."""
     sides = np.roll(polygon, -1, axis=0) - polygon
     longest: Doubles = sides[np.argmax(np.hypot(*sides.T))]
     return longest
 
 
-class Bend:
+class LineBender:
     """Bends straight lines by about `by_m` metres. Points near each other move alike."""
 
     def __init__(self, rng: np.random.Generator, width_m: float, depth_m: float, by_m: float) -> None:
         shape = int(depth_m / _GRID_M) + 8, int(width_m / _GRID_M) + 8
-        self._shift_m = by_m * np.stack([noise(rng, shape, 7, 1), noise(rng, shape, 7, 1)], axis=-1)
+        self._shift_m = by_m * np.stack([make_noise(rng, shape, 7, 1), make_noise(rng, shape, 7, 1)], axis=-1)
 
     def __call__(self, points_m: Doubles, closed: bool) -> Doubles:
         """Return the line through the points as a chain of short pieces, bent; `closed` joins its ends."""

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Array, Doubles, Image
-from edgevpr.lab.simulate.brush import Scene, noise, smooth_step
+from edgevpr.lab.simulate.brush import Scene, make_noise, smooth_step
 
 _MAX_SHADOW_M = 30.0
-_STRIP = 256  # rows lit at a time: the working memory stays small
+_STRIP_ROWS = 256  # rows lit at a time: the working memory stays small
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,14 +77,14 @@ def light_scene(scene: Scene, light: Light, seed: int) -> Image:
     shadow = _cast_shadows(scene, towards_sun, float(np.tan(elevation)))
     sky = np.array([0.42, 0.36, 0.32], np.float32)
     sun = np.array([0.64 - 0.12 * light.warmth, 0.66, 0.68 + 0.10 * light.warmth], np.float32)
-    cloud = _clouds(scene, light.cloud_frac, seed)
+    cloud = _make_clouds(scene, light.cloud_frac, seed)
     ground = np.empty_like(scene.albedo)
-    for top in range(0, len(ground), _STRIP):
-        rows = slice(top, top + _STRIP)
-        around_cm = scene.height_cm[max(0, top - 1) : top + _STRIP + 1].astype(np.float32)
+    for top in range(0, len(ground), _STRIP_ROWS):
+        rows = slice(top, top + _STRIP_ROWS)
+        around_cm = scene.height_cm[max(0, top - 1) : top + _STRIP_ROWS + 1].astype(np.float32)
         down, right = (np.gradient(around_cm, 100 * scene.metres_per_pixel, axis=axis) for axis in (0, 1))
         inner = slice(top - max(0, top - 1), None)
-        down, right = down[inner][:_STRIP], right[inner][:_STRIP]
+        down, right = down[inner][:_STRIP_ROWS], right[inner][:_STRIP_ROWS]
         slope = np.sin(elevation) - np.cos(elevation) * (right * towards_sun[0] + down * towards_sun[1])
         slope = np.clip(slope / np.sqrt(1 + right**2 + down**2) / np.sin(elevation), 0.05, 1.9)
         direct = slope * (1 - shadow[rows] / np.float32(255)) * (1 - cloud[rows] / np.float32(255))
@@ -110,9 +110,9 @@ def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: flo
     return cv2.GaussianBlur(hidden, (5, 5), 0)
 
 
-def _clouds(scene: Scene, cloud_frac: float, seed: int) -> Array:
+def _make_clouds(scene: Scene, cloud_frac: float, seed: int) -> Array:
     """Return the share of sunlight that clouds hold back, uint8 (H, W); 255 is all of it."""
-    coarse = noise(np.random.default_rng(seed), (64, 64), 16, 3)
+    coarse = make_noise(np.random.default_rng(seed), (64, 64), 16, 3)
     edge = float(np.quantile(coarse, 1 - cloud_frac)) + (0.25 if cloud_frac == 0 else 0)
     cover = (150 * smooth_step(coarse, edge - 0.25, edge + 0.25)).astype(np.uint8)
     return cv2.resize(cover, scene.height_cm.shape[::-1], interpolation=cv2.INTER_CUBIC)

@@ -21,8 +21,8 @@ from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
     SCENE_WIDTH_M,
     GeneratedFlight,
-    later_flight,
-    mapping_flight,
+    plan_later_flight,
+    plan_mapping_flight,
     to_metres,
     write_flight,
 )
@@ -33,7 +33,7 @@ _SEED = 1
 _INTERVAL_S = 0.2  # of the later flight, which is flown by the times of its pictures
 _CAMERA = ("--camera", "nadir", "--fov-deg", 66)  # that of the generated flights
 # A place is the right one where the two pictures share 30 % of their ground, which is 78 m long from a height of 80 m.
-RIGHT_M = 55.0
+MAX_RIGHT_M = 55.0
 _PICTURE_PX = (1600, 1050)
 # Colours (blue, green, red) of the places, of the later flight, and of the matches by their outcome.
 _MAPPED, _LATER = (255, 255, 255), (10, 214, 255)
@@ -60,7 +60,7 @@ def run_demo(folder: str | Path) -> str:
     for old in (*folder.glob("map.gpkg*"), log_path, picture_path):
         old.unlink(missing_ok=True)
     scene = make_scene(_SEED, SCENE_WIDTH_M, SCENE_DEPTH_M)
-    mapping, later = mapping_flight(_SEED), replace(later_flight(_SEED), interval_s=_INTERVAL_S)
+    mapping, later = plan_mapping_flight(_SEED), replace(plan_later_flight(_SEED), interval_s=_INTERVAL_S)
     for out, flight, label in ((first, mapping, "flight 1, to map     "), (second, later, "flight 2, hours later")):
         for _ in progress(write_flight(out, scene, flight), len(flight.poses), label):
             pass
@@ -108,7 +108,7 @@ def is_right(query: LoggedQuery) -> bool:
 
 
 def _are_near(point: LatLon | None, other: LatLon | None) -> bool:
-    return point is not None and other is not None and float(distance_m(*point, *other)) <= RIGHT_M
+    return point is not None and other is not None and float(distance_m(*point, *other)) <= MAX_RIGHT_M
 
 
 def summarise(queries: Sequence[LoggedQuery], places: Sequence[LatLon]) -> str:
@@ -121,14 +121,14 @@ def summarise(queries: Sequence[LoggedQuery], places: Sequence[LatLon]) -> str:
     recall = sum(map(is_right, on_map)) / max(len(on_map), 1)
     return f"""
 queries           {len(queries)}: {len(on_map)} over the map, {off_map} beyond it
-recall@1          {recall:.2f} of those over the map (best place within {RIGHT_M:g} m)
+recall@1          {recall:.2f} of those over the map (best place within {MAX_RIGHT_M:g} m)
 accepted          {len(accepted)}, {sum(not is_right(query) for query in accepted)} of them wrong
 rejected          {len(queries) - len(accepted)}, among them {off_map_rejected} of the {off_map} beyond the map
 position error    median {np.median(errors_m):.1f} m, 90 % within {np.quantile(errors_m, 0.9):.1f} m, \
 largest {max(errors_m):.1f} m (of the accepted; places are 21 m apart)"""
 
 
-def _colour(query: LoggedQuery) -> tuple[int, int, int]:
+def _choose_colour(query: LoggedQuery) -> tuple[int, int, int]:
     if not query.accepted:
         return _REJECTED
     return _RIGHT if is_right(query) else _WRONG
@@ -157,21 +157,21 @@ def _draw(path: Path, ground: Image, mapping: GeneratedFlight, queries: Sequence
     for place in places:
         cv2.circle(picture, place, 4, _MAPPED, -1, cv2.LINE_AA)
     for query, here, there in zip(found, taken, matched, strict=True):
-        cv2.line(picture, here, there, _colour(query), 3 if query.accepted else 1, cv2.LINE_AA)
-        cv2.circle(picture, here, 7, _colour(query), -1, cv2.LINE_AA)
+        cv2.line(picture, here, there, _choose_colour(query), 3 if query.accepted else 1, cv2.LINE_AA)
+        cv2.circle(picture, here, 7, _choose_colour(query), -1, cv2.LINE_AA)
     for row, (text, colour) in enumerate(_LEGEND.items()):
         cv2.putText(picture, text, (20, 920 + 28 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
-    cv2.imwrite(str(path), np.hstack([picture, _pairs(path.parent, found)]))
+    cv2.imwrite(str(path), np.hstack([picture, _draw_pairs(path.parent, found)]))
 
 
-def _pairs(folder: Path, queries: Sequence[LoggedQuery]) -> Image:
+def _draw_pairs(folder: Path, queries: Sequence[LoggedQuery]) -> Image:
     """Draw ten queries, evenly spread over the flight, each with the picture of its place: uint8 (H, W, 3) BGR."""
     pairs: list[Image] = []
     for index in np.linspace(0, len(queries) - 1, 10).astype(int):
         query = queries[index]
         files = (folder / "flight-2/images" / query.name, folder / f"flight-1/images/{query.reference_image}")
         pictures = [cv2.resize(read_image(file), (240, 180), interpolation=cv2.INTER_AREA) for file in files]
-        pair = cv2.copyMakeBorder(np.hstack(pictures), 25, 5, 5, 5, cv2.BORDER_CONSTANT, value=_colour(query))
+        pair = cv2.copyMakeBorder(np.hstack(pictures), 25, 5, 5, 5, cv2.BORDER_CONSTANT, value=_choose_colour(query))
         outcome = "rejected" if query.off_m is None else f"{query.off_m:.1f} m off"
         text = f"query, and its place: {outcome}, score {query.line['score']:.2f}"
         cv2.putText(pair, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)

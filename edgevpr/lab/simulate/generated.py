@@ -40,7 +40,7 @@ class GeneratedFlight:
     interval_s: float = 2.0
 
 
-def mapping_flight(seed: int) -> GeneratedFlight:
+def plan_mapping_flight(seed: int) -> GeneratedFlight:
     """Plan 70 pictures on five parallel legs, flown to and fro on a clear morning with the nose ahead."""
     rng = np.random.default_rng((seed, 1))
     poses = []
@@ -60,14 +60,14 @@ def mapping_flight(seed: int) -> GeneratedFlight:
     )
 
 
-def later_flight(seed: int) -> GeneratedFlight:
+def plan_later_flight(seed: int) -> GeneratedFlight:
     """Plan 40 pictures on an afternoon with clouds and haze: back along the fourth leg, out along the third one and on
     over land that is in no map, with drifts in place, height, heading and tilt."""
     rng = np.random.default_rng((seed, 2))
     back_m = np.arange(_LEG_END_M - 6, _LEG_START_M, -21.0)
     out_m = np.arange(_LEG_START_M + 8, SCENE_WIDTH_M - 62, 19.0)
     legs = [(east, _LEGS_NORTH_M[3], 270.0) for east in back_m] + [(east, _LEGS_NORTH_M[2], 90.0) for east in out_m]
-    drifts = np.stack([wander(rng, len(legs)) for _ in range(5)], axis=1).tolist()
+    drifts = np.stack([make_oscillation(rng, len(legs)) for _ in range(5)], axis=1).tolist()
     poses = tuple(
         CameraPose(
             east_m=float(east_m),
@@ -125,9 +125,9 @@ def write_shots(folder: Path, shots: Iterable[tuple[GeoTag, Image | None]], qual
     write_positions(folder / "positions.csv", written)
 
 
-def fly_and_write(folder: Path, which: str, seed: int) -> str:
+def write_generated_flight(folder: Path, which: str, seed: int) -> str:
     """Write the flight `which`, "map" or "query", over the landscape of a seed; return a sentence about it."""
-    flight = mapping_flight(seed) if which == "map" else later_flight(seed)
+    flight = plan_mapping_flight(seed) if which == "map" else plan_later_flight(seed)
     written = list(write_flight(folder, make_scene(seed, SCENE_WIDTH_M, SCENE_DEPTH_M), flight))
     return f"{folder}: {len(written)} images in images/, where they were taken in positions.csv"
 
@@ -144,7 +144,7 @@ def to_metres(lat_deg: float, lon_deg: float) -> tuple[float, float]:
     return float(east_m), float(north_m)
 
 
-def wander(rng: np.random.Generator, count: int) -> Doubles:
+def make_oscillation(rng: np.random.Generator, count: int) -> Doubles:
     """Make a slow random oscillation between -1 and 1, float64 (count,)."""
     t = np.arange(count)[:, None] / 9
     waves = np.sin(2 * np.pi * (t * (1, 2.3) + rng.random(2)))

@@ -11,20 +11,20 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Doubles, Singles
 from edgevpr.lab.simulate.brush import (
-    AROUND,
     BASE_CM,
-    Bend,
+    CORNERS,
+    LineBender,
     Scene,
-    bgr_mix,
-    crown,
-    longest_side,
-    noise,
-    parcels,
-    roof,
+    cut_parcels,
+    find_longest_side,
+    make_crown,
+    make_noise,
+    make_winding,
+    mix_colours,
+    paint_building,
+    paint_tree,
     rotate_axes,
     smooth_step,
-    stand,
-    winding,
 )
 
 # Colours under even white light, BGR.
@@ -42,27 +42,27 @@ def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: floa
     rng = np.random.default_rng(seed)
     shape = round(depth_m / metres_per_pixel), round(width_m / metres_per_pixel)
     canvas = Scene(np.full((*shape, 3), GRASS, np.uint8), np.full(shape, BASE_CM, np.uint16), metres_per_pixel)
-    river_m = winding(rng, (width_m * 0.55, depth_m * 1.1), (width_m * 0.45, -depth_m * 0.1), 30)
-    road_m = winding(rng, (-width_m * 0.1, depth_m * 0.42), (width_m * 1.1, depth_m * 0.60), 14)
-    bend = Bend(rng, width_m, depth_m, by_m=2.5)
-    fields, cuts = parcels(rng, width_m, depth_m, field_m2=7500)
-    trees = [_field(rng, canvas, bend(field_m, closed=True)) for field_m in fields]
-    trees += [_border(rng, canvas, bend(cut_m, closed=False), level) for level, cut_m in cuts]
-    trees.append(_river(rng, canvas, river_m))
-    _road(rng, canvas, road_m)
-    yards_m = _farms(rng, canvas, road_m, river_m)
-    _mottle(rng, canvas)
-    _plant(rng, canvas, np.concatenate(trees), keep_off_m=((road_m, 4.0), (river_m, 7.0), (yards_m, 19.0)))
+    river_m = make_winding(rng, (width_m * 0.55, depth_m * 1.1), (width_m * 0.45, -depth_m * 0.1), 30)
+    road_m = make_winding(rng, (-width_m * 0.1, depth_m * 0.42), (width_m * 1.1, depth_m * 0.60), 14)
+    bend = LineBender(rng, width_m, depth_m, by_m=2.5)
+    fields, cuts = cut_parcels(rng, width_m, depth_m, field_m2=7500)
+    trees = [_paint_field(rng, canvas, bend(field_m, closed=True)) for field_m in fields]
+    trees += [_paint_border(rng, canvas, bend(cut_m, closed=False), level) for level, cut_m in cuts]
+    trees.append(_paint_river(rng, canvas, river_m))
+    _paint_road(rng, canvas, road_m)
+    yards_m = _paint_farms(rng, canvas, road_m, river_m)
+    _vary_brightness(rng, canvas)
+    _paint_trees(rng, canvas, np.concatenate(trees), keep_off_m=((road_m, 4.0), (river_m, 7.0), (yards_m, 19.0)))
     return canvas
 
 
-def _border(rng: np.random.Generator, canvas: Scene, line_m: Doubles, level: int) -> Doubles:
-    """Paint the border of two fields, of which great cuts are lanes (see `parcels`); return its trees."""
+def _paint_border(rng: np.random.Generator, canvas: Scene, line_m: Doubles, level: int) -> Doubles:
+    """Paint the border of two fields, of which great cuts are lanes (see `cut_parcels`); return its trees."""
     box = canvas.box(line_m, 5.0)
     if canvas.height_cm[box].size == 0:
         return np.empty((0, 4))
     away_m = canvas.distance_m(box, line_m)
-    verge = smooth_step(away_m + 0.4 * noise(rng, away_m.shape, 25, 2), 3.4, 1.8)
+    verge = smooth_step(away_m + 0.4 * make_noise(rng, away_m.shape, 25, 2), 3.4, 1.8)
     canvas.paint(box, verge * 0.8, DRY if rng.random() < 0.5 else LUSH)
     canvas.height_cm[box] = np.where(verge > 0.5, BASE_CM, canvas.height_cm[box])
     kind = "lane" if level <= 1 else rng.choice(["hedge", "wall", "strip"], p=[0.6, 0.15, 0.25])
@@ -74,15 +74,15 @@ def _border(rng: np.random.Generator, canvas: Scene, line_m: Doubles, level: int
         canvas.paint(box, wall, _STONE)
         canvas.height_cm[box] = np.where(wall > 0.5, BASE_CM + 130, canvas.height_cm[box])
     if kind == "strip" or (kind in ("lane", "wall") and rng.random() < 0.6):
-        return _plant_along(rng, line_m, step_m=26, spread_m=1.5 if kind == "strip" else 4.5, radius_m=2.6)
+        return _make_trees(rng, line_m, step_m=26, spread_m=1.5 if kind == "strip" else 4.5, radius_m=2.6)
     if kind == "hedge":
-        shrubs = _plant_along(rng, line_m, step_m=1.3, spread_m=0.35, radius_m=1.25)
+        shrubs = _make_trees(rng, line_m, step_m=1.3, spread_m=0.35, radius_m=1.25)
         gaps = np.sin(np.arange(len(shrubs)) * rng.uniform(0.05, 0.2) + rng.uniform(0, 6)) > -0.85
-        return np.concatenate((shrubs[gaps], _plant_along(rng, line_m, step_m=22, spread_m=0.8, radius_m=2.9)))
+        return np.concatenate((shrubs[gaps], _make_trees(rng, line_m, step_m=22, spread_m=0.8, radius_m=2.9)))
     return np.empty((0, 4))
 
 
-def _plant_along(rng: np.random.Generator, line_m: Doubles, step_m: float, spread_m: float, radius_m: float) -> Doubles:
+def _make_trees(rng: np.random.Generator, line_m: Doubles, step_m: float, spread_m: float, radius_m: float) -> Doubles:
     """Return trees about every `step_m` along a line, about `spread_m` off it, with radii of about `radius_m`."""
     run_m = np.concatenate(([0], np.cumsum(np.hypot(*np.diff(line_m, axis=0).T))))
     at_m = np.arange(rng.uniform(0, step_m), run_m[-1], step_m)
@@ -92,10 +92,13 @@ def _plant_along(rng: np.random.Generator, line_m: Doubles, step_m: float, sprea
     return _grow_trees(rng, points, radius_m, (1.4, 2.2))
 
 
-def _river(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> Doubles:
+def _paint_river(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> Doubles:
     box = canvas.box(line_m, 24.0)
     shape = canvas.height_cm[box].shape
-    wide, fine = noise(rng, shape, 40 / canvas.metres_per_pixel, 2), noise(rng, shape, 5 / canvas.metres_per_pixel)
+    wide, fine = (
+        make_noise(rng, shape, 40 / canvas.metres_per_pixel, 2),
+        make_noise(rng, shape, 5 / canvas.metres_per_pixel),
+    )
     away_m = canvas.distance_m(box, line_m) + 1.3 * wide + 0.5 * fine
     canvas.paint(box, 0.85 * smooth_step(away_m, 15, 9), LUSH)
     canvas.paint(box, smooth_step(away_m, 7.2, 6.2) * smooth_step(fine, -3, 1), _GRAVEL)
@@ -107,13 +110,13 @@ def _river(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> Doubles:
     level_cm = BASE_CM + bank * 12 * fine - 170 * smooth_step(away_m, 8.5, 5.5)
     canvas.height_cm[box] = np.where(bank > 0, np.clip(level_cm, 0, None), canvas.height_cm[box])
     beside = np.gradient(line_m, axis=0)[:, ::-1] * (-1, 1) / np.hypot(*np.gradient(line_m, axis=0).T)[:, None]
-    return np.concatenate([_plant_along(rng, line_m + side * 11 * beside, 8.0, 2.5, 2.6) for side in (-1, 1)])
+    return np.concatenate([_make_trees(rng, line_m + side * 11 * beside, 8.0, 2.5, 2.6) for side in (-1, 1)])
 
 
-def _road(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> None:
+def _paint_road(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> None:
     box = canvas.box(line_m, 7.0)
     away_m = canvas.distance_m(box, line_m)
-    worn = noise(rng, away_m.shape, 12 / canvas.metres_per_pixel)
+    worn = make_noise(rng, away_m.shape, 12 / canvas.metres_per_pixel)
     canvas.paint(box, 0.9 * smooth_step(away_m + 0.3 * worn, 5.5, 4.2), DRY)
     canvas.paint(box, smooth_step(away_m, 2.95, 2.75), _ASPHALT)
     canvas.paint(box, 0.3 * smooth_step(away_m, 2.95, 2.75) * smooth_step(worn, -1, 2), _STONE)
@@ -122,7 +125,7 @@ def _road(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> None:
     canvas.height_cm[box] = np.where(away_m < 4.2, BASE_CM + 20, canvas.height_cm[box])
 
 
-def _farms(rng: np.random.Generator, canvas: Scene, road_m: Doubles, river_m: Doubles) -> Doubles:
+def _paint_farms(rng: np.random.Generator, canvas: Scene, road_m: Doubles, river_m: Doubles) -> Doubles:
     """Paint farms beside the road, away from the river; return the middles of their yards, (N, 2) metres."""
     yards = []
     for at in range(18, len(road_m) - 18, 13):
@@ -139,10 +142,10 @@ def _farms(rng: np.random.Generator, canvas: Scene, road_m: Doubles, river_m: Do
 def _farm(rng: np.random.Generator, canvas: Scene, middle: Doubles, turn_rad: float) -> None:
     """Paint a yard with ragged edges, buildings around it and vehicles on it."""
     along, beside = rotate_axes(turn_rad)
-    yard = np.array([middle + a * along * 19 + b * beside * 17 for a, b in AROUND])
+    yard = np.array([middle + a * along * 19 + b * beside * 17 for a, b in CORNERS])
     box = canvas.box(yard, 4.0)
     cover = canvas.polygon(box, yard)
-    ragged = smooth_step(cv2.GaussianBlur(cover, (0, 0), 8) + 0.16 * noise(rng, cover.shape, 30), 0.42, 0.58)
+    ragged = smooth_step(cv2.GaussianBlur(cover, (0, 0), 8) + 0.16 * make_noise(rng, cover.shape, 30), 0.42, 0.58)
     canvas.paint(box, ragged, np.array(_GRAVEL if rng.random() < 0.6 else MUD) * rng.uniform(0.8, 0.95))
     canvas.height_cm[box] = np.where(ragged > 0.3, BASE_CM, canvas.height_cm[box])
     for u_m, v_m, length_m, width_m, quarter_turns in _BUILDINGS:
@@ -151,26 +154,28 @@ def _farm(rng: np.random.Generator, canvas: Scene, middle: Doubles, turn_rad: fl
             length_m, width_m = (np.array((length_m, width_m)) * rng.uniform(0.8, 1.25, 2)).tolist()
             colour = np.array(_ROOFS[rng.integers(len(_ROOFS))]) * rng.uniform(0.85, 1.1)
             ridge_rad = turn_rad + quarter_turns * np.pi / 2
-            roof(canvas, centre, length_m, width_m, ridge_rad, rng.uniform(2.6, 5), colour)
+            paint_building(canvas, centre, length_m, width_m, ridge_rad, rng.uniform(2.6, 5), colour)
     for _ in range(rng.integers(2, 7)):
         centre = middle + rng.uniform(-14, 14) * along + rng.uniform(-2, 3) * beside
         colour = rng.uniform(60, 225) * rng.uniform(0.6, 1.2, 3)
-        roof(canvas, centre, 4.3, 1.9, turn_rad + rng.integers(2) * np.pi / 2 + rng.normal(0, 0.2), 1.4, colour)
+        paint_building(
+            canvas, centre, 4.3, 1.9, turn_rad + rng.integers(2) * np.pi / 2 + rng.normal(0, 0.2), 1.4, colour
+        )
 
 
-def _mottle(rng: np.random.Generator, canvas: Scene) -> None:
+def _vary_brightness(rng: np.random.Generator, canvas: Scene) -> None:
     """Vary the brightness of the ground in bumps of 60 m, of 5 m and of 1 m: real ground is never of one colour."""
     for share, bump_m in ((0.06, 60.0), (0.07, 5.0), (0.08, 1.0)):
         bump_px = max(bump_m / canvas.metres_per_pixel, 2.0)
         coarse = max(2, int(bump_px / 8))
-        change = noise(rng, (canvas.shape[0] // coarse + 1, canvas.shape[1] // coarse + 1), bump_px / coarse, 3)
+        change = make_noise(rng, (canvas.shape[0] // coarse + 1, canvas.shape[1] // coarse + 1), bump_px / coarse, 3)
         change = np.clip(128 * (1 + share * change), 0, 255).astype(np.uint8)
         change = cv2.resize(change, canvas.shape[::-1], interpolation=cv2.INTER_LINEAR)
         for channel in range(3):
             canvas.albedo[..., channel] = cv2.multiply(canvas.albedo[..., channel], change, scale=1 / 128)
 
 
-def _plant(
+def _paint_trees(
     rng: np.random.Generator, canvas: Scene, trees: Doubles, keep_off_m: Iterable[tuple[Doubles, float]]
 ) -> None:
     """Paint the trees that keep the distances in metres from the points (N, 2) of `keep_off_m`."""
@@ -181,89 +186,91 @@ def _plant(
     for east_m, north_m, radius_m, top_m in trees:
         radius_px = max(2, round(radius_m / canvas.metres_per_pixel))
         if radius_px not in domes:
-            domes[radius_px] = [crown(rng, radius_px) for _ in range(4)]
+            domes[radius_px] = [make_crown(rng, radius_px) for _ in range(4)]
         colour = _LEAVES[rng.integers(len(_LEAVES))] * rng.uniform(0.8, 1.2)
-        stand(canvas, domes[radius_px][rng.integers(4)], (east_m, north_m), top_m, colour)
+        paint_tree(canvas, domes[radius_px][rng.integers(4)], (east_m, north_m), top_m, colour)
 
 
 # The looks of fields. `patches` and `tufts`, float32 (H, W), are noise with bumps of 22 m and of 2.4 m; `across_m` is
 # the distance in metres across the rows of the field.
-Look = tuple[Array, Array]  # colour (H, W, 3) BGR, relief (H, W) cm
+FieldTexture = tuple[Array, Array]  # colour (H, W, 3) BGR, relief (H, W) cm
 
 
-def _plough(patches: Singles, tufts: Singles, across_m: Array) -> Look:
+def _texture_plough(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
     furrow = np.sin(across_m * (2 * np.pi / 1.2) + 0.5 * tufts)
-    return bgr_mix(SOIL, MUD, smooth_step(patches + 0.7 * tufts + 0.25 * furrow, -2, 2.4)), 2 * furrow + 2 * tufts
+    return mix_colours(SOIL, MUD, smooth_step(patches + 0.7 * tufts + 0.25 * furrow, -2, 2.4)), 2 * furrow + 2 * tufts
 
 
-def _cereal(patches: Singles, tufts: Singles, across_m: Array) -> Look:
+def _texture_cereal(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
     wheels = smooth_step(np.abs(np.abs(across_m % 15 - 7.5) - 0.9), 0.45, 0.15)
     laid = smooth_step(patches + 0.5 * tufts, 1.2, 1.7)
     drilled = np.sin(across_m * (2 * np.pi / 0.9))
     share = 0.6 * wheels + 0.2 * smooth_step(tufts - 0.6 * patches + 0.4 * drilled, -1.5, 2.5) + 0.2 * laid
-    return bgr_mix(STRAW, SOIL, share), 50 - 35 * wheels - 12 * laid + 3 * tufts
+    return mix_colours(STRAW, SOIL, share), 50 - 35 * wheels - 12 * laid + 3 * tufts
 
 
-def _row_crop(patches: Singles, tufts: Singles, across_m: Array) -> Look:
+def _texture_row_crop(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
     plants = smooth_step(np.sin(across_m * (2 * np.pi / 1.8)) + 0.6 * tufts, -0.9, 0.7)
     plants = plants * smooth_step(patches + 0.4 * tufts, 1.9, 1.3)
-    return bgr_mix(SOIL, LUSH, 0.9 * plants), 20 * plants + 2 * tufts
+    return mix_colours(SOIL, LUSH, 0.9 * plants), 20 * plants + 2 * tufts
 
 
-def _meadow(patches: Singles, tufts: Singles, across_m: Array) -> Look:
+def _texture_meadow(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
     swath = smooth_step(np.sin(across_m * (2 * np.pi / 6.5)), -0.5, 0.5)
     heap = smooth_step(np.abs(across_m % 6.5 - 3.2) + 0.15 * tufts, 0.8, 0.3)
     share = 0.15 + 0.3 * swath + 0.12 * patches + 0.2 * tufts + 0.2 * heap
-    return bgr_mix(GRASS, DRY, share), 8 * heap + 2 * tufts
+    return mix_colours(GRASS, DRY, share), 8 * heap + 2 * tufts
 
 
-def _pasture(patches: Singles, tufts: Singles, across_m: Array) -> Look:
+def _texture_pasture(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
     worn = smooth_step(patches + 0.4 * tufts, 0.4, 2.4)
     wet = smooth_step(-patches, 0.3, 1.7)
     rushes = smooth_step(tufts + 0.9 * patches, 1.4, 2.8)
     # Cattle walk one behind the other: narrow paths wind along the lines of equal noise.
     path = smooth_step(np.abs(patches + 0.02 * across_m % 2 - 0.9), 0.05, 0.02)
-    colour = bgr_mix(GRASS, DRY, 0.35 + 0.3 * worn - 0.3 * wet + 0.2 * tufts + 0.45 * path)
+    colour = mix_colours(GRASS, DRY, 0.35 + 0.3 * worn - 0.3 * wet + 0.2 * tufts + 0.45 * path)
     return colour * (1 - 0.3 * rushes[..., None]), 2 * tufts + 10 * rushes
 
 
-def _forest_floor(patches: Singles, tufts: Singles, across_m: Array) -> Look:
-    return 0.75 * bgr_mix(LUSH, SOIL, 0.35 + 0.2 * tufts), 10 * tufts
+def _texture_forest_floor(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
+    return 0.75 * mix_colours(LUSH, SOIL, 0.35 + 0.2 * tufts), 10 * tufts
 
 
 # Kinds of fields: how frequent, how they look, and their trees (spacing, scatter and radius in metres; None: no trees).
-_KINDS: tuple[tuple[float, Callable[[Singles, Singles, Array], Look], tuple[float, float, float] | None], ...] = (
-    (7, _pasture, (31, 40, 2.6)),
-    (4, _meadow, (60, 60, 2.8)),
-    (4, _plough, None),
-    (5, _cereal, None),
-    (4, _row_crop, None),
-    (2.5, _forest_floor, (4.1, 1.4, 2.8)),
-    (0.8, _pasture, (6.5, 0.25, 1.7)),  # an orchard
+_FIELD_KINDS: tuple[
+    tuple[float, Callable[[Singles, Singles, Array], FieldTexture], tuple[float, float, float] | None], ...
+] = (
+    (7, _texture_pasture, (31, 40, 2.6)),
+    (4, _texture_meadow, (60, 60, 2.8)),
+    (4, _texture_plough, None),
+    (5, _texture_cereal, None),
+    (4, _texture_row_crop, None),
+    (2.5, _texture_forest_floor, (4.1, 1.4, 2.8)),
+    (0.8, _texture_pasture, (6.5, 0.25, 1.7)),  # an orchard
 )
 
 
-def _field(rng: np.random.Generator, canvas: Scene, outline_m: Doubles) -> Doubles:
+def _paint_field(rng: np.random.Generator, canvas: Scene, outline_m: Doubles) -> Doubles:
     """Paint a field of a random kind within its outline (N, 2); return its trees."""
-    weights = np.array([weight for weight, _, _ in _KINDS])
-    _, look, trees_m = _KINDS[rng.choice(len(_KINDS), p=weights / weights.sum())]
-    side = longest_side(outline_m[:: max(1, len(outline_m) // 10)])
+    weights = np.array([weight for weight, _, _ in _FIELD_KINDS])
+    _, look, trees_m = _FIELD_KINDS[rng.choice(len(_FIELD_KINDS), p=weights / weights.sum())]
+    side = find_longest_side(outline_m[:: max(1, len(outline_m) // 10)])
     turn_rad = np.arctan2(side[1], side[0]) + rng.normal(0, 0.06)
     along, _ = rotate_axes(turn_rad)
     box = canvas.box(outline_m)
     if canvas.height_cm[box].size:
         cover = canvas.polygon(box, outline_m)
         east_m, north_m = canvas.grid_m(box)
-        patches = noise(rng, cover.shape, 22 / canvas.metres_per_pixel)
-        tufts = noise(rng, cover.shape, 2.4 / canvas.metres_per_pixel)
+        patches = make_noise(rng, cover.shape, 22 / canvas.metres_per_pixel)
+        tufts = make_noise(rng, cover.shape, 2.4 / canvas.metres_per_pixel)
         across_m = -along[1] * east_m + along[0] * north_m + 0.4 * patches
         colour, relief_cm = look(patches, tufts, across_m)
         canvas.paint(box, cover, colour * rng.uniform(0.85, 1.12) * rng.normal(1, 0.025, 3))
         canvas.height_cm[box] = np.where(cover > 0.5, np.clip(BASE_CM + relief_cm, 0, None), canvas.height_cm[box])
-    return _trees(rng, outline_m, turn_rad, *trees_m) if trees_m else np.empty((0, 4))
+    return _make_tree_rows(rng, outline_m, turn_rad, *trees_m) if trees_m else np.empty((0, 4))
 
 
-def _trees(
+def _make_tree_rows(
     rng: np.random.Generator, outline_m: Doubles, turn_rad: float, spacing_m: float, scatter_m: float, radius_m: float
 ) -> Doubles:
     """Return trees in rows along `turn_rad`, `spacing_m` apart, moved at random by about `scatter_m`."""

@@ -15,7 +15,7 @@ from edgevpr.core.geodesy import distance_m, offset_m
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph, view_on_ground
-from edgevpr.lab.simulate.generated import wander, write_shots
+from edgevpr.lab.simulate.generated import make_oscillation, write_shots
 from edgevpr.mapmaking.cuttings import MAX_WITHOUT_DATA, extent_words
 from edgevpr.mapmaking.missions import read_area
 from edgevpr.mapmaking.orthophoto import Orthophoto
@@ -25,7 +25,9 @@ SPEED_M_S = 10.0
 _SWAY_DEG = 2.0  # the most roll, pitch and yaw off a track that tells none
 _START_UTC_S = 1_771_029_000.0
 _LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)  # the shadows stay those of the orthophoto
-_FARTHEST = 3.0  # heights from the point below the camera to a corner of its picture: more is nearly the horizon
+_MAX_CORNER_HEIGHTS = (
+    3.0  # heights from the point below the camera to a corner of its picture: more is nearly the horizon
+)
 
 
 def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list[GeoTag]:
@@ -36,7 +38,7 @@ def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list
     if Path(path).suffix.lower() == ".csv":
         shots = [tag for tag in read_positions(path).values() if tag.position]
     else:
-        shots = _fly_mission(path, every_m)
+        shots = _plan_mission_shots(path, every_m)
     if not shots:
         raise UsageError(f"{path} has no path: a track needs waypoints, or lines with lat and lon.")
     places = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
@@ -56,7 +58,7 @@ def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list
     return flown
 
 
-def _fly_mission(path: str | Path, every_m: float) -> list[GeoTag]:
+def _plan_mission_shots(path: str | Path, every_m: float) -> list[GeoTag]:
     waypoints = read_area(path).path
     if len(waypoints) < 2:
         return []
@@ -70,7 +72,7 @@ def _fly_mission(path: str | Path, every_m: float) -> list[GeoTag]:
     return [GeoTag(position=Position(*at), height_m=height) for at, height in zip(places, over_m, strict=True)]
 
 
-def ground_under(shots: Sequence[GeoTag], fov_deg: float) -> Ground:
+def compute_ground(shots: Sequence[GeoTag], fov_deg: float) -> Ground:
     """Return the ground that the pictures show, for tiles of it."""
     points = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
     highest_m = max(shot.height_m or 0.0 for shot in shots)
@@ -81,7 +83,7 @@ def make_poses(shots: list[GeoTag], seed: int) -> list[CameraPose]:
     """Return the pose of the camera for each picture, placed at 0 m east and north. Where the track has neither roll
     nor pitch, both vary slowly by up to 2 degrees, and so does the heading."""
     rng = np.random.default_rng((seed, 4))
-    sways = _SWAY_DEG * np.stack([wander(rng, len(shots)) for _ in range(3)])
+    sways = _SWAY_DEG * np.stack([make_oscillation(rng, len(shots)) for _ in range(3)])
     poses = []
     for shot, sway in zip(shots, sways.T.tolist(), strict=True):
         is_told = shot.roll_deg is not None or shot.pitch_deg is not None
@@ -92,13 +94,13 @@ def make_poses(shots: list[GeoTag], seed: int) -> list[CameraPose]:
     return poses
 
 
-def photograph_from(
+def photograph_ground(
     orthophoto: Orthophoto, at: Position, pose: CameraPose, camera: Camera, light: Light, rng: np.random.Generator
 ) -> Image | None:
     """Take one picture over `at`, uint8 (camera.height, camera.width, 3) BGR. Returns None if the orthophoto lacks a
     tenth or more of the ground in the picture. Raises UsageError if the picture shows the horizon."""
     corners_m = view_on_ground(pose, camera)
-    if corners_m is None or (reach_m := float(np.abs(corners_m).max())) > _FARTHEST * pose.height_m:
+    if corners_m is None or (reach_m := float(np.abs(corners_m).max())) > _MAX_CORNER_HEIGHTS * pose.height_m:
         raise UsageError(
             f"At roll {pose.roll_deg:.0f} and pitch {pose.pitch_deg:.0f} degrees the picture shows the horizon, and "
             "an orthophoto has none: give smaller angles, or a narrower --fov-deg."
@@ -127,7 +129,7 @@ def write_overflight(
 
     def taken() -> Iterator[tuple[GeoTag, Image | None]]:
         for shot, pose in zip(shots, make_poses(shots, seed), strict=True):
-            picture = photograph_from(orthophoto, shot.position, pose, camera, _LIGHT, rng) if shot.position else None
+            picture = photograph_ground(orthophoto, shot.position, pose, camera, _LIGHT, rng) if shot.position else None
             tag = replace(shot, heading_deg=pose.heading_deg, roll_deg=pose.roll_deg, pitch_deg=pose.pitch_deg)
             yield tag, picture
 

@@ -16,7 +16,7 @@ from enum import Enum, auto
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
-from edgevpr.core.geodesy import offset_m, shorter_deg
+from edgevpr.core.geodesy import offset_m, wrap_deg
 from edgevpr.core.types import FRAME_TIME_SD_S, Frame, Position
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -132,7 +132,7 @@ class AgeWatch:
             north_m += step_s / 2 * (was_north_m_s + north_m_s)
             grown = step_s * (_GPS_WANDER_M_S if has_gps else _GUST_SD_M_S) ** 2 + abs(start - before)
             if math.isfinite(before_deg):
-                heading_deg = before_deg + float(shorter_deg(heading_deg - before_deg))  # without a step at north
+                heading_deg = before_deg + float(wrap_deg(heading_deg - before_deg))  # without a step at north
         self._motion.append((t_s, east_m, north_m, heading_deg, east_m_s, north_m_s, grown, start))
         while t_s - self._motion[0][0] > _KEPT_S + DELAYS_S[-1]:
             self._motion.popleft()
@@ -184,10 +184,10 @@ class AgeWatch:
         """Learn by how much the headings of pictures and compass differ, while the delay is as usual."""
         times_s, _, _, headings_deg, *_ = np.array(self._motion).T
         taken_s = seen.t_s - (self._delay.s if self._delay else 0.0)
-        off_deg = float(shorter_deg(seen.heading_deg - np.interp(taken_s, times_s, headings_deg)))
+        off_deg = float(wrap_deg(seen.heading_deg - np.interp(taken_s, times_s, headings_deg)))
         if math.isfinite(off_deg):
             before_deg = self._compass_deg if math.isfinite(self._compass_deg) else off_deg
-            self._compass_deg = before_deg + _COMPASS_GAIN * float(shorter_deg(off_deg - before_deg))
+            self._compass_deg = before_deg + _COMPASS_GAIN * float(wrap_deg(off_deg - before_deg))
             self._compass_s = seen.t_s
 
     def _resume(self) -> None:
@@ -221,7 +221,7 @@ class AgeWatch:
         heading_deg = math.nan
         if where.heading_deg is not None and event.view.up_deg is not None:
             times_s, _, _, headings_deg, *_ = np.array(self._motion).T
-            turn_deg = shorter_deg(where.heading_deg - event.view.up_deg)
+            turn_deg = wrap_deg(where.heading_deg - event.view.up_deg)
             heading_deg = float(np.interp(frame.t_mono_s, times_s, headings_deg) + turn_deg)
         sd_m = math.hypot(where.sd_m, _MATCH_SD_M)
         return Sighting(t_s=t_s, east_m=float(east_m), north_m=float(north_m), heading_deg=heading_deg, sd_m=sd_m)
@@ -262,7 +262,7 @@ class AgeWatch:
         for seen, moved in zip(seen_m, (east_m, north_m), strict=True):
             off_m = seen - np.interp(taken_s, moved_s, moved)
             cost += np.einsum("ki,kij,kj->k", off_m, inverse, off_m)
-        off_deg = np.asarray(shorter_deg(seen_deg - np.interp(taken_s, moved_s, turned_deg) - compass[0]))
+        off_deg = np.asarray(wrap_deg(seen_deg - np.interp(taken_s, moved_s, turned_deg) - compass[0]))
         is_known = np.isfinite(off_deg).all(axis=0)
         off_deg, first_s = off_deg[:, is_known], first_s[:, is_known][:, :, is_known]
         wander_deg2 = compass[1] ** 2 + _COMPASS_WANDER_DEG**2 * first_s

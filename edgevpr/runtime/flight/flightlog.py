@@ -17,18 +17,18 @@ from pathlib import Path
 from typing import Any
 
 from edgevpr.core.appending import (
-    append,
-    is_still_at,
-    keep_within,
+    append_bytes,
+    delete_oldest,
+    is_same_file,
+    list_related,
     open_appending,
-    relatives,
-    set_aside,
-    sync,
+    rotate_file,
+    sync_file,
     sync_folder,
     try_lock,
 )
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.text import json_line
+from edgevpr.core.text import format_json_line
 
 Line = dict[str, Any]
 
@@ -98,7 +98,7 @@ class FlightLog:
         Never raises OSError."""
         if self.path is None:
             return
-        if self._file is not None and not is_still_at(self._file, self._at):
+        if self._file is not None and not is_same_file(self._file, self._at):
             self._warn(f"The flight log {self._at} was deleted or moved in flight: it goes on in a new file.")
             self._let_go()
         now_s, utc_s = self._clock(), self._utc_s()
@@ -112,7 +112,7 @@ class FlightLog:
             file = self._writable(len(lines))
             if self._start and not is_start and _identity(file) != self._ours:
                 is_start = True
-                lines = json_line({**self._start, "repeated": True, "part": self._part + 1}) + lines
+                lines = format_json_line({**self._start, "repeated": True, "part": self._part + 1}) + lines
             _append(file, lines)
             self._ours, self._is_synced = _identity(file), False
             self._part += is_start
@@ -154,18 +154,18 @@ class FlightLog:
         if not size or (is_ours and size + more_bytes <= self._part_bytes):
             return file
         try:
-            set_aside(self._at)
+            rotate_file(self._at)
         except OSError as error:
             self._warn(
                 f"The flight log {self.path} cannot be set aside ({error.strerror}), so it is written on, and may "
                 "grow past log.max_mb: let the flight write to its folder."
             )
             return file
-        sync(file)
+        sync_file(file)
         self._let_go()
         if not math.isinf(self._part_bytes):
             with suppress(OSError):
-                keep_within(self._at, self._part_bytes * (_PARTS - 1))
+                delete_oldest(self._at, self._part_bytes * (_PARTS - 1))
         return self._open()
 
     def _open(self) -> FileIO:
@@ -181,7 +181,7 @@ class FlightLog:
         return file
 
     def _sync(self, file: FileIO, now_s: float) -> None:
-        sync(file)
+        sync_file(file)
         self._is_synced, self._synced_s = True, now_s
 
     def _record_trouble(self, error: OSError) -> None:
@@ -213,12 +213,12 @@ def _append(file: FileIO, lines: bytes) -> None:
         file.seek(end - 1)
         if file.read(1) != b"\n":  # cut by a pulled battery, or by a failure that could not be undone
             lines = b"\n" + lines
-    append(file, lines)
+    append_bytes(file, lines)
 
 
 def _line(kind: str, utc_s: float, fields: dict[str, Any]) -> bytes:
     now = datetime.fromtimestamp(utc_s, timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-    return json_line({"kind": kind, "time": now, **fields})
+    return format_json_line({"kind": kind, "time": now, **fields})
 
 
 def _identity(file: FileIO) -> tuple[int, int]:
@@ -291,7 +291,7 @@ def select_last_flight(path: str | Path) -> FlightLines:
     parts = {path: _parts(starts, flight)}
     if min(parts[path]) > 1:
         with suppress(OSError):
-            for other in relatives(path):
+            for other in list_related(path):
                 with suppress(OSError):  # a file that may not be read counts as missing
                     found = _parts(_starts(other), flight)
                     if found and min(found) < min(parts[path]):

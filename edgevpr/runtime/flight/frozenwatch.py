@@ -15,7 +15,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.config import SourceConfig
-from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.sameness import BLOCK_COUNT, CoarsePicture, make_coarse
@@ -257,7 +257,7 @@ def _change_deg(then: Vehicle, now: Vehicle, name: str) -> float:
     before, after = getattr(then, name), getattr(now, name)
     if before is None or after is None or not math.isfinite(before + after):
         return 0.0
-    return float(shorter_deg(after - before))
+    return float(wrap_deg(after - before))
 
 
 def _exceed_doubt(angle_deg: float) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
-from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.types import FRAME_TIME_SD_S, Position, Vehicle
 from edgevpr.runtime.flight.drift import GRAVITY_M_S2
 from edgevpr.runtime.recognise.locate import covariance_matrix
@@ -76,7 +76,7 @@ class PositionedMatch:
         """Tell whether its picture is turned against the compass by about `turn_deg`, where both are known."""
         if self.turn_deg is None or turn_deg is None:
             return True
-        return abs(shorter_deg(self.turn_deg - turn_deg)) <= _MAX_TURN_DEG
+        return abs(wrap_deg(self.turn_deg - turn_deg)) <= _MAX_TURN_DEG
 
 
 def measure_frame(
@@ -141,7 +141,7 @@ def position_match(event: Recognition, frame: FrameMeasurement) -> PositionedMat
         return None
     turn_deg, shown_deg, reported_deg = None, event.located.heading_deg, event.view.up_deg
     if shown_deg is not None and reported_deg is not None:
-        turn_deg = shorter_deg(shown_deg - reported_deg)
+        turn_deg = wrap_deg(shown_deg - reported_deg)
     return PositionedMatch(
         frame=frame,
         position=event.located.position,

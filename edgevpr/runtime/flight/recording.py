@@ -19,7 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from edgevpr.core.appending import append, open_appending, sync
+from edgevpr.core.appending import append_bytes, open_appending, sync_file
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.text import redact_passwords
 from edgevpr.runtime.flight.boundary import Tape
@@ -129,8 +129,8 @@ class Recording(Tape):
             else:
                 number, jpeg = each
                 with open_appending(frame_path(self.path, number)) as file:
-                    append(file, jpeg)
-                    sync(file)
+                    append_bytes(file, jpeg)
+                    sync_file(file)
                 self._bytes_written += len(jpeg)
         if not notes:
             return
@@ -139,8 +139,8 @@ class Recording(Tape):
             raise OSError(errno.ENOSPC, f"less than {SPARED_BYTES // 1_000_000} MB are left on the disk")
         if self._bytes_written + os.fstat(self._tape.fileno()).st_size > self._most_bytes:
             raise OSError(errno.EFBIG, "it is as large as half of log.record_mb allows")
-        append(self._tape, b"".join(notes))
-        sync(self._tape)
+        append_bytes(self._tape, b"".join(notes))
+        sync_file(self._tape)
 
     def _delete_oldest(self) -> None:
         *earlier, _ = recordings(self.path.parent)

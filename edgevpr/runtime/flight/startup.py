@@ -13,7 +13,7 @@ from statistics import median
 from typing import Any
 
 from edgevpr import __version__
-from edgevpr.core.config import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Config, SourceConfig
+from edgevpr.core.config import MAX_RATE_HZ, MIN_RATE_HZ, Config, SourceConfig
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Position
@@ -51,7 +51,7 @@ def apply_recorded_rate(source: SourceConfig, steps_s: Sequence[float]) -> Sourc
     if not steps_s:
         return source
     usual_hz = 1 / median(step_s for step_s in steps_s if step_s > 0)
-    usual_hz = min(max(usual_hz, LOWEST_RATE_HZ), HIGHEST_RATE_HZ)
+    usual_hz = min(max(usual_hz, MIN_RATE_HZ), MAX_RATE_HZ)
     return replace(source, rate_hz=usual_hz)
 
 

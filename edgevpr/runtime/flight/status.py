@@ -10,7 +10,7 @@ from typing import Any
 
 from edgevpr import __version__
 from edgevpr.core.errors import EdgevprError
-from edgevpr.core.text import json_line
+from edgevpr.core.text import format_json_line
 
 NAME = "status.json"
 _MODE = 0o660  # positions are private, but the flight's group may read them
@@ -43,7 +43,7 @@ class StatusFile:
     def write(self, status: dict[str, Any]) -> None:
         """Replace the status in the file. Never raises OSError."""
         with suppress(OSError):
-            self._write(json_line(status))
+            self._write(format_json_line(status))
             os.replace(self._new, self._path)
 
     def _write(self, data: bytes) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 from edgevpr import techniques
 from edgevpr.core.errors import ConfigError
-from edgevpr.core.types import FIX_MAX_AGE_S
+from edgevpr.core.types import MAX_FIX_AGE_S
 from edgevpr.power.boards import Board
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
@@ -176,8 +176,8 @@ def check_fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
         shortfalls.append(f"the process takes {process_ram_mb:.0f} MB and {board.memory_max_mb:.0f} are allowed")
     if reachable_hz < demand.rate_hz:
         shortfalls.append(f"it reaches {_round_down(reachable_hz):g} Hz of {demand.rate_hz:g}")
-    if query.wall_s > FIX_MAX_AGE_S:
-        limit = f"no fix of a frame older than {FIX_MAX_AGE_S:g} s is ever sent"
+    if query.wall_s > MAX_FIX_AGE_S:
+        limit = f"no fix of a frame older than {MAX_FIX_AGE_S:g} s is ever sent"
         shortfalls.append(f"a query takes {query.wall_s:.1f} s, and {limit}")
     return Fit(
         t_query_s=query.wall_s,

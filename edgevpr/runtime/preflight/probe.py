@@ -14,7 +14,7 @@ import numpy as np
 from edgevpr.core.arrays import Image
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import ModelError
-from edgevpr.core.types import NO_COST, Frame, StageCost, Steps
+from edgevpr.core.types import NO_COST, Frame, StageCost, StepCosts
 from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import times_as_many
@@ -161,13 +161,13 @@ class _Bench:
 
     def try_map(
         self, place_map: PlaceMap, index: PlaceIndex, candidates: int, max_tries: int = _MAX_TRIES
-    ) -> list[Steps]:
+    ) -> list[StepCosts]:
         """Match each picture several times (`max_tries` at most) with `place_map`, of which `index` is in RAM and
         `candidates` places are compared. Returns one `Steps` per picture: the least cost of every step."""
         recogniser = self._open_recogniser(place_map, index, candidates)
         times_s = (0.1 * number for number in itertools.count())
 
-        def match_pictures() -> list[Steps]:
+        def match_pictures() -> list[StepCosts]:
             return [_match_picture(recogniser, image, next(times_s)).steps for image in self._images]
 
         for _ in range(math.ceil((self.sequence - 1) / len(self._images))):
@@ -176,7 +176,7 @@ class _Bench:
         while len(rounds) < max_tries and time.monotonic() < end_s:
             rounds.append(match_pictures())
         return [
-            Steps(**{name: _find_least([getattr(steps, name) for steps in tries]) for name in _STEPS})
+            StepCosts(**{name: _find_least([getattr(steps, name) for steps in tries]) for name in _STEPS})
             for tries in zip(*rounds, strict=True)
         ]
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Bytes, Covariance, Singles
-from edgevpr.core.geodesy import fit_similarity, shorter_deg
+from edgevpr.core.geodesy import fit_similarity, wrap_deg
 from edgevpr.runtime.recognise.landmarks import Landmarks
 
 # Inliers with which an agreement is confirmed, and proven. Of 14,799 pairs of a query and a place of another site,
@@ -61,7 +61,7 @@ class Overlay:
         """Relative pose of the query as in a tie of `mapmaking.graph`: its offset, right + i up, and the logarithm of
         its scale + i times its counter-clockwise rotation."""
         dx, dy = self.shift_share
-        turned = np.radians(shorter_deg(self.rotation_deg))
+        turned = np.radians(wrap_deg(self.rotation_deg))
         return complex(dx, -dy), complex(np.log(self.scale or 1.0), -turned)
 
 

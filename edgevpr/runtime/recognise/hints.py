@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from edgevpr.core.contract import find_nearest_height
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import distance_m, shorter_deg
+from edgevpr.core.geodesy import distance_m, wrap_deg
 from edgevpr.core.types import Candidate, Frame, Place, Position, Vehicle
 from edgevpr.frames.positions import GeoTag
 from edgevpr.places.index import PlaceIndex
@@ -71,7 +71,7 @@ class Hints:
             away_m = distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
             in_reach = bool(away_m <= self.reach.radius_m)
         if self.heading_deg is not None and place.heading_deg is not None and rotation_deg is not None:
-            off_deg = shorter_deg(rotation_deg - (self.heading_deg - place.heading_deg))
+            off_deg = wrap_deg(rotation_deg - (self.heading_deg - place.heading_deg))
             in_heading = heading_within_deg is None or abs(off_deg) <= heading_within_deg
         return in_reach, in_heading
 

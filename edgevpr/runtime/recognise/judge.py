@@ -12,7 +12,7 @@ import numpy as np
 
 from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Descriptor, FineMatch, Technique
-from edgevpr.core.geodesy import shorter_deg
+from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking, margin, outside_neighbourhood
@@ -277,7 +277,7 @@ def is_at_rest(match: FineMatch) -> bool:
     """Return True if a match has about no shift, rotation or change of height."""
     if match.rotation_deg is None or match.shift_cells is None:
         return False
-    off_deg = abs(shorter_deg(match.rotation_deg))
+    off_deg = abs(wrap_deg(match.rotation_deg))
     if off_deg > _AT_REST_DEG or abs((match.height_ratio or 1.0) - 1) > _AT_REST_HEIGHT:
         return False
     return max(map(abs, match.shift_cells)) <= _AT_REST_CELLS

@@ -5,7 +5,7 @@ from typing import Any
 
 from edgevpr.core.contract import Descriptor
 from edgevpr.core.reasons import NOT_SEARCHED, Reason
-from edgevpr.core.types import Candidate, FixReport, Frame, Position, QueryCost, Steps, Vehicle
+from edgevpr.core.types import Candidate, FixReport, Frame, Position, QueryCost, StepCosts, Vehicle
 from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage, View
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.agreement import Agreement
@@ -47,7 +47,7 @@ class Recognition:
     left_out: tuple[tuple[int, str], ...] = ()  # places unreadable since the last event: number, and what is wrong
     located: Located | None = None  # position of the aircraft, only if the match is accepted and the place has one
     accuracy_m: float | None = None  # the 1-sigma to send with it
-    steps: Steps = field(default_factory=Steps)
+    steps: StepCosts = field(default_factory=StepCosts)
     cost: QueryCost = field(default_factory=QueryCost)
     fix: FixReport | None = None
 

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-from edgevpr.core.geodesy import picture_axes, shorter_deg
+from edgevpr.core.geodesy import picture_axes, wrap_deg
 from edgevpr.frames.level import View
 from edgevpr.runtime.recognise.agreement import measure_agreement
 from edgevpr.runtime.recognise.landmarks import OF_PLACE, Landmarks
@@ -68,7 +68,7 @@ class Strides:
             return None
         if found.shift_share is None or found.rotation_deg is None or found.scale is None:
             return None
-        turned_deg = shorter_deg(found.rotation_deg - (view.up_deg - start.up_deg))
+        turned_deg = wrap_deg(found.rotation_deg - (view.up_deg - start.up_deg))
         stretched = found.scale * start.footprint_m / view.footprint_m
         if abs(turned_deg) > _MAX_TURN_DEG or not 1 / _MAX_SCALE < stretched < _MAX_SCALE:
             return None

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.errors import ImageError
-from edgevpr.core.types import FIX_MAX_AGE_S
+from edgevpr.core.types import MAX_FIX_AGE_S
 from edgevpr.frames.lens import compute_lens_view
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import Source, is_program_uri, open_source
@@ -69,8 +69,8 @@ def check_frame(what: str, config: SourceConfig) -> Finding:
     if size is None:
         waited_s = time.monotonic() - begin_s
         return report_fault(what, FindingCode.NO_FRAME, uri=config.uri, state=state, waited_s=waited_s)
-    if age_s is not None and age_s > FIX_MAX_AGE_S:
-        return report_fault(what, FindingCode.FRAMES_LATE, uri=config.uri, age_s=age_s, limit_s=FIX_MAX_AGE_S)
+    if age_s is not None and age_s > MAX_FIX_AGE_S:
+        return report_fault(what, FindingCode.FRAMES_LATE, uri=config.uri, age_s=age_s, limit_s=MAX_FIX_AGE_S)
     frame: dict[str, float | str | None] = {"width": size[0], "height": size[1], "age_s": age_s}
     frame["facts"] = str(facts) if facts else None
     frame["lens"] = lens.path if lens else None

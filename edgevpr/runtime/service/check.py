@@ -10,7 +10,7 @@ from edgevpr.core.config import Config, MavlinkConfig, SourceConfig, load_config
 from edgevpr.core.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.text import show_waiting
-from edgevpr.core.types import FIX_MAX_AGE_S
+from edgevpr.core.types import MAX_FIX_AGE_S
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import find_missing_cause, is_live, open_source, read_intervals
 from edgevpr.mavlink.address import parse_links
@@ -60,8 +60,8 @@ def _check_map(what: str, config: Config, board: Board) -> Finding:
             calibration = read_calibration_for(place_map)
             confidence = calibration.described() if calibration else not_calibrated(len(place_map))
     settings = config.mavlink
-    if settings.link and settings.send_fixes and t_query_s > FIX_MAX_AGE_S:
-        return report_fault(what, FindingCode.QUERY_TOO_SLOW, t_query_s=t_query_s, limit_s=FIX_MAX_AGE_S)
+    if settings.link and settings.send_fixes and t_query_s > MAX_FIX_AGE_S:
+        return report_fault(what, FindingCode.QUERY_TOO_SLOW, t_query_s=t_query_s, limit_s=MAX_FIX_AGE_S)
     facts = {"technique": technique, "cost": cost, "confidence": confidence}
     return report_ok(what, FindingCode.MAP_READY, path=config.map, t_query_s=t_query_s, **facts)
 

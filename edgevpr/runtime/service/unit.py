@@ -3,14 +3,14 @@
 import re
 
 from edgevpr.core.files import find_shipped
-from edgevpr.core.text import printable
+from edgevpr.core.text import escape_unprintable
 from edgevpr.power.boards import Board
 
 
 def render_unit(board: Board) -> str:
     """Return the text of deploy/edgevpr.service with the limits of a board."""
     changed = {
-        "# Board: ": printable(board.name),
+        "# Board: ": escape_unprintable(board.name),
         "MemoryMax=": f"{board.memory_max_mb * 1e6:.0f}",
         "CPUQuota=": f"{100 * board.cpu_share * board.cores:.0f}%",
     }

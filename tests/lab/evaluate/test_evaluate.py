@@ -11,8 +11,8 @@ from pictures import textured
 from edgevpr.core.errors import UsageError
 from edgevpr.lab.evaluate.dataset import load_dataset
 from edgevpr.lab.evaluate.evaluate import evaluate
-from edgevpr.lab.evaluate.metrics import compare, from_json
-from edgevpr.lab.evaluate.tables import results_text
+from edgevpr.lab.evaluate.metrics import add_pcu, read_result
+from edgevpr.lab.evaluate.tables import format_results
 from edgevpr.mapmaking import finishing
 from edgevpr.runtime.preflight.probe import measure_costs
 from edgevpr.techniques import create
@@ -36,7 +36,7 @@ def load(folder):
 
 @pytest.mark.parametrize(("name", "parameters"), [("hog", HOG), ("cohog", COHOG)])
 def test_evaluate_measures_recall_costs_and_sizes(folder, name, parameters):
-    (result,) = compare([evaluate(name, load(folder), parameters)])
+    (result,) = add_pcu([evaluate(name, load(folder), parameters)])
     assert (result.queries, result.queries_off_map, result.references) == (8, 1, 8)
     assert (result.recall_at_1, result.with_match.recall_at_1) == (6 / 8, 6 / 7)
     assert (result.recall_at_10, result.with_match.recall_at_10) == (7 / 8, 1)
@@ -77,14 +77,14 @@ def test_evaluate_says_what_could_not_be_done_to_the_map(folder, monkeypatch):
     monkeypatch.setattr(finishing, "calibrate_map", lack_scipy)
     result = evaluate("cohog", load(folder), COHOG)
     assert result.not_done == ("the map is not calibrated: SciPy is missing.",)
-    assert result.not_done[0] in results_text(compare([result]))
+    assert result.not_done[0] in format_results(add_pcu([result]))
     assert evaluate("hog", load(folder), HOG).not_done == (), "it has no confidence to calibrate"
 
 
 def test_from_json_gives_the_same_tables(folder):
-    (result,) = compare([evaluate("hog", load(folder), HOG)])
+    (result,) = add_pcu([evaluate("hog", load(folder), HOG)])
     read_back = json.loads(json.dumps(asdict(result), allow_nan=False))
-    assert results_text([from_json({**read_back, "other": 1})]) == results_text([result])
+    assert format_results([read_result({**read_back, "other": 1})]) == format_results([result])
 
 
 @pytest.mark.parametrize(("name", "settings"), [("hog", {"form": "1bit"}), ("cohog", {"camera": "nadir", "w1": 208})])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from edgevpr.lab.evaluate import metrics
-from edgevpr.lab.evaluate.metrics import compute_both, compute_figures, interval
+from edgevpr.lab.evaluate.metrics import compute_figures, compute_quality, wilson_interval
 
 NEVER = math.inf
 
@@ -19,7 +19,7 @@ def figures_of(*queries):
     """The figures of queries (score, rank of the first right reference), whose place is in the map unless they have a
     third value, False."""
     scores, ranks, has_match = zip(*((*query, True)[:3] for query in queries), strict=True)
-    both = compute_both(np.array(scores), np.array(ranks), np.array(has_match))
+    both = compute_quality(np.array(scores), np.array(ranks), np.array(has_match))
     return metrics.Quality(technique="", references=10, **both)
 
 
@@ -83,7 +83,7 @@ def test_pcu_of_the_slowest_technique_is_its_precision():
 @pytest.mark.parametrize(("right", "of"), [(0, 1), (0, 20), (13, 20), (20, 20)])
 def test_interval_is_that_of_wilson(right, of):
     expected = stats.binomtest(right, of).proportion_ci(method="wilson")
-    assert interval(np.arange(of) < right) == pytest.approx((expected.low, expected.high), abs=1e-6)
+    assert wilson_interval(np.arange(of) < right) == pytest.approx((expected.low, expected.high), abs=1e-6)
 
 
 # Few distinct scores, so that ties are usual; and the rank of the first right one, infinite where there is none.

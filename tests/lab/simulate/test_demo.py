@@ -7,7 +7,7 @@ import cv2
 import pytest
 
 from edgevpr.lab.simulate import demo
-from edgevpr.lab.simulate.generated import later_flight, mapping_flight
+from edgevpr.lab.simulate.generated import plan_later_flight, plan_mapping_flight
 from edgevpr.lab.simulate.landscape import make_scene
 
 pytestmark = [pytest.mark.process, pytest.mark.slow]
@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.process, pytest.mark.slow]
 @pytest.fixture
 def small(monkeypatch):
     monkeypatch.setattr(demo, "make_scene", partial(make_scene, metres_per_pixel=0.5))
-    for name, flight in (("mapping_flight", mapping_flight), ("later_flight", later_flight)):
+    for name, flight in (("mapping_flight", plan_mapping_flight), ("later_flight", plan_later_flight)):
         monkeypatch.setattr(demo, name, lambda seed, flight=flight: replace(flight(seed), poses=flight(seed).poses[:6]))
 
 

@@ -13,8 +13,8 @@ from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
     SCENE_WIDTH_M,
     GeneratedFlight,
-    later_flight,
-    mapping_flight,
+    plan_later_flight,
+    plan_mapping_flight,
     to_metres,
     write_flight,
 )
@@ -33,7 +33,7 @@ def scene():
 
 @pytest.mark.slow
 def test_write_flight_writes_positions_to_a_decimetre(tmp_path, scene):
-    flight = first_frames(mapping_flight(1), 17)
+    flight = first_frames(plan_mapping_flight(1), 17)
     names = list(write_flight(tmp_path, scene, flight))
     tags = read_positions(tmp_path / "positions.csv")
     assert list(tags) == names == sorted(path.name for path in (tmp_path / "images").iterdir())
@@ -46,7 +46,7 @@ def test_write_flight_writes_positions_to_a_decimetre(tmp_path, scene):
 
 def test_write_flight_writes_the_same_each_time(tmp_path, scene):
     for folder in ("one", "two"):
-        list(write_flight(tmp_path / folder, scene, first_frames(later_flight(4), 2)))
+        list(write_flight(tmp_path / folder, scene, first_frames(plan_later_flight(4), 2)))
     one, two = ((tmp_path / folder / "images" / "frame_0001.jpg").read_bytes() for folder in ("one", "two"))
     assert one == two
     assert cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR).shape == (480, 640, 3)

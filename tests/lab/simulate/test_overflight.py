@@ -14,7 +14,7 @@ from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel
-from edgevpr.lab.simulate.overflight import make_poses, photograph_from, read_shots, write_overflight
+from edgevpr.lab.simulate.overflight import make_poses, photograph_ground, read_shots, write_overflight
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 pytestmark = pytest.mark.slow
@@ -45,7 +45,7 @@ def orthophoto(tmp_path_factory):
 def test_seen_from_shows_a_mark_where_the_pinhole_camera_does(orthophoto, change, off_m):
     at = Position(*offset_position(HOME.lat_deg, HOME.lon_deg, *off_m))
     pose = replace(LEVEL, **change)
-    picture = photograph_from(orthophoto, at, pose, CAMERA, CLEAR, np.random.default_rng(0))
+    picture = photograph_ground(orthophoto, at, pose, CAMERA, CLEAR, np.random.default_rng(0))
     assert picture.shape == (480, 640, 3)
     bright = np.clip(picture[..., 2].astype(float) - 75, 0, None)
     rows, columns = np.indices(bright.shape)
@@ -64,10 +64,10 @@ def test_seen_from_shows_a_mark_where_the_pinhole_camera_does(orthophoto, change
 def test_seen_from_takes_none_beyond_the_orthophoto_and_refuses_the_horizon(orthophoto):
     rng = np.random.default_rng(0)
     edge = Position(*offset_position(HOME.lat_deg, HOME.lon_deg, 300, 0))
-    assert photograph_from(orthophoto, edge, LEVEL, CAMERA, CLEAR, rng) is None
+    assert photograph_ground(orthophoto, edge, LEVEL, CAMERA, CLEAR, rng) is None
     for angle_deg in (58, 75):
         with pytest.raises(UsageError, match="horizon"):
-            photograph_from(orthophoto, HOME, replace(LEVEL, roll_deg=angle_deg), CAMERA, CLEAR, rng)
+            photograph_ground(orthophoto, HOME, replace(LEVEL, roll_deg=angle_deg), CAMERA, CLEAR, rng)
 
 
 def csv_of(tmp_path, text):

@@ -18,7 +18,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.core.types import Position, QueryCost, Steps
+from edgevpr.core.types import Position, QueryCost, StepCosts
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log, select_last_flight
 from edgevpr.runtime.flight.startup import start_fields
@@ -63,7 +63,7 @@ def test_a_match_is_written_as_it_is_with_nan_as_null(path):
         reason=Reason(ReasonCode.ACCEPTED_WITHOUT_RIVAL, {"score": 0.9}),
         located=locate_at_place(Position(50.12345678901, -1.5, None), 20.0),
         accuracy_m=20.0,
-        steps=Steps(),
+        steps=StepCosts(),
         cost=COST,
     )
     with FlightLog(path) as log:

@@ -7,7 +7,7 @@ import pytest
 from sureness import agreed
 
 from edgevpr.core.contract import FineMatch
-from edgevpr.core.geodesy import metres, offset_position
+from edgevpr.core.geodesy import offset_position, project_to_metres
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Candidate, Place, Pose, Position
 from edgevpr.frames.level import View
@@ -26,7 +26,9 @@ def candidate(number=1, shift=(0.0, 0.0), east_m=0.0, north_m=0.0, up_deg=0.0, t
 
 
 def off_m(position):
-    east_m, north_m = metres(np.array([ORIGIN.lat_deg, position.lat_deg]), np.array([ORIGIN.lon_deg, position.lon_deg]))
+    east_m, north_m = project_to_metres(
+        np.array([ORIGIN.lat_deg, position.lat_deg]), np.array([ORIGIN.lon_deg, position.lon_deg])
+    )
     return east_m[1], north_m[1]
 
 

@@ -13,7 +13,7 @@ from mavlink_peers import Peer, UdpPort
 
 from edgevpr.cli.main import main
 from edgevpr.mavlink.wire import mavlink
-from edgevpr.review.compare import compare
+from edgevpr.review.compare import compare_lines
 from edgevpr.review.replay import replay
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.runtime.flight.recording import TAPE, recordings
@@ -43,7 +43,7 @@ def ended(process):
 def is_the_same(log, **how):
     """Replay the flight of a log, and hold both against each other; give the lines of the replay."""
     again = replay(log, **how)
-    lines = compare(again.flown, again.lines)
+    lines = compare_lines(again.flown, again.lines)
     assert lines.others == []
     assert again.packets.others == []
     assert lines.alike == len(again.lines) > 0
