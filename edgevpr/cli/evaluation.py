@@ -70,6 +70,7 @@ def run_eval(args: Namespace) -> int:
         return _measure_similarities(args)
     from edgevpr.lab.evaluate.evaluate import MatchOptions
     from edgevpr.lab.evaluate.runs import Plan, measure, write_results
+    from edgevpr.lab.evaluate.tables import format_results
 
     config, rows, sets = load_command_config(args, args.config), _list_rows(args), _open_sets(args)
     options = MatchOptions(

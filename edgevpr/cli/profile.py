@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     """Add the command and its flags."""
-    parser = add_command(commands, "profile", profile, "estimate memory, rate and battery use before take-off")
+    parser = add_command(commands, "profile", run_profile, "estimate memory, rate and battery use before take-off")
     asked = parser.add_mutually_exclusive_group(required=True)
     asked.add_argument("--list", action="store_true", help="list the boards")
     asked.add_argument("--map", metavar="MAP", help="map of the flight: estimate its technique")
@@ -45,7 +45,7 @@ def add(commands: Any) -> None:
     add_json(parser)
 
 
-def profile(args: Namespace) -> int:
+def run_profile(args: Namespace) -> int:
     """Run `profile`: estimate what techniques cost in a flight, or list the boards that have a profile."""
     from edgevpr.power.boards import list_boards, load_board, resolve_board
     from edgevpr.runtime.preflight.choose import list_preferred
@@ -61,14 +61,14 @@ def profile(args: Namespace) -> int:
     config = load_command_config(args)
     board = resolve_board(load_board(args.board), config.source, config.memory)
     list_preferred(board)  # raises if the profile names a technique that is not there
-    plan, trials = _plan(args, config, board)
+    plan, trials = _make_plan(args, config, board)
     results = progress(run_trials(trials, board.threads), len(trials), "trying techniques")
     estimate = estimate_flight(board, compare_speed(board), results, plan)
     print_result(estimate, args.json, format_table(estimate))
     return 0
 
 
-def _plan(args: Namespace, config: Config, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ...]]":
+def _make_plan(args: Namespace, config: Config, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ...]]":
     """Make two things from the flags: the plan of the flight, and the techniques to try in all their forms: that of
     --map, else every one."""
     from edgevpr import techniques

@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.process, pytest.mark.slow]
 @pytest.fixture
 def small(monkeypatch):
     monkeypatch.setattr(demo, "make_scene", partial(make_scene, metres_per_pixel=0.5))
-    for name, flight in (("mapping_flight", plan_mapping_flight), ("later_flight", plan_later_flight)):
+    for name, flight in (("plan_mapping_flight", plan_mapping_flight), ("plan_later_flight", plan_later_flight)):
         monkeypatch.setattr(demo, name, lambda seed, flight=flight: replace(flight(seed), poses=flight(seed).poses[:6]))
 
 
