@@ -39,10 +39,10 @@ def run_report(args: Namespace) -> int:
     from edgevpr.review.logged import get_text, read_flight
     from edgevpr.review.page import make_flight_page
     from edgevpr.review.webpage import read_ground
-    from edgevpr.runtime.flight.recording import list_frames, open_recording
+    from edgevpr.runtime.flight.recording import find_recording, list_frames
 
     flight = read_flight(args.log)
-    folder = open_recording(get_text(flight.start, "recording"), args.log)
+    folder = find_recording(get_text(flight.start, "recording"), args.log)
     frames = make_album(args.images, list_frames(folder) if folder else {})
     ground: list[Place] = []
     no_ground = "The log does not name a map: give it with --map."

@@ -6,7 +6,7 @@ from typing import Any
 
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import GeoTag
-from edgevpr.runtime.flight.recording import is_of_camera, list_frames, read_recorded
+from edgevpr.runtime.flight.recording import has_live_source, list_frames, read_recorded
 from edgevpr.tracks.record import Record, make_tag
 
 _MAX_REPORT_AGE_S = 1.0
@@ -19,7 +19,7 @@ def read_flight(path: Path) -> Record:
     has no position if the autopilot had no GPS, its report was old, or it may only have repeated a fix of ours. Raises
     UsageError if the flight was not recorded, or not by a camera, and EdgevprError if the file holds no flight."""
     lines, folder = read_recorded(path)
-    if not is_of_camera(folder):
+    if not has_live_source(folder):
         raise UsageError(
             f"{path}: its pictures were no camera's but a folder's or a film's, and the aircraft was elsewhere: place "
             "those pictures by what was recorded with them."

@@ -16,7 +16,7 @@ from edgevpr.mavlink.messages import Fix
 from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.navigator import Navigator
-from edgevpr.runtime.flight.notifier import Notifier, Trouble
+from edgevpr.runtime.flight.notifier import Alert, Notifier
 from edgevpr.runtime.flight.output import Output
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -49,7 +49,7 @@ class ToAutopilot:
         self._held, self._is_holding = 0, False
         self._output = Output.STARTING  # as it was last reported
         self._unknown_age, self._delay_s = (
-            Trouble(notifier, "age", _UNKNOWN_AGE, ReasonCode.AGE_KNOWN),
+            Alert(notifier, "age", _UNKNOWN_AGE, ReasonCode.AGE_KNOWN),
             0.0,
         )  # as last reported
 
@@ -153,7 +153,7 @@ class ToAutopilot:
     @property
     def age_summary(self) -> str | None:
         """What people should know of the age of the pictures (None: nothing)."""
-        note = _UNKNOWN_AGE if self._unknown_age.is_so else self._delay_note
+        note = _UNKNOWN_AGE if self._unknown_age.is_active else self._delay_note
         return None if note is None else str(note)
 
     @property

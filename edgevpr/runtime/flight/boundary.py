@@ -107,18 +107,18 @@ class TapedStop(Stop):
         self._tape = tape
 
     @property
-    def asked(self) -> bool:
-        return self._tape.read("stop", lambda: super(TapedStop, self).asked)
+    def is_requested(self) -> bool:
+        return self._tape.read("stop", lambda: super(TapedStop, self).is_requested)
 
     @contextmanager
-    def breaks_off(self) -> Iterator[None]:
-        with super().breaks_off():
+    def allow_interrupt(self) -> Iterator[None]:
+        with super().allow_interrupt():
             yield
         self._tape.read("went on", lambda: True)
 
-    def _break_off(self) -> None:
+    def _interrupt(self) -> None:
         self._tape.note("stopped")
-        super()._break_off()
+        super()._interrupt()
 
 
 class RecordedSource(Source):

@@ -40,7 +40,7 @@ from edgevpr.runtime.flight.startup import (
 )
 from edgevpr.runtime.flight.stop import StopNow
 from edgevpr.runtime.flight.vitals import Vitals
-from edgevpr.runtime.flight.watching import MapWatch, Sight, Surveyor, Tally
+from edgevpr.runtime.flight.watching import MapCoverageWatch, MapWatch, SurveyReporter, Tally
 from edgevpr.runtime.preflight.pick import list_safe_candidates
 from edgevpr.runtime.recognise.recognition import Recognition, to_fields
 
@@ -85,12 +85,12 @@ class Flight:
             parts, self._frozen, tally=self._tally, pace=self._pace, commands=self._commands, remarks=self._remarks
         )
         gps = GpsWatch(min_accuracy_m, notifier, parts.autopilot)
-        self._surveyor = Surveyor(notifier, gps, camera, self._set_mount)
+        self._surveyor = SurveyReporter(notifier, gps, camera, self._set_mount)
         self._observers: tuple[Callable[[Recognition], None], ...] = (
             self._tally.update,
             self._vitals.update,
             self._map_watch.update,
-            Sight(notifier).update,
+            MapCoverageWatch(notifier).update,
             TurnWatch(notifier, camera).update,
             MirrorWatch(notifier, parts.recogniser).update,
             HeightWatch(notifier, parts.autopilot).update,
@@ -105,7 +105,7 @@ class Flight:
         begins."""
         systemd.notify(EXTEND_TIMEOUT_USEC=systemd.MAX_START_US)
         with ExitStack() as stack:
-            with io.stop.beginning():
+            with io.stop.interrupt_start():
                 recogniser = open_map(config, io)
                 stack.callback(recogniser.place_map.close)
                 flight_log = stack.enter_context(_open_log(io))
@@ -150,7 +150,7 @@ class Flight:
     def run(self) -> int:
         """Fly until the source has ended or a signal ends the flight. Return 1 if any frame failed, else 0."""
         with suppress(StopNow):
-            while not (self._parts.io.stop.asked or self._parts.source.ended):
+            while not (self._parts.io.stop.is_requested or self._parts.source.ended):
                 self._run_pass()
         self._end()
         return 1 if self._tally.unusable + self._tally.failed else 0
@@ -197,7 +197,7 @@ class Flight:
         if is_paused:  # the newest picture is dropped, so that none is old when the flight goes on
             return
         with meter.measure_cost(thread_only=True) as work:
-            with self._parts.io.stop.breaks_off():
+            with self._parts.io.stop.allow_interrupt():
                 event = self._recognise(frame, is_query)
             event = replace(event, steps=replace(event.steps, read=reading.cost))
             if is_query:

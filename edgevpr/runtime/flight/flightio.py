@@ -39,7 +39,7 @@ from edgevpr.runtime.flight.machine import Machine
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.flight.recording import Recording
-from edgevpr.runtime.flight.status import StatusFile, default_path
+from edgevpr.runtime.flight.status import StatusFile, find_default_path
 from edgevpr.runtime.flight.stop import Stop
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
@@ -107,7 +107,7 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
         log, record = config.log, config.log.record
         recording = _open_optional(lambda: stack.enter_context(Recording(record, log.record_mb))) if record else None
         folder = str(recording.path.resolve()) if recording else None
-        status_path = config.status.file or default_path()
+        status_path = config.status.file or find_default_path()
         status = _open_optional(lambda: stack.enter_context(StatusFile(status_path))) if status_path else None
 
         def open_own(step_s: float) -> Source:

@@ -1,4 +1,4 @@
-"""This computer as a flight asks it: heat, load, memory, and what its disk takes."""
+"""The computer of a flight: its heat, load and memory, and whether its disk takes the flight log."""
 
 from edgevpr.power.boards import Board
 from edgevpr.power.machine import read_rss_mb
@@ -8,8 +8,7 @@ from edgevpr.runtime.flight.flightlog import FlightLog
 
 
 class Machine:
-    """Answers each question by a measurement. `watch` reads the sensors (None: those of this computer,
-    with the limit of the `board`)."""
+    """Measures the computer. `watch` reads the sensors (None: its own, with the limit of the `board`)."""
 
     def __init__(self, board: Board, watch: ThermalWatch | None = None) -> None:
         self._watch = watch or ThermalWatch(hot_c=board.thermal_limit_c)

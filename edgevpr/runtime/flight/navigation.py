@@ -12,7 +12,7 @@ from edgevpr.mavlink.receivers import RECEIVER_LAG_S, extrapolate
 from edgevpr.runtime.flight.consistency import BELIEVED, ComparedFix, GateResult
 from edgevpr.runtime.flight.drift import Drift, DriftFilter, OdometryMeasurement
 from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurement, PositionedMatch, worst_sd
-from edgevpr.runtime.flight.output import PROOF_S
+from edgevpr.runtime.flight.output import MATCH_PROOF_S
 from edgevpr.runtime.flight.path import Path, Point
 from edgevpr.runtime.recognise.locate import mahalanobis
 
@@ -117,13 +117,13 @@ class Navigation:
         if path is None:
             self._start_at_estimate(vehicle)
             return
-        self._filter.predict(path.fly(t_s, velocity_m_s))
+        self._filter.predict(path.add_velocity(t_s, velocity_m_s))
         if had_gps and not self.has_gps:
             self._filter.lose_gps()
-        there = path.at(t_s)
+        there = path.interpolate(t_s)
         if there and self.has_gps and t_s - self._gps_s >= _GPS_EVERY_S:
             self._record_gps(t_s)
-            off_m = path.from_origin(vehicle.lat_deg, vehicle.lon_deg) - there.at_m
+            off_m = path.compute_offset_m(vehicle.lat_deg, vehicle.lon_deg) - there.position_m
             sd_m = _GPS_ALIKE * (vehicle.position_sd_m or _UNKNOWN_M)
             self._filter.correct_by_gps(off_m, sd_m, velocity_m_s - there.velocity_m_s, _GPS_VELOCITY_SD)
 
@@ -154,7 +154,7 @@ class Navigation:
 
     def _contradict(self, receiver: Receiver, now_s: float) -> None:
         """Process a receiver that contradicts our position: where it goes on and no match proves ours, begin there."""
-        self.has_gps, self.is_in_doubt = False, now_s - self._fixed_s > PROOF_S
+        self.has_gps, self.is_in_doubt = False, now_s - self._fixed_s > MATCH_PROOF_S
         if self._contradicted_since_s is None:
             self._contradicted_since_s = now_s
         lasts_s = min(receiver.steady_for_s, now_s - self._contradicted_since_s)
@@ -167,10 +167,10 @@ class Navigation:
         """Return the offset (2,) from the path to a receiver, its standard deviation, by how much the receiver's
         velocity exceeds the path's (2,; None: unknown), its standard deviation, and the age of both (None: unknown)."""
         measured_s = receiver.t_s - RECEIVER_LAG_S
-        there, before = path.at(measured_s), path.at(measured_s - RECEIVER_LAG_SD_S)
+        there, before = path.interpolate(measured_s), path.interpolate(measured_s - RECEIVER_LAG_SD_S)
         if there is None or before is None:
             return None
-        off_m = path.from_origin(receiver.lat_deg, receiver.lon_deg) - there.at_m
+        off_m = path.compute_offset_m(receiver.lat_deg, receiver.lon_deg) - there.position_m
         speed_m_s = float(np.hypot(*there.velocity_m_s))
         sd_m = math.hypot(_GPS_ALIKE * receiver.sd_m, RECEIVER_LAG_SD_S * speed_m_s)
         off_m_s = None if receiver.velocity_m_s is None else np.array(receiver.velocity_m_s) - there.velocity_m_s
@@ -203,7 +203,7 @@ class Navigation:
     def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
         """Process the mean acceleration (2,) over the ground, east and north, since the last call."""
         if (path := self._valid_path) and self._drift.is_of_attitude:
-            self._filter.predict(path.accelerate(t_s, acceleration_m_s2))
+            self._filter.predict(path.add_acceleration(t_s, acceleration_m_s2))
 
     def add_frame(self, frame: FrameMeasurement, is_query: bool = True, turn_deg: float | None = None) -> None:
         """Process a frame, whatever is recognised in it, or one that is no query and only shows its stride. `turn_deg`
@@ -211,7 +211,7 @@ class Navigation:
         if is_query:
             self._asks_every_s, self._asked_s = frame.t_s - self._asked_s, frame.t_s
         path, before = self._valid_path, self._framed
-        self._framed = there = path.at(frame.t_s) if path else None
+        self._framed = there = path.interpolate(frame.t_s) if path else None
         if path is None or there is None:
             return
         if turn_deg is not None:
@@ -219,7 +219,7 @@ class Navigation:
         stride, strode = frame.stride, None
         if stride and before and before.t_s == stride.from_s:
             moved_m = np.array(stride.moved_m)
-            strode = OdometryMeasurement(moved_m, moved_m - (there.at_m - before.at_m), stride.sd_m)
+            strode = OdometryMeasurement(moved_m, moved_m - (there.position_m - before.position_m), stride.sd_m)
         is_used = self._filter.add_frame(path.now.t_s - frame.t_s, frame.lean_s2, frame.sd_m, strode)
         if stride and strode and is_used:
             self._strides_since_fix.add(strode.moved_m, stride.zoom, frame)
@@ -234,9 +234,9 @@ class Navigation:
         if path is None or there is None:
             return None
         expected_m, covariance_m2 = self._filter.predict_fix()
-        off_m = path.from_origin(seen.position.lat_deg, seen.position.lon_deg) - there.at_m
+        off_m = path.compute_offset_m(seen.position.lat_deg, seen.position.lon_deg) - there.position_m
         return ComparedFix(
-            seen=seen, path_m=there.at_m, off_m=off_m, expected_m=expected_m, covariance_m2=covariance_m2
+            seen=seen, path_m=there.position_m, off_m=off_m, expected_m=expected_m, covariance_m2=covariance_m2
         )
 
     def correct_by_fix(self, fix: ComparedFix, verdict: GateResult = BELIEVED) -> None:
@@ -273,11 +273,11 @@ class Navigation:
     def state_at(self, t_s: float) -> NavState | None:
         """Return where the aircraft is, or was, at `t_s`; None if that is not known."""
         path = self._valid_path
-        there = path.at(t_s) if path else None
+        there = path.interpolate(t_s) if path else None
         if path is None or there is None:
             return None
         off_m, off_m_s, covariance = self._filter.errors(path.now.t_s - t_s)
-        at_m = there.at_m + off_m
+        at_m = there.position_m + off_m
         velocity_m_s = there.velocity_m_s + off_m_s
         return NavState(
             t_s=t_s,

@@ -1,5 +1,5 @@
-"""Talk of a flight with people. The notifier reports to the journal (the log of the process), to
-the flight log and to the ground station; all observers report through it. `Commands` does what ground stations ask."""
+"""Messages of a flight to its operators. The notifier reports to the journal (the log of the process), the flight log
+and the ground station. `Commands` carries out the requests of ground stations."""
 
 import logging
 from typing import Any
@@ -10,11 +10,11 @@ from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import TEXT_BYTES, Severity
 from edgevpr.runtime.flight.flightlog import FlightLog
 
-_NOTES = {
+_COMMAND_CODES = {
     Wish.PAUSE: ReasonCode.PAUSED_BY_COMMAND,
     Wish.RESUME: ReasonCode.RESUMED_BY_COMMAND,
 }
-_SHORT_BYTES = TEXT_BYTES - len("edgevpr: ")  # of a text for the ground station
+_MAX_GCS_BYTES = TEXT_BYTES - len("edgevpr: ")  # of a text for the ground station
 
 _log = logging.getLogger(__name__)
 
@@ -51,25 +51,25 @@ class Notifier:
         long, or the text `ground`. Without a `topic`, the kind is the topic of the text."""
         self.log(kind, note=note, **fields)
         text = str(note)
-        ground = ground or (note.code.summary if len(text.encode()) > _SHORT_BYTES else None)
+        ground = ground or (note.code.summary if len(text.encode()) > _MAX_GCS_BYTES else None)
         self.announce(severity, text, ground=ground, topic=topic or kind)
 
 
-class Trouble:
-    """Reports a bad condition once when it begins, with the note `begun`, and once when it ends, with the note `over`.
-    `kind` is that of its lines in the flight log. `is_so`: the condition holds."""
+class Alert:
+    """Reports a bad condition once when it begins (`onset`), and once when it ends (`cleared`). `kind` is that of its
+    lines in the flight log."""
 
-    def __init__(self, notifier: Notifier, kind: str, begun: Reason, over: ReasonCode) -> None:
-        self.is_so = False
-        self._notifier, self._kind, self._begun, self._over = notifier, kind, begun, over
+    def __init__(self, notifier: Notifier, kind: str, onset: Reason, cleared: ReasonCode) -> None:
+        self.is_active = False
+        self._notifier, self._kind, self._onset, self._cleared = notifier, kind, onset, cleared
 
-    def update(self, is_so: bool) -> None:
+    def update(self, is_active: bool) -> None:
         """Set whether the condition holds now, and report if that has changed."""
-        if is_so == self.is_so:
+        if is_active == self.is_active:
             return
-        self.is_so = is_so
-        note = self._begun if is_so else Reason(self._over)
-        self._notifier.report(self._kind, Severity.WARNING if is_so else Severity.INFO, note)
+        self.is_active = is_active
+        note = self._onset if is_active else Reason(self._cleared)
+        self._notifier.report(self._kind, Severity.WARNING if is_active else Severity.INFO, note)
 
 
 class Commands:
@@ -90,13 +90,13 @@ class Commands:
         if self._link is None:
             return
         if wished := self._link.take_wish():
-            self._fulfil(wished)
+            self._carry_out(wished)
         self._link.accept_wishes()
 
-    def _fulfil(self, wished: Wished) -> None:
+    def _carry_out(self, wished: Wished) -> None:
         is_new = self.is_paused != (wished.wish is Wish.PAUSE)
         self.is_paused = wished.wish is Wish.PAUSE
-        code = _NOTES[wished.wish]
+        code = _COMMAND_CODES[wished.wish]
         self._notifier.log("command", wish=wished.wish.name, sender=wished.sender, note=Reason(code), is_new=is_new)
         if is_new:  # a command repeated because its answer was lost changes nothing
             text = code.summary

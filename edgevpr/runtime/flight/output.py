@@ -1,5 +1,5 @@
-"""What a continuous channel carries at a moment, and the watch that withdraws it: an autopilot that flies by our
-positions is led by their errors."""
+"""What a continuous channel sends, and the watch that withdraws it: an autopilot that flies by our positions follows
+their errors."""
 
 import math
 from enum import Enum
@@ -9,14 +9,14 @@ from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.receivers import extrapolate
 
-PROOF_S = 5.0  # a match of the last seconds proves our position
-_REFUSED_RATIO = 1.0  # of an innovation to the filter's gate
-_REFUSED_S = 3.0
-_LED_AWAY_M = 15.0  # of the autopilot's estimate from a good receiver, and no less
-_LED_AWAY_SD = 4.0
-_LED_AWAY_S = 2.0
-_STEADY_S = 3.0
-_CAUSE_S = 10.0  # so long after our last position an error of the estimate may still be ours
+MATCH_PROOF_S = 5.0  # a match of the last seconds proves our position
+_MAX_INNOVATION_RATIO = 1.0  # to the gate of the autopilot's filter
+_MIN_REFUSED_S = 3.0
+_MAX_ESTIMATE_ERROR_M = 15.0  # of the autopilot's estimate from a good receiver, and no less
+_MAX_ESTIMATE_ERROR_SD = 4.0
+_MIN_LED_AWAY_S = 2.0
+_MIN_STEADY_S = 3.0
+_INFLUENCE_S = 10.0  # so long after our last position an error of the estimate may still be ours
 
 
 class Output(Enum):
@@ -47,8 +47,8 @@ class Output(Enum):
 
 
 class OutputWatch:
-    """Withdraws our positions where the autopilot's filter refuses them, or its estimate leaves a good receiver while
-    they are sent, until a match or GPS proves them. `withdrawn` says why none may be sent (None: they may)."""
+    """Withdraws our positions if the autopilot's filter refuses them, or if its estimate leaves a good receiver while
+    they are sent, until a match or GPS proves them. `withdrawn` is the reason (None: positions may be sent)."""
 
     def __init__(self) -> None:
         self.withdrawn: Output | None = None
@@ -57,31 +57,32 @@ class OutputWatch:
         self._refused_since_s = self._led_away_since_s = math.inf
 
     def record_sent(self, t_s: float) -> None:
-        """Note that a position was sent at `t_s`."""
+        """Record that a position was sent at `t_s`."""
         self._sent_s = t_s
 
-    def update(self, vehicle: Vehicle, fixed_s: float, has_gps: bool) -> None:
-        """Process a report of the autopilot. `fixed_s` is the time of the last match that was believed; `has_gps`: a
+    def update(self, vehicle: Vehicle, match_s: float, has_gps: bool) -> None:
+        """Process a report of the autopilot. `match_s` is the time of the last match that was believed; `has_gps`: a
         receiver is believed."""
         now_s = vehicle.t_heard_s
-        is_led_away = has_gps and _leaves_receiver(vehicle) and now_s - self._sent_s <= _CAUSE_S
-        is_refused = not has_gps and (vehicle.innovation_ratio or 0.0) > _REFUSED_RATIO and now_s - self._sent_s <= 1.0
+        is_led_away = has_gps and _is_off_receiver(vehicle) and now_s - self._sent_s <= _INFLUENCE_S
+        is_over_gate = (vehicle.innovation_ratio or 0.0) > _MAX_INNOVATION_RATIO
+        is_refused = is_over_gate and not has_gps and now_s - self._sent_s <= 1.0
         self._led_away_since_s = min(self._led_away_since_s, now_s) if is_led_away else math.inf
         self._refused_since_s = min(self._refused_since_s, now_s) if is_refused else math.inf
-        is_proven = now_s - fixed_s <= PROOF_S
-        if now_s - self._led_away_since_s >= _LED_AWAY_S and not is_proven:
+        is_proven = now_s - match_s <= MATCH_PROOF_S
+        if now_s - self._led_away_since_s >= _MIN_LED_AWAY_S and not is_proven:
             self.withdrawn, self._withdrawn_s = Output.LEADS_AWAY, now_s
-        elif now_s - self._refused_since_s >= _REFUSED_S and not is_proven:
+        elif now_s - self._refused_since_s >= _MIN_REFUSED_S and not is_proven:
             self.withdrawn, self._withdrawn_s = Output.REFUSED, now_s
-        elif fixed_s > self._withdrawn_s or (has_gps and not is_led_away and now_s - self._withdrawn_s > _CAUSE_S):
+        elif match_s > self._withdrawn_s or (has_gps and not is_led_away and now_s - self._withdrawn_s > _INFLUENCE_S):
             self.withdrawn = None
 
 
-def _leaves_receiver(vehicle: Vehicle) -> bool:
+def _is_off_receiver(vehicle: Vehicle) -> bool:
     """Tell whether the autopilot's estimate is farther from a steady receiver than both allow."""
     receiver = vehicle.gps
-    if receiver is None or receiver.steady_for_s < _STEADY_S:
+    if receiver is None or receiver.steady_for_s < _MIN_STEADY_S:
         return False
-    there = extrapolate(receiver, vehicle.t_heard_s)
-    off_m = float(distance_m(*there, vehicle.lat_deg, vehicle.lon_deg))
-    return off_m > max(_LED_AWAY_M, _LED_AWAY_SD * receiver.sd_m)
+    receiver_deg = extrapolate(receiver, vehicle.t_heard_s)
+    off_m = float(distance_m(*receiver_deg, vehicle.lat_deg, vehicle.lon_deg))
+    return off_m > max(_MAX_ESTIMATE_ERROR_M, _MAX_ESTIMATE_ERROR_SD * receiver.sd_m)

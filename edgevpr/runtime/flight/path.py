@@ -12,17 +12,17 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
 
-KEPT_S = 6.0  # a frame is at most 5 s old when it is recognised
+HISTORY_S = 6.0  # a frame is at most 5 s old when it is recognised
 _MAX_STEP_S = 1.0  # after a longer gap in the reports the path is not known
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A point of a path: `t_s`, time in seconds; `at_m` (2,), metres east and north of the path's origin;
+    """A point of a path: `t_s`, time in seconds; `position_m` (2,), metres east and north of the path's origin;
     `velocity_m_s` (2,), m/s east and north."""
 
     t_s: float
-    at_m: Doubles
+    position_m: Doubles
     velocity_m_s: Doubles
 
 
@@ -39,11 +39,11 @@ class Path:
         """The newest point."""
         return self._points[-1]
 
-    def from_origin(self, lat_deg: float, lon_deg: float) -> Doubles:
+    def compute_offset_m(self, lat_deg: float, lon_deg: float) -> Doubles:
         """Return the metres (2,), east and north, from the origin to a position."""
         return np.array(offset_m(self.origin.lat_deg, self.origin.lon_deg, lat_deg, lon_deg))
 
-    def fly(self, t_s: float, velocity_m_s: Doubles) -> float:
+    def add_velocity(self, t_s: float, velocity_m_s: Doubles) -> float:
         """Add a point at `t_s` with this velocity (2,), and return the seconds since the last point. If `t_s` is not
         later than that, nothing is added, and 0 returned."""
         last = self._points[-1]
@@ -52,18 +52,19 @@ class Path:
             return 0.0
         self.is_broken |= step_s > _MAX_STEP_S
         velocity_m_s = np.asarray(velocity_m_s, float)
-        at_m = last.at_m + step_s / 2 * (last.velocity_m_s + velocity_m_s)
-        self._points.append(Point(t_s, at_m, velocity_m_s))
-        if self._points[0].t_s < t_s - 2 * KEPT_S:  # rarely, since this moves all points
-            del self._points[: bisect_left(self._points, t_s - KEPT_S, key=lambda point: point.t_s)]
+        position_m = last.position_m + step_s / 2 * (last.velocity_m_s + velocity_m_s)
+        self._points.append(Point(t_s, position_m, velocity_m_s))
+        if self._points[0].t_s < t_s - 2 * HISTORY_S:  # rarely, since this moves all points
+            del self._points[: bisect_left(self._points, t_s - HISTORY_S, key=lambda point: point.t_s)]
         return step_s
 
-    def accelerate(self, t_s: float, acceleration_m_s2: Doubles) -> float:
-        """Add a point, as `fly` does, that is reached with this mean acceleration (2,) over the ground."""
+    def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> float:
+        """Add a point, as `add_velocity` does, that is reached with this mean acceleration (2,) over the ground."""
         last = self._points[-1]
-        return self.fly(t_s, last.velocity_m_s + max(0.0, t_s - last.t_s) * np.asarray(acceleration_m_s2, float))
+        step_s = max(0.0, t_s - last.t_s)
+        return self.add_velocity(t_s, last.velocity_m_s + step_s * np.asarray(acceleration_m_s2, float))
 
-    def at(self, t_s: float) -> Point | None:
+    def interpolate(self, t_s: float) -> Point | None:
         """Return the point at `t_s`; after the last point, its velocity is continued. None if `t_s` is before the first
         point kept or more than a second after the last."""
         if not self._points[0].t_s <= t_s <= self._points[-1].t_s + _MAX_STEP_S:
@@ -71,15 +72,15 @@ class Path:
         after = bisect_left(self._points, t_s, key=lambda point: point.t_s)
         if after == len(self._points):
             last = self._points[-1]
-            return Point(t_s, last.at_m + (t_s - last.t_s) * last.velocity_m_s, last.velocity_m_s)
+            return Point(t_s, last.position_m + (t_s - last.t_s) * last.velocity_m_s, last.velocity_m_s)
         if after == 0:
             return self._points[0]
-        one, other = self._points[after - 1], self._points[after]
-        step_s = other.t_s - one.t_s
-        share = (t_s - one.t_s) / step_s
-        velocity_m_s = one.velocity_m_s + share * (other.velocity_m_s - one.velocity_m_s)
-        at_m = one.at_m + share * step_s / 2 * (one.velocity_m_s + velocity_m_s)
-        return Point(t_s, at_m, velocity_m_s)
+        start, end = self._points[after - 1], self._points[after]
+        step_s = end.t_s - start.t_s
+        share = (t_s - start.t_s) / step_s
+        velocity_m_s = start.velocity_m_s + share * (end.velocity_m_s - start.velocity_m_s)
+        position_m = start.position_m + share * step_s / 2 * (start.velocity_m_s + velocity_m_s)
+        return Point(t_s, position_m, velocity_m_s)
 
 
 def to_ground_acceleration(

@@ -1,8 +1,8 @@
 """The recording of a flight, with which `review` can fly it again: a folder with `tape.jsonl`, one line for each input,
 and `frames/`, the pictures as JPEG.
 
-A thread of its own writes, so that a slow disk delays nobody. A recording is of no use after a gap: if the disk is too
-slow or full, or the recording too large, it ends and the flight goes on.
+A thread of its own writes, so that a slow disk delays no query. A recording with a gap cannot be replayed: if the disk
+is too slow or full, or the recording too large, it ends and the flight goes on.
 """
 
 import errno
@@ -25,13 +25,14 @@ from edgevpr.core.text import redact_passwords
 from edgevpr.runtime.flight.boundary import Tape
 from edgevpr.runtime.flight.flightlog import Line, select_last_flight
 
-TAPE, FRAMES = "tape.jsonl", "frames"
-SPARED_BYTES = 100_000_000  # free bytes of the disk that are left to logs and map
-WAITING_BYTES = 32_000_000  # most bytes of pictures that may wait for a slow disk: minutes of a small camera
-WAITING_NOTES = 100_000
-_WRITE_S = 0.5  # interval of writing: a power cut loses what came since
-_CLOSE_S = 1.5  # longest wait for the thread: the end of a flight takes two seconds at most
-_FOLDER = re.compile(r"flight-(\d{4,})")
+TAPE = "tape.jsonl"
+FRAMES = "frames"
+MIN_FREE_BYTES = 100_000_000  # free bytes of the disk that are left to logs and map
+MAX_QUEUED_BYTES = 32_000_000  # most bytes of pictures that may wait for a slow disk: minutes of a small camera
+MAX_QUEUED_NOTES = 100_000
+_WRITE_INTERVAL_S = 0.5  # a power cut loses the input since the last write
+_CLOSE_TIMEOUT_S = 1.5  # longest wait for the thread: the end of a flight takes two seconds at most
+_FOLDER_PATTERN = re.compile(r"flight-(\d{4,})")
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -45,22 +46,21 @@ class Recording(Tape):
         """Make a folder for this flight in `folder`. Recordings there take at most half of `max_mb`, the oldest are
         deleted; the new one may take the other half. Raises EdgevprError."""
         self.state: str | None = None
-        self._most_bytes = 1e6 * max_mb / 2
-        self._waiting: deque[bytes | tuple[int, bytes]] = deque()  # a note, or a frame with its number
-        self._bytes_put = self._bytes_written = 0  # of frames
+        self._max_bytes = 1e6 * max_mb / 2
+        self._queue: deque[bytes | tuple[int, bytes]] = deque()  # a note, or a frame with its number
+        self._bytes_queued = self._bytes_written = 0  # of frames
         self._frames = 0
         self._closing = threading.Event()
         try:
             Path(folder).mkdir(mode=0o750, exist_ok=True)
-            last = max((int(each.name.rpartition("-")[2]) for each in recordings(Path(folder))), default=0)
+            last = max((int(path.name.rpartition("-")[2]) for path in recordings(Path(folder))), default=0)
             self.path = Path(folder) / f"flight-{last + 1:04d}"
             self.path.mkdir(mode=0o750)
             (self.path / FRAMES).mkdir(mode=0o750)
             self._tape = open_appending(self.path / TAPE)
         except OSError as error:
             raise EdgevprError(
-                f"No flight can be recorded in {folder} ({error.strerror}): give a folder that is there and may be "
-                "written to, or leave `log.record` out."
+                f"Cannot record in {folder} ({error.strerror}): set `log.record` to a writable folder, or leave it out."
             ) from error
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._thread.start()
@@ -73,61 +73,61 @@ class Recording(Tape):
 
     def read(self, kind: str, look: Callable[[], T]) -> T:
         """Return the result of `look`, and record it on the tape under `kind`."""
-        found = look()
-        self.note(kind, found)
-        return found
+        value = look()
+        self.note(kind, value)
+        return value
 
     def note(self, kind: str, *values: Any) -> None:
         """Record an event on the tape. May be called from any thread and from a signal handler; never blocks."""
         if self.state is None:
             line = json.dumps([kind, *values], default=lambda data: b64encode(data).decode())
-            self._waiting.append(redact_passwords(line).encode() + b"\n")
+            self._queue.append(redact_passwords(line).encode() + b"\n")
 
     def keep(self, jpeg: bytes) -> int:
         """Record a picture, and return its number in this recording (1, 2, ...), by which `frame_path` finds it."""
         self._frames += 1
         if self.state is None:
-            self._bytes_put += len(jpeg)
-            self._waiting.append((self._frames, jpeg))
+            self._bytes_queued += len(jpeg)
+            self._queue.append((self._frames, jpeg))
         return self._frames
 
     def close(self) -> None:
         """Write what still waits, and close the tape. Gives up after 1.5 seconds, with a warning."""
         self._closing.set()
-        self._thread.join(_CLOSE_S)
+        self._thread.join(_CLOSE_TIMEOUT_S)
         if self._thread.is_alive():
-            _log.warning("The end of the recording %s is missing: the disk is too slow.", self.path)
+            _log.warning("The recording %s lacks its end: the disk is too slow.", self.path)
 
     # The methods below run in the recording's own thread.
 
     def _run(self) -> None:
         try:
             self._delete_oldest()
-            while not self._closing.wait(_WRITE_S):
+            while not self._closing.wait(_WRITE_INTERVAL_S):
                 self._write()
             self._write()
         except OSError as error:
             self.state = (
-                f"The recording {self.path} has ended ({error.strerror}): what there is can be replayed, and the "
-                "flight goes on."
+                f"The recording {self.path} has ended ({error.strerror}). It can be replayed up to here; the flight "
+                "goes on."
             )
             _log.warning("%s", self.state)
         finally:
-            self._waiting.clear()
+            self._queue.clear()
             with suppress(OSError):
                 self._tape.close()
 
     def _write(self) -> None:
-        """Write all that waits, frames before the lines that name them. Raises OSError if the recording must end."""
-        if self._bytes_put - self._bytes_written > WAITING_BYTES or len(self._waiting) > WAITING_NOTES:
+        """Write the queue, frames before the lines that name them. Raises OSError if the recording must end."""
+        if self._bytes_queued - self._bytes_written > MAX_QUEUED_BYTES or len(self._queue) > MAX_QUEUED_NOTES:
             raise OSError(errno.EIO, "the disk is too slow for it")
         notes = []
-        for _ in range(len(self._waiting)):
-            each = self._waiting.popleft()
-            if isinstance(each, bytes):
-                notes.append(each)
+        for _ in range(len(self._queue)):
+            item = self._queue.popleft()
+            if isinstance(item, bytes):
+                notes.append(item)
             else:
-                number, jpeg = each
+                number, jpeg = item
                 with open_appending(frame_path(self.path, number)) as file:
                     append_bytes(file, jpeg)
                     sync_file(file)
@@ -135,22 +135,22 @@ class Recording(Tape):
         if not notes:
             return
         disk = os.fstatvfs(self._tape.fileno())
-        if disk.f_bavail * disk.f_frsize < SPARED_BYTES:
-            raise OSError(errno.ENOSPC, f"less than {SPARED_BYTES // 1_000_000} MB are left on the disk")
-        if self._bytes_written + os.fstat(self._tape.fileno()).st_size > self._most_bytes:
+        if disk.f_bavail * disk.f_frsize < MIN_FREE_BYTES:
+            raise OSError(errno.ENOSPC, f"less than {MIN_FREE_BYTES // 1_000_000} MB free on the disk")
+        if self._bytes_written + os.fstat(self._tape.fileno()).st_size > self._max_bytes:
             raise OSError(errno.EFBIG, "it is as large as half of log.record_mb allows")
         append_bytes(self._tape, b"".join(notes))
         sync_file(self._tape)
 
     def _delete_oldest(self) -> None:
         *earlier, _ = recordings(self.path.parent)
-        taken = {each: sum(file.stat().st_size for file in each.rglob("*") if file.is_file()) for each in earlier}
+        sizes = {path: sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) for path in earlier}
         for folder in earlier:
-            if sum(taken.values()) <= self._most_bytes:
+            if sum(sizes.values()) <= self._max_bytes:
                 return
             shutil.rmtree(folder)
-            del taken[folder]
-            _log.info("the recording %s is deleted, to make room for this flight's", folder)
+            del sizes[folder]
+            _log.info("deleted the recording %s, to make room for this flight's", folder)
 
 
 def frame_path(folder: Path, number: int) -> Path:
@@ -158,45 +158,45 @@ def frame_path(folder: Path, number: int) -> Path:
     return folder / FRAMES / f"{number:06d}.jpg"
 
 
-def open_recording(said: str | None, log: str | Path) -> Path | None:
-    """Find the recording that the file `log` names as `said` (None: none): there, or in a folder of that name beside
-    it."""
-    if not said:
+def find_recording(folder_name: str | None, log: str | Path) -> Path | None:
+    """Return the folder of the recording that the file `log` names (None: it names none): at that path, or in a folder
+    of that name next to the log; None if it is at neither."""
+    if not folder_name:
         return None
-    here = Path(said)
-    beside = Path(log).resolve().parent / here.parent.name / here.name
-    return next((each for each in (here, beside) if (each / TAPE).is_file()), None)
+    path = Path(folder_name)
+    next_to_log = Path(log).resolve().parent / path.parent.name / path.name
+    return next((folder for folder in (path, next_to_log) if (folder / TAPE).is_file()), None)
 
 
 def read_recorded(log: str | Path) -> tuple[list[Line], Path]:
-    """Return the lines of the last flight of `log`, and the folder of its recording (see `open_recording`). Raises
+    """Return the lines of the last flight of `log`, and the folder of its recording (see `find_recording`). Raises
     UsageError if there is none, and EdgevprError if the file holds no flight."""
     flight = select_last_flight(log)
     if flight.missing:
         _log.warning("%s", flight.missing)
     lines = list(flight)
-    said = lines[0].get("recording") if lines else None
-    if not said:
+    folder_name = lines[0].get("recording") if lines else None
+    if not folder_name:
         raise UsageError(f"{log}: its last flight was not recorded: fly with `log: {{record: FOLDER}}`.")
-    folder = open_recording(said, log)
+    folder = find_recording(folder_name, log)
     if folder is None:
-        raise UsageError(f"{log}: its recording is neither at {said} nor beside the log: bring it there.")
+        raise UsageError(f"{log}: its recording is neither at {folder_name} nor next to the log: copy it there.")
     return lines, folder
 
 
 def list_frames(folder: Path) -> dict[str, Path]:
     """Return the picture files of the recording in `folder`, by the frames' names in the flight log."""
-    found = {}
+    paths = {}
     with open(folder / TAPE, "rb") as tape:
         for line in tape:
             with suppress(ValueError, LookupError, TypeError):  # a line that was cut, or no frame
                 if line.startswith(b'["frame", {'):
-                    known = json.loads(line)[1]
-                    found[known["name"]] = frame_path(folder, known["number"])
-    return found
+                    frame = json.loads(line)[1]
+                    paths[frame["name"]] = frame_path(folder, frame["number"])
+    return paths
 
 
-def is_of_camera(folder: Path) -> bool:
+def has_live_source(folder: Path) -> bool:
     """Return True if the pictures of the recording in `folder` came from a camera or stream as they were taken."""
     with open(folder / TAPE, "rb") as tape:
         return any(line.startswith(b'["is_live", true') for line in tape)
@@ -204,5 +204,5 @@ def is_of_camera(folder: Path) -> bool:
 
 def recordings(folder: Path) -> list[Path]:
     """List the folders of the recordings in `folder`, oldest first."""
-    numbered = [(int(found[1]), each) for each in folder.iterdir() if (found := _FOLDER.fullmatch(each.name))]
-    return [each for _, each in sorted(numbered)]
+    numbered = [(int(match[1]), path) for path in folder.iterdir() if (match := _FOLDER_PATTERN.fullmatch(path.name))]
+    return [path for _, path in sorted(numbered)]

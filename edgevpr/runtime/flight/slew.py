@@ -6,18 +6,18 @@ from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.runtime.flight.navigation import NavState
 
 MAX_CORRECTION_M_S = 2.0  # ArduPilot did not follow a jump of 25 m for 8 s
-# A position that lags farther behind jumps: a filter refuses it for seven to ten seconds, then resets to it. That is
-# sooner than the lag would be made up, and meanwhile nothing is sent that is far from the estimate.
+# A position that lags by more jumps. The autopilot's filter refuses the jump for seven to ten seconds, then resets to
+# it: sooner than the slew would make up the lag, and nothing far from the estimate is sent meanwhile.
 MAX_LAG_M = 40.0
 
 
 class Slew:
-    """A position that does not jump: it moves with the velocity of the estimates, and its error against them shrinks by
-    2 m/s at most. One that is more than 40 m behind begins anew."""
+    """A position that does not jump: it moves with the velocity of the estimates, and approaches them by 2 m/s at most.
+    It restarts at the estimate if it is more than 40 m off."""
 
     def __init__(self) -> None:
         self._last: NavState | None = None
-        self._at = 0.0, 0.0
+        self._position_deg = 0.0, 0.0
 
     def reset(self) -> None:
         """Restart at the next estimate."""
@@ -26,18 +26,19 @@ class Slew:
     def follow(self, estimate: NavState) -> tuple[float, float, float]:
         """Move towards an estimate that is later than the last one. Returns latitude and longitude in degrees, and the
         remaining distance to the estimate in metres."""
-        here = estimate.position
+        target = estimate.position
         if self._last is None:
-            self._last, self._at = estimate, (here.lat_deg, here.lon_deg)
-            return *self._at, 0.0
+            self._last, self._position_deg = estimate, (target.lat_deg, target.lon_deg)
+            return *self._position_deg, 0.0
         step_s = max(0.0, estimate.t_s - self._last.t_s)
         east_m_s, north_m_s = estimate.velocity_m_s
-        moved_on = offset_position(*self._at, step_s * east_m_s, step_s * north_m_s)
-        east_m, north_m = offset_m(*moved_on, here.lat_deg, here.lon_deg)
+        moved_on = offset_position(*self._position_deg, step_s * east_m_s, step_s * north_m_s)
+        east_m, north_m = offset_m(*moved_on, target.lat_deg, target.lon_deg)
         lag_m = math.hypot(east_m, north_m)
         if lag_m > MAX_LAG_M:
             self.reset()
             return self.follow(estimate)
-        part = min(1.0, MAX_CORRECTION_M_S * step_s / lag_m) if lag_m > 0 else 1.0
-        self._last, self._at = estimate, offset_position(*moved_on, part * float(east_m), part * float(north_m))
-        return *self._at, (1 - part) * lag_m
+        share = min(1.0, MAX_CORRECTION_M_S * step_s / lag_m) if lag_m > 0 else 1.0
+        self._last = estimate
+        self._position_deg = offset_position(*moved_on, share * float(east_m), share * float(north_m))
+        return *self._position_deg, (1 - share) * lag_m

@@ -26,7 +26,7 @@ from edgevpr.runtime.recognise.levelling import read_camera_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-_ORIGIN_PLACES = 15  # the first places of the map, by which the altitude of the ground is found
+_ORIGIN_PLACES = 15  # the first places of the map, for the altitude of the ground
 _LIBRARIES = ("numpy", "cv2", "onnxruntime")
 
 _log = logging.getLogger(__name__)
@@ -118,5 +118,5 @@ def _identity(place_map: PlaceMap) -> MapIdentity | None:
     try:
         return read_identity(place_map)
     except MapError as error:  # the flight uses the places that can be read
-        _log.warning("the log does not say which map it is: %s", error)
+        _log.warning("the flight log does not identify the map: %s", error)
         return None

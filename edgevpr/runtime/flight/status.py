@@ -1,5 +1,5 @@
-"""The file with the status of a flight: one JSON object, replaced as a whole once a second. `vitals` writes it and says
-what its keys mean, the command `edgevpr top` reads it."""
+"""The file with the status of a flight: one JSON object, replaced as a whole once a second. `vitals` writes it and
+documents its keys, the command `edgevpr top` reads it."""
 
 import json
 import os
@@ -12,25 +12,25 @@ from edgevpr import __version__
 from edgevpr.core.errors import EdgevprError
 from edgevpr.core.text import format_json_line
 
-NAME = "status.json"
-_MODE = 0o660  # positions are private, but the flight's group may read them
+STATUS_NAME = "status.json"
+_FILE_MODE = 0o660  # positions are private, but the flight's group may read them
 
 
 class StatusFile:
     """Writes the status of a flight (see `Vitals._status`) to a file, which is removed when it is closed."""
 
     def __init__(self, path: str | Path) -> None:
-        """Check that the file `path` can be written; `write` writes it. Raises EdgevprError if it cannot be made."""
+        """Check that the file `path` can be written; `write` writes it. Raises EdgevprError if it cannot be created."""
         self._path, self._new = Path(path), Path(f"{path}.new")
         try:
             if self._path.exists() and not self._path.is_file():
-                raise OSError("it is there and is no file")
+                raise OSError("it exists and is not a file")
             self._write(b"")
             self._new.unlink()
         except OSError as error:
             raise EdgevprError(
-                f"The status file {path} cannot be made ({error.strerror or error}): give a name in a folder that is "
-                "there and may be written to, or none (status.file)."
+                f"The status file {path} cannot be created ({error.strerror or error}): set status.file to a path in "
+                "an existing, writable folder, or leave it out."
             ) from error
 
     def __enter__(self) -> "StatusFile":
@@ -47,9 +47,10 @@ class StatusFile:
             os.replace(self._new, self._path)
 
     def _write(self, data: bytes) -> None:
-        descriptor = os.open(self._new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, _MODE)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
+        descriptor = os.open(self._new, flags, _FILE_MODE)
         with open(descriptor, "wb") as file:
-            os.fchmod(descriptor, _MODE)  # again, since the umask may have removed bits
+            os.fchmod(descriptor, _FILE_MODE)  # again, since the umask may have removed bits
             file.write(data)
 
 
@@ -66,17 +67,17 @@ def read_status(path: str | Path) -> tuple[dict[str, Any], float] | None:
         return None
     except OSError as error:
         raise EdgevprError(
-            f"The status at {path} cannot be read ({error.strerror}): be its user or of its group (sudo), or name "
-            "another file with --file."
+            f"The status file {path} cannot be read ({error.strerror}): run as its owner or group (or with sudo), or "
+            "name another file with --file."
         ) from error
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         raise EdgevprError(
-            f"{path} tells no status that this edgevpr understands: use the edgevpr of the flight."
+            f"{path} is not a status file of this version of edgevpr: use the version that flies."
         ) from error
     return status, age_s
 
 
-def default_path() -> str | None:
+def find_default_path() -> str | None:
     """Return the path of the status file in the folder that systemd makes for the service; None if there is none."""
     folder = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
-    return str(Path(folder) / NAME) if folder else None
+    return str(Path(folder) / STATUS_NAME) if folder else None

@@ -9,44 +9,44 @@ class StopNow(BaseException):
 
 
 class Stop:
-    """Signal handler that ends a flight: by StopNow before it begins and while a frame is recognised, otherwise after
-    the present pass of the loop."""
+    """Signal handler that ends a flight: by StopNow during its start and while a frame is recognised, otherwise after
+    the current pass of the loop."""
 
     def __init__(self) -> None:
-        self._asked = self._breakable = self._begins = False
+        self._is_requested = self._is_interruptible = self._is_starting = False
 
     @property
-    def asked(self) -> bool:
+    def is_requested(self) -> bool:
         """True if a signal has asked for the end of the flight."""
-        return self._asked
+        return self._is_requested
 
     def __call__(self, *_: object) -> None:
-        self._asked = True
-        if self._begins:
+        self._is_requested = True
+        if self._is_starting:
             raise StopNow
-        if self._breakable:
-            self._breakable = False  # a second signal must not raise again
-            self._break_off()
+        if self._is_interruptible:
+            self._is_interruptible = False  # a second signal must not raise again
+            self._interrupt()
 
     @contextmanager
-    def beginning(self) -> Iterator[None]:
+    def interrupt_start(self) -> Iterator[None]:
         """Context manager for the start of a flight: a signal, also an earlier one, raises StopNow."""
-        self._begins = True
+        self._is_starting = True
         try:
-            if self._asked:
+            if self._is_requested:
                 raise StopNow
             yield
         finally:
-            self._begins = False
+            self._is_starting = False
 
     @contextmanager
-    def breaks_off(self) -> Iterator[None]:
+    def allow_interrupt(self) -> Iterator[None]:
         """Context manager: a signal interrupts the work inside it by StopNow."""
-        self._breakable = True
+        self._is_interruptible = True
         try:
             yield
         finally:
-            self._breakable = False
+            self._is_interruptible = False
 
-    def _break_off(self) -> None:
+    def _interrupt(self) -> None:
         raise StopNow

@@ -1,4 +1,4 @@
-"""Reports once a second how a flight goes: to systemd (with its watchdog), the autopilot and the status file."""
+"""Reports the state of a flight once a second: to systemd (with its watchdog), the autopilot and the status file."""
 
 import logging
 import math
@@ -18,25 +18,26 @@ from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.companionwatch import CompanionWatch
 from edgevpr.runtime.flight.flightio import FlightParts
 from edgevpr.runtime.flight.frozenwatch import FrozenWatch
-from edgevpr.runtime.flight.notifier import Commands, Trouble
-from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW, NOTHING_IN_A_ROW, Tally
+from edgevpr.runtime.flight.notifier import Alert, Commands
+from edgevpr.runtime.flight.watching import MAX_BLANK_IN_A_ROW, MAX_FAILURES_IN_A_ROW, Tally
 from edgevpr.runtime.recognise.recognition import Recognition, to_fields
 
-_HEALTH_S, _MINUTE_S = 1.0, 60.0
-_START_S = 10.0  # from the start to a camera's first picture, if nothing is to be said of it
-# Without a query, while pictures come and none is paused: more than a query takes on the slowest board, and rarer ones
-# than asked for are due to something that hangs.
-_UNEXPLAINED_S = 45.0
-_UNEXPLAINED_QUERIES = 3
-_TROUBLES = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged", Condition.LATE: "late"}
+_REPORT_INTERVAL_S = 1.0
+_MINUTE_S = 60.0
+_CAMERA_START_TIMEOUT_S = 10.0
+# Something hangs if a live camera gives no query for so long: more than one takes on the slowest board, and than so
+# many intervals between queries.
+_QUERY_TIMEOUT_S = 45.0
+_QUERY_TIMEOUT_INTERVALS = 3
+_FAULTS = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged", Condition.LATE: "late"}
 
 _log = logging.getLogger(__name__)
 
 
 class Vitals:
-    """Pings the watchdog of systemd while queries come, or what keeps them off is reported. Reports once a second how
-    the flight goes, and once a minute also to a terminal. It notifies once when the camera is lost, frozen, damaged or
-    shows nothing, when nothing can be recognised any more, when this computer is hot, throttled or short of voltage,
+    """Pings the watchdog of systemd while queries come, or their absence is explained by something that is reported.
+    Reports the state once a second, and once a minute also to a terminal. It notifies once when the camera is lost,
+    frozen, damaged or blank, when recognition keeps failing, when this computer is hot, throttled or short of voltage,
     and when each of these is over. `remarks` returns sentences for the status (None: left out)."""
 
     def __init__(
@@ -52,14 +53,14 @@ class Vitals:
         self._parts, self._frozen, self._tally, self._pace = parts, frozen, tally, pace
         self._commands, self._remarks = commands, remarks
         self._watchdog_s = systemd.watchdog_interval_s()
-        self._watchdog_due_s = self._health_due_s = parts.io.clock.mono_s()
-        self._minute_due_s = self._health_due_s + _MINUTE_S if sys.stderr.isatty() else math.inf
+        self._watchdog_due_s = self._report_due_s = parts.io.clock.mono_s()
+        self._minute_due_s = self._report_due_s + _MINUTE_S if sys.stderr.isatty() else math.inf
         self._source_trouble: str | None = None
-        self._start_s = self._explained_s = self._health_due_s
+        self._start_s = self._last_explained_s = self._report_due_s
         self._has_log = True
-        failing, nothing = Reason(ReasonCode.FAILING, {"count": FAILURES_IN_A_ROW}), Reason(ReasonCode.NOTHING_SHOWN)
-        self._failing = Trouble(parts.notifier, "failing", failing, ReasonCode.NOT_FAILING)
-        self._blind = Trouble(parts.notifier, "camera", nothing, ReasonCode.GROUND_SHOWN)
+        failing = Reason(ReasonCode.FAILING, {"count": MAX_FAILURES_IN_A_ROW})
+        self._failing = Alert(parts.notifier, "failing", failing, ReasonCode.NOT_FAILING)
+        self._no_texture = Alert(parts.notifier, "camera", Reason(ReasonCode.NOTHING_SHOWN), ReasonCode.GROUND_SHOWN)
         self._companion = CompanionWatch(parts.notifier)
         self._has_event = False
         self._newest: dict[str, Any] | None = None
@@ -75,33 +76,33 @@ class Vitals:
     def beat(self) -> None:
         """Ping the watchdog and report, if due, and log the answers to fixes. Call it in every pass of the loop."""
         now_s = self._parts.io.clock.mono_s()
-        if self._watchdog_s and now_s >= self._watchdog_due_s and self._is_explained(now_s):
+        if self._watchdog_s and now_s >= self._watchdog_due_s and self._is_silence_explained(now_s):
             systemd.notify(WATCHDOG=1)
             self._watchdog_due_s = now_s + self._watchdog_s
         if self._parts.autopilot:
             self._parts.autopilot.log_answers()
-        if now_s >= self._health_due_s:
-            self._health_due_s = now_s + _HEALTH_S
+        if now_s >= self._report_due_s:
+            self._report_due_s = now_s + _REPORT_INTERVAL_S
             self._parts.flight_log.sync_due(now_s)
             self._report()
 
-    def _is_explained(self, now_s: float) -> bool:
-        """Tell whether queries come, or something that is reported explains that none does."""
+    def _is_silence_explained(self, now_s: float) -> bool:
+        """Return True if queries come, or a reported condition explains why none does."""
         is_awaited = self._parts.source.is_live and not (self._source_trouble or self._commands.is_paused)
         if self._has_event or not is_awaited:
-            self._explained_s, self._has_event = now_s, False
-        return now_s - self._explained_s < max(_UNEXPLAINED_S, _UNEXPLAINED_QUERIES / self._pace.rate_hz)
+            self._last_explained_s, self._has_event = now_s, False
+        return now_s - self._last_explained_s < max(_QUERY_TIMEOUT_S, _QUERY_TIMEOUT_INTERVALS / self._pace.rate_hz)
 
     def _report(self) -> None:
         parts = self._parts
         parts.meter.measure_heat()
         self._companion.take(parts.io.clock.mono_s(), parts.meter.thermal)
         self._check_source()
-        self._failing.update(self._tally.failed_in_a_row >= FAILURES_IN_A_ROW)
+        self._failing.update(self._tally.failed_in_a_row >= MAX_FAILURES_IN_A_ROW)
         self._check_log()
-        self._blind.update(self._tally.nothing_in_a_row >= NOTHING_IN_A_ROW)
-        health, load = self._health(), parts.meter.machine_load()
-        status = self._status(health, load)
+        self._no_texture.update(self._tally.blank_in_a_row >= MAX_BLANK_IN_A_ROW)
+        health, load = self._assess_health(), parts.meter.machine_load()
+        status = self._make_status(health, load)
         systemd.notify(STATUS=status["summary"])
         if status["t_mono_s"] >= self._minute_due_s:
             self._minute_due_s += _MINUTE_S
@@ -114,8 +115,8 @@ class Vitals:
     def _check_source(self) -> None:
         source = self._parts.source
         condition = source.condition
-        trouble = _TROUBLES.get(condition)
-        if condition is Condition.OPENING and self._health_due_s - self._start_s > _START_S:
+        trouble = _FAULTS.get(condition)
+        if condition is Condition.OPENING and self._report_due_s - self._start_s > _CAMERA_START_TIMEOUT_S:
             trouble = "gives no picture yet"
         if trouble == self._source_trouble:
             return
@@ -135,20 +136,20 @@ class Vitals:
             if self._parts.link:
                 self._parts.link.announce(Severity.INFO if has_log else Severity.WARNING, text, "log")
 
-    def _health(self) -> Health:
+    def _assess_health(self) -> Health:
         if self._source_trouble or self._frozen.is_frozen:
             return Health.CRITICAL
         if self._commands.is_paused:
             return Health.STANDBY
-        return Health.CRITICAL if self._failing.is_so or self._blind.is_so else Health.ACTIVE
+        return Health.CRITICAL if self._failing.is_active or self._no_texture.is_active else Health.ACTIVE
 
-    def _status(self, health: Health, load: MachineLoad) -> dict[str, Any]:
-        """Return the status of the flight. Its keys that need a word (null: unknown):
+    def _make_status(self, health: Health, load: MachineLoad) -> dict[str, Any]:
+        """Return the status of the flight. Keys that are not obvious (null: unknown):
         - `t_mono_s`: the `time` on the clock of the frames; `latency_s`: age of the newest picture
         - `asked_rate_hz`: queries per second that the flight tries to keep
         - `machine_cpu_share` (0..1), `machine_ram_mb` (of `machine_ram_total_mb`): those of all programs
         - `newest`: the last query; `match`: the last accepted one; `link`: see `ToAutopilot.state` (null: no link)
-        - `remarks`: sentences on what else people should know; `summary`: the most important values in one line.
+        - `remarks`: further sentences for operators; `summary`: the most important values in one line.
         """
         parts, tally, thermal = self._parts, self._tally, self._parts.meter.thermal
         totals, now_s = parts.meter.totals(), parts.io.clock.mono_s()

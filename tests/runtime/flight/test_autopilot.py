@@ -7,7 +7,7 @@ from fakes import FakeSource
 from flights import flight_over, of_kind, pictures
 
 from edgevpr.mavlink.messages import Health
-from edgevpr.runtime.flight.watching import NOTHING_IN_A_ROW
+from edgevpr.runtime.flight.watching import MAX_BLANK_IN_A_ROW
 
 
 def fixes(lines):
@@ -121,4 +121,8 @@ def test_ten_pictures_of_nothing_are_reported_once_and_so_is_the_ground_after_th
     assert queries[1]["fix"] is queries[1]["place"] is None
     assert [severity for severity, _ in link.texts()] == [4, 6]
     assert [line["note"]["code"] for line in of_kind(lines, "camera")] == ["NOTHING_SHOWN", "GROUND_SHOWN"]
-    assert [health[number] for number in (NOTHING_IN_A_ROW, 15, -1)] == [Health.ACTIVE, Health.CRITICAL, Health.ACTIVE]
+    assert [health[number] for number in (MAX_BLANK_IN_A_ROW, 15, -1)] == [
+        Health.ACTIVE,
+        Health.CRITICAL,
+        Health.ACTIVE,
+    ]

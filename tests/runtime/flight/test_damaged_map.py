@@ -12,7 +12,7 @@ from flights import PLACES, STEP_DEG, Flight, fly_acts, nothing, of_kind
 from pictures import textured
 
 from edgevpr.mavlink.messages import Health
-from edgevpr.runtime.flight.watching import FAILURES_IN_A_ROW
+from edgevpr.runtime.flight.watching import MAX_FAILURES_IN_A_ROW
 
 DAMAGE = (None, b"", b"\xff", b"\x00" * 7, "text", 10**18, -1.5, float("inf"), b"\xa5" * 40_000)
 COLUMNS = ("geom", "time", "alt_m", "heading_deg", "source_image", "quality", "coarse", "fine")
@@ -100,11 +100,13 @@ def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
         health.append(link.health)
 
     flight = Flight(place_map, tmp_path / "log", clock, link, **{"source.rate_hz": 1.0})
-    calls = iter([nothing, damage, *[look] * FAILURES_IN_A_ROW, lambda: place_map.write_bytes(whole), look, look, look])
-    count = FAILURES_IN_A_ROW + 6
+    calls = iter(
+        [nothing, damage, *[look] * MAX_FAILURES_IN_A_ROW, lambda: place_map.write_bytes(whole), look, look, look]
+    )
+    count = MAX_FAILURES_IN_A_ROW + 6
     lines = flight.fly(FakeSource([textured(1, 240, 320)] * count, clock, work=lambda: next(calls)()))
     queries = of_kind(lines, "query")
-    assert [line["accepted"] for line in queries] == [True, *[False] * (FAILURES_IN_A_ROW + 1), *[True] * 4]
+    assert [line["accepted"] for line in queries] == [True, *[False] * (MAX_FAILURES_IN_A_ROW + 1), *[True] * 4]
     assert health[-4] is Health.CRITICAL
     assert health[0] is health[-1] is Health.ACTIVE
     assert [line["note"]["code"] for line in of_kind(lines, "failing")] == ["FAILING", "NOT_FAILING"]
@@ -114,7 +116,7 @@ def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
         (6, "edgevpr: its map is read again"),
         (6, "edgevpr: frames are recognised again"),
     ]
-    assert flight.end["unusable"] == FAILURES_IN_A_ROW + 1
+    assert flight.end["unusable"] == MAX_FAILURES_IN_A_ROW + 1
     assert flight.end["left_out"] == 0, "where all are damaged the file is at fault, and may come back"
     told = [record.message for record in caplog.records if "is damaged" in record.message]
     assert len(told) == 1, "the same trouble is said once"

@@ -9,7 +9,7 @@ from walks import map_of
 
 from edgevpr.core.types import Frame, Position
 from edgevpr.runtime.flight import watching
-from edgevpr.runtime.flight.survey import Measure, Sightings, Surveyed
+from edgevpr.runtime.flight.survey import MapSurvey, SurveyMeasure, SurveyResult
 from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
@@ -95,18 +95,18 @@ def test_between_rare_queries_without_gps_pictures_are_taken_for_their_strides(
 @pytest.fixture
 def surveyed(monkeypatch):
     """Nine degrees ahead, and a map that lies 5 m beside GPS: what each survey finds."""
-    known, unknown = Measure((9.0,), 0.9, 1.5, 1.0), Measure((0.0,), 9.0, 1.5, 1.0)
-    off_m = Measure((3.0, -4.0), 0.5, 1.0, 1.0)
+    known, unknown = SurveyMeasure((9.0,), 0.9, 1.5, 1.0), SurveyMeasure((0.0,), 9.0, 1.5, 1.0)
+    off_m = SurveyMeasure((3.0, -4.0), 0.5, 1.0, 1.0)
     where = Position(50.0, 8.0)
     measures = {"off_m": off_m, "scale": unknown, "ahead_deg": known, "right_deg": unknown}
-    found = Surveyed(matches=99, middle=where, measures=measures)
-    monkeypatch.setattr(Sightings, "result", lambda self: found)
+    found = SurveyResult(matches=99, middle=where, measures=measures)
+    monkeypatch.setattr(MapSurvey, "compute_result", lambda self: found)
 
 
 @pytest.mark.usefixtures("surveyed")
 def test_pictures_are_levelled_by_it_as_soon_as_it_is_known(place_map, tmp_path, monkeypatch):
-    monkeypatch.setattr(watching, "_SURVEYED_EVERY", 2)
-    monkeypatch.setattr(Sightings, "take", lambda self, event, is_doubted: True)
+    monkeypatch.setattr(watching, "_SURVEY_INTERVAL", 2)
+    monkeypatch.setattr(MapSurvey, "add_match", lambda self, event, is_doubted: True)
     queries, _ = fly(place_map, tmp_path / "f.jsonl", 0, roll_deg=0.0, pitch_deg=0.0, height_m=80.0)
     _, *of_under = zip(*(query["view"]["aside"] for query in queries), strict=True)
     behind = -80.0 * np.tan(np.radians(9.0)) / 103.9

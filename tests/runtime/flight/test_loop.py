@@ -57,16 +57,16 @@ def test_a_stop_while_others_are_told_lets_them_finish(flight, clock):
     lines = flown.fly(FakeSource([PICTURE] * 9, clock))
     assert len(of_kind(lines, "query")) <= 1
     stop = Stop()
-    with pytest.raises(StopNow), stop.breaks_off():
+    with pytest.raises(StopNow), stop.allow_interrupt():
         stop()
-    assert stop.asked
+    assert stop.is_requested
 
 
 def test_a_stop_before_the_flight_begins_ends_it_at_once():
     stop = Stop()
-    with pytest.raises(StopNow), stop.beginning():
+    with pytest.raises(StopNow), stop.interrupt_start():
         stop()
-    with pytest.raises(StopNow), stop.beginning():
+    with pytest.raises(StopNow), stop.interrupt_start():
         pytest.fail("it was stopped before")
     stop()  # nothing is left to break off
 

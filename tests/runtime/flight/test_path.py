@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edgevpr.core.types import Position
-from edgevpr.runtime.flight.path import KEPT_S, Path, to_ground_acceleration
+from edgevpr.runtime.flight.path import HISTORY_S, Path, to_ground_acceleration
 
 HOME = Position(47.0, 8.0)
 
@@ -14,19 +14,19 @@ HOME = Position(47.0, 8.0)
 def test_only_the_last_seconds_are_kept_and_beyond_the_end_the_velocity_goes_on():
     path = Path(HOME, 0.0, (1.0, 0.0))
     for step in range(1, 2001):
-        path.fly(step / 10, (1.0, 0.0))
-    assert path.at(200.0 - 2 * KEPT_S - 0.2) is None
-    assert np.allclose(path.at(200.0 - KEPT_S + 0.1).at_m, (200.0 - KEPT_S + 0.1, 0))
-    assert np.allclose(path.at(200.9).at_m, (200.9, 0))
-    assert path.at(201.1) is None
+        path.add_velocity(step / 10, (1.0, 0.0))
+    assert path.interpolate(200.0 - 2 * HISTORY_S - 0.2) is None
+    assert np.allclose(path.interpolate(200.0 - HISTORY_S + 0.1).position_m, (200.0 - HISTORY_S + 0.1, 0))
+    assert np.allclose(path.interpolate(200.9).position_m, (200.9, 0))
+    assert path.interpolate(201.1) is None
 
 
 def test_a_silence_breaks_a_path():
     path = Path(HOME, 0.0, (1.0, 0.0))
-    path.fly(0.9, (1.0, 0.0))
+    path.add_velocity(0.9, (1.0, 0.0))
     assert not path.is_broken
-    assert path.fly(0.9, (1.0, 0.0)) == path.fly(0.5, (1.0, 0.0)) == 0.0, "no time has passed"
-    path.fly(2.5, (1.0, 0.0))
+    assert path.add_velocity(0.9, (1.0, 0.0)) == path.add_velocity(0.5, (1.0, 0.0)) == 0.0, "no time has passed"
+    path.add_velocity(2.5, (1.0, 0.0))
     assert path.is_broken
 
 

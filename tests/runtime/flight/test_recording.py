@@ -77,7 +77,7 @@ def test_one_that_is_as_large_as_it_may_be_ends_and_says_so(tmp_path, caplog):
         for _ in range(4):
             tape.keep(bytes(1_500_000))
             tape.note("frame")
-            wait_until(lambda: not tape._waiting)
+            wait_until(lambda: not tape._queue)
         wait_until(lambda: tape.state)
         tape.keep(b"no more")
         tape.note("no more")
@@ -91,7 +91,7 @@ def test_one_that_is_as_large_as_it_may_be_ends_and_says_so(tmp_path, caplog):
 def test_a_full_disk_ends_it_and_nothing_else(tmp_path):
     with Recording(tmp_path, 100) as tape:
         tape.note("x")
-        wait_until(lambda: not tape._waiting)
+        wait_until(lambda: not tape._queue)
         with no_file_larger_than(5000):
             tape.keep(bytes(9000))
             tape.note("frame")
@@ -104,8 +104,8 @@ def test_a_full_disk_ends_it_and_nothing_else(tmp_path):
 @pytest.mark.slow
 def test_the_last_of_the_disk_is_left_to_logs_and_map(tmp_path, monkeypatch):
     disk = os.statvfs(tmp_path)
-    monkeypatch.setattr(module, "SPARED_BYTES", disk.f_bavail * disk.f_frsize + 10**12)
+    monkeypatch.setattr(module, "MIN_FREE_BYTES", disk.f_bavail * disk.f_frsize + 10**12)
     with Recording(tmp_path, 100) as tape:
         tape.note("x")
         wait_until(lambda: tape.state)
-    assert "are left" in tape.state
+    assert "MB free" in tape.state

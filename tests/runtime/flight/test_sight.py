@@ -12,14 +12,14 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.frames.level import View
 from edgevpr.runtime.flight.camerawatch import TurnWatch
 from edgevpr.runtime.flight.flightlog import read_log
-from edgevpr.runtime.flight.watching import Sight
+from edgevpr.runtime.flight.watching import MapCoverageWatch
 
 
 class Seen:
     """A sight with its listeners; `look` shows it pictures, one a second."""
 
     def __init__(self, notifier, clock, link):
-        self.clock, self.link, self.sight = clock, link, Sight(notifier)
+        self.clock, self.link, self.sight = clock, link, MapCoverageWatch(notifier)
 
     def look(self, outcomes: str, every_s: float = 1.0):
         """`+` accepted, `-` not, `L` not and lost, `0` shows nothing, `x` failed, `t` tilted, `n` not worth a search,

@@ -10,7 +10,7 @@ from flights import pictures
 from edgevpr import __version__
 from edgevpr.cli.main import main
 from edgevpr.core.errors import EdgevprError
-from edgevpr.runtime.flight.status import StatusFile, default_path, read_status
+from edgevpr.runtime.flight.status import StatusFile, find_default_path, read_status
 
 STATUS = {"version": __version__, "queries": 7}
 
@@ -76,7 +76,7 @@ def test_top_shows_the_status_of_a_flight_and_none_of_one_that_is_gone(make_flig
 )
 def test_a_service_has_a_folder_for_it(monkeypatch, folder, usual):
     monkeypatch.setenv("RUNTIME_DIRECTORY", folder)
-    assert default_path() == usual
+    assert find_default_path() == usual
 
 
 def test_a_disk_that_is_full_ends_no_flight(path):

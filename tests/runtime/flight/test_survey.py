@@ -16,8 +16,8 @@ from edgevpr.frames.level import STRAIGHT_DOWN, View
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
 from edgevpr.runtime.flight.gpswatch import GpsWatch
 from edgevpr.runtime.flight.notifier import Notifier
-from edgevpr.runtime.flight.survey import Sightings
-from edgevpr.runtime.flight.watching import Surveyor
+from edgevpr.runtime.flight.survey import MapSurvey
+from edgevpr.runtime.flight.watching import SurveyReporter
 from edgevpr.runtime.recognise.levelling import read_mount
 
 OFF_M, SCALE, AHEAD_DEG, RIGHT_DEG = np.array([5.0, -3.0]), 0.01, 9.0, -3.0
@@ -84,10 +84,10 @@ def events(way, seconds, seed=1, wrong=0.0, scale=SCALE, compass_deg=0.0, **said
 
 
 def surveyed(way, seconds, mount=STRAIGHT_DOWN, **how):
-    sightings = Sightings(mount, is_level=False)
+    sightings = MapSurvey(mount, is_level=False)
     for event in events(way, seconds, **how):
-        sightings.take(event)
-    return sightings.result()
+        sightings.add_match(event)
+    return sightings.compute_result()
 
 
 def wrong_m(found):
@@ -153,15 +153,15 @@ def test_without_gps_or_attitude_nothing_is_found(said):
 def test_a_position_that_may_be_ours_is_not_gps():
     """After a fix of ours the autopilot may repeat it: the receiver itself counts, which is 0.1 s late here."""
     rng = np.random.default_rng(3)
-    sightings = Sightings(STRAIGHT_DOWN, is_level=False)
+    sightings = MapSurvey(STRAIGHT_DOWN, is_level=False)
     for event in events(lanes, 900):
         vehicle, v = event.vehicle, event.vehicle.velocity_m_s
         late = offset_position(vehicle.lat_deg, vehicle.lon_deg, -0.1 * v[0], -0.1 * v[1])
         ours = offset_position(vehicle.lat_deg, vehicle.lon_deg, *rng.normal(20, 5, 2))
         gps = receiver_at(late, GPS_SD_M, event.frame.t_mono_s)
         vehicle = replace(vehicle, lat_deg=ours[0], lon_deg=ours[1], gps=gps, t_fix_s=event.frame.t_mono_s)
-        sightings.take(replace(event, vehicle=vehicle))
-    found = sightings.result()
+        sightings.add_match(replace(event, vehicle=vehicle))
+    found = sightings.compute_result()
     assert np.abs(wrong_m(found)).max() < 2.5 * found.measures["off_m"].sd
     assert found.measures["ahead_deg"].value[0] == pytest.approx(AHEAD_DEG, abs=found.measures["ahead_deg"].sd)
 
@@ -189,7 +189,7 @@ class Flown:
             notifier = Notifier(flight_log, link)
             watch = GpsWatch(map_sd_m, notifier, None)
             self.mounts, beside = [], read_mount(config.source)
-            surveyor = Surveyor(notifier, watch, config.source, self.mounts.append)
+            surveyor = SurveyReporter(notifier, watch, config.source, self.mounts.append)
             for event in flight:
                 clock.now_s = event.frame.t_mono_s
                 if self.mounts:
