@@ -14,7 +14,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.types import Frame, Receiver, Vehicle
 from edgevpr.frames.shot import Condition
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.fixes import Fixes, Sending
+from edgevpr.mavlink.fixes import Fixes, FixTransmission
 from edgevpr.mavlink.ground import Wish, Wished
 from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
@@ -163,7 +163,7 @@ class FakeLink:
     def send(self, *outgoing) -> None:
         self.sent += outgoing
 
-    def send_fix(self, fix: Fix) -> Sending:
+    def send_fix(self, fix: Fix) -> FixTransmission:
         sending = self._waiting.put(fix, self._clock())
         self._turn()
         return sending
@@ -174,7 +174,7 @@ class FakeLink:
     def accept_wishes(self) -> None:
         self._is_under_way = True
 
-    def take_between(self):
+    def take_interim_fixes(self):
         return []
 
     def take_wish(self) -> Wished | None:
@@ -190,13 +190,13 @@ class FakeLink:
     def set_health(self, health: Health) -> None:
         self.health = health
 
-    def want_position(self) -> None:
+    def request_position(self) -> None:
         pass
 
     def vehicle(self) -> Vehicle | None:
         return self._vehicle()
 
-    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
+    def predict_vehicle(self, t_mono_s: float) -> Vehicle | None:
         vehicle = self.vehicle()
         if vehicle is None:
             return None

@@ -102,7 +102,7 @@ def link(request):
 
     try:
         with link_to(f"udpout:127.0.0.1:{number}", clock=clock) as real:
-            real.want_position()
+            real.request_position()
             wait_until(is_ready)
             yield real, clock
     finally:
@@ -130,7 +130,7 @@ def test_send_fix_is_answered_or_dropped_and_link_reports_the_vehicle(link):
     assert (vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m) == (50.0, 8.0, 300.0)
     assert (vehicle.heading_deg, vehicle.has_gps) == (None, False)
     assert vehicle.is_fresh(clock.now_s)
-    seen = link.vehicle_at(clock.now_s)
+    seen = link.predict_vehicle(clock.now_s)
     assert (seen.lat_deg, seen.lon_deg, seen.heading_deg, seen.roll_deg) == (50.0, 8.0, None, None)
 
 

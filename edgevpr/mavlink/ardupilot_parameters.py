@@ -4,24 +4,24 @@ receivers: a real one with a fix must always come first. Each row names the file
 from collections.abc import Iterator
 
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.mavlink.channel import Channel, Choice, Kind, Parameters, own_name, read_value
+from edgevpr.mavlink.channel import Channel, ChannelChoice, Parameters, VehicleKind, read_value, resolve_name
 from edgevpr.mavlink.parameters import (
     MAX_DELAY_MS,
     MAX_OFFSET_M,
     Check,
     ParameterTable,
-    at_most,
-    dangerous,
-    demand,
+    expect,
     has_bit,
     is_small_offset,
     join_checks,
-    name_axes,
-    weak,
+    list_axes,
+    make_limit,
+    recommend,
+    require,
 )
 
 MAVLINK_GPS = 14  # value of GPSn_TYPE: the receiver's positions come as GPS_INPUT
-SECOND = 1  # index of the receiver that we advise the user to give to us
+ADVISED_RECEIVER = 1  # index of the receiver that we advise the user to give to us
 RECEIVERS = ("GPS1_TYPE", "GPS2_TYPE")
 DELAYS = ("GPS1_DELAY_MS", "GPS2_DELAY_MS")
 VISION = "VISO_TYPE"
@@ -29,40 +29,44 @@ _MAVLINK_VISION = 1
 # AP_GPS assumes this age for the positions of a receiver whose delay is not configured (GPS_Backend::get_lag).
 _GPS_LAG_S = 0.2
 
-_ALL = (Channel.COMMAND, Channel.GPS_INPUT, Channel.ODOMETRY)
-_BY_GPS = (Channel.GPS_INPUT,)
-_BY_ODOMETRY = (Channel.ODOMETRY,)
-_CONTINUOUS = _BY_GPS + _BY_ODOMETRY
+_ALL_CHANNELS = (Channel.COMMAND, Channel.GPS_INPUT, Channel.ODOMETRY)
+_GPS_INPUT = (Channel.GPS_INPUT,)
+_ODOMETRY = (Channel.ODOMETRY,)
+_CONTINUOUS = _GPS_INPUT + _ODOMETRY
 
 # Values of GPS_AUTO_SWITCH.
-_PRIMARY_ALWAYS = 0
-_BEST = 1
-_BLEND = 2
-_PRIMARY_WHILE_FIXED = 4
+_SWITCH_PRIMARY = 0
+_SWITCH_BEST = 1
+_SWITCH_BLEND = 2
+_SWITCH_PRIMARY_IF_3D = 4
 # Bits of GPS_BLEND_MASK, EK3_AFFINITY, EK3_SRC_OPTIONS and ARMING_CHECK.
-_BLENDS_POSITION = 1
-_BLENDS_HEIGHT = 2
-_GPS_LANES = 1
-_SET_PER_LANE = 8
-_ALL_CHECKS = 1
-_GPS_CHECK = 1 << 3
-_VISION_CHECK = 1 << 18
+_BLEND_POSITION_BIT = 1
+_BLEND_HEIGHT_BIT = 2
+_AFFINITY_GPS_BIT = 1
+_SET_PER_LANE_BIT = 8
+_ALL_CHECKS_BIT = 1
+_GPS_CHECK_BIT = 1 << 3
+_VISION_CHECK_BIT = 1 << 18
 # Values of EK3_SRCn_...
-_FROM_GPS = 3
-_FROM_VISION = 6
-_FROM_GPS_VELOCITY = 8
-_BARO = 1
-_COMPASS = 1
+_SOURCE_GPS = 3
+_SOURCE_VISION = 6
+_SOURCE_GSF = 8
+_SOURCE_BARO = 1
+_SOURCE_COMPASS = 1
 # What an ODOMETRY repeats of the autopilot's own: name of the source, its wrong value, and a right one.
-_OWN_SOURCES = (("POSZ", _FROM_VISION, _BARO), ("VELZ", _FROM_VISION, 0), ("YAW", _FROM_VISION, _COMPASS))
+_OWN_SOURCES = (
+    ("POSZ", _SOURCE_VISION, _SOURCE_BARO),
+    ("VELZ", _SOURCE_VISION, 0),
+    ("YAW", _SOURCE_VISION, _SOURCE_COMPASS),
+)
 _MAX_GPS_DELAY_MS = 250  # EK3's buffer is never longer: AP_NavEKF3_core.cpp, setup_core
 _MAX_GLITCH_RADIUS_M = 100
 _MAX_VISION_SD_M = 10
 # Set 2 for ODOMETRY: position by us, height and heading by the autopilot's own sensors.
-_VISION_SET = ("EK3_SRC2_POSXY=6", "EK3_SRC2_VELXY=0", "EK3_SRC2_POSZ=1", "EK3_SRC2_YAW=1")
+_VISION_SET_CHANGES = ("EK3_SRC2_POSXY=6", "EK3_SRC2_VELXY=0", "EK3_SRC2_POSZ=1", "EK3_SRC2_YAW=1")
 
 
-def choose_ardupilot_channel(kind: Kind, parameters: Parameters) -> Choice:
+def choose_ardupilot_channel(kind: VehicleKind, parameters: Parameters) -> ChannelChoice:
     """Choose the channel for an ArduPilot: GPS_INPUT or ODOMETRY if its parameters are set for it, else command 43003.
     `parameters` has values by name, without those that the autopilot does not have.
 
@@ -70,69 +74,75 @@ def choose_ardupilot_channel(kind: Kind, parameters: Parameters) -> Choice:
     Without GPS and optical flow a copter lands after some seconds and a rover stops, whatever single fixes say.
     """
     for number in range(len(RECEIVERS)):
-        name = own_name(parameters, RECEIVERS[number])
+        name = resolve_name(parameters, RECEIVERS[number])
         if parameters.get(name) == MAVLINK_GPS:
             delay_ms = read_value(parameters, DELAYS[number], 0)
             lag_s = delay_ms / 1e3 if delay_ms > 0 else _GPS_LAG_S
-            return Choice(Channel.GPS_INPUT, Reason(ReasonCode.BY_GPS_INPUT, {"parameter": name}), number, lag_s)
+            return ChannelChoice(Channel.GPS_INPUT, Reason(ReasonCode.BY_GPS_INPUT, {"parameter": name}), number, lag_s)
     if parameters.get(VISION) == _MAVLINK_VISION:
-        sets = [n for n, name in enumerate(_name_sources("POSXY"), 1) if parameters.get(name) == _FROM_VISION]
+        sets = [n for n, name in enumerate(_name_sources("POSXY"), 1) if parameters.get(name) == _SOURCE_VISION]
         source_set = None if 1 in sets or not sets else sets[0]
         reason = Reason(ReasonCode.BY_ODOMETRY, {"parameter": VISION, "source_set": source_set})
-        return Choice(Channel.ODOMETRY, reason)
-    if kind is Kind.PLANE:
-        return Choice(Channel.COMMAND, Reason(ReasonCode.COMMAND_TO_PLANE))
-    change = f"{own_name(parameters, RECEIVERS[SECOND])}={MAVLINK_GPS}"
-    return Choice(Channel.COMMAND, Reason(ReasonCode.COMMAND_NEEDS_FLOW, {"vehicle": kind.value, "change": change}))
+        return ChannelChoice(Channel.ODOMETRY, reason)
+    if kind is VehicleKind.PLANE:
+        return ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_TO_PLANE))
+    change = f"{resolve_name(parameters, RECEIVERS[ADVISED_RECEIVER])}={MAVLINK_GPS}"
+    return ChannelChoice(
+        Channel.COMMAND, Reason(ReasonCode.COMMAND_NEEDS_FLOW, {"vehicle": kind.value, "change": change})
+    )
 
 
-def _has_other_receiver(parameters: Parameters, choice: Choice) -> bool:
+def _has_other_receiver(parameters: Parameters, choice: ChannelChoice) -> bool:
     return read_value(parameters, RECEIVERS[1 - choice.receiver], 0) != 0
 
 
-def _is_primary(parameters: Parameters, choice: Choice) -> bool:
+def _is_primary(parameters: Parameters, choice: ChannelChoice) -> bool:
     """Return True if ArduPilot takes our receiver for the primary one (AP_GPS::update_primary)."""
     is_second = parameters.get("GPS_PRIMARY") == 1 and read_value(parameters, RECEIVERS[1], 0) != 0
     return int(is_second) == choice.receiver
 
 
-def _find_primary(parameters: Parameters, choice: Choice) -> Iterator[str]:
+def _check_primary(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
     """AP_GPS.cpp, update_primary: the primary receiver, while it has a 3D fix, or for ever."""
-    switch = parameters.get("GPS_AUTO_SWITCH", _BEST)
+    switch = parameters.get("GPS_AUTO_SWITCH", _SWITCH_BEST)
     is_ours = _is_primary(parameters, choice) and _has_other_receiver(parameters, choice)
-    if switch in (_PRIMARY_ALWAYS, _PRIMARY_WHILE_FIXED) and is_ours:
+    if switch in (_SWITCH_PRIMARY, _SWITCH_PRIMARY_IF_3D) and is_ours:
         yield f"GPS_PRIMARY={1 - choice.receiver}"
-        if switch == _PRIMARY_ALWAYS:
-            yield f"GPS_AUTO_SWITCH={_BEST}"
+        if switch == _SWITCH_PRIMARY:
+            yield f"GPS_AUTO_SWITCH={_SWITCH_BEST}"
 
 
-def _find_switch(parameters: Parameters, choice: Choice) -> Iterator[str]:
+def _check_switch(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
     """AP_GPS.cpp, update_primary: with 0 no other receiver is ever used; 2 uses all of them."""
-    switch = parameters.get("GPS_AUTO_SWITCH", _BEST)
-    if switch in (_BEST, _PRIMARY_WHILE_FIXED) or (switch == _PRIMARY_ALWAYS and _is_primary(parameters, choice)):
+    switch = parameters.get("GPS_AUTO_SWITCH", _SWITCH_BEST)
+    if switch in (_SWITCH_BEST, _SWITCH_PRIMARY_IF_3D) or (
+        switch == _SWITCH_PRIMARY and _is_primary(parameters, choice)
+    ):
         return
-    if switch != _BLEND or (_has_other_receiver(parameters, choice) and not any(_find_blend(parameters, choice))):
-        yield f"GPS_AUTO_SWITCH={_BEST}"
+    if switch != _SWITCH_BLEND or (
+        _has_other_receiver(parameters, choice) and not any(_check_blend(parameters, choice))
+    ):
+        yield f"GPS_AUTO_SWITCH={_SWITCH_BEST}"
 
 
-def _find_blend(parameters: Parameters, choice: Choice) -> Iterator[str]:
+def _check_blend(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
     """AP_GPS_Blended.cpp, _calc_weights: the mean of one weight for each bit of the mask. By horizontal accuracy ours
     is about 0.01, by speed 0.1. By height it is a third to a half, since our height is the autopilot's own."""
     mask = parameters.get("GPS_BLEND_MASK", 5)
-    is_safe = has_bit(mask, _BLENDS_POSITION) and not has_bit(mask, _BLENDS_HEIGHT)
-    is_blended = parameters.get("GPS_AUTO_SWITCH") == _BLEND and _has_other_receiver(parameters, choice)
+    is_safe = has_bit(mask, _BLEND_POSITION_BIT) and not has_bit(mask, _BLEND_HEIGHT_BIT)
+    is_blended = parameters.get("GPS_AUTO_SWITCH") == _SWITCH_BLEND and _has_other_receiver(parameters, choice)
     if is_blended and not is_safe:
-        yield f"GPS_AUTO_SWITCH={_BEST}"
+        yield f"GPS_AUTO_SWITCH={_SWITCH_BEST}"
 
 
-def _find_lanes(parameters: Parameters, choice: Choice) -> Iterator[str]:
+def _check_lanes(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
     """AP_NavEKF3_Measurements.cpp, update_gps_selection: lane n flies by receiver n while that has a 3D fix."""
     affinity = parameters.get("EK3_AFFINITY", 0)
-    if has_bit(affinity, _GPS_LANES) and _has_other_receiver(parameters, choice):
-        yield f"EK3_AFFINITY={int(affinity) & ~_GPS_LANES}"
+    if has_bit(affinity, _AFFINITY_GPS_BIT) and _has_other_receiver(parameters, choice):
+        yield f"EK3_AFFINITY={int(affinity) & ~_AFFINITY_GPS_BIT}"
 
 
-def _check_receivers(*checks: Check) -> Check:
+def _check_own_receiver(*checks: Check) -> Check:
     """Join the checks of the two receivers to one that goes by that of our own."""
     names = tuple(name for check in checks for name in check.names)
     return Check(names, lambda parameters, choice: checks[choice.receiver].find_changes(parameters, choice))
@@ -144,109 +154,110 @@ def _name_sources(what: str) -> tuple[str, ...]:
 
 def _refuse_source(what: str, wrong: int, right: int) -> Check:
     """Demand that no source set has the source `wrong` for `what`."""
-    return demand(right, *_name_sources(what), allows=lambda source: source != wrong)
+    return expect(right, *_name_sources(what), allows=lambda source: source != wrong)
 
 
 def _has_source(parameters: Parameters, source: int) -> bool:
     first, *others = _name_sources("POSXY")
-    return parameters.get(first, _FROM_GPS) == source or source in map(parameters.get, others)
+    return parameters.get(first, _SOURCE_GPS) == source or source in map(parameters.get, others)
 
 
-def _find_set(parameters: Parameters, choice: Choice) -> Iterator[str]:
+def _check_source_set(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
     """AP_NavEKF_Source.cpp: a source that no set has is never used."""
-    if choice.channel is Channel.GPS_INPUT and not _has_source(parameters, _FROM_GPS):
-        yield f"EK3_SRC1_POSXY={_FROM_GPS}"
-    if choice.channel is Channel.ODOMETRY and not _has_source(parameters, _FROM_VISION):
-        yield from _VISION_SET
+    if choice.channel is Channel.GPS_INPUT and not _has_source(parameters, _SOURCE_GPS):
+        yield f"EK3_SRC1_POSXY={_SOURCE_GPS}"
+    if choice.channel is Channel.ODOMETRY and not _has_source(parameters, _SOURCE_VISION):
+        yield from _VISION_SET_CHANGES
 
 
-def _find_set_per_lane(parameters: Parameters, _choice: Choice) -> Iterator[str]:
+def _check_set_per_lane(parameters: Parameters, _choice: ChannelChoice) -> Iterator[str]:
     """AP_NavEKF_Source.h, getActiveSourceSet: lane n uses set n, whatever the pilot selects."""
     options = parameters.get("EK3_SRC_OPTIONS", 0)
-    is_mixed = _has_source(parameters, _FROM_GPS) and _has_source(parameters, _FROM_VISION)
-    if has_bit(options, _SET_PER_LANE) and is_mixed:
-        yield f"EK3_SRC_OPTIONS={int(options) & ~_SET_PER_LANE}"
+    is_mixed = _has_source(parameters, _SOURCE_GPS) and _has_source(parameters, _SOURCE_VISION)
+    if has_bit(options, _SET_PER_LANE_BIT) and is_mixed:
+        yield f"EK3_SRC_OPTIONS={int(options) & ~_SET_PER_LANE_BIT}"
 
 
-def _find_checks(parameters: Parameters, choice: Choice) -> Iterator[str]:
+def _check_arming(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
     """AP_Arming.cpp, check_enabled."""
-    bit = _GPS_CHECK if choice.channel is Channel.GPS_INPUT else _VISION_CHECK
-    if not has_bit(parameters.get("ARMING_CHECK", _ALL_CHECKS), _ALL_CHECKS | bit):
-        yield f"ARMING_CHECK={_ALL_CHECKS}"
+    bit = _GPS_CHECK_BIT if choice.channel is Channel.GPS_INPUT else _VISION_CHECK_BIT
+    if not has_bit(parameters.get("ARMING_CHECK", _ALL_CHECKS_BIT), _ALL_CHECKS_BIT | bit):
+        yield f"ARMING_CHECK={_ALL_CHECKS_BIT}"
     if has_bit(parameters.get("ARMING_SKIPCHK", 0), bit):
         yield "ARMING_SKIPCHK=0"
 
 
 # fmt: off
 _RULES = (
-    dangerous(_BY_GPS, "the index of the real receiver: 0 if GPS2_TYPE is 14, 1 if GPS1_TYPE is",
-        Check(("GPS_PRIMARY", "GPS_AUTO_SWITCH", *RECEIVERS), _find_primary),
+    require(_GPS_INPUT, "the index of the real receiver: 0 if GPS2_TYPE is 14, 1 if GPS1_TYPE is",
+        Check(("GPS_PRIMARY", "GPS_AUTO_SWITCH", *RECEIVERS), _check_primary),
         "With GPS_AUTO_SWITCH 0 or 4 it flies by us, the primary receiver, while GPS is good."),
-    weak(_BY_GPS, "1; 4 is as good",
-        Check(("GPS_AUTO_SWITCH", "GPS_PRIMARY", "GPS_BLEND_MASK", *RECEIVERS), _find_switch),
+    recommend(_GPS_INPUT, "1; 4 is as good",
+        Check(("GPS_AUTO_SWITCH", "GPS_PRIMARY", "GPS_BLEND_MASK", *RECEIVERS), _check_switch),
         "With 0 our receiver is never used; with 2 a part of each position is ours while GPS is good."),
-    dangerous(_BY_GPS, "1 or 5, where GPS_AUTO_SWITCH is 2",
-        Check(("GPS_BLEND_MASK", "GPS_AUTO_SWITCH", *RECEIVERS), _find_blend),
+    require(_GPS_INPUT, "1 or 5, where GPS_AUTO_SWITCH is 2",
+        Check(("GPS_BLEND_MASK", "GPS_AUTO_SWITCH", *RECEIVERS), _check_blend),
         "Without the bit 1, or with the bit 2, a large part of each position is ours while GPS is good."),
-    dangerous(_BY_GPS, "0, or any value without the bit 1 (GPS); then EK3_PRIMARY may be any",
-        Check(("EK3_AFFINITY", "EK3_PRIMARY", *RECEIVERS), _find_lanes),
+    require(_GPS_INPUT, "0, or any value without the bit 1 (GPS); then EK3_PRIMARY may be any",
+        Check(("EK3_AFFINITY", "EK3_PRIMARY", *RECEIVERS), _check_lanes),
         "With the bit 1 a lane of the filter flies by us while GPS is good."),
     # AP_GPS.cpp, get_lag: any delay is believed, but the filter's buffer ends (NavEKF3_core::setup_core).
-    dangerous(_BY_GPS,
+    require(_GPS_INPUT,
         f"0 to {_MAX_GPS_DELAY_MS}: edgevpr reads it, and sends where it was so long ago (0: 0.2 s)",
-        _check_receivers(*(demand(0, name, allows=at_most(_MAX_GPS_DELAY_MS)) for name in DELAYS)),
+        _check_own_receiver(*(expect(0, name, allows=make_limit(_MAX_GPS_DELAY_MS)) for name in DELAYS)),
         "The filter cannot take a position so far back, and would take it for a newer one.", "GPSn_DELAY_MS"),
     # AP_NavEKF3_Measurements.cpp, CorrectGPSForAntennaOffset: it is taken off our position.
-    dangerous(_BY_GPS, f"within {MAX_OFFSET_M:g} m of 0 for our receiver",
-        _check_receivers(*(demand(0, *name_axes(f"GPS{n}_POS"), allows=is_small_offset) for n in (1, 2))),
+    require(_GPS_INPUT, f"within {MAX_OFFSET_M:g} m of 0 for our receiver",
+        _check_own_receiver(*(expect(0, *list_axes(f"GPS{n}_POS"), allows=is_small_offset) for n in (1, 2))),
         "We send the position of the vehicle itself, and an antenna's place would move it.", "GPSn_POS_*"),
-    dangerous(_BY_GPS, "1",  # AP_AHRS_DCM.cpp and AP_AHRS.cpp, get_relative_position_D_home
-        demand(1, "AHRS_GPS_USE", allows=lambda value: value in (0, 1)),
+    require(_GPS_INPUT, "1",  # AP_AHRS_DCM.cpp and AP_AHRS.cpp, get_relative_position_D_home
+        expect(1, "AHRS_GPS_USE", allows=lambda value: value in (0, 1)),
         "With 2 the height can come from our receiver, and that is the autopilot's own height."),
-    weak(_ALL, "AHRS_EKF_TYPE 3, EK3_ENABLE 1",  # AP_AHRS.cpp, handle_external_position_estimate
-        join_checks(demand(1, "EK3_ENABLE"), demand(3, "AHRS_EKF_TYPE")),
+    recommend(_ALL_CHANNELS, "AHRS_EKF_TYPE 3, EK3_ENABLE 1",  # AP_AHRS.cpp, handle_external_position_estimate
+        join_checks(expect(1, "EK3_ENABLE"), expect(3, "AHRS_EKF_TYPE")),
         "Only the third EKF takes our positions: use it, and reboot.", "AHRS_EKF_TYPE"),
-    weak(_CONTINUOUS, "3 in one set for GPS_INPUT; 6 in one set for ODOMETRY",
-        Check(_name_sources("POSXY"), _find_set), "No source set of the filter takes our position.", "EK3_SRCn_POSXY"),
-    dangerous(_BY_GPS, "not 3",  # AP_NavEKF3_PosVelFusion.cpp, selectHeightForFusion
-        _refuse_source("POSZ", _FROM_GPS, right=_BARO),
+    recommend(_CONTINUOUS, "3 in one set for GPS_INPUT; 6 in one set for ODOMETRY",
+        Check(_name_sources("POSXY"), _check_source_set),
+        "No source set of the filter takes our position.", "EK3_SRCn_POSXY"),
+    require(_GPS_INPUT, "not 3",  # AP_NavEKF3_PosVelFusion.cpp, selectHeightForFusion
+        _refuse_source("POSZ", _SOURCE_GPS, right=_SOURCE_BARO),
         "The height would come from our receiver, and that is the autopilot's own height.", "EK3_SRCn_POSZ"),
-    dangerous(_BY_GPS, "not 8",  # EKFGSF_yaw.cpp: accelerations have to fit the receiver's velocity
-        _refuse_source("YAW", _FROM_GPS_VELOCITY, right=_COMPASS),
+    require(_GPS_INPUT, "not 8",  # EKFGSF_yaw.cpp: accelerations have to fit the receiver's velocity
+        _refuse_source("YAW", _SOURCE_GSF, right=_SOURCE_COMPASS),
         "The heading would come from our velocity, and that is computed with the autopilot's own heading.",
         "EK3_SRCn_YAW"),
-    weak(_CONTINUOUS, f"above 0, up to {_MAX_GLITCH_RADIUS_M}",  # SelectVelPosFusion
-        demand(25, "EK3_GLITCH_RAD", allows=lambda radius_m: 0 < radius_m <= _MAX_GLITCH_RADIUS_M),
+    recommend(_CONTINUOUS, f"above 0, up to {_MAX_GLITCH_RADIUS_M}",  # SelectVelPosFusion
+        expect(25, "EK3_GLITCH_RAD", allows=lambda radius_m: 0 < radius_m <= _MAX_GLITCH_RADIUS_M),
         "With 0 the filter refuses no position, not even a wrong one; with more it comes back to a right one late."),
-    weak(_CONTINUOUS,
+    recommend(_CONTINUOUS,
         "1, or with the bits 8 (GPS) and 262144 (vision); ARMING_SKIPCHK in newer firmware: without them",
-        Check(("ARMING_CHECK",), _find_checks), "It arms although our positions do not come, or contradict GPS."),
+        Check(("ARMING_CHECK",), _check_arming), "It arms although our positions do not come, or contradict GPS."),
     # AP_VisualOdom_MAV.cpp: VISO_VEL_M_NSE is the accuracy, whatever we send.
-    dangerous(_BY_ODOMETRY, "not 6", _refuse_source("VELXY", _FROM_VISION, right=0),
+    require(_ODOMETRY, "not 6", _refuse_source("VELXY", _SOURCE_VISION, right=0),
         "Our velocity comes from the same matches as the position; the filter would trust it more than its gyros.",
         "EK3_SRCn_VELXY"),
-    dangerous(_BY_ODOMETRY, "POSZ, VELZ and YAW not 6",
+    require(_ODOMETRY, "POSZ, VELZ and YAW not 6",
         join_checks(*(_refuse_source(*source) for source in _OWN_SOURCES)),
         "Height, climb and heading in our ODOMETRY are the autopilot's own: it would measure itself.", "EK3_SRCn_*"),
-    dangerous(_BY_ODOMETRY, "without the bit 8, where one set has GPS and one has us",
-        Check(("EK3_SRC_OPTIONS", *_name_sources("POSXY")), _find_set_per_lane),
+    require(_ODOMETRY, "without the bit 8, where one set has GPS and one has us",
+        Check(("EK3_SRC_OPTIONS", *_name_sources("POSXY")), _check_set_per_lane),
         "Each lane of the filter has its own source set, so one flies by us while GPS is good."),
-    dangerous(_BY_ODOMETRY, "1", demand(1, "VISO_SCALE"),  # AP_VisualOdom_MAV, handle_pose_estimate
+    require(_ODOMETRY, "1", expect(1, "VISO_SCALE"),  # AP_VisualOdom_MAV, handle_pose_estimate
         "It multiplies our distance from the origin."),
     # AP_VisualOdom_Backend.cpp turns VISION_POSITION_DELTA only, AP_VisualOdom_IntelT265.cpp all, but is not ours.
-    weak(_BY_ODOMETRY, "0", demand(0, "VISO_ORIENT"),
+    recommend(_ODOMETRY, "0", expect(0, "VISO_ORIENT"),
         "Our positions must not be turned; 4.7 does not turn those of ODOMETRY, but that may change."),
-    dangerous(_BY_ODOMETRY, f"within {MAX_OFFSET_M:g} m of 0",  # CorrectExtNavForSensorOffset
-        demand(0, *name_axes("VISO_POS"), allows=is_small_offset),
+    require(_ODOMETRY, f"within {MAX_OFFSET_M:g} m of 0",  # CorrectExtNavForSensorOffset
+        expect(0, *list_axes("VISO_POS"), allows=is_small_offset),
         "We send the position of the vehicle itself, and a camera's place would move it.", "VISO_POS_*"),
-    dangerous(_BY_ODOMETRY, f"10, the default; up to {MAX_DELAY_MS:g}",
-        demand(10, "VISO_DELAY_MS", allows=at_most(MAX_DELAY_MS)),  # AP_NavEKF3_Measurements.cpp, writeExtNavData
+    require(_ODOMETRY, f"10, the default; up to {MAX_DELAY_MS:g}",
+        expect(10, "VISO_DELAY_MS", allows=make_limit(MAX_DELAY_MS)),  # AP_NavEKF3_Measurements.cpp, writeExtNavData
         "We send the position of the moment, and it would be taken for an old one."),
-    dangerous(_BY_ODOMETRY, "0 to 100",  # AP_VisualOdom_MAV.cpp, handle_pose_estimate
-        demand(0, "VISO_QUAL_MIN", allows=lambda quality: quality >= 0),
+    require(_ODOMETRY, "0 to 100",  # AP_VisualOdom_MAV.cpp, handle_pose_estimate
+        expect(0, "VISO_QUAL_MIN", allows=lambda quality: quality >= 0),
         "With -1 even a position that we call bad is used."),
-    weak(_BY_ODOMETRY, f"up to {_MAX_VISION_SD_M}",  # handle_pose_estimate: the least deviation
-        demand(0.2, "VISO_POS_M_NSE", allows=at_most(_MAX_VISION_SD_M)),
+    recommend(_ODOMETRY, f"up to {_MAX_VISION_SD_M}",  # handle_pose_estimate: the least deviation
+        expect(0.2, "VISO_POS_M_NSE", allows=make_limit(_MAX_VISION_SD_M)),
         "A good position counts for no more than a poor one."),
 )
 # fmt: on

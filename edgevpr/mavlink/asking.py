@@ -11,27 +11,27 @@ from dataclasses import dataclass
 from edgevpr.core.errors import LinkError
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import LinkAddress
-from edgevpr.mavlink.channel import Kind, classify_vehicle
+from edgevpr.mavlink.channel import VehicleKind, classify_vehicle
 from edgevpr.mavlink.messages import AUTOPILOT, Health
-from edgevpr.mavlink.parameters import name_alternative
+from edgevpr.mavlink.parameters import find_alternative
 from edgevpr.mavlink.ports import open_port
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink, parameter_value
 
-HEARTBEAT_S = 1.0
-HEARTBEAT_WAIT_S = 5.0  # an autopilot sends one each second
-TRIES = 3
-ANSWER_WAIT_S = 1.0
-IN_FLIGHT = 10  # parameters asked for at once; ArduPilot drops what comes on top of 20
+HEARTBEAT_INTERVAL_S = 1.0
+HEARTBEAT_TIMEOUT_S = 5.0  # an autopilot sends one each second
+MAX_TRIES = 3
+ANSWER_TIMEOUT_S = 1.0
+MAX_PARALLEL_REQUESTS = 10  # parameters asked for at once; ArduPilot drops what comes on top of 20
 LISTEN_S = 4.0  # for other autopilots, damaged bytes and signatures
 
-_STREAMED_WITHIN_S = 1.2
-_FINAL = (mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED)
+_STREAM_TIMEOUT_S = 1.2
+_REFUSALS = (mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED)
 _FIRMWARES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", mavlink.MAV_AUTOPILOT_PX4: "px4"}
 _RELEASES = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}  # FIRMWARE_VERSION_TYPE
 
 
-class Inquiry(AbstractContextManager["Inquiry"]):
+class RequestLink(AbstractContextManager["RequestLink"]):
     """A link to one autopilot, for a caller that waits for each answer. It sends a heartbeat once a second, as some
     ports of autopilots do not answer without. It is a context manager, which raises LinkError when the link is lost.
 
@@ -67,27 +67,29 @@ class Inquiry(AbstractContextManager["Inquiry"]):
         if isinstance(error, OSError):
             raise LinkError(f"{self._address} was lost ({error.strerror or error}): look at the cable.") from error
 
-    def heartbeat(self, wait_s: float = HEARTBEAT_WAIT_S) -> Message | None:
+    def heartbeat(self, wait_s: float = HEARTBEAT_TIMEOUT_S) -> Message | None:
         """Wait for the heartbeat of an autopilot (None: none came); from then on all others are ignored."""
-        return self._first(wait_s, lambda message: bool(message.get_type() == "HEARTBEAT"))
+        return self._wait_for(wait_s, lambda message: bool(message.get_type() == "HEARTBEAT"))
 
     def listen(self, wait_s: float) -> None:
         """Receive messages for `wait_s` seconds without asking for any; they are only counted."""
-        self._first(wait_s, lambda message: False)
+        self._wait_for(wait_s, lambda message: False)
 
     def message(self, message_id: int) -> Message | None:
         """Request one message (MAV_CMD_REQUEST_MESSAGE) and return it; None: it was refused, or not answered."""
         name = mavlink.mavlink_map[message_id].msgname
-        for _ in range(TRIES):
+        for _ in range(MAX_TRIES):
             sent_s = time.monotonic()
-            self._put(messages.message_request(self.system_id or 0, message_id))
-            answer = self._first(ANSWER_WAIT_S, lambda message: message.get_type() == name or _refuses(message))
+            self._send(messages.message_request(self.system_id or 0, message_id))
+            answer = self._wait_for(
+                ANSWER_TIMEOUT_S, lambda message: message.get_type() == name or _is_refusal(message)
+            )
             if answer is None:
                 continue
             self.round_trips_s.append(time.monotonic() - sent_s)
             if answer.get_type() != name and answer.result == mavlink.MAV_RESULT_DENIED:
                 # PX4 denies what it has not anew since it last streamed it: wait for the next of the stream.
-                answer = self._first(_STREAMED_WITHIN_S, lambda message: message.get_type() == name)
+                answer = self._wait_for(_STREAM_TIMEOUT_S, lambda message: message.get_type() == name)
             return answer if answer and answer.get_type() == name else None
         return None
 
@@ -96,20 +98,20 @@ class Inquiry(AbstractContextManager["Inquiry"]):
         does not have, and values that are not finite, are left out. For `bytewise` see `parameter_value`."""
         values: dict[str, float | int] = {}
         missing = list(dict.fromkeys(names))
-        for _ in range(TRIES):
-            for start in range(0, len(missing), IN_FLIGHT):
-                asked = missing[start : start + IN_FLIGHT]
+        for _ in range(MAX_TRIES):
+            for start in range(0, len(missing), MAX_PARALLEL_REQUESTS):
+                asked = missing[start : start + MAX_PARALLEL_REQUESTS]
                 for name in asked:
-                    self._put(messages.parameter_request(self.system_id or 0, name))
+                    self._send(messages.parameter_request(self.system_id or 0, name))
                 waiting = set(asked)
-                while waiting and (answer := self._first(ANSWER_WAIT_S, _answers_any(waiting))):
+                while waiting and (answer := self._wait_for(ANSWER_TIMEOUT_S, _match_parameters(waiting))):
                     waiting.remove(answer.param_id)
                     if answer.get_type() == "PARAM_VALUE" and (value := parameter_value(answer, bytewise)) is not None:
                         values[answer.param_id] = value
             missing = [name for name in missing if name not in values]
         return values
 
-    def _first(self, wait_s: float, is_wanted: Callable[[Message], bool]) -> Message | None:
+    def _wait_for(self, wait_s: float, is_wanted: Callable[[Message], bool]) -> Message | None:
         """Return the first wanted message of those received already, and those that arrive within `wait_s` seconds."""
         end_s = time.monotonic() + wait_s
         while True:
@@ -124,17 +126,17 @@ class Inquiry(AbstractContextManager["Inquiry"]):
     def _receive(self, now_s: float, wait_s: float) -> None:
         """Send a heartbeat if one is due, then receive for up to `wait_s` seconds."""
         if self._port.connected and now_s >= self._heartbeat_due_s:
-            self._heartbeat_due_s = now_s + HEARTBEAT_S
+            self._heartbeat_due_s = now_s + HEARTBEAT_INTERVAL_S
             # Of no kind: PX4 warns of a lost companion when one that has only asked falls silent.
-            self._put(messages.heartbeat(Health.BOOT, mavlink.MAV_TYPE_GENERIC))
+            self._send(messages.heartbeat(Health.BOOT, mavlink.MAV_TYPE_GENERIC))
         readable, _, _ = select.select([self._port], [], [], wait_s)
         # A serial port without a byte would look lost; a refused datagram makes its port readable again and again.
         data = self._port.read() if readable else b""
         if readable and not data:
             time.sleep(0.01)
-        self._arrived.extend(filter(self._is_ours, self.reader.feed(data, self._port.sender)))
+        self._arrived.extend(filter(self._admit, self.reader.feed(data, self._port.sender)))
 
-    def _is_ours(self, message: Message) -> bool:
+    def _admit(self, message: Message) -> bool:
         beats = message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
         if message.get_srcComponent() != AUTOPILOT or message.get_srcSystem() == 0:
             return False
@@ -152,7 +154,7 @@ class Inquiry(AbstractContextManager["Inquiry"]):
         self.says_version_1 = message.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V1
         return True
 
-    def _put(self, message: Message) -> None:
+    def _send(self, message: Message) -> None:
         """Send a message; what a full port does not take is lost, as on any line: every question is asked again."""
         self.signing.stamp(self._packer)
         self._port.write(message.pack(self._packer))
@@ -165,7 +167,7 @@ class AutopilotReading:
 
     system_id: int
     firmware: str  # "ardupilot", "px4" or "other"
-    vehicle: str  # the value of a `Kind`
+    vehicle: str  # the value of a `VehicleKind`
     is_armed: bool
     version: tuple[int, int, int] | None
     version_text: str | None
@@ -184,11 +186,11 @@ class AutopilotReading:
     clock_ahead_s: float | None  # its UTC minus that of this machine
 
     @property
-    def kind(self) -> Kind:
-        return Kind(self.vehicle)
+    def kind(self) -> VehicleKind:
+        return VehicleKind(self.vehicle)
 
 
-def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
+def read_autopilot(asking: RequestLink, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
     """Read all that an autopilot tells about itself, in ten seconds; return None if no heartbeat comes. `wanted` maps a
     firmware to the names of the parameters to be read; those that it has under another name are found too."""
     beat = asking.heartbeat()
@@ -212,7 +214,7 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
     # Without an answer each question would take three seconds. Of the last two it only counts that they are heard.
     filter_state, first, second, origin, clock, *_ = (asking.message(each) if answers else None for each in numbers)
     parameters = asking.parameters(names, is_px4)
-    others = (name_alternative(name) for name in names if name not in parameters)
+    others = (find_alternative(name) for name in names if name not in parameters)
     parameters |= asking.parameters(filter(None, others), is_px4)
     packed = said.flight_sw_version if said else 0
     version = packed >> 24, packed >> 16 & 255, packed >> 8 & 255
@@ -239,11 +241,11 @@ def read_autopilot(asking: Inquiry, wanted: Mapping[str, Iterable[str]]) -> Auto
     )
 
 
-def _refuses(message: Message) -> bool:
+def _is_refusal(message: Message) -> bool:
     is_answer = message.get_type() == "COMMAND_ACK" and message.command == mavlink.MAV_CMD_REQUEST_MESSAGE
-    return is_answer and message.result in _FINAL
+    return is_answer and message.result in _REFUSALS
 
 
-def _answers_any(names: set[str]) -> Callable[[Message], bool]:
+def _match_parameters(names: set[str]) -> Callable[[Message], bool]:
     kinds = ("PARAM_VALUE", "PARAM_ERROR")  # the value, or that the parameter is unknown
     return lambda message: message.get_type() in kinds and message.param_id in names

@@ -41,7 +41,7 @@ class Channel(Enum):
         return self in (Channel.GPS_INPUT, Channel.ODOMETRY)
 
 
-class Kind(Enum):
+class VehicleKind(Enum):
     """A kind of vehicle; it decides what the autopilot can do without GPS."""
 
     PLANE = "plane"
@@ -51,14 +51,14 @@ class Kind(Enum):
 
 
 _MAV_TYPES = {
-    Kind.PLANE: (1, 19, 20, 21, 22, 23, 24, 25),
-    Kind.COPTER: (2, 3, 4, 13, 14, 15, 29, 35, 43),
-    Kind.ROVER: (10, 11, 46),
+    VehicleKind.PLANE: (1, 19, 20, 21, 22, 23, 24, 25),
+    VehicleKind.COPTER: (2, 3, 4, 13, 14, 15, 29, 35, 43),
+    VehicleKind.ROVER: (10, 11, 46),
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class ChannelChoice:
     """The channel chosen for an autopilot, and the `reason` for it. For GPS_INPUT, `receiver` is the index of the GPS
     receiver that we replace (0: the first), and `lag_s` the age that the autopilot assumes our positions to have."""
 
@@ -68,18 +68,18 @@ class Choice:
     lag_s: float = 0.0
 
     @property
-    def why_nothing(self) -> Reason | None:
+    def silence_reason(self) -> Reason | None:
         """The reason why nothing is sent; None if something is."""
         return self.reason if self.channel is Channel.NONE else None
 
 
-def classify_vehicle(mav_type: int) -> Kind:
+def classify_vehicle(mav_type: int) -> VehicleKind:
     """Return the kind of vehicle for the `type` field of its HEARTBEAT (a MAV_TYPE). A VTOL aircraft counts as a plane:
     in forward flight it dead-reckons as one, and its type does not tell whether it hovers."""
-    return next((kind for kind, types in _MAV_TYPES.items() if mav_type in types), Kind.OTHER)
+    return next((kind for kind, types in _MAV_TYPES.items() if mav_type in types), VehicleKind.OTHER)
 
 
-def own_name(parameters: Parameters, name: str) -> str:
+def resolve_name(parameters: Parameters, name: str) -> str:
     """Return the name that this autopilot has for a parameter: its old one if only that was read, else `name`."""
     old = OLD_NAMES.get(name, name)
     return old if old in parameters and name not in parameters else name
@@ -87,4 +87,4 @@ def own_name(parameters: Parameters, name: str) -> str:
 
 def read_value(parameters: Parameters, name: str, default: float) -> float:
     """Return the value of a parameter under its new or old name; `default` if the autopilot has neither."""
-    return parameters.get(own_name(parameters, name), default)
+    return parameters.get(resolve_name(parameters, name), default)

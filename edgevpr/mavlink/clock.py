@@ -11,28 +11,28 @@ from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.wire import Message, mavlink
 
-SILENT_AFTER_S = 5.0  # heartbeats come once a second, and this many may be lost
-OWN_CLOCK_AFTER_S = 5.0  # without an answer
-_ASK_EVERY_S = 1.0
-_ASK_EVERY_AT_FIRST_S = 0.25
-_KEPT_S = 10.0  # of answers; two quartz clocks drift apart by 1 ms at most in this time
-_DRIFT_S = 1e-3
+HEARTBEAT_TIMEOUT_S = 5.0  # heartbeats come once a second, and this many may be lost
+TIMESYNC_TIMEOUT_S = 5.0  # without an answer
+_REQUEST_INTERVAL_S = 1.0
+_URGENT_REQUEST_INTERVAL_S = 0.25
+_MAX_ANSWER_AGE_S = 10.0  # of answers; two quartz clocks drift apart by 1 ms at most in this time
+_MAX_CLOCK_DRIFT_S = 1e-3
 _MAX_REQUESTS = 64  # whose answers are still awaited: those of a link that is very late
-_BACK_S = 1.0  # a boot time that goes back by more is that of another boot
-_DOUBT_S = 3.0  # after a gap of heartbeats; an autopilot that shows no boot time meanwhile counts as restarted
-_UTC_ROUNDED_S = 5e-3  # its boot time comes in whole milliseconds
-_STAMP_OFF_S = 1.0
+_MIN_STEP_BACK_S = 1.0  # a boot time that goes back by more is that of another boot
+_RESTART_CHECK_S = 3.0  # after a gap of heartbeats; an autopilot that shows no boot time meanwhile counts as restarted
+_UTC_ROUNDING_S = 5e-3  # its boot time comes in whole milliseconds
+_MAX_STAMP_ERROR_S = 1.0
 JITTER_LAG_S = 0.5  # `max_lag_ms` of ArduPilot's JitterCorrection
 _JITTER_SAMPLES = 200  # of our stamps, after the last foreign one: twice `convergence_loops`, which start anywhere
 # Only messages whose time is that of sending: others report the time of a measurement, which may be an old one.
-_BOOT_TIMES = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU", "SYSTEM_TIME")
+_BOOT_TIME_MESSAGES = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU", "SYSTEM_TIME")
 _WRAP_MS = 2**32
-_NEAR_WRAP_MS = 60_000
-LATE_S = 0.5  # a report that comes later is not used: at 20 m/s it is 10 m old
-_PUNCTUAL_AFTER_S = 10.0  # without a late report
+_WRAP_MARGIN_MS = 60_000
+MAX_REPORT_DELAY_S = 0.5  # a report that comes later is not used: at 20 m/s it is 10 m old
+_MIN_PUNCTUAL_S = 10.0  # without a late report
 # The messages that share ArduPilot's one correction of time stamps per link, with the name of the stamp: all callers of
 # `GCS_MAVLINK::correct_offboard_timestamp_usec_to_ms` but command 43003.
-_STAMPS = {
+_STAMP_FIELDS = {
     "ATT_POS_MOCAP": "time_usec",
     "GLOBAL_VISION_POSITION_ESTIMATE": "usec",
     "LANDING_TARGET": "time_usec",
@@ -49,15 +49,15 @@ class _Answer(NamedTuple):
     """The bounds that an answer to TIMESYNC sets to the offset, boot time less monotonic time; received at `t_s`."""
 
     t_s: float
-    least_s: float
-    most_s: float
+    low_s: float
+    high_s: float
 
     @property
     def round_trip_s(self) -> float:
-        return self.most_s - self.least_s
+        return self.high_s - self.low_s
 
     def contradicts(self, other: "_Answer") -> bool:
-        return max(self.least_s, other.least_s) > min(self.most_s, other.most_s) + _DRIFT_S
+        return max(self.low_s, other.low_s) > min(self.high_s, other.high_s) + _MAX_CLOCK_DRIFT_S
 
 
 class AutopilotClock:
@@ -67,28 +67,28 @@ class AutopilotClock:
 
     def __init__(self) -> None:
         self._requests_ns: deque[int] = deque(maxlen=_MAX_REQUESTS)
-        self._asked_s = self._due_s = -math.inf  # first asked; when to ask next
+        self._first_request_s = self._due_s = -math.inf  # first asked; when to ask next
         self._answers: list[_Answer] = []
         self._best: _Answer | None = None
-        self._uses_own = False
-        self._beat_s = math.inf  # of the last heartbeat
+        self._uses_own_clock = False
+        self._heartbeat_s = math.inf  # of the last heartbeat
         self._boot_ms: dict[str, int] = {}  # the last of each kind of message
-        self._doubt_s: float | None = None  # when a heartbeat came after a gap; None: it is the same boot
-        self._goes_on = False  # boot times have gone on since the gap
+        self._gap_end_s: float | None = None  # when a heartbeat came after a gap; None: it is the same boot
+        self._is_same_boot = False  # boot times have gone on since the gap
         self._utc_ahead_s: float | None = None  # UTC less boot time
         self._utc_ahead_of_ours_s: float | None = None  # UTC less our time, where the boot time is not known
 
-    def request(self, now_s: float) -> Message | None:
+    def make_request(self, now_s: float) -> Message | None:
         """Return the TIMESYNC to be sent at `now_s`; None if none is due."""
         if not self._requests_ns:
-            self._asked_s = now_s
-        if self._best is None and not self._uses_own and now_s - self._asked_s > OWN_CLOCK_AFTER_S:
-            self._uses_own = True
+            self._first_request_s = now_s
+        if self._best is None and not self._uses_own_clock and now_s - self._first_request_s > TIMESYNC_TIMEOUT_S:
+            self._uses_own_clock = True
             log.warning("the autopilot does not answer TIMESYNC: time stamps are those of our own clock")
         if now_s < self._due_s:
             return None
-        is_urgent = self._doubt_s is not None or (self._best is None and not self._uses_own)
-        self._due_s = now_s + (_ASK_EVERY_AT_FIRST_S if is_urgent else _ASK_EVERY_S)
+        is_urgent = self._gap_end_s is not None or (self._best is None and not self._uses_own_clock)
+        self._due_s = now_s + (_URGENT_REQUEST_INTERVAL_S if is_urgent else _REQUEST_INTERVAL_S)
         self._requests_ns.append(round(now_s * 1e9))
         return mavlink.MAVLink_timesync_message(tc1=0, ts1=self._requests_ns[-1])
 
@@ -99,29 +99,29 @@ class AutopilotClock:
         if kind == "TIMESYNC" and message.tc1 > 0 and message.ts1 in self._requests_ns:
             if self._handle_answer(message.tc1 / 1e9, message.ts1 / 1e9, now_s):
                 return True
-        elif kind in _BOOT_TIMES:
+        elif kind in _BOOT_TIME_MESSAGES:
             if self._handle_boot_time(kind, message.time_boot_ms):
                 return True
             if kind == "SYSTEM_TIME" and message.time_unix_usec:
                 self._handle_utc(message, now_s)
         elif kind == "HEARTBEAT":
-            if now_s - self._beat_s > SILENT_AFTER_S:
-                self._doubt_s, self._due_s, self._goes_on = now_s, now_s, False
-            self._beat_s = now_s
-        if self._doubt_s is not None and now_s - self._doubt_s > _DOUBT_S:
-            self._doubt_s = None
-            return not self._goes_on
+            if now_s - self._heartbeat_s > HEARTBEAT_TIMEOUT_S:
+                self._gap_end_s, self._due_s, self._is_same_boot = now_s, now_s, False
+            self._heartbeat_s = now_s
+        if self._gap_end_s is not None and now_s - self._gap_end_s > _RESTART_CHECK_S:
+            self._gap_end_s = None
+            return not self._is_same_boot
         return False
 
     def boot_time_s(self, t_mono_s: float) -> float | None:
         """Return the autopilot's time since boot at `t_mono_s`; None: not known (yet)."""
-        return t_mono_s + (self._best.least_s + self._best.most_s) / 2 if self._best else None
+        return t_mono_s + (self._best.low_s + self._best.high_s) / 2 if self._best else None
 
     def stamp_s(self, t_mono_s: float) -> float | None:
         """Return `t_mono_s` as a time stamp for the autopilot; None: not known yet, or perhaps that of a past boot."""
-        if self._doubt_s is not None:
+        if self._gap_end_s is not None:
             return None
-        return t_mono_s if self._uses_own else self.boot_time_s(t_mono_s)
+        return t_mono_s if self._uses_own_clock else self.boot_time_s(t_mono_s)
 
     def utc_s(self, t_mono_s: float) -> float | None:
         """Return the autopilot's UTC at `t_mono_s`, seconds since 1970; None: unknown."""
@@ -142,14 +142,14 @@ class AutopilotClock:
         """Process the answer to the request sent at `sent_s`. Returns True if it is from another boot."""
         answer, before = _Answer(now_s, boot_s - now_s, boot_s - sent_s), self._best
         last = self._answers[-1] if self._answers else None
-        if last and boot_s < last.t_s + last.least_s - _BACK_S:
+        if last and boot_s < last.t_s + last.low_s - _MIN_STEP_BACK_S:
             return True
-        if self._doubt_s is not None and before and answer.round_trip_s < _BACK_S:
-            if answer.most_s < before.least_s - _BACK_S:
+        if self._gap_end_s is not None and before and answer.round_trip_s < _MIN_STEP_BACK_S:
+            if answer.high_s < before.low_s - _MIN_STEP_BACK_S:
                 return True
-            self._doubt_s = None
+            self._gap_end_s = None
         # One that contradicts the newest is from before a pause of either clock.
-        kept = (old for old in self._answers if now_s - old.t_s <= _KEPT_S and not old.contradicts(answer))
+        kept = (old for old in self._answers if now_s - old.t_s <= _MAX_ANSWER_AGE_S and not old.contradicts(answer))
         self._answers = [*kept, answer]
         self._best = min(self._answers, key=lambda kept: kept.round_trip_s)
         return False
@@ -160,9 +160,9 @@ class AutopilotClock:
         self._boot_ms[kind] = boot_ms
         if last_ms is None:
             return False
-        is_wrapped = last_ms > _WRAP_MS - _NEAR_WRAP_MS and boot_ms < _NEAR_WRAP_MS
-        is_back = boot_ms < last_ms - _BACK_S * 1e3 and not is_wrapped
-        self._goes_on |= not is_back
+        is_wrapped = last_ms > _WRAP_MS - _WRAP_MARGIN_MS and boot_ms < _WRAP_MARGIN_MS
+        is_back = boot_ms < last_ms - _MIN_STEP_BACK_S * 1e3 and not is_wrapped
+        self._is_same_boot |= not is_back
         return is_back
 
     def _handle_utc(self, message: Message, now_s: float) -> None:
@@ -174,13 +174,13 @@ class AutopilotClock:
         if expected_s is None:
             return
         boot_s += round((expected_s - boot_s) * 1e3 / _WRAP_MS) * _WRAP_MS / 1e3
-        if self._utc_ahead_s is None or abs(utc_s - boot_s - self._utc_ahead_s) > _UTC_ROUNDED_S:
+        if self._utc_ahead_s is None or abs(utc_s - boot_s - self._utc_ahead_s) > _UTC_ROUNDING_S:
             self._utc_ahead_s = utc_s - boot_s
 
 
 class ReportDelay:
     """Decides by their delay whether the autopilot's reports are used, and announces it when that changes. `is_late`:
-    the newest came more than LATE_S after it was sent, as on a link that is full, or after we were stopped."""
+    the newest came more than MAX_REPORT_DELAY_S after it was sent, as on a full link, or after we were stopped."""
 
     def __init__(self, announce: Announce) -> None:
         self.is_late = False
@@ -189,7 +189,7 @@ class ReportDelay:
 
     def update(self, delay_s: float, now_s: float) -> None:
         """Process the delay of a report received at `now_s`."""
-        self.is_late = delay_s > LATE_S
+        self.is_late = delay_s > MAX_REPORT_DELAY_S
         if self.is_late:
             if self._late_s is None:
                 log.warning(
@@ -198,7 +198,7 @@ class ReportDelay:
                 )  # fmt: skip
                 self._announce(Severity.WARNING, f"link full: reports {delay_s:.1f} s late", "delay")
             self._late_s = now_s
-        elif self._late_s is not None and now_s - self._late_s > _PUNCTUAL_AFTER_S:
+        elif self._late_s is not None and now_s - self._late_s > _MIN_PUNCTUAL_S:
             self._late_s = None
             self._announce(Severity.INFO, "reports come in time again", "delay")
 
@@ -208,34 +208,34 @@ class ForeignStamps:
     senders of a link (`JitterCorrection`): after a stamp that is ahead, ours counts as sent 0.5 s before it arrives."""
 
     def __init__(self) -> None:
-        self._found: set[tuple[str, str]] = set()
-        self._spoilt = 0  # stamps of ours that still count as too old
+        self._reported: set[tuple[str, str]] = set()
+        self._spoilt_stamps = 0  # stamps of ours that still count as too old
 
     def take_lag_s(self) -> float:
         """Return by how many seconds the stamp that we send now will count as too old."""
-        if self._spoilt == 0:
+        if self._spoilt_stamps == 0:
             return 0.0
-        self._spoilt -= 1
+        self._spoilt_stamps -= 1
         return JITTER_LAG_S
 
     def find(self, message: Message, boot_s: float | None) -> str | None:
         """Return sender and name of a message whose stamp is off by more than a second, the first time (None: it is
         not). `boot_s` is the autopilot's time since boot."""
         kind = message.get_type()
-        if kind in _STAMPS:
-            stamp_s = getattr(message, _STAMPS[kind]) / 1e6
+        if kind in _STAMP_FIELDS:
+            stamp_s = getattr(message, _STAMP_FIELDS[kind]) / 1e6
         elif kind == "COMMAND_INT" and message.command == mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE:
             kind, stamp_s = "43003", message.param1
         else:
             return None
         sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
-        if boot_s is None or abs(stamp_s - boot_s) <= _STAMP_OFF_S:
+        if boot_s is None or abs(stamp_s - boot_s) <= _MAX_STAMP_ERROR_S:
             return None
         if stamp_s > boot_s:
-            self._spoilt = _JITTER_SAMPLES
-        if (sender, kind) in self._found:
+            self._spoilt_stamps = _JITTER_SAMPLES
+        if (sender, kind) in self._reported:
             return None
-        self._found.add((sender, kind))
+        self._reported.add((sender, kind))
         why = "ArduPilot has one time correction for all senders of a link: ODOMETRY counts as up to 0.5 s older"
         advice = "let it take its time from TIMESYNC, or give it a port of its own"
         text = f"{sender} stamps its {kind} {stamp_s - boot_s:.1f} s off the autopilot's time since boot"

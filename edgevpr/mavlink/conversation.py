@@ -14,21 +14,21 @@ from edgevpr.core.types import Position, Vehicle
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.clock import SILENT_AFTER_S
-from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, Sending, put_back
+from edgevpr.mavlink.clock import HEARTBEAT_TIMEOUT_S
+from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, FixTransmission, compensate_lag
 from edgevpr.mavlink.ground import FOR_PEOPLE, Requests, Texts
 from edgevpr.mavlink.messages import AUTOPILOT, Fix, Health, Severity
 from edgevpr.mavlink.peer import Autopilot, Listener
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
-MESSAGES_MAX = 64
-HEARTBEAT_S = 1.0
-STATE_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
-HEALTH_GOOD_FOR_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
-BETWEEN_S = 0.5  # from a single fix to the next one that no match asks for
-ASK_AGAIN_S = 5.0
-ORIGIN_WITHIN_S = 5.0  # an autopilot that has an origin sends it once a second when asked to
+MAX_MESSAGES = 64
+HEARTBEAT_INTERVAL_S = 1.0
+STATE_INTERVAL_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
+HEALTH_TIMEOUT_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
+INTERIM_FIX_INTERVAL_S = 0.5  # from a single fix to the next one that no match asks for
+REQUEST_INTERVAL_S = 5.0
+ORIGIN_TIMEOUT_S = 5.0  # an autopilot that has an origin sends it once a second when asked to
 
 log = logging.getLogger(__name__)
 
@@ -49,86 +49,88 @@ class LinkSettings:
 
 
 class Conversation:
-    """Makes the packets to be sent, one after another, and processes those received. `sent` counts messages by name."""
+    """Makes the packets to send, one after another, and processes those received. `sent` counts messages by name."""
 
     def __init__(self, settings: LinkSettings, clock: Callable[[], float]) -> None:
         self.settings = settings
-        self.autopilot = Autopilot(settings.component_id, settings.system_id, settings.listener, self._report)
-        self.fixes = Fixes(settings.max_fix_age_s, self._report)
+        self.autopilot = Autopilot(
+            settings.component_id, settings.system_id, settings.listener, lambda *report: self._reports.append(report)
+        )
+        self.fixes = Fixes(settings.max_fix_age_s, lambda *report: self._reports.append(report))
         self.texts, self.requests = Texts(), Requests()
         self.reader = PacketReader(settings.signing.admits)
-        self.between: deque[Sending] = deque(maxlen=MESSAGES_MAX)
+        self.interim_fixes: deque[FixTransmission] = deque(maxlen=MAX_MESSAGES)
         self.sent: Counter[str] = Counter()
         self.dropped_queue_full = 0
-        self._ground: Conversation | None = None
+        self._gcs: Conversation | None = None
         self._reports: list[tuple[Severity, str, str]] = []
-        self._messages: deque[Message] = deque(maxlen=MESSAGES_MAX)
+        self._messages: deque[Message] = deque(maxlen=MAX_MESSAGES)
         self._clock = clock
         self._health, self._health_set_s = Health.BOOT, clock()
         self._packer = mavlink.MAVLink(None, srcSystem=settings.system_id or 1, srcComponent=settings.component_id)
-        self._heartbeat_due_s = self._state_due_s = self._between_due_s = clock()
-        self._ask_position_s: float | None = None  # when to request its reports next; None: not wanted
-        self._restarts, self._restarted_s = 0, -math.inf
-        self._told_channel: Channel | None = self.channel  # the channel that the listener knows
-        self._asked_for_state: bool | None = None
-        self._no_origin_since_s, self._has_set_origin = math.inf, False
-        self._has_asked_pressure = False
-        self._is_there: bool | None = None  # as the ground station was last told; None: never heard yet
+        self._heartbeat_due_s = self._state_due_s = self._interim_fix_due_s = clock()
+        self._next_request_s: float | None = None  # for its reports; None: not needed
+        self._restarts, self._restart_reported_s = 0, -math.inf
+        self._reported_channel: Channel | None = self.channel  # the channel that the listener knows
+        self._has_requested_continuous: bool | None = None
+        self._origin_missing_since_s, self._has_set_origin = math.inf, False
+        self._has_requested_pressure = False
+        self._was_alive: bool | None = None  # as last announced; None: no heartbeat yet
 
     @property
     def channel(self) -> Channel:
-        """The channel by which the autopilot is told positions."""
+        """The channel by which positions are sent."""
         return self.autopilot.interview.choice.channel
 
     @property
-    def waits(self) -> bool:
+    def has_pending(self) -> bool:
         """True if a message or a text waits to be sent, or a fix for its answer."""
         return bool(self._messages or self.texts or self.fixes)
 
-    def copy_to(self, ground: "Conversation") -> None:
-        """From now on copy health and all that is for people to a ground station, and obey its requests, too."""
-        self._ground, ground.requests = ground, self.requests
-        ground._packer.srcSystem = self._packer.srcSystem
+    def copy_to(self, gcs: "Conversation") -> None:
+        """From now on copy health and `GCS_MESSAGES` to a ground station, and obey its requests too."""
+        self._gcs, gcs.requests = gcs, self.requests
+        gcs._packer.srcSystem = self._packer.srcSystem
 
     def send(self, *outgoing: Message) -> None:
         """Queue messages to be sent. If the queue is full, the oldest messages are dropped and counted."""
         for message in outgoing:
-            self.dropped_queue_full += len(self._messages) == MESSAGES_MAX
+            self.dropped_queue_full += len(self._messages) == MAX_MESSAGES
             self._messages.append(message)
-            if self._ground and message.get_type() in FOR_PEOPLE:
-                self._ground.send(copy(message))  # packing changes a message, and each link packs it
+            if self._gcs and message.get_type() in FOR_PEOPLE:
+                self._gcs.send(copy(message))  # packing changes a message, and each link packs it
 
-    def send_fix(self, fix: Fix) -> Sending:
-        """Queue a position fix. It is sent within `max_fix_age_s` seconds, while the autopilot is heard, or never."""
+    def send_fix(self, fix: Fix) -> FixTransmission:
+        """Queue a position fix. It is sent within `max_fix_age_s` seconds, while the autopilot is alive, or never."""
         now_s = self._clock()
-        self._between_due_s = now_s + BETWEEN_S
+        self._interim_fix_due_s = now_s + INTERIM_FIX_INTERVAL_S
         return self.fixes.put(fix, now_s)
 
-    def take_between(self) -> list[Sending]:
+    def take_interim_fixes(self) -> list[FixTransmission]:
         """Return the fixes sent between matches since the last call."""
-        taken, self.between = list(self.between), deque(maxlen=MESSAGES_MAX)
+        taken, self.interim_fixes = list(self.interim_fixes), deque(maxlen=MAX_MESSAGES)
         return taken
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        """Queue a text for the people on the ground, one in five seconds. `topic`: what it is about (see `Texts`)."""
+        """Queue a status text; one is sent every five seconds. `topic`: its subject (see `Texts`)."""
         self.texts.put(severity, text, topic)
-        if self._ground:
-            self._ground.announce(severity, text, topic)
+        if self._gcs:
+            self._gcs.announce(severity, text, topic)
 
     def set_health(self, health: Health) -> None:
         """Set the health to be sent in heartbeats. It holds for ten seconds; without a new call it is then CRITICAL."""
         self._health, self._health_set_s = health, self._clock()
-        if self._ground:
-            self._ground.set_health(health)
+        if self._gcs:
+            self._gcs.set_health(health)
 
-    def want_position(self) -> None:
+    def request_position(self) -> None:
         """From now on request the autopilot's reports, and again whenever they stop or become rare."""
-        self._ask_position_s = self._clock()
+        self._next_request_s = self._clock()
 
-    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
+    def predict_vehicle(self, t_mono_s: float) -> Vehicle | None:
         """Return the last report of the vehicle, moved to `t_mono_s`, the time of a frame, as far as velocity and
         attitude (within 0.3 s) are known; None without a position. On a continuous channel, `t_fix_s` is now."""
-        vehicle = self.autopilot.vehicle_at(t_mono_s)
+        vehicle = self.autopilot.predict_vehicle(t_mono_s)
         t_fix_s = self._clock() if self.channel.is_continuous else self.fixes.t_fix_s
         return vehicle and replace(vehicle, t_fix_s=t_fix_s)
 
@@ -137,7 +139,7 @@ class Conversation:
         due_in_s = self._state_due_s - self._clock() if self.channel.is_continuous else longest_s
         return min(longest_s, max(0.0, due_in_s))
 
-    def next_packet(self) -> tuple[bytes, Sending | None] | None:
+    def next_packet(self) -> tuple[bytes, FixTransmission | None] | None:
         """Choose and pack the next message. Returns its packet and the fix in it, if any; None: nothing is due."""
         while (chosen := self._next_message(self._clock())) is not None:
             message, sending = chosen
@@ -145,7 +147,7 @@ class Conversation:
             try:
                 packet: bytes = message.pack(self._packer)
             except (struct.error, OverflowError) as error:  # a value that its field cannot hold must not end the link
-                log.error("%s is not sent: %s", message, error)
+                log.error("%s not sent: %s", message, error)
                 if sending:
                     sending.settle(False, Reason(ReasonCode.NOT_ENCODABLE, {"problem": str(error)}))
                 continue
@@ -157,105 +159,106 @@ class Conversation:
             return packet, sending
         return None
 
-    def count_departed(self, fixes: list[Sending]) -> None:
+    def count_sent_fixes(self, fixes: list[FixTransmission]) -> None:
         """Count the fixes that have left the port. Call it before `handle` processes the answer to one of them."""
         self.sent["COMMAND_INT"] += len(fixes)
 
     def handle(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
         """Process bytes received from `sender` at `now_s`. Returns True if they contain the autopilot's heartbeat."""
-        is_ours = False
+        beats = False
         for message in self.reader.feed(data, sender):
             if self.autopilot.handle(message, now_s, sender):
-                is_ours = True
+                beats = True
                 self._packer.srcSystem = self.autopilot.system_id
-                if self._ground:
-                    self._ground._packer.srcSystem = self.autopilot.system_id
+                if self._gcs:
+                    self._gcs._packer.srcSystem = self.autopilot.system_id
                 if self.autopilot.identity.has_moved:
-                    self._begin_anew(ReasonCode.AUTOPILOT_REPLACED)
+                    self._reset(ReasonCode.AUTOPILOT_REPLACED)
                     self.announce(Severity.WARNING, "autopilot has another address", "autopilot")
             if self.autopilot.has_restarted:
-                self._begin_anew(ReasonCode.AUTOPILOT_RESTARTED)
+                self._reset(ReasonCode.AUTOPILOT_RESTARTED)
                 self._announce_restart(now_s)
             if self.autopilot.answer:
                 self._handle_answer(self.autopilot.answer, now_s)
             if not self.autopilot.identity.is_foreign(sender):
                 self._handle_request(message, now_s)
                 self._handle_stamp(message, now_s)
-        return is_ours
+        return beats
 
     def announce_changes(self) -> None:
         """Announce what has changed with the autopilot and its answers since the last call."""
         now_s = self._clock()
-        is_there = self.autopilot.listens(now_s)
-        if is_there and self._is_there is False:
+        is_alive = self.autopilot.listens(now_s)
+        if is_alive and self._was_alive is False:
             self.announce(Severity.INFO, "autopilot is back", "autopilot")
-        elif self._is_there and not is_there:
-            log.warning("the autopilot is silent")
+        elif self._was_alive and not is_alive:
+            log.warning("no heartbeat from the autopilot")
             self.announce(Severity.WARNING, "autopilot is silent", "autopilot")
-        if is_there or self._is_there is not None:
-            self._is_there = is_there
+        if is_alive or self._was_alive is not None:
+            self._was_alive = is_alive
         self.fixes.report_silence(self.autopilot.readiness(now_s).why_silent, now_s)
         while self._reports:
             self.announce(*self._reports.pop(0))
 
     def break_off(self, lost_fixes: int) -> None:
-        """Reset what ends when the port is lost. `lost_fixes` is the number of fixes thrown away with the port."""
+        """Reset the state of a lost port. `lost_fixes` is the number of fixes discarded with it."""
         self.fixes.record_lost(lost_fixes)
-        self.autopilot.heard_s = -math.inf  # another one may be at the port when it is open again
+        self.autopilot.heard_s = -math.inf  # another autopilot may be there when the port is open again
         self.reader.parsers.clear()  # with incomplete messages
 
     def drop_stale(self) -> None:
-        """Give up the fixes that have waited too long for a port."""
+        """Give up the fixes that have waited too long."""
         self.fixes.drop_stale(self._clock())
 
     def end(self) -> None:
-        """Give up all fixes, whether they wait for an answer or wait to be sent."""
-        self.fixes.break_off(Reason(ReasonCode.ENDED_BEFORE_ANSWER))
+        """Give up all fixes, awaited and queued."""
+        self.fixes.cancel_awaited(Reason(ReasonCode.ENDED_BEFORE_ANSWER))
         self.fixes.drop_stale(math.inf)
 
-    def _next_message(self, now_s: float) -> tuple[Message, Sending | None] | None:
+    def _next_message(self, now_s: float) -> tuple[Message, FixTransmission | None] | None:
         late_s = now_s - self._heartbeat_due_s
         if late_s >= 0:
-            self._heartbeat_due_s = now_s + HEARTBEAT_S - late_s % HEARTBEAT_S  # keeps the rhythm after delays
-            is_stuck = now_s - self._health_set_s > HEALTH_GOOD_FOR_S
+            self._heartbeat_due_s = now_s + HEARTBEAT_INTERVAL_S - late_s % HEARTBEAT_INTERVAL_S
+            is_stuck = now_s - self._health_set_s > HEALTH_TIMEOUT_S
             return messages.heartbeat(Health.CRITICAL if is_stuck else self._health), None
         system_id = self.autopilot.system_id
         if system_id is not None and self.autopilot.listens(now_s):
-            if request := self.autopilot.clock.request(now_s):
+            if request := self.autopilot.clock.make_request(now_s):
                 return request, None
-            self._ask_for_position(system_id, now_s)
-            if self.channel.is_continuous and (state := self._state(system_id, now_s)):
+            self._request_reports(system_id, now_s)
+            if self.channel.is_continuous and (state := self._make_state(system_id, now_s)):
                 return state, None
             pause = Reason(ReasonCode.PAUSED) if self.requests.is_paused else None
-            if why := pause or self.autopilot.interview.choice.why_nothing or self.fixes.why_not(now_s):
+            if why := pause or self.autopilot.interview.choice.silence_reason or self.fixes.find_objection(now_s):
                 self.fixes.withhold(why)
             elif (stamp_s := self.autopilot.stamp_s(now_s)) is None:
                 self.fixes.drop_stale(now_s, ReasonCode.CLOCK_UNKNOWN)
-            elif sending := self.fixes.next(now_s) or self._next_between(now_s):
-                fix = put_back(sending.fix, now_s, self.autopilot.foreign_stamps.take_lag_s(), self.autopilot.vehicle)
+            elif sending := self.fixes.next(now_s) or self._next_interim_fix(now_s):
+                lag_s = self.autopilot.foreign_stamps.take_lag_s()
+                fix = compensate_lag(sending.fix, now_s, lag_s, self.autopilot.vehicle)
                 return messages.position_fix(fix, now_s, system_id, stamp_s), sending
         else:
             self.fixes.drop_stale(now_s)
         if text := self.texts.next(now_s):
-            return text, None  # not by `send`, which copies to the ground's link: that has its own texts
+            return text, None  # not by `send`: the link to the ground station has its own texts
         return (self._messages.popleft(), None) if self._messages else None
 
-    def _next_between(self, now_s: float) -> Sending | None:
-        """Return a fix that no match asks for, where one is due and helps. ArduPilot moves its position by it; PX4 may
-        move its velocity, too, and would confirm itself."""
-        is_due = now_s >= self._between_due_s and self.autopilot.firmware == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
-        if not is_due or not (fix := self.settings.listener.fix_between(now_s)):
+    def _next_interim_fix(self, now_s: float) -> FixTransmission | None:
+        """Return a fix between two matches, if one is due and helps. ArduPilot corrects its position by it; PX4 may
+        correct its velocity too, and would confirm itself."""
+        is_due = now_s >= self._interim_fix_due_s and self.autopilot.firmware == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+        if not is_due or not (fix := self.settings.listener.make_interim_fix(now_s)):
             return None
-        self.between.append(self.send_fix(fix))
+        self.interim_fixes.append(self.send_fix(fix))
         return self.fixes.next(now_s)
 
-    def _state(self, system_id: int, now_s: float) -> Message | None:
+    def _make_state(self, system_id: int, now_s: float) -> Message | None:
         """Make the next message of a continuous channel, if any: a position, or the origin of its local frame."""
         if now_s < self._state_due_s:
             return None
-        self._state_due_s = max(self._state_due_s + STATE_S, now_s)
+        self._state_due_s = max(self._state_due_s + STATE_INTERVAL_S, now_s)
         choice, autopilot = self.autopilot.interview.choice, self.autopilot
-        state = self.settings.listener.state_at(t_s := now_s - choice.lag_s)
+        state = self.settings.listener.estimate_state(t_s := now_s - choice.lag_s)
         if self.requests.is_paused:
             state = None
         if choice.channel in (Channel.SENSOR, Channel.VISION):
@@ -264,79 +267,76 @@ class Conversation:
             return None
         if choice.channel is Channel.GPS_INPUT:
             return messages.gps_input(state, choice.receiver, stamp_s, autopilot.clock.utc_s(t_s))
-        here = self.settings.origin
-        if autopilot.origin is None and here and now_s - self._no_origin_since_s > ORIGIN_WITHIN_S:
-            self._no_origin_since_s = now_s  # again if it is not heard: a filter that has not started ignores it
-            return self._place_origin(here, system_id)
+        origin = self.settings.origin
+        if autopilot.origin is None and origin and now_s - self._origin_missing_since_s > ORIGIN_TIMEOUT_S:
+            self._origin_missing_since_s = now_s  # again later: a filter that has not started ignores it
+            return self._make_origin(origin, system_id)
         if state and state.attitude and autopilot.origin:
             return messages.odometry(state, state.attitude, autopilot.origin, stamp_s)
         return None
 
-    def _place_origin(self, here: Position, system_id: int) -> Message:
-        """Make the message that sets the origin, without an altitude by air pressure: that is requested if unknown."""
-        alt_m = self.autopilot.pressure_alt_m if here.alt_m is None else here.alt_m
+    def _make_origin(self, origin: Position, system_id: int) -> Message:
+        """Make the message that sets the origin, or requests the air pressure for an altitude that the map lacks."""
+        alt_m = self.autopilot.pressure_alt_m if origin.alt_m is None else origin.alt_m
         if alt_m is None:
-            if self._has_asked_pressure:
+            if self._has_requested_pressure:
                 self.announce(Severity.WARNING, "origin altitude unknown: set EKF origin", "origin")
-            self._has_asked_pressure = True
+            self._has_requested_pressure = True
             return messages.message_request(system_id, mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE)
-        self._has_asked_pressure = False  # an autopilot that restarts is asked again
+        self._has_requested_pressure = False  # an autopilot that restarts is asked again
         if not self._has_set_origin:
-            source = "an altitude by its air pressure, which may be 150 m off" if here.alt_m is None else "the map's"
-            log.warning("the autopilot has no origin: it is set to the first place of the map, at %s", source)
+            altitude = "by air pressure, up to 150 m off" if origin.alt_m is None else "of the map"
+            log.warning("the autopilot has no origin: set to the first place of the map, altitude %s", altitude)
             self._has_set_origin = True
-        if here.alt_m is None:
+        if origin.alt_m is None:
             self.announce(Severity.WARNING, f"origin altitude unknown: about {alt_m:.0f} m", "origin")
-        return messages.origin(system_id, here.lat_deg, here.lon_deg, alt_m)
+        return messages.origin(system_id, origin.lat_deg, origin.lon_deg, alt_m)
 
-    def _ask_for_position(self, system_id: int, now_s: float) -> None:
-        """Queue the questions that are due, and request reports that have stopped or have become half as frequent."""
-        if self._ask_position_s is None:
+    def _request_reports(self, system_id: int, now_s: float) -> None:
+        """Request the parameters that are due, and reports that have stopped or come at less than half the rate."""
+        if self._next_request_s is None:
             return
         self.send(*self.autopilot.interview.questions(now_s, system_id))
-        if self.channel is not self._told_channel:
-            self._told_channel, self._no_origin_since_s, self._ask_position_s = self.channel, now_s, now_s
+        if self.channel is not self._reported_channel:
+            self._reported_channel, self._origin_missing_since_s, self._next_request_s = self.channel, now_s, now_s
             self.settings.listener.handle_channel(self.channel)
-        if now_s < self._ask_position_s:
+        if now_s < self._next_request_s:
             return
-        self._ask_position_s = now_s + ASK_AGAIN_S
+        self._next_request_s = now_s + REQUEST_INTERVAL_S
         if self.channel is Channel.VISION and self.autopilot.origin is None:
             self.send(messages.message_request(system_id, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
         vehicle, is_continuous = self.autopilot.vehicle, self.channel.is_continuous
-        is_silent = vehicle is None or now_s - vehicle.t_heard_s > ASK_AGAIN_S
+        is_silent = vehicle is None or now_s - vehicle.t_heard_s > REQUEST_INTERVAL_S
         is_slowed = self.autopilot.attitudes.rate_hz(now_s) < messages.attitude_hz(is_continuous) / 2
-        is_slowed |= is_continuous and now_s - self.autopilot.force_s > ASK_AGAIN_S
-        if is_silent or is_slowed or self._asked_for_state != is_continuous:
-            self._asked_for_state = is_continuous
+        is_slowed |= is_continuous and now_s - self.autopilot.force_s > REQUEST_INTERVAL_S
+        if is_silent or is_slowed or self._has_requested_continuous != is_continuous:
+            self._has_requested_continuous = is_continuous
             self.send(*messages.report_requests(system_id, self.autopilot.firmware, is_continuous))
 
-    def _report(self, severity: Severity, text: str, topic: str) -> None:
-        self._reports.append((severity, text, topic))
-
-    def _begin_anew(self, why: ReasonCode) -> None:
-        """Begin again with an autopilot that has forgotten all. `why` goes to the fixes without an answer."""
-        self.fixes.break_off(Reason(why))
-        self._asked_for_state = self._told_channel = None
-        self._no_origin_since_s, self._has_set_origin = math.inf, False
-        if self._ask_position_s is not None:
-            self._ask_position_s = self._clock()
+    def _reset(self, why: ReasonCode) -> None:
+        """Start anew with an autopilot that has forgotten everything. `why` is reported for the awaited fixes."""
+        self.fixes.cancel_awaited(Reason(why))
+        self._has_requested_continuous = self._reported_channel = None
+        self._origin_missing_since_s, self._has_set_origin = math.inf, False
+        if self._next_request_s is not None:
+            self._next_request_s = self._clock()
 
     def _announce_restart(self, now_s: float) -> None:
         self._restarts += 1
-        if now_s - self._restarted_s > SILENT_AFTER_S:
-            log.warning("the autopilot has restarted: its parameters, rates and origin are asked for again")
-            often = f" {self._restarts} times" if self._restarts > 1 else ""
-            self.announce(Severity.WARNING, f"autopilot has restarted{often}", "autopilot")
-        self._restarted_s = now_s
+        if now_s - self._restart_reported_s > HEARTBEAT_TIMEOUT_S:
+            log.warning("the autopilot has restarted: requesting its parameters, rates and origin again")
+            count = f" {self._restarts} times" if self._restarts > 1 else ""
+            self.announce(Severity.WARNING, f"autopilot has restarted{count}", "autopilot")
+        self._restart_reported_s = now_s
 
     def _handle_stamp(self, message: Message, now_s: float) -> None:
-        """Report a time stamp of another program that spoils those of all senders to an ArduPilot."""
-        us = self._packer.srcSystem, self._packer.srcComponent
+        """Announce a wrong time stamp of another program, which spoils ours too (ArduPilot)."""
+        own_id = self._packer.srcSystem, self._packer.srcComponent
         sender, autopilot = (message.get_srcSystem(), message.get_srcComponent()), self.autopilot
-        if sender in (us, (us[0], AUTOPILOT)) or autopilot.firmware != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
+        if sender in (own_id, (own_id[0], AUTOPILOT)) or autopilot.firmware != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
             return
-        if found := autopilot.foreign_stamps.find(message, autopilot.clock.boot_time_s(now_s)):
-            self.announce(Severity.WARNING, f"wrong stamps: {found}", "stamps")
+        if wrong_stamp := autopilot.foreign_stamps.find(message, autopilot.clock.boot_time_s(now_s)):
+            self.announce(Severity.WARNING, f"wrong stamps: {wrong_stamp}", "stamps")
 
     def _handle_request(self, message: Message, now_s: float) -> None:
         self.send(*self.requests.handle(message, (self._packer.srcSystem, self._packer.srcComponent), now_s))

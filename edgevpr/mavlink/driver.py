@@ -12,15 +12,15 @@ from typing import Protocol
 from edgevpr.core.errors import LinkError
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.conversation import Conversation
-from edgevpr.mavlink.ports import Line, Port, open_port
+from edgevpr.mavlink.ports import PacketWriter, Port, open_port
 from edgevpr.mavlink.signing import OLD
 from edgevpr.mavlink.turns import Turns
 
-SLEEP_S = 0.25  # of the thread, when nothing wakes it
-RETRY_FIRST_S = 0.2
-RETRY_MAX_S = 2.0
-WATCH_S = 0.01  # between two checks whether a fix has left the operating system
-FLUSH_S = 0.5
+MAX_SLEEP_S = 0.25  # of the thread, when nothing wakes it
+FIRST_RETRY_S = 0.2
+MAX_RETRY_S = 2.0
+DEPARTURE_CHECK_S = 0.01  # between two checks whether a fix has left the operating system
+FLUSH_TIMEOUT_S = 0.5
 
 PortState = tuple[bool, str | None, int]  # is it connected; why not, or None; how often it was opened again
 
@@ -33,7 +33,7 @@ class Driver(Protocol):
     def start(self) -> None:
         """Begin to send and receive. Raises LinkError for a fault that only the user can correct."""
 
-    def ring(self) -> None:
+    def wake(self) -> None:
         """Send soon: there is something to be sent."""
 
     def state(self) -> PortState:
@@ -56,18 +56,18 @@ class PortDriver:
     def __init__(self, name: str, address: LinkAddress, conversation: Conversation, turns: Turns) -> None:
         self._name, self._address, self._conversation, self._turns = name, address, conversation, turns
         self._settings = conversation.settings
-        self._line: Line | None = None
+        self._writer: PacketWriter | None = None
         self._reopened = 0
-        self._retry_s = RETRY_FIRST_S
+        self._retry_s = FIRST_RETRY_S
         self._trouble: str | None = None
         self._closing = threading.Event()
-        self._bell, self._bell_button = socket.socketpair()  # wakes the thread when there is something to send
-        self._bell_button.setblocking(False)
+        self._wake_receiver, self._wake_sender = socket.socketpair()  # wakes the thread when there is something to send
+        self._wake_sender.setblocking(False)
         self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
 
     def start(self) -> None:
         try:
-            self._line = self._opened()
+            self._writer = self._open()
         except OSError as error:
             self._record_trouble(error)
         except LinkError:
@@ -75,75 +75,75 @@ class PortDriver:
             raise
         self._thread.start()
 
-    def ring(self) -> None:
+    def wake(self) -> None:
         with suppress(OSError):  # it rings already, or the link is closed
-            self._bell_button.send(b"!")
+            self._wake_sender.send(b"!")
 
     def state(self) -> PortState:
-        line = self._line
+        line = self._writer
         return line is not None and line.port.connected, self._trouble, self._reopened
 
     def close(self) -> None:
         self._closing.set()
-        self.ring()
+        self.wake()
         if self._thread.ident is None:  # never started
             self._close_all()
         else:
-            self._thread.join(2 * FLUSH_S)
+            self._thread.join(2 * FLUSH_TIMEOUT_S)
 
-    def _opened(self) -> Line:
-        return Line(open_port(self._address), self._settings.clock)
+    def _open(self) -> PacketWriter:
+        return PacketWriter(open_port(self._address), self._settings.clock)
 
     # The methods below run in the driver's own thread.
 
     def _run(self) -> None:
         while not self._closing.is_set():
             try:
-                if self._line is None:
+                if self._writer is None:
                     self._reopen()
                 else:
-                    self._work(self._line, timeout_s=SLEEP_S)
+                    self._work(self._writer, timeout_s=MAX_SLEEP_S)
             except (OSError, LinkError) as error:
-                self._lose(error)
+                self._handle_loss(error)
             except Exception as error:  # a flight without a link is worse than one with a link opened anew
                 log.exception("the link failed")
-                self._lose(error)
+                self._handle_loss(error)
         self._flush()
         self._close_all()
 
     def _reopen(self) -> None:
         if self._closing.wait(self._retry_s):
             return
-        self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
+        self._retry_s = min(2 * self._retry_s, MAX_RETRY_S)
         with self._turns.take_link_turn(self._name):
             self._conversation.drop_stale()
-        self._line = self._opened()
+        self._writer = self._open()
         self._reopened += 1
 
-    def _work(self, line: Line, timeout_s: float) -> None:
+    def _work(self, line: PacketWriter, timeout_s: float) -> None:
         """Write as much as the port accepts, wait until there is something to do or `timeout_s` is over, and read."""
         with self._turns.take_link_turn(self._name):
             if line.port.connected:
                 self._transmit(line)
             self._conversation.announce_changes()
-        reading: list[Port | socket.socket] = [line.port, self._bell]
+        reading: list[Port | socket.socket] = [line.port, self._wake_receiver]
         writing = [line.port] if line.unsent else []
-        timeout_s = min(timeout_s, WATCH_S) if line.leaving else self._conversation.wait_s(timeout_s)
+        timeout_s = min(timeout_s, DEPARTURE_CHECK_S) if line.pending_fixes else self._conversation.wait_s(timeout_s)
         readable, _, _ = select.select(reading, writing, [], timeout_s)
-        if self._bell in readable:
-            self._bell.recv(4096)
+        if self._wake_receiver in readable:
+            self._wake_receiver.recv(4096)
         if line.port in readable:
             self._receive(line)
 
-    def _receive(self, line: Line) -> None:
+    def _receive(self, line: PacketWriter) -> None:
         data = line.port.read()
         if data:
-            self._retry_s = RETRY_FIRST_S
+            self._retry_s = FIRST_RETRY_S
             if self._trouble is not None:
                 log.info("%s is back", self._address)
                 self._trouble = None
         with self._turns.take_link_turn(self._name):
-            self._count_departed(line)  # before its answer is read
+            self._count_sent_fixes(line)  # before its answer is read
             self._settings.signing.verdicts.clear()
             beats = self._conversation.handle(data, self._turns.now_s(), line.port.sender)
             # An autopilot whose clock is old, which has the key, learns the time from what we send it.
@@ -152,10 +152,10 @@ class PortDriver:
         if beats or is_behind:
             line.port.answer_sender()
 
-    def _transmit(self, line: Line) -> None:
+    def _transmit(self, line: PacketWriter) -> None:
         while True:
             # Before writing: what has waited too long must not be written on.
-            self._count_departed(line)
+            self._count_sent_fixes(line)
             if not line.unsent:
                 next_one = self._conversation.next_packet()
                 if next_one is None:
@@ -165,18 +165,18 @@ class PortDriver:
             if line.unsent:
                 return
 
-    def _count_departed(self, line: Line) -> None:
-        if departed := line.take_departed():
-            self._conversation.count_departed(departed)
+    def _count_sent_fixes(self, line: PacketWriter) -> None:
+        if departed := line.take_sent_fixes():
+            self._conversation.count_sent_fixes(departed)
 
-    def _lose(self, error: Exception) -> None:
+    def _handle_loss(self, error: Exception) -> None:
         with self._turns.take_link_turn(self._name):
-            self._conversation.break_off(self._close_line())
+            self._conversation.break_off(self._close_writer())
         self._record_trouble(error)
 
-    def _close_line(self) -> int:
+    def _close_writer(self) -> int:
         """Close the port, and return the number of fixes thrown away with it."""
-        line, self._line = self._line, None
+        line, self._writer = self._writer, None
         return line.close() if line else 0
 
     def _record_trouble(self, error: Exception) -> None:
@@ -186,16 +186,16 @@ class PortDriver:
             log.warning("%s is not there (%s); trying again", self._address, reason)
 
     def _flush(self) -> None:
-        give_up_s = time.monotonic() + FLUSH_S
+        give_up_s = time.monotonic() + FLUSH_TIMEOUT_S
         with suppress(OSError):
-            while self._line and self._line.port.connected and time.monotonic() < give_up_s:
-                self._work(self._line, timeout_s=0.01)
-                if not self._conversation.waits and self._line.is_idle:
+            while self._writer and self._writer.port.connected and time.monotonic() < give_up_s:
+                self._work(self._writer, timeout_s=0.01)
+                if not self._conversation.has_pending and self._writer.is_idle:
                     break
 
     def _close_all(self) -> None:
         with self._turns.take_link_turn(self._name):
-            self._close_line()
+            self._close_writer()
             self._conversation.end()
-        self._bell.close()
-        self._bell_button.close()
+        self._wake_receiver.close()
+        self._wake_sender.close()

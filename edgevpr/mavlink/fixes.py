@@ -18,13 +18,13 @@ from edgevpr.core.types import MAX_FIX_AGE_S, Vehicle
 from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Fix, Severity
 
-FIXES_MAX = 8
+MAX_QUEUED_FIXES = 8
 # The longest that a fix may wait, from `put` on and in all buffers together. types.FIX_MAX_AGE_S limits the age of its
 # frame, which the autopilot is told.
 MAX_FIX_WAIT_S = 1.0
-UNANSWERED_MAX = 5  # this number of unanswered fixes in a row stops the sending, until one is answered
-TRIED_AGAIN_AFTER_S = 10.0  # while the sending is stopped, one fix is sent at this interval
-ANSWERED_WITHIN_S = 1.0  # an answer takes some tens of milliseconds, over a radio up to half a second
+MAX_UNANSWERED = 5  # this number of unanswered fixes in a row stops the sending, until one is answered
+RETRY_INTERVAL_S = 10.0  # while the sending is stopped, one fix is sent at this interval
+ANSWER_TIMEOUT_S = 1.0  # an answer takes some tens of milliseconds, over a radio up to half a second
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ class FixAnswer:
     latency_s: float | None
 
 
-class Sending:
+class FixTransmission:
     """A fix to be sent by `due_s`. `sent` is None while it waits, then True, or False with the reason in `why`.
     `t_sent_s` is when it was handed to the port, `outcome` the answer of the autopilot."""
 
@@ -67,9 +67,9 @@ class Sending:
 
 
 class Fixes:
-    """Holds the fixes of one link: those that wait to be sent, and those sent whose answers are awaited. It counts the
-    fixes `dropped` because they were too old or too many, `withheld` because of `why_not` or a pause, and `unanswered`.
-    `refusal` is the reason for the last refusal by the autopilot (None: there was none)."""
+    """The fixes of one link: those that wait to be sent, and those that wait for their answer. Counts those `dropped`
+    (too old or too many), `withheld` (by `find_objection` or a pause), and `unanswered`. `refusal` is the reason of the
+    last refusal by the autopilot (None: there was none)."""
 
     def __init__(
         self, max_wait_s: float = MAX_FIX_WAIT_S, announce: Announce = lambda severity, text, topic: None
@@ -78,37 +78,37 @@ class Fixes:
         self.dropped = self.withheld = self.unanswered = 0
         self.refusal: Reason | None = None
         self._max_wait_s = max_wait_s
-        self._waiting: deque[Sending] = deque()
-        self._under_way: deque[tuple[float, Sending]] = deque()  # sent, without an answer; with the time of sending
-        self._taken_s = -math.inf  # time of the newest fix that was accepted, or perhaps was
+        self._waiting: deque[FixTransmission] = deque()
+        self._awaited: deque[tuple[float, FixTransmission]] = deque()  # sent, with the time of sending
+        self._accepted_s = -math.inf  # time of the newest fix that was accepted, or perhaps was
         self._last_answer: tuple[str, Reason] | None = None
         self._sent_s = -math.inf
-        self._row = 0  # fixes without an answer, in a row
+        self._unanswered_row = 0  # fixes without an answer, in a row
         self._is_stopped = False  # as the ground station was last told
         self._resumes_s = -math.inf
 
     def __len__(self) -> int:
         """Return the number of fixes that wait for their answers."""
-        return len(self._under_way)
+        return len(self._awaited)
 
     @property
     def t_fix_s(self) -> float:
         """The time of the newest fix that the autopilot may be using: any that it has not refused (-inf: none)."""
-        return max(self._taken_s, self._under_way[-1][0] if self._under_way else -math.inf)
+        return max(self._accepted_s, self._awaited[-1][0] if self._awaited else -math.inf)
 
-    def put(self, fix: Fix, now_s: float) -> Sending:
+    def put(self, fix: Fix, now_s: float) -> FixTransmission:
         """Queue a fix. It is sent within `max_wait_s` seconds and before its frame is 5 s old, or not at all."""
-        sending = Sending(fix, min(now_s + self._max_wait_s, fix.t_frame_s + MAX_FIX_AGE_S))
+        sending = FixTransmission(fix, min(now_s + self._max_wait_s, fix.t_frame_s + MAX_FIX_AGE_S))
         age_s = now_s - fix.t_frame_s
         if age_s > MAX_FIX_AGE_S:
             self._drop(sending, Reason(ReasonCode.FRAME_TOO_OLD, {"age_s": age_s, "limit_s": MAX_FIX_AGE_S}))
             return sending
-        if len(self._waiting) == FIXES_MAX:
+        if len(self._waiting) == MAX_QUEUED_FIXES:
             self._drop(self._waiting.popleft(), Reason(ReasonCode.SUPERSEDED))
         self._waiting.append(sending)
         return sending
 
-    def next(self, now_s: float) -> Sending | None:
+    def next(self, now_s: float) -> FixTransmission | None:
         """Drop the fixes that have waited too long; return the oldest of the others, None without any."""
         self.drop_stale(now_s)
         return self._waiting.popleft() if self._waiting else None
@@ -127,33 +127,33 @@ class Fixes:
             sending.settle(False, why)
         self._waiting.clear()
 
-    def why_not(self, now_s: float) -> Reason | None:
+    def find_objection(self, now_s: float) -> Reason | None:
         """Return the reason why no fix may be sent now (None: it may)."""
-        if self._row >= UNANSWERED_MAX and now_s - self._sent_s < TRIED_AGAIN_AFTER_S:
+        if self._unanswered_row >= MAX_UNANSWERED and now_s - self._sent_s < RETRY_INTERVAL_S:
             return Reason(ReasonCode.FIXES_UNANSWERED)
         if now_s < self._resumes_s:
             return Reason(ReasonCode.ANSWERS_BEGIN_AGAIN)
         return None
 
-    def record_sent(self, sending: Sending, now_s: float) -> None:
+    def record_sent(self, sending: FixTransmission, now_s: float) -> None:
         """Note that a fix was handed to the port."""
         sending.t_sent_s = self._sent_s = now_s
-        self._row += 1
-        self._under_way.append((now_s, sending))
+        self._unanswered_row += 1
+        self._awaited.append((now_s, sending))
 
     def record_lost(self, count: int) -> None:
         """Note that `count` fixes were thrown away with the port: they do not count as unanswered in a row, unless the
         sending is stopped already, which only an answer ends."""
         if not self._is_stopped:
-            self._row -= count
-        self.break_off(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))
+            self._unanswered_row -= count
+        self.cancel_awaited(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))
 
-    def handle(self, result: str, reason: Reason, now_s: float) -> Sending | None:
+    def handle(self, result: str, reason: Reason, now_s: float) -> FixTransmission | None:
         """Process an answer: `result` is the name of a MAV_RESULT, `reason` explains it. Returns its fix, if any."""
         if self._is_stopped:
             # The answers to all those fixes may arrive now, and must not be matched to a new fix.
-            self._resumes_s = now_s + ANSWERED_WITHIN_S
-        self._row = 0
+            self._resumes_s = now_s + ANSWER_TIMEOUT_S
+        self._unanswered_row = 0
         self.time_out(now_s)
         is_taken = result == "ACCEPTED"
         if (result, reason) != self._last_answer:
@@ -165,54 +165,54 @@ class Fixes:
                 self._announce(severity, text, "fixes")
         self._last_answer = result, reason
         if is_taken:
-            self._taken_s = now_s
+            self._accepted_s = now_s
         else:
             self.refusal = reason
-        if not self._under_way:
+        if not self._awaited:
             return None
-        sent_s, sending = self._under_way.popleft()
+        sent_s, sending = self._awaited.popleft()
         sending.outcome = FixAnswer(result, None if is_taken else reason, now_s - sent_s)
         return sending
 
     def time_out(self, now_s: float) -> None:
         """Count the fixes sent more than a second ago as unanswered."""
-        while self._under_way and self._under_way[0][1].sent and now_s - self._under_way[0][0] > ANSWERED_WITHIN_S:
-            self._give_up(Reason(ReasonCode.NO_ANSWER, {"limit_s": ANSWERED_WITHIN_S}))
+        while self._awaited and self._awaited[0][1].sent and now_s - self._awaited[0][0] > ANSWER_TIMEOUT_S:
+            self._give_up(Reason(ReasonCode.NO_ANSWER, {"limit_s": ANSWER_TIMEOUT_S}))
 
-    def break_off(self, reason: Reason) -> None:
+    def cancel_awaited(self, reason: Reason) -> None:
         """Stop waiting for the answers to all fixes sent, for `reason`."""
-        while self._under_way:
+        while self._awaited:
             self._give_up(reason)
 
     def report_silence(self, why_silent: Reason, now_s: float) -> None:
         """Report if fixes are no longer answered (for the likely reason `why_silent`), or are answered again."""
         self.time_out(now_s)
-        is_stopped = self._row >= UNANSWERED_MAX
-        if is_stopped == self._is_stopped or (is_stopped and now_s - self._sent_s < ANSWERED_WITHIN_S):
+        is_stopped = self._unanswered_row >= MAX_UNANSWERED
+        if is_stopped == self._is_stopped or (is_stopped and now_s - self._sent_s < ANSWER_TIMEOUT_S):
             return
         self._is_stopped = is_stopped
         if is_stopped:
-            often = f"one every {TRIED_AGAIN_AFTER_S:g} s is sent until one is answered"
+            often = f"one every {RETRY_INTERVAL_S:g} s is sent until one is answered"
             log.warning("five fixes in a row had no answer, so %s: %s", often, why_silent)
             self._announce(Severity.WARNING, f"fixes unanswered: {why_silent.code.summary}", "answers")
         else:
             log.warning("position fixes are answered again: they are sent again")
             self._announce(Severity.INFO, "fixes are answered again", "answers")
 
-    def _drop(self, sending: Sending, why: Reason) -> None:
+    def _drop(self, sending: FixTransmission, why: Reason) -> None:
         self.dropped += 1
         sending.settle(False, why)
 
     def _give_up(self, reason: Reason) -> None:
         """Give up the oldest fix sent; the autopilot may use it all the same."""
-        sent_s, sending = self._under_way.popleft()
-        self._taken_s = max(self._taken_s, sent_s)
+        sent_s, sending = self._awaited.popleft()
+        self._accepted_s = max(self._accepted_s, sent_s)
         if sending.sent:
             self.unanswered += 1
             sending.outcome = FixAnswer(None, reason, None)
 
 
-def put_back(fix: Fix, now_s: float, lag_s: float, vehicle: Vehicle | None) -> Fix:
+def compensate_lag(fix: Fix, now_s: float, lag_s: float, vehicle: Vehicle | None) -> Fix:
     """Return a fix for an autopilot that takes what it receives at `now_s` as sent `lag_s` earlier: one that is so much
     younger or, where it has no such age, the position of the vehicle so long ago."""
     younger_s = min(lag_s, max(0.0, now_s - fix.t_frame_s))

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.ardupilot_parameters import ARDUPILOT_TABLE
-from edgevpr.mavlink.channel import Channel, Choice, Kind, classify_vehicle
+from edgevpr.mavlink.channel import Channel, ChannelChoice, VehicleKind, classify_vehicle
 from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Severity
-from edgevpr.mavlink.parameters import Decision, ParameterTable, name_alternative
+from edgevpr.mavlink.parameters import Decision, ParameterTable, find_alternative
 from edgevpr.mavlink.px4_parameters import PX4_TABLE
 from edgevpr.mavlink.wire import Message, mavlink, parameter_value
 
@@ -28,7 +28,7 @@ VERSION_ASKS_MAX = 4
 TOPIC = "parameters"
 
 TABLES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUPILOT_TABLE, mavlink.MAV_AUTOPILOT_PX4: PX4_TABLE}
-_OF_ANY = Choice(Channel.COMMAND, Reason(ReasonCode.COMMAND_TO_ANY))
+_OF_ANY = ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_TO_ANY))
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ class Interview:
         self._values: dict[str, float] = {}
         self._decision = Decision(_OF_ANY)
         self._reported: Decision | None = None
-        self._autopilot, self._kind = int(mavlink.MAV_AUTOPILOT_GENERIC), Kind.OTHER
+        self._autopilot, self._kind = int(mavlink.MAV_AUTOPILOT_GENERIC), VehicleKind.OTHER
         self._version: tuple[int, int] | None = None
         self._version_asks = 0
         self._absent: set[str] = set()
@@ -64,7 +64,7 @@ class Interview:
         self._has_reported_missing = False
 
     @property
-    def choice(self) -> Choice:
+    def choice(self) -> ChannelChoice:
         return self._decision.choice
 
     def handle(self, message: Message) -> None:
@@ -152,7 +152,7 @@ class Interview:
         return self._table.all_names if self._table else frozenset()
 
     def _is_known(self, name: str) -> bool:
-        names = {name, name_alternative(name) or name}
+        names = {name, find_alternative(name) or name}
         return not names.isdisjoint(self._values) or names <= self._absent
 
     def _find_missing(self) -> list[str]:
@@ -160,12 +160,12 @@ class Interview:
         these first those that were asked for least. An alternative name is asked for once the first had no answer."""
         if not (table := self._table):
             return []
-        needed = table.name_needed(table.choose(self._kind, self._values))
+        needed = table.list_needed(table.choose(self._kind, self._values))
         rank = dict.fromkeys(needed, 1) | dict.fromkeys(table.deciding, 0)
         missing: list[tuple[int, int, str]] = []
         for name in table.names:
             if not self._is_known(name):
-                other = name_alternative(name)
+                other = find_alternative(name)
                 names = (name, other) if other and self._asks[name] else (name,)
                 missing += [(rank.get(name, 2), self._asks[each], each) for each in names if each not in self._absent]
         return [name for *_, name in sorted(missing)]
@@ -175,7 +175,7 @@ class Interview:
         answers may have been lost."""
         names = list(self._values)
         if is_alone:
-            names += [name for name in self._absent if name_alternative(name) not in self._values]
+            names += [name for name in self._absent if find_alternative(name) not in self._values]
         self._again += 1
         return [sorted(names)[self._again % len(names)]] if names else []
 

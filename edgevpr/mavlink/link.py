@@ -9,7 +9,7 @@ from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.driver import DriverMaker, PortDriver
-from edgevpr.mavlink.fixes import Sending
+from edgevpr.mavlink.fixes import FixTransmission
 from edgevpr.mavlink.ground import Wished
 from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.turns import Turns
@@ -94,7 +94,7 @@ class Link:
         with self._sending("send"):
             self.conversation.send(*outgoing)
 
-    def send_fix(self, fix: Fix) -> Sending:
+    def send_fix(self, fix: Fix) -> FixTransmission:
         with self._sending("send_fix"):
             return self.conversation.send_fix(fix)
 
@@ -106,9 +106,9 @@ class Link:
         with self.turn("offer"):  # so called on the tapes of recorded flights, as the turn of `take_wish`
             self.conversation.requests.is_under_way = True
 
-    def take_between(self) -> list[Sending]:
+    def take_interim_fixes(self) -> list[FixTransmission]:
         with self.turn("take_between"):
-            return self.conversation.take_between()
+            return self.conversation.take_interim_fixes()
 
     def take_wish(self) -> Wished | None:
         with self.turn("take_wishes"):
@@ -118,18 +118,18 @@ class Link:
         with self.turn("set_health"):
             self.conversation.set_health(health)
 
-    def want_position(self) -> None:
+    def request_position(self) -> None:
         with self.turn("want_position"):
-            self.conversation.want_position()
+            self.conversation.request_position()
 
     def vehicle(self) -> Vehicle | None:
         """Return the autopilot's last report of its vehicle; None before the first, and if the last had no position."""
         with self.turn("vehicle"):
             return self.conversation.autopilot.vehicle
 
-    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
+    def predict_vehicle(self, t_mono_s: float) -> Vehicle | None:
         with self.turn("vehicle_at"):
-            return self.conversation.vehicle_at(t_mono_s)
+            return self.conversation.predict_vehicle(t_mono_s)
 
     @property
     def channel(self) -> Channel:
@@ -185,4 +185,4 @@ class Link:
         """Context manager: take a turn, and wake the thread after it."""
         with self.turn(what):
             yield
-        self._driver.ring()
+        self._driver.wake()

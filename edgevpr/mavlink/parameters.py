@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.mavlink.channel import OLD_NAMES, Channel, Choice, Kind, Parameters, own_name, read_value
+from edgevpr.mavlink.channel import OLD_NAMES, Channel, ChannelChoice, Parameters, VehicleKind, read_value, resolve_name
 
 # ARMING_SKIPCHK takes the place of ARMING_CHECK after ArduPilot 4.6: it names the checks to leave out.
 _ALTERNATIVES = {**OLD_NAMES, "ARMING_CHECK": "ARMING_SKIPCHK"}
@@ -24,7 +24,7 @@ class Check(NamedTuple):
     chosen for them, and returns the changes, such as "GPS_PRIMARY=0"; none if the values are right."""
 
     names: tuple[str, ...]
-    find_changes: Callable[[Parameters, Choice], Iterable[str]]
+    find_changes: Callable[[Parameters, ChannelChoice], Iterable[str]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +64,7 @@ class Decision:
     """A choice, the `missing` parameters without which it cannot be made, and the `faults` of the channel's table rows:
     if the first is dangerous, nothing is sent."""
 
-    choice: Choice
+    choice: ChannelChoice
     missing: tuple[str, ...] = ()
     faults: tuple[ParameterFault, ...] = ()
 
@@ -77,7 +77,7 @@ class ParameterTable:
     name: str
     deciding: tuple[str, ...]
     rules: tuple[ParameterRule, ...]
-    choose: Callable[[Kind, Parameters], Choice]
+    choose: Callable[[VehicleKind, Parameters], ChannelChoice]
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -87,27 +87,27 @@ class ParameterTable:
     @cached_property
     def all_names(self) -> frozenset[str]:
         """The names of all parameters, and those that they have in other releases."""
-        return frozenset(self.names).union(filter(None, map(name_alternative, self.names)))
+        return frozenset(self.names).union(filter(None, map(find_alternative, self.names)))
 
-    def name_needed(self, choice: Choice) -> tuple[str, ...]:
+    def list_needed(self, choice: ChannelChoice) -> tuple[str, ...]:
         """Return the names of the parameters that must be known before anything is sent by the channel of `choice`."""
         return self._join(rule for rule in self.rules if choice.channel in rule.channels)
 
-    def find_faults(self, choice: Choice, parameters: Parameters) -> tuple[ParameterFault, ...]:
+    def find_faults(self, choice: ChannelChoice, parameters: Parameters) -> tuple[ParameterFault, ...]:
         """Return the rules that `parameters` break for the channel of `choice`, the dangerous ones first."""
         ours = (rule for rule in self.rules if choice.channel in rule.channels)
         faults = (ParameterFault(rule, tuple(rule.check.find_changes(parameters, choice))) for rule in ours)
         broken = (fault for fault in faults if fault.changes)
         return tuple(sorted(broken, key=lambda fault: not fault.rule.is_dangerous))
 
-    def decide(self, kind: Kind, parameters: Parameters, is_known: Callable[[str], bool]) -> Decision:
+    def decide(self, kind: VehicleKind, parameters: Parameters, is_known: Callable[[str], bool]) -> Decision:
         """Choose the channel. `parameters` has the values that were read; `is_known` returns whether a parameter's
         value was read, or the autopilot is known not to have it."""
         if missing := tuple(name for name in self.deciding if not is_known(name)):
-            return _wait_for(missing)
+            return _decide_to_wait(missing)
         choice = self.choose(kind, parameters)
-        if missing := tuple(name for name in self.name_needed(choice) if not is_known(name)):
-            return _wait_for(missing)
+        if missing := tuple(name for name in self.list_needed(choice) if not is_known(name)):
+            return _decide_to_wait(missing)
         faults = self.find_faults(choice, parameters)
         if faults and faults[0].rule.is_dangerous:
             choice = replace(choice, channel=Channel.NONE, reason=faults[0].reason)
@@ -117,37 +117,37 @@ class ParameterTable:
         return tuple(dict.fromkeys((*self.deciding, *(name for rule in rules for name in rule.check.names))))
 
 
-def _wait_for(missing: tuple[str, ...]) -> Decision:
+def _decide_to_wait(missing: tuple[str, ...]) -> Decision:
     reason = Reason(ReasonCode.PARAMETERS_UNANSWERED, {"names": ", ".join(missing)})
-    return Decision(Choice(Channel.NONE, reason), missing)
+    return Decision(ChannelChoice(Channel.NONE, reason), missing)
 
 
-def name_alternative(name: str) -> str | None:
+def find_alternative(name: str) -> str | None:
     """Return the name under which another release has this parameter, or one in its place; None if there is none."""
     return _ALTERNATIVES.get(name)
 
 
-def dangerous(channels: tuple[Channel, ...], right: str, check: Check, why: str, label: str = "") -> ParameterRule:
+def require(channels: tuple[Channel, ...], right: str, check: Check, why: str, label: str = "") -> ParameterRule:
     """Make a rule for values with which an aircraft can be lost that would be fine alone: nothing may be sent then. The
     `label` is the name of the first parameter, unless another one is given."""
-    return replace(weak(channels, right, check, why, label), is_dangerous=True)
+    return replace(recommend(channels, right, check, why, label), is_dangerous=True)
 
 
-def weak(channels: tuple[Channel, ...], right: str, check: Check, why: str, label: str = "") -> ParameterRule:
+def recommend(channels: tuple[Channel, ...], right: str, check: Check, why: str, label: str = "") -> ParameterRule:
     """Make a rule for values with which we are only useless, or weak."""
     label = label or check.names[0]
     return ParameterRule(label=label, channels=channels, is_dangerous=False, right=right, check=check, why=why)
 
 
-def demand(advised: float, *names: str, allows: Callable[[float], bool] | None = None) -> Check:
+def expect(advised: float, *names: str, allows: Callable[[float], bool] | None = None) -> Check:
     """Return a check that advises NAME=`advised` for each of the parameters whose value `allows` refuses (by default
     any but `advised`). A parameter that the autopilot does not have is right."""
 
-    def find_changes(parameters: Parameters, _choice: Choice) -> Iterator[str]:
+    def find_changes(parameters: Parameters, _choice: ChannelChoice) -> Iterator[str]:
         for name in names:
             value = read_value(parameters, name, advised)
             if not (value == advised if allows is None else allows(value)):
-                yield f"{own_name(parameters, name)}={advised:g}"
+                yield f"{resolve_name(parameters, name)}={advised:g}"
 
     return Check(names, find_changes)
 
@@ -158,7 +158,7 @@ def join_checks(*checks: Check) -> Check:
     return Check(names, lambda *read: (change for check in checks for change in check.find_changes(*read)))
 
 
-def at_most(limit: float) -> Callable[[float], bool]:
+def make_limit(limit: float) -> Callable[[float], bool]:
     """Return a function that allows values up to a limit."""
     return lambda value: value <= limit
 
@@ -173,6 +173,6 @@ def has_bit(value: float, bit: int) -> bool:
     return bool(int(value) & bit)
 
 
-def name_axes(prefix: str) -> tuple[str, ...]:
+def list_axes(prefix: str) -> tuple[str, ...]:
     """Return the names of the three coordinates of a position in the airframe."""
     return tuple(f"{prefix}_{axis}" for axis in "XYZ")

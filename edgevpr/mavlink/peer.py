@@ -10,7 +10,7 @@ from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.clock import SILENT_AFTER_S, AutopilotClock, ForeignStamps, ReportDelay
+from edgevpr.mavlink.clock import HEARTBEAT_TIMEOUT_S, AutopilotClock, ForeignStamps, ReportDelay
 from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.heights import Altitudes, Heights
 from edgevpr.mavlink.interview import Interview
@@ -116,11 +116,11 @@ class Listener:
         """Return False while matches prove the GPS receiver wrong."""
         return True
 
-    def state_at(self, t_s: float) -> MotionState | None:
+    def estimate_state(self, t_s: float) -> MotionState | None:
         """Return the vehicle's position and motion at `t_s`, for a continuous channel; None: not known well enough."""
         return None
 
-    def fix_between(self, now_s: float) -> Fix | None:
+    def make_interim_fix(self, now_s: float) -> Fix | None:
         """Return a fix to be sent between two matches, where fixes are single; None: it would not help."""
         return None
 
@@ -165,7 +165,7 @@ class Autopilot:
 
     def listens(self, now_s: float) -> bool:
         """Return True if the autopilot's heartbeat came in the last five seconds, through the port now open."""
-        return now_s - self.heard_s <= SILENT_AFTER_S
+        return now_s - self.heard_s <= HEARTBEAT_TIMEOUT_S
 
     def asks_origin(self, now_s: float) -> bool:
         """Return True, and note the time, if the origin is to be requested now: a restart may have lost it."""
@@ -190,8 +190,8 @@ class Autopilot:
         is_late = self._lacked_origin or now_s - self._asked_origin_s > _ORIGIN_WITHIN_S
         return self._origin_s < self._asked_origin_s and is_late
 
-    def vehicle_at(self, t_mono_s: float) -> Vehicle | None:
-        """Return the last report, moved to `t_mono_s`: see `Conversation.vehicle_at`."""
+    def predict_vehicle(self, t_mono_s: float) -> Vehicle | None:
+        """Return the last report, moved to `t_mono_s`: see `Conversation.predict_vehicle`."""
         vehicle, attitude = self.vehicle, self.attitudes.at(t_mono_s)
         if vehicle and vehicle.velocity_m_s and vehicle.is_fresh(t_mono_s):
             east_m, north_m = ((t_mono_s - vehicle.t_heard_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)

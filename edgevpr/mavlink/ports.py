@@ -1,6 +1,6 @@
 """Ports of four kinds: UDP out, UDP in, TCP and serial. None of them blocks once it is open, and all behave alike after
-every fault: pymavlink's own connections may spin, hang or raise. A `Line` is an open port together with the packets
-written into it: no position fix leaves late from a buffer, be it ours or that of the operating system."""
+every fault: pymavlink's own connections may spin, hang or raise. A `PacketWriter` writes packets
+to an open port: no position fix leaves late from a buffer, be it ours or that of the operating system."""
 
 import errno
 import fcntl
@@ -16,14 +16,16 @@ from contextlib import ExitStack, suppress
 from edgevpr.core.errors import LinkAddressError, LinkError
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.address import LinkAddress, Sender
-from edgevpr.mavlink.fixes import Sending
+from edgevpr.mavlink.fixes import FixTransmission
 
 CONNECT_TIMEOUT_S = 1.0
-TCP_GIVE_UP_MS = 1000  # if the other end has not confirmed bytes by then, the connection is closed and they are lost
-TCP_SEND_BYTES = 8192  # doubled by the system: some 30 messages; left to itself it takes megabytes
+TCP_TIMEOUT_MS = 1000  # if the other end has not confirmed bytes by then, the connection is closed and they are lost
+TCP_BUFFER_BYTES = 8192  # doubled by the system: some 30 messages; left to itself it takes megabytes
 READ_BYTES = 65_536
 LOST = Reason(ReasonCode.LINK_LOST)
-STUCK_S = 0.5  # a port that has accepted no byte for this time is reopened: bytes that wait in it would leave late
+WRITE_TIMEOUT_S = (
+    0.5  # a port that has accepted no byte for this time is reopened: bytes that wait in it would leave late
+)
 
 
 class Port:
@@ -32,7 +34,7 @@ class Port:
 
     connected = True
     sender: Sender | None = None
-    _end = "the other end closed the connection"
+    _loss = "the other end closed the connection"
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
@@ -47,7 +49,7 @@ class Port:
         with suppress(BlockingIOError):
             data = os.read(self.fileno(), READ_BYTES)
             if not data:
-                raise ConnectionError(self._end)
+                raise ConnectionError(self._loss)
             return data
         return b""
 
@@ -64,7 +66,7 @@ class Port:
         """Return the number of bytes written that have not left the system, or (TCP) are not confirmed."""
         return 0
 
-    def throw_away(self) -> None:
+    def discard_on_close(self) -> None:
         """Make `close` discard the bytes that have not left, instead of letting them leave later."""
 
     def close(self) -> None:
@@ -132,21 +134,21 @@ class TcpPort(Port):
     def __init__(self, host: str, port: int) -> None:
         super().__init__(socket.create_connection((host, port), CONNECT_TIMEOUT_S))
         self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, TCP_GIVE_UP_MS)
-        self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_SEND_BYTES)
+        self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, TCP_TIMEOUT_MS)
+        self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER_BYTES)
 
     def unsent(self) -> int:
         # SIOCOUTQ, which has the number of TIOCOUTQ.
         return int.from_bytes(fcntl.ioctl(self._sock, termios.TIOCOUTQ, bytes(4)), "little")
 
-    def throw_away(self) -> None:
+    def discard_on_close(self) -> None:
         self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
 
 class SerialPort(Port):
     """A serial line, written by its file descriptor: pyserial's own write spins when the buffer is full."""
 
-    _end = "the device is gone"
+    _loss = "the device is gone"
 
     def __init__(self, device: str, baud: int) -> None:
         import serial  # not at the top: no other kind of link needs it
@@ -176,7 +178,7 @@ class SerialPort(Port):
         self._port.close()
 
 
-_OPENERS: dict[str, Callable[[str, int], Port]] = {
+_PORT_TYPES: dict[str, Callable[[str, int], Port]] = {
     "udpout": UdpOutPort,
     "udpin": UdpInPort,
     "tcp": TcpPort,
@@ -195,7 +197,7 @@ def open_port(address: LinkAddress) -> Port:
     the user must correct (a port in use, no permission), and OSError for one that may end by itself (no device)."""
     is_serial = address.kind == "serial"
     try:
-        return _OPENERS[address.kind](address.where, address.number)
+        return _PORT_TYPES[address.kind](address.where, address.number)
     except (socket.gaierror, UnicodeError) as error:
         # The host may be found later: no name server has answered, or a .local host announces itself.
         is_unasked = isinstance(error, socket.gaierror) and error.errno != socket.EAI_NONAME
@@ -210,17 +212,17 @@ def open_port(address: LinkAddress) -> Port:
         raise kind(f"{address}: {advice}.") from error
 
 
-class Line:
+class PacketWriter:
     """Writes packets to a port, one after another. A fix counts as sent when all its bytes have left the operating
-    system (over TCP: when they are confirmed). If that has not happened by its `due_s`, `take_departed` raises
+    system (over TCP: when they are confirmed). If that has not happened by its `due_s`, `take_sent_fixes` raises
     ConnectionError; closing the port then throws the bytes away. `unsent` are the bytes of the last packet that the
     port has not accepted yet."""
 
     def __init__(self, port: Port, clock: Callable[[], float]) -> None:
         self.port, self._clock = port, clock
         self.unsent = b""
-        self._taken = 0  # number of bytes that the port has accepted so far
-        self.leaving: deque[tuple[int, Sending]] = deque()  # fixes not sent yet; `_taken` at their last byte
+        self._accepted_bytes = 0
+        self.pending_fixes: deque[tuple[int, FixTransmission]] = deque()  # `_accepted_bytes` at their last byte
         self._blocked_since_s: float | None = None
 
     @property
@@ -228,36 +230,36 @@ class Line:
         """True if every byte has left the operating system."""
         return not self.unsent and self.port.unsent() == 0
 
-    def put(self, packet: bytes, sending: Sending | None) -> None:
+    def put(self, packet: bytes, sending: FixTransmission | None) -> None:
         """Set the next packet and the fix in it, if any, once the port has accepted the previous packet in full."""
         self.unsent = packet
         if sending:
-            self.leaving.append((self._taken + len(packet), sending))
+            self.pending_fixes.append((self._accepted_bytes + len(packet), sending))
 
     def write(self) -> None:
-        """Write what the port accepts without blocking. Raises OSError if it is lost, or took nothing for STUCK_S."""
+        """Write what the port accepts without blocking. Raises OSError if it is lost, or took nothing for 0.5 s."""
         if not self.unsent:
             return
         taken = self.port.write(self.unsent)
         self.unsent = self.unsent[taken:]
-        self._taken += taken
+        self._accepted_bytes += taken
         if taken:
             self._blocked_since_s = None
         elif self._blocked_since_s is None:
             self._blocked_since_s = self._clock()
-        elif self._clock() - self._blocked_since_s > STUCK_S:
+        elif self._clock() - self._blocked_since_s > WRITE_TIMEOUT_S:
             raise ConnectionError("the port takes no more bytes")
 
-    def take_departed(self) -> list[Sending]:
+    def take_sent_fixes(self) -> list[FixTransmission]:
         """Return the fixes that have left since the last call, now sent. Raises ConnectionError if one is too late."""
         departed = []
         # Read before the bytes are asked for: a clock that jumps meanwhile must not condemn what has just left.
         now_s = self._clock()
-        left = self._taken - self.port.unsent() if self.leaving else 0
-        while self.leaving and self.leaving[0][0] <= left:
-            departed.append(self.leaving.popleft()[1])
+        left = self._accepted_bytes - self.port.unsent() if self.pending_fixes else 0
+        while self.pending_fixes and self.pending_fixes[0][0] <= left:
+            departed.append(self.pending_fixes.popleft()[1])
             departed[-1].settle(True)
-        if not departed and self.leaving and now_s > self.leaving[0][1].due_s:
+        if not departed and self.pending_fixes and now_s > self.pending_fixes[0][1].due_s:
             raise ConnectionError("a position fix has waited too long in it")
         return departed
 
@@ -265,8 +267,8 @@ class Line:
         """Close the port, throw away all bytes that have not left, and return the number of fixes in them."""
         with suppress(OSError):
             if not self.is_idle:
-                self.port.throw_away()
+                self.port.discard_on_close()
         self.port.close()
-        for _, sending in self.leaving:
+        for _, sending in self.pending_fixes:
             sending.settle(False, LOST)
-        return len(self.leaving)
+        return len(self.pending_fixes)

@@ -2,19 +2,19 @@
 decides, or says that it was flown in its own simulator."""
 
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.mavlink.channel import Channel, Choice, Kind, Parameters
+from edgevpr.mavlink.channel import Channel, ChannelChoice, Parameters, VehicleKind
 from edgevpr.mavlink.messages import SENSOR_ID
 from edgevpr.mavlink.parameters import (
     MAX_DELAY_MS,
     MAX_OFFSET_M,
     ParameterTable,
-    at_most,
-    dangerous,
-    demand,
+    expect,
     has_bit,
     is_small_offset,
-    name_axes,
-    weak,
+    list_axes,
+    make_limit,
+    recommend,
+    require,
 )
 
 FUSES_POSITION = 1  # bit of EKF2_AGPn_CTRL
@@ -33,57 +33,57 @@ _MAX_GATE_SD = 10
 _TAKEN_FOR_OLD = "We send the position of the moment, and it would be taken for an old one."
 
 
-def choose_px4_channel(_kind: Kind, parameters: Parameters) -> Choice:
+def choose_px4_channel(_kind: VehicleKind, parameters: Parameters) -> ChannelChoice:
     """Choose the channel for a PX4: message 296 or ODOMETRY if CONTROL or VISION_CONTROL let it fuse positions, else
     command 43003."""
     fuses_ours = has_bit(parameters.get(CONTROL, 0), FUSES_POSITION)
     if parameters.get(VISION_CONTROL) == FUSES_POSITION and not fuses_ours:
         reason = Reason(ReasonCode.BY_ODOMETRY, {"parameter": VISION_CONTROL, "source_set": None})
-        return Choice(Channel.VISION, reason)
+        return ChannelChoice(Channel.VISION, reason)
     if CONTROL not in parameters:
-        return Choice(Channel.COMMAND, Reason(ReasonCode.COMMAND_WITHOUT_296, {"parameter": CONTROL}))
+        return ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_WITHOUT_296, {"parameter": CONTROL}))
     if fuses_ours:
-        return Choice(Channel.SENSOR, Reason(ReasonCode.BY_MESSAGE_296, {"parameter": CONTROL}))
-    return Choice(Channel.COMMAND, Reason(ReasonCode.COMMAND_FOR_296, {"parameter": CONTROL}))
+        return ChannelChoice(Channel.SENSOR, Reason(ReasonCode.BY_MESSAGE_296, {"parameter": CONTROL}))
+    return ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_FOR_296, {"parameter": CONTROL}))
 
 
 # fmt: off
 _RULES = (
-    weak(_ALL, "7, the default: with the bit 1",  # gps_control.cpp, controlGnssPosFusion
-        demand(7, "EKF2_GPS_CTRL", allows=lambda value: has_bit(value, _USES_POSITION)),
+    recommend(_ALL, "7, the default: with the bit 1",  # gps_control.cpp, controlGnssPosFusion
+        expect(7, "EKF2_GPS_CTRL", allows=lambda value: has_bit(value, _USES_POSITION)),
         "GPS is not used for the position: it flies by us alone. That is for an aircraft without GPS only."),
-    dangerous(_ALL, "0", demand(0, "EKF2_GPS_MODE"),  # gps_control.cpp, isGnssPosResetAllowed
+    require(_ALL, "0", expect(0, "EKF2_GPS_MODE"),  # gps_control.cpp, isGnssPosResetAllowed
         "GPS that comes back far from our position is refused for as long as airspeed or optical flow is used."),
-    weak(_CONTINUOUS, "0 or 1", demand(1, "EKF2_HGT_REF", allows=lambda value: value != _FROM_VISION),
+    recommend(_CONTINUOUS, "0 or 1", expect(1, "EKF2_HGT_REF", allows=lambda value: value != _FROM_VISION),
         "We send no height: with 3 (vision) it never gets ready to arm."),  # flown
-    weak(_ALL, "1", demand(1, "SYS_HAS_GPS"),
+    recommend(_ALL, "1", expect(1, "SYS_HAS_GPS"),
         "With 0 it arms without GPS, so that the start may be unknown. That is for an aircraft without GPS only."),
     # aux_global_position.cpp: a slot whose number is 0 at the start does not exist.
-    weak(_BY_296, f"{SENSOR_ID}", demand(SENSOR_ID, "EKF2_AGP0_ID"),
+    recommend(_BY_296, f"{SENSOR_ID}", expect(SENSOR_ID, "EKF2_AGP0_ID"),
         "It is the number that our positions carry; with another they are not used."),
-    dangerous(_BY_296, f"1, the default; up to {_MAX_SD_M}",  # flown
-        demand(1, "EKF2_AGP0_NOISE", allows=at_most(_MAX_SD_M)),
+    require(_BY_296, f"1, the default; up to {_MAX_SD_M}",  # flown
+        expect(1, "EKF2_AGP0_NOISE", allows=make_limit(_MAX_SD_M)),
         "It hardly follows us, and takes positions that are far off: with 50 it was 20 m off, and all seemed well."),
-    dangerous(_BY_296, f"3, the default; up to {_MAX_GATE_SD}",
-        demand(3, "EKF2_AGP0_GATE", allows=at_most(_MAX_GATE_SD)),  # fuseHorizontalPosition
+    require(_BY_296, f"3, the default; up to {_MAX_GATE_SD}",
+        expect(3, "EKF2_AGP0_GATE", allows=make_limit(_MAX_GATE_SD)),  # fuseHorizontalPosition
         "The filter refuses no position, not even a wrong one."),
-    weak(_BY_296, "0", demand(0, "EKF2_AGP0_MODE"),  # aux_global_position_control.cpp, isResetAllowed
+    recommend(_BY_296, "0", expect(0, "EKF2_AGP0_MODE"),  # aux_global_position_control.cpp, isResetAllowed
         "With airspeed or optical flow it never comes back to us, once it has left the gate."),
-    dangerous(_BY_296, f"0; up to {MAX_DELAY_MS:g}",  # aux_global_position_control.cpp, bufferData
-        demand(0, "EKF2_AGP0_DELAY", allows=at_most(MAX_DELAY_MS)), _TAKEN_FOR_OLD),
-    dangerous(_BY_ODOMETRY, "0", demand(0, "EKF2_EV_NOISE_MD"),  # params_external_vision.yaml
+    require(_BY_296, f"0; up to {MAX_DELAY_MS:g}",  # aux_global_position_control.cpp, bufferData
+        expect(0, "EKF2_AGP0_DELAY", allows=make_limit(MAX_DELAY_MS)), _TAKEN_FOR_OLD),
+    require(_BY_ODOMETRY, "0", expect(0, "EKF2_EV_NOISE_MD"),  # params_external_vision.yaml
         "With 1 each position is taken to be good to EKF2_EVP_NOISE (0.1 m), whatever we send."),
-    dangerous(_BY_ODOMETRY, f"0.1, the default; up to {_MAX_SD_M}",  # flown
-        demand(0.1, "EKF2_EVP_NOISE", allows=at_most(_MAX_SD_M)),
+    require(_BY_ODOMETRY, f"0.1, the default; up to {_MAX_SD_M}",  # flown
+        expect(0.1, "EKF2_EVP_NOISE", allows=make_limit(_MAX_SD_M)),
         "It hardly follows us, and takes positions that are far off: with 20 it was 35 m off, and landed."),
-    dangerous(_BY_ODOMETRY, f"5, the default; up to {_MAX_GATE_SD}",
-        demand(5, "EKF2_EVP_GATE", allows=at_most(_MAX_GATE_SD)),  # ev_pos_control.cpp, controlEvPosFusion
+    require(_BY_ODOMETRY, f"5, the default; up to {_MAX_GATE_SD}",
+        expect(5, "EKF2_EVP_GATE", allows=make_limit(_MAX_GATE_SD)),  # ev_pos_control.cpp, controlEvPosFusion
         "The filter refuses no position, not even a wrong one."),
-    dangerous(_BY_ODOMETRY, f"within {MAX_OFFSET_M:g} m of 0",  # ev_pos_control.cpp, pos_offset_body
-        demand(0, *name_axes("EKF2_EV_POS"), allows=is_small_offset),
+    require(_BY_ODOMETRY, f"within {MAX_OFFSET_M:g} m of 0",  # ev_pos_control.cpp, pos_offset_body
+        expect(0, *list_axes("EKF2_EV_POS"), allows=is_small_offset),
         "We send the position of the vehicle itself, and a camera's place would move it.", "EKF2_EV_POS_*"),
-    dangerous(_BY_ODOMETRY, f"0; up to {MAX_DELAY_MS:g}",
-        demand(0, "EKF2_EV_DELAY", allows=at_most(MAX_DELAY_MS)), _TAKEN_FOR_OLD),
+    require(_BY_ODOMETRY, f"0; up to {MAX_DELAY_MS:g}",
+        expect(0, "EKF2_EV_DELAY", allows=make_limit(MAX_DELAY_MS)), _TAKEN_FOR_OLD),
 )
 # fmt: on
 PX4_TABLE = ParameterTable("PX4", (CONTROL, VISION_CONTROL), _RULES, choose_px4_channel)

@@ -20,7 +20,7 @@ from edgevpr.frames.source import Source
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.conversation import Conversation
 from edgevpr.mavlink.driver import PortState
-from edgevpr.mavlink.fixes import Sending
+from edgevpr.mavlink.fixes import FixTransmission
 from edgevpr.mavlink.ports import LOST
 from edgevpr.mavlink.signing import Signing
 from edgevpr.mavlink.turns import Turns
@@ -46,7 +46,7 @@ class ReplayedDriver:
         self, playback: "Playback", name: str, address: LinkAddress, conversation: Conversation, turns: Turns
     ) -> None:
         self._playback, self._name, self._conversation, self._turns = playback, name, conversation, turns
-        self._leaving: deque[Sending] = deque()
+        self._leaving: deque[FixTransmission] = deque()
 
     def start(self) -> None:
         """Let the playback perform the link's turns from now on."""
@@ -57,7 +57,7 @@ class ReplayedDriver:
         connected, trouble, reopened = self._playback.read("port", lambda: (False, None, 0))
         return connected, trouble, reopened
 
-    def ring(self) -> None:
+    def wake(self) -> None:
         """Do nothing: what is sent when is on the tape."""
 
     def close(self) -> None:
@@ -91,7 +91,7 @@ class ReplayedDriver:
                 departed = [self._leaving.popleft() for _ in range(min(count, len(self._leaving)))]
                 for sending in departed:
                     sending.settle(True)
-                conversation.count_departed(departed)
+                conversation.count_sent_fixes(departed)
             case ["lost" | "closed" as what, *count]:
                 for sending in self._leaving:
                     sending.settle(False, LOST)

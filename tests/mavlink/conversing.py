@@ -44,10 +44,10 @@ class Ear(Listener):
     def handle_force(self, t_s, force_m_s2, attitude):
         self.forces.append((force_m_s2, attitude.roll_deg))
 
-    def state_at(self, t_s):
+    def estimate_state(self, t_s):
         return self.state and replace(self.state, t_mono_s=t_s)
 
-    def fix_between(self, now_s):
+    def make_interim_fix(self, now_s):
         return self.between and replace(self.between, t_frame_s=now_s)
 
 
@@ -91,7 +91,7 @@ class Autopilot:
                 self.packets.append(packet)
             if fix:
                 fix.settle(True)
-                self.conversation.count_departed([fix])
+                self.conversation.count_sent_fixes([fix])
 
     def say(self, message, system_id=7, component_id=1, address=None):
         packer = self._packers.setdefault((system_id, component_id), mavlink.MAVLink(None, system_id, component_id))
@@ -203,7 +203,7 @@ class Autopilot:
         return self.conversation.autopilot.vehicle
 
     def at(self, t_s):
-        return self.conversation.vehicle_at(t_s)
+        return self.conversation.predict_vehicle(t_s)
 
     def sd_m(self):
         """The certainty that comes with its next report."""

@@ -8,7 +8,7 @@ from mavlink_peers import SerialCable
 from edgevpr.core.errors import LinkError
 from edgevpr.mavlink import asking as module
 from edgevpr.mavlink.address import LinkAddress
-from edgevpr.mavlink.asking import Inquiry, read_autopilot
+from edgevpr.mavlink.asking import RequestLink, read_autopilot
 from edgevpr.mavlink.wire import mavlink
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -27,7 +27,7 @@ def _listens_briefly(monkeypatch):
 
 
 def read(address, names=(), **autopilot):
-    with AnsweringAutopilot(address.number, **autopilot) as peer, Inquiry(address) as asking:
+    with AnsweringAutopilot(address.number, **autopilot) as peer, RequestLink(address) as asking:
         return read_autopilot(asking, {"ardupilot": names, "px4": names}), peer
 
 
@@ -51,7 +51,7 @@ def test_all_that_an_autopilot_says_is_read(address):
 def test_questions_that_are_lost_are_asked_again(address):
     names = [f"P{number}" for number in range(12)]
     answers = {"messages": healthy_messages(), "parameters": dict.fromkeys(names, 3)}
-    with AnsweringAutopilot(address.number, loses=1, **answers), Inquiry(address) as asking:
+    with AnsweringAutopilot(address.number, loses=1, **answers), RequestLink(address) as asking:
         assert asking.heartbeat(60)
         assert asking.message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
         assert asking.parameters(names, bytewise=False) == dict.fromkeys(names, 3)
@@ -61,14 +61,14 @@ def test_a_message_that_is_denied_since_it_was_just_streamed_is_taken_from_the_s
     """As a PX4 does with GPS_RAW_INT."""
     fix = mavlink.MAVLink_gps_raw_int_message(0, 3, 500_000_000, 140_000_000, 0, 80, 120, 0, 0, 14)
     streamed = fix.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
-    with AnsweringAutopilot(address.number, noise=streamed), Inquiry(address) as asking:
+    with AnsweringAutopilot(address.number, noise=streamed), RequestLink(address) as asking:
         assert asking.heartbeat(60)
         assert asking.message(mavlink.MAVLINK_MSG_ID_GPS_RAW_INT).fix_type == 3
         assert asking.message(mavlink.MAVLINK_MSG_ID_GPS2_RAW) is None
 
 
 def test_a_parameter_that_older_firmware_is_silent_about_is_left_out(address, monkeypatch):
-    monkeypatch.setattr(module, "ANSWER_WAIT_S", 0.3)
+    monkeypatch.setattr(module, "ANSWER_TIMEOUT_S", 0.3)
     said, peer = read(address, ["A", "B"], says_unknown=False, messages=healthy_messages(), parameters={"B": 2})
     assert said.parameters == {"B": 2}
     assert [m.param_id for m in peer.heard if m.get_type() == "PARAM_REQUEST_READ"] == ["A", "B", "A", "A"]
@@ -76,7 +76,7 @@ def test_a_parameter_that_older_firmware_is_silent_about_is_left_out(address, mo
 
 @pytest.mark.parametrize("key", [None, bytes(32)])
 def test_an_autopilot_that_is_heard_and_answers_nothing_is_told_from_one_that_signs(address, monkeypatch, key):
-    monkeypatch.setattr(module, "ANSWER_WAIT_S", 0.1)
+    monkeypatch.setattr(module, "ANSWER_TIMEOUT_S", 0.1)
     said, _ = read(address, ["A"], is_mute=True, key=key)
     assert (said.answers, said.signs, said.version, said.parameters) == (False, bool(key), None, {})
 
@@ -89,7 +89,7 @@ def test_mavlink_1_and_damaged_bytes_are_seen(address):
 
 def test_a_second_autopilot_is_named_and_not_listened_to(address):
     with AnsweringAutopilot(address.number, system_id=3), AnsweringAutopilot(address.number, system_id=4) as other:
-        with Inquiry(address, system_id=4) as asking:
+        with RequestLink(address, system_id=4) as asking:
             assert asking.heartbeat(60).get_srcSystem() == 4
             asking.listen(0.3)
         assert asking.others == {3}
@@ -100,7 +100,7 @@ def test_a_second_autopilot_is_named_and_not_listened_to(address):
 def test_a_cable_that_is_pulled_is_a_sentence(tmp_path):
     cable = SerialCable(tmp_path)
     cable.plug()
-    asking = Inquiry(LinkAddress("serial", str(tmp_path / "a"), 115_200))
+    asking = RequestLink(LinkAddress("serial", str(tmp_path / "a"), 115_200))
     cable.unplug()
     with pytest.raises(LinkError, match="was lost"), asking:
         asking.listen(60)

@@ -5,7 +5,7 @@ import math
 import pytest
 from conversing import Autopilot, Ear
 
-from edgevpr.mavlink.channel import Channel, Choice
+from edgevpr.mavlink.channel import Channel, ChannelChoice
 from edgevpr.mavlink.clock import AutopilotClock
 from edgevpr.mavlink.messages import Fix, Severity, status_text
 from edgevpr.mavlink.parameters import Decision
@@ -18,7 +18,7 @@ WRAP_MS = 2**32
 def streaming(channel, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, lag_s=0.0):
     """An autopilot that booted 400 s ago, when our clock stood at 600 s, and that a channel has been chosen for."""
     autopilot = Autopilot(firmware, booted_s=600.0, listener=Ear())
-    autopilot.conversation.autopilot.interview._decision = Decision(Choice(channel, "for a test", 1, lag_s))
+    autopilot.conversation.autopilot.interview._decision = Decision(ChannelChoice(channel, "for a test", 1, lag_s))
     autopilot.conversation.autopilot.origin = 47.0, 8.0, 500.0
     return autopilot
 
@@ -65,7 +65,7 @@ def test_nothing_with_a_stamp_is_sent_before_the_time_is_known_or_not_answered_f
     autopilot = Autopilot(booted_s=600.0, timesync_s=None, listener=Ear())
     sent_after_s = []
     for step in range(80):
-        autopilot.conversation.autopilot.interview._decision = Decision(Choice(channel, "for a test", 1))
+        autopilot.conversation.autopilot.interview._decision = Decision(ChannelChoice(channel, "for a test", 1))
         autopilot.conversation.autopilot.origin = 47.0, 8.0, 500.0
         autopilot.wait(0.1)
         autopilot.put_fix()
@@ -84,7 +84,7 @@ def learnt(*trips, start_s=1000.0):
     clock = AutopilotClock()
     for number, (there_s, back_s) in enumerate(trips):
         sent_s = start_s + number
-        request = clock.request(sent_s)
+        request = clock.make_request(sent_s)
         boot_ns = round((sent_s + there_s - 600.0) * 1e9)
         assert not clock.handle(mavlink.MAVLink_timesync_message(boot_ns, request.ts1), sent_s + there_s + back_s)
     return clock
@@ -100,7 +100,7 @@ def test_the_shortest_round_trip_counts_for_ten_seconds():
 
 def test_an_answer_that_we_have_not_asked_for_is_ignored():
     clock = AutopilotClock()
-    request = clock.request(1000.0)
+    request = clock.make_request(1000.0)
     for tc1, ts1 in ((5 * 10**9, request.ts1 + 1), (0, request.ts1), (-5, request.ts1), (2**62, 0)):
         assert not clock.handle(mavlink.MAVLink_timesync_message(tc1, ts1), 1000.1)
     assert clock.boot_time_s(1000.0) is None
@@ -112,7 +112,7 @@ def test_an_answer_that_we_have_not_asked_for_is_ignored():
 def test_an_answer_that_contradicts_older_ones_replaces_them():
     """As after a pause of a simulated autopilot, or of our computer."""
     clock = learnt((0.001, 0.001), (0.001, 0.001))
-    request = clock.request(1002.0)
+    request = clock.make_request(1002.0)
     assert not clock.handle(mavlink.MAVLink_timesync_message(round(401.5e9), request.ts1), 1002.2)
     assert clock.boot_time_s(1002.1) == pytest.approx(401.5)
 
@@ -182,7 +182,7 @@ def test_delay_s_keeps_reports_of_a_full_link_from_being_used(is_the_way_back):
         autopilot.timesync_s = 1.5
     texts = [text for _ in range(4) for text in report_late(autopilot, 1.2 if is_the_way_back else 0.0)]
     assert autopilot.vehicle.t_heard_s - before.t_heard_s < 2.0, "the vehicle is where it was last heard in time"
-    assert autopilot.conversation.vehicle_at(autopilot.clock.now_s).roll_deg is None
+    assert autopilot.conversation.predict_vehicle(autopilot.clock.now_s).roll_deg is None
     assert any("link full: reports" in text for text in texts)
     autopilot.timesync_s = 0.0
     texts = [text for _ in range(12) for text in report_late(autopilot, 0.05)]

@@ -12,7 +12,7 @@ from edgevpr.core.geodesy import offset_m
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Position
 from edgevpr.mavlink.ardupilot_parameters import choose_ardupilot_channel
-from edgevpr.mavlink.channel import Channel, Kind
+from edgevpr.mavlink.channel import Channel, VehicleKind
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.px4_parameters import choose_px4_channel
 from edgevpr.mavlink.wire import mavlink
@@ -21,29 +21,29 @@ ARDUPILOT, PX4 = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4
 
 
 def test_the_receiver_is_the_one_that_is_ours_and_as_late_as_it_is_taken_to_be():
-    second = choose_ardupilot_channel(Kind.COPTER, {"GPS1_TYPE": 1, "GPS2_TYPE": 14, "GPS2_DELAY_MS": 0})
+    second = choose_ardupilot_channel(VehicleKind.COPTER, {"GPS1_TYPE": 1, "GPS2_TYPE": 14, "GPS2_DELAY_MS": 0})
     assert (second.receiver, second.lag_s) == (1, 0.2)
-    needed = choose_ardupilot_channel(Kind.COPTER, {"GPS1_TYPE": 1}).reason
+    needed = choose_ardupilot_channel(VehicleKind.COPTER, {"GPS1_TYPE": 1}).reason
     assert (needed.code, needed.parameters["change"]) == (ReasonCode.COMMAND_NEEDS_FLOW, "GPS2_TYPE=14")
-    first = choose_ardupilot_channel(Kind.COPTER, {"GPS_TYPE": 14, "GPS_TYPE2": 1, "GPS_DELAY_MS": 60})
+    first = choose_ardupilot_channel(VehicleKind.COPTER, {"GPS_TYPE": 14, "GPS_TYPE2": 1, "GPS_DELAY_MS": 60})
     assert (first.receiver, first.lag_s) == (0, 0.06)
 
 
 def test_a_px4_gets_the_sensor_s_message_where_it_fuses_it():
-    assert choose_px4_channel(Kind.PLANE, {"EKF2_AGP0_CTRL": 3}).channel is Channel.SENSOR
-    assert choose_px4_channel(Kind.PLANE, {"EKF2_AGP0_CTRL": 2}).channel is Channel.COMMAND
-    assert choose_px4_channel(Kind.COPTER, {"EKF2_EV_CTRL": 1}).channel is Channel.VISION
-    assert choose_px4_channel(Kind.COPTER, {"EKF2_EV_CTRL": 1, "EKF2_AGP0_CTRL": 0}).channel is Channel.VISION
-    assert choose_px4_channel(Kind.COPTER, {"EKF2_EV_CTRL": 1, "EKF2_AGP0_CTRL": 1}).channel is Channel.SENSOR
-    assert choose_px4_channel(Kind.COPTER, {"EKF2_EV_CTRL": 15}).channel is Channel.COMMAND, "another system's"
-    assert choose_px4_channel(Kind.PLANE, {}).channel is Channel.COMMAND
+    assert choose_px4_channel(VehicleKind.PLANE, {"EKF2_AGP0_CTRL": 3}).channel is Channel.SENSOR
+    assert choose_px4_channel(VehicleKind.PLANE, {"EKF2_AGP0_CTRL": 2}).channel is Channel.COMMAND
+    assert choose_px4_channel(VehicleKind.COPTER, {"EKF2_EV_CTRL": 1}).channel is Channel.VISION
+    assert choose_px4_channel(VehicleKind.COPTER, {"EKF2_EV_CTRL": 1, "EKF2_AGP0_CTRL": 0}).channel is Channel.VISION
+    assert choose_px4_channel(VehicleKind.COPTER, {"EKF2_EV_CTRL": 1, "EKF2_AGP0_CTRL": 1}).channel is Channel.SENSOR
+    assert choose_px4_channel(VehicleKind.COPTER, {"EKF2_EV_CTRL": 15}).channel is Channel.COMMAND, "another system's"
+    assert choose_px4_channel(VehicleKind.PLANE, {}).channel is Channel.COMMAND
 
 
 def interviewed(firmware=ARDUPILOT, seconds=3, *, origin=None, **parameters):
     """An autopilot with `parameters` beside those of its firmware, once it has answered; and the listener."""
     ear = Ear()
     autopilot = Autopilot(firmware, listener=ear, origin=origin)
-    autopilot.conversation.want_position()
+    autopilot.conversation.request_position()
     for _ in range(seconds * 4):
         autopilot.wait(0.25)
         autopilot.beat()
@@ -197,8 +197,8 @@ def test_between_matches_a_fix_is_sent_where_none_has_been_for_half_a_second():
     ear.between = Fix(47.0, 8.0, 9.0, 0.0)
     autopilot.beat()
     assert [each.x for each in sent(autopilot, "COMMAND_INT", 1.8)] == [470_000_000] * 4
-    assert len(autopilot.conversation.take_between()) == 4
-    assert autopilot.conversation.take_between() == []
+    assert len(autopilot.conversation.take_interim_fixes()) == 4
+    assert autopilot.conversation.take_interim_fixes() == []
     autopilot.beat()
     autopilot.conversation.send_fix(Fix(50.0, 8.0, 9.0, autopilot.clock.now_s))
     assert [each.x for each in sent(autopilot, "COMMAND_INT", 0.4)] == [500_000_000], "a match has just been sent"

@@ -7,7 +7,7 @@ import pytest
 from conversing import FIX_3D
 
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.mavlink.fixes import FixAnswer, Fixes, Sending
+from edgevpr.mavlink.fixes import FixAnswer, Fixes, FixTransmission
 from edgevpr.mavlink.messages import TEXT_BYTES, Fix
 from edgevpr.mavlink.vehicle import Readiness
 from edgevpr.mavlink.wire import mavlink
@@ -28,7 +28,7 @@ def fixes():
 def sent(fixes, *times_s):
     """Send a fix at each time; give the last."""
     for t_s in times_s:
-        sending = Sending(Fix(50.0, 8.0, 20.0, t_s), t_s + 1)
+        sending = FixTransmission(Fix(50.0, 8.0, 20.0, t_s), t_s + 1)
         fixes.record_sent(sending, t_s)
         sending.settle(True)
     return sending
@@ -82,7 +82,7 @@ def test_a_fix_may_be_in_the_position_unless_it_was_refused(fixes):
     fixes.time_out(14.1)
     assert fixes.t_fix_s == 13.0, "only the answer may have been lost"
     sent(fixes, 15.0)
-    fixes.break_off(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))
+    fixes.cancel_awaited(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))
     assert fixes.t_fix_s == 15.0
 
 
@@ -91,13 +91,13 @@ def test_fixes_thrown_away_with_the_port_wait_for_no_answer_but_do_not_end_a_sto
     fixes = Fixes(announce=lambda *report: reports.append(report))
     sent(fixes, 0, 1, 2, 3, 4)
     fixes.record_lost(3)
-    assert fixes.why_not(5.0) is None
+    assert fixes.find_objection(5.0) is None
     sent(fixes, 5, 6, 7)
     fixes.report_silence(SILENT, 8.5)
     sent(fixes, 17.5)
     fixes.record_lost(2)
     fixes.report_silence(SILENT, 20.0)
-    assert fixes.why_not(20.0) == UNANSWERED
+    assert fixes.find_objection(20.0) == UNANSWERED
     assert [text for _, text, _ in reports] == ["fixes unanswered: signing? system id?"]
 
 

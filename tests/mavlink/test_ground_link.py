@@ -46,7 +46,7 @@ def test_the_ground_hears_what_is_for_people_and_no_fix_and_no_request(two, cloc
     flight, autopilot, _, station = two
     flight.send_fix(Fix(50.0, 14.0, 25.0, clock()))
     autopilot.expect("COMMAND_INT")
-    flight.want_position()
+    flight.request_position()
     flight.send(text("wake up"))
     autopilot.expect("COMMAND_LONG")
     station.expect_text("wake up")

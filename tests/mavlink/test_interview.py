@@ -24,7 +24,7 @@ class Asked(Autopilot):
         super().__init__(firmware)
         self.parameters, self.link = dict(parameters), link
         self.requests, self.sent, self.begin_s = [], [], self.clock.now_s
-        self.conversation.want_position()
+        self.conversation.request_position()
 
     def answer_for(self, seconds, channel=None):
         """Answer for so long, or until the channel is this one; returns for how long it took."""

@@ -17,9 +17,9 @@ from mavlink_peers import AutopilotThread, Peer, SerialCable, TcpServer, link_to
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.fixes import Sending
+from edgevpr.mavlink.fixes import FixTransmission
 from edgevpr.mavlink.messages import Fix, Severity, status_text
-from edgevpr.mavlink.ports import Line, open_port
+from edgevpr.mavlink.ports import PacketWriter, open_port
 from edgevpr.mavlink.wire import mavlink
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -40,13 +40,13 @@ def narrow_server():
 def line(narrow_server, clock):
     """A line over TCP, and the other end of it."""
     port = narrow_server._listener.getsockname()[1]
-    line = Line(open_port(parse_link(f"tcp:127.0.0.1:{port}")), clock)
+    line = PacketWriter(open_port(parse_link(f"tcp:127.0.0.1:{port}")), clock)
     yield line, narrow_server.accept()
     line.port.close()
 
 
 def sending(clock):
-    return Sending(Fix(50.0, 8.0, 20.0, clock.now_s), clock.now_s + 1.0)
+    return FixTransmission(Fix(50.0, 8.0, 20.0, clock.now_s), clock.now_s + 1.0)
 
 
 def hold_up(line) -> None:
@@ -75,10 +75,10 @@ def test_a_fix_that_the_system_still_holds_when_it_is_due_is_thrown_away_with_th
     line.write()
     assert not line.unsent
     clock.now_s += 0.99
-    assert line.take_departed() == []
+    assert line.take_sent_fixes() == []
     clock.now_s += 0.02
     with pytest.raises(ConnectionError, match="too long"):
-        line.take_departed()
+        line.take_sent_fixes()
     assert line.close() == 1
     assert (fix.sent, fix.why) == (False, THROWN_AWAY)
     got = drained(far)

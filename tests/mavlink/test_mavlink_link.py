@@ -8,7 +8,7 @@ import pytest
 from loopback import free_port, wait_until
 from mavlink_peers import Peer, TcpServer, UdpPort, link_to
 
-from edgevpr.mavlink.conversation import MESSAGES_MAX
+from edgevpr.mavlink.conversation import MAX_MESSAGES
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix, Health, Severity, make_named_values, status_text
 from edgevpr.mavlink.wire import mavlink
@@ -127,13 +127,13 @@ def test_an_absent_tcp_server_is_no_error_and_the_newest_messages_wait_for_it(cl
     with link_to(f"tcp:127.0.0.1:{number}", clock=clock) as link:
         assert not link.stats().connected
         assert link.stats().trouble == "Connection refused"
-        for count in range(MESSAGES_MAX + 36):
+        for count in range(MAX_MESSAGES + 36):
             link.send(text(f"{count}"))
         assert link.stats().dropped_queue_full == 36
         server = TcpServer(number)
         peer = Peer(server.accept())
-        texts = [m.text for m in peer.expect_text(f"{MESSAGES_MAX + 35}") if m.get_type() == "STATUSTEXT"]
-        assert texts == [f"{count}" for count in range(36, MESSAGES_MAX + 35)]
+        texts = [m.text for m in peer.expect_text(f"{MAX_MESSAGES + 35}") if m.get_type() == "STATUSTEXT"]
+        assert texts == [f"{count}" for count in range(36, MAX_MESSAGES + 35)]
     server.close()
 
 
@@ -144,7 +144,7 @@ def test_a_peer_that_does_not_read_never_blocks_the_sender(clock):
         server.accept()
 
         def stuck() -> bool:
-            link.send(*[text("x" * 50)] * MESSAGES_MAX)
+            link.send(*[text("x" * 50)] * MAX_MESSAGES)
             clock.now_s += 0.01
             return link.stats().trouble is not None
 

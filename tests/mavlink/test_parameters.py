@@ -4,7 +4,7 @@ import pytest
 from simulated.firmware import ARDUPILOT, PX4
 
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.mavlink.channel import OLD_NAMES, Channel, Kind
+from edgevpr.mavlink.channel import OLD_NAMES, Channel, VehicleKind
 from edgevpr.mavlink.interview import TABLES
 from edgevpr.mavlink.wire import mavlink
 
@@ -18,7 +18,7 @@ SENSOR = PX4
 VISION = PX4 | {"EKF2_AGP0_CTRL": 0, "EKF2_EV_CTRL": 1}
 
 
-def decide(parameters, kind=Kind.COPTER):
+def decide(parameters, kind=VehicleKind.COPTER):
     table = ARDUPILOT_TABLE if "VISO_TYPE" in parameters else PX4_TABLE
     return table.decide(kind, parameters, lambda name: True)
 
@@ -81,7 +81,7 @@ DANGEROUS = [
 def test_decide_stops_the_channel_for_what_is_dangerous(parameters, wrong, advice):
     decision = decide(parameters | wrong)
     assert decision.choice.channel is Channel.NONE
-    why = decision.choice.why_nothing
+    why = decision.choice.silence_reason
     assert (why.code, why.parameters["changes"]) == (ReasonCode.PARAMETER_DANGEROUS, advice)
 
 

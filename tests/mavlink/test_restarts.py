@@ -20,7 +20,7 @@ class Aircraft(Autopilot):
         self.parameters, self.ear = dict(parameters), Ear()
         self.says_boot_time, self.has_origin = says_boot_time, False
         super().__init__(booted_s=booted_s, listener=self.ear, origin=Position(46.5, 7.5, 400.0), **settings)
-        self.conversation.want_position()
+        self.conversation.request_position()
         self.forget()
 
     def forget(self):

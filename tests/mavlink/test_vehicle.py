@@ -75,7 +75,7 @@ def test_a_position_says_whether_gps_stands_behind_it(autopilot, message):
 
 def test_it_is_asked_where_it_is_until_it_says_so(autopilot):
     assert autopilot.questions() == [], "nobody wants to know"
-    autopilot.conversation.want_position()
+    autopilot.conversation.request_position()
     version, *requests = autopilot.questions()
     assert (version.command, version.param1) == (mavlink.MAV_CMD_REQUEST_MESSAGE, 148)
     assert {command.command for command in requests} == {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL}
@@ -95,7 +95,7 @@ def test_it_is_asked_where_it_is_until_it_says_so(autopilot):
 
 
 def test_it_is_asked_again_where_a_ground_station_has_set_other_rates(autopilot):
-    autopilot.conversation.want_position()
+    autopilot.conversation.request_position()
     autopilot.questions()
     for attitude_hz, has_to_ask in ((10, False), (4, True), (10, False), (5, False)):
         autopilot.fly_on(seconds=5, attitude_hz=attitude_hz)

@@ -12,7 +12,7 @@ from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import FRAME_TIME_SD_S, Candidate, Frame, Place, Position, QueryCost, StepCosts, Vehicle
 from edgevpr.frames.level import LevelledImage, View
-from edgevpr.mavlink.conversation import BETWEEN_S
+from edgevpr.mavlink.conversation import INTERIM_FIX_INTERVAL_S
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.mavlink.vehicle import Attitude
@@ -139,14 +139,14 @@ class Air:
                 if self.step % _REPORT_STEPS == 0:
                     self._report(velocity)
             if self.step % _STATE_STEPS == 0:
-                self.states.append((self.t_s, self.navigator.state_at(self.t_s)))
+                self.states.append((self.t_s, self.navigator.estimate_state(self.t_s)))
             if self.step % self.every_steps == 0 and self.sees:
                 self.waiting.append((self.step, self.vehicle))
             if self.stride_steps and not self.has_gps and self.step % self.stride_steps == 0 and not self.waiting:
                 self._see(self.step, self.vehicle, is_query=False)
             if self.waiting and self.waiting[0][0] <= self.step - self.late_steps:
                 self._look(*self.waiting.popleft())
-            if self.t_s >= self.between_due_s and (fix := self.navigator.fix_between(self.t_s)):
+            if self.t_s >= self.between_due_s and (fix := self.navigator.make_interim_fix(self.t_s)):
                 self.between.append((fix, self.off(fix.lat_deg, fix.lon_deg)))
                 self.take(fix)
             if self.step % 50 == 0:
@@ -196,7 +196,7 @@ class Air:
 
     def take(self, fix: Fix) -> None:
         """Take a fix, as the autopilot does that gets it."""
-        self.between_due_s = self.t_s + BETWEEN_S
+        self.between_due_s = self.t_s + INTERIM_FIX_INTERVAL_S
         if self.takes_fixes:
             self.off_m = self.off(fix.lat_deg, fix.lon_deg, fix.t_frame_s)
             self.known = fix.accuracy_m, self.t_s

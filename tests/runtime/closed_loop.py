@@ -57,7 +57,7 @@ class ClosedLoop:
         settings = LinkSettings(clock=self._clock, listener=self.navigator)
         self.conversation = Conversation(settings, self._clock) if edgevpr else None
         if self.conversation:
-            self.conversation.want_position()
+            self.conversation.request_position()
             self.conversation.requests.is_under_way = True
         self._packer, self._reader = mavlink.MAVLink(None, 1, 1), PacketReader()
         self._waiting, self._last_frame = [], None
@@ -128,7 +128,7 @@ class ClosedLoop:
                 for message in self._reader.feed(packet[0]):
                     self.sent.append((self.now_s, message))
                     said += self.controller.receive(message)
-            conversation.count_departed(sending)
+            conversation.count_sent_fixes(sending)
             if not said:
                 break
         if self._steps % round(1 / STEP_S) == 0:
@@ -142,7 +142,7 @@ class ClosedLoop:
 
     def _take_frame(self):
         truth, t_s = self.brain.truth, self._clock.now_s + self.time_error_s
-        vehicle = self.conversation.vehicle_at(t_s)
+        vehicle = self.conversation.predict_vehicle(t_s)
         frames = round(self.now_s / _FRAME_S)
         if self.matches and frames % self.match_every == 0:
             # A camera that is levelled by an attitude that is wrong puts the place beside the true one.

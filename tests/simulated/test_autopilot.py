@@ -11,7 +11,7 @@ from mavlink_peers import AutopilotThread, Peer, UdpPort, link_to
 
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.asking import Inquiry, read_autopilot
+from edgevpr.mavlink.asking import RequestLink, read_autopilot
 from edgevpr.mavlink.messages import Fix, Health
 from edgevpr.mavlink.wire import mavlink
 from simulated import autopilot
@@ -66,7 +66,7 @@ def test_track_starts_with_a_flight_and_not_with_questions(monkeypatch):
     link = f"127.0.0.1:{free_port()}"
     autopilot = AutopilotThread(f"udpin:{link}", track=track, vehicle="px4-copter", gps=True)
     try:
-        with Inquiry(parse_link(f"udpout:{link}")) as asking:
+        with RequestLink(parse_link(f"udpout:{link}")) as asking:
             assert read_autopilot(asking, {"px4": ("EKF2_AGP0_CTRL",)}).parameters == {"EKF2_AGP0_CTRL": 1}
             there = asking.message(mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
         assert there.lat / 1e7 == 50.0
@@ -97,7 +97,7 @@ def test_script_sets_parameters_and_prints_its_summary():
     )
     try:
         assert "a simulated arducopter that has lost GPS" in process.stderr.readline()
-        with Inquiry(parse_link(f"udpout:127.0.0.1:{number}")) as asking:
+        with RequestLink(parse_link(f"udpout:127.0.0.1:{number}")) as asking:
             assert asking.heartbeat().type == mavlink.MAV_TYPE_QUADROTOR
             assert asking.parameters(["GPS2_TYPE"], bytewise=False) == {"GPS2_TYPE": 14}
         process.terminate()

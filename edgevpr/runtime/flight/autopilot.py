@@ -10,7 +10,7 @@ from edgevpr.core.config import MavlinkConfig, SourceSetsConfig
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import FixReport, Frame
 from edgevpr.mavlink import messages
-from edgevpr.mavlink.fixes import Sending
+from edgevpr.mavlink.fixes import FixTransmission
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Fix
 from edgevpr.power.meter import MachineLoad
@@ -45,7 +45,7 @@ class ToAutopilot:
     ) -> None:
         self._link, self._navigator, self._notifier, self._cores, self._clock = link, navigator, notifier, cores, clock
         self._send_fixes, self._source_sets = settings.send_fixes, SourceSets(settings.source_sets)
-        self._unanswered: list[tuple[str, Sending]] = []
+        self._unanswered: list[tuple[str, FixTransmission]] = []
         self._held, self._is_holding = 0, False
         self._output = Output.STARTING  # as it was last reported
         self._unknown_age, self._delay_s = (
@@ -92,7 +92,7 @@ class ToAutopilot:
         """Write a log line "answer" for each fix that, since the last call, was answered, was not answered in time, or
         was given up before it was sent; and a line "between" for each fix that was sent between two matches."""
         with self._link.turn("answers"):
-            for sending in self._link.take_between():
+            for sending in self._link.take_interim_fixes():
                 self._notifier.log("between", t_sent_s=sending.t_sent_s, **_position_fields(sending.fix))
             # An answer can arrive a moment before the link has noted that the fix was sent.
             settled = [each for each in self._unanswered if each[1].sent is False or (each[1].sent and each[1].outcome)]
@@ -233,7 +233,7 @@ class ToAutopilot:
             self._notifier.log("output", state=output.name)
             self._notifier.announce(output.severity, output.text, topic="output")
 
-    def _send_match(self, event: Recognition) -> tuple[FixReport | None, Sending | None]:
+    def _send_match(self, event: Recognition) -> tuple[FixReport | None, FixTransmission | None]:
         """Send the fix of an accepted match. Return (None, the sending), or (a report of why it is not sent, None)."""
         try:
             advice = self._navigator.advise(event, self._clock.mono_s())
@@ -289,7 +289,7 @@ class SourceSets:
         return wanted
 
 
-def _make_report(query: str, sending: Sending) -> FixReport:
+def _make_report(query: str, sending: FixTransmission) -> FixReport:
     return FixReport(
         query=query,
         sent=sending.sent,

@@ -42,7 +42,7 @@ _STEPS = {
     Conversation.drop_stale.__name__: "waits",
     Conversation.announce_changes.__name__: "answers",
     Conversation.next_packet.__name__: "said",
-    Conversation.count_departed.__name__: "departed",
+    Conversation.count_sent_fixes.__name__: "departed",
     Conversation.handle.__name__: "heard",
     Conversation.break_off.__name__: "lost",
     Conversation.end.__name__: "closed",

@@ -215,7 +215,7 @@ class Flight:
         parts, is_live = self._parts, self._parts.source.is_live
         if is_live and parts.autopilot:
             frame = parts.autopilot.correct_age(frame)
-        vehicle = parts.link.vehicle_at(frame.t_mono_s) if parts.link else None
+        vehicle = parts.link.predict_vehicle(frame.t_mono_s) if parts.link else None
         if is_live and (reason := self._frozen.judge(frame, vehicle)):
             return Recognition(frame=frame, vehicle=vehicle, reason=reason)
         event = (parts.recogniser.step if is_query else parts.recogniser.measure_motion)(frame, vehicle)
@@ -317,5 +317,5 @@ def open_links(
         signing=io.signing,
     )
     link = stack.enter_context(Link(address, link_settings, io.turns, drive=io.drive))
-    link.want_position()
+    link.request_position()
     return link, stack.enter_context(GroundLink(ground_address, link, io.drive)) if ground_address else None

@@ -270,7 +270,7 @@ class Navigation:
             self._start(position, sd_m, np.zeros(2), now_s, _ANY_M_S)
             self._fixed_s = t_s
 
-    def state_at(self, t_s: float) -> NavState | None:
+    def estimate_state(self, t_s: float) -> NavState | None:
         """Return where the aircraft is, or was, at `t_s`; None if that is not known."""
         path = self._valid_path
         there = path.interpolate(t_s) if path else None

@@ -10,7 +10,7 @@ from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.conversation import BETWEEN_S
+from edgevpr.mavlink.conversation import INTERIM_FIX_INTERVAL_S
 from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.receivers import PLAUSIBLE_SD_M
@@ -78,7 +78,7 @@ class Navigator(Listener):
 
     def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False, is_level: bool = False) -> None:
         self._is_muted, self._is_level = is_muted, is_level
-        self._map_sd_m, self._next_s = map_sd_m, min(every_s, BETWEEN_S)  # from one fix to the next
+        self._map_sd_m, self._next_s = map_sd_m, min(every_s, INTERIM_FIX_INTERVAL_S)  # from one fix to the next
         self._navigation = Navigation(RECKONED, map_sd_m)
         self._consistency, self.age = Consistency(), AgeWatch()
         self._slew = Slew()
@@ -183,7 +183,7 @@ class Navigator(Listener):
             self._attitude_error_s = seen.t_s
         return self._advise_improvement(vehicle, vehicle.velocity_m_s, now_s)
 
-    def fix_between(self, now_s: float) -> Fix | None:
+    def make_interim_fix(self, now_s: float) -> Fix | None:
         """Return a fix by what the matches before have shown, for the time in which none is accepted; None where the
         autopilot is no better off with it, or a match has contradicted what is known."""
         vehicle = self._vehicle
@@ -203,10 +203,10 @@ class Navigator(Listener):
 
     def accuracy_m(self, now_s: float) -> float | None:
         """Return how well the position is known: metres, standard deviation of one axis (None: it is not known)."""
-        estimate = self._navigation.state_at(now_s)
+        estimate = self._navigation.estimate_state(now_s)
         return None if estimate is None else self._claimed_m(estimate)
 
-    def state_at(self, t_s: float) -> MotionState | None:
+    def estimate_state(self, t_s: float) -> MotionState | None:
         """Return position and motion at `t_s`, to be sent through a continuous channel; None if they are not known well
         enough. `t_s` must be later than in the last call."""
         if self._is_muted:
@@ -272,7 +272,7 @@ class Navigator(Listener):
         return measure_frame(event, vehicle, is_level=self._is_level, height_ratio=ratio, height_ratio_sd=ratio_sd)
 
     def _estimate(self, t_s: float) -> NavState | None:
-        estimate = self._navigation.state_at(t_s)
+        estimate = self._navigation.estimate_state(t_s)
         if estimate is None or estimate.accuracy_m > _LOST_M:
             return None
         shown_s, gps_s = self._navigation.shown_s, self._navigation.gps_s
@@ -293,7 +293,7 @@ class Navigator(Listener):
             return _withhold(ReasonCode.HAS_GPS if self._believes_gps else ReasonCode.HAS_WRONG_GPS)
         if self._doubts_map:
             return _withhold(ReasonCode.MAP_CONTRADICTS_GPS)
-        estimate = self._navigation.state_at(now_s)
+        estimate = self._navigation.estimate_state(now_s)
         if estimate is None:
             return _withhold(ReasonCode.NO_TELEMETRY)
         here, claimed_m = estimate.position, self._claimed_m(estimate)

@@ -14,7 +14,7 @@ from edgevpr.core.types import MAX_FIX_AGE_S
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import find_missing_cause, is_live, open_source, read_intervals
 from edgevpr.mavlink.address import parse_links
-from edgevpr.mavlink.asking import Inquiry
+from edgevpr.mavlink.asking import RequestLink
 from edgevpr.mavlink.signing import open_signing
 from edgevpr.power.boards import Board, load_board, resolve_board
 from edgevpr.runtime.flight.startup import apply_recorded_rate
@@ -87,11 +87,11 @@ def _check_link(what: str, settings: MavlinkConfig, offline: bool) -> Finding:
     if address is None:
         return report_ok(what, ReasonCode.NO_LINK)
     signing = open_signing(settings, to_ask=True)
-    with Inquiry(address, settings.component_id, settings.system_id, signing) as inquiry:
+    with RequestLink(address, settings.component_id, settings.system_id, signing) as inquiry:
         if not offline and inquiry.heartbeat() is None:
             return explain_silence(address, inquiry)
     if ground:
-        with Inquiry(ground, settings.component_id, settings.system_id):
+        with RequestLink(ground, settings.component_id, settings.system_id):
             pass  # it can be opened
     code = FindingCode.LINK_OPENED if settings.send_fixes else FindingCode.LINK_OPENED_DRY
     system = None if offline else inquiry.system_id

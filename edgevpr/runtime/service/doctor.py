@@ -8,7 +8,7 @@ from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.text import show_waiting
 from edgevpr.frames.source import is_live
 from edgevpr.mavlink.address import LinkAddress
-from edgevpr.mavlink.asking import HEARTBEAT_WAIT_S, AutopilotReading, Inquiry, read_autopilot
+from edgevpr.mavlink.asking import HEARTBEAT_TIMEOUT_S, AutopilotReading, RequestLink, read_autopilot
 from edgevpr.mavlink.signing import MEANING, open_signing
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.power.boards import load_board
@@ -40,7 +40,7 @@ def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], Au
     show_waiting(f"asking the autopilot at {address}")
     reading = None
     try:
-        with Inquiry(address, settings.component_id, settings.system_id, signing) as inquiry:
+        with RequestLink(address, settings.component_id, settings.system_id, signing) as inquiry:
             reading = read_autopilot(inquiry, {name: rules.parameters for name, rules in RULES.items()})
             if reading:
                 autopilot_findings = list(check_autopilot(reading, address, settings.send_fixes))
@@ -52,7 +52,7 @@ def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], Au
     return autopilot_findings + machine_findings, reading
 
 
-def explain_silence(address: LinkAddress, inquiry: Inquiry) -> Finding:
+def explain_silence(address: LinkAddress, inquiry: RequestLink) -> Finding:
     """Return the finding that explains, by what else has arrived, why no heartbeat of the autopilot was received."""
     link = str(address)
     if refused := inquiry.signing.refused:
@@ -64,10 +64,10 @@ def explain_silence(address: LinkAddress, inquiry: Inquiry) -> Finding:
             "link", FindingCode.OTHER_SYSTEM, change, address=link, systems=_join_numbers(sorted(inquiry.others))
         )
     if address.kind != "serial":
-        return report_fault("link", FindingCode.NO_HEARTBEAT, address=link, waited_s=HEARTBEAT_WAIT_S)
+        return report_fault("link", FindingCode.NO_HEARTBEAT, address=link, waited_s=HEARTBEAT_TIMEOUT_S)
     code = FindingCode.SERIAL_NOT_MAVLINK if inquiry.reader.bad_bytes else FindingCode.SERIAL_SILENT
     changes = (f"{rules.name}: {', '.join(rules.port_changes(address.number))}" for rules in RULES.values())
-    return report_fault("link", code, *changes, address=link, waited_s=HEARTBEAT_WAIT_S)
+    return report_fault("link", code, *changes, address=link, waited_s=HEARTBEAT_TIMEOUT_S)
 
 
 def check_autopilot(reading: AutopilotReading, address: LinkAddress, sends_fixes: bool) -> Iterator[Finding]:

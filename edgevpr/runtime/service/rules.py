@@ -8,9 +8,9 @@ were flown in simulation with GPS taken away, with PX4 1.17.0 and 1.18-beta1.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
-from edgevpr.mavlink.ardupilot_parameters import ARDUPILOT_TABLE, MAVLINK_GPS, RECEIVERS, SECOND
+from edgevpr.mavlink.ardupilot_parameters import ADVISED_RECEIVER, ARDUPILOT_TABLE, MAVLINK_GPS, RECEIVERS
 from edgevpr.mavlink.asking import AutopilotReading
-from edgevpr.mavlink.channel import Channel, Choice, Kind, own_name
+from edgevpr.mavlink.channel import Channel, ChannelChoice, VehicleKind, resolve_name
 from edgevpr.mavlink.parameters import ParameterTable
 from edgevpr.mavlink.px4_parameters import CONTROL, FUSES_POSITION, PX4_TABLE, VISION_CONTROL
 from edgevpr.runtime.service.finding import Finding, report_fault, report_ok
@@ -47,11 +47,11 @@ def _check_ardupilot(reading: AutopilotReading, sends_fixes: bool) -> Iterator[F
     yield _check_port(reading, "SERIALn_PROTOCOL=2")
 
 
-def _report_channel(choice: Choice) -> Finding:
+def _report_channel(choice: ChannelChoice) -> Finding:
     return Finding(what="channel", ok=True, reason=choice.reason)
 
 
-def _check_parameters(table: ParameterTable, choice: Choice, reading: AutopilotReading) -> Iterator[Finding]:
+def _check_parameters(table: ParameterTable, choice: ChannelChoice, reading: AutopilotReading) -> Iterator[Finding]:
     """Check the parameters that change what our messages do: one finding for each row of the table that is broken."""
     faults = table.find_faults(choice, reading.parameters)
     for fault in faults:
@@ -60,17 +60,17 @@ def _check_parameters(table: ParameterTable, choice: Choice, reading: AutopilotR
         yield report_ok("parameters", FindingCode.PARAMETERS_RIGHT)
 
 
-def _check_single_fixes(choice: Choice, reading: AutopilotReading, sends_fixes: bool) -> Finding:
+def _check_single_fixes(choice: ChannelChoice, reading: AutopilotReading, sends_fixes: bool) -> Finding:
     """Check the use of command 43003, which sends single fixes: something else, such as airspeed or optical flow, must
     carry the vehicle's position from one fix to the next."""
     parameters = reading.parameters
     hovers = parameters.get("Q_ENABLE") == 1  # only planes have it, whatever type the heartbeat reports
-    if reading.kind is Kind.PLANE and not hovers:
+    if reading.kind is VehicleKind.PLANE and not hovers:
         return _report_channel(choice)
     flow = parameters.get("FLOW_TYPE", 0)
     if flow and any(parameters.get(name) == _SOURCE_OPTICAL_FLOW for name in _VELOCITY_SOURCES):
         return report_ok("channel", FindingCode.COMMAND_WITH_FLOW, flow=flow)
-    second = own_name(parameters, RECEIVERS[SECOND])
+    second = resolve_name(parameters, RECEIVERS[ADVISED_RECEIVER])
     changes = [f"{second}={MAVLINK_GPS}"]
     if parameters.get("GPS_AUTO_SWITCH") not in _AUTO_SWITCH_VALUES:
         changes.append("GPS_AUTO_SWITCH=1")
@@ -81,12 +81,13 @@ def _check_single_fixes(choice: Choice, reading: AutopilotReading, sends_fixes: 
     return report_fault("channel", FindingCode.NOT_CARRIED, *changes, vehicle=reading.vehicle, **figures)
 
 
-def _report_dry_run(choice: Choice, reading: AutopilotReading) -> Finding:
+def _report_dry_run(choice: ChannelChoice, reading: AutopilotReading) -> Finding:
     """Return the finding about a continuous channel in a dry run, which sends no positions: ArduPilot does not arm
     without positions on every channel that is set up."""
     change = "VISO_TYPE=0"
     if choice.channel is Channel.GPS_INPUT:
-        change = f"{own_name(reading.parameters, RECEIVERS[choice.receiver])}={0 if choice.receiver == SECOND else 1}"
+        name = resolve_name(reading.parameters, RECEIVERS[choice.receiver])
+        change = f"{name}={0 if choice.receiver == ADVISED_RECEIVER else 1}"
     return report_fault(
         "channel", FindingCode.DRY_RUN_NOT_ARMED, change, channel=choice.channel.name, vehicle=reading.vehicle
     )
@@ -99,7 +100,7 @@ def _check_px4(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Findin
     elif CONTROL in reading.parameters:
         yield replace(_report_channel(choice), ok=False, changes=(f"{CONTROL}={FUSES_POSITION}",), exit_code=1)
         choice = replace(choice, channel=Channel.SENSOR)  # for the other parameters that it will need
-    elif reading.kind is Kind.PLANE:
+    elif reading.kind is VehicleKind.PLANE:
         yield _report_channel(choice)
     else:
         vision_control = reading.parameters.get(VISION_CONTROL) or None

@@ -38,7 +38,7 @@ class Known:
         self.reports, self.frames, self.begun, self.contradicts_m = [], [], [], 0.0
         self.add_acceleration = self.correct_by_fix = lambda *_: None
 
-    def state_at(self, t_s):
+    def estimate_state(self, t_s):
         if self.accuracy_m is None:
             return None
         where = Position(*offset_position(*HOME, *self.off_m))
@@ -137,38 +137,38 @@ def receiver(sd_m=1.0, **said):
 def test_output_is_chosen_by_channel_and_receiver(channel, reports, before, output):
     navigator = navigate(channel, reports=reports)
     navigator.output = before
-    assert (navigator.state_at(NOW_S) is not None) is output.is_sent
+    assert (navigator.estimate_state(NOW_S) is not None) is output.is_sent
     assert navigator.output is output
 
 
 def test_no_position_is_sent_that_is_unknown_contradicted_or_withdrawn():
     unheard, unknown = navigate(Channel.GPS_INPUT, is_heard=False), navigate(Channel.GPS_INPUT, accuracy_m=None)
     for navigator in (unheard, unknown):
-        assert (navigator.state_at(NOW_S), navigator.output) == (None, Output.STARTING)
+        assert (navigator.estimate_state(NOW_S), navigator.output) == (None, Output.STARTING)
     unknown.output = Output.SENDING
-    assert (unknown.state_at(NOW_S), unknown.output) == (None, Output.UNKNOWN)
+    assert (unknown.estimate_state(NOW_S), unknown.output) == (None, Output.UNKNOWN)
     in_doubt, doubted, withdrawn = (navigate(Channel.GPS_INPUT) for _ in range(3))
     in_doubt._navigation.is_in_doubt = True
     doubted.doubt_map(True)
     withdrawn._watch.withdrawn = Output.REFUSED
     for navigator in (in_doubt, doubted):
-        assert (navigator.state_at(NOW_S), navigator.output) == (None, Output.CONTRADICTS_GPS)
-    assert (withdrawn.state_at(NOW_S), withdrawn.output) == (None, Output.REFUSED)
-    assert navigate(Channel.GPS_INPUT, how={"is_muted": True}).state_at(NOW_S) is None
+        assert (navigator.estimate_state(NOW_S), navigator.output) == (None, Output.CONTRADICTS_GPS)
+    assert (withdrawn.estimate_state(NOW_S), withdrawn.output) == (None, Output.REFUSED)
+    assert navigate(Channel.GPS_INPUT, how={"is_muted": True}).estimate_state(NOW_S) is None
 
 
 def test_continuous_position_claims_accuracy_and_lag_for_fifty_like_it():
     navigator = navigate(Channel.GPS_INPUT, reports={"sink_m_s": 0.7}, map_sd_m=1.0)
     navigator.handle_force(NOW_S, (0.0, 0.0, -9.8), Attitude(NOW_S, 90.0, -45.0, 180.0))
-    state = navigator.state_at(NOW_S)
+    state = navigator.estimate_state(NOW_S)
     assert (state.t_mono_s, state.alt_m, state.alt_accuracy_m, state.is_reserve) == (NOW_S, 300.0, 3.0, False)
     assert (state.lat_deg, state.lon_deg) == pytest.approx(HOME)
     assert state.velocity_m_s == (3.0, 4.0, 0.7)
     assert state.attitude == pytest.approx((math.pi / 2, -math.pi / 4, math.pi))
     assert (state.accuracy_m, state.speed_accuracy_m_s) == pytest.approx((2.0 * LIKE_ONE, 0.5 * LIKE_ONE))
     navigator._navigation.off_m = (3.0 + 10.0, 4.0)  # as far as it has flown, and 10 m of which 2 m are made up
-    assert navigator.state_at(NOW_S + 1.0).accuracy_m == pytest.approx(math.hypot(2.0, 8.0) * LIKE_ONE, rel=1e-4)
-    bare = navigate(Channel.GPS_INPUT).state_at(NOW_S)
+    assert navigator.estimate_state(NOW_S + 1.0).accuracy_m == pytest.approx(math.hypot(2.0, 8.0) * LIKE_ONE, rel=1e-4)
+    bare = navigate(Channel.GPS_INPUT).estimate_state(NOW_S)
     assert (bare.attitude, bare.velocity_m_s[2]) == (None, 0.0)
 
 
@@ -176,7 +176,7 @@ def test_continuous_position_claims_accuracy_and_lag_for_fifty_like_it():
     ("sd_m", "alt_m", "expected_m"), [(1.0, 250.0, 250.0), (1.0, None, 300.0), (20.0, 250.0, 300.0)]
 )
 def test_altitude_of_a_reserve_is_that_of_the_receiver(sd_m, alt_m, expected_m):
-    state = navigate(Channel.GPS_INPUT, reports=receiver(sd_m, alt_m=alt_m)).state_at(NOW_S)
+    state = navigate(Channel.GPS_INPUT, reports=receiver(sd_m, alt_m=alt_m)).estimate_state(NOW_S)
     assert (state.alt_m, state.is_reserve) == (expected_m, sd_m == 1.0)
 
 
@@ -195,7 +195,7 @@ def test_px4_is_told_plain_errors_while_pictures_show_its_attitude(channel, how,
     if shown_ago_s:
         lean = AttitudeError((0.01, 0.0), 0.01)
         navigator.advise(match_at(Position(*HOME), NOW_S - shown_ago_s, None, 1.5, (1,), lean=lean), NOW_S)
-    assert navigator.state_at(NOW_S).accuracy_m == pytest.approx(2.0 * factor)
+    assert navigator.estimate_state(NOW_S).accuracy_m == pytest.approx(2.0 * factor)
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_px4_is_told_plain_errors_while_pictures_show_its_attitude(channel, how,
 def test_estimate_may_be_ours_for_ten_seconds(after_s, reports, is_ours):
     navigator = navigate(Channel.GPS_INPUT)
     assert navigator._navigation.reports == [(True, False)]
-    navigator.state_at(NOW_S)
+    navigator.estimate_state(NOW_S)
     navigator.believe_gps(False)
     navigator.handle_vehicle(vehicle_at(*HOME, NOW_S + after_s, velocity_m_s=(0.0, 0.0), **reports))
     assert navigator._navigation.reports[1:] == [(False, is_ours)]
@@ -328,17 +328,17 @@ def test_no_fix_is_sent_beside_gps_or_where_the_map_contradicts_it():
 )
 def test_fix_between_matches_is_sent_to_an_autopilot_that_needs_it_only(change):
     off = {"off_m": (10.0, 0.0)}
-    assert navigate(**off).fix_between(NOW_S)
-    assert navigate(**off | change).fix_between(NOW_S) is None
+    assert navigate(**off).make_interim_fix(NOW_S)
+    assert navigate(**off | change).make_interim_fix(NOW_S) is None
 
 
 def test_no_fix_is_sent_between_matches_that_contradict_or_of_unknown_age():
     navigator = navigate(off_m=(10.0, 0.0))
     navigator.age.is_unknown = True
-    assert navigator.fix_between(NOW_S) is None
+    assert navigator.make_interim_fix(NOW_S) is None
     navigator.age.is_unknown, navigator._navigation.contradicts_m = False, 500.0
     assert navigator.advise(matched(), NOW_S).is_held
-    assert navigator.fix_between(NOW_S) is None
+    assert navigator.make_interim_fix(NOW_S) is None
 
 
 def test_navigation_begins_anew_where_the_path_errs_otherwise():

@@ -145,7 +145,7 @@ def test_the_navigation_believes_the_fixes_and_no_longer_gps_but_sends_none_to_a
     off_m = []
     for _ in range(20):
         air.fly(1)
-        here = air.navigator._navigation.state_at(air.t_s).position
+        here = air.navigator._navigation.estimate_state(air.t_s).position
         off_m.append(air.off(here.lat_deg, here.lon_deg))
     assert lengths(off_m).max() < 8, "where the autopilot is 60 m off and more"
     assert air.link.stats().fixes_sent == 0

@@ -39,7 +39,7 @@ class TimedLink(FakeLink):
 
     asked_s = ()
 
-    def vehicle_at(self, t_mono_s):
+    def predict_vehicle(self, t_mono_s):
         self.asked_s = (*self.asked_s, t_mono_s)
         return self.vehicle()
 

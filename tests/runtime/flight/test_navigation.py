@@ -68,7 +68,7 @@ class Flown:
             if self.step % 50 == 0 and self.step > self.late_steps:
                 if fixes:
                     self.fix()
-                here = self.navigation.state_at(self.t_s)
+                here = self.navigation.estimate_state(self.t_s)
                 off_m = offset_m(*HOME, here.position.lat_deg, here.position.lon_deg)
                 errors_m.append(np.array(off_m) - self.at_m)
                 said_m.append(here.accuracy_m)
@@ -166,7 +166,7 @@ class Received:
 
     @property
     def east_m(self):
-        here = self.navigation.state_at(self.t_s).position
+        here = self.navigation.estimate_state(self.t_s).position
         return float(offset_m(*HOME, here.lat_deg, here.lon_deg)[0])
 
 
@@ -174,7 +174,7 @@ def test_navigation_beside_accelerations_takes_the_receiver_and_never_the_estima
     flown = Received().fly(20)
     assert flown.east_m == pytest.approx(0.0, abs=0.5)
     assert flown.navigation.has_gps
-    assert Received().fly(5, has_gps=False).navigation.state_at(5.0) is None, "its estimate may be ours"
+    assert Received().fly(5, has_gps=False).navigation.estimate_state(5.0) is None, "its estimate may be ours"
 
 
 def test_navigation_allows_for_the_lag_of_a_receiver():
@@ -221,14 +221,14 @@ def test_strides_claim_what_unknown_ground_can_do(zoom, gap_s, least_m, most_m):
         flown.navigation._strides_since_fix.add(
             np.array([10.0, 0.0]), zoom, FrameMeasurement(t_s=flown.t_s, sd_m=0.2, stride=stride)
         )
-        assert number or flown.navigation.state_at(flown.t_s)
+        assert number or flown.navigation.estimate_state(flown.t_s)
     assert least_m <= flown.navigation._strides_since_fix.error_m <= most_m
 
 
 def test_by_accelerations_alone_it_begins_with_a_fix():
     flown = Flown(INERTIAL)
-    assert flown.navigation.state_at(0.0) is None
+    assert flown.navigation.estimate_state(0.0) is None
     flown.navigation.begin(Position(*HOME), 3.0, -1.0, 0.0)
-    assert flown.navigation.state_at(0.0).accuracy_m > 10, "nobody knows how fast it was"
+    assert flown.navigation.estimate_state(0.0).accuracy_m > 10, "nobody knows how fast it was"
     errors_m, _ = flown.fly(60)
     assert lengths(errors_m)[-20:].max() < 6.0

@@ -83,7 +83,7 @@ def test_what_is_claimed_is_met(how):
         air = lost(seed=seed, **how).fly(10)
         for _ in range(200):
             air.fly(1)
-            here = air.navigator._navigation.state_at(air.t_s)
+            here = air.navigator._navigation.estimate_state(air.t_s)
             known.append((*air.off(here.position.lat_deg, here.position.lon_deg), here.accuracy_m))
     known = np.array(known)
     assert (abs(known[:, :2]) < known[:, 2:]).mean() == pytest.approx(0.68, abs=0.1)
@@ -92,7 +92,7 @@ def test_what_is_claimed_is_met(how):
 @pytest.mark.parametrize("channel", [Channel.SENSOR, Channel.VISION])
 def test_a_px4_is_sent_positions_while_it_has_no_gps_and_none_while_it_has(channel):
     navigator = Navigator(1.0, 1.0)
-    navigator.hear_channel(channel)
+    navigator.handle_channel(channel)
     air = Air(navigator, wind=WIND).fly(30)
     assert not said_states(air)
     air.lose_gps()
@@ -182,7 +182,7 @@ def test_a_continuous_position_holds_and_says_how_good_it_is():
 class OnlyAtMatches(Navigator):
     """A navigator as it would be without fixes between matches."""
 
-    def fix_between(self, now_s):
+    def make_interim_fix(self, now_s):
         return None
 
 

@@ -26,7 +26,7 @@ def without_gps(air, seconds):
 
 def off_m(air):
     """Metres (2,) by which our position is wrong now, and what it says of itself."""
-    here = air.navigator._navigation.state_at(air.t_s)
+    here = air.navigator._navigation.estimate_state(air.t_s)
     return air.off(here.position.lat_deg, here.position.lon_deg), here.accuracy_m
 
 
