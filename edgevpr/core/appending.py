@@ -48,10 +48,10 @@ def append_bytes(file: BinaryIO, data: bytes) -> None:
     try:
         rest = memoryview(data)
         while rest:  # a nearly full disk writes a part, and reports only at the next write that it is full
-            taken = file.write(rest)
-            if not taken:  # such as a terminal that is stopped
-                raise OSError(errno.EAGAIN, "it takes nothing more at the moment")
-            rest = rest[taken:]
+            written = file.write(rest)
+            if not written:  # such as a terminal that is stopped
+                raise OSError(errno.EAGAIN, "it takes no more data at the moment")
+            rest = rest[written:]
     except OSError:
         with suppress(OSError):
             file.truncate(end)
@@ -111,10 +111,10 @@ def create_numbered(path: str | Path) -> Path:
     """Create an empty file with the next number, so that no other process takes the number. Return its path."""
     path = Path(os.path.realpath(path))
     for number in range(max((number for number, _ in _find_numbered(path)), default=0) + 1, _MAX_NUMBER + 1):
-        claimed = path.with_name(f"{path.stem}-{number:04d}{path.suffix}")
+        target = path.with_name(f"{path.stem}-{number:04d}{path.suffix}")
         with suppress(FileExistsError):  # another process was faster
-            os.close(os.open(claimed, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, LOG_FILE_MODE))
-            return claimed
+            os.close(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, LOG_FILE_MODE))
+            return target
     raise OSError(errno.EEXIST, f"there is a file of number {_MAX_NUMBER}", str(path))
 
 
@@ -130,8 +130,8 @@ def rotate_file(path: str | Path) -> Path:
     return target
 
 
-def delete_oldest(path: str | Path, most_bytes: float) -> bool:
-    """Delete the oldest numbered files of `path` until the others take at most `most_bytes` together. A file that a
+def delete_oldest(path: str | Path, max_bytes: float) -> bool:
+    """Delete the oldest numbered files of `path` until the others take at most `max_bytes` together. A file that a
     process has locked stays. Return True if any was deleted."""
     sizes = {}
     for file in list_numbered(path):
@@ -139,7 +139,7 @@ def delete_oldest(path: str | Path, most_bytes: float) -> bool:
             sizes[file] = os.lstat(file).st_size
     kept_bytes = before_bytes = sum(sizes.values())
     for file, size in sizes.items():
-        if kept_bytes > most_bytes and _is_free(file):
+        if kept_bytes > max_bytes and _is_free(file):
             file.unlink(missing_ok=True)
             kept_bytes -= size
     return kept_bytes < before_bytes

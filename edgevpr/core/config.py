@@ -247,7 +247,7 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
 
 def resolve_log_paths(log: LogConfig, folder: str) -> LogConfig:
     """Return settings of logs and recordings whose paths, where relative, are relative to `folder`."""
-    path, record = (given and os.path.join(folder, given) for given in (log.path, log.record))
+    path, record = (value and os.path.join(folder, value) for value in (log.path, log.record))
     return replace(log, path=path, record=record)
 
 
@@ -257,14 +257,14 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
     Raises ConfigError for a key that is unknown or missing, and for a value of a wrong type or out of range.
     """
     hints = typing.get_type_hints(cls)
-    known = {f.name: f for f in fields(cls)}
+    specs = {spec.name: spec for spec in fields(cls)}
     for key in mapping:
-        if key not in known:
+        if key not in specs:
             name = str(key)[:_MAX_VALUE_CHARS]
-            hint = suggest(name, known, f"known: {', '.join(sorted(known))}")
+            hint = suggest(name, specs, f"known: {', '.join(sorted(specs))}")
             raise ConfigError(f"{where}: unknown key `{prefix}{name}` ({hint}).")
     values = {}
-    for name, spec in known.items():
+    for name, spec in specs.items():
         if name in mapping:
             values[name] = _convert(mapping[name], hints[name], spec.metadata.get("key", _ANY), where, prefix + name)
         elif spec.default is MISSING and spec.default_factory is MISSING:
@@ -273,24 +273,24 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
 
 
 def _convert(value: Any, hint: Any, rules: Key, where: str, name: str) -> Any:
-    wanted, what = _get_class(hint), f"{where}: `{name}`"
+    kind, what = _get_class(hint), f"{where}: `{name}`"
     limits: Any = rules.within
     if value is None and isinstance(hint, types.UnionType):
         return None
-    if is_dataclass(wanted):
+    if is_dataclass(kind):
         if not isinstance(value, dict):
             raise ConfigError(f"{what} is a section: write its keys below it, indented.")
-        return build(wanted, value, where, f"{name}.")
+        return build(kind, value, where, f"{name}.")
     if value is None:
         raise ConfigError(f"{what} has no value: write one.")
     if isinstance(value, int) and abs(value) > _MAX_INTEGER:
-        raise ConfigError(f"{what} is a number of too many digits: write a smaller one.")
-    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+        raise ConfigError(f"{what} has too many digits: write a smaller number.")
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if isinstance(value, str) and _NOT_IN_NAMES.search(value):
-        raise ConfigError(f"{what} holds a character that no file name can have ({value!a:.60}): write it anew.")
-    if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
-        raise ConfigError(f"{what} must be {_TYPE_NAMES.get(wanted, wanted)}, not {value!r:.{_MAX_VALUE_CHARS}}.")
+        raise ConfigError(f"{what} holds a character that no file name can have ({value!a:.60}): remove it.")
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        raise ConfigError(f"{what} must be {_TYPE_NAMES.get(kind, kind)}, not {value!r:.{_MAX_VALUE_CHARS}}.")
     if limits and not limits[0] <= value <= limits[1]:
         raise ConfigError(f"{what} is {value:g}; it must be between {limits[0]:g} and {limits[1]:g}.")
     if rules.choices and value not in rules.choices:

@@ -43,8 +43,8 @@ def find_model(file: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def open_file(path: str | Path, most_bytes: int) -> BinaryIO:
-    """Open a regular file of at most `most_bytes` for reading, without blocking. Raises OSError, with a `strerror` that
+def open_file(path: str | Path, max_bytes: int) -> BinaryIO:
+    """Open a regular file of at most `max_bytes` for reading, without blocking. Raises OSError, with a `strerror` that
     fits into a sentence, also for a larger file, for a pipe, which would wait for a writer, and for a device, which may
     never end."""
     handle = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
@@ -52,8 +52,8 @@ def open_file(path: str | Path, most_bytes: int) -> BinaryIO:
         status = os.fstat(handle.fileno())
         if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "it is a pipe or a device and not a regular file", str(path))
-        if status.st_size > most_bytes:
-            size = f"it has {status.st_size / 1e6:,.1f} MB, and at most {most_bytes / 1e6:,.1f} are read"
+        if status.st_size > max_bytes:
+            size = f"it has {status.st_size / 1e6:,.1f} MB, and the limit is {max_bytes / 1e6:,.1f} MB"
             raise OSError(errno.EFBIG, size, str(path))
     except BaseException:
         handle.close()
@@ -61,18 +61,18 @@ def open_file(path: str | Path, most_bytes: int) -> BinaryIO:
     return handle
 
 
-def read_file(path: str | Path, most_bytes: int) -> bytes:
-    """Read a regular file of at most `most_bytes`; raises OSError as `open_file` does."""
-    with open_file(path, most_bytes) as handle:
+def read_file(path: str | Path, max_bytes: int) -> bytes:
+    """Read a regular file of at most `max_bytes`; raises OSError as `open_file` does."""
+    with open_file(path, max_bytes) as handle:
         # Never ask for more than the file has: Python allocates the requested size first.
-        size = os.fstat(handle.fileno()).st_size or min(most_bytes, _KERNEL_FILE_BYTES)
+        size = os.fstat(handle.fileno()).st_size or min(max_bytes, _KERNEL_FILE_BYTES)
         return handle.read(size) or b""  # read gives None for a kernel file that has no data yet
 
 
-def compute_sha256(path: str | Path, most_bytes: int = sys.maxsize) -> str:
+def compute_sha256(path: str | Path, max_bytes: int = sys.maxsize) -> str:
     """Compute the SHA-256 of a regular file, 64 hexadecimal digits; raises OSError as `open_file` does."""
     digest = hashlib.sha256()
-    with open_file(path, most_bytes) as handle:
+    with open_file(path, max_bytes) as handle:
         while block := handle.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
@@ -81,7 +81,7 @@ def compute_sha256(path: str | Path, most_bytes: int = sys.maxsize) -> str:
 def require_folder(path: Path) -> None:
     """Check, before the work, that the folder of the file `path` to be written exists; else raise UsageError."""
     if not path.resolve().parent.is_dir():
-        raise UsageError(f"{path}: there is no such folder: make it first.")
+        raise UsageError(f"{path}: there is no such folder: create it first.")
 
 
 def write_atomically(path: Path, write: Callable[[Path], T]) -> T:

@@ -14,7 +14,7 @@ EARTH_RADIUS_M = 6_371_009.0  # mean radius: over a few kilometres a sphere is w
 
 
 def wrap_deg(turn_deg: D) -> D:
-    """Return the shorter of the two turns that lead to the same direction, -180..180 (a scalar or an array)."""
+    """Wrap an angle to -180..180 degrees (a scalar or an array)."""
     return (turn_deg + 180) % 360 - 180
 
 
@@ -42,8 +42,8 @@ def _north_m_and_longitude_rad(
 def project_to_metres(lat_deg: Floats, lon_deg: Floats) -> tuple[Floats, Floats]:
     """Project points, float (N,) each, to metres (east, north), float (N,) each, on the plane that touches the Earth at
     the first point that is not NaN. NaN stays NaN."""
-    known = np.flatnonzero(~np.isnan(lat_deg))
-    lat_0_deg, lon_0_deg = (lat_deg[known[0]], lon_deg[known[0]]) if len(known) else (0.0, 0.0)
+    valid = np.flatnonzero(~np.isnan(lat_deg))
+    lat_0_deg, lon_0_deg = (lat_deg[valid[0]], lon_deg[valid[0]]) if len(valid) else (0.0, 0.0)
     return offset_m(lat_0_deg, lon_0_deg, lat_deg, lon_deg)
 
 

@@ -44,11 +44,11 @@ class ReasonCode(Code):
     ACCEPTED_BY_SCORE = "accepted", "score {score:.3f}, {lead:.3f} ahead of any place elsewhere"
     ACCEPTED_WITHOUT_RIVAL = "accepted", "score {score:.3f}; there is no place elsewhere to compare with"
 
-    # Of a picture that was not searched for
-    NOT_SEARCHED = "not searched for"
-    PICTURES_STAY = "camera frozen: pictures stay the same"
-    PICTURES_REPEAT = "camera frozen: pictures repeat"
-    AGE_UNKNOWN = "age of pictures unknown", "{summary}, none is used: they do not fit the aircraft's motion"
+    # Of an image that was not searched
+    NOT_SEARCHED = "not searched"
+    PICTURES_STAY = "camera frozen: images do not change"
+    PICTURES_REPEAT = "camera frozen: images repeat"
+    AGE_UNKNOWN = "age of images unknown", "{summary}: none is used, as they do not fit the aircraft's motion"
     LOW_TEXTURE = "too little texture in the image", "{summary}: {usable:.0%} usable, {needed:.0%} needed"
     TILTED = "the image is not levelled", "{summary}: it is tilted {tilt_deg:.0f} degrees"
     TILTED_WITHOUT_HEADING = "the image is not levelled", "{summary}: tilted {tilt_deg:.0f} degrees, heading unknown"
@@ -60,7 +60,7 @@ class ReasonCode(Code):
     UNUSABLE = "unusable", "{problem}"
     MAP_UNREADABLE = "the map cannot be read", "{problem}"
     PLACE_UNREADABLE = "a place cannot be read", "{problem}"
-    UNFORESEEN = "an unforeseen error", "an unforeseen {error} ({problem}): report it, with the output of --debug"
+    UNFORESEEN = "unexpected error", "unexpected {error} ({problem}): report it with the output of --debug"
 
     # Of a match that was refused
     LOW_SCORE = "not similar enough to any place", "{summary}: score {score:.3f}, {needed:.3f} needed"
@@ -71,10 +71,10 @@ class ReasonCode(Code):
     LOW_CONFIDENCE = "confidence too low", "{summary}: ", *_FIGURES
     ELSEWHERE_AGREES_BETTER = "a place elsewhere agrees better", "{summary}: ", *_FIGURES
     TRACK_CONTRADICTS = "the track filter contradicts it", "{summary}: ", *_FIGURES
-    TURNED_AGREES = "the same place agrees nearly as well if the picture is turned otherwise", "{summary}: ", *_FIGURES
+    TURNED_AGREES = "the same place agrees nearly as well at another rotation", "{summary}: ", *_FIGURES
     ELSEWHERE_AT_REST = (
-        "places elsewhere have not moved either",
-        "{summary}, as behind a display: mask it (`source.mask`)",
+        "places elsewhere agree without a shift too",
+        "{summary}, as under an overlay: mask it (`source.mask`)",
     )
     LANDMARKS_DISAGREE = "landmarks and regions disagree on the offset", "{summary}: {landmarks:.0f} support another"
     FEW_LANDMARKS = "too few landmarks agree", "{summary}: {landmarks:.0f}, {needed:.0f} needed at such a score"
@@ -84,8 +84,8 @@ class ReasonCode(Code):
     )
     POSITIONS_DISAGREE = "places of the same ground disagree on the position", "{summary} by {apart_m:.0f} m"
     SEQUENCE_INCOMPLETE = "the sequence is not complete yet", "{summary}: {queries:.0f} queries of {needed:.0f}"
-    NEWEST_DISAGREES = "other places resemble the newest query more than this one does"
-    NEWEST_LEFT = "the newest queries no longer see what those before them saw"
+    NEWEST_DISAGREES = "the newest query resembles other places more"
+    NEWEST_LEFT = "the newest queries show other ground than those before"
     LOW_LEAD_SPEED = (
         "too little ahead of a place passed at another speed",
         "{summary}: {lead:.3f}, {needed:.3f} needed",
@@ -106,24 +106,23 @@ class ReasonCode(Code):
         "not needed: the autopilot's position is as good",
         "not needed: the autopilot is {off_m:.1f} m from our position, which is good to {accuracy_m:.1f} m",
     )
-    HELD_TURNED = "held back: turned against compass", "held back: turned {turn_deg:.0f} degrees against the compass"
-    HELD_OFF_GPS = "held back: far from GPS", "held back: {off_m:.0f} m from the position by GPS and the fixes before"
+    HELD_TURNED = "held back: contradicts compass", "held back: rotated {turn_deg:.0f} degrees against the compass"
+    HELD_OFF_GPS = "held back: far from GPS", "held back: {off_m:.0f} m from the position by GPS and earlier fixes"
     HELD_OFF_PATH = (
-        "held back: far from where the aircraft should be",
-        "held back: {off_m:.0f} m from where the aircraft is by the autopilot's reckoning and the fixes before, ",
-        "good to {accuracy_m:.0f} m: another fix has to agree",
+        "held back: far from the predicted position",
+        "held back: {off_m:.0f} m from the predicted position, accurate to {accuracy_m:.0f} m: another fix must agree",
     )
     PAUSED = "not sent: paused by the ground station"
     PARAMETER_DANGEROUS = "not sent: a parameter is dangerous", "not sent: set {changes}. {why}"
     PARAMETERS_UNANSWERED = "not sent: parameters not answered", "not sent: no answer for {names} from the autopilot"
     FIXES_UNANSWERED = "not sent: five fixes in a row had no answer"
-    ANSWERS_BEGIN_AGAIN = "not sent: the autopilot has only just begun to answer again"
-    FRAME_TOO_OLD = "its frame is too old", "its frame is {age_s:.1f} s old, and {limit_s:g} s are the limit"
-    SUPERSEDED = "newer ones came before its turn"
-    NO_AUTOPILOT = "no autopilot was there to take it", "{summary} within {limit_s:g} s"
+    ANSWERS_BEGIN_AGAIN = "not sent: the autopilot has only just resumed answering"
+    FRAME_TOO_OLD = "its frame is too old", "its frame is {age_s:.1f} s old, and the limit is {limit_s:g} s"
+    SUPERSEDED = "replaced by a newer fix"
+    NO_AUTOPILOT = "no autopilot to receive it", "{summary} within {limit_s:g} s"
     CLOCK_UNKNOWN = "the autopilot's clock was not known", "{summary} within {limit_s:g} s"
     NOT_ENCODABLE = "it does not fit its message", "{summary} ({problem})"
-    LINK_LOST = "the link was lost before it had left"
+    LINK_LOST = "the link was lost before it was sent"
 
     # Of a fix without an answer
     NO_ANSWER = "it had no answer", "{summary} within {limit_s:g} s"
@@ -134,16 +133,16 @@ class ReasonCode(Code):
 
     # Of an autopilot's answer to fixes, or of its silence: "it" is the autopilot, and a summary has 26 bytes at most
     TAKEN = "taken", "it takes them"
-    GPS_IN_USE = "GPS in use", "a GPS receiver of its has a fix, and while it has GPS it takes no other position"
+    GPS_IN_USE = "GPS in use", "one of its GPS receivers has a fix, and with GPS it takes no other position"
     NOT_STARTED = "filter not started", "its position filter has not started: a plane starts it with GPS only"
     NO_ORIGIN = "no origin", "it has no origin, so it takes no position: it must have had GPS once, or be sent one"
-    NOT_ARMED = "not armed", "it is not armed: on the ground it reckons no position that a fix could correct"
-    NOT_RECKONING = "nothing to reckon by", "it reckons no position, with neither GPS, airspeed, flow nor vision"
-    OTHER_AID = "not dead reckoning", "it takes a fix only while it reckons its position without any aid"
-    NOT_PLAUSIBLE = "fix not plausible", "it reckons its position, and the fix does not fit, or it has no origin"
-    NOT_SAID = "see its log", "it does not say: GPS just in use, no origin, or nothing to reckon by"
+    NOT_ARMED = "not armed", "it is not armed: on the ground it has no dead-reckoned position to correct"
+    NOT_RECKONING = "no source of position", "it estimates no position: it has neither GPS, airspeed, flow nor vision"
+    OTHER_AID = "not dead reckoning", "it takes a fix only while it dead-reckons without any aid"
+    NOT_PLAUSIBLE = "fix not plausible", "it dead-reckons, and the fix does not fit, or it has no origin"
+    NOT_SAID = "see its log", "it gives no reason: GPS just in use, no origin, or no source of position"
     OTHER_ANSWER = "see its log", "it answers {result}"
-    WRONG_FORM = "wrong form", "it does not like their form"
+    WRONG_FORM = "wrong format", "it rejects their format"
     NO_COMMAND = "43003 not known", "its firmware has no command 43003, or was built without, as for boards of 1 MB"
     NO_COMMAND_ANSWERED = (
         "signing? system id?",
@@ -159,36 +158,36 @@ class ReasonCode(Code):
     # Notes of a flight. The ground station is sent the summary where the sentence is too long for a STATUSTEXT.
     FAILING = "frames fail in a row", "{count:.0f} frames in a row have failed"
     NOT_FAILING = "frames are recognised again"
-    NOTHING_SHOWN = "camera shows nothing"
+    NOTHING_SHOWN = "camera image is blank"
     GROUND_SHOWN = "camera shows ground again"
     MAP_LEFT = "map left"
     MAP_FOUND = "map found again"
     TILT_TOO_LARGE = "tilt too large"
     TILT_FINE = "tilt is fine again"
-    MAP_LOST = "its map cannot be read, see its log"
-    MAP_BACK = "its map is read again"
-    PICTURES_MOVE = "camera is back: pictures move again"
-    AGE_KNOWN = "age of pictures known again"
-    DELAY_FOUND = "pictures are late: corrected", "pictures are {delay_s:.1f} s older than they claim: corrected"
-    DELAY_GONE = "pictures are as old as they claim"
+    MAP_LOST = "map cannot be read, see the log"
+    MAP_BACK = "map can be read again"
+    PICTURES_MOVE = "camera works again: images change"
+    AGE_KNOWN = "age of images known again"
+    DELAY_FOUND = "images are late: corrected", "images are {delay_s:.1f} s older than they claim: corrected"
+    DELAY_GONE = "images are as old as they claim"
     PICTURES_TURNED = (
-        "pictures are turned",
-        "pictures are turned {turn_deg:.0f} degrees against the heading: if the compass is right, ",
+        "images are turned",
+        "images are turned {turn_deg:.0f} degrees against the heading: if the compass is right, ",
         "set source.up_deg: {up_deg:.0f}",
     )
-    PICTURES_MIRRORED = "pictures are mirrored", "{summary}, so none can match: switch off mirror or flip in the camera"
+    PICTURES_MIRRORED = "images are mirrored", "{summary}, so none can match: switch off mirror or flip in the camera"
     HEIGHT_DIFFERS = "height differs", "height: autopilot {by_autopilot_m:.0f} m, pictures {by_pictures_m:.0f} m"
     HEIGHT_AGREES = "height agrees with pictures again"
     GPS_DIFFERS = "GPS is far from the map", "GPS is {off_m:.0f} m from the map's position"
     GPS_AGREES = "GPS agrees with the map again"
-    SURVEY_WITHDRAWN = "the map's place is unknown again", "{summary}: GPS contradicts what was reported"
+    SURVEY_WITHDRAWN = "map offset unknown again", "{summary}: GPS contradicts the reported one"
     PAUSED_BY_COMMAND = "paused by command"
-    RESUMED_BY_COMMAND = "goes on by command"
+    RESUMED_BY_COMMAND = "resumed by command"
     UNDER_VOLTAGE = "companion under-voltage: check 5 V supply"
     SUPPLY_FINE = "companion supply is fine again"
     THROTTLED = "companion throttled", "{summary}", " at {temperature_c:.0f} C", ": runs slower"
     FULL_SPEED = "companion runs at full speed again"
-    HOT = "companion hot", "{summary}", " at {temperature_c:.0f} C", ": give it cool air"
+    HOT = "companion hot", "{summary}", " at {temperature_c:.0f} C", ": improve its cooling"
     COOL = "companion is cool again", "{summary}", " at {temperature_c:.0f} C"
 
     # Of the channel to the autopilot: "it" is the autopilot
@@ -196,28 +195,30 @@ class ReasonCode(Code):
     BY_ODOMETRY = "ODOMETRY", "ODOMETRY, as its {parameter} is 1", "; without GPS by source set {source_set:.0f}"
     BY_MESSAGE_296 = "message 296", "message 296, as its {parameter} fuses positions"
     COMMAND_TO_PLANE = "command 43003, which a dead-reckoning plane accepts at any time"
-    COMMAND_NEEDS_FLOW = "command 43003", "command 43003, for a {vehicle} that optical flow carries; else set {change}"
+    COMMAND_NEEDS_FLOW = (
+        "command 43003",
+        "command 43003, for a {vehicle} with optical flow; else set {change}",
+    )
     COMMAND_WITHOUT_296 = "command 43003", "command 43003, as it has no {parameter} for message 296 (1.18 has)"
     COMMAND_FOR_296 = (
         "command 43003",
         "command 43003, as its {parameter} fuses no positions of message 296: set it, and reboot",
     )
-    COMMAND_TO_ANY = "command 43003, the only one that is asked of an unknown firmware"
-    PARAMETER_WEAK = "a parameter is not right", "set {changes}. {why}"
+    COMMAND_TO_ANY = "command 43003, the only channel used with unknown firmware"
+    PARAMETER_WEAK = "a parameter should change", "set {changes}. {why}"
 
     # Of a change of the governor
-    BOARD_HOT = "the board is too hot", "{temperature_c:.0f} degrees, and {limit_c:.0f} are the limit"
-    BOARD_SLOW = "the board slows itself down"
-    CORES_TAKEN = "too much of all cores taken", "{taken:.0%} of all cores taken, and {allowed:.0%} allowed"
-    QUERIES_LATE = "queries come late, kept waiting by other programs or the disk"
-    MEMORY_TAKEN = "too much memory taken", "{taken_mb:.0f} MB of memory taken, and {allowed_mb:.0f} allowed"
-    ROOM_AGAIN = "there is room again"
+    BOARD_HOT = "the board is too hot", "{temperature_c:.0f} °C, and the limit is {limit_c:.0f} °C"
+    BOARD_SLOW = "the board throttles itself"
+    CORES_TAKEN = "too much CPU used", "{taken:.0%} of all cores used, {allowed:.0%} allowed"
+    QUERIES_LATE = "queries are late: other programs or the disk delay them"
+    MEMORY_TAKEN = "too much memory used", "{taken_mb:.0f} MB of memory used, {allowed_mb:.0f} MB allowed"
+    ROOM_AGAIN = "resources are free again"
 
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """A code with the parameters of this case, numbers or text (None or not there: unknown). As text it is the
-    sentence."""
+    """A code with the parameters of this case, numbers or text (None or missing: unknown). `str` gives the sentence."""
 
     code: Code
     parameters: Parameters = field(default_factory=dict)
@@ -227,8 +228,8 @@ class Reason:
 
     def fields(self) -> dict[str, Any]:
         """Return the reason as fields of the flight log and of JSON, without unknown parameters."""
-        known = {name: value for name, value in self.parameters.items() if value is not None}
-        return {"code": self.code.name, "parameters": known}
+        values = {name: value for name, value in self.parameters.items() if value is not None}
+        return {"code": self.code.name, "parameters": values}
 
     def _fill(self, part: str) -> str:
         if any(self.parameters.get(name) is None for name in _list_names(part)):

@@ -62,18 +62,18 @@ def decode_name(name: str) -> str:
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
-def suggest(name: str, known: Iterable[str], otherwise: str) -> str:
-    """Return "did you mean `X`?" with the one of the `known` names that is most similar to `name`; `otherwise` if none
+def suggest(name: str, names: Iterable[str], otherwise: str) -> str:
+    """Return "did you mean `X`?" with the one of `names` that is most similar to `name`; `otherwise` if none
     is similar."""
-    near = get_close_matches(name, list(known), n=1)
+    near = get_close_matches(name, list(names), n=1)
     return f"did you mean `{near[0]}`?" if near else otherwise
 
 
 def align_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
     """Format rows of cells as a table, one line for each row (which may be shorter than others). The first `left`
     columns are flush left, the others flush right."""
-    widths = [max(map(len, column)) for column in zip_longest(*rows, fillvalue="")]
-    lines = ([f"{cell:{'<' if at < left else '>'}{widths[at]}}" for at, cell in enumerate(row)] for row in rows)
+    widths = [max(map(len, cells)) for cells in zip_longest(*rows, fillvalue="")]
+    lines = ([f"{cell:{'<' if i < left else '>'}{widths[i]}}" for i, cell in enumerate(row)] for row in rows)
     return ["  ".join(line).rstrip() for line in lines]
 
 
@@ -201,6 +201,6 @@ def format_probability(probability: float) -> str:
 
 
 def format_offset(east_m: float, north_m: float) -> str:
-    """Write a step on the ground: "3.1 m east and 1.2 m south"."""
-    along, up = "east" if east_m > 0 else "west", "north" if north_m > 0 else "south"
-    return f"{abs(east_m):.1f} m {along} and {abs(north_m):.1f} m {up}"
+    """Format an offset on the ground: "3.1 m east and 1.2 m south"."""
+    side, end = "east" if east_m > 0 else "west", "north" if north_m > 0 else "south"
+    return f"{abs(east_m):.1f} m {side} and {abs(north_m):.1f} m {end}"

@@ -170,7 +170,7 @@ def test_the_ground_station_hears_each_reason_once_and_that_fixes_are_taken_agai
         texts += autopilot.texts()
     assert texts == [
         (6, "edgevpr: fixes refused: GPS in use"),
-        (4, "edgevpr: fixes refused: wrong form"),
+        (4, "edgevpr: fixes refused: wrong format"),
         (6, "edgevpr: fixes are taken again"),
     ]
     assert caplog.text.count("the autopilot's answer") == 4

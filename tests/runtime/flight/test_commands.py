@@ -30,7 +30,7 @@ def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_pict
         ("PAUSE", "255/190", "PAUSED_BY_COMMAND"),
         ("RESUME", "255/190", "RESUMED_BY_COMMAND"),
     ]
-    assert link.texts() == [(6, "edgevpr: paused by command"), (6, "edgevpr: goes on by command")]
+    assert link.texts() == [(6, "edgevpr: paused by command"), (6, "edgevpr: resumed by command")]
 
 
 def test_a_recording_waits_while_paused(make_flight, clock, link):

@@ -111,9 +111,9 @@ def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
     assert health[0] is health[-1] is Health.ACTIVE
     assert [line["note"]["code"] for line in of_kind(lines, "failing")] == ["FAILING", "NOT_FAILING"]
     assert link.texts() == [
-        (4, "edgevpr: its map cannot be read, see its log"),
+        (4, "edgevpr: map cannot be read, see the log"),
         (4, "edgevpr: 10 frames in a row have failed"),
-        (6, "edgevpr: its map is read again"),
+        (6, "edgevpr: map can be read again"),
         (6, "edgevpr: frames are recognised again"),
     ]
     assert flight.end["unusable"] == MAX_FAILURES_IN_A_ROW + 1

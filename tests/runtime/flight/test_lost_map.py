@@ -11,7 +11,7 @@ from flights import PLACES, fly_acts, nothing, of_kind
 from edgevpr.places.geopackage import point_blob
 from edgevpr.places.mapfile import PlaceMap
 
-SAID = [(4, "edgevpr: its map cannot be read, see its log"), (6, "edgevpr: its map is read again")]
+SAID = [(4, "edgevpr: map cannot be read, see the log"), (6, "edgevpr: map can be read again")]
 
 
 class Locked:

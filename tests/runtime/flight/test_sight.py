@@ -123,7 +123,7 @@ def test_mirrored_pictures_are_reported_once_and_only_where_none_matches(make_fl
     mirrored = [np.flip(picture, axis).copy() for picture in pictures(8)]
     lines = make_flight().fly(FakeSource([*mirrored, *mirrored, *mirrored[:4]], clock))
     assert not any(line["accepted"] for line in of_kind(lines, "query"))
-    assert link.texts() == [(4, "edgevpr: pictures are mirrored")]
+    assert link.texts() == [(4, "edgevpr: images are mirrored")]
     (line,) = of_kind(lines, "camera")
     assert line["note"]["code"] == "PICTURES_MIRRORED"
 
