@@ -15,9 +15,9 @@ from edgevpr.core.types import Frame, Receiver, Vehicle
 from edgevpr.frames.shot import Condition
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.fixes import Fixes, FixTransmission
-from edgevpr.mavlink.ground import Wish, Wished
+from edgevpr.mavlink.ground import CommandRequest, UserCommand
 from edgevpr.mavlink.link import LinkStats
-from edgevpr.mavlink.messages import Fix, Health, Severity, status_text
+from edgevpr.mavlink.messages import Fix, Health, Severity, make_status_text
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.vehicle import Readiness
 from edgevpr.runtime.flight.autopilot import ToAutopilot
@@ -169,22 +169,22 @@ class FakeLink:
         return sending
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        self.send(status_text(severity, f"edgevpr: {text}"))
+        self.send(make_status_text(severity, f"edgevpr: {text}"))
 
-    def accept_wishes(self) -> None:
+    def accept_commands(self) -> None:
         self._is_under_way = True
 
     def take_interim_fixes(self):
         return []
 
-    def take_wish(self) -> Wished | None:
+    def take_command(self) -> CommandRequest | None:
         wish, self._wish = self._wish, None
         return wish
 
-    def wish(self, wish: Wish) -> str:
+    def wish(self, wish: UserCommand) -> str:
         if not self._is_under_way:
             return "TEMPORARILY_REJECTED"
-        self._wish = Wished(wish, "255/190")
+        self._wish = CommandRequest(wish, "255/190")
         return "ACCEPTED"
 
     def set_health(self, health: Health) -> None:
@@ -250,7 +250,7 @@ class FakeLink:
             self._fixes.append(sending.fix)
             self._waiting.record_sent(sending, self._clock())
             sending.settle(True)
-            self._waiting.handle(self.answer, Readiness(has_gps=True).why(self.answer), self._clock())
+            self._waiting.handle(self.answer, Readiness(has_gps=True).explain(self.answer), self._clock())
             self._acks[self.answer] += 1
 
 

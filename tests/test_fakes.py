@@ -17,7 +17,7 @@ from edgevpr.frames.devices import DeviceCapture
 from edgevpr.frames.live import LiveSource
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import open_source
-from edgevpr.mavlink.ground import Wish
+from edgevpr.mavlink.ground import UserCommand
 from edgevpr.mavlink.messages import Fix, Severity
 from edgevpr.mavlink.wire import mavlink
 
@@ -153,11 +153,11 @@ def test_link_announces_texts_and_hands_on_wishes(kind):
 
     link.announce(Severity.WARNING, "camera lost", "camera")
     wait_until(lambda: link.stats().sent.get("STATUSTEXT") == 1)
-    assert wish(Wish.PAUSE) == "TEMPORARILY_REJECTED"
-    link.accept_wishes()
-    assert (wish(Wish.RESUME), wish(Wish.PAUSE)) == ("ACCEPTED", "ACCEPTED")
-    assert link.take_wish() == (Wish.PAUSE, "255/190")
-    assert link.take_wish() is None
+    assert wish(UserCommand.PAUSE) == "TEMPORARILY_REJECTED"
+    link.accept_commands()
+    assert (wish(UserCommand.RESUME), wish(UserCommand.PAUSE)) == ("ACCEPTED", "ACCEPTED")
+    assert link.take_command() == (UserCommand.PAUSE, "255/190")
+    assert link.take_command() is None
     link.close()
     port.close()
 

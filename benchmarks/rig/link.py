@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from edgevpr.mavlink.wire import Message, PacketReader, mavlink, parameter_value
+from edgevpr.mavlink.wire import Message, PacketReader, mavlink, read_parameter_value
 
 GROUND_STATION, AUTOPILOT = (255, 190), (1, 1)
 # SIM_STATE is the truth; a plane, whose loop turns 50 times a second, gives it no more often.
@@ -84,7 +84,7 @@ class Link:
         """Set a parameter. Raises RuntimeError where the autopilot does not take it."""
 
         def is_taken(told: Message) -> bool:
-            held = parameter_value(told, self._bytewise) if told.param_id == name else None
+            held = read_parameter_value(told, self._bytewise) if told.param_id == name else None
             return held is not None and math.isclose(held, value, rel_tol=1e-5, abs_tol=1e-6)  # floats of 32 bits
 
         for _ in range(4):

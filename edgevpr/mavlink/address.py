@@ -30,9 +30,9 @@ def parse_link(url: str) -> LinkAddress:
     kind, _, rest = url.partition(":")
     where, _, number = rest.rpartition(":")  # from the right: names in /dev/serial/by-path hold colons
     if kind not in ("udpout", "udpin", "tcp", "serial") or not where.strip() or not number:
-        raise LinkAddressError(f"{url!r} is no MAVLink link: write {FORMS}.")
+        raise LinkAddressError(f"{url!r} is not a MAVLink link: write {FORMS}.")
     if kind != "serial" and ":" in where:
-        raise LinkAddressError(f"{url}: {where!r} is no host: give a name or an IPv4 address.")
+        raise LinkAddressError(f"{url}: {where!r} is not a host: give a name or an IPv4 address.")
     low, high, what = _BAUD if kind == "serial" else _PORT
     if not (number.isascii() and number.isdigit() and len(number) < 10 and low <= int(number) <= high):
         raise LinkAddressError(f"{url}: {what}, not {number!r}.")

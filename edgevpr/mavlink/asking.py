@@ -16,7 +16,7 @@ from edgevpr.mavlink.messages import AUTOPILOT, Health
 from edgevpr.mavlink.parameters import find_alternative
 from edgevpr.mavlink.ports import open_port
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
-from edgevpr.mavlink.wire import Message, PacketReader, mavlink, parameter_value
+from edgevpr.mavlink.wire import Message, PacketReader, mavlink, read_parameter_value
 
 HEARTBEAT_INTERVAL_S = 1.0
 HEARTBEAT_TIMEOUT_S = 5.0  # an autopilot sends one each second
@@ -60,7 +60,9 @@ class RequestLink(AbstractContextManager["RequestLink"]):
             self._port = open_port(address)
         except OSError as error:
             why = error.strerror or error
-            raise LinkError(f"{address} is not there ({why}): connect it, start it, or correct the link.") from error
+            raise LinkError(
+                f"{address} cannot be opened ({why}): connect it, start it, or correct the link."
+            ) from error
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self._port.close()
@@ -80,7 +82,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         name = mavlink.mavlink_map[message_id].msgname
         for _ in range(MAX_TRIES):
             sent_s = time.monotonic()
-            self._send(messages.message_request(self.system_id or 0, message_id))
+            self._send(messages.make_message_request(self.system_id or 0, message_id))
             answer = self._wait_for(
                 ANSWER_TIMEOUT_S, lambda message: message.get_type() == name or _is_refusal(message)
             )
@@ -95,18 +97,21 @@ class RequestLink(AbstractContextManager["RequestLink"]):
 
     def parameters(self, names: Iterable[str], bytewise: bool) -> dict[str, float | int]:
         """Read parameters by name (PARAM_REQUEST_READ) and return their values by name. Parameters that the autopilot
-        does not have, and values that are not finite, are left out. For `bytewise` see `parameter_value`."""
+        does not have, and values that are not finite, are left out. For `bytewise` see `read_parameter_value`."""
         values: dict[str, float | int] = {}
         missing = list(dict.fromkeys(names))
         for _ in range(MAX_TRIES):
             for start in range(0, len(missing), MAX_PARALLEL_REQUESTS):
                 asked = missing[start : start + MAX_PARALLEL_REQUESTS]
                 for name in asked:
-                    self._send(messages.parameter_request(self.system_id or 0, name))
+                    self._send(messages.make_parameter_request(self.system_id or 0, name))
                 waiting = set(asked)
                 while waiting and (answer := self._wait_for(ANSWER_TIMEOUT_S, _match_parameters(waiting))):
                     waiting.remove(answer.param_id)
-                    if answer.get_type() == "PARAM_VALUE" and (value := parameter_value(answer, bytewise)) is not None:
+                    if (
+                        answer.get_type() == "PARAM_VALUE"
+                        and (value := read_parameter_value(answer, bytewise)) is not None
+                    ):
                         values[answer.param_id] = value
             missing = [name for name in missing if name not in values]
         return values
@@ -128,7 +133,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         if self._port.connected and now_s >= self._heartbeat_due_s:
             self._heartbeat_due_s = now_s + HEARTBEAT_INTERVAL_S
             # Of no kind: PX4 warns of a lost companion when one that has only asked falls silent.
-            self._send(messages.heartbeat(Health.BOOT, mavlink.MAV_TYPE_GENERIC))
+            self._send(messages.make_heartbeat(Health.BOOT, mavlink.MAV_TYPE_GENERIC))
         readable, _, _ = select.select([self._port], [], [], wait_s)
         # A serial port without a byte would look lost; a refused datagram makes its port readable again and again.
         data = self._port.read() if readable else b""

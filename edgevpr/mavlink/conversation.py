@@ -16,7 +16,7 @@ from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.clock import HEARTBEAT_TIMEOUT_S
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, FixTransmission, compensate_lag
-from edgevpr.mavlink.ground import FOR_PEOPLE, Requests, Texts
+from edgevpr.mavlink.ground import GCS_MESSAGES, Requests, Texts
 from edgevpr.mavlink.messages import AUTOPILOT, Fix, Health, Severity
 from edgevpr.mavlink.peer import Autopilot, Listener
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSettings:
-    """The settings of a link. `system_id`: that of the autopilot (None: of the first one heard). A fix that has waited
+    """The settings of a link. `system_id`: that of the autopilot (None: of the first one). A fix that has waited
     for `max_fix_age_s` is never sent. `clock`: the monotonic clock of all stamps. `origin` is sent to an autopilot that
     takes ODOMETRY and has none (None: never)."""
 
@@ -97,7 +97,7 @@ class Conversation:
         for message in outgoing:
             self.dropped_queue_full += len(self._messages) == MAX_MESSAGES
             self._messages.append(message)
-            if self._gcs and message.get_type() in FOR_PEOPLE:
+            if self._gcs and message.get_type() in GCS_MESSAGES:
                 self._gcs.send(copy(message))  # packing changes a message, and each link packs it
 
     def send_fix(self, fix: Fix) -> FixTransmission:
@@ -196,14 +196,14 @@ class Conversation:
             self.announce(Severity.WARNING, "autopilot is silent", "autopilot")
         if is_alive or self._was_alive is not None:
             self._was_alive = is_alive
-        self.fixes.report_silence(self.autopilot.readiness(now_s).why_silent, now_s)
+        self.fixes.report_silence(self.autopilot.assess_readiness(now_s).silence_reason, now_s)
         while self._reports:
             self.announce(*self._reports.pop(0))
 
     def break_off(self, lost_fixes: int) -> None:
         """Reset the state of a lost port. `lost_fixes` is the number of fixes discarded with it."""
         self.fixes.record_lost(lost_fixes)
-        self.autopilot.heard_s = -math.inf  # another autopilot may be there when the port is open again
+        self.autopilot.heartbeat_s = -math.inf  # another autopilot may be there when the port is open again
         self.reader.parsers.clear()  # with incomplete messages
 
     def drop_stale(self) -> None:
@@ -220,7 +220,7 @@ class Conversation:
         if late_s >= 0:
             self._heartbeat_due_s = now_s + HEARTBEAT_INTERVAL_S - late_s % HEARTBEAT_INTERVAL_S
             is_stuck = now_s - self._health_set_s > HEALTH_TIMEOUT_S
-            return messages.heartbeat(Health.CRITICAL if is_stuck else self._health), None
+            return messages.make_heartbeat(Health.CRITICAL if is_stuck else self._health), None
         system_id = self.autopilot.system_id
         if system_id is not None and self.autopilot.listens(now_s):
             if request := self.autopilot.clock.make_request(now_s):
@@ -236,7 +236,7 @@ class Conversation:
             elif sending := self.fixes.next(now_s) or self._next_interim_fix(now_s):
                 lag_s = self.autopilot.foreign_stamps.take_lag_s()
                 fix = compensate_lag(sending.fix, now_s, lag_s, self.autopilot.vehicle)
-                return messages.position_fix(fix, now_s, system_id, stamp_s), sending
+                return messages.make_position_fix(fix, now_s, system_id, stamp_s), sending
         else:
             self.fixes.drop_stale(now_s)
         if text := self.texts.next(now_s):
@@ -266,13 +266,13 @@ class Conversation:
         if (stamp_s := autopilot.stamp_s(t_s)) is None:
             return None
         if choice.channel is Channel.GPS_INPUT:
-            return messages.gps_input(state, choice.receiver, stamp_s, autopilot.clock.utc_s(t_s))
+            return messages.make_gps_input(state, choice.receiver, stamp_s, autopilot.clock.utc_s(t_s))
         origin = self.settings.origin
         if autopilot.origin is None and origin and now_s - self._origin_missing_since_s > ORIGIN_TIMEOUT_S:
             self._origin_missing_since_s = now_s  # again later: a filter that has not started ignores it
             return self._make_origin(origin, system_id)
         if state and state.attitude and autopilot.origin:
-            return messages.odometry(state, state.attitude, autopilot.origin, stamp_s)
+            return messages.make_odometry(state, state.attitude, autopilot.origin, stamp_s)
         return None
 
     def _make_origin(self, origin: Position, system_id: int) -> Message:
@@ -282,7 +282,7 @@ class Conversation:
             if self._has_requested_pressure:
                 self.announce(Severity.WARNING, "origin altitude unknown: set EKF origin", "origin")
             self._has_requested_pressure = True
-            return messages.message_request(system_id, mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE)
+            return messages.make_message_request(system_id, mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE)
         self._has_requested_pressure = False  # an autopilot that restarts is asked again
         if not self._has_set_origin:
             altitude = "by air pressure, up to 150 m off" if origin.alt_m is None else "of the map"
@@ -290,7 +290,7 @@ class Conversation:
             self._has_set_origin = True
         if origin.alt_m is None:
             self.announce(Severity.WARNING, f"origin altitude unknown: about {alt_m:.0f} m", "origin")
-        return messages.origin(system_id, origin.lat_deg, origin.lon_deg, alt_m)
+        return messages.make_origin(system_id, origin.lat_deg, origin.lon_deg, alt_m)
 
     def _request_reports(self, system_id: int, now_s: float) -> None:
         """Request the parameters that are due, and reports that have stopped or come at less than half the rate."""
@@ -304,14 +304,14 @@ class Conversation:
             return
         self._next_request_s = now_s + REQUEST_INTERVAL_S
         if self.channel is Channel.VISION and self.autopilot.origin is None:
-            self.send(messages.message_request(system_id, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
+            self.send(messages.make_message_request(system_id, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
         vehicle, is_continuous = self.autopilot.vehicle, self.channel.is_continuous
         is_silent = vehicle is None or now_s - vehicle.t_heard_s > REQUEST_INTERVAL_S
         is_slowed = self.autopilot.attitudes.rate_hz(now_s) < messages.attitude_hz(is_continuous) / 2
-        is_slowed |= is_continuous and now_s - self.autopilot.force_s > REQUEST_INTERVAL_S
+        is_slowed |= is_continuous and now_s - self.autopilot.imu_s > REQUEST_INTERVAL_S
         if is_silent or is_slowed or self._has_requested_continuous != is_continuous:
             self._has_requested_continuous = is_continuous
-            self.send(*messages.report_requests(system_id, self.autopilot.firmware, is_continuous))
+            self.send(*messages.make_report_requests(system_id, self.autopilot.firmware, is_continuous))
 
     def _reset(self, why: ReasonCode) -> None:
         """Start anew with an autopilot that has forgotten everything. `why` is reported for the awaited fixes."""
@@ -342,9 +342,9 @@ class Conversation:
         self.send(*self.requests.handle(message, (self._packer.srcSystem, self._packer.srcComponent), now_s))
 
     def _handle_answer(self, answer: str, now_s: float) -> None:
-        sending = self.fixes.handle(answer, self.autopilot.readiness(now_s).why(answer), now_s)
+        sending = self.fixes.handle(answer, self.autopilot.assess_readiness(now_s).explain(answer), now_s)
         if sending and answer == "ACCEPTED":
-            self.autopilot.certainty.record_accuracy(sending.fix.accuracy_m, now_s)
-        if answer == "FAILED" and self.autopilot.asks_origin(now_s):
+            self.autopilot.accuracy.record_accuracy(sending.fix.accuracy_m, now_s)
+        if answer == "FAILED" and self.autopilot.is_origin_request_due(now_s):
             origin = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
-            self.send(messages.message_request(self.autopilot.system_id or 0, origin))
+            self.send(messages.make_message_request(self.autopilot.system_id or 0, origin))

@@ -183,7 +183,7 @@ class PortDriver:
         reason = getattr(error, "strerror", None) or str(error)
         if reason != self._trouble:
             self._trouble = reason
-            log.warning("%s is not there (%s); trying again", self._address, reason)
+            log.warning("%s is not connected (%s); trying again", self._address, reason)
 
     def _flush(self) -> None:
         give_up_s = time.monotonic() + FLUSH_TIMEOUT_S

@@ -1,5 +1,5 @@
-"""The people on the ground: the requests that arrive over the links, and the texts for the ground station. A wish is a
-request that only the flight itself can fulfil, such as a pause. Used by `conversation` and the flight."""
+"""Requests that arrive over the links, and texts for the ground station. A command is a request that only the flight
+itself can carry out, such as a pause. Used by `conversation` and the flight."""
 
 import math
 from collections import Counter
@@ -7,52 +7,52 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import NamedTuple
 
-from edgevpr.mavlink.messages import Severity, status_text
+from edgevpr.mavlink.messages import Severity, make_status_text
 from edgevpr.mavlink.wire import Message, mavlink
 
-ANSWERED_MAX = 50  # requests a second; the answers to a flood of them must not displace our own messages
-FOR_PEOPLE = ("STATUSTEXT", "NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "ONBOARD_COMPUTER_STATUS")  # copied to all links
-SPACING_S = 5.0
+MAX_ANSWERS_PER_S = 50  # requests a second; the answers to a flood of them must not displace our own messages
+GCS_MESSAGES = ("STATUSTEXT", "NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "ONBOARD_COMPUTER_STATUS")  # copied to all links
+TEXT_INTERVAL_S = 5.0
 
 Announce = Callable[[Severity, str, str], None]  # reports to the ground station: severity, text and topic
 
 
-class Wish(IntEnum):
+class UserCommand(IntEnum):
     """A request to the flight; the value is the first parameter of MAV_CMD_USER_1 (31010)."""
 
     PAUSE = 1
     RESUME = 2
 
 
-class Wished(NamedTuple):
-    """A wish, and the sender who made it, as the text "system id/component id"."""
+class CommandRequest(NamedTuple):
+    """A command, and the sender who made it, as the text "system id/component id"."""
 
-    wish: Wish
+    command: UserCommand
     sender: str
 
 
 class Requests:
-    """Answers the requests of all links, and keeps the newest wish until the main loop of the flight takes it. Wishes
-    are rejected until the flight `is_under_way`. `results` counts commands by the name of their result, `ignored` the
+    """Answers the requests of all links, and keeps the newest command until the flight's main loop takes it. Commands
+    are rejected until the flight `is_flying`. `results` counts commands by the name of their result, `ignored` the
     other messages to us, of an unknown kind or too many a second. While it `is_paused`, no fix may be sent."""
 
     def __init__(self) -> None:
-        self.is_under_way = False
+        self.is_flying = False
         self.results: Counter[str] = Counter()
         self.ignored = 0
         self.is_paused = False
-        self._waiting: Wished | None = None
+        self._waiting: CommandRequest | None = None
         self._second_s, self._answered = 0.0, 0
 
-    def take(self) -> Wished | None:
-        """Return the newest wish that has arrived since the last call (None: none has)."""
+    def take(self) -> CommandRequest | None:
+        """Return the newest command that has arrived since the last call (None: none has)."""
         waiting, self._waiting = self._waiting, None
         return waiting
 
     def handle(self, message: Message, us: tuple[int, int], now_s: float) -> tuple[Message, ...]:
         """Process a message and return the replies. `us` is our (system id, component id), `now_s` our clock."""
         sender = message.get_srcSystem(), message.get_srcComponent()
-        if sender[0] == 0 or sender == us or not _asks(message, us):
+        if sender[0] == 0 or sender == us or not _needs_answer(message, us):
             return ()
         kind = message.get_type()
         if kind not in ("TIMESYNC", "COMMAND_LONG", "COMMAND_INT") or not self._may_answer(now_s):
@@ -60,28 +60,28 @@ class Requests:
             return ()
         if kind == "TIMESYNC":
             return (mavlink.MAVLink_timesync_message(tc1=round(now_s * 1e9), ts1=message.ts1),)
-        is_wish = message.command == mavlink.MAV_CMD_USER_1
-        result = self._take_wish(message.param1, sender) if is_wish else int(mavlink.MAV_RESULT_UNSUPPORTED)
+        is_command = message.command == mavlink.MAV_CMD_USER_1
+        result = self._keep_command(message.param1, sender) if is_command else int(mavlink.MAV_RESULT_UNSUPPORTED)
         self.results[mavlink.enums["MAV_RESULT"][result].name.removeprefix("MAV_RESULT_")] += 1
         to = {"target_system": sender[0], "target_component": sender[1]}
         return (mavlink.MAVLink_command_ack_message(message.command, result, **to),)
 
-    def _take_wish(self, wanted: float, sender: tuple[int, int]) -> int:
-        """Keep a wish, in place of a waiting one. Returns a MAV_RESULT."""
-        if wanted not in tuple(Wish):  # a whole float equals its integer, and NaN equals none
+    def _keep_command(self, code: float, sender: tuple[int, int]) -> int:
+        """Keep a command, in place of a waiting one. Returns a MAV_RESULT."""
+        if code not in tuple(UserCommand):  # a whole float equals its integer, and NaN equals none
             return int(mavlink.MAV_RESULT_DENIED)
-        if not self.is_under_way:
+        if not self.is_flying:
             return int(mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
-        wish = Wish(int(wanted))
-        self.is_paused = wish is Wish.PAUSE
-        self._waiting = Wished(wish, f"{sender[0]}/{sender[1]}")
+        command = UserCommand(int(code))
+        self.is_paused = command is UserCommand.PAUSE
+        self._waiting = CommandRequest(command, f"{sender[0]}/{sender[1]}")
         return int(mavlink.MAV_RESULT_ACCEPTED)
 
     def _may_answer(self, now_s: float) -> bool:
         if now_s - self._second_s >= 1.0:
             self._second_s, self._answered = now_s, 0
         self._answered += 1
-        return self._answered <= ANSWERED_MAX
+        return self._answered <= MAX_ANSWERS_PER_S
 
 
 class Texts:
@@ -92,7 +92,7 @@ class Texts:
     def __init__(self) -> None:
         self._waiting: dict[tuple[str, Severity], str] = {}  # the oldest first
         self._last: dict[str, str] = {}  # the last text sent of each topic
-        self._spacing_s = SPACING_S
+        self._spacing_s = TEXT_INTERVAL_S
         self._sent_s = -math.inf
 
     def __len__(self) -> int:
@@ -114,14 +114,14 @@ class Texts:
             return None
         topic, severity = chosen = min(self._waiting, key=lambda key: key[1])  # the oldest warning, else note
         self._sent_s, self._last[topic] = now_s, self._waiting.pop(chosen)
-        return status_text(severity, f"edgevpr: {self._last[topic]}")
+        return make_status_text(severity, f"edgevpr: {self._last[topic]}")
 
-    def hurry(self) -> None:
+    def remove_pauses(self) -> None:
         """Send the remaining texts without pauses: the link is about to be closed."""
         self._spacing_s = 0.0
 
 
-def _asks(message: Message, us: tuple[int, int]) -> bool:
+def _needs_answer(message: Message, us: tuple[int, int]) -> bool:
     """Return True if a message asks something of us: a TIMESYNC without `tc1`, or a message addressed to exactly us. A
     command to all is not for us, since every component would acknowledge it."""
     if message.get_type() == "TIMESYNC":

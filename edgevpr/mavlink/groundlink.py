@@ -34,7 +34,7 @@ class GroundLink(Link):
         settings = LinkSettings(
             component_id=of_flight.component_id,
             clock=of_flight.clock,
-            signing=of_flight.signing.for_ground(),
+            signing=of_flight.signing.make_gcs_signing(),
         )
         super().__init__(address, settings, flight.turns, converse=GroundConversation, drive=drive)
         with self.turn("ground link"):

@@ -20,12 +20,12 @@ MAX_STANDING_SPEED_M_S = 3.0
 MAX_STANDING_CLIMB_M_S = 1.0
 # A change of altitude between two reports that differs by more from the reported climb is a jump, unless the reports
 # are so far apart that the climb between them is not known.
-JUMP_M = 2.0
+MIN_JUMP_M = 2.0
 JUMP_M_PER_S = 5.0
 MAX_STEP_S = 5.0
-CONTRADICTION_M = 5.0
+MIN_CONTRADICTION_M = 5.0
 CONTRADICTION_SHARE = 0.25
-CONTRADICTION_LASTS_S = 3.0  # longer than the flight over a house
+MIN_CONTRADICTION_S = 3.0  # longer than the flight over a house
 
 _log = logging.getLogger(__name__)
 
@@ -80,27 +80,27 @@ class Heights:
         self._is_standing = is_still and not is_armed
         if self._is_standing:
             self.takeoff_m, self.jumped_m, self._is_guess = 0.0, 0.0, False
-            self._takeoff_terrain_m = self._recent(self._terrain, altitudes.t_s, TERRAIN_MAX_AGE_S)
+            self._takeoff_terrain_m = self._get_recent(self._terrain, altitudes.t_s, TERRAIN_MAX_AGE_S)
         elif self.takeoff_m is None or self._last is None:
             self.takeoff_m, self._is_guess = altitudes.above_home_m, True
         elif self._is_guess and was_without_home and self._has_home:
             self.takeoff_m = altitudes.above_home_m
         else:
-            self.takeoff_m += self._change_m(self._last, altitudes)
+            self.takeoff_m += self._compute_change_m(self._last, altitudes)
         self._last = altitudes
         self._check_range(altitudes.t_s)
 
     def now(self, now_s: float) -> float:
         """Return the height above the ground in metres, by the best recent source."""
-        measured_m = self._recent(self._range, now_s, RANGE_MAX_AGE_S)
-        return self._by_autopilot_m(now_s) if measured_m is None else measured_m
+        measured_m = self._get_recent(self._range, now_s, RANGE_MAX_AGE_S)
+        return self._compute_autopilot_height_m(now_s) if measured_m is None else measured_m
 
     @property
     def doubt_m(self) -> float:
         """By how much the height is in doubt, metres: by its jumps, and by a contradiction."""
         return max(abs(self.jumped_m), self.contradiction_m or 0.0)
 
-    def _change_m(self, last: Altitudes, altitudes: Altitudes) -> float:
+    def _compute_change_m(self, last: Altitudes, altitudes: Altitudes) -> float:
         """Return the change of height since the `last` report: that of the altitude above sea level or, if it has
         jumped, of that above home, or, if both have, the reported climb."""
         step_s = abs(altitudes.t_s - last.t_s)
@@ -111,7 +111,7 @@ class Heights:
         jumped_before, self._has_jumped = self._has_jumped, False
         if not steps_m:
             return climbed_m
-        limit_m = JUMP_M + step_s * (JUMP_M_PER_S + abs(altitudes.climb_m_s - last.climb_m_s) / 2)
+        limit_m = MIN_JUMP_M + step_s * (JUMP_M_PER_S + abs(altitudes.climb_m_s - last.climb_m_s) / 2)
         for step_m in steps_m:
             if abs(step_m - climbed_m) <= limit_m:
                 return step_m
@@ -126,19 +126,22 @@ class Heights:
 
     def _check_range(self, now_s: float) -> None:
         """Compare the range finder with the other heights; it must differ, or agree, for some seconds."""
-        by_range_m, by_autopilot_m = self._recent(self._range, now_s, RANGE_MAX_AGE_S), self._by_autopilot_m(now_s)
+        by_range_m, by_autopilot_m = (
+            self._get_recent(self._range, now_s, RANGE_MAX_AGE_S),
+            self._compute_autopilot_height_m(now_s),
+        )
         if by_range_m is None:
             self._changing_since_s = None
             return
         difference_m = abs(by_range_m - by_autopilot_m)
-        differs = difference_m > max(CONTRADICTION_M, CONTRADICTION_SHARE * abs(by_autopilot_m))
+        differs = difference_m > max(MIN_CONTRADICTION_M, CONTRADICTION_SHARE * abs(by_autopilot_m))
         if differs == (self.contradiction_m is not None):
             self._changing_since_s = None
             self.contradiction_m = difference_m if differs else None
             return
         if self._changing_since_s is None:
             self._changing_since_s = now_s
-        if now_s - self._changing_since_s < CONTRADICTION_LASTS_S:
+        if now_s - self._changing_since_s < MIN_CONTRADICTION_S:
             return
         self.contradiction_m, self._changing_since_s = difference_m if differs else None, None
         if differs:
@@ -159,13 +162,13 @@ class Heights:
             # Before version 4.7, ArduPilot's own height follows home, so it is taken only once.
             self._takeoff_terrain_m = report.terrain_height + report.current_height - self.takeoff_m
 
-    def _by_autopilot_m(self, now_s: float) -> float:
-        terrain_m = self._recent(self._terrain, now_s, TERRAIN_MAX_AGE_S)
+    def _compute_autopilot_height_m(self, now_s: float) -> float:
+        terrain_m = self._get_recent(self._terrain, now_s, TERRAIN_MAX_AGE_S)
         takeoff_m = self.takeoff_m or 0.0
         if terrain_m is None or self._takeoff_terrain_m is None:
             return takeoff_m
         return takeoff_m + self._takeoff_terrain_m - terrain_m
 
     @staticmethod
-    def _recent(measured: tuple[float, float] | None, now_s: float, max_age_s: float) -> float | None:
+    def _get_recent(measured: tuple[float, float] | None, now_s: float, max_age_s: float) -> float | None:
         return measured[0] if measured and now_s - measured[1] <= max_age_s else None

@@ -1,5 +1,4 @@
-"""The interview: what an autopilot is asked about itself for as long as the flight lasts, and the channel that follows
-from its answers. Used by the conversation in flight."""
+"""The interview: requests an autopilot's version and parameters during the flight, and chooses the channel by them."""
 
 import logging
 import math
@@ -14,21 +13,22 @@ from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.parameters import Decision, ParameterTable, find_alternative
 from edgevpr.mavlink.px4_parameters import PX4_TABLE
-from edgevpr.mavlink.wire import Message, mavlink, parameter_value
+from edgevpr.mavlink.wire import Message, mavlink, read_parameter_value
 
-ASKED_AT_ONCE_MAX = 10  # ArduPilot drops what comes on top of 20 (GCS_Param.cpp, param_requests)
-ROUND_S = 1.0
-NEXT_ROUND_S = 0.1  # after a round in which all was answered
-SILENT_ROUNDS = 4  # rounds without any answer, after which the pauses grow
-PAUSE_MAX_S = 30.0
-AGAIN_EVERY_S = 2.0  # one known parameter is asked for again, so that a change in flight is noticed
-ROUNDS_TO_ABSENT, ALL_LOST_PROBABILITY = 4, 1e-4
-REPORTED_AFTER_S = 10.0
-VERSION_ASKS_MAX = 4
+MAX_PARALLEL_REQUESTS = 10  # ArduPilot drops what comes on top of 20 (GCS_Param.cpp, param_requests)
+ROUND_INTERVAL_S = 1.0
+MIN_ROUND_INTERVAL_S = 0.1  # after a round in which all was answered
+MAX_SILENT_ROUNDS = 4  # rounds without any answer, after which the pauses grow
+MAX_PAUSE_S = 30.0
+REFRESH_INTERVAL_S = 2.0  # one known parameter is asked for again, so that a change in flight is noticed
+MIN_ROUNDS_TO_ABSENT = 4
+MAX_LOSS_PROBABILITY = 1e-4  # that all answers for one parameter were lost
+MISSING_REPORT_DELAY_S = 10.0
+MAX_VERSION_REQUESTS = 4
 TOPIC = "parameters"
 
 TABLES = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUPILOT_TABLE, mavlink.MAV_AUTOPILOT_PX4: PX4_TABLE}
-_OF_ANY = ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_TO_ANY))
+_DEFAULT_CHOICE = ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_TO_ANY))
 
 log = logging.getLogger(__name__)
 
@@ -47,19 +47,19 @@ class Interview:
     def __init__(self, announce: Announce) -> None:
         self._announce = announce
         self._values: dict[str, float] = {}
-        self._decision = Decision(_OF_ANY)
+        self._decision = Decision(_DEFAULT_CHOICE)
         self._reported: Decision | None = None
         self._autopilot, self._kind = int(mavlink.MAV_AUTOPILOT_GENERIC), VehicleKind.OTHER
         self._version: tuple[int, int] | None = None
-        self._version_asks = 0
+        self._version_requests = 0
         self._absent: set[str] = set()
-        self._asks: Counter[str] = Counter()
+        self._requests: Counter[str] = Counter()
         self._unanswered: Counter[str] = Counter()  # rounds without an answer for this name, but with one for another
         self._waiting: set[str] = set()  # asked for in the last round, and not answered
         self._answers = 0
-        self._silent_rounds = self._again = 0
+        self._silent_rounds = self._refresh_index = 0
         self._asked_s = self._due_s = -math.inf
-        self._is_begun = self._is_asking = False  # since the first questions; as long as an answer is missing
+        self._has_begun = self._is_asking = False  # since the first questions; as long as an answer is missing
         self._missing_since_s: float | None = None
         self._has_reported_missing = False
 
@@ -78,7 +78,7 @@ class Interview:
             case "AUTOPILOT_VERSION":
                 self._version = message.flight_sw_version >> 24 & 255, message.flight_sw_version >> 16 & 255
             case "PARAM_VALUE" if message.param_id in self._all_names():
-                value = parameter_value(message, bytewise=self._autopilot == mavlink.MAV_AUTOPILOT_PX4)
+                value = read_parameter_value(message, bytewise=self._autopilot == mavlink.MAV_AUTOPILOT_PX4)
                 if value is not None:
                     self._handle_value(message.param_id, value)
             case "PARAM_ERROR" if message.error == mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST:
@@ -89,31 +89,31 @@ class Interview:
 
     def questions(self, now_s: float, target_system: int) -> Iterator[Message]:
         """Yield the requests that are due at `now_s`."""
-        if not self._is_begun:
-            self._is_begun = True
+        if not self._has_begun:
+            self._has_begun = True
             self._decide()
         self._report_missing(now_s)
         if now_s < self._due_s:
             return
         if self._silent_rounds == 0 and self._waiting:
             self._unanswered.update(self._waiting)
-            self._find_absent()
+            self._mark_absent()
         missing = self._find_missing()
-        names = missing[: ASKED_AT_ONCE_MAX - 1]
-        names += self._find_again(is_alone=not missing)
-        wants_version = self._version is None and self._version_asks < VERSION_ASKS_MAX
+        names = missing[: MAX_PARALLEL_REQUESTS - 1]
+        names += self._choose_refresh(is_alone=not missing)
+        wants_version = self._version is None and self._version_requests < MAX_VERSION_REQUESTS
         self._is_asking = bool(missing) or wants_version
         self._waiting, self._asked_s = set(names), now_s
-        self._asks.update(names)
+        self._requests.update(names)
         self._silent_rounds += 1
-        doublings = min(8, max(0, self._silent_rounds - SILENT_ROUNDS))
-        pause_s = min(PAUSE_MAX_S, ROUND_S * 2**doublings)
-        self._due_s = now_s + (pause_s if self._is_asking else AGAIN_EVERY_S)
+        doublings = min(8, max(0, self._silent_rounds - MAX_SILENT_ROUNDS))
+        pause_s = min(MAX_PAUSE_S, ROUND_INTERVAL_S * 2**doublings)
+        self._due_s = now_s + (pause_s if self._is_asking else REFRESH_INTERVAL_S)
         if wants_version:
-            self._version_asks += 1
-            yield messages.message_request(target_system, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+            self._version_requests += 1
+            yield messages.make_message_request(target_system, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
         for name in names:
-            yield messages.parameter_request(target_system, name)
+            yield messages.make_parameter_request(target_system, name)
 
     def _handle_value(self, name: str, value: float) -> None:
         self._record_answer(name)
@@ -124,21 +124,23 @@ class Interview:
             self._decide()
 
     def _record_answer(self, name: str) -> None:
-        """Note that the autopilot answered for one parameter: so it hears us, and may not have the others."""
-        self._version_asks *= bool(self._values)
+        """Note that the autopilot answered for one parameter: so it receives us, and may not have the others."""
+        self._version_requests *= bool(self._values)
         self._silent_rounds = 0
         self._answers += name in self._waiting
         self._waiting.discard(name)
         if self._is_asking:
-            self._due_s = min(self._due_s, self._asked_s + (ROUND_S if self._waiting else NEXT_ROUND_S))
+            self._due_s = min(
+                self._due_s, self._asked_s + (ROUND_INTERVAL_S if self._waiting else MIN_ROUND_INTERVAL_S)
+            )
 
-    def _find_absent(self) -> None:
+    def _mark_absent(self) -> None:
         """Take those for absent that were asked for in vain so often that a loss of all answers is next to impossible,
         by the share of answers that arrive. Of others that may be absent too, one answer counts as lost."""
         unknown = {name for name in self._unanswered.keys() - self._values.keys() if not self._is_known(name)}
         lost = sum(self._unanswered[name] for name in self._values) + len(unknown - self._absent)
         arrives = (self._answers + 1) / (self._answers + lost + 2)
-        rounds = max(ROUNDS_TO_ABSENT, math.log(ALL_LOST_PROBABILITY) / math.log(1 - arrives))
+        rounds = max(MIN_ROUNDS_TO_ABSENT, math.log(MAX_LOSS_PROBABILITY) / math.log(1 - arrives))
         absent = {name for name in unknown - self._absent if self._unanswered[name] >= rounds}
         if absent:
             self._absent |= absent
@@ -166,25 +168,25 @@ class Interview:
         for name in table.names:
             if not self._is_known(name):
                 other = find_alternative(name)
-                names = (name, other) if other and self._asks[name] else (name,)
-                missing += [(rank.get(name, 2), self._asks[each], each) for each in names if each not in self._absent]
+                names = (name, other) if other and self._requests[name] else (name,)
+                missing += [(rank.get(name, 2), self._requests[key], key) for key in names if key not in self._absent]
         return [name for *_, name in sorted(missing)]
 
-    def _find_again(self, is_alone: bool) -> list[str]:
+    def _choose_refresh(self, is_alone: bool) -> list[str]:
         """Return the name to be asked for again, if any: a known one or, if it `is_alone`, an absent one, since all its
         answers may have been lost."""
         names = list(self._values)
         if is_alone:
             names += [name for name in self._absent if find_alternative(name) not in self._values]
-        self._again += 1
-        return [sorted(names)[self._again % len(names)]] if names else []
+        self._refresh_index += 1
+        return [sorted(names)[self._refresh_index % len(names)]] if names else []
 
     def _decide(self) -> None:
         """Choose the channel anew, and report it if anything about it has changed."""
-        if not self._is_begun:
+        if not self._has_begun:
             return
         table = self._table
-        decision = table.decide(self._kind, self._values, self._is_known) if table else Decision(_OF_ANY)
+        decision = table.decide(self._kind, self._values, self._is_known) if table else Decision(_DEFAULT_CHOICE)
         self._decision = decision
         if not decision.missing and decision != self._reported:
             self._report(decision, table.name if table else "unknown firmware")
@@ -198,11 +200,11 @@ class Interview:
             log.warning("%s: %s", who, choice.reason)
             self._announce(Severity.WARNING, f"nothing sent: {faults.pop(0).brief}", TOPIC)
         else:
-            log.info("%s: positions go to it by %s", who, choice.reason)
+            log.info("%s: sending positions by %s", who, choice.reason)
             if faults:
                 self._announce(Severity.WARNING, f"{faults[0].brief}: see the log", TOPIC)
             elif self._reported or self._has_reported_missing:
-                self._announce(Severity.INFO, f"positions go by {choice.channel.name}", TOPIC)
+                self._announce(Severity.INFO, f"positions sent by {choice.channel.name}", TOPIC)
         for fault in faults:
             log.warning("%s", fault.reason)
 
@@ -212,7 +214,7 @@ class Interview:
             self._missing_since_s = None
         elif self._missing_since_s is None:
             self._missing_since_s, self._has_reported_missing = now_s, False
-        elif not self._has_reported_missing and now_s - self._missing_since_s >= REPORTED_AFTER_S:
+        elif not self._has_reported_missing and now_s - self._missing_since_s >= MISSING_REPORT_DELAY_S:
             self._has_reported_missing = True
             log.warning("%s", self._decision.choice.reason)
             more = f" and {len(missing) - 1} more" if missing[1:] else ""

@@ -10,7 +10,7 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.driver import DriverMaker, PortDriver
 from edgevpr.mavlink.fixes import FixTransmission
-from edgevpr.mavlink.ground import Wished
+from edgevpr.mavlink.ground import CommandRequest
 from edgevpr.mavlink.messages import Fix, Health, Severity
 from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Message
@@ -88,7 +88,7 @@ class Link:
 
     def turn(self, what: str) -> AbstractContextManager[None]:
         """Take a turn: a context manager in which the link does nothing, and its time stands still (see `Turns`)."""
-        return self.turns.taken(what)
+        return self.turns.take_turn(what)
 
     def send(self, *outgoing: Message) -> None:
         with self._sending("send"):
@@ -102,15 +102,15 @@ class Link:
         with self._sending("announce"):
             self.conversation.announce(severity, text, topic)
 
-    def accept_wishes(self) -> None:
-        with self.turn("offer"):  # so called on the tapes of recorded flights, as the turn of `take_wish`
-            self.conversation.requests.is_under_way = True
+    def accept_commands(self) -> None:
+        with self.turn("offer"):  # so called on the tapes of recorded flights, as the turn of `take_command`
+            self.conversation.requests.is_flying = True
 
     def take_interim_fixes(self) -> list[FixTransmission]:
         with self.turn("take_between"):
             return self.conversation.take_interim_fixes()
 
-    def take_wish(self) -> Wished | None:
+    def take_command(self) -> CommandRequest | None:
         with self.turn("take_wishes"):
             return self.conversation.requests.take()
 
@@ -170,7 +170,7 @@ class Link:
     def close(self) -> None:
         """Send what is queued, wait for the answers to fixes, both for half a second at most, and close the port."""
         with self.turn("close"):
-            self.conversation.texts.hurry()
+            self.conversation.texts.remove_pauses()
         self._driver.close()
 
     def __enter__(self) -> "Link":

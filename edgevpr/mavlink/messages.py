@@ -14,18 +14,20 @@ from edgevpr.core.geodesy import offset_m
 from edgevpr.mavlink.wire import Message, mavlink, quaternion, rotmat
 
 POSITION_FIX = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE  # 43003
-SOURCE_SET = mavlink.MAV_CMD_SET_EKF_SOURCE_SET  # 42007
+SET_SOURCE_SET = mavlink.MAV_CMD_SET_EKF_SOURCE_SET  # 42007
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
-TEXT_BYTES = 50
+MAX_TEXT_BYTES = 50
 SENSOR_ID = 1  # the `id` in our messages 296, equal to EKF2_AGP0_ID, whose value 0 would switch the slot off
-_YAW_SD = math.radians(5.0)
+_YAW_SD_RAD = math.radians(5.0)
 # A reserve must never outbid a real receiver that has a 3D fix, which takes four satellites. At the same fix type
 # ArduPilot changes to the one with more satellites, and blends by accuracies (AP_GPS::update_primary, AP_GPS_Blended).
 _RESERVE_SATELLITES = 2
 _RESERVE_SD_M = 100.0
 _RESERVE_SD_M_S = 10.0
-_SATELLITES = 6  # the smallest number with which a filter starts
-_GPS_EPOCH_S, _LEAP_S, _WEEK_S = 315_964_800, 18, 604_800  # 1980-01-06; leap seconds since then, as of 2017
+_NORMAL_SATELLITES = 6  # the smallest number with which a filter starts
+_GPS_EPOCH_S = 315_964_800  # 1980-01-06
+_LEAP_S = 18  # since then, as of 2017
+_WEEK_S = 604_800
 
 
 class Health(IntEnum):
@@ -82,13 +84,13 @@ class MotionState:
     is_reserve: bool = False
 
 
-def heartbeat(health: Health, kind: int = mavlink.MAV_TYPE_ONBOARD_CONTROLLER) -> Message:
+def make_heartbeat(health: Health, kind: int = mavlink.MAV_TYPE_ONBOARD_CONTROLLER) -> Message:
     """Make the HEARTBEAT (0) of an onboard computer, or of another `kind` (MAV_TYPE)."""
     autopilot = mavlink.MAV_AUTOPILOT_INVALID
     return mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, system_status=health, mavlink_version=3)
 
 
-def position_fix(fix: Fix, t_sent_s: float, target_system: int, stamp_s: float | None = None) -> Message:
+def make_position_fix(fix: Fix, t_sent_s: float, target_system: int, stamp_s: float | None = None) -> Message:
     """Make a COMMAND_INT (75) with command 43003, in the form that ArduPilot accepts: global frame, no altitude (NaN).
     The age of the fix is sent as processing time, `stamp_s` (None: `t_sent_s`) as that of sending: a float32, good to
     8 ms after one day."""
@@ -109,7 +111,7 @@ def position_fix(fix: Fix, t_sent_s: float, target_system: int, stamp_s: float |
     )
 
 
-def position_sensor(state: MotionState) -> Message:
+def make_position_sensor(state: MotionState) -> Message:
     """Make a GLOBAL_POSITION_SENSOR (296): a position without altitude. PX4 goes by the time of its arrival."""
     return mavlink.MAVLink_global_position_sensor_message(
         target_system=0,
@@ -128,7 +130,7 @@ def position_sensor(state: MotionState) -> Message:
     )
 
 
-def gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_unix_s: float | None) -> Message:
+def make_gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_unix_s: float | None) -> Message:
     """Make a GPS_INPUT (232) as GPS receiver number `receiver` (0: the first). A `state` of None is sent as "no fix", a
     reserve as a poor fix. `stamp_s` is the time of the state, `t_unix_s` the same time in UTC, seconds since 1970
     (None: unknown)."""
@@ -136,7 +138,7 @@ def gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_unix_s
     east, north, down = state.velocity_m_s if state else (0, 0, 0)
     satellites, sd_m, sd_m_s = 0, 0.0, 0.0
     if state:
-        satellites, sd_m, sd_m_s = _SATELLITES, state.accuracy_m, state.speed_accuracy_m_s
+        satellites, sd_m, sd_m_s = _NORMAL_SATELLITES, state.accuracy_m, state.speed_accuracy_m_s
     if state and state.is_reserve:
         satellites, sd_m, sd_m_s = _RESERVE_SATELLITES, _RESERVE_SD_M, _RESERVE_SD_M_S
     return mavlink.MAVLink_gps_input_message(
@@ -161,10 +163,10 @@ def gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_unix_s
     )
 
 
-def odometry(
+def make_odometry(
     state: MotionState, attitude: tuple[float, float, float], origin: tuple[float, float, float], stamp_s: float
 ) -> Message:
-    """Make an ODOMETRY (331) in the only frames that ArduPilot accepts: position north, east, down of `origin`
+    """Make an ODOMETRY (331) in the only frames that ArduPilot accepts: position north, east, down of `make_origin`
     (latitude, longitude in degrees, altitude in metres above sea level), velocity along the axes of the airframe.
     `attitude` is (roll, pitch, yaw) in radians. ArduPilot computes a standard deviation as the cube root of the sum of
     the squared variances (`GCS_MAVLINK::handle_odometry`); the variances sent are those from which it gets the right
@@ -176,9 +178,9 @@ def odometry(
     # The upper triangle of 6 x 6, row by row: only its diagonal is known.
     pose_variances, velocity_variances = [0.0] * 21, [0.0] * 21
     pose_variances[0] = pose_variances[6] = math.sqrt(state.accuracy_m**3 / 2)
-    pose_variances[20] = math.sqrt(_YAW_SD**3)
+    pose_variances[20] = math.sqrt(_YAW_SD_RAD**3)
     velocity_variances[0] = velocity_variances[6] = velocity_variances[11] = state.speed_accuracy_m_s**2
-    return _odometry(
+    return _complete_odometry(
         state,
         origin,
         time_usec=round(stamp_s * 1e6),
@@ -192,13 +194,13 @@ def odometry(
     )
 
 
-def vision_position(state: MotionState, origin: tuple[float, float, float]) -> Message:
-    """Make an ODOMETRY (331) that says a position, north, east, down of `origin` (latitude, longitude in degrees,
+def make_vision_position(state: MotionState, origin: tuple[float, float, float]) -> Message:
+    """Make an ODOMETRY (331) that says a position, north, east, down of `make_origin` (latitude, longitude in degrees,
     altitude in metres above sea level), and nothing else. PX4 knows our clock by our answers to its TIMESYNC."""
     variances = [math.nan] * 21  # the upper triangle of 6 x 6, row by row
     variances[0] = variances[6] = state.accuracy_m**2
     variances[11] = state.alt_accuracy_m**2
-    return _odometry(
+    return _complete_odometry(
         state,
         origin,
         time_usec=round(state.t_mono_s * 1e6),
@@ -212,8 +214,8 @@ def vision_position(state: MotionState, origin: tuple[float, float, float]) -> M
     )
 
 
-def _odometry(state: MotionState, origin: tuple[float, float, float], **fields: Any) -> Message:
-    """Make an ODOMETRY with the position of a state beside `origin`, and with `fields`, those of the channel."""
+def _complete_odometry(state: MotionState, origin: tuple[float, float, float], **fields: Any) -> Message:
+    """Make an ODOMETRY with the position of a state beside `make_origin`, and with `fields`, those of the channel."""
     east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
     return mavlink.MAVLink_odometry_message(
         child_frame_id=mavlink.MAV_FRAME_BODY_FRD,
@@ -230,32 +232,32 @@ def _odometry(state: MotionState, origin: tuple[float, float, float], **fields: 
     )
 
 
-def report_requests(target_system: int, firmware: int, is_continuous: bool = False) -> tuple[Message, ...]:
+def make_report_requests(target_system: int, firmware: int, is_continuous: bool = False) -> tuple[Message, ...]:
     """Make the requests for all reports that the flight needs, each a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL
     (511). `firmware` is a MAV_AUTOPILOT; a continuous channel (`is_continuous`) needs more, at higher rates."""
     rates_hz = _rates_hz(is_continuous)
     if firmware in _FILTER_REPORTS:
         rates_hz[_FILTER_REPORTS[firmware]] = 2
     interval = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
-    return tuple(_command(target_system, interval, number, 1e6 / rate_hz) for number, rate_hz in rates_hz.items())
+    return tuple(_make_command(target_system, interval, number, 1e6 / rate_hz) for number, rate_hz in rates_hz.items())
 
 
 def attitude_hz(is_continuous: bool) -> int:
-    """Return how many attitudes a second `report_requests` asks for."""
+    """Return how many attitudes a second `make_report_requests` asks for."""
     return _rates_hz(is_continuous)[mavlink.MAVLINK_MSG_ID_ATTITUDE]
 
 
-def message_request(target_system: int, message_id: int) -> Message:
+def make_message_request(target_system: int, message_id: int) -> Message:
     """Make a COMMAND_LONG (76) with REQUEST_MESSAGE (512): the autopilot shall send message `message_id` once."""
-    return _command(target_system, mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
+    return _make_command(target_system, mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
 
 
-def parameter_request(target_system: int, name: str) -> Message:
+def make_parameter_request(target_system: int, name: str) -> Message:
     """Make a PARAM_REQUEST_READ (20) for the parameter of this name."""
     return mavlink.MAVLink_param_request_read_message(target_system, AUTOPILOT, name.encode(), -1)
 
 
-def origin(target_system: int, lat_deg: float, lon_deg: float, alt_m: float) -> Message:
+def make_origin(target_system: int, lat_deg: float, lon_deg: float, alt_m: float) -> Message:
     """Make a SET_GPS_GLOBAL_ORIGIN (48): the origin of the autopilot's local frame, `alt_m` above sea level."""
     return mavlink.MAVLink_set_gps_global_origin_message(
         target_system, round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3)
@@ -275,12 +277,12 @@ def make_named_values(t_mono_s: float, **values: float | None) -> tuple[Message,
     )
 
 
-def source_set(number: int, target_system: int) -> Message:
+def make_source_set(number: int, target_system: int) -> Message:
     """Make a COMMAND_LONG (76) with SET_EKF_SOURCE_SET (42007): ArduPilot shall use source set `number` (1..3)."""
-    return _command(target_system, SOURCE_SET, number)
+    return _make_command(target_system, SET_SOURCE_SET, number)
 
 
-def computer_status(
+def make_computer_status(
     t_mono_s: float, loads: Sequence[float], ram_used_bytes: int, ram_total_bytes: int, temperature_c: float | None
 ) -> Message:
     """Make an ONBOARD_COMPUTER_STATUS (390): the load of each core (0..1; the first eight are sent), used and total RAM
@@ -301,16 +303,16 @@ def computer_status(
         gpu_combined=[255] * 10,
         temperature_board=127,
         fan_speed=[32_767] * 4,
-        **{f"storage_{what}": [_UNUSED] * 4 for what in ("type", "usage", "total")},
-        **{f"link_{what}": [_UNUSED] * 6 for what in ("type", "tx_rate", "rx_rate", "tx_max", "rx_max")},
+        **{f"storage_{what}": [_UNKNOWN_UINT32] * 4 for what in ("type", "usage", "total")},
+        **{f"link_{what}": [_UNKNOWN_UINT32] * 6 for what in ("type", "tx_rate", "rx_rate", "tx_max", "rx_max")},
     )
 
 
-def status_text(severity: Severity, text: str) -> Message:
+def make_status_text(severity: Severity, text: str) -> Message:
     """Make a STATUSTEXT (253), cut to 50 bytes: not every ground station can read a text in chunks."""
     data = text.encode()
-    if len(data) > TEXT_BYTES:
-        data = data[: TEXT_BYTES - 3].decode(errors="ignore").encode() + b"..."
+    if len(data) > MAX_TEXT_BYTES:
+        data = data[: MAX_TEXT_BYTES - 3].decode(errors="ignore").encode() + b"..."
     return mavlink.MAVLink_statustext_message(severity, data)
 
 
@@ -328,7 +330,7 @@ _CONTINUOUS_HZ = {
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1,
     mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: 1,
 }
-_UNUSED = 2**32 - 1
+_UNKNOWN_UINT32 = 2**32 - 1
 # Only the right one: ArduPilot sends the pilot a text for each request of a message that it does not know.
 _FILTER_REPORTS = {
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
@@ -340,7 +342,7 @@ def _rates_hz(is_continuous: bool) -> dict[int, int]:
     return _REPORTS_HZ | (_CONTINUOUS_HZ if is_continuous else {})
 
 
-def _command(target_system: int, command: int, first: float, second: float = 0) -> Message:
+def _make_command(target_system: int, command: int, first: float, second: float = 0) -> Message:
     return mavlink.MAVLink_command_long_message(target_system, AUTOPILOT, command, 0, first, second, 0, 0, 0, 0, 0)
 
 

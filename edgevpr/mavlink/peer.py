@@ -1,4 +1,4 @@
-"""The autopilot at the other end of the link: which of the senders it is, and its state as its messages tell it."""
+"""The autopilot at the other end of the link: which sender it is, and its state by its messages."""
 
 import logging
 import math
@@ -15,13 +15,13 @@ from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.heights import Altitudes, Heights
 from edgevpr.mavlink.interview import Interview
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, Fix, MotionState
-from edgevpr.mavlink.px4 import Px4Use
-from edgevpr.mavlink.receivers import GPS_GONE_AFTER_S, GPS_REPORTS, Receivers
-from edgevpr.mavlink.vehicle import FILTER_FRESH_S, Attitude, Attitudes, Certainty, Readiness
+from edgevpr.mavlink.px4 import Px4Fusion
+from edgevpr.mavlink.receivers import GPS_REPORTS, GPS_TIMEOUT_S, Receivers
+from edgevpr.mavlink.vehicle import MAX_FILTER_REPORT_AGE_S, Attitude, Attitudes, PositionAccuracy, Readiness
 from edgevpr.mavlink.wire import Message, mavlink
 
-GPS_AGREES_WITHIN_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
-FASTEST_M_S = 150.0  # over ground: a small aircraft is never faster, so such a report is wrong
+MAX_GPS_DISAGREEMENT_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
+MAX_SPEED_M_S = 150.0  # over ground: a small aircraft is never faster, so such a report is wrong
 _MIN_HPA = 300.0  # of the air where anything flies
 _MAX_HPA = 1100.0
 _MILLI_G_M_S2 = 9.80665e-3
@@ -29,14 +29,14 @@ _MILLI_G_M_S2 = 9.80665e-3
 # Reports of where the vehicle is, and how it moves; the first three carry the boot time.
 _TIMED_REPORTS = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU")
 _MOTION_REPORTS = (*_TIMED_REPORTS, *GPS_REPORTS)
-_ORIGIN_WITHIN_S = 2.0  # of the request: an autopilot that has not answered by then has no origin
-_ASK_ORIGIN_AGAIN_S = 10.0
-RETAKEN_AFTER_S = 30.0  # a flight controller that restarts is back within 20 s; who speaks meanwhile is not it
+_ORIGIN_TIMEOUT_S = 2.0  # of the request: an autopilot that has not answered by then has no origin
+_ORIGIN_REQUEST_INTERVAL_S = 10.0
+REPLACEMENT_SILENCE_S = 30.0  # a flight controller that restarts is back within 20 s; who speaks meanwhile is not it
 
 log = logging.getLogger(__name__)
 
 
-class Speaker(NamedTuple):
+class Endpoint(NamedTuple):
     """The sender of an autopilot's messages; its address is None if the link has one sender only."""
 
     system_id: int
@@ -53,58 +53,58 @@ class Identity:
     our autopilot has been silent for 30 s: then it `has_moved`. `foreign_messages` counts the messages of others."""
 
     def __init__(self, system_id: int | None = None) -> None:
-        self.kept: Speaker | None = None
+        self.kept: Endpoint | None = None
         self.foreign_messages = 0
         self._configured = system_id
-        self._spoke_s = -math.inf
+        self._received_s = -math.inf
         self._has_warned = False
         self.has_moved = False
 
-    def admits(self, speaker: Speaker, beats: bool, now_s: float) -> bool:
-        """Return True if this speaker is our autopilot, which it may become by a message that `beats`: a heartbeat."""
+    def admits(self, endpoint: Endpoint, beats: bool, now_s: float) -> bool:
+        """Return True if this endpoint is our autopilot, which it may become by a message that `beats`: a heartbeat."""
         self.has_moved = False
-        if beats and speaker != self.kept and self._is_next(speaker, now_s):
+        if beats and endpoint != self.kept and self._may_replace(endpoint, now_s):
             if self.kept is None:
-                log.info("autopilot heard: %s", speaker)
+                log.info("connected to autopilot (%s)", endpoint)
             else:
-                silent_s = now_s - self._spoke_s
-                log.warning("the autopilot is %s now: %s has been silent for %.0f s", speaker, self.kept, silent_s)
+                silent_s = now_s - self._received_s
+                log.warning("the autopilot is %s now: %s has been silent for %.0f s", endpoint, self.kept, silent_s)
                 self.has_moved = True
-            self.kept, self._has_warned = speaker, False
-        if speaker != self.kept:
+            self.kept, self._has_warned = endpoint, False
+        if endpoint != self.kept:
             # Not counted where any sender may still become our autopilot.
             self.foreign_messages += self.kept is not None or self._configured is not None
             return False
-        self._spoke_s = now_s
+        self._received_s = now_s
         return True
 
     def is_foreign(self, address: Sender | None) -> bool:
         """Return True if bytes from this address cannot come from our autopilot, whose address is another one."""
         return self.kept is not None and address != self.kept.address
 
-    def _is_next(self, speaker: Speaker, now_s: float) -> bool:
-        """Return True if a speaker that is not our autopilot becomes ours by its heartbeat."""
+    def _may_replace(self, endpoint: Endpoint, now_s: float) -> bool:
+        """Return True if a endpoint that is not our autopilot becomes ours by its heartbeat."""
         kept = self.kept
-        if kept is None and self._configured in (None, speaker.system_id):
+        if kept is None and self._configured in (None, endpoint.system_id):
             return True
         if not self._has_warned:  # two vehicles on one link are dangerous
             self._has_warned = True
             ours = kept or f"system {self._configured}"
             advice = "give each vehicle a link of its own, or set mavlink.system_id and restart edgevpr"
-            log.warning("another autopilot, %s, is on this link: fixes go to %s only; %s", speaker, ours, advice)
-        is_same = kept is not None and speaker.system_id == kept.system_id
-        return is_same and now_s - self._spoke_s >= RETAKEN_AFTER_S
+            log.warning("another autopilot, %s, is on this link: fixes go to %s only; %s", endpoint, ours, advice)
+        is_same = kept is not None and endpoint.system_id == kept.system_id
+        return is_same and now_s - self._received_s >= REPLACEMENT_SILENCE_S
 
 
 class Listener:
-    """Base class of an object that navigates by the reports of the autopilot, and gives the positions to be sent; this
-    one does nothing. The link's thread calls the methods, which never block and never raise."""
+    """Base class of an object that navigates by the autopilot's reports and estimates the positions to send; this one
+    does nothing. The link's thread calls the methods, which never block and never raise."""
 
     def handle_autopilot(self, t_s: float) -> None:
         """Note that at `t_s` an autopilot was first heard, has restarted, or that another one has taken its place."""
 
     def handle_channel(self, channel: Channel) -> None:
-        """Note the channel by which the autopilot is told positions: when first chosen, and when it changes."""
+        """Note the channel by which positions are sent, when it is first chosen and when it changes."""
 
     def handle_vehicle(self, vehicle: Vehicle) -> None:
         """Process a report of the vehicle's position and velocity."""
@@ -127,20 +127,20 @@ class Listener:
 
 class Autopilot:
     """The state of the autopilot and its vehicle, from all messages received, of which `identity` decides whose they
-    are. `own_component` is our component id, `system_id` that of the autopilot (None: of the first one heard)."""
+    are. `component_id` is our component id, `system_id` that of the autopilot (None: of the first one heard)."""
 
-    def __init__(self, own_component: int, system_id: int | None, listener: Listener, announce: Announce) -> None:
+    def __init__(self, component_id: int, system_id: int | None, listener: Listener, announce: Announce) -> None:
         self.identity = Identity(system_id)
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
         self.answered_s: dict[int, float] = {}  # when it last answered a command of ours, by the command's number
         self.firmware: int = mavlink.MAV_AUTOPILOT_GENERIC  # MAV_AUTOPILOT; this until its heartbeat
-        self._listener, self._own_component, self._announce = listener, own_component, announce
-        self.heard_s = -math.inf  # the time of its last heartbeat through the port now open
+        self._listener, self._component_id, self._announce = listener, component_id, announce
+        self.heartbeat_s = -math.inf  # the time of its last heartbeat through the port now open
         self.answer: str | None = None  # name of a MAV_RESULT, if the message heard last answers a fix
         self.has_restarted = False  # as the message heard last shows
-        self._forget()
+        self._reset()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self.interview = Interview(self._announce)
         self.is_armed: bool | None = None  # None: no heartbeat yet
         self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
@@ -148,9 +148,9 @@ class Autopilot:
         self._lacked_origin, self._flags = False, 0
         self.pressure_alt_m: float | None = None  # metres in the standard atmosphere, by its barometer
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
-        self.attitudes, self.heights, self.certainty = Attitudes(), Heights(self._announce), Certainty()
-        self.clock, self.force_s = AutopilotClock(), -math.inf  # when its accelerometers were last heard
-        self.px4 = Px4Use()
+        self.attitudes, self.heights, self.accuracy = Attitudes(), Heights(self._announce), PositionAccuracy()
+        self.clock, self.imu_s = AutopilotClock(), -math.inf  # when its accelerometers were last heard
+        self.px4 = Px4Fusion()
         self.receivers, self.foreign_stamps = Receivers(), ForeignStamps()
         self.report_delay = ReportDelay(self._announce)
 
@@ -165,29 +165,29 @@ class Autopilot:
 
     def listens(self, now_s: float) -> bool:
         """Return True if the autopilot's heartbeat came in the last five seconds, through the port now open."""
-        return now_s - self.heard_s <= HEARTBEAT_TIMEOUT_S
+        return now_s - self.heartbeat_s <= HEARTBEAT_TIMEOUT_S
 
-    def asks_origin(self, now_s: float) -> bool:
+    def is_origin_request_due(self, now_s: float) -> bool:
         """Return True, and note the time, if the origin is to be requested now: a restart may have lost it."""
-        if now_s - self._gps_s <= GPS_GONE_AFTER_S or now_s - self._asked_origin_s < _ASK_ORIGIN_AGAIN_S:
+        if now_s - self._gps_s <= GPS_TIMEOUT_S or now_s - self._asked_origin_s < _ORIGIN_REQUEST_INTERVAL_S:
             return False
         self._lacked_origin, self._asked_origin_s = self._lacks_origin(now_s), now_s
         return True
 
-    def readiness(self, now_s: float) -> Readiness:
+    def assess_readiness(self, now_s: float) -> Readiness:
         """Return what is known of its readiness to accept a fix."""
         return Readiness(
             is_px4=self.firmware == mavlink.MAV_AUTOPILOT_PX4,
             is_armed=self.is_armed,
-            has_gps=now_s - self._gps_s <= GPS_GONE_AFTER_S,
+            has_gps=now_s - self._gps_s <= GPS_TIMEOUT_S,
             lacks_origin=self._lacks_origin(now_s),
-            flags=self._flags if now_s - self._flags_s <= FILTER_FRESH_S else 0,
+            flags=self._flags if now_s - self._flags_s <= MAX_FILTER_REPORT_AGE_S else 0,
             answers_others=bool(self.answered_s.keys() - {POSITION_FIX}),
         )
 
     def _lacks_origin(self, now_s: float) -> bool:
         """Return True if it did not answer the last request for its origin, or that before as long as it may answer."""
-        is_late = self._lacked_origin or now_s - self._asked_origin_s > _ORIGIN_WITHIN_S
+        is_late = self._lacked_origin or now_s - self._asked_origin_s > _ORIGIN_TIMEOUT_S
         return self._origin_s < self._asked_origin_s and is_late
 
     def predict_vehicle(self, t_mono_s: float) -> Vehicle | None:
@@ -214,21 +214,21 @@ class Autopilot:
         kind = message.get_type()
         beats = bool(kind == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID)
         before = self.identity.kept
-        if not self.identity.admits(Speaker(message.get_srcSystem(), address), beats, now_s):
+        if not self.identity.admits(Endpoint(message.get_srcSystem(), address), beats, now_s):
             return False
         is_other = self.identity.kept != before
         self.has_restarted = not is_other and self.clock.handle(message, now_s)
         if is_other or self.has_restarted:
-            self._forget()
+            self._reset()
             self.clock.handle(message, now_s)
             self._listener.handle_autopilot(now_s)
         self.interview.handle(message)
-        if kind == "COMMAND_ACK" and message.target_component not in (0, self._own_component):  # 0: to all
+        if kind == "COMMAND_ACK" and message.target_component not in (0, self._component_id):  # 0: to all
             return False
         if kind == "COMMAND_ACK":
             self.answered_s[message.command] = now_s
         if beats:
-            self.heard_s, self.firmware = now_s, message.autopilot
+            self.heartbeat_s, self.firmware = now_s, message.autopilot
             self.is_armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         else:
             self._handle_report(message, now_s)
@@ -242,8 +242,8 @@ class Autopilot:
             return  # on a link that is full, or after we were stopped: what it says is past
         match kind:
             case "COMMAND_ACK" if message.command == POSITION_FIX and message.result != mavlink.MAV_RESULT_IN_PROGRESS:
-                known = mavlink.enums["MAV_RESULT"].get(message.result)
-                self.answer = answer = known.name.removeprefix("MAV_RESULT_") if known else str(message.result)
+                entry = mavlink.enums["MAV_RESULT"].get(message.result)
+                self.answer = answer = entry.name.removeprefix("MAV_RESULT_") if entry else str(message.result)
                 self.acks[answer] += 1
             case "DISTANCE_SENSOR" | "TERRAIN_REPORT":
                 self.heights.handle(message, now_s, self.attitudes.at(now_s))
@@ -253,7 +253,7 @@ class Autopilot:
                     self._gps_s = now_s
             case "EKF_STATUS_REPORT" | "ESTIMATOR_STATUS" as name:
                 self._flags, self._flags_s = message.flags, now_s
-                self.certainty.handle(message, now_s)
+                self.accuracy.handle(message, now_s)
                 if name == "ESTIMATOR_STATUS":
                     self.px4.handle(message, now_s, self._receiver(now_s), self._listener.believes_gps())
             case "GLOBAL_POSITION_INT":
@@ -261,7 +261,7 @@ class Autopilot:
             case "ATTITUDE":
                 self.attitudes.handle(message, now_s)
             case "SCALED_IMU" if attitude := self.attitudes.at(now_s):
-                self.force_s = now_s
+                self.imu_s = now_s
                 force_m_s2 = tuple(axis * _MILLI_G_M_S2 for axis in (message.xacc, message.yacc, message.zacc))
                 self._listener.handle_force(now_s, force_m_s2, attitude)
             case "SCALED_PRESSURE" if _MIN_HPA < message.press_abs < _MAX_HPA:
@@ -273,17 +273,17 @@ class Autopilot:
     def _handle_position(self, message: Message, now_s: float) -> None:
         """Process a GLOBAL_POSITION_INT. One off the Earth, or at 0, 0, is no position: `vehicle` is then None."""
         gps, lat_deg, lon_deg = self._receiver(now_s), message.lat / 1e7, message.lon / 1e7
-        is_near = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= GPS_AGREES_WITHIN_M)
+        is_near = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= MAX_GPS_DISAGREEMENT_M)
         # By a continuous channel the estimate may be made of our own positions: it says nothing about the receiver.
         has_gps = bool(gps) and (is_near or self.interview.choice.channel.is_continuous) and self.px4.uses_gps
         if gps and has_gps:
-            self.certainty.record_accuracy(gps.sd_m, now_s)
-        is_nowhere = (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7
+            self.accuracy.record_accuracy(gps.sd_m, now_s)
+        has_no_position = (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7
         east_m_s, north_m_s = message.vy / 100, message.vx / 100
-        above_sea_m = None if is_nowhere else message.alt / 1e3
+        above_sea_m = None if has_no_position else message.alt / 1e3
         altitudes = Altitudes(now_s, above_sea_m, message.relative_alt / 1e3, -message.vz / 100)
         self.heights.handle_altitudes(altitudes, self.is_armed is not False, math.hypot(east_m_s, north_m_s))
-        if is_nowhere:
+        if has_no_position:
             self.vehicle = None
             return
         self.vehicle = Vehicle(
@@ -292,14 +292,14 @@ class Autopilot:
             alt_m=message.alt / 1e3,
             heading_deg=message.hdg / 100 if message.hdg <= 36_000 else None,  # 65535: unknown
             sink_m_s=message.vz / 100,
-            velocity_m_s=(east_m_s, north_m_s) if math.hypot(east_m_s, north_m_s) <= FASTEST_M_S else None,
+            velocity_m_s=(east_m_s, north_m_s) if math.hypot(east_m_s, north_m_s) <= MAX_SPEED_M_S else None,
             t_heard_s=now_s,
             has_gps=has_gps,
             gps=gps,
             height_m=self.heights.now(now_s),
             height_doubt_m=self.heights.doubt_m,
-            position_sd_m=self.certainty.now(now_s),
-            innovation_ratio=self.certainty.innovation_ratio(now_s),
+            position_sd_m=self.accuracy.now(now_s),
+            innovation_ratio=self.accuracy.innovation_ratio(now_s),
         )
         self._listener.handle_vehicle(self.vehicle)
 
@@ -307,4 +307,4 @@ class Autopilot:
         """Return the newest report of the best GPS receiver that is not played by us; None if none has a fix."""
         choice = self.interview.choice
         own = GPS_REPORTS[choice.receiver] if choice.channel is Channel.GPS_INPUT else None
-        return self.receivers.best(now_s, own)
+        return self.receivers.choose_best(now_s, own)

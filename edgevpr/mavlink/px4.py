@@ -13,18 +13,19 @@ from edgevpr.mavlink import messages
 from edgevpr.mavlink.messages import MotionState
 from edgevpr.mavlink.wire import Message, mavlink
 
-_FUSES_ABSOLUTE, _FUSES_ANY = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS, mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
-_OURS_FOR_S = 6.0  # so long after our last message 296 the flag may still be about ours: PX4 waits for 5 s
-_VISION_FOR_S = 1.0  # of ODOMETRY, whose flag is another one, it only has to notice the end
-_UNUSED_FOR_S = 2.0  # of a receiver with a fix: one that has just lost it, or got it, is judged by its reports
-_SENDING_FOR_S = 1.0
+_FUSES_ABSOLUTE = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+_FUSES_ANY = mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
+_SENSOR_TIMEOUT_S = 6.0  # so long after our last message 296 the flag may still be about ours: PX4 waits for 5 s
+_VISION_TIMEOUT_S = 1.0  # of ODOMETRY, whose flag is another one, it only has to notice the end
+_MIN_UNUSED_S = 2.0  # of a receiver with a fix: one that has just lost it, or got it, is judged by its reports
+_SENDING_TIMEOUT_S = 1.0
 # A receiver that has come back has to be steady for so long before it is left to PX4: less would follow a flapping one.
-_STEADY_S = 1.5
+_MIN_STEADY_S = 1.5
 _FIRST_PAUSE_S = 30.0  # from a try that PX4 did not take to the next; twice as long each time
 _MAX_PAUSE_S = 240.0
 
 
-class Px4Use:
+class Px4Fusion:
     """Keeps whether PX4 `uses_gps` while a receiver has a fix: with EKF2_GPS_CTRL=0, or when it rejects GPS, it does
     not. Of its reports while our positions are sent, `used` and `unused` count those that say that they are fused, or
     not."""
@@ -48,11 +49,15 @@ class Px4Use:
         self, state: MotionState | None, is_vision: bool, origin: tuple[float, float, float] | None, now_s: float
     ) -> Message | None:
         """Make the message that tells PX4 a state (None: unknown), by message 296 or, if it `is_vision`, by ODOMETRY,
-        which needs the `origin` of its local frame: latitude, longitude in degrees, altitude in metres."""
+        which needs the `make_origin` of its local frame: latitude, longitude in degrees, altitude in metres."""
         if state is None or (is_vision and origin is None):
             return None
         self._sent_s, self._is_vision = now_s, is_vision
-        return messages.vision_position(state, origin) if is_vision and origin else messages.position_sensor(state)
+        return (
+            messages.make_vision_position(state, origin)
+            if is_vision and origin
+            else messages.make_position_sensor(state)
+        )
 
     def handle(self, report: Message, now_s: float, receiver: Receiver | None, is_believed: bool = True) -> None:
         """Process an ESTIMATOR_STATUS. `receiver` is the best GPS receiver that has a fix (None: none has), which
@@ -60,7 +65,7 @@ class Px4Use:
         is_fusing = bool(report.flags & _FUSES_ABSOLUTE)
         self._reports_fusion |= is_fusing
         silent_s = now_s - self._sent_s
-        if silent_s < _SENDING_FOR_S:
+        if silent_s < _SENDING_TIMEOUT_S:
             # A ratio above 1 is beyond the filter's gate.
             ours = _FUSES_ANY if self._is_vision else _FUSES_ABSOLUTE
             is_used = bool(report.flags & ours) and not report.pos_horiz_ratio > 1
@@ -74,10 +79,12 @@ class Px4Use:
         if receiver is None:
             self._unused_since_s = None
             self._next_try_s, self._pause_s = -math.inf, _FIRST_PAUSE_S
-        elif silent_s > (_VISION_FOR_S if self._is_vision else _OURS_FOR_S) or (self._is_vision and is_fusing):
+        elif silent_s > (_VISION_TIMEOUT_S if self._is_vision else _SENSOR_TIMEOUT_S) or (
+            self._is_vision and is_fusing
+        ):
             self._judge(is_fusing, now_s)
-        elif not self.uses_gps or silent_s < _SENDING_FOR_S:
-            is_due = now_s >= self._next_try_s and receiver.steady_for_s >= _STEADY_S
+        elif not self.uses_gps or silent_s < _SENDING_TIMEOUT_S:
+            is_due = now_s >= self._next_try_s and receiver.steady_for_s >= _MIN_STEADY_S
             self._unused_since_s, self.uses_gps = None, takes_velocity and is_due and is_believed
         elif not takes_velocity:
             self._judge(False, now_s)  # it does not take what we have stopped for
@@ -88,7 +95,7 @@ class Px4Use:
             self._unused_since_s, self.uses_gps, self._pause_s = None, True, _FIRST_PAUSE_S
         elif self._unused_since_s is None:
             self._unused_since_s = now_s
-        elif now_s - self._unused_since_s >= _UNUSED_FOR_S and self.uses_gps:
+        elif now_s - self._unused_since_s >= _MIN_UNUSED_S and self.uses_gps:
             self.uses_gps = False
             self._next_try_s = now_s + self._pause_s
             self._pause_s = min(2 * self._pause_s, _MAX_PAUSE_S)

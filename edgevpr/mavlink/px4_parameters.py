@@ -17,73 +17,73 @@ from edgevpr.mavlink.parameters import (
     require,
 )
 
-FUSES_POSITION = 1  # bit of EKF2_AGPn_CTRL
-CONTROL = "EKF2_AGP0_CTRL"  # since 1.18, as is message 296: 1.17.0 has neither
+POSITION_BIT = 1  # bit of EKF2_AGPn_CTRL
+AGP_CONTROL = "EKF2_AGP0_CTRL"  # since 1.18, as is message 296: 1.17.0 has neither
 VISION_CONTROL = "EKF2_EV_CTRL"  # with more bits it may be that of another system; before 1.16 the default is 15
 
-_ALL = (Channel.COMMAND, Channel.SENSOR, Channel.VISION)
+_ALL_CHANNELS = (Channel.COMMAND, Channel.SENSOR, Channel.VISION)
 _CONTINUOUS = (Channel.SENSOR, Channel.VISION)
-_BY_296 = (Channel.SENSOR,)
-_BY_ODOMETRY = (Channel.VISION,)
+_MESSAGE_296 = (Channel.SENSOR,)
+_ODOMETRY = (Channel.VISION,)
 
-_USES_POSITION = 1  # bit of EKF2_GPS_CTRL
-_FROM_VISION = 3  # value of EKF2_HGT_REF
+_GPS_POSITION_BIT = 1  # bit of EKF2_GPS_CTRL
+_HEIGHT_FROM_VISION = 3  # value of EKF2_HGT_REF
 _MAX_SD_M = 10  # the least error that the filter takes a position to have
 _MAX_GATE_SD = 10
-_TAKEN_FOR_OLD = "We send the position of the moment, and it would be taken for an old one."
+_DELAY_CONSEQUENCE = "We send the position of the moment, and it would be taken for an old one."
 
 
 def choose_px4_channel(_kind: VehicleKind, parameters: Parameters) -> ChannelChoice:
     """Choose the channel for a PX4: message 296 or ODOMETRY if CONTROL or VISION_CONTROL let it fuse positions, else
     command 43003."""
-    fuses_ours = has_bit(parameters.get(CONTROL, 0), FUSES_POSITION)
-    if parameters.get(VISION_CONTROL) == FUSES_POSITION and not fuses_ours:
+    fuses_ours = has_bit(parameters.get(AGP_CONTROL, 0), POSITION_BIT)
+    if parameters.get(VISION_CONTROL) == POSITION_BIT and not fuses_ours:
         reason = Reason(ReasonCode.BY_ODOMETRY, {"parameter": VISION_CONTROL, "source_set": None})
         return ChannelChoice(Channel.VISION, reason)
-    if CONTROL not in parameters:
-        return ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_WITHOUT_296, {"parameter": CONTROL}))
+    if AGP_CONTROL not in parameters:
+        return ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_WITHOUT_296, {"parameter": AGP_CONTROL}))
     if fuses_ours:
-        return ChannelChoice(Channel.SENSOR, Reason(ReasonCode.BY_MESSAGE_296, {"parameter": CONTROL}))
-    return ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_FOR_296, {"parameter": CONTROL}))
+        return ChannelChoice(Channel.SENSOR, Reason(ReasonCode.BY_MESSAGE_296, {"parameter": AGP_CONTROL}))
+    return ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_FOR_296, {"parameter": AGP_CONTROL}))
 
 
 # fmt: off
 _RULES = (
-    recommend(_ALL, "7, the default: with the bit 1",  # gps_control.cpp, controlGnssPosFusion
-        expect(7, "EKF2_GPS_CTRL", allows=lambda value: has_bit(value, _USES_POSITION)),
+    recommend(_ALL_CHANNELS, "7, the default: with the bit 1",  # gps_control.cpp, controlGnssPosFusion
+        expect(7, "EKF2_GPS_CTRL", allows=lambda value: has_bit(value, _GPS_POSITION_BIT)),
         "GPS is not used for the position: it flies by us alone. That is for an aircraft without GPS only."),
-    require(_ALL, "0", expect(0, "EKF2_GPS_MODE"),  # gps_control.cpp, isGnssPosResetAllowed
+    require(_ALL_CHANNELS, "0", expect(0, "EKF2_GPS_MODE"),  # gps_control.cpp, isGnssPosResetAllowed
         "GPS that comes back far from our position is refused for as long as airspeed or optical flow is used."),
-    recommend(_CONTINUOUS, "0 or 1", expect(1, "EKF2_HGT_REF", allows=lambda value: value != _FROM_VISION),
+    recommend(_CONTINUOUS, "0 or 1", expect(1, "EKF2_HGT_REF", allows=lambda value: value != _HEIGHT_FROM_VISION),
         "We send no height: with 3 (vision) it never gets ready to arm."),  # flown
-    recommend(_ALL, "1", expect(1, "SYS_HAS_GPS"),
+    recommend(_ALL_CHANNELS, "1", expect(1, "SYS_HAS_GPS"),
         "With 0 it arms without GPS, so that the start may be unknown. That is for an aircraft without GPS only."),
     # aux_global_position.cpp: a slot whose number is 0 at the start does not exist.
-    recommend(_BY_296, f"{SENSOR_ID}", expect(SENSOR_ID, "EKF2_AGP0_ID"),
+    recommend(_MESSAGE_296, f"{SENSOR_ID}", expect(SENSOR_ID, "EKF2_AGP0_ID"),
         "It is the number that our positions carry; with another they are not used."),
-    require(_BY_296, f"1, the default; up to {_MAX_SD_M}",  # flown
+    require(_MESSAGE_296, f"1, the default; up to {_MAX_SD_M}",  # flown
         expect(1, "EKF2_AGP0_NOISE", allows=make_limit(_MAX_SD_M)),
         "It hardly follows us, and takes positions that are far off: with 50 it was 20 m off, and all seemed well."),
-    require(_BY_296, f"3, the default; up to {_MAX_GATE_SD}",
+    require(_MESSAGE_296, f"3, the default; up to {_MAX_GATE_SD}",
         expect(3, "EKF2_AGP0_GATE", allows=make_limit(_MAX_GATE_SD)),  # fuseHorizontalPosition
         "The filter refuses no position, not even a wrong one."),
-    recommend(_BY_296, "0", expect(0, "EKF2_AGP0_MODE"),  # aux_global_position_control.cpp, isResetAllowed
+    recommend(_MESSAGE_296, "0", expect(0, "EKF2_AGP0_MODE"),  # aux_global_position_control.cpp, isResetAllowed
         "With airspeed or optical flow it never comes back to us, once it has left the gate."),
-    require(_BY_296, f"0; up to {MAX_DELAY_MS:g}",  # aux_global_position_control.cpp, bufferData
-        expect(0, "EKF2_AGP0_DELAY", allows=make_limit(MAX_DELAY_MS)), _TAKEN_FOR_OLD),
-    require(_BY_ODOMETRY, "0", expect(0, "EKF2_EV_NOISE_MD"),  # params_external_vision.yaml
+    require(_MESSAGE_296, f"0; up to {MAX_DELAY_MS:g}",  # aux_global_position_control.cpp, bufferData
+        expect(0, "EKF2_AGP0_DELAY", allows=make_limit(MAX_DELAY_MS)), _DELAY_CONSEQUENCE),
+    require(_ODOMETRY, "0", expect(0, "EKF2_EV_NOISE_MD"),  # params_external_vision.yaml
         "With 1 each position is taken to be good to EKF2_EVP_NOISE (0.1 m), whatever we send."),
-    require(_BY_ODOMETRY, f"0.1, the default; up to {_MAX_SD_M}",  # flown
+    require(_ODOMETRY, f"0.1, the default; up to {_MAX_SD_M}",  # flown
         expect(0.1, "EKF2_EVP_NOISE", allows=make_limit(_MAX_SD_M)),
         "It hardly follows us, and takes positions that are far off: with 20 it was 35 m off, and landed."),
-    require(_BY_ODOMETRY, f"5, the default; up to {_MAX_GATE_SD}",
+    require(_ODOMETRY, f"5, the default; up to {_MAX_GATE_SD}",
         expect(5, "EKF2_EVP_GATE", allows=make_limit(_MAX_GATE_SD)),  # ev_pos_control.cpp, controlEvPosFusion
         "The filter refuses no position, not even a wrong one."),
-    require(_BY_ODOMETRY, f"within {MAX_OFFSET_M:g} m of 0",  # ev_pos_control.cpp, pos_offset_body
+    require(_ODOMETRY, f"within {MAX_OFFSET_M:g} m of 0",  # ev_pos_control.cpp, pos_offset_body
         expect(0, *list_axes("EKF2_EV_POS"), allows=is_small_offset),
         "We send the position of the vehicle itself, and a camera's place would move it.", "EKF2_EV_POS_*"),
-    require(_BY_ODOMETRY, f"0; up to {MAX_DELAY_MS:g}",
-        expect(0, "EKF2_EV_DELAY", allows=make_limit(MAX_DELAY_MS)), _TAKEN_FOR_OLD),
+    require(_ODOMETRY, f"0; up to {MAX_DELAY_MS:g}",
+        expect(0, "EKF2_EV_DELAY", allows=make_limit(MAX_DELAY_MS)), _DELAY_CONSEQUENCE),
 )
 # fmt: on
-PX4_TABLE = ParameterTable("PX4", (CONTROL, VISION_CONTROL), _RULES, choose_px4_channel)
+PX4_TABLE = ParameterTable("PX4", (AGP_CONTROL, VISION_CONTROL), _RULES, choose_px4_channel)

@@ -12,9 +12,9 @@ from edgevpr.core.types import Receiver
 from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
-GPS_GONE_AFTER_S = 2.5  # reports come at least once a second, and one may be lost
-GPS_SD_M = 5.0  # of a receiver that does not report its accuracy
-PLAUSIBLE_SD_M = 15.0  # one that is worse is no reason to do without our own positions
+GPS_TIMEOUT_S = 2.5  # reports come at least once a second, and one may be lost
+DEFAULT_GPS_SD_M = 5.0  # of a receiver that does not report its accuracy
+MAX_PLAUSIBLE_SD_M = 15.0  # one that is worse is no reason to do without our own positions
 # From the moment that a receiver measures to the arrival of its report: next to nothing in PX4's simulator, 0.1 s and
 # up to 0.2 s until the next report in ArduPilot's.
 RECEIVER_LAG_S = 0.1
@@ -25,7 +25,7 @@ _MAX_GAP_S = 1.5  # a receiver that was silent for longer has to be steady anew
 
 
 @dataclass(frozen=True, slots=True)
-class _Tracked:
+class _TrackedReceiver:
     """A receiver with a 3D fix: its newest report, the autopilot's time stamp of it, and since when it is steady."""
 
     report: Receiver
@@ -38,7 +38,7 @@ class Receivers:
     by its own velocity, with a plausible accuracy."""
 
     def __init__(self) -> None:
-        self._tracked: dict[str, _Tracked] = {}
+        self._tracked: dict[str, _TrackedReceiver] = {}
 
     def handle(self, message: Message, now_s: float) -> None:
         """Process a GPS_RAW_INT or GPS2_RAW of the autopilot that arrived at `now_s`."""
@@ -50,19 +50,19 @@ class Receivers:
         # After a receiver is lost, its last position is reported for some seconds more, with an unchanged time stamp.
         if before and message.time_usec and message.time_usec == before.time_usec:
             return
-        report = _report(message, now_s)
-        is_steady = before is not None and report.sd_m <= PLAUSIBLE_SD_M and _follows(before.report, report)
+        report = _to_receiver(message, now_s)
+        is_steady = before is not None and report.sd_m <= MAX_PLAUSIBLE_SD_M and _is_continuous(before.report, report)
         since_s = before.steady_since_s if before and is_steady else now_s
-        self._tracked[name] = _Tracked(report, message.time_usec, since_s)
+        self._tracked[name] = _TrackedReceiver(report, message.time_usec, since_s)
 
-    def best(self, now_s: float, own: str | None = None) -> Receiver | None:
+    def choose_best(self, now_s: float, own: str | None = None) -> Receiver | None:
         """Return the newest report of the most accurate receiver that had a fix in the last 2.5 s; None if there is
         none. `own` is the name of the report of the receiver that edgevpr plays."""
-        real = [each for name, each in self._tracked.items() if name != own]
-        recent = [each for each in real if now_s - each.report.t_s <= GPS_GONE_AFTER_S]
+        real = (tracked for name, tracked in self._tracked.items() if name != own)
+        recent = [tracked for tracked in real if now_s - tracked.report.t_s <= GPS_TIMEOUT_S]
         if not recent:
             return None
-        best = min(recent, key=lambda each: each.report.sd_m)
+        best = min(recent, key=lambda tracked: tracked.report.sd_m)
         return replace(best.report, steady_for_s=best.report.t_s - best.steady_since_s)
 
 
@@ -74,27 +74,27 @@ def extrapolate(receiver: Receiver, t_s: float, velocity_m_s: tuple[float, float
     return offset_position(receiver.lat_deg, receiver.lon_deg, east_m, north_m)
 
 
-def _report(message: Message, now_s: float) -> Receiver:
+def _to_receiver(message: Message, now_s: float) -> Receiver:
     return Receiver(
         lat_deg=message.lat / 1e7,
         lon_deg=message.lon / 1e7,
-        sd_m=GPS_SD_M if message.h_acc in _ACCURACY_UNKNOWN else message.h_acc / 1e3,
+        sd_m=DEFAULT_GPS_SD_M if message.h_acc in _ACCURACY_UNKNOWN else message.h_acc / 1e3,
         t_s=now_s,
-        velocity_m_s=_velocity(message),
+        velocity_m_s=_read_velocity(message),
         alt_m=message.alt / 1e3,
     )
 
 
-def _velocity(message: Message) -> tuple[float, float] | None:
-    """Return the velocity of a report, m/s (east, north); None where it tells none."""
+def _read_velocity(message: Message) -> tuple[float, float] | None:
+    """Return the velocity of a report, m/s (east, north); None if it has none."""
     if _SPEED_UNKNOWN in (message.vel, message.cog):
         return None
     speed_m_s, course = message.vel / 100, math.radians(message.cog / 100)
     return speed_m_s * math.sin(course), speed_m_s * math.cos(course)
 
 
-def _follows(before: Receiver, report: Receiver) -> bool:
-    """Tell whether a report follows the one before without a gap or a jump."""
+def _is_continuous(before: Receiver, report: Receiver) -> bool:
+    """Return True if a report follows the one before without a gap or a jump."""
     step_s = report.t_s - before.t_s
     if step_s > _MAX_GAP_S:
         return False

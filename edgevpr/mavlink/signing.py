@@ -23,25 +23,29 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 TICKS_S = 100_000  # per second: a time stamp counts units of 10 microseconds since the beginning of 2015, UTC
 _EPOCH_S = 1_420_070_400
-_LATEST = 2**48 - 1  # it has six bytes
-_NEAR = 60 * TICKS_S
-_KEPT_EVERY = 30 * TICKS_S
+_MAX_STAMP = 2**48 - 1  # it has six bytes
+_MAX_STREAM_OFFSET = 60 * TICKS_S
+_SAVE_INTERVAL = 30 * TICKS_S
 # Each start adds a minute to the largest time stamp that can have been used. So all earlier messages, ours and those to
 # us, are more than a minute old, and are not accepted as a new stream when somebody sends them again.
-_MOVED_ON = _KEPT_EVERY + 60 * TICKS_S
+_START_ADVANCE = _SAVE_INTERVAL + 60 * TICKS_S
 
 KEY_BYTES = 32
 # Link ids. A receiver checks the time stamps of each stream (system, component and link id) on their own.
-TO_AUTOPILOT, TO_GROUND, TO_ASK = 1, 2, 3
-UNSIGNED, WRONG = "unsigned", "wrong signature"
-OLD, FUTURE = "old time stamp", "time stamp from the future"
-_MAKE_ONE = "`(umask 077; head -c 32 /dev/urandom > FILE)` makes one"
+AUTOPILOT_LINK_ID = 1
+GCS_LINK_ID = 2
+CHECK_LINK_ID = 3  # of `edgevpr check` and `doctor`
+UNSIGNED = "unsigned"
+WRONG = "wrong signature"
+OLD = "old time stamp"
+FUTURE = "time stamp from the future"
+_KEY_ADVICE = "`(umask 077; head -c 32 /dev/urandom > FILE)` makes one"
 
-MEANING = {
+REFUSAL_MEANINGS = {
     UNSIGNED: "the other end does not sign: give it the key, or remove `mavlink.signing_key`",
-    WRONG: "the other end has another key, or somebody forges them",
-    OLD: "usual for a moment after a start; else they are sent again by somebody, or the other end does not hear us",
-    FUTURE: "a clock of some sender is wrong, or those of all others are",
+    WRONG: "the other end has another key, or the messages are forged",
+    OLD: "usual for a moment after a start; else they are replayed, or the other end does not receive our messages",
+    FUTURE: "the clock of one sender is wrong, or the clocks of all others",
 }
 
 Stream = tuple[int, int, int]  # system, component and link id of a sender
@@ -55,41 +59,41 @@ class TimeStamps:
     one link id). Any thread may call it. The largest is kept in the file `path`, since a board without a clock chip
     starts with an old time: it is written at the start (raises ConfigError), and then every half minute.
 
-    With `is_kept` False the file is only read, for a program that asks before the flight: that may run as root, and the
-    service could not overwrite a file of root."""
+    With `is_saved` False the file is only read, for a check before the flight: that may run as root, and the service
+    could not overwrite a file of root."""
 
     def __init__(
-        self, path: Path, mono_s: Clock = time.monotonic, utc_s: Clock = time.time, is_kept: bool = True
+        self, path: Path, mono_s: Clock = time.monotonic, utc_s: Clock = time.time, is_saved: bool = True
     ) -> None:
-        self._path, self._mono_s, self._utc_s, self._is_kept = path, mono_s, utc_s, is_kept
+        self._path, self._mono_s, self._utc_s, self._is_saved = path, mono_s, utc_s, is_saved
         self._lock, self._writing = Lock(), Lock()
         self._streams: dict[Stream, int] = {}
         self._has_warned = False
-        self._rebase(_read_stamp(path) + _MOVED_ON)
-        self._largest = self._kept = self._now()
-        self._keep(may_fail=not path.exists())
+        self._rebase(_read_stamp(path) + _START_ADVANCE)
+        self._largest = self._saved = self._now()
+        self._save(may_fail=not path.exists())
 
     def next(self) -> int:
         """Return the time stamp for the next message to be sent, larger than all before."""
         with self._lock:
-            self._move_on(max(self._largest + 1, self._now()))
-            return min(self._largest, _LATEST)
+            self._advance(max(self._largest + 1, self._now()))
+            return min(self._largest, _MAX_STAMP)
 
-    def refusal(self, stream: Stream, stamp: int) -> str | None:
+    def check(self, stream: Stream, stamp: int) -> str | None:
         """Return why a message with this time stamp is refused, or None if it is admitted; its time stamp is then kept,
         so the signature must be right. Time stamps of a stream must increase. The first of a new stream must be within
         a minute of the largest, but the very first stream may be ahead: a board without a clock chip learns the time.
         """
         with self._lock:
             now = max(self._largest, self._now())
-            if stamp <= self._streams.get(stream, now - _NEAR):
+            if stamp <= self._streams.get(stream, now - _MAX_STREAM_OFFSET):
                 return OLD
-            if self._streams and stream not in self._streams and stamp > now + _NEAR:
+            if self._streams and stream not in self._streams and stamp > now + _MAX_STREAM_OFFSET:
                 return FUTURE
             self._streams[stream] = stamp
             if stamp > now:
                 self._rebase(stamp)
-                self._move_on(stamp)
+                self._advance(stamp)
             return None
 
     def _now(self) -> int:
@@ -100,27 +104,27 @@ class TimeStamps:
     def _rebase(self, stamp: int) -> None:
         self._base, self._base_s = stamp, self._mono_s()
 
-    def _move_on(self, stamp: int) -> None:
+    def _advance(self, stamp: int) -> None:
         self._largest = stamp
-        if stamp - self._kept >= _KEPT_EVERY:
-            self._kept = stamp
+        if stamp - self._saved >= _SAVE_INTERVAL:
+            self._saved = stamp
             # Not in the thread of a link: a slow card must not hold up a fix.
-            Thread(target=self._keep, name="signing time", daemon=True).start()
+            Thread(target=self._save, name="signing time", daemon=True).start()
 
-    def _keep(self, may_fail: bool = False) -> None:
+    def _save(self, may_fail: bool = False) -> None:
         """Write the time stamp to be kept. If that fails, log one warning or, with `may_fail`, raise ConfigError."""
-        if not self._is_kept:
+        if not self._is_saved:
             return
         try:
             with self._writing:
-                write_atomically(self._path, lambda path: path.write_text(f"{self._kept}\n"))
+                write_atomically(self._path, lambda path: path.write_text(f"{self._saved}\n"))
         except OSError as error:
             if may_fail:
-                why = f"the time of signed messages cannot be kept there ({error.strerror})"
+                why = f"the time of signed messages cannot be saved there ({error.strerror})"
                 raise ConfigError(f"{self._path}: {why}: correct `mavlink: {{signing_state: ...}}`.") from error
             if not self._has_warned:
                 self._has_warned = True
-                log.warning("%s: the time of signed messages is not kept (%s)", self._path, error.strerror)
+                log.warning("%s: the time of signed messages is not saved (%s)", self._path, error.strerror)
 
 
 class Signing:
@@ -128,14 +132,14 @@ class Signing:
     than earlier ones. `refused` counts the others by reason; `verdicts` has the reason for each message received last
     (None: admitted). Without a key (no `stamps`) nothing is signed, and every message is admitted."""
 
-    def __init__(self, key: bytes = b"", stamps: TimeStamps | None = None, link_id: int = TO_AUTOPILOT) -> None:
+    def __init__(self, key: bytes = b"", stamps: TimeStamps | None = None, link_id: int = AUTOPILOT_LINK_ID) -> None:
         self.refused: Counter[str] = Counter()
         self._key, self._stamps, self._link_id = key, stamps, link_id
         self.verdicts: list[str | None] = []
 
-    def for_ground(self) -> "Signing":
+    def make_gcs_signing(self) -> "Signing":
         """Return the signing of the link to the ground: the same key and time stamps, but another link id."""
-        return Signing(self._key, self._stamps, TO_GROUND)
+        return Signing(self._key, self._stamps, GCS_LINK_ID)
 
     def stamp(self, packer: Message) -> None:
         """Make a pymavlink packer sign its next message."""
@@ -153,7 +157,7 @@ class Signing:
         if reason is None:
             return True
         if reason not in self.refused:
-            log.warning("messages are refused (%s): %s", reason, MEANING[reason])
+            log.warning("messages are refused (%s): %s", reason, REFUSAL_MEANINGS[reason])
         self.refused[reason] += 1
         return False
 
@@ -168,19 +172,21 @@ class Signing:
         if not hmac.compare_digest(expected, packet[-6:]):
             return WRONG
         stamp = int.from_bytes(packet[-12:-6], "little")
-        return stamps.refusal((header.srcSystem, header.srcComponent, packet[-13]), stamp)
+        return stamps.check((header.srcSystem, header.srcComponent, packet[-13]), stamp)
 
 
 NOT_SIGNING = Signing()
 
 
-def open_signing(settings: MavlinkConfig, to_ask: bool = False) -> Signing:
-    """Open the signing with the configured key, if there is one. With `to_ask` (questions before the flight) the file
-    of the kept time is only read. Raises ConfigError."""
+def open_signing(settings: MavlinkConfig, is_read_only: bool = False) -> Signing:
+    """Open the signing with the configured key, if there is one. With `is_read_only` (a check before the flight) the
+    file of the time is not written. Raises ConfigError."""
     if settings.signing_key is None:
         return NOT_SIGNING
     key, state = read_key(settings.signing_key), Path(settings.signing_state or f"{settings.signing_key}.time")
-    return Signing(key, TimeStamps(state, is_kept=not to_ask), TO_ASK if to_ask else TO_AUTOPILOT)
+    return Signing(
+        key, TimeStamps(state, is_saved=not is_read_only), CHECK_LINK_ID if is_read_only else AUTOPILOT_LINK_ID
+    )
 
 
 def read_key(path: str) -> bytes:
@@ -189,11 +195,11 @@ def read_key(path: str) -> bytes:
         with open_file(path, 1_000_000) as handle:
             mode, key = stat.S_IMODE(os.fstat(handle.fileno()).st_mode), handle.read(KEY_BYTES + 1)
     except OSError as error:
-        raise ConfigError(f"{path}: the signing key cannot be read ({error.strerror}): {_MAKE_ONE}.") from error
+        raise ConfigError(f"{path}: the signing key cannot be read ({error.strerror}): {_KEY_ADVICE}.") from error
     if mode & 0o077 and not _is_credential(path, mode):
         raise ConfigError(f"{path}: others may open the signing key (mode {mode:04o}): `chmod 600 {path}`.")
     if len(key) != KEY_BYTES:
-        raise ConfigError(f"{path}: a signing key has {KEY_BYTES} bytes, and this file has not: {_MAKE_ONE}.")
+        raise ConfigError(f"{path}: a signing key has {KEY_BYTES} bytes, this file has not: {_KEY_ADVICE}.")
     return key
 
 
@@ -211,6 +217,6 @@ def _read_stamp(path: Path) -> int:
         return 0
     except OSError as error:
         raise ConfigError(f"{path}: the time of signed messages cannot be read ({error.strerror}).") from error
-    if not (text.isascii() and text.isdigit() and int(text) <= _LATEST):
+    if not (text.isascii() and text.isdigit() and int(text) <= _MAX_STAMP):
         raise ConfigError(f"{path} holds no time of signed messages: set the clock, and delete the file.")
     return int(text)

@@ -19,17 +19,17 @@ class Turns:
         return self._clock() if t_s is None else t_s
 
     @contextmanager
-    def taken(self, what: str) -> Iterator[None]:
+    def take_turn(self, what: str) -> Iterator[None]:
         """Context manager: take a turn in the flight's thread, or go on with its own. `what` names it."""
         with self._lock:
             if self._t_s is not None:
                 yield
                 return
-            with self.again(self._begin(what)):
+            with self.freeze_clock(self._begin(what)):
                 yield
 
     @contextmanager
-    def again(self, t_s: float) -> Iterator[None]:
+    def freeze_clock(self, t_s: float) -> Iterator[None]:
         """Context manager: let the time stand still at `t_s`; in a replay, this repeats a link's turn."""
         self._t_s = t_s
         try:
@@ -40,7 +40,7 @@ class Turns:
     @contextmanager
     def take_link_turn(self, name: str) -> Iterator[None]:
         """Context manager: take a turn in the thread of the link `name`."""
-        with self._lock, self.again(self._clock()):
+        with self._lock, self.freeze_clock(self._clock()):
             yield
 
     def _begin(self, what: str) -> float:

@@ -9,13 +9,13 @@ from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.wire import Message, mavlink
 
-_KEPT_S = 3.0  # of attitudes: a frame is hardly ever older when it is recognised
-_MAX_KEPT = 200
-_NEAR_S = 0.3  # from an attitude to the time of a frame that it is used for
+_HISTORY_S = 3.0  # of attitudes: a frame is hardly ever older when it is recognised
+_MAX_ATTITUDES = 200
+_MAX_ATTITUDE_AGE_S = 0.3  # from an attitude to the time of a frame that it is used for
 # A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that came up when GPS was lost. In a gale it would be
 # four times as much, or four standard deviations.
 DRIFT_M_S = 5.0
-FILTER_FRESH_S = 3.0  # of the filter's report, which is requested twice a second
+MAX_FILTER_REPORT_AGE_S = 3.0  # of the filter's report, which is requested twice a second
 
 # Flags of EKF_STATUS_REPORT (ArduPilot) and ESTIMATOR_STATUS (PX4), which are the same. An ArduPilot that dead-reckons
 # reports only a relative position, from where it was last known (NavEKF3: absolute means measured).
@@ -41,18 +41,18 @@ class Attitudes:
 
     def rate_hz(self, now_s: float) -> float:
         """Return how many attitudes a second have come in the last three seconds."""
-        return sum(now_s - attitude.t_s <= _KEPT_S for attitude in self._kept) / _KEPT_S
+        return sum(now_s - attitude.t_s <= _HISTORY_S for attitude in self._kept) / _HISTORY_S
 
     def handle(self, message: Message, now_s: float) -> None:
         """Add the attitude of an ATTITUDE message; one that is not finite is ignored."""
         radians = message.roll, message.pitch, message.yaw
         if all(map(math.isfinite, radians)):
-            kept = [attitude for attitude in self._kept[1 - _MAX_KEPT :] if now_s - attitude.t_s <= _KEPT_S]
+            kept = [attitude for attitude in self._kept[1 - _MAX_ATTITUDES :] if now_s - attitude.t_s <= _HISTORY_S]
             self._kept = (*kept, Attitude(now_s, *map(math.degrees, radians)))
 
     def at(self, t_s: float) -> Attitude | None:
         """Return the attitude at `t_s`: between those before and after it, or the only one within 0.3 s, if any."""
-        near = [attitude for attitude in self._kept if abs(attitude.t_s - t_s) <= _NEAR_S]
+        near = [attitude for attitude in self._kept if abs(attitude.t_s - t_s) <= _MAX_ATTITUDE_AGE_S]
         before = next((attitude for attitude in reversed(near) if attitude.t_s <= t_s), None)
         after = next((attitude for attitude in near if attitude.t_s > t_s), None)
         if before is None or after is None:
@@ -64,13 +64,13 @@ class Attitudes:
         return Attitude(t_s, roll, pitch, yaw, math.hypot(*changed_deg[:2]) / step_s)
 
 
-class Certainty:
+class PositionAccuracy:
     """Estimates the standard deviation of one axis of the autopilot's own position: what its filter reports (PX4) or,
     without that, what it was when last known, growing by DRIFT_M_S a second."""
 
     def __init__(self) -> None:
-        self._known: tuple[float, float] | None = None  # standard deviation, time
-        self._own: tuple[float, float] | None = None  # standard deviation that the filter reports, time
+        self._last_known: tuple[float, float] | None = None  # standard deviation, time
+        self._reported: tuple[float, float] | None = None  # standard deviation that the filter reports, time
         self._ratio: tuple[float, float] | None = None  # innovation of measured positions over the filter's gate, time
 
     def handle(self, message: Message, now_s: float) -> None:
@@ -80,25 +80,25 @@ class Certainty:
         # PX4 calls it constant too while it stands still with GPS.
         is_constant = message.flags & mavlink.EKF_CONST_POS_MODE and not is_px4
         if is_constant or not message.flags & _HAS_POSITION:
-            self._known = self._own = None  # the position is still reported, but is an old one
+            self._last_known = self._reported = None  # the position is still reported, but is an old one
         elif is_px4:
             # PX4 reports that of both axes together, larger than that of one: a cautious value. 0: it has none.
             sd_m = message.pos_horiz_accuracy
-            self._own = (sd_m, now_s) if 0 < sd_m < math.inf else None
+            self._reported = (sd_m, now_s) if 0 < sd_m < math.inf else None
 
     def innovation_ratio(self, now_s: float) -> float | None:
         """Return the newest ratio of the innovation of measured positions to the filter's gate; None if it is old."""
-        return self._ratio[0] if self._ratio and now_s - self._ratio[1] <= FILTER_FRESH_S else None
+        return self._ratio[0] if self._ratio and now_s - self._ratio[1] <= MAX_FILTER_REPORT_AGE_S else None
 
     def record_accuracy(self, sd_m: float, now_s: float) -> None:
         """Note that at `now_s` the position is known this well, by GPS or by an accepted fix of ours."""
-        self._known = sd_m, now_s
+        self._last_known = sd_m, now_s
 
     def now(self, now_s: float) -> float | None:
         """Return the standard deviation in metres; None if it is unknown, or the autopilot has no position."""
-        if self._own and now_s - self._own[1] <= FILTER_FRESH_S:
-            return self._own[0]
-        return math.hypot(self._known[0], DRIFT_M_S * (now_s - self._known[1])) if self._known else None
+        if self._reported and now_s - self._reported[1] <= MAX_FILTER_REPORT_AGE_S:
+            return self._reported[0]
+        return math.hypot(self._last_known[0], DRIFT_M_S * (now_s - self._last_known[1])) if self._last_known else None
 
 
 class Readiness(NamedTuple):
@@ -113,23 +113,23 @@ class Readiness(NamedTuple):
     answers_others: bool = False  # our commands that are no fixes
 
     @property
-    def why_silent(self) -> Reason:
+    def silence_reason(self) -> Reason:
         """The likely reason why it does not answer fixes."""
         return Reason(ReasonCode.FIXES_NOT_ANSWERED if self.answers_others else ReasonCode.NO_COMMAND_ANSWERED)
 
-    def why(self, result: str) -> Reason:
+    def explain(self, result: str) -> Reason:
         """Return the likely reason for an answer to a fix; `result` is the name of a MAV_RESULT."""
         rejected = ReasonCode.OTHER_AID if self.is_px4 else ReasonCode.NOT_SAID
         codes = {
             "ACCEPTED": ReasonCode.TAKEN,
             "DENIED": ReasonCode.WRONG_FORM,
-            "FAILED": self._why_failed(),
+            "FAILED": self._explain_failure(),
             "TEMPORARILY_REJECTED": ReasonCode.GPS_IN_USE if self.has_gps else rejected,
             "UNSUPPORTED": ReasonCode.NO_COMMAND,
         }
         return Reason(codes[result]) if result in codes else Reason(ReasonCode.OTHER_ANSWER, {"result": result})
 
-    def _why_failed(self) -> ReasonCode:
+    def _explain_failure(self) -> ReasonCode:
         """Return the likely reason for the answer FAILED: the first one in order that is known to apply."""
         # PX4 answers with TEMPORARILY_REJECTED while it has GPS, and uses this flag for glitches of it.
         if self.is_px4:

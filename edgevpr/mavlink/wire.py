@@ -13,11 +13,11 @@ from typing import Any, TypeAlias
 from pymavlink import quaternion, rotmat
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-__all__ = ["Message", "PacketReader", "mavlink", "parameter_value", "quaternion", "rotmat"]
+__all__ = ["Message", "PacketReader", "mavlink", "quaternion", "read_parameter_value", "rotmat"]
 
 Message: TypeAlias = Any  # a mavlink.MAVLink_message; each kind has its own fields
 
-_SENDERS_MAX = 8  # senders whose incomplete messages are kept; a flood from invented addresses must not fill the memory
+_MAX_SENDERS = 8  # senders whose incomplete messages are kept; a flood from invented addresses must not fill the memory
 
 
 class PacketReader:
@@ -53,13 +53,13 @@ class PacketReader:
         if (parser := self.parsers.pop(sender, None)) is None:
             parser = mavlink.MAVLink(None)
             parser.robust_parsing = True  # bad data comes as BAD_DATA messages instead of an exception
-            if len(self.parsers) == _SENDERS_MAX:
+            if len(self.parsers) == _MAX_SENDERS:
                 self.parsers.pop(next(iter(self.parsers)))
         self.parsers[sender] = parser
         return parser
 
 
-def parameter_value(message: Message, bytewise: bool) -> float | int | None:
+def read_parameter_value(message: Message, bytewise: bool) -> float | int | None:
     """Return the number in a PARAM_VALUE, or None if it is not finite. Its float32 field holds the number itself or,
     with `bytewise` (PX4), the four bytes of a whole number."""
     is_whole = message.param_type < mavlink.MAV_PARAM_TYPE_REAL32

@@ -65,7 +65,7 @@ class ReplayedDriver:
 
     def _perform(self, t_s: float, steps: list[Note]) -> None:
         """Repeat the `steps` of a turn at the time `t_s`."""
-        with self._turns.again(t_s):
+        with self._turns.freeze_clock(t_s):
             for step in steps:
                 self._repeat(step, t_s)
 

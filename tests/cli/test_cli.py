@@ -132,7 +132,7 @@ def test_main_exits_with_2_and_a_sentence_if_the_request_is_wrong(capsys, flight
     wrong_row = tmp_path / "positions.csv"
     wrong_row.write_text("file,lat,lon\n0.png,91,8\n")
     for argv, says in [
-        (["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", "udp:1"], "no MAVLink link"),
+        (["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", "udp:1"], "not a MAVLink link"),
         (["match", valley, "--images", query, "--min-score", "3"], "between 0 and 1"),
         (["match", valley, "--images", query, "--accept-precision", "nan"], "`match.accept_precision` is"),
         (["match", valley, "--images", query, "--board", "rpi5"], "did you mean `rpi-5`"),

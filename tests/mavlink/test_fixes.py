@@ -8,7 +8,7 @@ from conversing import FIX_3D
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.fixes import FixAnswer, Fixes, FixTransmission
-from edgevpr.mavlink.messages import TEXT_BYTES, Fix
+from edgevpr.mavlink.messages import MAX_TEXT_BYTES, Fix
 from edgevpr.mavlink.vehicle import Readiness
 from edgevpr.mavlink.wire import mavlink
 
@@ -36,7 +36,7 @@ def sent(fixes, *times_s):
 
 def hear(fixes, result, t_s):
     """Let an autopilot that has GPS answer."""
-    return fixes.handle(result, Readiness(has_gps=True).why(result), t_s)
+    return fixes.handle(result, Readiness(has_gps=True).explain(result), t_s)
 
 
 def test_one_fix_a_second_has_its_own_answer_though_some_are_lost(fixes):
@@ -222,12 +222,12 @@ REJECTED = "TEMPORARILY_REJECTED"
         ("99", {}, ReasonCode.OTHER_ANSWER),
     ],
 )
-def test_why_returns_the_first_reason_that_applies(result, state, code):
-    assert Readiness(**state).why(result).code is code
+def test_explain_returns_the_first_reason_that_applies(result, state, code):
+    assert Readiness(**state).explain(result).code is code
 
 
 def test_every_answer_of_an_autopilot_fits_a_status_text():
     codes = list(ReasonCode)
     answers = codes[codes.index(ReasonCode.TAKEN) : codes.index(ReasonCode.FIXES_NOT_ANSWERED) + 1]
     assert len(answers) > 10
-    assert all(len(f"edgevpr: fixes unanswered: {code.summary}".encode()) <= TEXT_BYTES for code in answers)
+    assert all(len(f"edgevpr: fixes unanswered: {code.summary}".encode()) <= MAX_TEXT_BYTES for code in answers)

@@ -12,12 +12,12 @@ from edgevpr.mavlink.messages import (
     Fix,
     Health,
     Severity,
-    computer_status,
+    make_computer_status,
     make_named_values,
-    position_fix,
-    status_text,
+    make_position_fix,
+    make_status_text,
 )
-from edgevpr.mavlink.signing import TO_GROUND, Signing, TimeStamps
+from edgevpr.mavlink.signing import GCS_LINK_ID, Signing, TimeStamps
 from edgevpr.mavlink.wire import mavlink
 
 pytestmark = pytest.mark.network
@@ -39,7 +39,7 @@ def two(clock):
 
 
 def text(words: str):
-    return status_text(Severity.INFO, words)
+    return make_status_text(Severity.INFO, words)
 
 
 def test_the_ground_hears_what_is_for_people_and_no_fix_and_no_request(two, clock):
@@ -51,8 +51,8 @@ def test_the_ground_hears_what_is_for_people_and_no_fix_and_no_request(two, cloc
     autopilot.expect("COMMAND_LONG")
     station.expect_text("wake up")
     figures = make_named_values(1.0, vpr_place=5, vpr_score=0.5, vpr_cpu=0.5, vpr_mah=2.0)
-    flight.send(*figures, computer_status(1.0, [0.5], 2**20, 2**30, None))
-    flight.send(position_fix(Fix(1.0, 2.0, 3.0, clock()), clock(), 7))  # not even where it is queued as a message
+    flight.send(*figures, make_computer_status(1.0, [0.5], 2**20, 2**30, None))
+    flight.send(make_position_fix(Fix(1.0, 2.0, 3.0, clock()), clock(), 7))  # not even where it is queued as a message
     flight.send(text("end"))
     mirrored = ["NAMED_VALUE_INT", *["NAMED_VALUE_FLOAT"] * 3, "ONBOARD_COMPUTER_STATUS"]
     assert [message.get_type() for message in station.expect_text("end")] == mirrored
@@ -125,4 +125,4 @@ def test_the_ground_is_spoken_to_with_the_same_key_and_another_link_id(clock, tm
             peer = Peer(port)
             peer.receiver._find_parser(None).signing.secret_key = bytes(32)
             heartbeat = peer.expect("HEARTBEAT")
-            assert (heartbeat.get_signed(), heartbeat.get_link_id()) == (True, TO_GROUND)
+            assert (heartbeat.get_signed(), heartbeat.get_link_id()) == (True, GCS_LINK_ID)

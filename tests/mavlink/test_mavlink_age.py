@@ -18,7 +18,7 @@ from mavlink_peers import AutopilotThread, Peer, SerialCable, TcpServer, link_to
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.fixes import FixTransmission
-from edgevpr.mavlink.messages import Fix, Severity, status_text
+from edgevpr.mavlink.messages import Fix, Severity, make_status_text
 from edgevpr.mavlink.ports import PacketWriter, open_port
 from edgevpr.mavlink.wire import mavlink
 
@@ -99,7 +99,7 @@ def test_a_serial_line_that_is_held_up_gives_no_old_fix_when_it_goes_on():
         assert (fix.sent, fix.why) == (False, THROWN_AWAY)
         termios.tcflow(slave, termios.TCOON)
         peer.seen.clear()
-        link.send(status_text(Severity.INFO, "goes on"))
+        link.send(make_status_text(Severity.INFO, "goes on"))
         before = [message.get_type() for message in peer.expect_text("goes on")]
         assert mavlink.MAVLink_command_int_message.msgname not in before
         assert link.stats().fixes_sent == 0

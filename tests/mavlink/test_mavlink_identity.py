@@ -3,14 +3,14 @@
 import pytest
 
 from edgevpr.mavlink.messages import Fix
-from edgevpr.mavlink.peer import Identity, Speaker
+from edgevpr.mavlink.peer import Endpoint, Identity
 from edgevpr.mavlink.wire import mavlink
 
-OURS, FOREIGN = Speaker(1, None), Speaker(2, None)
+OURS, FOREIGN = Endpoint(1, None), Endpoint(2, None)
 HERE, THERE = ("127.0.0.1", 1000), ("127.0.0.1", 2000)
 
 
-def beat(identity: Identity, speaker: Speaker, *times_s: float) -> list[bool]:
+def beat(identity: Identity, speaker: Endpoint, *times_s: float) -> list[bool]:
     return [identity.admits(speaker, True, t_s) for t_s in times_s]
 
 
@@ -35,28 +35,28 @@ def test_the_first_autopilot_heard_is_kept_while_it_speaks(caplog):
 
 def test_the_same_system_from_elsewhere_is_taken_after_thirty_seconds_of_silence(caplog):
     identity = Identity()
-    beat(identity, Speaker(1, HERE), 0.0)
+    beat(identity, Endpoint(1, HERE), 0.0)
     for t_s in seconds(20, 40):
-        assert beat(identity, Speaker(7, THERE), t_s) == [False]
-        assert beat(identity, Speaker(1, THERE), t_s + 0.5) == [t_s >= 30]
+        assert beat(identity, Endpoint(7, THERE), t_s) == [False]
+        assert beat(identity, Endpoint(1, THERE), t_s + 0.5) == [t_s >= 30]
         assert identity.has_moved == (t_s == 30)
     assert "for 30 s" in caplog.text
-    assert beat(identity, Speaker(1, HERE), 41.0) == [False]
+    assert beat(identity, Endpoint(1, HERE), 41.0) == [False]
 
 
 def test_a_configured_system_is_never_given_up_but_may_come_from_elsewhere(caplog):
     identity = Identity(system_id=1)
-    assert not any(beat(identity, Speaker(2, HERE), *seconds(0, 99)))
+    assert not any(beat(identity, Endpoint(2, HERE), *seconds(0, 99)))
     assert identity.foreign_messages == 100
     assert caplog.text.count("fixes go to system 1 only") == 1
-    assert beat(identity, Speaker(1, HERE), 100.0) == [True]
-    assert not any(beat(identity, Speaker(2, HERE), *seconds(101, 200)))
-    assert beat(identity, Speaker(1, THERE), 129.0, 130.0) == [False, True]
-    assert identity.kept == Speaker(1, THERE)
+    assert beat(identity, Endpoint(1, HERE), 100.0) == [True]
+    assert not any(beat(identity, Endpoint(2, HERE), *seconds(101, 200)))
+    assert beat(identity, Endpoint(1, THERE), 129.0, 130.0) == [False, True]
+    assert identity.kept == Endpoint(1, THERE)
 
 
 def test_second_sender_with_our_autopilots_number_is_neither_believed_nor_obeyed(autopilot, caplog):
-    autopilot.conversation.requests.is_under_way = True
+    autopilot.conversation.requests.is_flying = True
     autopilot.put_fix()
     for _ in range(40):
         autopilot.wait(1.0)

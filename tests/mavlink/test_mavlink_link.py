@@ -10,7 +10,7 @@ from mavlink_peers import Peer, TcpServer, UdpPort, link_to
 
 from edgevpr.mavlink.conversation import MAX_MESSAGES
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.messages import Fix, Health, Severity, make_named_values, status_text
+from edgevpr.mavlink.messages import Fix, Health, Severity, make_named_values, make_status_text
 from edgevpr.mavlink.wire import mavlink
 
 pytestmark = pytest.mark.network
@@ -26,7 +26,7 @@ def heard(link: Link, peer: Peer) -> None:
 
 
 def text(words: str):
-    return status_text(Severity.INFO, words)
+    return make_status_text(Severity.INFO, words)
 
 
 def test_the_heartbeat_comes_once_a_second_with_the_current_health(link, peer, clock):

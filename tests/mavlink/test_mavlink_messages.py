@@ -35,7 +35,7 @@ def sent_and_received(message: Message) -> Message:
     [(50.12345678, 14.98765432), (-33.8688197, -151.2092955), (89.99999995, 179.99999995), (-90.0, -180.0), (0.0, 0.0)],
 )
 def test_a_fix_arrives_to_a_ten_millionth_of_a_degree_and_without_an_altitude(lat_deg, lon_deg):
-    heard = sent_and_received(messages.position_fix(Fix(lat_deg, lon_deg, 25.0, 99.25), 100.5, target_system=7))
+    heard = sent_and_received(messages.make_position_fix(Fix(lat_deg, lon_deg, 25.0, 99.25), 100.5, target_system=7))
     assert heard.get_type() == "COMMAND_INT"
     assert (heard.command, heard.frame) == (43003, mavlink.MAV_FRAME_GLOBAL)
     assert (heard.target_system, heard.target_component) == (7, 1)
@@ -72,14 +72,14 @@ def test_whole_numbers_and_others_are_named_values_and_what_is_not_known_is_none
 
 
 def test_the_computer_tells_load_memory_and_temperature_and_marks_the_rest_as_unknown():
-    heard = sent_and_received(messages.computer_status(60.0, [0.5, 1.25, 0.0], 512 << 20, 4096 << 20, 61.4))
+    heard = sent_and_received(messages.make_computer_status(60.0, [0.5, 1.25, 0.0], 512 << 20, 4096 << 20, 61.4))
     assert heard.cpu_cores == [50, 100, 0, 255, 255, 255, 255, 255]
     assert (heard.ram_usage, heard.ram_total) == (512, 4096)
     assert heard.temperature_core[:2] == [61, 127]
     assert heard.temperature_board == 127
     assert (heard.uptime, heard.time_usec) == (60_000, 60_000_000)
     assert set(heard.storage_total) == {2**32 - 1}
-    heard = sent_and_received(messages.computer_status(60.0, [0.1] * 20, 1 << 20, 1 << 30, None))
+    heard = sent_and_received(messages.make_computer_status(60.0, [0.1] * 20, 1 << 20, 1 << 30, None))
     assert (heard.cpu_cores, set(heard.temperature_core)) == ([10] * 8, {127})
 
 
@@ -93,7 +93,7 @@ def test_the_computer_tells_load_memory_and_temperature_and_marks_the_rest_as_un
     ],
 )
 def test_a_text_is_cut_to_what_one_message_holds(text, arrives):
-    heard = sent_and_received(messages.status_text(Severity.WARNING, text))
+    heard = sent_and_received(messages.make_status_text(Severity.WARNING, text))
     assert heard.severity == mavlink.MAV_SEVERITY_WARNING
     assert heard.get_msgbuf()[11:-2].decode() == arrives
 
@@ -103,13 +103,13 @@ def test_a_text_is_cut_to_what_one_message_holds(text, arrives):
     [(mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, [193]), (mavlink.MAV_AUTOPILOT_PX4, [230]), (mavlink.MAV_AUTOPILOT_PPZ, [])],
 )
 def test_a_firmware_is_asked_only_for_the_report_of_its_own_filter(firmware, filter_report):
-    asked = {int(each.param1) for each in messages.report_requests(1, firmware)}
+    asked = {int(each.param1) for each in messages.make_report_requests(1, firmware)}
     assert sorted(asked & {193, 230}) == filter_report
     assert {24, 30, 33, 132, 136} <= asked
 
 
 def test_gps_input_says_position_velocity_and_what_they_are_good_to_or_that_it_has_none():
-    heard = sent_and_received(messages.gps_input(STATE, 1, 100.0, 1_700_000_000.25))
+    heard = sent_and_received(messages.make_gps_input(STATE, 1, 100.0, 1_700_000_000.25))
     assert (heard.gps_id, heard.fix_type, heard.lat, heard.lon) == (1, 3, 471234567, 87654321)
     assert (heard.ve, heard.vn, heard.vd) == (3.0, -4.0, 0.5)
     assert (heard.horiz_accuracy, heard.vert_accuracy) == (2.5, 3.0)
@@ -119,14 +119,14 @@ def test_gps_input_says_position_velocity_and_what_they_are_good_to_or_that_it_h
     assert (heard.time_week, heard.time_week_ms) == (2288, (2 * 86_400 + 80_000 + 18) * 1000 + 250)
     assert heard.satellites_visible < 10, "a real receiver is to be preferred"
     assert heard.yaw == 0, "which says nothing"
-    heard = sent_and_received(messages.gps_input(None, 0, 100.0, None))
+    heard = sent_and_received(messages.make_gps_input(None, 0, 100.0, None))
     assert (heard.gps_id, heard.fix_type, heard.satellites_visible) == (0, mavlink.GPS_FIX_TYPE_NO_FIX, 0)
     assert (heard.time_week, heard.time_week_ms) == (0, 0)
 
 
 def test_odometry_lies_north_east_down_of_the_origin_and_moves_along_the_airframe():
     origin = *offset_position(STATE.lat_deg, STATE.lon_deg, -200.0, 300.0), 500.0
-    heard = sent_and_received(messages.odometry(STATE, STATE.attitude, origin, 7.0))
+    heard = sent_and_received(messages.make_odometry(STATE, STATE.attitude, origin, 7.0))
     assert (heard.frame_id, heard.child_frame_id) == (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD)
     assert (heard.x, heard.y, heard.z) == pytest.approx((-300.0, 200.0, -12.3), abs=0.1)
     w, x, y, z = heard.q

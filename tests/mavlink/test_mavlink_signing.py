@@ -15,11 +15,11 @@ from edgevpr.core.config import MavlinkConfig
 from edgevpr.core.errors import ConfigError
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.signing import (
+    AUTOPILOT_LINK_ID,
     FUTURE,
     NOT_SIGNING,
     OLD,
     TICKS_S,
-    TO_AUTOPILOT,
     UNSIGNED,
     WRONG,
     Signing,
@@ -71,7 +71,7 @@ def test_signed_messages_are_admitted_in_their_order_and_once(signing):
     first, second, third = (signer.packet() for _ in range(3))
     assert admitted(signing, first, third, second, third, first) == [True, True, False, False, False]
     assert signing.refused == {OLD: 3}
-    assert admitted(signing.for_ground(), third) == [False], "nor on the other link"
+    assert admitted(signing.make_gcs_signing(), third) == [False], "nor on the other link"
 
 
 def test_a_forged_message_from_the_far_future_shuts_out_no_true_one(signing, clock):
@@ -161,7 +161,7 @@ def test_a_link_and_pymavlink_understand_each_other_by_key(key_file, monkeypatch
             link.send_fix(Fix(50.0, 14.0, 25.0, time.monotonic()))
             fix = wait_until(lambda: other.recv_match(type="COMMAND_INT", blocking=True, timeout=1), "the fix")
             assert fix.get_signed()
-            assert fix.get_link_id() == TO_AUTOPILOT
+            assert fix.get_link_id() == AUTOPILOT_LINK_ID
             assert other.mav.signing.badsig_count == 0
     assert (key_file.parent / "signing.key.time").exists()
 

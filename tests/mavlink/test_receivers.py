@@ -34,12 +34,12 @@ def receive(*reports):
 def test_best_receiver_has_position_velocity_and_altitude_of_its_newest_report():
     flown = [(BEGIN_S + 0.2 * number, {"north_m": 2.0 * number}) for number in range(15)]
     receivers = receive(*flown, (BEGIN_S + 3.0, {"north_m": 30.0, "speed_m_s": 20.0, "course_deg": 30.0}))
-    best = receivers.best(BEGIN_S + 5.5)
+    best = receivers.choose_best(BEGIN_S + 5.5)
     assert (best.sd_m, best.t_s, best.alt_m, best.steady_for_s) == (0.5, BEGIN_S + 3.0, 300.0, 3.0)
     assert (best.lat_deg, best.lon_deg) == pytest.approx(offset_position(*HOME, 0.0, 30.0), abs=1e-7)
     assert best.velocity_m_s == pytest.approx((10.0, 10.0 * math.sqrt(3)))
-    assert receivers.best(BEGIN_S + 5.6) is None, "it has fallen silent"
-    assert receivers.best(BEGIN_S + 3.0, own="GPS_RAW_INT") is None, "edgevpr plays it"
+    assert receivers.choose_best(BEGIN_S + 5.6) is None, "it has fallen silent"
+    assert receivers.choose_best(BEGIN_S + 3.0, own="GPS_RAW_INT") is None, "edgevpr plays it"
 
 
 @pytest.mark.parametrize(
@@ -59,22 +59,22 @@ def test_best_receiver_has_position_velocity_and_altitude_of_its_newest_report()
     ],
 )
 def test_receiver_is_steady_without_a_jump_a_gap_or_poor_accuracy(after_s, fields, is_steady):
-    best = receive((BEGIN_S, {}), (BEGIN_S + after_s, fields)).best(BEGIN_S + after_s)
+    best = receive((BEGIN_S, {}), (BEGIN_S + after_s, fields)).choose_best(BEGIN_S + after_s)
     assert best.steady_for_s == pytest.approx(after_s if is_steady else 0.0)
 
 
 def test_receiver_without_a_new_fix_is_gone():
     frozen = receive((BEGIN_S, {}), (BEGIN_S + 2.6, {"stamp_s": BEGIN_S}))
-    assert frozen.best(BEGIN_S + 2.6) is None, "its position is reported again, with the stamp of before"
-    assert receive((BEGIN_S, {}), (BEGIN_S + 1.0, {"fix_type": 2})).best(BEGIN_S + 1.0) is None
+    assert frozen.choose_best(BEGIN_S + 2.6) is None, "its position is reported again, with the stamp of before"
+    assert receive((BEGIN_S, {}), (BEGIN_S + 1.0, {"fix_type": 2})).choose_best(BEGIN_S + 1.0) is None
     without_stamps = receive((BEGIN_S, {"stamp_s": 0.0}), (BEGIN_S + 1.0, {"stamp_s": 0.0}))
-    assert without_stamps.best(BEGIN_S + 1.0).t_s == BEGIN_S + 1.0
+    assert without_stamps.choose_best(BEGIN_S + 1.0).t_s == BEGIN_S + 1.0
 
 
 def test_receiver_that_reports_no_speed_or_accuracy_has_a_usual_one():
-    assert receive((BEGIN_S, {"speed_m_s": UNKNOWN_SPEED})).best(BEGIN_S).velocity_m_s is None
+    assert receive((BEGIN_S, {"speed_m_s": UNKNOWN_SPEED})).choose_best(BEGIN_S).velocity_m_s is None
     for accuracy_m in (0.0, UNKNOWN_ACCURACY_M):
-        assert receive((BEGIN_S, {"h_acc_m": accuracy_m})).best(BEGIN_S).sd_m == 5.0
+        assert receive((BEGIN_S, {"h_acc_m": accuracy_m})).choose_best(BEGIN_S).sd_m == 5.0
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import math
 import pytest
 
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.mavlink.ground import ANSWERED_MAX, Requests, Texts, Wish
+from edgevpr.mavlink.ground import MAX_ANSWERS_PER_S, Requests, Texts, UserCommand
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.wire import mavlink
 
@@ -41,7 +41,7 @@ def answered(autopilot, message):
 
 @pytest.fixture
 def requests(autopilot):
-    autopilot.conversation.requests.is_under_way = True
+    autopilot.conversation.requests.is_flying = True
     return autopilot.conversation.requests
 
 
@@ -53,7 +53,7 @@ def test_a_request_for_the_time_is_answered_by_the_clock_that_stamps_the_message
 
 
 @pytest.mark.parametrize("form", [command_long, command_int])
-@pytest.mark.parametrize("wish", list(Wish))
+@pytest.mark.parametrize("wish", list(UserCommand))
 def test_a_wish_that_can_be_fulfilled_is_accepted_and_handed_on(autopilot, requests, form, wish):
     assert answered(autopilot, form(31010, wish)) == "ACCEPTED"
     assert requests.take() == (wish, "255/190")
@@ -64,14 +64,14 @@ def test_a_wish_that_can_be_fulfilled_is_accepted_and_handed_on(autopilot, reque
 def test_a_wish_is_rejected_for_the_time_being_where_nobody_flies(autopilot):
     assert answered(autopilot, command_long(31010, 1)) == "TEMPORARILY_REJECTED"
     assert autopilot.conversation.requests.take() is None
-    autopilot.conversation.requests.is_under_way = True
+    autopilot.conversation.requests.is_flying = True
     assert answered(autopilot, command_long(31010, 2)) == "ACCEPTED"
 
 
 def test_of_wishes_that_contradict_each_other_the_newest_is_left(autopilot, requests):
-    for wish in (Wish.PAUSE, Wish.RESUME, Wish.PAUSE):
+    for wish in (UserCommand.PAUSE, UserCommand.RESUME, UserCommand.PAUSE):
         assert answered(autopilot, command_long(31010, wish)) == "ACCEPTED"
-    assert requests.take().wish is Wish.PAUSE
+    assert requests.take().command is UserCommand.PAUSE
 
 
 def test_no_fix_leaves_once_a_pause_is_acknowledged(autopilot, requests):
@@ -96,9 +96,9 @@ def test_nothing_is_answered_that_claims_to_come_from_us(autopilot):
 
 
 def test_a_flood_of_requests_is_answered_in_part_and_does_not_push_out_what_we_say(autopilot, requests):
-    flood = [mavlink.MAVLink_timesync_message(tc1=0, ts1=number) for number in range(3 * ANSWERED_MAX)]
-    assert len(replies(autopilot, *flood)) == ANSWERED_MAX
-    assert requests.ignored == 2 * ANSWERED_MAX
+    flood = [mavlink.MAVLink_timesync_message(tc1=0, ts1=number) for number in range(3 * MAX_ANSWERS_PER_S)]
+    assert len(replies(autopilot, *flood)) == MAX_ANSWERS_PER_S
+    assert requests.ignored == 2 * MAX_ANSWERS_PER_S
     assert autopilot.conversation.dropped_queue_full == 0
     autopilot.wait(1.0)
     assert answered(autopilot, command_long(31010, 1)) == "ACCEPTED"
@@ -107,7 +107,7 @@ def test_a_flood_of_requests_is_answered_in_part_and_does_not_push_out_what_we_s
 def react(message, sender=STATION):
     """The replies to a message, the requests that it has met, and the wish."""
     requests = Requests()
-    requests.is_under_way = True
+    requests.is_flying = True
     message._header.srcSystem, message._header.srcComponent = sender
     return requests.handle(message, US, 5.0), requests, requests.take()
 

@@ -33,7 +33,7 @@ def test_it_is_kept_every_half_minute_and_the_next_start_is_a_minute_beyond_all_
     wait_until(lambda: last - int(path.read_text()) < 30 * TICKS_S, "keeping the time")
     after = stamps_at(path)
     assert after.next() >= last + MINUTE
-    assert after.refusal(STREAM, last) == OLD, "a message of before was admitted after the restart"
+    assert after.check(STREAM, last) == OLD, "a message of before was admitted after the restart"
 
 
 def test_a_clock_that_is_set_forward_is_followed_and_one_that_is_set_back_is_not(path):
@@ -91,7 +91,7 @@ def test_a_disk_that_becomes_full_in_flight_ends_nothing(path, monkeypatch, capl
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("edgevpr.mavlink.signing.write_whole", full)
+    monkeypatch.setattr("edgevpr.mavlink.signing.write_atomically", full)
     tries = []
     monkeypatch.setattr("edgevpr.mavlink.signing.Thread.start", lambda thread: tries.append(thread.run()))
     first = stamps.next()
@@ -106,12 +106,12 @@ def test_a_borrowed_time_goes_on_from_the_file_and_leaves_it_as_it_is(path):
     clock = FakeClock()
     flown = stamps_at(path, clock=clock).next()
     before = path.read_bytes()
-    borrowed = TimeStamps(path, clock, lambda: 0.0, is_kept=False)
+    borrowed = TimeStamps(path, clock, lambda: 0.0, is_saved=False)
     assert borrowed.next() > flown
     clock.now_s += 300
-    assert borrowed.refusal((1, 1, 0), borrowed.next() + 3600 * TICKS_S) is None  # the time is learnt
+    assert borrowed.check((1, 1, 0), borrowed.next() + 3600 * TICKS_S) is None  # the time is learnt
     assert borrowed.next() > flown + 3600 * TICKS_S
     assert path.read_bytes() == before
-    assert TimeStamps(path.with_name("absent"), is_kept=False).next() > 0
+    assert TimeStamps(path.with_name("absent"), is_saved=False).next() > 0
     assert list(path.parent.iterdir()) == [path]
     assert stamps_at(path, clock=clock).next() < flown + 3600 * TICKS_S

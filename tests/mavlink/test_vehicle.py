@@ -6,7 +6,7 @@ import pytest
 
 from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Vehicle
-from edgevpr.mavlink.receivers import GPS_SD_M
+from edgevpr.mavlink.receivers import DEFAULT_GPS_SD_M
 from edgevpr.mavlink.vehicle import DRIFT_M_S
 from edgevpr.mavlink.wire import mavlink
 
@@ -147,7 +147,7 @@ def test_a_range_that_says_nothing_is_not_taken(autopilot, wrong):
 
 
 @pytest.mark.parametrize("message", [mavlink.MAVLink_gps_raw_int_message, mavlink.MAVLink_gps2_raw_message])
-@pytest.mark.parametrize(("h_acc", "sd_m"), [(1800, 1.8), (0, GPS_SD_M), (2**32 - 1, GPS_SD_M)])
+@pytest.mark.parametrize(("h_acc", "sd_m"), [(1800, 1.8), (0, DEFAULT_GPS_SD_M), (2**32 - 1, DEFAULT_GPS_SD_M)])
 def test_the_certainty_is_with_gps_that_of_the_receiver(autopilot, message, h_acc, sd_m):
     autopilot.filter(ABS | REL)
     assert autopilot.sd_m() is None, "never known"
@@ -166,7 +166,7 @@ def test_a_filter_that_says_it_has_no_position_ends_the_certainty(autopilot, fla
     autopilot.filter(REL)
     assert autopilot.sd_m() is None, "where it had stood still meanwhile, it does not know"
     autopilot.gps()
-    assert autopilot.sd_m() == GPS_SD_M
+    assert autopilot.sd_m() == DEFAULT_GPS_SD_M
 
 
 def test_a_fix_that_it_took_is_where_it_reckons_from(autopilot):
@@ -199,7 +199,7 @@ def test_a_filter_that_says_how_good_it_is_is_believed_while_it_speaks(autopilot
 
 def test_another_autopilot_is_not_known_as_well_and_starts_with_a_clean_slate(autopilot):
     autopilot.gps()
-    assert autopilot.sd_m() == GPS_SD_M
+    assert autopilot.sd_m() == DEFAULT_GPS_SD_M
     for _ in range(5):
         autopilot.put_fix()
     autopilot.wait(30.0)

@@ -58,7 +58,7 @@ class ClosedLoop:
         self.conversation = Conversation(settings, self._clock) if edgevpr else None
         if self.conversation:
             self.conversation.request_position()
-            self.conversation.requests.is_under_way = True
+            self.conversation.requests.is_flying = True
         self._packer, self._reader = mavlink.MAVLink(None, 1, 1), PacketReader()
         self._waiting, self._last_frame = [], None
 

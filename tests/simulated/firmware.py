@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from edgevpr.core.arrays import LatLon
-from edgevpr.mavlink.wire import Message, mavlink, parameter_value
+from edgevpr.mavlink.wire import Message, mavlink, read_parameter_value
 from simulated.estimator import Estimator
 from simulated.motion import Motion, displace, displacement_m
 from simulated.sensors import PositionMeasurement, Receivers
@@ -167,7 +167,7 @@ class Parameters(dict[str, float]):
         if name not in self:
             return []
         if message.get_type() == "PARAM_SET":
-            self.set(name, parameter_value(message, self._bytewise) or 0.0)
+            self.set(name, read_parameter_value(message, self._bytewise) or 0.0)
         value, is_whole = self[name], isinstance(self[name], int)
         kind = mavlink.MAV_PARAM_TYPE_INT32 if is_whole else mavlink.MAV_PARAM_TYPE_REAL32
         if is_whole and self._bytewise:

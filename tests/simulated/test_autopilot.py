@@ -21,7 +21,7 @@ pytestmark = pytest.mark.network
 
 
 def a_fix(**changes):
-    command = messages.position_fix(Fix(50.0, 14.0, 25.0, 0.0), 0.5, target_system=1)
+    command = messages.make_position_fix(Fix(50.0, 14.0, 25.0, 0.0), 0.5, target_system=1)
     for field, value in changes.items():
         setattr(command, field, value)
     return command
@@ -37,7 +37,7 @@ def test_run_autopilot_answers_and_counts():
     def send(message):
         companion.send(message, component_id=197)
 
-    send(messages.heartbeat(Health.ACTIVE))
+    send(messages.make_heartbeat(Health.ACTIVE))
     port.send(b"noise")
     assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
     assert heartbeat.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA

@@ -63,7 +63,9 @@ class Flown:
     def fix(self, north_m: float = 0.0, age_s: float = 0.0, **changes: float) -> int:
         """Send a fix so far north of the truth."""
         lat_deg, lon_deg = displace(self.brain.truth.point, 1j * north_m)
-        command = messages.position_fix(Fix(lat_deg, lon_deg, 5.0, self.now_s - age_s), self.now_s, target_system=1)
+        command = messages.make_position_fix(
+            Fix(lat_deg, lon_deg, 5.0, self.now_s - age_s), self.now_s, target_system=1
+        )
         for field, value in changes.items():
             setattr(command, field, value)
         return self.controller.receive(command)[0].result
@@ -99,7 +101,7 @@ def lose_gps(vehicle: str, wind_m_s: float = 6.0, **parameters: float) -> Flown:
 
 def gps_input(north_m: float = 1.0, accuracy_m: float = 1.0, fix_type: int = 3, satellites: int = 6):
     def make(flown: Flown):
-        message = messages.gps_input(flown.state(north_m, accuracy_m), 1, 0.0, None)
+        message = messages.make_gps_input(flown.state(north_m, accuracy_m), 1, 0.0, None)
         message.fix_type, message.satellites_visible = fix_type, satellites
         return message
 
@@ -108,7 +110,7 @@ def gps_input(north_m: float = 1.0, accuracy_m: float = 1.0, fix_type: int = 3, 
 
 def sensed(north_m: float = 0.0, eph_m: float = 1.0, slot: int = 1):
     def make(flown: Flown):
-        message = messages.position_sensor(flown.state(north_m, eph_m))
+        message = messages.make_position_sensor(flown.state(north_m, eph_m))
         message.id = slot
         return message
 
@@ -260,7 +262,7 @@ def test_px4_fuses_message_296_of_its_slot_and_flags_it():
 
 def test_px4_fuses_odometry_by_another_flag():
     flown = Flown("px4-copter", EKF2_EV_CTRL=1).set(EKF2_GPS_CTRL=0).wait(8)
-    flown.wait(6, lambda flown: messages.vision_position(flown.state(2.0), flown.brain.origin))
+    flown.wait(6, lambda flown: messages.make_vision_position(flown.state(2.0), flown.brain.origin))
     assert flown.flags & (FUSES | FUSES_ANY) == FUSES_ANY
     assert flown.error_m == pytest.approx(2, abs=0.5)
     assert not flown.wait(1).flags & FUSES_ANY

@@ -210,7 +210,7 @@ class ToAutopilot:
             self._ask_for_sources()
             self._report_output()
             self._link.send(
-                messages.computer_status(
+                messages.make_computer_status(
                     self._clock.mono_s(), load.core_shares, load.ram_used_bytes, load.ram_total_bytes, temperature_c
                 )
             )
@@ -220,10 +220,10 @@ class ToAutopilot:
         if vehicle is None or not vehicle.is_fresh(now_s) or not self._send_fixes or not self._source_sets.are_set:
             return
         has_own, stats = self._navigator.knows_position(now_s), self._link.stats()
-        answered_s = stats.answered_s.get(messages.SOURCE_SET, -math.inf)
+        answered_s = stats.answered_s.get(messages.SET_SOURCE_SET, -math.inf)
         if number := self._source_sets.choose_set(now_s, self._navigator.has_gps, has_own, answered_s):
             self._notifier.announce(messages.Severity.WARNING, f"source set {number} asked for", topic="sources")
-            self._link.send(messages.source_set(number, stats.autopilot_system_id or 0))
+            self._link.send(messages.make_source_set(number, stats.autopilot_system_id or 0))
 
     def _report_output(self) -> None:
         """Report what a continuous channel carries, where that has changed."""

@@ -13,7 +13,7 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.conversation import INTERIM_FIX_INTERVAL_S
 from edgevpr.mavlink.messages import Fix, MotionState
 from edgevpr.mavlink.peer import Listener
-from edgevpr.mavlink.receivers import PLAUSIBLE_SD_M
+from edgevpr.mavlink.receivers import MAX_PLAUSIBLE_SD_M
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.agewatch import AgeWatch
 from edgevpr.runtime.flight.consistency import Consistency
@@ -250,7 +250,7 @@ class Navigator(Listener):
         if self._watch.withdrawn:
             return self._watch.withdrawn
         receiver = vehicle.gps if uses_gps else None
-        if receiver is None or receiver.sd_m > PLAUSIBLE_SD_M:
+        if receiver is None or receiver.sd_m > MAX_PLAUSIBLE_SD_M:
             return Output.SENDING
         if self._channel is not Channel.GPS_INPUT:
             return Output.BESIDE_GPS

@@ -5,16 +5,16 @@ import logging
 from typing import Any
 
 from edgevpr.core.reasons import Reason, ReasonCode
-from edgevpr.mavlink.ground import Wish, Wished
+from edgevpr.mavlink.ground import CommandRequest, UserCommand
 from edgevpr.mavlink.link import Link
-from edgevpr.mavlink.messages import TEXT_BYTES, Severity
+from edgevpr.mavlink.messages import MAX_TEXT_BYTES, Severity
 from edgevpr.runtime.flight.flightlog import FlightLog
 
 _COMMAND_CODES = {
-    Wish.PAUSE: ReasonCode.PAUSED_BY_COMMAND,
-    Wish.RESUME: ReasonCode.RESUMED_BY_COMMAND,
+    UserCommand.PAUSE: ReasonCode.PAUSED_BY_COMMAND,
+    UserCommand.RESUME: ReasonCode.RESUMED_BY_COMMAND,
 }
-_MAX_GCS_BYTES = TEXT_BYTES - len("edgevpr: ")  # of a text for the ground station
+_MAX_GCS_BYTES = MAX_TEXT_BYTES - len("edgevpr: ")  # of a text for the ground station
 
 _log = logging.getLogger(__name__)
 
@@ -73,8 +73,7 @@ class Alert:
 
 
 class Commands:
-    """Carries out the requests (`Wish`) of ground stations. While the flight `is_paused`, nothing is recognised and no
-    fix is sent."""
+    """Carries out commands of ground stations. While it `is_paused`, no frame is recognised and no fix is sent."""
 
     def __init__(self, link: Link | None, notifier: Notifier) -> None:
         self.is_paused = False
@@ -89,15 +88,17 @@ class Commands:
         """Carry out the request received since the last call, and let the link accept requests from now on."""
         if self._link is None:
             return
-        if wished := self._link.take_wish():
-            self._carry_out(wished)
-        self._link.accept_wishes()
+        if request := self._link.take_command():
+            self._carry_out(request)
+        self._link.accept_commands()
 
-    def _carry_out(self, wished: Wished) -> None:
-        is_new = self.is_paused != (wished.wish is Wish.PAUSE)
-        self.is_paused = wished.wish is Wish.PAUSE
-        code = _COMMAND_CODES[wished.wish]
-        self._notifier.log("command", wish=wished.wish.name, sender=wished.sender, note=Reason(code), is_new=is_new)
+    def _carry_out(self, request: CommandRequest) -> None:
+        is_new = self.is_paused != (request.command is UserCommand.PAUSE)
+        self.is_paused = request.command is UserCommand.PAUSE
+        code = _COMMAND_CODES[request.command]
+        self._notifier.log(
+            "command", wish=request.command.name, sender=request.sender, note=Reason(code), is_new=is_new
+        )
         if is_new:  # a command repeated because its answer was lost changes nothing
             text = code.summary
-            self._notifier.announce(Severity.INFO, f"{text}, as {wished.sender} wishes", ground=text, topic="pause")
+            self._notifier.announce(Severity.INFO, f"{text} by {request.sender}", ground=text, topic="pause")

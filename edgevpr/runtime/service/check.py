@@ -86,7 +86,7 @@ def _check_link(what: str, settings: MavlinkConfig, offline: bool) -> Finding:
     address, ground = parse_links(settings)
     if address is None:
         return report_ok(what, ReasonCode.NO_LINK)
-    signing = open_signing(settings, to_ask=True)
+    signing = open_signing(settings, is_read_only=True)
     with RequestLink(address, settings.component_id, settings.system_id, signing) as inquiry:
         if not offline and inquiry.heartbeat() is None:
             return explain_silence(address, inquiry)

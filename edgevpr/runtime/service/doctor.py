@@ -9,7 +9,7 @@ from edgevpr.core.text import show_waiting
 from edgevpr.frames.source import is_live
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.asking import HEARTBEAT_TIMEOUT_S, AutopilotReading, RequestLink, read_autopilot
-from edgevpr.mavlink.signing import MEANING, open_signing
+from edgevpr.mavlink.signing import REFUSAL_MEANINGS, open_signing
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.service.camera import check_camera, check_frame
@@ -29,7 +29,7 @@ def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], Au
     read from the autopilot (None: nothing could be read). Raises ConfigError for a board that is unknown or a signing
     key that cannot be used."""
     settings, source = config.mavlink, config.source
-    signing = open_signing(settings, to_ask=True)
+    signing = open_signing(settings, is_read_only=True)
     machine_findings = list(check_machine(load_board(config.board), config.log, address))
     if (uri := source.uri) and is_live(uri):
         camera_findings = list(check_camera(uri))
@@ -57,7 +57,9 @@ def explain_silence(address: LinkAddress, inquiry: RequestLink) -> Finding:
     link = str(address)
     if refused := inquiry.signing.refused:
         cause = max(refused, key=lambda reason: refused[reason])
-        return report_fault("link", FindingCode.MESSAGES_REFUSED, address=link, cause=cause, meaning=MEANING[cause])
+        return report_fault(
+            "link", FindingCode.MESSAGES_REFUSED, address=link, cause=cause, meaning=REFUSAL_MEANINGS[cause]
+        )
     if inquiry.others:
         change = f"mavlink: {{system_id: {min(inquiry.others)}}}"
         return report_fault(

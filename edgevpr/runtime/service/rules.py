@@ -12,7 +12,7 @@ from edgevpr.mavlink.ardupilot_parameters import ADVISED_RECEIVER, ARDUPILOT_TAB
 from edgevpr.mavlink.asking import AutopilotReading
 from edgevpr.mavlink.channel import Channel, ChannelChoice, VehicleKind, resolve_name
 from edgevpr.mavlink.parameters import ParameterTable
-from edgevpr.mavlink.px4_parameters import CONTROL, FUSES_POSITION, PX4_TABLE, VISION_CONTROL
+from edgevpr.mavlink.px4_parameters import AGP_CONTROL, POSITION_BIT, PX4_TABLE, VISION_CONTROL
 from edgevpr.runtime.service.finding import Finding, report_fault, report_ok
 from edgevpr.runtime.service.findingcodes import FindingCode
 
@@ -97,15 +97,15 @@ def _check_px4(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Findin
     choice = PX4_TABLE.choose(reading.kind, reading.parameters)
     if choice.channel is not Channel.COMMAND:
         yield _report_channel(choice)
-    elif CONTROL in reading.parameters:
-        yield replace(_report_channel(choice), ok=False, changes=(f"{CONTROL}={FUSES_POSITION}",), exit_code=1)
+    elif AGP_CONTROL in reading.parameters:
+        yield replace(_report_channel(choice), ok=False, changes=(f"{AGP_CONTROL}={POSITION_BIT}",), exit_code=1)
         choice = replace(choice, channel=Channel.SENSOR)  # for the other parameters that it will need
     elif reading.kind is VehicleKind.PLANE:
         yield _report_channel(choice)
     else:
         vision_control = reading.parameters.get(VISION_CONTROL) or None
         figures = {"receiver_type": None, "parameter": VISION_CONTROL, "value": vision_control}
-        change = f"{VISION_CONTROL}={FUSES_POSITION}"
+        change = f"{VISION_CONTROL}={POSITION_BIT}"
         yield report_fault("channel", FindingCode.NOT_CARRIED, change, vehicle=reading.vehicle, **figures)
     yield from _check_parameters(PX4_TABLE, choice, reading)
     yield _check_port(reading, "MAV_PROTO_VER=2")

@@ -4,7 +4,7 @@ import pytest
 from fakes import FakeSource
 from flights import of_kind, pictures
 
-from edgevpr.mavlink.ground import Wish
+from edgevpr.mavlink.ground import UserCommand
 from edgevpr.runtime.flight import systemd
 
 
@@ -14,7 +14,7 @@ def queries(lines):
 
 def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_picture(make_flight, clock, link):
     answers, health = [], []
-    wishes = {2: Wish.PAUSE, 5: Wish.RESUME}
+    wishes = {2: UserCommand.PAUSE, 5: UserCommand.RESUME}
 
     def work():
         health.append(link.health.name)
@@ -35,8 +35,8 @@ def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_pict
 
 def test_a_recording_waits_while_paused(make_flight, clock, link):
     flown = make_flight()
-    source = FakeSource(pictures(3), clock, is_live=False, work=lambda: link.wish(Wish.PAUSE))
-    clock.at(30.0, lambda: link.wish(Wish.RESUME))
+    source = FakeSource(pictures(3), clock, is_live=False, work=lambda: link.wish(UserCommand.PAUSE))
+    clock.at(30.0, lambda: link.wish(UserCommand.RESUME))
     clock.at(60.0, flown.stop)
     started_s = clock.now_s
     lines = flown.fly(source)
@@ -50,7 +50,7 @@ def test_while_paused_the_watchdog_is_fed_and_the_status_says_so(make_flight, cl
     monkeypatch.delenv("WATCHDOG_PID", raising=False)
     assert systemd.watchdog_interval_s() == 1.0
     monkeypatch.setattr(systemd, "notify", lambda **said: told.append(said))
-    source = FakeSource(pictures(9), clock, work=lambda: link.wish(Wish.PAUSE))
+    source = FakeSource(pictures(9), clock, work=lambda: link.wish(UserCommand.PAUSE))
     lines = make_flight().fly(source)
     assert queries(lines) == ["frame 000000"]
     assert sum("WATCHDOG" in each for each in told) == 9

@@ -154,7 +154,7 @@ def test_a_continuous_position_comes_ten_times_a_second_and_does_not_jump():
     beyond_m = []
     for (_, one), (_, other) in pairwise(states):
         east_m, north_m = np.array(other.velocity_m_s[:2]) * 0.1
-        carried = navigator.moved(one.lat_deg, one.lon_deg, east_m, north_m)
+        carried = navigator.offset_position(one.lat_deg, one.lon_deg, east_m, north_m)
         beyond_m.append(float(distance_m(*carried, other.lat_deg, other.lon_deg)))
     assert max(beyond_m) < 0.5
     accuracies_m = [state.accuracy_m / LIKE_ONE for _, state in states]

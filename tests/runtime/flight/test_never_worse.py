@@ -3,7 +3,7 @@
 import pytest
 from closed_loop import ClosedLoop
 
-from edgevpr.mavlink.ground import Wish
+from edgevpr.mavlink.ground import UserCommand
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.flight.output import Output
 
@@ -136,7 +136,7 @@ def test_paused_flight_sends_no_position_on_any_channel(vehicle, parameters):
         flight.command(mavlink.MAV_CMD_SET_EKF_SOURCE_SET, 2)
     paused_s = flight.fly(20).now_s
     assert flight.positions_sent(paused_s - 10)
-    assert flight.ask(mavlink.MAV_CMD_USER_1, Wish.PAUSE) == mavlink.MAV_RESULT_ACCEPTED
+    assert flight.ask(mavlink.MAV_CMD_USER_1, UserCommand.PAUSE) == mavlink.MAV_RESULT_ACCEPTED
     flight.fly(10)
     assert not flight.positions_sent(paused_s)
 

@@ -7,7 +7,7 @@ import pytest
 from fakes import receiver_at, vehicle_at
 
 from edgevpr.core.geodesy import offset_position
-from edgevpr.mavlink.messages import TEXT_BYTES
+from edgevpr.mavlink.messages import MAX_TEXT_BYTES
 from edgevpr.runtime.flight.output import Output, OutputWatch
 
 HOME = 50.0, 8.0
@@ -81,4 +81,4 @@ def test_positions_are_withdrawn_until_a_match_or_gps_proves_them(known, output)
 
 @pytest.mark.parametrize("output", Output)
 def test_text_of_an_output_fits_a_status_text(output):
-    assert len(f"edgevpr: {output.text}") <= TEXT_BYTES
+    assert len(f"edgevpr: {output.text}") <= MAX_TEXT_BYTES

@@ -8,7 +8,7 @@ from air import Air
 from fakes import FakeClock, FakeLink, to_autopilot
 
 from edgevpr.core.config import SourceSetsConfig
-from edgevpr.mavlink.messages import SOURCE_SET, Health
+from edgevpr.mavlink.messages import SET_SOURCE_SET, Health
 from edgevpr.power.meter import MachineLoad
 from edgevpr.runtime.flight.autopilot import SourceSets
 from edgevpr.runtime.flight.navigator import Navigator
@@ -29,7 +29,7 @@ class Flown(Air):
         self.clock, self.asked = FakeClock(0.0), []
         self.link = FakeLink(self.clock, vehicle=lambda: self.vehicle)
         stats = self.link.stats
-        self.link.stats = lambda: replace(stats(), answered_s={SOURCE_SET: self.asked[-1][0]} if self.asked else {})
+        self.link.stats = lambda: replace(stats(), answered_s={SET_SOURCE_SET: self.asked[-1][0]} if self.asked else {})
         self.autopilot = to_autopilot(self.link, self.navigator, self.clock, **settings)
         super().fly(20)
 
@@ -41,7 +41,7 @@ class Flown(Air):
             self.autopilot.report(Health.ACTIVE, LOAD, None)
             commands = [each for each in self.link.sent if each.get_type() == "COMMAND_LONG"]
             to = {(each.command, each.target_system, each.target_component) for each in commands}
-            assert to <= {(SOURCE_SET, 1, 1)}
+            assert to <= {(SET_SOURCE_SET, 1, 1)}
             self.asked += [(self.t_s, int(each.param1)) for each in commands]
         return self
 
