@@ -49,9 +49,9 @@ def test_in_flight_a_fix_held_back_is_in_the_log_and_the_ground_is_told_once(rec
 def compared(off_m, t_s, places=1, *, path_m=0.0, expected_m=0.0, turn_deg=None):
     """A fix off to the east, whose covariance is 5.5 m2 and that of its prediction 30.5 m2: together 6 m."""
     places = places if isinstance(places, tuple) else (places,)
-    frame = FrameMeasurement(t_s=float(t_s), sd_m=0.0)
+    frame = FrameMeasurement(t_s=START_S + t_s, sd_m=0.0)
     said = {"position": Position(*HOME), "accuracy_m": 1.0, "places": places, "turn_deg": turn_deg}
-    path, off, expected = (np.array([each, 0.0]) for each in (path_m, off_m, expected_m))
+    path, off, expected = (np.array([each, 0.0]) for each in (700.0 + path_m, off_m, expected_m))
     seen = PositionedMatch(frame=frame, covariance_m2=5.5 * np.eye(2), **said)
     return ComparedFix(seen=seen, path_m=path, off_m=off, expected_m=expected, covariance_m2=30.5 * np.eye(2))
 
@@ -109,20 +109,20 @@ def test_consistency_believes_no_fix_against_gps():
     for second in range(6):
         why = judge.judge(compared(500.0, second, second), has_gps=True, is_followed=False).why
         assert why == Reason(ReasonCode.HELD_OFF_GPS, {"off_m": 500.0})
-    assert not judge.is_contradicted(5.0, is_followed=False)
+    assert not judge.is_contradicted(START_S + 5, is_followed=False)
 
 
 @pytest.mark.parametrize(("is_followed", "good_for_s"), [(True, 2.5), (False, 30.0)])
 def test_consistency_is_in_doubt_until_another_should_have_agreed(is_followed, good_for_s):
     judge = Consistency()
-    assert not judge.is_contradicted(0.0, is_followed)
+    assert not judge.is_contradicted(START_S, is_followed)
     for t_s in range(8):
         why = judge.judge(compared(-100, t_s), has_gps=False, is_followed=is_followed).why
         assert why == Reason(ReasonCode.HELD_OFF_PATH, {"off_m": 100.0, "accuracy_m": math.sqrt(30.5)})
-    assert judge.is_contradicted(7 + good_for_s, is_followed)
-    assert not judge.is_contradicted(7.1 + good_for_s, is_followed), "no other has agreed"
+    assert judge.is_contradicted(START_S + 7 + good_for_s, is_followed)
+    assert not judge.is_contradicted(START_S + 7.1 + good_for_s, is_followed), "no other has agreed"
     assert judge.judge(compared(0.0, 9), has_gps=False, is_followed=is_followed).why is None
-    assert not judge.is_contradicted(9.0, is_followed)
+    assert not judge.is_contradicted(START_S + 9, is_followed)
 
 
 @pytest.mark.parametrize(("before_deg", "turn_deg"), [(100.0, 0.0), (0.0, 100.0)])

@@ -7,7 +7,7 @@ import pytest
 from fakes import receiver_at, vehicle_at
 
 from edgevpr.core.geodesy import offset_position
-from edgevpr.mavlink.messages import MAX_TEXT_BYTES
+from edgevpr.mavlink.messages import MAX_TEXT_BYTES, Severity
 from edgevpr.runtime.flight.output import Output, OutputWatch
 
 HOME = 50.0, 8.0
@@ -23,7 +23,8 @@ def withdrawn(*reports):
     for after_s, known in reports:
         known = {"off_m": 0.0, "ratio": 0.1, "has_gps": True, "sd_m": 1.0, "steady_s": 60.0} | known
         t_s, has_gps = BEGIN_S + after_s, known["has_gps"]
-        watch.record_sent(t_s - known.get("sent_ago_s", 0.0))
+        if known.get("sent_ago_s") != math.inf:
+            watch.record_sent(t_s - known.get("sent_ago_s", 0.0))
         receiver = receiver_at(HOME, known["sd_m"], t_s, steady_for_s=known["steady_s"]) if has_gps else None
         vehicle = vehicle_at(*offset_position(*HOME, known["off_m"], 0.0), t_s, has_gps=has_gps, gps=receiver)
         fixed_s = t_s - known.get("fixed_ago_s", math.inf)
@@ -43,6 +44,7 @@ def withdrawn(*reports):
         (2.0, AWAY | {"steady_s": 2.9}, None),
         (2.0, AWAY | {"sent_ago_s": 10.0}, Output.LEADS_AWAY),
         (2.0, AWAY | {"sent_ago_s": 10.1}, None),
+        (2.0, AWAY | {"sent_ago_s": math.inf}, None),
         (2.0, AWAY | {"fixed_ago_s": 5.0}, None),
         (2.0, AWAY | {"fixed_ago_s": 5.1}, Output.LEADS_AWAY),
         (2.0, AWAY | {"has_gps": False}, None),
@@ -81,4 +83,5 @@ def test_positions_are_withdrawn_until_a_match_or_gps_proves_them(known, output)
 
 @pytest.mark.parametrize("output", Output)
 def test_text_of_an_output_fits_a_status_text(output):
+    assert isinstance(output.severity, Severity)
     assert len(f"edgevpr: {output.text}") <= MAX_TEXT_BYTES
