@@ -113,7 +113,7 @@ def test_landmark_matches_one_that_differs_in_a_quarter_of_its_bits(bits, matche
     flipped = np.unpackbits(query.bits[3])
     flipped[:bits] ^= 1
     query.bits[3] = np.packbits(flipped)
-    other_order = Landmarks(*(np.roll(getattr(place, name), 1, axis=0)[1:] for name in Landmarks.__slots__))
+    other_order = Landmarks(*(np.roll(getattr(place, name), 2, axis=0)[1:] for name in Landmarks.__slots__))
     assert measure_agreement(query, other_order).matched == 8 + matches
 
 
@@ -141,7 +141,7 @@ def test_three_landmarks_agree(count, inliers):
 
 def test_landmarks_on_one_spot_do_not_agree():
     """What a damaged map may hold."""
-    spot, points = landmarks([0.0] * 20), landmarks(ring(20))
+    spot, points = landmarks([0.1] * 20), landmarks(ring(20, 0.2, middle=0.1))
     for expected in (None, SAME):
         assert measure_agreement(spot, points, expected).inliers == 0
         assert measure_agreement(points, spot, expected).inliers == 0
