@@ -144,7 +144,7 @@ def _compare_among(
         if len(slots):
             among = index.only(slots)
             query = Query(technique=technique, descriptor=descriptor, place_map=place_map, index=among)
-            for at, match in compare(query, scan(query), technique.candidates).compared.items():
+            for at, match in compare(query, scan(query), technique.candidates, 0.0).compared.items():
                 yield int(slots[at]), log_share(compute_share(match))
 
 

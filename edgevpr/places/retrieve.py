@@ -103,7 +103,7 @@ def scan(query: Query) -> Scan:
     return technique.coarse_scores(query.descriptor, index.rows, index.mean, **hints)
 
 
-def compare(query: Query, scanned: Scan, candidates: int | None = None, apart_m: float = 0.0) -> Ranking:
+def compare(query: Query, scanned: Scan, candidates: int | None, apart_m: float) -> Ranking:
     """Compare the `candidates` places that have the best scan scores with the query, and rank them.
 
     Of more than the technique's `in_full`, only those with the best `Technique.glance` are compared in full. Among

@@ -13,7 +13,14 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.places import retrieve
 from edgevpr.places.index import bytes_per_place, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Query, load_candidates, margin, outside_neighbourhood, unmoved_outside_neighbourhood
+from edgevpr.places.retrieve import (
+    Query,
+    load_candidates,
+    margin,
+    outside_neighbourhood,
+    times_as_many,
+    unmoved_outside_neighbourhood,
+)
 
 
 @pytest.fixture(scope="module")
@@ -202,6 +209,11 @@ def test_in_a_large_map_more_are_compared_where_no_heading_is_known(ruler_map, m
     assert sum(len(hypotheses) for hypotheses in technique.tried) == compared
 
 
+def test_more_are_compared_from_two_thousand_places_on():
+    assert [times_as_many(True, places) for places in (1999, 2000)] == [1, 1.6]
+    assert times_as_many(False, 2000) == 1
+
+
 def test_a_ranking_says_how_many_rotations_were_not_ruled_out(ruler_map):
     _, place_map = ruler_map
 
@@ -323,8 +335,9 @@ def test_a_few_places_all_over_the_map_are_asked_unmoved(ruler):
     technique = Unmoved()
     query = Query(technique=technique, descriptor=technique.encode(0), place_map=place_map, index=index)
     place_map.left_out[25] = "gone"
-    asked = [match.score for match in unmoved_outside_neighbourhood(query, 0, 100.0)]
-    assert asked == list(range(12, 96, 12)), "of 21 places outside_neighbourhood that can be read, every third"
+    for apart_m, numbers in ((200.0, range(20, 96, 12)), (250.0, range(24, 96, 8))):
+        asked = [match.score for match in unmoved_outside_neighbourhood(query, 0, apart_m)]
+        assert asked == list(numbers), "of 19 and 18 places that can be read nine at most"
     place_map.left_out[16] = "gone"
     assert unmoved_outside_neighbourhood(query, 0, 1e6) == [], "the only one outside_neighbourhood cannot be read"
     assert unmoved_outside_neighbourhood(query, 15, 1e6)[0].score == 0.0, "only neighbours of one without a position"
