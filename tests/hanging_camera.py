@@ -42,7 +42,7 @@ class HangingCapture:
         if self._number > _PICTURES and _STEP in ("read", "release"):
             return hang() if _STEP == "read" else None
         picture = textured(next(_SEEDS), 240, 320)
-        return Shot(t_mono_s=time.monotonic(), look=picture[::4, ::4], pixels=lambda: self._pixels(picture))
+        return Shot(t_mono_s=time.monotonic(), thumbnail=picture[::4, ::4], convert=lambda: self._pixels(picture))
 
     def _pixels(self, picture):
         if self._number > _PICTURES and _STEP == "pixels":

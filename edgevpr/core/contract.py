@@ -169,7 +169,7 @@ class Perspective:
 
 class Technique(Protocol):
     """A technique of place recognition: it describes pictures (`encode`), and compares a query with all places by their
-    coarse parts (`coarse_scores`), then with some by their fine parts (`match`). Needed only with the ability:
+    coarse parts (`score_places`), then with some by their fine parts (`match`). Needed only with the ability:
     `match` with `spec.fine`, `pack` with `spec.packed`, `score_quickly` with `spec.in_full`, `match_rotated`,
     `match_at_rest` and `measure_perspective` with `spec.looks_down`."""
 
@@ -186,7 +186,7 @@ class Technique(Protocol):
         """Pack coarse parts (N, *coarse.shape) to rows of the index (N, *row.shape). `mean`, of `coarse.shape`, is the
         mean of all coarse parts of the map."""
 
-    def coarse_scores(
+    def score_places(
         self,
         query: Descriptor,
         rows: np.ndarray,
@@ -206,7 +206,7 @@ class Technique(Protocol):
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None) -> FineMatch:
         """Compare the query with the fine part of one place under `hypotheses` (None: all). These are numbers from 0 to
-        H - 1, the columns of the scores of hypotheses that `coarse_scores` returns."""
+        H - 1, the columns of the scores of hypotheses that `score_places` returns."""
 
     def score_quickly(
         self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None

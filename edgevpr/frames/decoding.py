@@ -1,6 +1,5 @@
-"""Decoding of streams and video files with FFmpeg (PyAV), which reports lost packets and incomplete pictures, as OpenCV
-does not. Imported only when a stream or video file is opened, because the library takes memory.
-"""
+"""Decoding of streams and video files with FFmpeg (PyAV), which unlike OpenCV reports lost packets and incomplete
+pictures. Imported only when a stream or video file is opened, because the library takes memory."""
 
 import errno
 import logging
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 av.logging.set_level(av.logging.WARNING)
 av.logging.set_skip_repeated(False)
 logging.getLogger("libav").setLevel(logging.CRITICAL + 1)
-_LOSS_WORD = "missed"  # "RTP: missed 3 packets", the only sign of it
+_LOSS_WORD = "missed"  # "RTP: missed 3 packets" is the only sign of a loss
 
 _DOUBTFUL_PACKETS = 2  # after a sign of loss: this packet and the next
 _NO_STAMPS_FLAG = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: the time stamps are made up from a frame rate
@@ -47,17 +46,17 @@ _ERRNO_CAUSES = {
 
 
 class TransportError(OpeningError):
-    """The camera refuses the transport that was requested for RTSP."""
+    """The camera refuses the requested RTSP transport."""
 
 
 class TimedPacket(NamedTuple):
-    """A packet of a stream. `is_doubtful`: packets before it may be missing. `asked_s`, `came_s`: when the call that
-    fetched it began and returned (seconds, monotonic). `is_after_gap`: packets before it were dropped here."""
+    """A packet of a stream. `is_doubtful`: packets before it may be missing. `request_s`, `arrival_s`: when the call
+    that fetched it began and returned (seconds, monotonic). `is_after_gap`: packets before it were dropped here."""
 
     packet: "Packet[Any]"
     is_doubtful: bool = False
-    asked_s: float = 0.0
-    came_s: float = 0.0
+    request_s: float = 0.0
+    arrival_s: float = 0.0
     is_after_gap: bool = False
 
 
@@ -69,7 +68,7 @@ def open_decoder(
     file: "ResponseFile | None" = None,
 ) -> "VideoDecoder":
     """Open the stream or file `uri` with `options` of FFmpeg. `timeouts_s`: time limits in seconds for opening it and
-    for each read (None: no limits). `form`: name of its format (None: FFmpeg finds out). `file`: an open file that is
+    for each read (None: no limits). `form`: name of its format (None: FFmpeg detects it). `file`: an open file that is
     read instead, and closed. Raises OpeningError with the cause if it cannot be opened or has no pictures."""
     with av.logging.Capture() as logged:
         try:
@@ -93,9 +92,8 @@ def _has_loss(logged: list[tuple[int, str, str]]) -> bool:
 
 
 def _explain_failure(uri: str, error: Exception, messages: list[str], timeout_s: float) -> OpeningError:
-    """Return the error with the cause why FFmpeg could not open `uri` in `timeout_s` seconds. `messages`: what FFmpeg
-    logged meanwhile; some causes are found only there. The cause never contains the address, which may hold a password.
-    """
+    """Return the error that says why FFmpeg could not open `uri` in `timeout_s` seconds. Some causes are found only in
+    the `messages` that FFmpeg logged. The text never contains the address, which may hold a password."""
     text = "\n".join(messages)
     if "SETUP failed: 461" in text or "Nonmatching transport" in text:
         return TransportError("transport refused (461)")
@@ -104,12 +102,12 @@ def _explain_failure(uri: str, error: Exception, messages: list[str], timeout_s:
 
 def _find_cause(uri: str, error: Exception, text: str, timeout_s: float) -> str:
     if host := _UNKNOWN_HOST_PATTERN.search(text):
-        if uri.count("@") > 1:  # then the host may be a part of the password
+        if uri.count("@") > 1:  # the host may be a part of the password
             return "no such host: percent-encode the password's special characters, such as @ as %40"
         return f"no such host {host[1]}"
     if isinstance(error, (av.HTTPClientError, av.HTTPServerError)):
-        found = _STATUS_PATTERN.search(f"{text}\n{error}")
-        status = found[1] if found else "HTTP"
+        code = _STATUS_PATTERN.search(f"{text}\n{error}")
+        status = code[1] if code else "HTTP"
         if status == "401":
             if "@" not in urlsplit(uri).netloc:
                 return "password needed (401): write USER:PASSWORD@ before the host"
@@ -127,12 +125,12 @@ def _find_cause(uri: str, error: Exception, text: str, timeout_s: float) -> str:
 
 
 class VideoDecoder:
-    """The complete pictures of one stream or file: `fetch` a packet, then `decode` it. A damaged picture is rejected,
-    and so are all pictures after it up to the next key frame, which is decoded without others.
+    """Decodes the complete pictures of one stream or file: `fetch` a packet, then `decode` it. A damaged picture is
+    rejected, and so are all after it up to the next key frame, which needs no other picture.
 
-    `is_cancelled`: set it to end a `fetch` in another thread with the next packet, be it of sound.
-    `is_backlog_doubtful`: FFmpeg reported lost packets while it read ahead, as it does when it opens a stream. It does
-    not say which: all are rejected until this is set to False."""
+    `is_cancelled`: set it to end a `fetch` in another thread with the next packet, even one of sound.
+    `is_backlog_doubtful`: FFmpeg reported lost packets while it read ahead at the opening. It does not say which ones:
+    all are rejected until this is set to False."""
 
     def __init__(
         self, container: "InputContainer", is_backlog_doubtful: bool, file: "ResponseFile | None" = None
@@ -153,7 +151,7 @@ class VideoDecoder:
 
     @property
     def facts(self) -> StreamFacts:
-        """What the stream states of its pictures; known once one is decoded."""
+        """The stream's own description of its pictures; known once one is decoded."""
         aspect, rate = self._codec.sample_aspect_ratio, self.stream.average_rate
         return StreamFacts(
             width_px=self._codec.width,
@@ -167,28 +165,28 @@ class VideoDecoder:
     def fetch(self) -> TimedPacket | None:
         """Wait for the next packet and return it; None at the end of the file, or if the stream is lost. One thread may
         fetch while another one decodes."""
-        ours = self.stream.index
+        index = self.stream.index
         with av.logging.Capture() as logged:
             try:
-                packet = next((each for each in self._packets if self.is_cancelled or each.stream.index == ours), None)
+                packets = (packet for packet in self._packets if self.is_cancelled or packet.stream.index == index)
+                packet = next(packets, None)
             except (av.FFmpegError, OSError):
                 return None
         if packet is None or self.is_cancelled:
             return None
         if packet.is_corrupt or _has_loss(logged):
-            # FFmpeg reports a gap while it assembles the picture after the one that it returns.
+            # FFmpeg reports a gap while it assembles the picture after the one it returns.
             self._doubtful = _DOUBTFUL_PACKETS
         self._doubtful -= 1
         return TimedPacket(packet, self._doubtful >= 0)
 
     def skip(self) -> Refusal:
         """Reject the packet just fetched without decoding it, and all after it up to the next key frame. Returns the
-        reason of the rejection: LATE, or that of an earlier rejection which still lasts."""
+        reason: LATE, or that of an earlier rejection that still lasts."""
         return self._refuse(Refusal.LATE)
 
     def decode(self, fetched: TimedPacket) -> "list[VideoFrame] | Refusal":
-        """Return the pictures that are complete after this packet (none, one, or at the end several), or the reason why
-        it is rejected."""
+        """Return the pictures that this packet completes (none, one, or at the end several), or why it is rejected."""
         packet = fetched.packet
         if not packet.size:
             return [] if self._refusal else self._decode_packet(packet)
@@ -200,21 +198,21 @@ class VideoDecoder:
             if self._has_begun:
                 self._codec.flush_buffers()
             self._refusal, self._has_begun = None, True
-        # Changed bytes within a JPEG are detected only if they are invalid or data run out. Most are valid and give a
-        # picture whose remainder is shifted or brighter, but that contains nothing of an older picture.
+        # Changed bytes within a JPEG are detected only if they are invalid or the data end early. Most are valid: the
+        # rest of the picture is shifted or brighter, but contains nothing of an older one.
         if self._codec.name == "mjpeg" and not is_whole_jpeg(bytes(packet)):
             return self._refuse()
         return self._decode_packet(packet)
 
-    def look(self, picture: "VideoFrame") -> Image:
-        """Return a coarse grey copy of a picture, see `Shot.look`."""
-        return self._converter.look(picture)
+    def make_thumbnail(self, picture: "VideoFrame") -> Image:
+        """Return a coarse grey copy of a picture, see `Shot.thumbnail`."""
+        return self._converter.make_thumbnail(picture)
 
-    def conversion(self, picture: "VideoFrame") -> Callable[[], Image]:
-        """Return a function that converts a picture to pixels, uint8 (H, W, 3) BGR or (H, W) grey. Another thread may
-        call it. Maps and queries are both converted here, so that equal pictures give equal pixels."""
+    def prepare_conversion(self, picture: "VideoFrame") -> Callable[[], Image]:
+        """Return a function that converts a picture to pixels, uint8 (H, W, 3) BGR or (H, W) grey; any thread may call
+        it. Maps and queries are both converted here, so that equal pictures give equal pixels."""
         aspect = self._codec.sample_aspect_ratio or self.stream.sample_aspect_ratio
-        return self._converter.conversion(picture, float(aspect or 1))
+        return self._converter.prepare_conversion(picture, float(aspect or 1))
 
     def close(self) -> None:
         """Close the file or the connection."""

@@ -1,7 +1,6 @@
-"""Pictures of more than 8 bits a channel, such as those of thermal cameras. They hold counts, of which a scene takes a
-small part somewhere in the middle: the upper 8 bits alone would show nothing. Streams, video files and folders of
-images are all read as defined here, so that a map and a flight show the same.
-"""
+"""Pictures of more than 8 bits a channel, such as those of thermal cameras. A scene takes a small part of their range
+of counts, somewhere in the middle: the upper 8 bits alone would show nothing. Streams, video files and folders of
+images are all converted here, so that a map and a flight show the same."""
 
 from typing import TypeAlias
 
@@ -14,11 +13,11 @@ from edgevpr.frames.shot import make_thumbnail
 Counts: TypeAlias = NDArray[np.uint16]
 Limits: TypeAlias = tuple[int, int]  # the counts that become grey levels 0 and 255
 
-_RANGE_PERCENTILES = (1.0, 99.0)  # dead pixels and small hot spots are outside
-_MIN_SPAN_COUNTS = 64  # a picture of sensor noise only stays flat
-_PICTURES_TO_FOLLOW = 30  # time constant: what passes through a picture does not change the grey levels of the rest
-_MAX_CLIPPED_SHARE = 0.25  # of a picture; with more outside the range, the camera or the scene is another one
-_MIN_USED_SHARE = 0.25  # of the range that a picture must use, else it would have too little contrast
+_RANGE_PERCENTILES = (1.0, 99.0)  # dead pixels and small hot spots lie outside
+_MIN_SPAN_COUNTS = 64  # so that a picture of sensor noise alone stays flat
+_TIME_CONSTANT_PICTURES = 30  # so long that a passing object does not change the grey levels of the rest
+_MAX_CLIPPED_SHARE = 0.25  # of a picture; with more outside the range, the camera or the scene has changed
+_MIN_USED_SHARE = 0.25  # of the range; a picture that uses less would have too little contrast
 
 
 class DepthRange:
@@ -29,14 +28,14 @@ class DepthRange:
         self._high = 0.0
 
     def update(self, counts: Counts) -> Limits:
-        """Return the range to show this picture with, uint16 (H, W[, C]). It begins with the picture's own range, and
-        does so again when a picture does not fit."""
+        """Return the range in which to show this picture, uint16 (H, W[, C]): at first, and when a picture does not fit
+        the range, the picture's own."""
         sample = make_thumbnail(counts)
         low, high = _find_limits(sample)
         clipped_share = float(((sample < self._low) | (sample > self._high)).mean())
         has_contrast = high - low >= _MIN_USED_SHARE * (self._high - self._low)
         is_known = self._high > 0 and has_contrast and clipped_share <= _MAX_CLIPPED_SHARE
-        gain = 1 / _PICTURES_TO_FOLLOW if is_known else 1.0
+        gain = 1 / _TIME_CONSTANT_PICTURES if is_known else 1.0
         self._low += gain * (low - self._low)
         self._high += gain * (high - self._high)
         return round(self._low), round(self._high)

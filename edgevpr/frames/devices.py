@@ -1,4 +1,4 @@
-"""V4L2 cameras: opening one, and the cause if that fails; the pictures of one."""
+"""V4L2 cameras: opens one, with the cause if that fails, and reads its pictures."""
 
 import contextlib
 import errno
@@ -51,8 +51,8 @@ def _find_cause(path: str) -> str:
     finally:
         os.close(device)
     if not int.from_bytes(capabilities[_DEVICE_CAPABILITIES], "little") & _VIDEO_CAPTURE:
-        return "this node of the camera has no pictures: give another one of its /dev/video numbers"
-    return "in use by another program, or in no format that OpenCV reads"
+        return "this /dev/video number of the camera gives no pictures: use another of its numbers"
+    return "in use by another program, or in a format that OpenCV cannot read"
 
 
 class DeviceCapture:
@@ -66,17 +66,17 @@ class DeviceCapture:
 
     def read(self) -> Shot | None:
         with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
-            asked_s = self._clock()
+            request_s = self._clock()
             is_read, picture = self._capture.read()
             if is_read:
-                came_s = self._clock()
-                sd_s = self._time.taken(asked_s, came_s).sd_s
-                look, pixels = self._prepare(picture)
-                return Shot(t_mono_s=came_s, t_sd_s=sd_s, look=look, pixels=pixels)
+                arrival_s = self._clock()
+                sd_s = self._time.estimate(request_s, arrival_s).sd_s
+                thumbnail, convert = self._prepare(picture)
+                return Shot(t_mono_s=arrival_s, t_sd_s=sd_s, thumbnail=thumbnail, convert=convert)
         return None
 
     def _prepare(self, picture: Array) -> tuple[Image, Callable[[], Image]]:
-        """Return the coarse copy of a picture, and what converts the picture."""
+        """Return the coarse copy of a picture, and a function that converts it to pixels."""
         if picture.dtype == np.uint16:
             counts = np.asarray(picture, np.uint16)
             limits = self._depth.update(counts)
@@ -85,7 +85,7 @@ class DeviceCapture:
         return make_thumbnail(image if image.ndim == 2 else image[:, :, 1]), lambda: image
 
     def cancel(self) -> None:
-        """Do nothing: OpenCV's wait for a picture cannot be ended, and lasts ten seconds at most."""
+        """Do nothing: OpenCV's wait for a picture cannot be interrupted, and lasts ten seconds at most."""
 
     def release(self) -> None:
         self._capture.release()

@@ -1,5 +1,5 @@
-"""Data that the camera wrote into an image file: position, heading and time from EXIF, roll, pitch and height from XMP.
-Used for the images of a folder without a positions.csv."""
+"""Reads what the camera wrote into an image file: position, heading and time from EXIF, roll, pitch and height from
+XMP. Used for images without a line in a positions.csv."""
 
 import contextlib
 import logging
@@ -18,15 +18,15 @@ Tags = Mapping[str, Any]  # values of exifread by their names, such as "GPS GPSL
 
 _FILM_DIAGONAL_MM = 43.27
 _MAX_SIDE_SHARE = 0.82  # of the diagonal
-_HEAD_BYTES = 300_000  # in a JPEG the XMP stands before the picture, behind EXIF data of 64 KB at most
-# A value in XMP, as an attribute or an element, of DJI, Parrot, Skydio, Autel (`drone`) or Pix4D (`Camera`).
+_HEAD_BYTES = 300_000  # in a JPEG the XMP comes before the picture, after at most 64 KB of EXIF data
+# A value in XMP, an attribute or an element, of DJI, Parrot, Skydio, Autel (`drone`) or Pix4D (`Camera`).
 _XMP_PATTERN = re.compile(
     rb"""\b((?:drone(?:-dji|-parrot|-skydio)?|Camera):\w+)(?:\s*=\s*["']|>)\s*([-+.\deE]+)\s*["'<]"""
 )
 _GIMBAL_NAMES = (
     "drone-dji:Gimbal{}Degree", "drone:Gimbal{}Degree", "drone-parrot:Camera{}Degree", "NED drone-skydio:{}"
 )  # fmt: skip
-# Skydio gives the same names to the angles of several frames: those against north, east and down count.
+# Skydio uses the same names for the angles in several coordinate frames; those in north, east and down count.
 _SKYDIO_PATTERN = re.compile(
     rb"<drone-skydio:CameraOrientationNED\b(.*?)(?:/>|</drone-skydio:CameraOrientationNED)", re.DOTALL
 )
@@ -38,30 +38,29 @@ def read_exif(path: str | Path) -> GeoTag:
     time zone. Heading, roll, pitch and height are those of `read_xmp`, else the heading is that of EXIF."""
     tags, xmp = _read_tags(path), read_xmp(path)
 
-    def first(*readers: Callable[[Tags], T]) -> T | None:
+    def read_first(*readers: Callable[[Tags], T]) -> T | None:
         for read in readers:
             with contextlib.suppress(Exception):  # a tag may be absent, impossible, of another type, or divide by zero
                 return read(tags)
         return None
 
-    position, alt_m = first(_read_position), first(_read_alt_m)
+    position, alt_m = read_first(_read_position), read_first(_read_alt_m)
     return replace(
         xmp,
         position=position and replace(position, alt_m=alt_m),
-        heading_deg=first(_read_heading_deg) if xmp.heading_deg is None else xmp.heading_deg,
-        t_utc_s=first(_read_gps_time_s, _read_camera_time_s),
+        heading_deg=read_first(_read_heading_deg) if xmp.heading_deg is None else xmp.heading_deg,
+        t_utc_s=read_first(_read_gps_time_s, _read_camera_time_s),
     )
 
 
 def read_fov_deg(path: str | Path) -> float | None:
-    """Return about how wide the lens sees along the longest side of a picture, by the focal length in its EXIF data
-    that gives the same view on film of 36 x 24 mm. The views are compared along the diagonal (CIPA DCG-001). None: the
-    EXIF data do not say it. Never raises."""
+    """Return the approximate field of view along the longest side of a picture, by the 35 mm equivalent focal length in
+    its EXIF data, which compares views along the diagonal (CIPA DCG-001); None if there is none. Never raises."""
     with contextlib.suppress(Exception):
         tags = _read_tags(path)
         focal_mm = float(tags["EXIF FocalLengthIn35mmFilm"].values[0])
         sides = [float(tags[f"EXIF ExifImage{side}"].values[0]) for side in ("Width", "Length")]
-        # Wider pictures than the sensors of 4:3 and 3:2 are cut out of theirs, and as long.
+        # Pictures wider than 4:3 and 3:2 are cut out of the sensor's, and as long.
         longest = min(max(sides) / math.hypot(*sides), _MAX_SIDE_SHARE)
         return _require_range(math.degrees(2 * math.atan(_FILM_DIAGONAL_MM * longest / 2 / focal_mm)), 5, 150)
     return None
@@ -92,7 +91,7 @@ def _read_position(tags: Tags) -> Position | None:
 
 def _read_degrees(tags: Tags, name: str, signs: dict[str, int], limit: float) -> float:
     degrees, minutes, seconds = map(float, tags[name].values)
-    # 60 is allowed: 59.99999 may have been rounded to it.
+    # 60 is allowed: it may be a rounded 59.99999.
     value = (
         _require_range(degrees, 0, limit) + _require_range(minutes, 0, 60) / 60 + _require_range(seconds, 0, 60) / 3600
     )
@@ -100,7 +99,7 @@ def _read_degrees(tags: Tags, name: str, signs: dict[str, int], limit: float) ->
 
 
 def _read_alt_m(tags: Tags) -> float:
-    # 0 is above and 1 below sea level; 2 and 3 (EXIF 3.0) are relative to the ellipsoid: not usable here.
+    # 0 is above and 1 below sea level; 2 and 3 (EXIF 3.0) refer to the ellipsoid and are not used.
     reference = tags["GPS GPSAltitudeRef"].values[0] if "GPS GPSAltitudeRef" in tags else 0
     return _require_range({0: 1, 1: -1}[reference] * float(tags["GPS GPSAltitude"].values[0]), *ALT_LIMITS_M)
 
@@ -128,15 +127,16 @@ def _read_camera_time_s(tags: Tags) -> float:
 
 
 def _parse_time_s(text: str) -> float:
-    if ":" not in text:  # it would be seconds, which EXIF does not have
+    if ":" not in text:  # seconds, which EXIF does not have
         raise ValueError(text)
     return parse_time(text)
 
 
 def read_xmp(path: str | Path) -> GeoTag:
-    """Read the XMP tags of DJI, Autel, Parrot, Skydio and Pix4D from the first 300 KB of a file. Never raises: a value
-    that is absent, damaged or impossible is None. The heading is that of the picture's top, else of the aircraft's
-    nose. Roll and pitch are the camera's deviation from straight down. The height is over the take-off point."""
+    """Read the XMP tags of DJI, Autel, Parrot, Skydio and Pix4D from the first 300 KB of a file. Never raises: a
+    value that is absent, damaged or impossible is None. The heading is that of the picture's top, else of the
+    aircraft's nose. Roll and pitch are the camera's deviation from straight down. The height is over the take-off
+    point."""
     head = b""
     with contextlib.suppress(OSError), open(path, "rb") as handle:
         head = handle.read(_HEAD_BYTES)
@@ -145,11 +145,11 @@ def read_xmp(path: str | Path) -> GeoTag:
         values |= {f"NED {name}": text for name, text in _find_values(oriented[1]).items()}
     height_m = _find_number(values, "RelativeAltitude", ("drone-dji", "drone", "drone-skydio"), *ALT_LIMITS_M)
     for name in _GIMBAL_NAMES:
-        # Small drones of DJI write zeros, which tell nothing: a gimbal that looks north and ahead is never so exact.
+        # Zeros, which small drones of DJI write, mean nothing: no gimbal looks exactly north and ahead.
         if angles := _find_angles(values, name):
             heading_deg, roll_deg, pitch_deg = to_nadir_angles(*angles)
             return GeoTag(heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
-    # In the tags of Pix4D, 0 is straight down; a camera without an IMU writes zeros, which are ignored.
+    # In tags of Pix4D 0 is straight down. Zeros, which a camera without an IMU writes, are ignored.
     if angles := _find_angles(values, "Camera:{}"):
         yaw_deg, pitch_deg, roll_deg = angles
         return GeoTag(heading_deg=yaw_deg % 360, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
@@ -162,7 +162,7 @@ def _find_values(packet: bytes) -> dict[str, bytes]:
 
 
 def _find_angles(values: Mapping[str, bytes], name: str) -> tuple[float, float, float] | None:
-    """Return the angles by a name with {} for Yaw, Pitch and Roll; None if one is missing, or if all are zero."""
+    """Return yaw, pitch and roll by a name with {} for each; None if one is missing, or if all are zero."""
     with contextlib.suppress(KeyError, ValueError):
         yaw, pitch, roll = (
             _require_range(float(values[name.format(axis)]), -360, 360) for axis in ("Yaw", "Pitch", "Roll")
@@ -183,8 +183,8 @@ def _find_number(
 def to_nadir_angles(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
     """Convert the angles of a gimbal (a pitch of -90 is straight down) to (heading of the picture's top, roll, pitch),
     where roll and pitch are the camera's deviation from straight down. All in degrees."""
-    # The result is the attitude of an imaginary airframe whose nose points along the top of the picture, and whose down
-    # is the camera's viewing direction. Straight down, the gimbal's own roll only turns the picture.
+    # The result is the attitude of an imaginary airframe, its nose along the top of the picture and its down along the
+    # camera's viewing direction. If the camera looks straight down, the gimbal's roll only turns the picture.
     yaw, pitch, roll = map(math.radians, (yaw_deg, pitch_deg, roll_deg))
     # The nose before the yaw is applied. Adding or subtracting 0.0 avoids -0.0, with which atan2 is off by half a turn.
     ahead, aside = 0.0 - math.cos(roll) * math.sin(pitch), 0.0 + math.sin(roll)

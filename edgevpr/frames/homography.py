@@ -1,4 +1,4 @@
-"""The warp of a picture by a homography, and the part of a picture that a homography can warp."""
+"""Warps pictures by a homography, and cuts out the part of a picture that it can warp."""
 
 import cv2
 import numpy as np
@@ -20,30 +20,31 @@ class Homography:
         shown = cv2.fillConvexPoly(np.zeros((side, side), np.uint8), points, (1,), shift=_SUBPIXEL_BITS)
         self.shown: Mask = shown.view(np.bool_)
 
-    def overlay(self, overlay: Mask) -> Mask:
+    def warp_mask(self, overlay: Mask) -> Mask:
         size = (self._side, self._side)
         return cv2.warpPerspective(overlay.view(np.uint8), self._out_from_pixel, size, flags=cv2.INTER_NEAREST).view(
             bool
         )
 
-    def picture(self, image: Image) -> Image:
+    def warp_image(self, image: Image) -> Image:
         small, out_from_pixel = shrink_image(image, self._shrink), self._out_from_pixel
         if small is not image:
             along, across = (before / after for before, after in zip(image.shape[:2], small.shape[:2], strict=True))
             out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]
-        # Outside the picture, where the mask is False, its edge is repeated, so that no gradient arises inside.
+        # Outside the picture, where the mask is False, its edge is repeated, so that no false gradient arises.
         return cv2.warpPerspective(  # type: ignore[return-value]  # of the same dtype
             small, out_from_pixel, (self._side, self._side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
 
 
 def cut_polygon(corners: Doubles, depth: Doubles) -> Doubles:
-    """Cut from a convex polygon, homogeneous (3, n), what is not deep: at its corners it has the `depth` (n,)."""
-    kept = []
-    for one, other in zip(range(-1, len(depth) - 1), range(len(depth)), strict=True):
-        if (depth[one] > 0) != (depth[other] > 0):
-            share = depth[one] / (depth[one] - depth[other])
-            kept.append(corners[:, one] + share * (corners[:, other] - corners[:, one]))
-        if depth[other] > 0:
-            kept.append(corners[:, other])
-    return np.column_stack(kept)
+    """Return the corners of the part of a convex polygon, homogeneous (3, n), with a positive depth; `depth` (n,) is
+    that of its corners."""
+    points = []
+    for previous, current in zip(range(-1, len(depth) - 1), range(len(depth)), strict=True):
+        if (depth[previous] > 0) != (depth[current] > 0):
+            share = depth[previous] / (depth[previous] - depth[current])
+            points.append(corners[:, previous] + share * (corners[:, current] - corners[:, previous]))
+        if depth[current] > 0:
+            points.append(corners[:, current])
+    return np.column_stack(points)

@@ -1,7 +1,5 @@
-"""Image files: listing the images of a folder, decoding one, and encoding pictures. An incomplete file is an error,
-never decoded in part. OpenCV's own log messages are turned off, as edgevpr reports each fault once, in its own words;
-to get them back, set OPENCV_LOG_LEVEL before the start.
-"""
+"""Lists, decodes and encodes image files. An incomplete file is an error and never decoded in part. OpenCV's log is
+turned off, since edgevpr reports each fault once, in its own words; OPENCV_LOG_LEVEL turns it on again."""
 
 import contextlib
 import os
@@ -27,7 +25,7 @@ os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "3")  # seconds; else
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 MIN_SIDE_PX = 16
 MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])
-_MAX_FILE_BYTES = 4 * MAX_PIXELS  # size of an uncompressed picture of so many pixels, with transparency
+_MAX_FILE_BYTES = 4 * MAX_PIXELS  # of an uncompressed picture with transparency
 _SMALL_PX = 640
 _SMALL_QUALITY = 80
 _WEBP_QUALITY = 55
@@ -54,7 +52,7 @@ def list_images(folder: str | Path) -> list[Path]:
     if images := [folder / name for name in names if is_image(name)]:
         return images
     inner = [str(folder / name) for name in names if any(is_image(path.name) for path in (folder / name).glob("*"))]
-    advice = " or ".join(inner[:3]) or "the one that does"
+    advice = " or ".join(inner[:3]) or "one that does"
     raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): give {advice}.")
 
 
@@ -71,15 +69,15 @@ def make_sort_key(name: str) -> tuple[list[str | int], str]:
 
 
 def read_image(path: str | Path, depth: DepthRange | None = None) -> Image:
-    """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey, rotated as its EXIF data say, without transparency.
-    An image of 16 bits is shown over the range `depth` of the images before it (None: over its own). Raises ImageError
-    for any file but a whole image of 8 or 16 bits, at least 16x16 pixels and at most `MAX_PIXELS`."""
+    """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey, rotated by its EXIF data, without transparency. An
+    image of 16 bits is shown in the range `depth` of the images before it (None: in its own). Raises ImageError for any
+    file but a whole image of 8 or 16 bits, at least 16x16 pixels and at most `MAX_PIXELS`."""
     try:
         data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
         raise ImageError(f"The image {path} cannot be read ({error.strerror}): give a readable file.") from error
     except MemoryError:
-        raise ImageError(f"{path} does not fit in the memory that is left: give a smaller image.") from None
+        raise ImageError(f"{path} does not fit into the free memory: give a smaller image.") from None
     return decode_image(data, str(path), depth)
 
 
@@ -91,7 +89,7 @@ def decode_image(data: bytes, path: str, depth: DepthRange | None = None) -> Ima
     with contextlib.suppress(cv2.error):  # raised for too many pixels
         if _START_PATTERN.match(data):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
-    # A program that has imported OpenCV before edgevpr has another limit there: so the size is checked here as well.
+    # OpenCV has another limit if a program imported it before edgevpr, so the size is checked here as well.
     if image is None or image.dtype not in (np.uint8, np.uint16) or image.shape[0] * image.shape[1] > MAX_PIXELS:
         raise ImageError(
             f"{path} is not an image edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file of 8 or 16 bits a "
@@ -141,8 +139,8 @@ def resize(image: Image, size_px: tuple[int, int]) -> Image:
 
 
 def shrink_image(image: Image, shrink: float) -> Image:
-    """Scale a picture down until `shrink` of its pixels along a side have become one: before a warp, whose
-    interpolation alone would ignore most pixels. Up to two it stays as it is."""
+    """Scale a picture down by the factor `shrink` before a warp, whose interpolation alone would ignore most pixels. Up
+    to 2 the picture is returned as it is."""
     if shrink <= 2:
         return image
     height, width = image.shape[:2]
@@ -154,16 +152,16 @@ def _encode(extension: str, image: Image, options: Sequence[int] = ()) -> bytes:
 
 
 def _is_incomplete(data: bytes) -> bool:
-    # OpenCV 4 fills the missing part of a JPEG with grey, and ignores the checksums of a PNG. Its decoders of the other
-    # formats detect damage themselves. Bytes after the end mark are allowed.
+    # OpenCV 4 fills the missing part of a JPEG with grey and ignores the checksums of a PNG; its decoders of the other
+    # formats detect damage. Bytes after the end mark are allowed.
     if data.startswith(_JPEG_START):
         return not is_whole_jpeg(data)
     return not data or (data.startswith(_PNG_START) and not _is_whole_png(data))
 
 
 def is_whole_jpeg(data: bytes) -> bool:
-    """Walk through the markers of a JPEG (ITU-T T.81, annex B); return True if its end mark is there. Segments are
-    skipped by their length, so that an EXIF thumbnail's end mark is not taken for the image's."""
+    """Return True if the end mark of a JPEG is there (ITU-T T.81, annex B). Segments are skipped by their length, so
+    that an EXIF thumbnail's end mark is not taken for the image's."""
     position = 2
     while marker := _MARKER_PATTERN.search(data, position):
         if data[marker.end() - 1] == _END_OF_IMAGE:
@@ -173,7 +171,7 @@ def is_whole_jpeg(data: bytes) -> bool:
 
 
 def _is_whole_png(data: bytes) -> bool:
-    """Walk through the chunks (length, kind, content, checksum) of a PNG; return True if all are intact to the end."""
+    """Return True if all chunks (length, kind, content, checksum) of a PNG are intact, to the end."""
     position = len(_PNG_START)
     while position + 12 <= len(data):
         end = position + 8 + int.from_bytes(data[position : position + 4], "big")

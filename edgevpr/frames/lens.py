@@ -1,7 +1,6 @@
-"""Lenses with distortion: the calibration of a camera, read from the files of OpenCV, ROS and Kalibr, and which of its
-pixels shows what.
+"""Lenses with distortion: reads calibrations of OpenCV, ROS and Kalibr, and undistorts pictures.
 
-A *straightened* picture is the one that a lens without distortion would take from the same place, along the same axis.
+An *undistorted* picture is the one that a lens without distortion would take from the same place, along the same axis.
 Its longest side shows as much as the calibrated lens does (at most `_MAX_STRAIGHT_FOV_DEG`), so everything that is
 computed with a field of view holds for it. A *ray* is a direction from the lens, as its tangents to the right and down.
 """
@@ -23,23 +22,25 @@ from edgevpr.core.yamlfile import parse_yaml
 from edgevpr.frames.images import shrink_image
 
 _MAX_FILE_BYTES = 300_000  # OpenCV's program writes all corners of the board into its file too
-# What of OpenCV's files is no YAML. Its own reader is not used: it crashes on damaged files.
+# These parts of OpenCV's files are not YAML. Its own reader is not used: it crashes on damaged files.
 _OPENCV_TAGS = re.compile(rb"^%YAML.*|!!opencv-matrix\b", re.MULTILINE)
 _COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)  # numbers of them that OpenCV knows, k1 k2 p1 p2 first; of a fisheye only 4
 _FISHEYE = "equidistant"
 _NO_DISTORTION = "none"
 # Names of models in files of ROS and Kalibr; "" stands for a file of OpenCV.
 _MODELS = ("", "plumb_bob", "rational_polynomial", "radtan", _FISHEYE, _NO_DISTORTION)
-_MAX_STRAIGHT_FOV_DEG = 100.0  # of a straightened picture: beyond, its corners would show little, in many pixels
-_MAX_SKEW = 0.002  # over the focal length: what is left out moves a pixel by less than one
+_MAX_STRAIGHT_FOV_DEG = 100.0  # of an undistorted picture: beyond, its corners would show little, in many pixels
+_MAX_SKEW = 0.002  # over the focal length: ignored, it moves a pixel by less than one
 _MIN_FOV_DEG = 5.0  # as of `source.fov_deg`
-_MAX_OFF_AXIS_DEG = 85.0  # from the axis: up to here a lens is sampled
+_MAX_OFF_AXIS_DEG = 85.0  # up to which a lens is sampled
 _OFF_AXIS_STEP_DEG = 0.25
 _DIRECTIONS_DEG = range(0, 360, 15)
-_RIGHT, _DOWN, _LEFT, _UP = (_DIRECTIONS_DEG.index(degrees) for degrees in (0, 90, 180, 270))
-# Pixels are computed for every eighth pixel of a picture and interpolated, which is wrong by less than a tenth of one.
-_CELL_PX = 8
-_OUTSIDE_PX = -1e6  # so far outside that what is interpolated with it is outside as well
+_RIGHT = _DIRECTIONS_DEG.index(0)
+_DOWN = _DIRECTIONS_DEG.index(90)
+_LEFT = _DIRECTIONS_DEG.index(180)
+_UP = _DIRECTIONS_DEG.index(270)
+_CELL_PX = 8  # pixels are computed for every eighth one and interpolated, with an error below a tenth of a pixel
+_OUTSIDE_PX = -1e6  # so far outside that values interpolated with it are outside as well
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,7 +61,7 @@ class CalibratedLens:
         (focal_x, focal_y), (column, row) = self.focal_px, self.centre_px
         return np.array([[focal_x, 0, column], [0, focal_y, row], [0, 0, 1]])
 
-    def projected(self, rays: Doubles) -> Doubles:
+    def project(self, rays: Doubles) -> Doubles:
         """Return the pixels (N, 2) of the rays (N, 2)."""
         points = np.ascontiguousarray(np.column_stack([rays, np.ones(len(rays))]))[:, None]
         project = cv2.fisheye.projectPoints if self.is_fisheye else cv2.projectPoints
@@ -74,76 +75,76 @@ class CalibratedLens:
         centre_px = scale_x * (column + 0.5) - 0.5, scale_y * (row + 0.5) - 0.5
         return replace(self, focal_px=(scale_x * focal_x, scale_y * focal_y), centre_px=centre_px, size_px=size_px)
 
-    def refuse(self, why: str) -> ConfigError:
-        """Return the error of a calibration that can be of no lens."""
-        return ConfigError(f"{self.path} is the calibration of no lens ({why}): calibrate the camera again.")
+    def make_error(self, why: str) -> ConfigError:
+        """Return the error of an impossible calibration."""
+        return ConfigError(f"{self.path} is no possible calibration ({why}): calibrate the camera again.")
 
 
 @dataclass(frozen=True, slots=True)
 class LensView:
-    """The view of a `lens`, for pictures of its size. `half`: the ray to the lower right corner of its straightened
-    picture. `farthest`: the length of a ray up to which its model holds. `field_deg`: all that it shows across the
+    """The view of a `lens`, for pictures of its size. `half`: the ray to the lower right corner of its undistorted
+    picture. `max_ray`: the length of a ray up to which its model holds. `field_deg`: its whole field of view across the
     longest side of its pictures, at most 170."""
 
     lens: CalibratedLens
     half: tuple[float, float]
-    farthest: float
+    max_ray: float
     field_deg: float
 
     @property
     def fov_deg(self) -> float:
-        """Field of view of the straightened picture across its longest side, degrees."""
+        """Field of view of the undistorted picture across its longest side, degrees."""
         return math.degrees(2 * math.atan(max(self.half)))
 
     @property
     def straight_px(self) -> tuple[int, int]:
-        """Size (width, height) of the straightened picture, of which the longest side stays as long as it was."""
+        """Size (width, height) of the undistorted picture; its longest side is as long as the lens's own."""
         longest = max(self.lens.size_px)
-        width, height = (max(1, round(longest * each / max(self.half))) for each in self.half)
+        width, height = (max(1, round(longest * tangent / max(self.half))) for tangent in self.half)
         return width, height
 
-    def straightening(self, longest_px: int) -> "Remap":
-        """Return the remap to a straightened picture with at most so many pixels along its longest side."""
+    def make_undistortion(self, longest_px: int) -> "Remap":
+        """Return the remap to an undistorted picture with at most `longest_px` pixels along its longest side."""
         longest = max(self.straight_px)
         scale = min(1.0, longest_px / longest)
         width, height = (max(1, round(scale * side)) for side in self.straight_px)
         focal_px = scale * longest / 2 / max(self.half)
         out_from_ray = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
-        return self.remap(out_from_ray, focal_px, (width, height))
+        return self.make_remap(out_from_ray, focal_px, (width, height))
 
-    def remap(self, out_from_ray: Doubles, out_px: float, size_px: tuple[int, int]) -> "Remap":
-        """Return the remap to a picture of `size_px` (width, height) and the focal length `out_px`, to whose pixels the
-        homography (3, 3) takes rays."""
+    def make_remap(self, out_from_ray: Doubles, out_px: float, size_px: tuple[int, int]) -> "Remap":
+        """Return the remap to a picture of `size_px` (width, height) and the focal length `out_px`; `out_from_ray` is
+        the homography (3, 3) from rays to its pixels."""
         columns, rows = (np.arange(0, side + _CELL_PX, _CELL_PX) for side in size_px)
         across, down = np.meshgrid(columns, rows)
         rays = np.stack([across, down, np.ones_like(down)], axis=-1) @ np.linalg.inv(out_from_ray).T
         is_ahead = rays[..., 2] > 0
         flat = rays[..., :2] / np.where(is_ahead, rays[..., 2], 1)[..., None]
-        holds = is_ahead & (np.hypot(flat[..., 0], flat[..., 1]) <= self.farthest)
-        nodes = self.lens.projected(np.where(holds[..., None], flat, 0).reshape(-1, 2)).reshape(flat.shape)
+        holds = is_ahead & (np.hypot(flat[..., 0], flat[..., 1]) <= self.max_ray)
+        nodes = self.lens.project(np.where(holds[..., None], flat, 0).reshape(-1, 2)).reshape(flat.shape)
         nodes[~holds] = _OUTSIDE_PX
-        finer = np.array([[_CELL_PX, 0, 0], [0, _CELL_PX, 0]], float)
-        pixels = np.asarray(cv2.warpAffine(nodes.astype(np.float32), finer, size_px), np.float32)
-        most = np.array([side - 0.5 for side in self.lens.size_px])
-        shown = cv2.inRange(pixels, np.array([-0.5, -0.5]), most).astype(bool)
+        pixel_from_node = np.array([[_CELL_PX, 0, 0], [0, _CELL_PX, 0]], float)
+        pixels = np.asarray(cv2.warpAffine(nodes.astype(np.float32), pixel_from_node, size_px), np.float32)
+        lower_right = np.array([side - 0.5 for side in self.lens.size_px])
+        shown = cv2.inRange(pixels, np.array([-0.5, -0.5]), lower_right).astype(bool)
         return Remap(pixels, shown, max(self.lens.focal_px) / out_px)
 
 
 @dataclass(frozen=True, slots=True)
 class Remap:
-    """A warp of a camera's picture to another picture, (H, W): `pixels` (H, W, 2) are those that show the same, `shown`
-    (H, W) is False where they lie outside of it, and `shrink` of them along a side become one."""
+    """A warp of a camera's picture to (H, W): `pixels` (H, W, 2) are those that show the same, `shown` (H, W) is False
+    where they lie outside of the camera's picture, and `shrink` of them along a side become one."""
 
     pixels: Singles
     shown: Mask
     shrink: float
 
-    def overlay(self, overlay: Mask) -> Mask:
+    def warp_mask(self, overlay: Mask) -> Mask:
         """Warp a mask, bool, of the camera's picture."""
         return _remap_image(overlay.view(np.uint8), self.pixels, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT).view(bool)
 
-    def picture(self, image: Image) -> Image:
-        """Warp the camera's picture. Outside of it its edge is repeated, so that no gradient arises."""
+    def warp_image(self, image: Image) -> Image:
+        """Warp the camera's picture. Outside of it its edge is repeated, so that no false gradient arises."""
         small, pixels = shrink_image(image, self.shrink), self.pixels
         if small is not image:
             pixels = pixels + np.float32(0.5)  # the only copy: a board has little memory
@@ -153,58 +154,58 @@ class Remap:
 
 
 def _remap_image(image: Image, pixels: Singles, interpolation: int, border: int) -> Image:
-    # None: of the two arrays of a map the first has both coordinates. OpenCV's types ask for a second one.
+    # None: the first of the two maps has both coordinates. OpenCV's types demand a second one.
     return cv2.remap(image, pixels, None, interpolation, borderMode=border)  # type: ignore
 
 
 @lru_cache(maxsize=8)
 def compute_lens_view(lens: CalibratedLens, size_px: tuple[int, int]) -> LensView:
-    """Return what a lens shows in pictures of `size_px` (width, height). Raises ImageError for pictures of another
-    shape than those that it was calibrated with, and ConfigError for a calibration that can be of no lens."""
-    (width, height), (own_width, own_height), (column, row) = size_px, lens.size_px, lens.centre_px
+    """Return the view of a lens in pictures of `size_px` (width, height). Raises ImageError for pictures of another
+    shape than those it was calibrated with, and ConfigError for an impossible calibration."""
+    (width, height), (lens_width, lens_height), (column, row) = size_px, lens.size_px, lens.centre_px
     if not np.isfinite([*lens.focal_px, column, row, *lens.coefficients]).all():
-        raise lens.refuse("a value is no number")
+        raise lens.make_error("a value is no number")
     if min(lens.focal_px) <= 0:
-        raise lens.refuse("a focal length is not above zero")
-    if not (0 < column < own_width and 0 < row < own_height):
-        raise lens.refuse("its centre lies outside of the picture")
-    if abs(height - width * own_height / own_width) > 1 and abs(width - height * own_width / own_height) > 1:
+        raise lens.make_error("a focal length is not above zero")
+    if not (0 < column < lens_width and 0 < row < lens_height):
+        raise lens.make_error("its centre lies outside of the picture")
+    if abs(height - width * lens_height / lens_width) > 1 and abs(width - height * lens_width / lens_height) > 1:
         raise ImageError(
-            f"The picture has {width}x{height} pixels, and {lens.path} was calibrated with {own_width}x{own_height}: "
-            "take pictures of that shape, or calibrate the camera with these."
+            f"The picture has {width}x{height} pixels, and {lens.path} was calibrated with {lens_width}x{lens_height}: "
+            "take pictures of that aspect ratio, or calibrate the camera again."
         )
     lens = lens.resize_to(size_px)
     tangents = np.tan(np.radians(np.arange(0, _MAX_OFF_AXIS_DEG + _OFF_AXIS_STEP_DEG, _OFF_AXIS_STEP_DEG)))
     around = np.radians(_DIRECTIONS_DEG)
     rays = np.stack([np.outer(np.cos(around), tangents), np.outer(np.sin(around), tangents)], axis=-1)
     with np.errstate(all="ignore"):
-        off_px = lens.projected(rays.reshape(-1, 2)).reshape(rays.shape) - lens.centre_px
+        off_px = lens.project(rays.reshape(-1, 2)).reshape(rays.shape) - lens.centre_px
         grows = np.diff(np.hypot(off_px[..., 0], off_px[..., 1]), axis=1) > 0  # False for NaN as well
-    steady = np.logical_and.accumulate(grows, axis=1).sum(axis=1)  # steps in which each ray goes on outwards
+    steady = np.logical_and.accumulate(grows, axis=1).sum(axis=1)  # steps in which each ray moves outwards
 
-    def reach(direction: int, axis: int, edge_px: float) -> float:
+    def find_edge(direction: int, axis: int, edge_px: float) -> float:
         """Return the tangent at which the picture ends in a direction."""
-        known = slice(steady[direction] + 1)
-        along_px, to_edge_px = np.abs(off_px[direction, known, axis]), abs(edge_px - lens.centre_px[axis])
+        steps = slice(steady[direction] + 1)
+        along_px, to_edge_px = np.abs(off_px[direction, steps, axis]), abs(edge_px - lens.centre_px[axis])
         if along_px[-1] < to_edge_px and steady[direction] < len(tangents) - 1:
-            raise lens.refuse("pixels before the edge of the picture have no direction of their own")
-        return float(np.interp(to_edge_px, along_px, tangents[known]))
+            raise lens.make_error("pixels before the edge of the picture have no direction of their own")
+        return float(np.interp(to_edge_px, along_px, tangents[steps]))
 
-    right, left = reach(_RIGHT, 0, width - 0.5), reach(_LEFT, 0, -0.5)
-    lower, upper = reach(_DOWN, 1, height - 0.5), reach(_UP, 1, -0.5)
+    right, left = find_edge(_RIGHT, 0, width - 0.5), find_edge(_LEFT, 0, -0.5)
+    lower, upper = find_edge(_DOWN, 1, height - 0.5), find_edge(_UP, 1, -0.5)
     widest = math.tan(math.radians(_MAX_STRAIGHT_FOV_DEG / 2))
-    half, farthest = (min(right, left, widest), min(lower, upper, widest)), float(tangents[steady.min()])
+    half, max_ray = (min(right, left, widest), min(lower, upper, widest)), float(tangents[steady.min()])
     field_deg = math.degrees(sum(map(math.atan, (right, left) if width >= height else (lower, upper))))
-    if math.hypot(*half) > farthest:
-        raise lens.refuse("pixels towards the corners of the picture have no direction of their own")
+    if math.hypot(*half) > max_ray:
+        raise lens.make_error("pixels towards the corners of the picture have no direction of their own")
     if field_deg < _MIN_FOV_DEG:
-        raise lens.refuse(f"it sees {field_deg:.1f} degrees")
-    return LensView(lens, half, farthest, field_deg)
+        raise lens.make_error(f"its field of view is {field_deg:.1f} degrees")
+    return LensView(lens, half, max_ray, field_deg)
 
 
 def read_lens(path: str) -> CalibratedLens:
     """Read a calibration from a file of OpenCV (YAML, XML or JSON of its FileStorage), of ROS (camera_info) or of
-    Kalibr (camchain, the camera cam0). Raises ConfigError for any other file, and for one that can be of no lens."""
+    Kalibr (camchain, the camera cam0). Raises ConfigError for any other file, and for an impossible calibration."""
     try:
         data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
@@ -214,10 +215,9 @@ def read_lens(path: str) -> CalibratedLens:
     try:
         lens = _read_kalibr(fields["cam0"], path) if "cam0" in fields else _read_matrix(fields, path)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        lacking = f"lacks `{error.args[0]}`" if isinstance(error, KeyError) else "is not whole"
-        raise ConfigError(
-            f"{path} {lacking}: give a calibration of OpenCV, ROS or Kalibr (docs/how-to/cameras.md)."
-        ) from error
+        fault = f"lacks `{error.args[0]}`" if isinstance(error, KeyError) else "is incomplete"
+        advice = "give a calibration of OpenCV, ROS or Kalibr (docs/how-to/cameras.md)"
+        raise ConfigError(f"{path} {fault}: {advice}.") from error
     compute_lens_view(lens, lens.size_px)
     return lens
 
@@ -226,9 +226,9 @@ def _read_matrix(fields: Mapping[str, Any], path: str) -> CalibratedLens:
     """Make the lens of a file of OpenCV or ROS: they name their fields alike."""
     matrix, coefficients = _read_numbers(fields["camera_matrix"]), _read_numbers(fields["distortion_coefficients"])
     if len(matrix) != 9:
-        raise ConfigError(f"{path}: `camera_matrix` has {len(matrix)} numbers, and nine are needed.")
+        raise ConfigError(f"{path}: `camera_matrix` has {len(matrix)} numbers, and needs 9.")
     if abs(matrix[1]) > _MAX_SKEW * abs(matrix[0]):
-        raise ConfigError(f"{path} has skew (the second number of `camera_matrix`): calibrate without it.")
+        raise ConfigError(f"{path} has skew (the second number of `camera_matrix`): calibrate without skew.")
     model = fields.get("distortion_model", _FISHEYE if int(fields.get("fisheye_model") or 0) else "")
     size_px = int(fields["image_width"]), int(fields["image_height"])
     return _make_lens(path, (matrix[0], matrix[4], matrix[2], matrix[5]), model, coefficients, size_px)
@@ -236,7 +236,7 @@ def _read_matrix(fields: Mapping[str, Any], path: str) -> CalibratedLens:
 
 def _read_kalibr(camera: Mapping[str, Any], path: str) -> CalibratedLens:
     if (model := camera["camera_model"]) != "pinhole":
-        raise ConfigError(f"{path} is of the camera model `{model}`: calibrate with the model `pinhole`.")
+        raise ConfigError(f"{path} has the camera model `{model}`: calibrate with the model `pinhole`.")
     coefficients = _read_numbers(camera.get("distortion_coeffs") or ())
     width, height = map(int, camera["resolution"])
     pinhole = _read_numbers(camera["intrinsics"])
@@ -246,15 +246,15 @@ def _read_kalibr(camera: Mapping[str, Any], path: str) -> CalibratedLens:
 def _make_lens(
     path: str, pinhole: tuple[float, ...], model: str, coefficients: tuple[float, ...], size_px: tuple[int, int]
 ) -> CalibratedLens:
-    """Make a lens of a distortion model by its name; `pinhole`: focal lengths and centre. Raises ConfigError for a
-    model that is not known."""
+    """Make a lens of the distortion model named `model`; `pinhole`: focal lengths and centre. Raises ConfigError for an
+    unknown model."""
     focal_x, focal_y, column, row = pinhole
     if model not in _MODELS:
-        raise ConfigError(f"{path} is of the distortion model `{model}`: calibrate with {', '.join(_MODELS[1:])}.")
+        raise ConfigError(f"{path} has the distortion model `{model}`: calibrate with {', '.join(_MODELS[1:])}.")
     if model == _NO_DISTORTION or not coefficients:
         model, coefficients = "", (0.0,) * 4
     if len(coefficients) not in (_COEFFICIENT_COUNTS[:1] if model == _FISHEYE else _COEFFICIENT_COUNTS):
-        raise ConfigError(f"{path} has {len(coefficients)} coefficients, which fit no model that edgevpr knows.")
+        raise ConfigError(f"{path} has {len(coefficients)} coefficients, which fit no supported distortion model.")
     return CalibratedLens(
         path=path,
         focal_px=(focal_x, focal_y),
@@ -266,7 +266,7 @@ def _make_lens(
 
 
 def _read_numbers(value: Any) -> tuple[float, ...]:
-    """Return the numbers of a matrix, which is a list, or as in files of ROS a section with `data`."""
+    """Return the numbers of a matrix: a list or, in files of ROS, a section with `data`."""
     return tuple(map(float, value["data"] if isinstance(value, dict) else value))
 
 
@@ -278,4 +278,4 @@ def _read_xml(data: bytes, path: str) -> dict[str, Any]:
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError) as error:
         raise ConfigError(f"{path} is not valid XML ({error}): give the calibration as OpenCV wrote it.") from error
-    return {each.tag: {"data": (each.findtext("data") or "").split()} if len(each) else each.text for each in root}
+    return {node.tag: {"data": (node.findtext("data") or "").split()} if len(node) else node.text for node in root}

@@ -1,8 +1,6 @@
-"""Levelling: warps the picture of a camera that looks down, as if taken straight from above, north-up and to scale.
-
-The ground is taken as flat. "Level" means without roll and pitch. The footprint of a picture is the ground that it
-shows. Recognition and mapping level their pictures by `runtime.recognise.levelling`, which calls this module.
-"""
+"""Levelling: warps the picture of a camera that looks down as if it were taken straight from above, north-up and to
+scale. The ground is assumed flat. "Level" means without roll and pitch. The footprint of a picture is the ground that
+it shows. Recognition and mapping level their pictures by `runtime.recognise.levelling`, which calls this module."""
 
 import math
 from collections.abc import Iterator
@@ -20,23 +18,22 @@ from edgevpr.frames.homography import Homography, cut_polygon
 from edgevpr.frames.lens import CalibratedLens, Remap, compute_lens_view
 
 MAX_TILT_DEG = 63.0  # a camera that looks 60 degrees ahead, and sways
-# Without a lens an image is not levelled, and beyond this tilt it looks otherwise than straight down. With one, the
-# ground under the aircraft lies at the edge of the image or outside, and the middle of the image takes its place.
+# Without a lens an image is not levelled, and beyond this tilt it differs too much from one taken straight down. With a
+# lens, the ground under the aircraft lies at the edge of the image or outside, and the middle takes its place.
 MAX_TILT_UNLEVELLED_DEG = 20.0
-# Rays, (right, down, 1) in focal lengths, that go down by less are left out: beyond are far too distant ground, the
-# horizon and the sky.
+# Rays, (right, down, 1) in focal lengths, that go down by less are left out: they show too distant ground, or the sky.
 _MIN_RAY_DOWN = 0.1
-# Standard deviations of a tilt, as tangents: of one that is reported, and of one that only the camera's mount tells.
+# Standard deviations of a tilt, as tangents: of a reported one, and of one known only by the camera's mount.
 _REPORTED_TILT_SD = math.tan(math.radians(1.0))
 _MOUNT_TILT_SD = math.tan(math.radians(3.0))
-# Of a height, as a share: the ground that a tilted camera shows is higher or lower than that below (tilt_ariel).
+# Of a height, as a share: a tilted camera shows ground that is higher or lower than that below (tilt_ariel).
 _HEIGHT_SD_SHARE = 0.13
 # Smaller corrections do not affect matches.
 _MIN_TILT_DEG = 1.0
 _MIN_TURN_DEG = 1.0
 _MIN_ZOOM_CHANGE = 0.03
-# Limits of a picture's footprint over the wanted footprint. Beyond them too few of its pixels are left, or too little
-# of the output is filled, and the height is more likely wrong than so far from the map's.
+# Of a picture's footprint over the requested one. Beyond these limits too few of its pixels are left, or too little of
+# the output is filled, and the height is more likely wrong than so far from the map's.
 _ZOOM_LIMITS = (0.3, 4.0)
 _MIN_FILLED_SHARE = 1 / 3  # of the output area that the same picture would fill if it were taken straight down
 _MAX_HEIGHT_M = 10_000.0
@@ -45,15 +42,15 @@ _MAX_SIDE_PX = 1024  # largest side of a warped picture: no technique uses more 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Constant angles by which a camera looks ahead and to the right of straight down of the airframe, or of the gimbal
-    that it hangs in (negative: behind, to the left)."""
+    """Constant angles by which a camera looks ahead and to the right of straight down, seen from the airframe or gimbal
+    (negative: behind, to the left)."""
 
     ahead_deg: float = 0.0
     right_deg: float = 0.0
 
     def body_from_straight(self) -> Doubles:
         """Return the rotation (3, 3), in the axes of the airframe, from straight down to where the camera looks."""
-        # To look ahead is to turn as the airframe does with its nose up, to the right as with its left wing down.
+        # The camera looks ahead if the airframe's nose is up, and to the right if its left wing is down.
         return _rotate_body_to_level(-self.right_deg, self.ahead_deg)
 
 
@@ -62,8 +59,8 @@ STRAIGHT_DOWN = Mount()
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """A camera's lens and mount. `fov_deg`: field of view across the longest side of the picture, straightened if
-    there is a calibration of its distortion, `calibrated`. `up_deg`: direction of the picture's top, from the nose."""
+    """A camera's lens and mount. `fov_deg`: field of view across the longest side of the picture, which is undistorted
+    if there is a calibration, `calibrated`. `up_deg`: direction of the picture's top, from the nose."""
 
     fov_deg: float
     up_deg: float = 0.0
@@ -76,9 +73,9 @@ class View:
     """Direction, size and offset of a picture on the ground (None: unknown).
 
     `up_deg`: compass direction (0..360) of the picture's top. `footprint_m`: ground length of its longest side.
-    `aside`: offset from the picture's middle to the point straight under the camera, (right, up) in shares of the
-    longest side. `aside_sd`: standard deviation of each, by what is not known of a large tilt. `zoom`: factor by which
-    the picture was enlarged; its longest side shows that many times less ground.
+    `aside`: offset from the picture's middle to the point under the camera, the nadir, (right, up) in shares of the
+    longest side. `aside_sd`: standard deviation of each, by the errors of a large tilt. `zoom`: factor by which the
+    picture was enlarged; its longest side shows that many times less ground.
     `lean_m`: that offset on the ground (east, north), of a picture that was not warped because its lens is unknown.
     `focal`: focal length in shares of the longest side. `reason`: why a tilted picture was not warped."""
 
@@ -92,13 +89,13 @@ class View:
     reason: Reason | None = None
 
     @property
-    def is_laid(self) -> bool:
-        """True if direction and size of the picture are known, and where in it the point under the camera is."""
+    def is_georeferenced(self) -> bool:
+        """True if direction and size of the picture and the offset of the nadir are known."""
         return None not in (self.up_deg, self.footprint_m, self.aside)
 
     @property
     def is_tilt_known(self) -> bool:
-        """True if it is known where in or beside it the point under the camera is."""
+        """True if the offset of the nadir is known, in the picture or on the ground."""
         return self.aside is not None or self.lean_m is not None
 
     def fields(self) -> dict[str, Any]:
@@ -107,7 +104,7 @@ class View:
             "up_deg": self.up_deg and round(self.up_deg, 1),
             "footprint_m": self.footprint_m and round(self.footprint_m, 2),
             "aside": self.aside and [round(share, 4) for share in self.aside],
-            "lean_m": self.lean_m and [round(each, 2) for each in self.lean_m],
+            "lean_m": self.lean_m and [round(offset_m, 2) for offset_m in self.lean_m],
             "reason": self.reason and self.reason.fields(),
         }
 
@@ -117,8 +114,8 @@ UNKNOWN_VIEW = View()
 
 @dataclass(frozen=True, slots=True)
 class LevelledImage:
-    """A picture ready to be encoded: `image` uint8 (H, W[, 3]); `mask` bool (H, W), False where it does not show ground
-    (None: it shows ground everywhere); and `view`, its direction, size and offset on the ground."""
+    """A picture ready to be encoded: `image` uint8 (H, W[, 3]); `mask` bool (H, W), False where it shows no ground
+    (None: nowhere); and `view`, its direction, size and offset on the ground."""
 
     image: Image
     mask: Mask | None
@@ -136,58 +133,61 @@ def level_image(
     scale: float = 1.0,
 ) -> LevelledImage:
     """Warp a picture as if it had been taken straight from above. Roll, pitch, heading and height are those of the
-    frame, or where it has none those of `vehicle` (None: no report).
+    frame, or else of `vehicle` (None: no report).
 
-    The warp removes roll and pitch (unknown: taken as 0), turns the picture north-up (heading unknown: not turned) and
-    scales it until its longest side shows `footprint_m` (None, or height unknown: by `scale` only). The picture shows
-    `scale` times as much ground as the height tells. Its middle shows the same point as before or, with `below`, the
-    point under the camera. `overlay`, bool (H, W), is False where the picture shows no ground (None: nowhere).
-    A picture of known pose is returned unchanged, and so is, but for the distortion of its lens, one that needs no warp
-    or is tilted too far for one. Raises ImageError for a picture of another shape than the calibrated lens takes, and
-    nothing for impossible values in frame or vehicle.
-    """
+    The warp removes roll and pitch (unknown: taken as 0), turns the picture north-up (heading unknown: not
+    turned) and scales it until its longest side shows `footprint_m` (None, or height unknown: by `scale` only). The
+    picture shows `scale` times as much ground as by the height. Its middle shows the same point as before or, with
+    `below`, the point under the camera. `overlay`, bool (H, W), is False where the picture shows no ground (None:
+    nowhere). A picture of known pose is returned unchanged. One that needs no warp, or is tilted too far for one, is
+    only undistorted. Raises ImageError for a picture of another aspect ratio than the calibrated lens takes; impossible
+    values in frame or vehicle raise nothing."""
     if frame.pose is not None:
-        known = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
-        return LevelledImage(frame.image, overlay, known)
-    taking = _CameraGeometry(frame, vehicle, lens)
-    if taking.is_too_tilted:
-        view = View(up_deg=taking.top_deg, reason=Reason(ReasonCode.TILTED, {"tilt_deg": taking.tilt_deg}))
+        view = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
+        return LevelledImage(frame.image, overlay, view)
+    geometry = _CameraGeometry(frame, vehicle, lens)
+    if geometry.is_too_tilted:
+        view = View(up_deg=geometry.top_deg, reason=Reason(ReasonCode.TILTED, {"tilt_deg": geometry.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
-    if below and taking.tilt_deg > MAX_TILT_UNLEVELLED_DEG and taking.heading_deg is None:
-        # The ground that it shows lies far from the aircraft, in an unknown direction. Of a query, the match tells it.
-        view = View(reason=Reason(ReasonCode.TILTED_WITHOUT_HEADING, {"tilt_deg": taking.tilt_deg}))
+    if below and geometry.tilt_deg > MAX_TILT_UNLEVELLED_DEG and geometry.heading_deg is None:
+        # The ground that it shows lies far from the aircraft, in a direction that only a match can tell.
+        view = View(reason=Reason(ReasonCode.TILTED_WITHOUT_HEADING, {"tilt_deg": geometry.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
-    own_m = taking.own_m and scale * taking.own_m
-    zoom = own_m / footprint_m if own_m and footprint_m else scale
+    image_m = geometry.footprint_m and scale * geometry.footprint_m
+    zoom = image_m / footprint_m if image_m and footprint_m else scale
     if not _ZOOM_LIMITS[0] <= zoom <= _ZOOM_LIMITS[1]:
         zoom = 1.0
-    turn_deg = abs(wrap_deg(taking.top_deg or 0.0))
-    if taking.tilt_deg < _MIN_TILT_DEG and turn_deg < _MIN_TURN_DEG and abs(zoom - 1) < _MIN_ZOOM_CHANGE:
-        aside, focal = taking.aside(taking.straight, 1.0), taking.focal_px / taking.longest_px
-        view = View(up_deg=taking.top_deg, footprint_m=own_m, aside=aside, aside_sd=taking.aside_sd(1.0), focal=focal)
+    turn_deg = abs(wrap_deg(geometry.top_deg or 0.0))
+    if geometry.tilt_deg < _MIN_TILT_DEG and turn_deg < _MIN_TURN_DEG and abs(zoom - 1) < _MIN_ZOOM_CHANGE:
+        aside, focal = geometry.aside(geometry.straight, 1.0), geometry.focal_px / geometry.longest_px
+        view = View(
+            up_deg=geometry.top_deg, footprint_m=image_m, aside=aside, aside_sd=geometry.aside_sd(1.0), focal=focal
+        )
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
 
-    below &= taking.tilt_deg <= MAX_TILT_UNLEVELLED_DEG
-    side = min(taking.longest_px, _MAX_SIDE_PX)
-    out_px = taking.focal_px * zoom * side / taking.longest_px  # focal length of the output, in its pixels
-    turned = taking.straight if taking.heading_deg is None else taking.level_from_lens(-taking.heading_deg)
-    middle = np.zeros(2) if below else turned[:2, 2] / turned[2, 2] * out_px
+    below &= geometry.tilt_deg <= MAX_TILT_UNLEVELLED_DEG
+    side = min(geometry.longest_px, _MAX_SIDE_PX)
+    out_px = geometry.focal_px * zoom * side / geometry.longest_px  # focal length of the output, in its pixels
+    out_from_lens = (
+        geometry.straight if geometry.heading_deg is None else geometry.level_from_lens(-geometry.heading_deg)
+    )
+    middle = np.zeros(2) if below else out_from_lens[:2, 2] / out_from_lens[2, 2] * out_px
     right, down = (side - 1) / 2 - middle
-    out_from_ray = np.array([[out_px, 0, right], [0, out_px, down], [0, 0, 1]]) @ turned
-    warp = taking.warp(out_from_ray, out_px, side)
+    out_from_ray = np.array([[out_px, 0, right], [0, out_px, down], [0, 0, 1]]) @ out_from_lens
+    warp = geometry.warp(out_from_ray, out_px, side)
 
-    width, height = (min(1.0, zoom * px / taking.longest_px) for px in taking.size_px)
+    width, height = (min(1.0, zoom * px / geometry.longest_px) for px in geometry.size_px)
     if (filled := warp.shown.mean() / (height * width)) < _MIN_FILLED_SHARE:
-        reason = Reason(ReasonCode.TILTED_OFF_GROUND, {"shown": float(filled), "tilt_deg": taking.tilt_deg})
-        view = View(up_deg=taking.top_deg, reason=reason)
+        reason = Reason(ReasonCode.TILTED_OFF_GROUND, {"shown": float(filled), "tilt_deg": geometry.tilt_deg})
+        view = View(up_deg=geometry.top_deg, reason=reason)
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     view = View(
-        up_deg=None if taking.heading_deg is None else 0.0,
-        footprint_m=own_m and own_m / zoom,
+        up_deg=None if geometry.heading_deg is None else 0.0,
+        footprint_m=image_m and image_m / zoom,
         zoom=zoom,
         focal=out_px / side,
-        aside=(0.0, 0.0) if below and taking.is_tilt_known else taking.aside(turned, zoom),
-        aside_sd=taking.aside_sd(zoom),
+        aside=(0.0, 0.0) if below and geometry.is_tilt_known else geometry.aside(out_from_lens, zoom),
+        aside_sd=geometry.aside_sd(zoom),
     )
     return _warp_image(frame.image, overlay, warp, view)
 
@@ -199,8 +199,8 @@ def compute_level_rotation(frame: Frame, lens: Lens) -> Doubles:
 
 
 def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> float | None:
-    """Return the ground length in metres of a picture's longest side if it were level, by the height of `frame` or,
-    where it has none, of `vehicle`. None: unknown."""
+    """Return the ground length in metres of a picture's longest side if it were level, by the height of `frame` or else
+    of `vehicle`; None: unknown."""
     *_, height_m = _choose_attitude(frame, vehicle)
     if height_m is None or not 0 < height_m <= _MAX_HEIGHT_M:
         return None
@@ -208,21 +208,21 @@ def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> floa
 
 
 def undistort_frame(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> LevelledImage:
-    """Take the distortion of `lens` from a picture that is not warped otherwise (None: it has none). `overlay` is as in
-    `level_image`. Raises ImageError for a picture of another shape than the lens takes."""
+    """Take the distortion of `lens` from a picture that is not warped otherwise (None: it has none). `overlay` is as
+    in `level_image`. Raises ImageError for a picture of another shape than the lens takes."""
     if lens is None:
         return LevelledImage(image, overlay, view)
     height, width = image.shape[:2]
-    return _warp_image(image, overlay, compute_lens_view(lens, (width, height)).straightening(_MAX_SIDE_PX), view)
+    return _warp_image(image, overlay, compute_lens_view(lens, (width, height)).make_undistortion(_MAX_SIDE_PX), view)
 
 
 def _warp_image(image: Image, overlay: Mask | None, warp: Homography | Remap, view: View) -> LevelledImage:
-    mask = warp.shown if overlay is None else warp.shown & warp.overlay(overlay)
-    return LevelledImage(warp.picture(image), None if mask.all() else mask, view)
+    mask = warp.shown if overlay is None else warp.shown & warp.warp_mask(overlay)
+    return LevelledImage(warp.warp_image(image), None if mask.all() else mask, view)
 
 
 def enlarge_image(picture: LevelledImage, zoom: float) -> LevelledImage:
-    """Enlarge a picture, that is not warped otherwise, around its middle; its size stays."""
+    """Enlarge a picture around its middle; its size in pixels stays."""
     if zoom == 1:
         return picture
     high_px, wide_px = picture.image.shape[:2]
@@ -236,9 +236,9 @@ def enlarge_image(picture: LevelledImage, zoom: float) -> LevelledImage:
 
 
 def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN) -> View:
-    """Return the view of a picture that cannot be warped, because its lens is unknown. It has only `lean_m`; or only
-    `reason`, if the picture is tilted too far; or neither, if too little is known. The arguments are as in
-    `level_image`, and impossible values never raise."""
+    """Return the view of a picture that cannot be warped because its lens is unknown. It has only `lean_m`, or only
+    `reason` if the picture is tilted too far, or neither if too little is known. The arguments are as in `level_image`;
+    impossible values never raise."""
     roll_deg, pitch_deg, heading_deg, height_m = _choose_attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
         return UNKNOWN_VIEW
@@ -255,22 +255,22 @@ def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = S
 
 
 class _CameraGeometry:
-    """The geometry of a picture when it was taken, as far as known; of a lens with distortion, of the straightened one.
+    """The geometry of a picture when it was taken, as far as known; with a calibrated lens, of the undistorted picture.
 
-    Rotation matrices are (3, 3). Their axes are those of the lens (right and down in the picture, and the way that it
-    looks), of the airframe (nose, right, down), and of the level picture (right, down in the picture, to the ground).
+    Rotation matrices are (3, 3). Their axes are those of the lens (right and down in the picture, viewing direction),
+    of the airframe (nose, right, down), and of the level picture (right, down in the picture, to the ground).
     `straight`: rotation from lens to level picture without a turn. `tilt_deg`: angle between the viewing direction and
-    straight down; `is_too_tilted` for a warp. `top_deg`: compass direction of the picture's top. `own_m`: ground length
-    of the longest side if the picture were level. `corners` (3, n): those of the part of the picture that goes down
-    enough, homogeneous pixels. `is_tilt_known`: by a reported attitude or, within some degrees, by the mount alone."""
+    straight down; `is_too_tilted` for a warp. `top_deg`: compass direction of the picture's top. `footprint_m`: ground
+    length of the longest side if the picture were level. `corners` (3, n): those of the part of the picture that goes
+    down enough, homogeneous pixels. `is_tilt_known`: by a reported attitude or, within some degrees, by the mount
+    alone."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
         roll_deg, pitch_deg, self.heading_deg, _ = _choose_attitude(frame, vehicle)
-        is_attitude_known = roll_deg is not None and pitch_deg is not None
-        self.is_tilt_known = is_attitude_known or lens.mount != STRAIGHT_DOWN
-        self._is_attitude_known = is_attitude_known
-        known = (roll_deg or 0.0, pitch_deg or 0.0) if is_attitude_known else (0.0, 0.0)
-        self._level_from_straight = _rotate_body_to_level(*known) @ lens.mount.body_from_straight()
+        self._is_attitude_known = roll_deg is not None and pitch_deg is not None
+        self.is_tilt_known = self._is_attitude_known or lens.mount != STRAIGHT_DOWN
+        attitude_deg = (roll_deg or 0.0, pitch_deg or 0.0) if self._is_attitude_known else (0.0, 0.0)
+        self._level_from_straight = _rotate_body_to_level(*attitude_deg) @ lens.mount.body_from_straight()
         self._lens = lens
         height, width = frame.image.shape[:2]
         self._sight = compute_lens_view(lens.calibrated, (width, height)) if lens.calibrated else None
@@ -278,7 +278,7 @@ class _CameraGeometry:
             width, height = self._sight.straight_px
         self.size_px, self.longest_px = (width, height), max(height, width)
         self.focal_px = self.longest_px / 2 / math.tan(math.radians(lens.fov_deg) / 2)
-        self.own_m = compute_footprint(frame, vehicle, lens)
+        self.footprint_m = compute_footprint(frame, vehicle, lens)
         focal, middle = self.focal_px, ((width - 1) / 2, (height - 1) / 2)
         self.lens_from_pixel = np.linalg.inv([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
         right, lower = width - 0.5, height - 0.5
@@ -292,10 +292,10 @@ class _CameraGeometry:
         self.top_deg = None if self.heading_deg is None else (self.heading_deg + lens.up_deg) % 360
 
     def warp(self, out_from_ray: Doubles, out_px: float, side: int) -> Homography | Remap:
-        """Return the warp to (side, side) pixels by the homography (3, 3) from rays to pixels of an output of the focal
-        length `out_px`."""
+        """Return the warp to (side, side) pixels by the homography `out_from_ray` (3, 3) from rays to pixels of an
+        output of the focal length `out_px`."""
         if self._sight:
-            return self._sight.remap(out_from_ray, out_px, (side, side))
+            return self._sight.make_remap(out_from_ray, out_px, (side, side))
         return Homography(out_from_ray @ self.lens_from_pixel, self.corners, side, self.focal_px / out_px)
 
     def level_from_lens(self, up_deg: float) -> Doubles:
@@ -304,14 +304,14 @@ class _CameraGeometry:
             _rotate_lens_to_body(up_deg).T @ self._level_from_straight @ _rotate_lens_to_body(self._lens.up_deg)
         )
 
-    def aside(self, turned: Doubles, zoom: float) -> tuple[float, float] | None:
-        """Return `View.aside` after the rotation `turned` and scaling by `zoom`; None if the tilt is unknown."""
-        right, back = turned[:2, 2] / turned[2, 2] * zoom * self.focal_px / self.longest_px
+    def aside(self, out_from_lens: Doubles, zoom: float) -> tuple[float, float] | None:
+        """Return `View.aside` after the rotation `out_from_lens` and scaling by `zoom`; None if the tilt is unknown."""
+        right, back = out_from_lens[:2, 2] / out_from_lens[2, 2] * zoom * self.focal_px / self.longest_px
         return (float(-right), float(back)) if self.is_tilt_known else None
 
     def aside_sd(self, zoom: float) -> float:
-        """Return `View.aside_sd` after scaling by `zoom`. An error of a tilt t moves the point by 1 + tan(t)^2 times
-        the height. Of a reported one, the 1 is part of the errors of all positions."""
+        """Return `View.aside_sd` after scaling by `zoom`. An error of a tilt t moves the nadir by 1 + tan(t)^2 times
+        the height; the 1 of a reported tilt is part of the errors of all positions."""
         if not self.is_tilt_known:
             return 0.0
         tangent, focal = math.tan(math.radians(self.tilt_deg)), zoom * self.focal_px / self.longest_px

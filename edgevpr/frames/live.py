@@ -1,11 +1,9 @@
-"""Live sources: cameras and network streams. The newest picture counts; a source that gives none is opened anew.
+"""Live sources: cameras and network streams. Only the newest picture counts; a source that gives none is reopened.
 
 A call into a driver or a decoder may never return, and a thread that hangs in one cannot be ended. So one thread opens
-a source and reads it, another converts the pictures that are used, and a third, which calls nothing that could hang,
-gives up on both and starts others; the process ends without them (`cli.main`). A process of its own, which can be
-ended, was not taken: it needs 40 MB more on a small board, every picture has to be copied out of it, and a driver that
-hangs in the kernel holds a process as it holds a thread.
-"""
+and reads a source, another converts the pictures that are used, and a third, which calls nothing that could hang,
+abandons both and starts others; the process ends without them (`cli.main`). A separate process, which could be ended,
+needs 40 MB more and a copy of every picture, and a driver that hangs in the kernel holds a process like a thread."""
 
 import threading
 from collections.abc import Callable
@@ -23,14 +21,14 @@ _FIRST_WAIT_S = 0.5
 _MAX_WAIT_S = 10.0
 _CLOSE_TIMEOUT_S = 0.5
 _POLL_PERIOD_S = 0.2
-_OPENING_TIMEOUT_S = 90.0  # longer than any opening that ends by itself, see `frames.programs`
+_OPENING_TIMEOUT_S = 90.0  # longer than any opening that ends on its own, see `frames.programs`
 _STALE_PICTURE_S = 1.0
-_MAX_HANGING_THREADS = 3  # threads that have not ended: a source that hangs each time must not take ever more of them
+_MAX_HANGING_THREADS = 3  # a source that hangs each time must not take ever more threads
 
 
 class _Opening:
-    """One opening of a camera or stream. `opened_s`: when it was open (None: not yet). `cause`: why it could not be
-    opened or read on, in a few words (None: it is lost, or cancelled). `thread` runs `read` with this object."""
+    """One opening of a camera or stream. `opened_s`: when it was open (None: not yet). `cause`: in a few words, why it
+    could not be opened or read on (None: it is lost, or cancelled). `thread` runs `read` with this object."""
 
     def __init__(self, read: Callable[["_Opening"], None], began_s: float) -> None:
         self.began_s = began_s
@@ -67,8 +65,8 @@ class _Converter:
 
     def _run(self) -> None:
         while (conversion := self.requests.get()) is not None:
-            with suppress(Exception):  # a picture that a decoder cannot give is left out
-                conversion.image = conversion.shot.pixels()
+            with suppress(Exception):  # a picture that cannot be decoded is left out
+                conversion.image = conversion.shot.convert()
             conversion.done.set()
             del conversion  # its picture is large
 
@@ -76,10 +74,9 @@ class _Converter:
 class LiveSource(Source):
     """Gives the newest frame of the camera or stream that `open_capture` opens, or cannot open (OpeningError).
 
-    `dropped` counts frames not read in time, and `refused` pictures that were not new and complete, by their reason.
-    `latency_s` grows while no new picture comes. The source is opened anew if no new picture comes in time
-    (`Liveness`), after pauses that grow, for ever. `read` and `close` wait for no call that hangs.
-    """
+    `dropped` counts frames not read in time, and `refused` pictures that were not new and complete, by reason.
+    `latency_s` grows while no new picture comes. If none comes in time (`Liveness`), the source is reopened again and
+    again, after pauses that grow. `read` and `close` never wait for a call that hangs."""
 
     def __init__(self, open_capture: Callable[[], Capture], clock: Callable[[], float]):
         self.is_live, self.total, self.ended = True, 0, False
@@ -92,16 +89,16 @@ class LiveSource(Source):
         self._t_start_s = clock()
         self._captured = 0
         self._last_taken_s = float("-inf")
-        self._newness = RepeatDetector()  # over all openings: a server may begin with the picture that it has kept
+        self._repeats = RepeatDetector()  # for all openings: a server may begin with the picture that it has kept
         self._liveness = Liveness()
         self._newest: tuple[int, Shot] | None = None
         self._conversion: _Conversion | None = None
         self._converter = _Converter()
         self._opening: _Opening | None = None
-        self._hanging: list[threading.Thread] = []  # threads that were given up
+        self._hanging: list[threading.Thread] = []  # abandoned threads
         self._changed = threading.Condition()  # guards all of these
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._keep_open, name="camera", daemon=True)
+        self._thread = threading.Thread(target=self._supervise, name="camera", daemon=True)
         self._thread.start()
 
     def read(self, timeout_s: float) -> Frame | None:
@@ -117,7 +114,7 @@ class LiveSource(Source):
         if not conversion.done.wait(timeout_s):  # the next call waits on
             return None
         with self._changed:
-            if conversion is not self._conversion:  # given up
+            if conversion is not self._conversion:  # abandoned
                 return None
             self._conversion = None
             if conversion.image is None:
@@ -129,7 +126,7 @@ class LiveSource(Source):
         return Frame(image=image, name=name, t_mono_s=shot.t_mono_s, t_sd_s=shot.t_sd_s, delay_sd_s=shot.delay_sd_s)
 
     def close(self) -> None:
-        """Stop all threads; return after about a second at most, whether they have ended or not."""
+        """Stop all threads; return after a second at most, whether they have ended or not."""
         with self._changed:
             self._closing.set()
             opening = self._opening
@@ -141,34 +138,34 @@ class LiveSource(Source):
         self._thread.join(_CLOSE_TIMEOUT_S)
         self.end()
 
-    def _keep_open(self) -> None:
+    def _supervise(self) -> None:
         wait_s = 0.0
         while not self._closing.is_set():
             with self._changed:
                 opening = self._opening = _Opening(self._read_capture, self._clock())
-            before = self._captured
+            captured = self._captured
             fault = self._watch(opening)
             opening.cancel()
             self._hanging.append(opening.thread)
-            has_failed_again = wait_s and self._captured == before and fault.condition is not Condition.FROZEN
+            has_failed_again = wait_s and self._captured == captured and fault.condition is not Condition.FROZEN
             wait_s = min(2 * wait_s, _MAX_WAIT_S) if has_failed_again else _FIRST_WAIT_S
-            self._liveness.reopen(fault)
+            self._liveness.record_reopening(fault)
             self._set_condition(fault.condition, f"{fault.text}, reopening in {wait_s:g} s")
             self._closing.wait(wait_s)
             self._wait_for_threads(fault)
 
     def _watch(self, opening: _Opening) -> Fault:
-        """Wait until a source that is being opened, or is open, must be opened anew, and return why."""
+        """Wait until a source must be reopened, and return why."""
         while opening.thread.is_alive() and not self._closing.is_set():
             opening.thread.join(_POLL_PERIOD_S)
             with self._changed:
-                if opening.thread.is_alive() and (fault := self._fault(opening)):
+                if opening.thread.is_alive() and (fault := self._find_fault(opening)):
                     self._set_condition(fault.condition, fault.text)
                     if fault.must_reopen:
                         return fault
         return Fault(Condition.LOST, opening.cause or ("lost" if self._captured else "no picture came"), True)
 
-    def _fault(self, opening: _Opening) -> Fault | None:
+    def _find_fault(self, opening: _Opening) -> Fault | None:
         now_s, conversion = self._clock(), self._conversion
         if self._captured and now_s - self._last_taken_s > _STALE_PICTURE_S:
             self.latency_s = now_s - self._last_taken_s
@@ -179,7 +176,7 @@ class LiveSource(Source):
             self._newest = None  # of the same decoder
             return Fault(Condition.LOST, "lost: a picture cannot be converted", True)
         if opening.opened_s is not None:
-            return self._liveness.fault(now_s)
+            return self._liveness.find_fault(now_s)
         return (
             Fault(Condition.LOST, "lost: the opening hangs", True)
             if now_s - opening.began_s > _OPENING_TIMEOUT_S
@@ -195,46 +192,46 @@ class LiveSource(Source):
             self._closing.wait(_FIRST_WAIT_S)
 
     def _read_capture(self, opening: _Opening) -> None:
-        """Open the source, take what it gives until it is lost or cancelled, and release it: the work of a thread."""
+        """Open the source, handle its pictures until it is lost or cancelled, and release it: the work of a thread."""
         try:
             capture = opening.capture = self._open_capture()
             try:
                 with self._changed:
                     if self._is_current(opening):
                         opening.opened_s = self._clock()
-                        self._liveness.open(opening.opened_s)
+                        self._liveness.record_opening(opening.opened_s)
                 while not opening.is_cancelled and (shot := capture.read()) is not None:
-                    self._take(opening, shot)
+                    self._handle_shot(opening, shot)
             finally:
                 capture.release()
         except OpeningError as error:
             opening.cause = str(error)
-        except Exception as error:  # of a driver or a decoder, whatever it is
+        except Exception as error:  # any error of a driver or a decoder
             opening.cause = f"{type(error).__name__}: {error}"
 
     def _is_current(self, opening: _Opening) -> bool:
         return opening is self._opening and not opening.is_cancelled
 
-    def _take(self, opening: _Opening, shot: Shot | Refusal) -> None:
-        """Take what an opening has read, unless it has been given up."""
+    def _handle_shot(self, opening: _Opening, shot: Shot | Refusal) -> None:
+        """Store or count what an opening has read, unless it was abandoned."""
         with self._changed:
             if not self._is_current(opening):
                 return
             now_s = self._clock()
-            refusal = shot if isinstance(shot, Refusal) else self._put(shot, now_s)
+            refusal = shot if isinstance(shot, Refusal) else self._store_shot(shot, now_s)
             if refusal is None:
                 self.facts = self.facts or getattr(opening.capture, "facts", None)
             else:
                 self.refused[refusal.value] += 1
-                self._liveness.refuse(refusal, now_s)
+                self._liveness.record_refusal(refusal, now_s)
 
-    def _put(self, shot: Shot, now_s: float) -> Refusal | None:
-        """Keep a picture as the newest one, or return why it is none."""
-        if refusal := self._newness.refusal(shot.look):
+    def _store_shot(self, shot: Shot, now_s: float) -> Refusal | None:
+        """Store a picture as the newest one, or return why it is not."""
+        if refusal := self._repeats.find_repeat(shot.thumbnail):
             return refusal
         if shot.t_mono_s < self._last_taken_s:
             return Refusal.LATE
-        if refusal := self._liveness.take(now_s):
+        if refusal := self._liveness.record_picture(now_s):
             return refusal
         self._set_condition(Condition.RUNNING, "streaming")
         self.latency_s, self._last_taken_s = now_s - shot.t_mono_s, shot.t_mono_s

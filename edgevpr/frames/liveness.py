@@ -1,5 +1,5 @@
-"""When a live source counts as lost, frozen or damaged, and when it is to be opened anew: by the time since its last
-new picture, whatever else arrives (sound, damaged pictures, repeats)."""
+"""Decides when a live source counts as lost, frozen or damaged, and when to reopen it: by the time since its last new
+picture, whatever else arrives (sound, damaged pictures, repeats)."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -7,17 +7,16 @@ from statistics import median_low
 
 from edgevpr.frames.shot import Condition, Refusal
 
-LOST_AFTER_S = 3.0  # without a new picture, for a source that has given more than one in this time
-# A source of which no rate is known yet: a key frame comes every ten seconds at most, a still picture of a slow camera
-# as well.
+LOST_AFTER_S = 3.0  # without a new picture, if the source has given more than one in this time
+# While the rate is unknown: key frames, and pictures of a slow camera, come at least every ten seconds.
 _UNKNOWN_RATE_TIMEOUT_S = 12.0
-_RATE_INTERVALS = 5  # pictures by which the rate of a source is known
-_MISSED_INTERVALS = 2.5  # a slow source is lost if it leaves out two pictures,
-_MAX_TIMEOUT_S = 30.0  # or gives none for so long
+_RATE_INTERVALS = 5  # between pictures, whose median is that of a source
+_MISSED_INTERVALS = 2.5  # a slow source is lost if two pictures are missing,
+_MAX_TIMEOUT_S = 30.0  # or if none comes for so long
 _FROZEN_AFTER_S = 1.0
-_MIN_REPEATS = 3  # repeats, beside the time: a slow camera may take less than three pictures a second
+_MIN_REPEATS = 3  # and the time: a slow camera may take less than three pictures a second
 _DAMAGED_REOPEN_S = 5.0  # longer than streams need to recover from a lost packet
-_FROZEN_REOPEN_S = 5.0  # and twice as long each time that it has not helped, up to:
+_FROZEN_REOPEN_S = 5.0  # doubled each time that it does not help
 _MAX_FROZEN_REOPEN_S = 30.0
 _LATE_TEXT = "late: the age of its pictures is unknown, as time stamps do not keep time or decoding lags behind"
 _LATE_REOPEN_S = 30.0  # longer than it takes to find the rate of a clock
@@ -25,8 +24,8 @@ _LATE_REOPEN_S = 30.0  # longer than it takes to find the rate of a clock
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What is wrong with a source, in words for people; `must_reopen`: it has lasted so long that only opening the
-    source anew may help."""
+    """What is wrong with a source, in words for people. `must_reopen`: it has lasted so long that only reopening the
+    source may help."""
 
     condition: Condition
     text: str
@@ -34,7 +33,7 @@ class Fault:
 
 
 class Liveness:
-    """Judges a source by what it gives. Times are in seconds of the monotonic clock."""
+    """Judges a source by its pictures. Times are in seconds of the monotonic clock."""
 
     def __init__(self) -> None:
         self._intervals_s: deque[float] = deque(maxlen=_RATE_INTERVALS)
@@ -46,14 +45,14 @@ class Liveness:
         self._frozen_reopen_s = _FROZEN_REOPEN_S
         self._is_doubtful = False
 
-    def open(self, now_s: float) -> None:
-        """Note that the source is open (again)."""
+    def record_opening(self, now_s: float) -> None:
+        """Record that the source is open (again)."""
         self._since_s, self._is_rate_known = now_s, False
         self._refusal, self._repeats = None, 0
 
-    def take(self, now_s: float) -> Refusal | None:
-        """Note a picture that differs from those before it. Returns why it is no new one: the first after a source was
-        opened anew because it was frozen may be the frozen picture in another coding. Only the next one tells."""
+    def record_picture(self, now_s: float) -> Refusal | None:
+        """Record a picture that differs from those before it. Returns FROZEN for the first one after a frozen source
+        was reopened, which may be the frozen picture in another encoding; else None."""
         if self._is_doubtful:
             self._is_doubtful = False
             return Refusal.FROZEN
@@ -65,12 +64,12 @@ class Liveness:
         self._frozen_reopen_s = _FROZEN_REOPEN_S
         return None
 
-    def refuse(self, refusal: Refusal, now_s: float) -> None:
-        """Note a picture that was rejected."""
+    def record_refusal(self, refusal: Refusal, now_s: float) -> None:
+        """Record a rejected picture."""
         self._refusal, self._refused_s = refusal, now_s
         self._repeats = self._repeats + 1 if refusal is Refusal.FROZEN else 0
 
-    def fault(self, now_s: float) -> Fault | None:
+    def find_fault(self, now_s: float) -> Fault | None:
         """Return what is wrong with the source at this time (None: nothing)."""
         silent_s, usual_s = now_s - self._since_s, LOST_AFTER_S
         if self._is_rate_known:
@@ -84,14 +83,14 @@ class Liveness:
             return Fault(Condition.DAMAGED, "damaged: no picture is whole", must_reopen)
         is_late = self._refusal is Refusal.LATE and now_s - self._refused_s <= LOST_AFTER_S
         if silent_s > limit_s and is_late:
-            # Before the first picture they may only wait for a key frame, or be too few to know their age by.
+            # Before the first picture they may only wait for a key frame, or be too few for an estimate of their age.
             return Fault(Condition.LATE, _LATE_TEXT, silent_s > _LATE_REOPEN_S)
         if silent_s > limit_s:
             return Fault(Condition.LOST, "lost: no new picture", True)
         return None
 
-    def reopen(self, fault: Fault) -> None:
-        """Note that the source is opened anew because of this fault."""
+    def record_reopening(self, fault: Fault) -> None:
+        """Record that the source is reopened because of this fault."""
         if fault.condition is Condition.FROZEN:
             self._is_doubtful = True
             self._frozen_reopen_s = min(2 * self._frozen_reopen_s, _MAX_FROZEN_REOPEN_S)

@@ -1,4 +1,4 @@
-"""The overlay mask: marks the part of every frame that shows ground, and not an on-screen display or the aircraft."""
+"""The overlay mask: the part of every frame that shows ground, not an on-screen display or the aircraft."""
 
 import hashlib
 from dataclasses import dataclass
@@ -11,40 +11,38 @@ from edgevpr.core.arrays import Bools, Image
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.frames.images import read_image
 
-MAX_MASKED_SHARE = 0.6  # share of the frame: with more masked, too little ground is left
-_MIN_WHITE_LEVEL = 128  # grey level from which on a pixel of a mask file shows ground
+MAX_MASKED_SHARE = 0.6  # of the frame: with more masked, too little ground is left
+_MIN_WHITE_LEVEL = 128  # grey level from which a pixel of a mask file shows ground
 
 
 @dataclass(frozen=True, slots=True)
 class OverlayMask:
-    """An overlay mask. `allowed`, bool (H, W), is True where frames show ground; `fitted` scales it to a frame's size.
+    """An overlay mask. `allowed`, bool (H, W), is True where frames show ground; `fit_to` scales it to a frame's size.
     `sha256` is the hash of the mask's pixels, not of its file."""
 
     allowed: Bools
     sha256: str
 
-    def fitted(self, image: Image) -> arrays.Mask:
+    def fit_to(self, image: Image) -> arrays.Mask:
         """Return the mask scaled to the size of `image`, bool (H, W), True where it shows ground."""
         height, width = image.shape[:2]
         return cv2.resize(self.allowed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
 def load_mask(path: str | None) -> OverlayMask | None:
-    """Read the image that the configuration names as a mask (`source.mask`): bright pixels show ground, dark ones are
-    ignored. None if it names none. Raises ImageError for a file that is no image, and UsageError for a mask that leaves
-    too little of the frame."""
+    """Read the mask image of the configuration, `source.mask` (None: there is none): bright pixels show ground. Raises
+    ImageError for a file that is no image, and UsageError for a mask that leaves too little of the frame."""
     if not path:
         return None
     try:
         image = read_image(path)
-    except ImageError as error:  # its message sounds as if a frame were meant
+    except ImageError as error:  # its message speaks of a frame
         raise ImageError(f"The mask of `source.mask` (--mask) cannot be used: {error}") from error
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     allowed = grey >= _MIN_WHITE_LEVEL
     if (masked := 1 - allowed.mean()) > MAX_MASKED_SHARE:
         raise UsageError(
-            f"{path} masks {masked:.0%} of the frame, and {MAX_MASKED_SHARE:.0%} is the most: leave more of it white."
+            f"{path} masks {masked:.0%} of the frame, at most {MAX_MASKED_SHARE:.0%} is allowed: leave more white."
         )
-    return OverlayMask(
-        allowed, hashlib.sha256(repr(allowed.shape).encode() + np.packbits(allowed).tobytes()).hexdigest()
-    )
+    pixels = repr(allowed.shape).encode() + np.packbits(allowed).tobytes()
+    return OverlayMask(allowed, hashlib.sha256(pixels).hexdigest())

@@ -1,4 +1,4 @@
-"""Conversion of decoded pictures of any pixel format to the pixels that edgevpr works with: 8 bits, square."""
+"""Converts decoded pictures of any pixel format to the pixels that edgevpr works with: 8 bits, square."""
 
 import re
 import threading
@@ -16,25 +16,26 @@ from edgevpr.frames.shot import make_thumbnail
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
-# Formats whose first plane is the brightness: grey, the bits of a channel (none: 8), and the order of its two bytes.
+# Formats whose first plane is the luma: grey, bits a channel (none: 8), and the order of its two bytes.
 _LUMA_FORMATS = re.compile(r"(?:(gray)|yuv[aj]?\d{3}p|nv12|nv21|nv16)(?:(9|1\d)(le|be))?")
-_SQUARE_TOLERANCE = 0.01  # pixels count as square within it: the positions are off by less than by other errors
-_MAX_ASPECT = 4.0  # the widest in use is 2.2; an encoder that states more than this, or less than 1/4, is wrong
+_SQUARE_TOLERANCE = 0.01  # of the aspect ratio of square pixels: it moves positions less than other errors
+_MAX_ASPECT = 4.0  # the widest in use is 2.2; an encoder that states more, or less than 1/4, is wrong
 
 
 class PixelConverter:
-    """Converts the pictures of one stream or file. `look` and `conversion` are called by the thread that decodes, for
-    every picture and in order; the functions that `conversion` returns may be called by any thread.
+    """Converts the pictures of one stream or file. `make_thumbnail` and `prepare_conversion` are called by the thread
+    that decodes, for every picture and in order; the functions that `prepare_conversion` returns may be called by any
+    thread.
 
     Grey pictures of more than 8 bits hold counts, and are shown over their own range (`frames.depth`). The levels of
     coloured video of more than 8 bits are defined, like those of 8 bits."""
 
     def __init__(self) -> None:
-        self._of_thread = threading.local()  # FFmpeg's converter hangs or crashes if two threads use it at once
+        self._local = threading.local()  # FFmpeg's converter hangs or crashes if two threads share it
         self._depth = DepthRange()
 
-    def look(self, picture: "VideoFrame") -> Image:
-        """Return a coarse grey copy of a picture, uint8 (h, w), see `Shot.look`."""
+    def make_thumbnail(self, picture: "VideoFrame") -> Image:
+        """Return a coarse grey copy of a picture, uint8 (h, w), see `Shot.thumbnail`."""
         layout = _match_layout(picture)
         if layout is None:
             return make_thumbnail(np.asarray(self._reformat(picture, "gray").to_ndarray(), np.uint8))
@@ -43,9 +44,9 @@ class PixelConverter:
             return make_counts_thumbnail(plane)
         return np.asarray(make_thumbnail(plane) >> (int(layout[2] or 8) - 8), np.uint8)
 
-    def conversion(self, picture: "VideoFrame", aspect: float) -> Callable[[], Image]:
+    def prepare_conversion(self, picture: "VideoFrame", aspect: float) -> Callable[[], Image]:
         """Return a function that converts a picture to uint8 (H, W, 3) BGR, or (H, W) grey for counts, with square
-        pixels of the same height. `aspect` is the width of its pixels over their height."""
+        pixels of the same height. `aspect`: width of its pixels over their height."""
         is_usable = abs(aspect - 1) > _SQUARE_TOLERANCE and 1 / _MAX_ASPECT <= aspect <= _MAX_ASPECT
         width_px = round(picture.width * aspect) if is_usable else picture.width
         layout = _match_layout(picture)
@@ -55,16 +56,16 @@ class PixelConverter:
         return lambda: to_8_bits(_read_luma(self._reformat(picture, picture.format.name, width_px), layout), limits)
 
     def _reformat(self, picture: "VideoFrame", form: str, width_px: int | None = None) -> "VideoFrame":
-        converter: VideoReformatter | None = getattr(self._of_thread, form, None)
+        converter: VideoReformatter | None = getattr(self._local, form, None)
         if converter is None:
             converter = VideoReformatter()
-            setattr(self._of_thread, form, converter)
+            setattr(self._local, form, converter)
         return converter.reformat(picture, width=width_px, format=form, interpolation="BICUBIC")
 
 
 def _match_layout(picture: "VideoFrame") -> re.Match[str] | None:
-    """Return how the brightness lies in the first plane, by `_LUMA_FORMATS`; None if it has to be computed. Rows from
-    the bottom to the top cannot be read in place."""
+    """Return how the luma lies in the first plane, by `_LUMA_FORMATS`; None if it must be computed. Rows from bottom to
+    top cannot be read in place."""
     return None if picture.planes[0].line_size < 0 else _LUMA_FORMATS.fullmatch(picture.format.name)
 
 

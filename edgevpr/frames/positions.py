@@ -1,5 +1,5 @@
 """Tables of positions in CSV: position, attitude and time of each image of a folder (positions.csv), or of a video at
-certain seconds. The sources of frames read them; `where` in this module is "FILE, line N" for error messages."""
+given seconds. The sources of frames read them. `where` in this module is "FILE, line N" for error messages."""
 
 import csv
 import io
@@ -18,7 +18,7 @@ from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.types import Position
 
 ALT_LIMITS_M = (-1000.0, 100_000.0)  # plausible altitudes
-# Each column of numbers with its limits. Of heading_deg and yaw_deg, and of height_m and rel_alt, the first counts.
+# Each column of numbers with its limits. heading_deg takes precedence over yaw_deg, and height_m over rel_alt.
 _COLUMN_LIMITS = {
     "lat": (-90.0, 90.0),
     "lon": (-180.0, 180.0),
@@ -34,12 +34,12 @@ _TAG_COLUMNS = ("lat", "lon", "alt", "yaw_deg", "roll_deg", "pitch_deg", "height
 _NEEDED_COLUMNS = ("file", "lat", "lon")
 _TRACK_COLUMNS = ("time", "lat", "lon")
 _MAX_FILE_BYTES = 100_000_000  # a million images
-# The years 1900 to 2200. Times written in milliseconds are a thousand times too large, and so lie outside.
+# The years 1900 to 2200. A time in milliseconds, a thousand times too large, lies outside.
 _MIN_TIME_S = -2_208_988_800
 _MAX_TIME_S = 7_258_118_400
-MAX_GAP_S = 5.0  # positions further apart in time are not interpolated: the aircraft may have turned in between
+MAX_GAP_S = 5.0  # no interpolation between positions further apart: the aircraft may have turned
 _TIME_ROUNDING_S = 0.001  # Matroska counts in milliseconds
-_ANGLE_INDICES = [1, 3, 4]  # which of `_to_numbers` are angles of a full turn
+_ANGLE_INDICES = [1, 3, 4]  # in `_to_numbers`, of angles of a full turn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,14 +100,14 @@ def _write_table(csv_path: str | Path, header: Sequence[str], rows: Iterable[Seq
 
 def _to_numbers(tag: GeoTag) -> tuple[Any, ...]:
     """Return latitude, longitude, altitude, heading, roll, pitch and height of a tag; None: unknown."""
-    at = tag.position
-    where = (at.lat_deg, at.lon_deg, at.alt_m) if at else (None, None, None)
-    return *where, tag.heading_deg, tag.roll_deg, tag.pitch_deg, tag.height_m
+    position = tag.position
+    coordinates = (position.lat_deg, position.lon_deg, position.alt_m) if position else (None, None, None)
+    return *coordinates, tag.heading_deg, tag.roll_deg, tag.pitch_deg, tag.height_m
 
 
 def _read_rows(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
-    """Read the rows of a table with the columns `needed`: for each "FILE, line N" and its values as text, by column
-    name. If `file` is one of `needed`, file names must be unique. Raises UsageError as `read_positions` does."""
+    """Read the rows of a table with the columns `needed`: "FILE, line N" and the values as text by column name of each.
+    If `file` is one of `needed`, file names must be unique. Raises UsageError as `read_positions` does."""
     try:
         text = read_file(csv_path, _MAX_FILE_BYTES).decode("utf-8-sig")
         table = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
@@ -116,41 +116,41 @@ def _read_rows(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) ->
     except OSError as error:
         raise UsageError(f"{csv_path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise UsageError(f"{csv_path} is not a text file of commas ({error}): save it as CSV in UTF-8.") from error
+        raise UsageError(f"{csv_path} is not a CSV text file ({error}): save it as CSV in UTF-8.") from error
     for name in (*needed, *_COLUMN_LIMITS, "time"):
         if header.count(name) > 1 or (name in needed and name not in header):
             raise UsageError(
-                f"{csv_path}, line 1 has no column `{name}`, or two: it must name {', '.join(needed)} once each, with "
-                "commas between them."
+                f"{csv_path}, line 1 has no column `{name}`, or two: it must name {', '.join(needed)} once each, "
+                "separated by commas."
             )
-    found, names = [], {""}
+    records, names = [], {""}
     for where, row in rows:
-        if None in row or None in row.values():  # so says DictReader
-            raise UsageError(f"{where} has not as many values as line 1 has columns: make them agree.")
-        row = {name: value.strip() for name, value in row.items()}
-        if "file" in needed and row["file"] in names:
-            raise UsageError(f"{where} names no image, or one of an earlier line (`{row['file']}`): correct it.")
-        names.add(row.get("file", ""))
-        found.append((where, row))
-    return found
+        if None in row or None in row.values():  # DictReader's sign of too many values, and of too few
+            raise UsageError(f"{where} has another number of values than line 1 has columns: correct it.")
+        record = {name: value.strip() for name, value in row.items()}
+        if "file" in needed and record["file"] in names:
+            raise UsageError(f"{where} names no image, or that of an earlier line (`{record['file']}`): correct it.")
+        names.add(record.get("file", ""))
+        records.append((where, record))
+    return records
 
 
 def _parse_tag(row: Mapping[str, str], where: str) -> GeoTag:
     """Convert a table's row (text by column name) to a GeoTag. Raises UsageError for a wrong value."""
-    known = {column: _parse_number(row, column, *limits, where) for column, limits in _COLUMN_LIMITS.items()}
-    lat_deg, lon_deg, position = known["lat"], known["lon"], None
+    values = {column: _parse_number(row, column, *limits, where) for column, limits in _COLUMN_LIMITS.items()}
+    lat_deg, lon_deg, position = values["lat"], values["lon"], None
     if lat_deg is not None and lon_deg is not None:
-        position = make_position(lat_deg, lon_deg, known["alt"])
+        position = make_position(lat_deg, lon_deg, values["alt"])
     elif lat_deg is not None or lon_deg is not None:
         raise UsageError(f"{where} has only one of lat and lon: write both, or leave both empty.")
-    heading_deg = known["yaw_deg"] if known["heading_deg"] is None else known["heading_deg"]
+    heading_deg = values["yaw_deg"] if values["heading_deg"] is None else values["heading_deg"]
     return GeoTag(
         position=position,
         heading_deg=None if heading_deg is None else heading_deg % 360,
         t_utc_s=_parse_time_cell(row, where),
-        roll_deg=known["roll_deg"],
-        pitch_deg=known["pitch_deg"],
-        height_m=known["rel_alt"] if known["height_m"] is None else known["height_m"],
+        roll_deg=values["roll_deg"],
+        pitch_deg=values["pitch_deg"],
+        height_m=values["rel_alt"] if values["height_m"] is None else values["height_m"],
     )
 
 
@@ -160,8 +160,8 @@ def make_position(lat_deg: float, lon_deg: float, alt_m: float | None) -> Positi
 
 
 def _parse_number(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
-    """Return the number in `column` of a row, None if the cell is empty or missing. Raises UsageError for text that is
-    no number within `low`..`high`."""
+    """Return the number in `column` of a row; None if the cell is empty or missing. Raises UsageError for text that is
+    no number from `low` to `high`."""
     if not (text := row.get(column)):
         return None
     try:
@@ -185,8 +185,8 @@ def _parse_time_cell(row: Mapping[str, str], where: str) -> float | None:
 
 
 def parse_time(text: str) -> float:
-    """Convert a time to seconds since 1970 (UTC): `2016:06:23 16:31:59` (EXIF), ISO 8601, or seconds. Without a zone it
-    is UTC. Raises ValueError for any other text, and for a time outside 1900 to 2200, such as one in milliseconds."""
+    """Convert a time to seconds since 1970 (UTC): `2016:06:23 16:31:59` (EXIF), ISO 8601, or seconds; without a zone it
+    is UTC. Raises ValueError for any other text, and for a time outside 1900 to 2200."""
     try:
         seconds = float(text)
     except ValueError:
@@ -201,8 +201,8 @@ def parse_time(text: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Positions and attitudes along a video. `t_s` are seconds from its first frame, ascending, and `tags` the data at
-    each, all with a position. `path` is the table's file, for messages."""
+    """Positions and attitudes along a video. `t_s`: seconds from its first frame, ascending. `tags`: the data at each,
+    all with a position. `path`: the table's file, for messages."""
 
     path: Path
     t_s: tuple[float, ...]
@@ -231,7 +231,7 @@ class Track:
             height_m=height_m,
         )
 
-    def require_within(self, video: Path, lasts_s: float) -> None:
+    def require_overlap(self, video: Path, lasts_s: float) -> None:
         """Raise UsageError if the times of the table and of the video, which lasts `lasts_s` seconds, do not overlap.
         `video` is its path, for the message."""
         if self.t_s[-1] < -_TIME_ROUNDING_S or self.t_s[0] > lasts_s:

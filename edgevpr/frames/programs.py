@@ -1,10 +1,9 @@
-"""Cameras that a program of the system reads for us. `rpicam`, or `rpicam:1` for the second one, is a Raspberry Pi's on
-the ribbon cable, read by rpicam-vid; `gst: PIPELINE` is whatever GStreamer can read, by gst-launch-1.0.
+"""Cameras that are read by a program of the system. `rpicam`, or `rpicam:1` for the second one, is a Raspberry Pi's
+ribbon-cable camera, read by rpicam-vid; `gst: PIPELINE` is whatever GStreamer can read, by gst-launch-1.0.
 
-The program sends pictures (MJPEG) over loopback, and they are read as any stream is, with its time-outs. So the flight
-loads no library of cameras, and one that hangs does not stop it. The program ends with the thread that has started it
-(setpriv), whatever ends that thread: a program left over would keep the camera.
-"""
+The program sends MJPEG over loopback, which is read like any stream, with the same timeouts. So the flight loads no
+camera library, and a camera that hangs does not stop it. The program ends with the thread that started it (setpriv),
+whatever ends that thread: a leftover program would keep the camera."""
 
 import logging
 import re
@@ -32,18 +31,18 @@ _PACKAGES = {
     _GSTREAMER: "gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-good",
 }
 _ADVICE = {
-    _RPICAM: "`rpicam-hello --list-cameras` says if it is found, and whether it is in use",
-    _GSTREAMER: "run `gst-launch-1.0 -v` with it to see why, and end it with raw video (video/x-raw)",
+    _RPICAM: "run `rpicam-hello --list-cameras` to see whether the camera is found and in use",
+    _GSTREAMER: "run `gst-launch-1.0 -v` with the pipeline to see why, and let it end with raw video (video/x-raw)",
 }
-# For this size the usual sensors (OV5647, IMX219, IMX477, IMX708) read all of their pixels, binned: for a smaller one
-# some read the middle only, and see less.
+# For this size the usual sensors (OV5647, IMX219, IMX477, IMX708) read all of their pixels, binned. For a smaller size
+# some read only the middle, and see less.
 _SIZE_PX = (1280, 960)
 _RATE_HZ = 10
 _QUALITY = 90
 _APPSINK_PATTERN = re.compile(r"!\s*appsink\b[^!]*$")  # as pipelines for OpenCV end
-_MAX_QUEUED_PICTURES = 10  # of a reader that does not read: older ones are dropped
-# From the start to the first picture. A camera takes a second or two, but GStreamer that looks for its plugins, or a
-# sensor behind several drivers, 10 s and more on a small board; and whoever is ended too early starts as slowly again.
+_MAX_QUEUED_PICTURES = 10  # for a reader that does not read: older ones are dropped
+# From the start to the first picture. A camera takes a second or two; a search of GStreamer for plugins, or a sensor
+# behind several drivers, 10 s or more on a small board. A program ended too early starts as slowly again.
 _FIRST_PICTURE_TIMEOUT_S = 60.0
 _POLL_PERIOD_S = 0.2
 _TERMINATE_TIMEOUT_S = 2.0
@@ -60,13 +59,15 @@ def require_program(uri: str) -> str:
         _split_pipeline(uri)
     path = shutil.which(name)
     if path is None:
-        raise SourceError(f"{name}, which reads this camera, is not here: run `sudo apt install {_PACKAGES[name]}`.")
+        raise SourceError(
+            f"{name}, which reads this camera, is not installed: run `sudo apt install {_PACKAGES[name]}`."
+        )
     return path
 
 
 def open_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
-    """Start the program for the camera `uri`, connect to it, and wait for its first picture for as long as it runs, a
-    minute at most. `clock` is the monotonic clock, in seconds. Raises OpeningError if it gives none."""
+    """Start the program for the camera `uri`, connect to it, and wait for its first picture while it runs, at most a
+    minute. `clock` is the monotonic clock, in seconds. Raises OpeningError if no picture comes."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -86,14 +87,14 @@ def open_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
             stream = open_raw(f"tcp://127.0.0.1:{port}", clock, "mjpeg", left_s, delay_sd_s)
             if time.monotonic() < end_s:
                 return ProgramCapture(stream, process)
-            stream.release()  # FFmpeg calls a stream open when its time is over, without a picture too
+            stream.release()  # FFmpeg calls a stream open after its timeout, even without a picture
         time.sleep(_POLL_PERIOD_S)
     exit_code = process.poll()
     _log.warning("%s gives no picture: %s", uri, _ADVICE[name])
     _terminate(process)
     if exit_code is None:
         raise OpeningError(f"no picture from {name} in {_FIRST_PICTURE_TIMEOUT_S:g} s")
-    raise OpeningError(f"{name} has ended with code {exit_code}{errors.explain_exit()}")
+    raise OpeningError(f"{name} ended with code {exit_code}{errors.explain_exit()}")
 
 
 class ProgramCapture:
@@ -115,7 +116,7 @@ class ProgramCapture:
 
 
 class ErrorLines:
-    """The last lines that a program writes to stderr. A thread reads them, as a program whose pipe is full hangs."""
+    """The last lines that a program writes to stderr, read by a thread: a program whose pipe is full hangs."""
 
     def __init__(self, process: "subprocess.Popen[bytes]") -> None:
         self._process = process
@@ -124,7 +125,7 @@ class ErrorLines:
         self._thread.start()
 
     def explain_exit(self) -> str:
-        """Return the line that tells best why the program has ended, after a colon; "" if there is none."""
+        """Return the line that best explains why the program ended, after a colon; "" if there is none."""
         self._thread.join(_POLL_PERIOD_S)
         lines = [line.decode(errors="replace").strip() for line in list(self._lines)]
         lines = [line for line in lines if 0 < len(line) <= _STDERR_CHARS]
@@ -142,9 +143,9 @@ def _choose_program(uri: str) -> str:
 
 
 def _make_rpicam_command(uri: str, port: int) -> list[str]:
-    """Return the command that sends the pictures of a ribbon camera to the first who connects to `port`."""
+    """Return the command that sends the pictures of a ribbon-cable camera to the first client at `port`."""
     return [
-        *("setpriv", "--pdeathsig", "KILL"),  # ends with our thread: it has nothing to close
+        *("setpriv", "--pdeathsig", "KILL"),  # with our thread; it has nothing to close
         *(require_program(uri), "--camera", uri.partition(":")[2] or "0", "--timeout", "0", "--nopreview"),
         *("--verbose", "0", "--codec", "mjpeg", "--quality", str(_QUALITY), "--framerate", str(_RATE_HZ)),
         *("--width", str(_SIZE_PX[0]), "--height", str(_SIZE_PX[1])),
@@ -153,20 +154,19 @@ def _make_rpicam_command(uri: str, port: int) -> list[str]:
 
 
 def _make_gstreamer_command(uri: str, port: int) -> list[str]:
-    """Return the command that sends the pictures of a pipeline to those who connect to `port`. It does not notice that
-    they have gone."""
+    """Return the command that sends the pictures of a pipeline to all clients at `port`. It does not end with them."""
     sink = f"sync=false buffers-soft-max={_MAX_QUEUED_PICTURES} recover-policy=latest host=127.0.0.1 port={port}"
     encoder = f"! videoconvert ! jpegenc quality={_QUALITY} ! tcpserversink {sink}"
-    ends = "setpriv", "--pdeathsig", "TERM"  # with our thread; it closes its camera upon this
-    return [*ends, require_program(uri), "-q", *_split_pipeline(uri), *encoder.split()]
+    guard = "setpriv", "--pdeathsig", "TERM"  # with our thread; on this signal it closes its camera
+    return [*guard, require_program(uri), "-q", *_split_pipeline(uri), *encoder.split()]
 
 
 def _split_pipeline(uri: str) -> list[str]:
-    """Split a pipeline, without an appsink, into words. Raises SourceError if there is none or a quote does not end."""
+    """Split a pipeline, without an appsink, into words. Raises SourceError if it is empty or a quote is not closed."""
     with suppress(ValueError):
         if words := shlex.split(_APPSINK_PATTERN.sub("", uri.removeprefix("gst:"))):
             return words
-    raise SourceError(f"`{uri}` is no pipeline: write one as for gst-launch-1.0 after `gst:`, with quotes that end.")
+    raise SourceError(f"`{uri}` is no pipeline: write one as for gst-launch-1.0 after `gst:`, and close all quotes.")
 
 
 def _terminate(process: "subprocess.Popen[bytes]") -> None:

@@ -1,5 +1,5 @@
-"""RTP that is sent to a UDP port without a description (RFC 3550), as many companion computers and ground stations do.
-FFmpeg needs an SDP (RFC 8866) that names the codec; it is made here from the first packets."""
+"""RTP sent to a UDP port without a description (RFC 3550), as by many companion computers and ground stations. FFmpeg
+needs an SDP (RFC 8866) that names the codec; it is made here from the first packets."""
 
 import base64
 import errno
@@ -14,20 +14,18 @@ from edgevpr.frames.shot import OpeningError
 
 _VERSION_2 = 0x80  # the two highest bits of an RTP packet
 _HEADER_BYTES = 12
-_MAX_PACKETS = 10  # by which the codec is found: most of them are fragments, which no other codec's packets look like
+_MAX_PACKETS = 10  # to find the codec by: most are fragments, and no other codec's packets look like them
 _STATIC_TYPES = {26: "JPEG", 32: "MPV", 33: "MP2T"}  # payload types of RFC 3551
 _FIRST_DYNAMIC_TYPE = 96
 _H264_TYPES = (1, 5, 6, 7, 8, 9, 24, 28)  # of NAL units, aggregates and fragments (RFC 6184)
 _H265_TYPES = (0, 1, 19, 20, 21, 32, 33, 34, 35, 39, 48, 49)  # the same (RFC 7798)
-_MULTICAST_OR_IPV6 = re.compile(
-    r"\w+://@?(2(2[4-9]|3\d)\.|\[)"
-)  # a multicast group, or IPv6: FFmpeg receives it by itself
+_MULTICAST_OR_IPV6 = re.compile(r"\w+://@?(2(2[4-9]|3\d)\.|\[)")  # FFmpeg receives these by itself
 
 
 def describe_rtp(uri: str, timeout_s: float) -> str | None:
-    """Wait for packets at `uri`, udp://[HOST]:PORT or rtp://[HOST]:PORT. If they are RTP, return the address of an SDP
-    that describes them; None if they are something else, which FFmpeg may know. Raises OpeningError if no packet comes,
-    if the port is in use, or if the codec is none of H.264, H.265, JPEG, MPEG-2 and MPEG-TS."""
+    """Wait for packets at `uri`, udp://[HOST]:PORT or rtp://[HOST]:PORT. Returns the address of an SDP that describes
+    them if they are RTP, else None: FFmpeg may know what they are. Raises OpeningError if no packet comes, if the port
+    is in use, or if the codec is none of H.264, H.265, JPEG, MPEG-2 and MPEG-TS."""
     if _MULTICAST_OR_IPV6.match(uri):
         return None
     try:
@@ -68,7 +66,7 @@ def _open_port(port: int) -> socket.socket:
 
 
 def _receive_packets(receiver: socket.socket, timeout_s: float) -> list[bytes]:
-    """Return the first packets: one that is no RTP, or some that are; as many as come in `timeout_s` seconds."""
+    """Return the packets that come in `timeout_s` seconds, up to `_MAX_PACKETS` or to the first that is no RTP."""
     packets: list[bytes] = []
     end_s = time.monotonic() + timeout_s
     with suppress(TimeoutError):
@@ -85,7 +83,7 @@ def _is_rtp(packet: bytes) -> bool:
 
 
 def _find_codec(packet: bytes) -> tuple[int, str] | None:
-    """Return the payload type and the name of the codec of an RTP packet, None if the packet does not show it."""
+    """Return payload type and codec name of an RTP packet; None if the packet does not show the codec."""
     kind, start = packet[1] & 0x7F, _HEADER_BYTES + 4 * (packet[0] & 0x0F)
     if packet[0] & 0x10:  # an extension, with its length in words
         start += 4 + 4 * int.from_bytes(packet[start + 2 : start + 4], "big")

@@ -1,11 +1,9 @@
-"""Comparison of two pictures by their content: do they show the same, unmoved, whatever noise, clock or display they
-carry? (Two exactly equal pictures are found by `shot.RepeatDetector`, before they are decoded in full.)
+"""Tells whether two pictures show the same, unmoved, whatever noise, clock or display they carry. (Exactly equal
+pictures are found by `shot.RepeatDetector`, before they are decoded in full.)
 
-Coarse copies are compared block by block. The texture of each block says by how much its correlation would fall if the
-picture had moved by 1.5 of their pixels, in any direction; a block that has lost less has not moved. So neither
-the kind of ground nor its contrast needs a limit, and a block whose texture cannot show every motion, as that of
-furrows, is not used.
-"""
+Coarse copies are compared block by block. The texture of a block determines by how much its correlation falls if the
+picture moves by 1.5 of their pixels in any direction; a block that lost less has not moved. So no limit is needed for
+the kind of ground or its contrast. Blocks whose texture cannot show every motion, such as furrows, are not used."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,10 +15,10 @@ from edgevpr.core.arrays import Array, Bools, Image, Singles
 
 _SIZE_PX = (128, 96)  # of a coarse copy, columns and rows
 _BLOCK_PX = 16
-_MIN_TEXTURE_LEVELS = 2.5  # least standard deviation in a block, grey levels; noise of a picture in the dark has less
+_MIN_TEXTURE_LEVELS = 2.5  # standard deviation of a block, grey levels; noise of a dark picture has less
 _MOTION_PX = 1.5
-_MIN_LOSS = 0.05  # of correlation by that motion: less cannot be told from the noise of a compressed picture
-_MAX_READ_COLUMNS = 640  # columns that are averaged, of a larger picture
+_MIN_LOSS = 0.05  # of correlation by that motion: less may be the noise of a compressed picture
+_MAX_READ_COLUMNS = 640  # that are averaged, of a larger picture
 _THUMBNAIL_PX = (16, 12)
 BLOCK_COUNT = _SIZE_PX[0] // _BLOCK_PX * (_SIZE_PX[1] // _BLOCK_PX)
 
@@ -48,26 +46,25 @@ class CoarsePicture:
         return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6), np.float32)
 
     @cached_property
-    def least_loss(self) -> Singles:
-        """By how much the correlation of each block falls, float32 (48,), if the picture moves by 1.5 pixels in the
-        direction in which that is seen least: from the least eigenvalue of its structure tensor."""
-        right, down = (_cut_blocks(cv2.Sobel(self.grey, cv2.CV_32F, 1 - axis, axis, ksize=1) / 2) for axis in (0, 1))
-        pairs = (right, right), (down, down), (right, down)
-        across, along, both = ((one * other).sum(axis=1) for one, other in pairs)
-        least = (across + along) / 2 - np.hypot((across - along) / 2, both)
+    def min_loss(self) -> Singles:
+        """Loss of correlation of each block, float32 (48,), if the picture moves by 1.5 pixels in the direction that
+        shows it least: from the smallest eigenvalue of the block's structure tensor."""
+        dx, dy = (_cut_blocks(cv2.Sobel(self.grey, cv2.CV_32F, 1 - axis, axis, ksize=1) / 2) for axis in (0, 1))
+        xx, yy, xy = (dx * dx).sum(axis=1), (dy * dy).sum(axis=1), (dx * dy).sum(axis=1)
+        eigenvalue = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
         blocks = _cut_blocks(self.grey)
         energy = ((blocks - blocks.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
-        return np.asarray(_MOTION_PX**2 * least / (2 * np.maximum(energy, 1e-6)), np.float32)
+        return np.asarray(_MOTION_PX**2 * eigenvalue / (2 * np.maximum(energy, 1e-6)), np.float32)
 
     @cached_property
     def is_textured(self) -> Bools:
         """True for each block whose texture would show a motion, bool (48,)."""
-        return np.asarray(self.blocks.any(axis=1) & (self.least_loss > _MIN_LOSS))
+        return np.asarray(self.blocks.any(axis=1) & (self.min_loss > _MIN_LOSS))
 
-    def is_unmoved(self, other: "CoarsePicture") -> Bools:
-        """True for each textured block that shows the same in the other picture, unmoved, bool (48,)."""
+    def find_unmoved_blocks(self, other: "CoarsePicture") -> Bools:
+        """Return True for each textured block that shows the same in the other picture, unmoved: bool (48,)."""
         loss = 1 - (self.blocks * other.blocks).sum(axis=1)
-        return np.asarray(self.is_textured & (loss < self.least_loss))
+        return np.asarray(self.is_textured & (loss < self.min_loss))
 
 
 def make_coarse(image: Image) -> CoarsePicture:

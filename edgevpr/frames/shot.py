@@ -1,9 +1,7 @@
-"""One picture of a camera or stream (`Shot`), what gives them (`Capture`), and the detection of repeats
-(`RepeatDetector`).
+"""Pictures of a camera or stream (`Shot`), their source (`Capture`), and the detection of repeats (`RepeatDetector`).
 
-A decoder that fills lost parts from older pictures, and a camera that hangs, do not always report that. But no two new
-pictures are exactly equal, because of the camera's noise. They are compared by coarse grey copies, in bands of rows.
-"""
+A decoder that fills lost parts from older pictures, and a camera that hangs, do not always report it. But the camera's
+noise makes all new pictures differ. They are compared by coarse grey copies, in bands of rows."""
 
 from collections import deque
 from collections.abc import Callable
@@ -19,25 +17,23 @@ from edgevpr.core.types import FRAME_TIME_SD_S
 
 Plane = TypeVar("Plane", bound=NDArray[Any])
 
-_MIN_THUMBNAIL_PX = (60, 80)  # least rows and columns of a coarse copy
+_MIN_THUMBNAIL_PX = (60, 80)  # rows and columns of a coarse copy
 _BANDS = 12
-_HISTORY_PICTURES = 6  # pictures: decoders use about as many buffers in rotation
+_HISTORY_PICTURES = 6  # decoders use about as many buffers in rotation
 # Bands are equal if this share of their pixels differs by at most this many grey levels.
 _MIN_EQUAL_SHARE = 0.99
 _MAX_EQUAL_LEVELS = 1
 _MIN_TEXTURE_LEVELS = 8.0  # least standard deviation of a band with enough texture to be judged, in grey levels
 _MIN_CHANGE_LEVELS = 3.0  # mean difference, in grey levels, of a band that has certainly changed
 _MIN_BANDS = 2
-_LEARNING_PICTURES = 8  # time constant, in pictures, of the share of pictures in which a band changed
-_MIN_CHANGE_SHARE = (
-    0.75  # least share of pictures in which a band changed; a band that changes less often is not judged
-)
+_LEARNING_PICTURES = 8  # time constant of the share of pictures in which a band changed
+_MIN_CHANGE_SHARE = 0.75  # a band that changed in a smaller share of pictures is not judged
 
 
 class Condition(Enum):
-    """The condition of a source. OPENING: no picture has come yet. RUNNING: new and complete pictures come. DAMAGED:
-    none is complete. LATE: their age is unknown. FROZEN: the same one comes again and again. LOST: none comes, and the
-    source is being reopened. ENDED: no more will come."""
+    """The condition of a source. OPENING: no picture has come yet. RUNNING: new and complete pictures come. DAMAGED: no
+    picture is complete. LATE: their age is unknown. FROZEN: the same picture comes again and again. LOST: no picture
+    comes, and the source is being reopened. ENDED: no more will come."""
 
     OPENING = auto()
     RUNNING = auto()
@@ -49,10 +45,10 @@ class Condition(Enum):
 
 
 class Refusal(Enum):
-    """The reason why a picture is rejected. DAMAGED: it is incomplete, or was decoded with the help of an incomplete
-    one. PATCHED: parts of it are copies from an older picture. FROZEN: it equals the picture before. LATE: its age is
-    unknown, because it was buffered before the source was opened, arrived out of order, or has a time stamp that does
-    not keep time; or it was skipped, because decoding lags behind."""
+    """The reason why a picture is rejected. DAMAGED: it is incomplete, or was decoded by means of an incomplete one.
+    PATCHED: parts of it are copies from an older picture. FROZEN: it equals the picture before. LATE: its age is
+    unknown, because it was buffered before the source was opened, arrived out of order, or has a wrong time stamp; or
+    it was skipped because decoding lags behind."""
 
     DAMAGED = "damaged"
     PATCHED = "patched"
@@ -62,26 +58,26 @@ class Refusal(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shot:
-    """A complete picture. `t_mono_s`: when it was taken, at most its arrival (seconds of the monotonic clock);
-    `t_sd_s`: standard deviation of that; `delay_sd_s`: of a hidden delay beside it, as is usual for such a camera.
-    `look`: coarse grey copy, uint8 (h, w). `pixels`: converts and returns a picture that is used, uint8 (H, W, 3) BGR
-    or (H, W) grey."""
+    """A complete picture. `t_mono_s`: when it was taken, at most its arrival (seconds of the monotonic clock).
+    `t_sd_s`: standard deviation of that. `delay_sd_s`: that of the usual hidden delay of such a camera, in addition.
+    `thumbnail`: coarse grey copy, uint8 (h, w). `convert`: returns the pixels of a picture that is used, uint8 (H, W,
+    3) BGR or (H, W) grey."""
 
     t_mono_s: float
-    look: Image
-    pixels: Callable[[], Image]
+    thumbnail: Image
+    convert: Callable[[], Image]
     t_sd_s: float = FRAME_TIME_SD_S
     delay_sd_s: float = FRAME_TIME_SD_S
 
 
 class OpeningError(Exception):
-    """A camera or stream cannot be opened at present. The text names the cause in a few words, for `Source.state`."""
+    """A camera or stream cannot be opened now. The text names the cause in a few words, for `Source.state`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamFacts:
-    """What a stream states of its pictures. `pixel_aspect`: width of a pixel by its height. `rate_hz`: None if not
-    stated."""
+    """A stream's own description of its pictures. `pixel_aspect`: width of a pixel by its height. `rate_hz`: None if
+    not stated."""
 
     width_px: int
     height_px: int
@@ -97,13 +93,13 @@ class StreamFacts:
 
 
 class Capture(Protocol):
-    """An open camera or stream, used by one thread from opening to release; only `cancel` is for other threads."""
+    """An open camera or stream, used by one thread from opening to release; other threads may call `cancel` only."""
 
     def read(self) -> Shot | Refusal | None:
         """Wait for the next picture and return it, or the reason why it is rejected; None if the source is lost."""
 
     def cancel(self) -> None:
-        """Let a `read` that waits return soon, if that is possible. Returns at once."""
+        """Let a waiting `read` return soon, if possible. Returns at once."""
 
     def release(self) -> None:
         """Close the camera or the connection."""
@@ -111,7 +107,7 @@ class Capture(Protocol):
 
 def make_thumbnail(plane: Plane) -> Plane:
     """Return a small copy of a picture's grey plane (H, W[, C]): every n-th row and column, 60 x 80 pixels or a few
-    more. Pixels are not averaged, as that would remove the noise that tells a new picture from a repeated one."""
+    more. Pixels are not averaged: that would remove the noise by which new pictures differ from repeats."""
     height, width = plane.shape[:2]
     return plane[:: max(1, height // _MIN_THUMBNAIL_PX[0]), :: max(1, width // _MIN_THUMBNAIL_PX[1])].copy()  # type: ignore[return-value]
 
@@ -120,29 +116,29 @@ class RepeatDetector:
     """Compares every picture of one source with the six before.
 
     A picture is PATCHED if at least two bands of rows equal those of an older picture, while at least two others have
-    changed. Only bands count that have texture and changed in nearly all pictures so far. That excludes borders, text
-    over the picture, and static parts of a scene."""
+    changed. Only bands with texture that changed in nearly all pictures so far count, which excludes borders, text over
+    the picture, and static parts of a scene."""
 
     def __init__(self) -> None:
-        self._before: deque[NDArray[np.int16]] = deque(maxlen=_HISTORY_PICTURES)  # pictures as bands, the newest first
-        self._moving = np.zeros(_BANDS)  # share of the latest pictures in which each band changed
+        self._history: deque[NDArray[np.int16]] = deque(maxlen=_HISTORY_PICTURES)  # pictures as bands, newest first
+        self._change_share = np.zeros(_BANDS)  # share of the latest pictures in which each band changed
 
-    def refusal(self, look: Image) -> Refusal | None:
-        """Return why the picture with the coarse copy `look`, uint8 (h, w), is not new; None if it is new."""
-        bands = look[: len(look) // _BANDS * _BANDS].reshape(_BANDS, -1).astype(np.int16)
-        if not self._before or self._before[0].shape != bands.shape:
-            self._before.clear()
-            self._before.appendleft(bands)
+    def find_repeat(self, thumbnail: Image) -> Refusal | None:
+        """Return why the picture with the coarse copy `thumbnail`, uint8 (h, w), is not new; None if it is new."""
+        bands = thumbnail[: len(thumbnail) // _BANDS * _BANDS].reshape(_BANDS, -1).astype(np.int16)
+        if not self._history or self._history[0].shape != bands.shape:
+            self._history.clear()
+            self._history.appendleft(bands)
             return None
-        apart = np.abs(np.stack(self._before) - bands)
-        same = (apart <= _MAX_EQUAL_LEVELS).mean(-1) >= _MIN_EQUAL_SHARE  # (pictures, bands)
+        differences = np.abs(np.stack(self._history) - bands)
+        same = (differences <= _MAX_EQUAL_LEVELS).mean(-1) >= _MIN_EQUAL_SHARE  # (pictures, bands)
         if same[0].all():
             return Refusal.FROZEN  # not remembered, so that it does not push out an older picture
-        self._before.appendleft(bands)
-        moved = (apart[0].mean(-1) > _MIN_CHANGE_LEVELS) & ~same[0]
-        must_move = (bands.std(-1) > _MIN_TEXTURE_LEVELS) & (self._moving > _MIN_CHANGE_SHARE)
+        self._history.appendleft(bands)
+        has_changed = (differences[0].mean(-1) > _MIN_CHANGE_LEVELS) & ~same[0]
+        must_move = (bands.std(-1) > _MIN_TEXTURE_LEVELS) & (self._change_share > _MIN_CHANGE_SHARE)
         is_patched = ((same & must_move).sum(-1) >= _MIN_BANDS).any()
-        if is_patched and moved.sum() >= _MIN_BANDS:
-            return Refusal.PATCHED  # no update below: a band that is patched for long must not count as a static one
-        self._moving += (moved - self._moving) / _LEARNING_PICTURES
+        if is_patched and has_changed.sum() >= _MIN_BANDS:
+            return Refusal.PATCHED  # without the update below: a band patched for long must not count as static
+        self._change_share += (has_changed - self._change_share) / _LEARNING_PICTURES
         return None

@@ -1,6 +1,5 @@
-"""Sources of frames: a folder of images, a video file, a camera or a network stream. All have the interface `Source`,
-and `open_source` opens each. Flights, mapping and all commands that read pictures use them. `RecordingSource` is the
-base class of those that end, `FolderSource` a folder of images."""
+"""Sources of frames: a folder of images, a video file, a camera or a network stream. All have the interface `Source`
+and are opened by `open_source`. `RecordingSource` is the base class of those that end, `FolderSource` a folder."""
 
 import os
 import re
@@ -28,22 +27,22 @@ _SNAPSHOT_PERIOD_S = 0.5
 _PROGRAM_PATTERN = re.compile(r"rpicam(:\d+)?|gst:.*", re.DOTALL)
 # udp://:PORT: on all interfaces.
 _ADDRESS_PATTERN = re.compile(r"(?i)(rtsps?|https?)://[^/].*|tcp://.+:\d+.*|(udp|rtp)://.*:\d+.*")
-# A password with a character that ends the part of an address in which FFmpeg looks for one. Port digits are none.
+# A password with a character that ends the part of an address in which FFmpeg looks for it. A port is no password.
 _UNESCAPED_PASSWORD = re.compile(r"\w+://(?!\[)[^\s/?#@:]*:(?!\d*([/?#]|$))[^@]*[\s/?#].*@.*", re.DOTALL)
 
 
 class Source:
     """A source of frames.
 
-    `is_live`: a camera or stream, of which only the newest picture is read, and no recording, which is read to its end.
+    `is_live`: a camera or stream, of which only the newest picture is read; a recording is read to its end.
     `ended`: no more frames will come. `total`: approximate number of frames, 0 if unknown.
     `dropped`: number of pictures not read in time; None for a recording.
     `refused`: numbers of rejected pictures by reason (values of `Refusal`).
-    `latency_s`: seconds from the taking of the newest picture until it could be read, or until now if it is the newest
-    one for long; None if unknown.
+    `latency_s`: seconds from the taking of the newest picture until it could be read, or until now if no newer one has
+    come for long; None if unknown.
     `condition`: see `Condition`. `state`: the condition in words for people ("reading", "lost, reopening in 2 s").
-    `facts`: what a stream states of its pictures, None if unknown.
-    `step_s`: seconds from the taking of the last picture read to that of the next, where a recording flies by them.
+    `facts`: a stream's description of its pictures, None if unknown.
+    `step_s`: seconds from the last picture read to the next, if a recording is replayed by its times.
     `twins`: refuses pictures whose halves show the same."""
 
     is_live: bool
@@ -59,10 +58,8 @@ class Source:
     twins: TwinCheck
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame (of a live source the newest), or None if there is none within `timeout_s` seconds.
-
-        Raises ImageError for an image that cannot be used; the next call continues with the image after it.
-        """
+        """Return the next frame (of a live source the newest), or None if none comes within `timeout_s` seconds. Raises
+        ImageError for an image that cannot be used; the next call continues with the image after it."""
         raise NotImplementedError
 
     def close(self) -> None:
@@ -84,21 +81,21 @@ class RecordingSource(Source):
         self.twins = TwinCheck()
         self._only = None if only is None else frozenset(only)
 
-    def is_wanted(self, name: str) -> bool:
+    def is_selected(self, name: str) -> bool:
         """Return True if the frame of this name is to be read."""
         return self._only is None or name in self._only
 
 
 def make_frame(image: Image, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
     """Make a frame of `image`, uint8 (H, W[, 3]), with the position, attitude, height and time of `tag`."""
-    known = {field.name: getattr(tag, field.name) for field in fields(tag)}
-    return Frame(image=image, name=name, t_mono_s=t_mono_s, **known)
+    values = {field.name: getattr(tag, field.name) for field in fields(tag)}
+    return Frame(image=image, name=name, t_mono_s=t_mono_s, **values)
 
 
 class FolderSource(RecordingSource):
-    """Gives each image of a folder once, in counting order of the names (2 before 10), with the position, attitude and
-    time of its line in the table of positions, or if it has no line, with those of its EXIF data. For the arguments see
-    `open_source`."""
+    """Gives each image of a folder once, in counting order of the names (2 before 10), with position, attitude and time
+    from its line in the table of positions, or without a line from its EXIF data. For the arguments see `open_source`.
+    """
 
     def __init__(
         self,
@@ -114,8 +111,8 @@ class FolderSource(RecordingSource):
         paths = {decode_name(path.name): path for path in list_images(folder)}  # names in maps and tables are UTF-8
         self._tags = _read_table(folder, positions)
         if positions and not self._tags.keys() & paths:
-            raise UsageError(f"{positions} names none of the images in {folder}: its column `file` must.")
-        self._unread = [(name, path) for name, path in paths.items() if self.is_wanted(name)][::-1]
+            raise UsageError(f"{positions} names none of the images in {folder}: correct its column `file`.")
+        self._unread = [(name, path) for name, path in paths.items() if self.is_selected(name)][::-1]
         self.total = len(self._unread)
         self._clock = clock
         self._depth = DepthRange()
@@ -143,22 +140,22 @@ def _read_table(folder: Path, positions: Path | None) -> dict[str, GeoTag]:
 
 
 def read_tags(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]:
-    """Read the tags that a `FolderSource` gives to the images of a folder, by path; `positions` is the source's. Raises
-    UsageError for an unusable table."""
+    """Read the tags of the images of a folder by path, as a `FolderSource` gives them; `positions` is the source's.
+    Raises UsageError for an unusable table."""
     tags = _read_table(folder, positions)
     return {path: tags.get(decode_name(path.name)) or read_exif(path) for path in list_images(folder)}
 
 
 def read_intervals(uri: str | None, positions: Path | None = None) -> list[float]:
-    """Return the seconds from each image of a folder to the next, by their times in `positions` or EXIF data. Empty:
-    `uri` is no folder that can be used, an image has no time, one is older than that before it, or all are equal."""
+    """Read the seconds from each image of a folder to the next, by their times in `positions` or EXIF data. Empty if
+    `uri` is no usable folder, an image has no time, one is older than the one before it, or all times are equal."""
     times: list[float | None] = []
     if uri is not None and os.path.isdir(uri):
         with suppress(EdgevprError):
             times = [tag.t_utc_s for tag in read_tags(Path(uri), positions).values()]
-    steps_s = [there - here for here, there in pairwise(times) if here is not None and there is not None]
-    in_order = len(steps_s) == len(times) - 1 and min(steps_s, default=-1) >= 0
-    return steps_s if in_order and any(steps_s) else []
+    steps_s = [later - earlier for earlier, later in pairwise(times) if earlier is not None and later is not None]
+    is_ordered = len(steps_s) == len(times) - 1 and min(steps_s, default=-1) >= 0
+    return steps_s if is_ordered and any(steps_s) else []
 
 
 def open_source(
@@ -176,14 +173,14 @@ def open_source(
     `step_s`: least video time in seconds between two frames of a video file (None: every frame); of an address of a
     single picture, seconds between two requests (None: 0.5). `positions`: table of the positions of a recording (None:
     of a folder the positions.csv in or beside it, else EXIF data; of a video the .csv of the same name beside it).
-    `live`: allow cameras and streams, which never end. One that is not there yet is opened as soon as it is.
+    `live`: allow cameras and streams, which never end. A missing one is opened as soon as it is there.
     `clock`: the monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`:
-    for a folder that is flown by its recorded times, the `read_intervals` (empty: it is not).
+    of a folder that is replayed by its times, the result of `read_intervals`.
     Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions.
     """
     path = Path(uri)
     if positions and is_live(uri):
-        raise UsageError(f"{positions} can only place the pictures of a recording, and {uri} is none: leave it out.")
+        raise UsageError(f"{positions} is a table for recordings, and {uri} is live: leave the table out.")
     if os.path.isdir(uri):  # Path.is_dir raises OSError for a long pipeline
         return FolderSource(folder=path, positions=positions, clock=clock, only=only, steps_s=steps_s)
     if is_live(uri):
@@ -202,14 +199,14 @@ def open_source(
     return VideoSource(path, step_s or 0.0, clock, only, track=read_track(table) if table else None)
 
 
-def read_to_end(source: Source, left_out: Callable[[ImageError], None]) -> Iterator[Frame | None]:
-    """Yield all frames of a recording, and close it at the end. For an image that cannot be used, `left_out` is called
-    with the error, and None is yielded. None is also yielded when reading the next frame takes longer than a second."""
+def read_to_end(source: Source, on_error: Callable[[ImageError], None]) -> Iterator[Frame | None]:
+    """Yield all frames of a recording, and close it at the end. For an image that cannot be used, `on_error` is called
+    with the error, and None is yielded, as it is if reading the next frame takes longer than a second."""
     while not source.ended:
         try:
             yield source.read(_READ_TIMEOUT_S)
         except ImageError as error:
-            left_out(error)
+            on_error(error)
             yield None
     source.close()
 
@@ -228,21 +225,19 @@ def is_program_uri(uri: str) -> bool:
 
 
 def find_missing_cause(uri: str) -> str | None:
-    """Return why the device or the .sdp file `uri` cannot be read at present, in a few words; None: it can, or `uri` is
-    neither."""
+    """Return in a few words why the device or .sdp file `uri` cannot be read; None if it can, or `uri` is neither."""
     if "://" in uri or is_program_uri(uri):
         return None
     if not Path(uri).exists():
         return f"there is nothing at {uri}"
     if not os.access(uri, os.R_OK):
-        return f"{uri} may not be read by this user: add the user to the group of the file, often `video`"
+        return f"this user may not read {uri}: add the user to the group of the file, often `video`"
     return None
 
 
 def _make_capture(uri: str, clock: Callable[[], float], period_s: float) -> Callable[[], Capture]:
-    """Return a function that opens the camera or stream `uri`; `period_s`: seconds between requests for pictures where
-    each must be requested. Raises SourceError if that can never succeed: a device or a file that is missing may come
-    later."""
+    """Return a function that opens the camera or stream `uri`. `period_s`: seconds between requests, if each picture
+    must be requested. Raises SourceError if that can never succeed; a missing device or file may come later."""
     if is_program_uri(uri):
         from edgevpr.frames.programs import open_program, require_program  # loads FFmpeg
 

@@ -1,5 +1,5 @@
 """Network streams, decoded by FFmpeg: complete pictures, each with the time at which it was taken (`frames.age`). A
-thread receives packets as they come (`PacketQueue`), the thread of `frames.live` decodes them (`StreamCapture`)."""
+thread receives packets as they arrive (`PacketQueue`), the thread of `frames.live` decodes them (`StreamCapture`)."""
 
 import threading
 from collections import deque
@@ -17,41 +17,40 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
 OPEN_TIMEOUT_S = 5.0
-# `frames.live` closes a stream that gives no picture sooner than this: so long it may wait for the second picture of a
-# slow camera. A port of UDP cannot be opened again while FFmpeg still waits at it, so that wait is short.
+# `frames.live` closes a stream without pictures sooner than this, which allows for the second picture of a slow camera.
+# A UDP port cannot be reopened while FFmpeg still waits at it, so that wait is short.
 READ_TIMEOUT_S = 15.0
 UDP_READ_TIMEOUT_S = 3.0
 # RTSP over TCP loses no packets, but the camera may lose some before sending. FFmpeg reports that only if it may hold
-# packets back to wait for the missing one: at least two. Its search for the rate, which nobody needs here, takes longer
-# than the opening may where a picture comes each second. It opens the addresses in an .sdp file only if these protocols
-# are allowed.
+# back at least two packets to wait for the missing one. Its search for the rate, which is not needed, takes longer than
+# the opening may if one picture comes per second. It opens addresses in an .sdp file only of allowed protocols.
 _OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2", "fpsprobesize": "0"}
 # Some cameras send RTSP by UDP only. FFmpeg then waits 0.1 s for a packet that is missing, and reports it.
 _UDP_OPTIONS = {"rtsp_transport": "udp", "fpsprobesize": "0"}
 _SDP_OPTIONS = {"protocol_whitelist": "data,file,rtp,udp"}
-_RAW_OPTIONS = {"analyzeduration": "1", "fpsprobesize": "0"}  # else FFmpeg watches for its rate for up to 5 s
-_SKIPPABLE_AGE_S = 0.3  # a packet that has waited longer for decoding is skipped if a later key frame has arrived
-_MAX_PACKET_AGE_S = 5.0  # a packet that has waited longer for decoding is skipped in any case
-_MAX_QUEUED_BYTES = 16_000_000  # most bytes of packets that wait for decoding: five seconds of 25 Mbit/s
+_RAW_OPTIONS = {"analyzeduration": "1", "fpsprobesize": "0"}  # else FFmpeg looks for the rate for up to 5 s
+_SKIPPABLE_AGE_S = 0.3  # a packet queued for longer is skipped if a later key frame has arrived
+_MAX_PACKET_AGE_S = 5.0  # a packet queued for longer is skipped in any case
+_MAX_QUEUED_BYTES = 16_000_000  # five seconds of 25 Mbit/s
 _MAX_QUEUED_PACKETS = 2000
-_CLOSE_TIMEOUT_S = 0.5  # longest wait for a stream to be closed
+_CLOSE_TIMEOUT_S = 0.5
 
 
 def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "StreamCapture | SnapshotCapture":
-    """Open a network stream, an .sdp file, or an address of a single picture, which is then requested every `period_s`
+    """Open a network stream, an .sdp file, or an address of a single picture, which is requested every `period_s`
     seconds. `clock` is the monotonic clock, in seconds. Raises OpeningError with the cause."""
     opened_s = clock()
-    answer = try_request(uri, OPEN_TIMEOUT_S) if uri.lower().startswith("http") else None
-    kind = answer.headers.get_content_type() if answer else ""
+    response = try_request(uri, OPEN_TIMEOUT_S) if uri.lower().startswith("http") else None
+    kind = response.headers.get_content_type() if response else ""
     timeouts_s = OPEN_TIMEOUT_S, READ_TIMEOUT_S
-    if answer and kind.startswith("multipart/"):
-        parts = ResponseFile(answer, is_multipart=True)
+    if response and kind.startswith("multipart/"):
+        parts = ResponseFile(response, is_multipart=True)
         return StreamCapture(open_decoder(uri, _RAW_OPTIONS, timeouts_s, "mpjpeg", parts), clock, opened_s)
-    if answer and kind == "application/octet-stream":  # of FFmpeg as a server, which would answer no second request
-        file = ResponseFile(answer, is_multipart=False)
+    if response and kind == "application/octet-stream":  # FFmpeg as a server would answer no second request
+        file = ResponseFile(response, is_multipart=False)
         return StreamCapture(open_decoder(uri, _OPTIONS, timeouts_s, file=file), clock, opened_s)
-    if answer:
-        answer.close()
+    if response:
+        response.close()
     if kind.startswith("image/"):
         return SnapshotCapture(uri, period_s, OPEN_TIMEOUT_S, clock)
     if kind == "text/html":
@@ -62,11 +61,11 @@ def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "Stre
 def open_raw(
     uri: str, clock: Callable[[], float], form: str, timeout_s: float, delay_sd_s: float = FRAME_TIME_SD_S
 ) -> "StreamCapture":
-    """Open a stream of a format without time stamps, `form` by its name in FFmpeg, whose first picture is waited for
+    """Open a stream of a format without time stamps, `form` by its name in FFmpeg, and wait for its first picture up to
     `timeout_s` seconds. `delay_sd_s`: see `Shot`. Raises OpeningError with the cause."""
     opened_s = clock()
-    whole = open_decoder(uri, _RAW_OPTIONS, (timeout_s, READ_TIMEOUT_S), form)
-    return StreamCapture(whole, clock, opened_s, delay_sd_s)
+    decoder = open_decoder(uri, _RAW_OPTIONS, (timeout_s, READ_TIMEOUT_S), form)
+    return StreamCapture(decoder, clock, opened_s, delay_sd_s)
 
 
 def _open_stream(uri: str) -> VideoDecoder:
@@ -84,25 +83,25 @@ def _open_stream(uri: str) -> VideoDecoder:
 
 
 class StreamCapture:
-    """The pictures of an open stream: a `Capture`. `whole` decodes it. `clock` is the monotonic clock in seconds, and
+    """The pictures of an open stream: a `Capture`. `decoder` decodes it. `clock` is the monotonic clock in seconds, and
     `opened_s` its time just before the opening. `delay_sd_s`: see `Shot`."""
 
     def __init__(
         self,
-        whole: VideoDecoder,
+        decoder: VideoDecoder,
         clock: Callable[[], float],
         opened_s: float,
         delay_sd_s: float = HIDDEN_DELAY_SD_S,
     ) -> None:
-        self._whole, self._clock, self._delay_sd_s = whole, clock, delay_sd_s
-        self._stamped = StampedTime() if whole.is_stamped else None
+        self._decoder, self._clock, self._delay_sd_s = decoder, clock, delay_sd_s
+        self._stamped = StampedTime() if decoder.is_stamped else None
         self._unstamped = UnstampedTime(opened_s)
         self._ready: deque[Shot | Refusal] = deque()
-        self._arrivals = PacketQueue(whole.fetch, clock, whole.close)
+        self._arrivals = PacketQueue(decoder.fetch, clock, decoder.close)
 
     @property
     def facts(self) -> StreamFacts:
-        return self._whole.facts
+        return self._decoder.facts
 
     def read(self) -> Shot | Refusal | None:
         while not self._ready:
@@ -110,51 +109,53 @@ class StreamCapture:
             if arrival is None:
                 return None
             if arrival.is_after_gap:
-                self._whole.skip()
+                self._decoder.skip()
             if self._stamped:
-                self._follow_stamps(self._stamped, arrival)
-            taken = self._unstamped.taken(arrival.asked_s, arrival.came_s)
-            waited_s = self._clock() - arrival.came_s
-            if waited_s > _MAX_PACKET_AGE_S or (waited_s > _SKIPPABLE_AGE_S and self._arrivals.can_begin_anew()):
-                return self._whole.skip()
-            pictures = self._whole.decode(arrival)
+                self._record_stamps(self._stamped, arrival)
+            taken = self._unstamped.estimate(arrival.request_s, arrival.arrival_s)
+            waited_s = self._clock() - arrival.arrival_s
+            if waited_s > _MAX_PACKET_AGE_S or (waited_s > _SKIPPABLE_AGE_S and self._arrivals.has_key_frame()):
+                return self._decoder.skip()
+            pictures = self._decoder.decode(arrival)
             if isinstance(pictures, Refusal):
                 return pictures
-            self._ready.extend(self._make_shot(picture, taken, arrival.came_s) for picture in pictures)
+            self._ready.extend(self._make_shot(picture, taken, arrival.arrival_s) for picture in pictures)
         return self._ready.popleft()
 
     def cancel(self) -> None:
-        self._whole.is_cancelled = True
+        self._decoder.is_cancelled = True
         self._arrivals.cancel()
 
     def release(self) -> None:
         self.cancel()
         self._arrivals.close()
 
-    def _follow_stamps(self, stamped: StampedTime, arrival: TimedPacket) -> None:
-        packet, unit_s = arrival.packet, self._whole.unit_s
+    def _record_stamps(self, stamped: StampedTime, arrival: TimedPacket) -> None:
+        packet, unit_s = arrival.packet, self._decoder.unit_s
         if packet.pts is None:
             return
         order = packet.pts if packet.dts is None else packet.dts
-        stamped.record_arrival(packet.pts * unit_s, order * unit_s, arrival.came_s, packet.size)
+        stamped.record_arrival(packet.pts * unit_s, order * unit_s, arrival.arrival_s, packet.size)
         if stamped.is_live:
-            self._whole.is_backlog_doubtful = False  # packets from now on were sent after the opening
+            self._decoder.is_backlog_doubtful = False  # packets from now on were sent after the opening
 
-    def _make_shot(self, picture: "VideoFrame", by_wait: CaptureTime, came_s: float) -> Shot | Refusal:
+    def _make_shot(self, picture: "VideoFrame", by_wait: CaptureTime, arrival_s: float) -> Shot | Refusal:
         taken: CaptureTime | None = by_wait
         if self._stamped:
-            taken = None if picture.pts is None else self._stamped.taken(picture.pts * self._whole.unit_s, came_s)
+            taken = (
+                None if picture.pts is None else self._stamped.estimate(picture.pts * self._decoder.unit_s, arrival_s)
+            )
         if taken is None:
             return Refusal.LATE
-        look, pixels = self._whole.look(picture), self._whole.conversion(picture)
+        thumbnail, convert = self._decoder.make_thumbnail(picture), self._decoder.prepare_conversion(picture)
         times = {"t_mono_s": taken.t_s, "t_sd_s": taken.sd_s, "delay_sd_s": self._delay_sd_s}
-        return Shot(look=look, pixels=pixels, **times)
+        return Shot(thumbnail=thumbnail, convert=convert, **times)
 
 
 class PacketQueue:
-    """A queue filled by a thread that fetches packets as soon as they come. If the board decodes too slowly, packets
-    wait in this queue, with known arrival times, and not in network buffers, where the time would be unknown. If more
-    wait than are decoded in time, all are dropped, and those to come up to the next key frame.
+    """A queue that a thread fills with packets as soon as they arrive. If the board decodes too slowly, packets wait
+    here, with known arrival times, and not in network buffers, where the time would be unknown. If too many wait, all
+    are dropped, and those to come up to the next key frame.
 
     The thread closes the stream by `close_stream`, since only it knows when its last fetch has returned: FFmpeg cannot
     be interrupted, and closing a stream in use would crash the process."""
@@ -163,8 +164,8 @@ class PacketQueue:
         self, fetch: Callable[[], TimedPacket | None], clock: Callable[[], float], close_stream: Callable[[], None]
     ) -> None:
         self._fetch, self._clock, self._close_stream = fetch, clock, close_stream
-        self._waiting: deque[TimedPacket] = deque()
-        self._waiting_bytes = 0
+        self._queued: deque[TimedPacket] = deque()
+        self._queued_bytes = 0
         self._has_gap = self._is_lost = False
         self._changed = threading.Condition()
         self._is_unused = threading.Event()
@@ -174,17 +175,17 @@ class PacketQueue:
     def next(self) -> TimedPacket | None:
         """Wait for the next packet and return it; None if the stream is lost or cancelled."""
         with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._is_lost)
-            if not self._waiting:
+            self._changed.wait_for(lambda: self._queued or self._is_lost)
+            if not self._queued:
                 return None
-            arrival = self._waiting.popleft()
-            self._waiting_bytes -= arrival.packet.size
+            arrival = self._queued.popleft()
+            self._queued_bytes -= arrival.packet.size
             return arrival
 
-    def can_begin_anew(self) -> bool:
-        """Return True if a key frame is in the queue, which can be decoded without the packets before it."""
+    def has_key_frame(self) -> bool:
+        """Return True if a key frame is in the queue: it can be decoded without the packets before it."""
         with self._changed:
-            return any(arrival.packet.is_keyframe for arrival in self._waiting)
+            return any(arrival.packet.is_keyframe for arrival in self._queued)
 
     def cancel(self) -> None:
         """Drop all packets, and let `next` return None from now on."""
@@ -194,8 +195,8 @@ class PacketQueue:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Let the thread close the stream, as soon as its fetch has returned; wait half a second for it. Nothing of
-        the stream may be used any more."""
+        """Let the thread close the stream as soon as its fetch has returned; wait for that up to half a second. The
+        stream must not be used any more."""
         self.cancel()
         self._is_unused.set()
         self._thread.join(_CLOSE_TIMEOUT_S)
@@ -203,11 +204,11 @@ class PacketQueue:
     def _run(self) -> None:
         try:
             while not self._is_lost:
-                asked_s = self._clock()
+                request_s = self._clock()
                 fetched = self._fetch()
                 if fetched is None:
                     break
-                self._put(fetched._replace(asked_s=asked_s, came_s=self._clock()))
+                self._put(fetched._replace(request_s=request_s, arrival_s=self._clock()))
         finally:
             with self._changed:
                 self._is_lost = True
@@ -217,16 +218,16 @@ class PacketQueue:
 
     def _put(self, arrival: TimedPacket) -> None:
         with self._changed:
-            if self._waiting_bytes > _MAX_QUEUED_BYTES or len(self._waiting) > _MAX_QUEUED_PACKETS:
+            if self._queued_bytes > _MAX_QUEUED_BYTES or len(self._queued) > _MAX_QUEUED_PACKETS:
                 self._clear()
                 self._has_gap = True
             if self._is_lost or (self._has_gap and not arrival.packet.is_keyframe):
                 return
-            self._waiting.append(arrival._replace(is_after_gap=self._has_gap))
-            self._waiting_bytes += arrival.packet.size
+            self._queued.append(arrival._replace(is_after_gap=self._has_gap))
+            self._queued_bytes += arrival.packet.size
             self._has_gap = False
             self._changed.notify_all()
 
     def _clear(self) -> None:
-        self._waiting.clear()
-        self._waiting_bytes = 0
+        self._queued.clear()
+        self._queued_bytes = 0

@@ -1,6 +1,5 @@
-"""Detects pictures whose two halves show the same, as a stereo camera sends them: side by side, or one above the other.
-They match places by a part of the picture only, so that positions are off by tens of metres.
-"""
+"""Detects pictures whose two halves show the same, as sent by a stereo camera: side by side, or one above the other.
+They match places by a part of the picture only, so that positions are off by tens of metres."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,22 +10,22 @@ from edgevpr.frames.images import cv2, resize
 
 _HALVES = ("left and the right", "upper and the lower")
 _COPY_PX = (128, 96)  # width and height of the copy that is compared
-_DETAIL_SIGMA_PX = 3.0  # differences in brightness over longer distances are alike in halves that show something else
+_DETAIL_SIGMA_PX = 3.0  # brightness over longer distances may be alike in halves that show something else
 _MAX_SHIFT_SHARE = 0.125  # of the width of a half, between the views of both eyes
 _MAX_OFFSET_SHARE = 0.04  # of its height, by how the lenses are mounted
 _PEAK_RADIUS_PX = 4.0
 # Chosen on 975 pictures of 14 sets and on stereo pictures made of them, with another exposure, turned by half a degree,
 # shifted, squeezed and noisy: 96 % of these reach both, and none of the ordinary ones (the nearest: 0.46 and 0.13).
 _MIN_TWIN_CORRELATION = 0.5
-_MIN_LEAD = 0.15  # over correlations farther from the largest one; lines (a road) and rows (crops) have none
+_MIN_LEAD = 0.15  # over correlations farther from the largest one; roads and rows of crops have none
 _MIN_DETAIL_LEVELS = 1.5  # standard deviation in grey levels; with less, nothing can be compared
-_TWINS_TO_DECIDE = 5  # pictures that look like twins, more than single ones
-_SINGLES_TO_DECIDE = 10  # single pictures, more than twins, after which no more are compared
+_TWINS_TO_DECIDE = 5  # how many more pictures must be twins than single ones
+_SINGLES_TO_DECIDE = 10  # how many more must be single ones until no more are compared
 
 
 class TwinCheck:
-    """Compares the halves of the first pictures of one source, until it is clear whether it gives twins. A picture that
-    looks like them is refused at once."""
+    """Compares the halves of the first pictures of one source until it is clear whether they are twins. Each picture of
+    twins is refused at once."""
 
     def __init__(self) -> None:
         self._evidence = 0  # above zero for twins
@@ -46,15 +45,15 @@ class TwinCheck:
         self._are_twins = self._evidence == _TWINS_TO_DECIDE or (self._are_twins and self._evidence > 0)
         if twins or self._are_twins:
             raise ImageError(
-                f"The {self._twins[0]} half of the picture show the same, as those of a stereo camera do: give one "
-                "half only, by a pipeline with videocrop (docs/how-to/cameras.md), or cropped images."
+                f"The {self._twins[0]} half of the picture show the same, as from a stereo camera: give one half only, "
+                "by a pipeline with videocrop (docs/how-to/cameras.md), or cropped images."
             )
         return image
 
 
 def correlate_halves(image: Image, side: str) -> tuple[float, float]:
-    """Return the largest correlation, 0 to 1, between both halves of a picture, one of `_HALVES`, over the shifts that
-    a stereo camera causes; and by how much it exceeds all others. 0 and 0: there is too little detail."""
+    """Return the largest correlation, 0 to 1, between the halves of a picture, one of `_HALVES`, over the shifts that a
+    stereo camera causes, and by how much it exceeds all others; 0 and 0 if there is too little detail."""
     are_above = side == _HALVES[1]
     copy = resize(image, _COPY_PX)
     grey = copy if copy.ndim == 2 else copy[:, :, 1]

@@ -1,4 +1,4 @@
-"""A video file as a source of frames: read in order to its end; damaged and missing parts are reported."""
+"""A video file as a source of frames: it is read in order to its end, and damaged and missing parts are reported."""
 
 import math
 from collections import deque
@@ -19,34 +19,34 @@ if TYPE_CHECKING:
 
 _TIMESTAMP_ROUNDING_S = 0.001  # Matroska counts in milliseconds
 _DEFAULT_RATE_HZ = 25.0
-_MAX_MISSING_S = 1.0  # seconds that may be missing at the end: other streams in the file may last a little longer
+_MAX_MISSING_S = 1.0  # at the end without a report: other streams in the file may last longer
 
 
 def read_start_s(path: Path) -> tuple[float | None, float]:
-    """Return when a video was begun, in seconds since 1970 by the clock of the camera (None: it does not say), and how
-    many seconds it lasts (0: unknown). Raises SourceError for a file that is no video."""
-    whole = _open_video(path, "the video file of the positions")
-    said = {**whole.container.metadata, **whole.stream.metadata}.get("creation_time")
-    lasts_s = (whole.container.duration or 0) / 1e6
-    whole.close()
+    """Return the start of a video, in seconds since 1970 by the clock of the camera (None: unknown), and its duration
+    in seconds (0: unknown). Raises SourceError for a file that is no video."""
+    decoder = _open_video(path, "the video file of the positions")
+    start = {**decoder.container.metadata, **decoder.stream.metadata}.get("creation_time")
+    duration_s = (decoder.container.duration or 0) / 1e6
+    decoder.close()
     with suppress(ValueError, OverflowError):
-        return (parse_time(said) if said else None), lasts_s
-    return None, lasts_s
+        return (parse_time(start) if start else None), duration_s
+    return None, duration_s
 
 
-def _open_video(path: Path, wanted: str) -> VideoDecoder:
+def _open_video(path: Path, advice: str) -> VideoDecoder:
     try:
         return open_decoder(str(path), {})
     except OpeningError:
-        raise SourceError(f"{path} is not a video that can be decoded: give {wanted}.") from None
+        raise SourceError(f"{path} is not a video that can be decoded: give {advice}.") from None
 
 
 class VideoSource(RecordingSource):
     """The frames of the video file `path`, at least `step_s` seconds of video time apart (0: every frame); every run
     gives the same frames. `track` has the positions of the frames (None: unknown).
 
-    Damaged frames, and those decoded with their help, are left out: `read` raises ImageError once for each run of them,
-    and once if the end of the file is missing."""
+    Damaged frames, and those decoded by means of them, are left out: `read` raises ImageError once for each sequence of
+    them, and once if the end of the file is missing."""
 
     def __init__(
         self,
@@ -59,17 +59,17 @@ class VideoSource(RecordingSource):
     ):
         super().__init__(only)
         self._path, self._step_s, self._clock, self._track = path, step_s, clock, track
-        self._whole = whole = _open_video(path, "a video file or a folder of images")
-        stream = whole.stream
+        self._decoder = decoder = _open_video(path, "a video file or a folder of images")
+        stream = decoder.stream
         self._first_stamp = stream.start_time or 0
         self._frame_s = 1 / float(stream.average_rate or _DEFAULT_RATE_HZ)
-        lasts_s = stream.duration * whole.unit_s if stream.duration else (whole.container.duration or 0) / 1e6
-        stated_s = lasts_s if whole.is_stamped else 0.0
+        lasts_s = stream.duration * decoder.unit_s if stream.duration else (decoder.container.duration or 0) / 1e6
+        stated_s = lasts_s if decoder.is_stamped else 0.0
         frames = stream.frames or stated_s / self._frame_s
-        self._promised_s = max(stated_s, stream.frames * self._frame_s)  # a cut AVI file has only this right
+        self._expected_s = max(stated_s, stream.frames * self._frame_s)  # in a cut AVI file only the latter is right
         self.total = math.ceil(frames * self._frame_s / max(step_s, self._frame_s))
-        if track and self._promised_s:
-            track.require_within(path, self._promised_s)
+        if track and self._expected_s:
+            track.require_overlap(path, self._expected_s)
         self._ready: deque[VideoFrame] = deque()
         self._index, self._damaged = -1, 0
         self._t_s = -self._frame_s
@@ -85,9 +85,9 @@ class VideoSource(RecordingSource):
             elif self._advance(picture := self._ready.popleft()):
                 self._t_due_s = self._t_s + self._step_s
                 name = f"frame {self._index:06d} t={self._t_s:.3f} s"
-                if self.is_wanted(name):
+                if self.is_selected(name):
                     tag = self._track.interpolate_tag(self._t_s) if self._track else GeoTag()
-                    image = self.twins.require_single(self._whole.conversion(picture)())
+                    image = self.twins.require_single(self._decoder.prepare_conversion(picture)())
                     return make_frame(image, name, self._clock(), tag)
             if self._clock() >= deadline_s:
                 break
@@ -95,16 +95,16 @@ class VideoSource(RecordingSource):
 
     def close(self) -> None:
         self.end()
-        self._whole.close()
+        self._decoder.close()
 
     def _decode_more(self) -> None:
-        fetched = self._whole.fetch()
+        fetched = self._decoder.fetch()
         if fetched is None:
             self._finish()
             return
         if fetched.packet.pts is not None:
-            self._read_s = max(self._read_s, (fetched.packet.pts - self._first_stamp) * self._whole.unit_s)
-        pictures = self._whole.decode(fetched)
+            self._read_s = max(self._read_s, (fetched.packet.pts - self._first_stamp) * self._decoder.unit_s)
+        pictures = self._decoder.decode(fetched)
         if isinstance(pictures, Refusal):
             self._damaged += 1
         else:
@@ -113,8 +113,8 @@ class VideoSource(RecordingSource):
     def _advance(self, picture: "VideoFrame") -> bool:
         """Set index and video time to those of `picture`, the next one decoded; return True if it should be given."""
         self._index += 1
-        stamp_s = ((picture.pts or 0) - self._first_stamp) * self._whole.unit_s
-        # A raw H.264 or MJPEG file has no time stamps (they read as zero or are wrong): the frame rate is used.
+        stamp_s = ((picture.pts or 0) - self._first_stamp) * self._decoder.unit_s
+        # Without usable time stamps, as in a raw H.264 or MJPEG file, the frame rate is used.
         self._t_s = stamp_s if stamp_s > self._t_s else self._t_s + self._frame_s
         return self._t_s >= self._t_due_s - _TIMESTAMP_ROUNDING_S
 
@@ -122,21 +122,21 @@ class VideoSource(RecordingSource):
         count, first, t_s = self._damaged, self._index + 1, self._t_s + self._frame_s
         self.refused[Refusal.DAMAGED.value] += count
         self._damaged, self._index = 0, self._index + count
-        self._t_s += 0.0 if self._whole.is_stamped else count * self._frame_s
+        self._t_s += 0.0 if self._decoder.is_stamped else count * self._frame_s
         which = f"frame {first:06d} (t={t_s:.1f} s)" + (f" and {count - 1} after it" if count > 1 else "")
         raise ImageError(
-            f"{self._path}: {which} cannot be used, being damaged or built on damage{until}: copy the video again.",
+            f"{self._path}: {which} cannot be used{until}: damaged, or decoded from damage: copy the video again.",
             count,
         )
 
     def _finish(self) -> None:
         if self._damaged:
-            self._report_damage(until=", to the end of the file, which may be cut short")
+            self._report_damage(until=" up to the end of the file")
         self.end()
-        missing_s = self._promised_s - self._read_s - self._frame_s
+        missing_s = self._expected_s - self._read_s - self._frame_s
         if missing_s > _MAX_MISSING_S:
             raise ImageError(
-                f"{self._path} ends after {self._promised_s - missing_s:.1f} s of {self._promised_s:.1f} s: it is cut "
+                f"{self._path} ends after {self._expected_s - missing_s:.1f} s of {self._expected_s:.1f} s: it is cut "
                 "short: copy the video again.",
                 round(missing_s / self._frame_s),
             )

@@ -1,5 +1,5 @@
-"""Pictures over HTTP that FFmpeg does not read as a stream: an address of one picture, requested again and again
-(`SnapshotCapture`), and a multipart stream whose parts may be of any image type (`ResponseFile`)."""
+"""Pictures over HTTP that FFmpeg cannot read as a stream: the address of a single picture, requested again and again
+(`SnapshotCapture`), and a multipart stream whose parts are of any image type (`ResponseFile`)."""
 
 import http.client
 import re
@@ -18,7 +18,7 @@ from edgevpr.frames.images import decode_image, encode_jpeg, is_whole_jpeg
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, make_thumbnail
 
 _MAX_BYTES = 64_000_000  # of one picture
-_MAX_PART_S = 15.0  # for one picture of a multipart stream: a sender that trickles must not hold a thread for ever
+_MAX_PART_S = 15.0  # for one picture of a multipart stream: a trickling sender must not hold a thread for ever
 _CHUNK_BYTES = 65536
 _MAX_PERIOD_S = 1.0  # from one request for a picture to the next
 _JPEG_START = b"\xff\xd8"
@@ -27,7 +27,7 @@ _REQUEST_ERRORS = (OSError, http.client.HTTPException, ValueError)
 
 
 def send_request(uri: str, timeout_s: float) -> http.client.HTTPResponse:
-    """Return the answer to a request for `uri`, http or https, that may hold user and password. `timeout_s` limits each
+    """Request `uri`, http or https, which may hold user and password, and return the response. `timeout_s` limits each
     wait. Raises one of `_REQUEST_ERRORS`."""
     parts = urlsplit(uri)
     account, _, host = parts.netloc.rpartition("@")
@@ -44,12 +44,12 @@ def send_request(uri: str, timeout_s: float) -> http.client.HTTPResponse:
         urllib.request.HTTPDigestAuthHandler(passwords),
         urllib.request.HTTPBasicAuthHandler(passwords),
     )
-    answer: http.client.HTTPResponse = opener.open(address, timeout=timeout_s)
-    return answer
+    response: http.client.HTTPResponse = opener.open(address, timeout=timeout_s)
+    return response
 
 
 def try_request(uri: str, timeout_s: float) -> http.client.HTTPResponse | None:
-    """Request `uri`; None if that fails, for a cause that FFmpeg can find. Raises OpeningError if nothing answers."""
+    """Request `uri`; return None if that fails by a cause that FFmpeg can find. Raises OpeningError after a timeout."""
     try:
         return send_request(uri, timeout_s)
     except _REQUEST_ERRORS as error:
@@ -59,24 +59,24 @@ def try_request(uri: str, timeout_s: float) -> http.client.HTTPResponse | None:
 
 
 class SnapshotCapture:
-    """A `Capture` that requests the picture at `uri` every `period_s` seconds. Its time is that of the request, as most
-    cameras take it then. One that gave the same file twice keeps a picture ready, which may be as old as the request
-    before."""
+    """A `Capture` that requests the picture at `uri` every `period_s` seconds. Its time is that of the request, when
+    most cameras take it. A camera that gave the same file twice keeps a picture ready, which may be as old as the
+    request before."""
 
     def __init__(self, uri: str, period_s: float, timeout_s: float, clock: Callable[[], float]) -> None:
         self._uri, self._timeout_s, self._clock = uri, timeout_s, clock
         self._period_s = min(period_s, _MAX_PERIOD_S)
-        self._due_s = self._asked_s = clock()
+        self._due_s = self._request_s = clock()
         self._data, self._is_kept, self._depth = b"", False, DepthRange()
 
     def read(self) -> Shot | Refusal | None:
         time.sleep(max(0.0, self._due_s - self._clock()))
-        before_s, self._asked_s = self._asked_s, self._clock()
-        self._due_s = self._asked_s + self._period_s
+        last_request_s, self._request_s = self._request_s, self._clock()
+        self._due_s = self._request_s + self._period_s
         try:
-            with send_request(self._uri, self._timeout_s) as answer:
-                data = answer.read(_MAX_BYTES)
-            answered_s = self._clock()
+            with send_request(self._uri, self._timeout_s) as response:
+                data = response.read(_MAX_BYTES)
+            arrival_s = self._clock()
             image = decode_image(data, "the snapshot", self._depth)
         except ImageError:
             return Refusal.DAMAGED
@@ -85,10 +85,10 @@ class SnapshotCapture:
         self._is_kept = self._is_kept or data == self._data
         self._data = data
         plane = image if image.ndim == 2 else image[:, :, 1]
-        taken_s = before_s if self._is_kept else self._asked_s
-        sd_s = max(FRAME_TIME_SD_S, self._period_s if self._is_kept else answered_s - self._asked_s)
+        taken_s = last_request_s if self._is_kept else self._request_s
+        sd_s = max(FRAME_TIME_SD_S, self._period_s if self._is_kept else arrival_s - self._request_s)
         times = {"t_mono_s": taken_s, "t_sd_s": sd_s, "delay_sd_s": HIDDEN_DELAY_SD_S}
-        return Shot(look=make_thumbnail(plane), pixels=lambda: image, **times)
+        return Shot(thumbnail=make_thumbnail(plane), convert=lambda: image, **times)
 
     def cancel(self) -> None:
         """Do nothing: a request lasts a few seconds at most."""
@@ -98,12 +98,12 @@ class SnapshotCapture:
 
 
 class ResponseFile:
-    """A file of what comes in the `answer` to a request, without waiting for more than that, and for `is_multipart` as
-    FFmpeg can read it: each part an image/jpeg. It ends if the connection is lost."""
+    """The body of a `response` as a file that never waits for more bytes than have come; with `is_multipart` each part
+    becomes an image/jpeg, which FFmpeg can read. It ends if the connection is lost."""
 
-    def __init__(self, answer: http.client.HTTPResponse, is_multipart: bool) -> None:
-        self._pieces, self._unread = (_read_parts if is_multipart else _read_chunks)(answer), b""
-        self.close = answer.close
+    def __init__(self, response: http.client.HTTPResponse, is_multipart: bool) -> None:
+        self._pieces, self._unread = (_read_parts if is_multipart else _read_chunks)(response), b""
+        self.close = response.close
 
     def read(self, size: int = -1) -> bytes:
         """Return the next bytes, at most `size`."""
@@ -112,17 +112,17 @@ class ResponseFile:
         return data
 
 
-def _read_chunks(answer: http.client.HTTPResponse) -> Iterator[bytes]:
+def _read_chunks(response: http.client.HTTPResponse) -> Iterator[bytes]:
     with suppress(*_REQUEST_ERRORS):
-        while chunk := answer.read1(_CHUNK_BYTES):
+        while chunk := response.read1(_CHUNK_BYTES):
             yield chunk
 
 
-def _read_parts(answer: http.client.HTTPResponse) -> Iterator[bytes]:
-    boundary = re.escape((answer.headers.get_boundary() or "").strip('-" ').encode("latin-1", "replace"))
+def _read_parts(response: http.client.HTTPResponse) -> Iterator[bytes]:
+    boundary = re.escape((response.headers.get_boundary() or "").strip('-" ').encode("latin-1", "replace"))
     head = re.compile(boundary + rb"[^\n]*\n((?:[^\r\n]+\r?\n)*)\r?\n")
     seen, whole_s = bytearray(), time.monotonic()
-    for chunk in _read_chunks(answer):
+    for chunk in _read_chunks(response):
         seen += chunk
         while (part := head.search(seen)) and (end := _find_end(seen, part, boundary)):
             data = bytes(seen[part.end() : end])
@@ -136,9 +136,9 @@ def _read_parts(answer: http.client.HTTPResponse) -> Iterator[bytes]:
 
 
 def _find_end(seen: bytearray, part: re.Match[bytes], boundary: bytes) -> int:
-    """Return where the picture ends that begins after the head of a `part`, 0 if its end has not come. If its length is
-    not stated, a JPEG ends with its end mark. FFmpeg waits for the next part instead, which makes each picture a whole
-    period older."""
+    """Return the end of the picture that begins after the head of a `part`; 0 if it has not come. Without a stated
+    length a JPEG ends with its end mark. FFmpeg would wait for the next part, so that each picture were a period older.
+    """
     start = part.end()
     if length := re.search(rb"(?im)^content-length:\s*(\d+)", part[1]):
         end = start + int(length[1])

@@ -151,7 +151,7 @@ def _compare_neighbours(pictures: FlownPictures, mask: OverlayMask | None) -> tu
     runs = map(_read_usable, _runs(folder)) if folder else [_read_film(pictures.source, _FILM_PICTURES)]
     pairs, clear, aside = 0, 0, 0
     for run in runs:
-        marks = [describe(image, mask.fitted(image) if mask else None, _LANDMARKS) for image in run]
+        marks = [describe(image, mask.fit_to(image) if mask else None, _LANDMARKS) for image in run]
         for seen in (measure_agreement(one, other) for one, other in pairwise(marks)):
             if seen.inliers < PROVEN or seen.shift_share is None or seen.rotation_deg is None or seen.scale is None:
                 continue
@@ -193,7 +193,7 @@ def measure_still_share(images: Iterable[Image], mask: OverlayMask | None) -> fl
     for image in images:
         across, along = _edges(image)
         x, y, strength, count = x + across, y + along, strength + cv2.magnitude(across, along), count + 1
-        allowed &= _shrunk(mask.fitted(image)) if mask else True
+        allowed &= _shrunk(mask.fit_to(image)) if mask else True
     if count < _MIN_DISPLAY_PICTURES:
         return None
     edges = allowed & (strength >= _MIN_EDGE * count)

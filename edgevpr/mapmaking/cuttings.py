@@ -97,7 +97,7 @@ class OrthophotoSource(RecordingSource):
         row, column = (str(number).zfill(max(3, len(str(count - 1)))) for number, count in numbers)
         of_several = f"_{lattice.footprint_m:g}m" if len(self._lattices) > 1 else ""
         name = f"{self.short_name}{of_several}_r{row}_c{column}"
-        if not self.is_wanted(name):
+        if not self.is_selected(name):
             return None
         position = lattice.locate_place(at)
         try:

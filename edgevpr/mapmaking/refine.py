@@ -320,7 +320,7 @@ def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], imag
 def _rank_hypotheses(technique: Technique, query: Descriptor, coarse: Array) -> list[int]:
     """Return the hypotheses of rotation and height under which `Technique.match` should compare a query with a place,
     by its coarse part: the eight with the best scores, as numbers, the best first."""
-    _, by_hypothesis = technique.coarse_scores(query, coarse[None], None)
+    _, by_hypothesis = technique.score_places(query, coarse[None], None)
     assert by_hypothesis is not None  # set by techniques for a camera that looks down
     best = np.argsort(-by_hypothesis[0], kind="stable")[:_TRIED]
     ranked: list[int] = best[np.isfinite(by_hypothesis[0][best])].tolist()

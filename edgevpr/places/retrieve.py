@@ -100,7 +100,7 @@ def scan(query: Query) -> Scan:
     hints: dict[str, Any] = {} if expected.turned_deg is None else {"turned_deg": expected.turned_deg}
     if technique.spec.height_ratios:
         hints |= {"height_ratio": expected.height_ratio, "in_reach": expected.in_reach}
-    return technique.coarse_scores(query.descriptor, index.rows, index.mean, **hints)
+    return technique.score_places(query.descriptor, index.rows, index.mean, **hints)
 
 
 def compare(query: Query, scanned: Scan, candidates: int | None, apart_m: float) -> Ranking:

@@ -123,7 +123,7 @@ class CoHog:
         if tells_height:
             self._hypotheses = range(len(HEIGHT_RATIOS) * ROTATIONS)
         # Converts blocks, float32 (N, 4 bins), to the vectors of length 1 that `matching` compares.
-        self._comparable: Callable[[Singles], Singles] = self._patterns if self._votes else normalise_rows
+        self._comparable: Callable[[Singles], Singles] = self._make_patterns if self._votes else normalise_rows
         self._query: Descriptor | None = None
         self._views: QueryViews | None = None
         code = PartSpec((placecode.SIDE, placecode.SIDE, self.bins), "|u1")
@@ -168,13 +168,13 @@ class CoHog:
         grey, allowed = make_grey_square(image, self.w1), make_mask_square(mask, self.w1)
         pixel_px = self.w1 / image.shape[1], self.w1 / image.shape[0]
         grey = stretch_contrast(grey, allowed, pixel_px, *_CONTRAST[self.camera])
-        blocks, seen, good = self._blocks(grey, allowed, self.w2)
+        blocks, seen, good = self._make_good_blocks(grey, allowed, self.w2)
         regions = blocks.reshape(-1, 4 * self.bins)
         # The square root of each value in 8 bits: most values are small, and the root keeps more of their digits.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
         if self._is_nadir:
             # In float64 a rounded number of the layout is the same on every processor.
-            coarse = layout.encode_place(self._patterns(regions.astype(np.float64)), good.ravel(), self._side)
+            coarse = layout.encode_place(self._make_patterns(regions.astype(np.float64)), good.ravel(), self._side)
         else:
             coarse = np.rint(255 * placecode.make_grid(blocks, seen, np.ones_like(seen))[0]).astype(np.uint8)
         quality = float(good.sum() / max(seen.sum(), 1))
@@ -183,15 +183,15 @@ class CoHog:
             coarse=coarse, fine=stored, regions=regions, good=good.ravel(), quality=quality, picture=picture
         )
 
-    def _blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools, Bools]:
+    def _make_good_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools, Bools]:
         """Describe a square picture, float32 `grey` with cells of `cell_px` pixels. Returns its blocks, float32 (n, n,
         4 bins); bool (n, n), True for seen blocks, those on `allowed` pixels only; and bool (n, n), True for good
         blocks: seen ones whose entropy is at least `gt`."""
-        blocks, seen = self._all_blocks(grey, allowed, cell_px)
+        blocks, seen = self._make_blocks(grey, allowed, cell_px)
         return blocks, seen, find_good_blocks(round_levels(grey), self.entropy, cell_px, self.gt, among=seen)
 
-    def _all_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools]:
-        """Return the first two results of `_blocks`."""
+    def _make_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools]:
+        """Return the first two results of `_make_blocks_and_goodness`."""
         blocks = normalise_blocks(orient_cells(grey, cell_px, self.bins, signed=True, allowed=allowed))
         if allowed is None:
             return blocks, np.ones(blocks.shape[:2], bool)
@@ -202,7 +202,7 @@ class CoHog:
         and the map's mean (12, 12, bins)."""
         return placecode.pack_grids(coarse.astype(np.float32) / 255, mean / 255)
 
-    def coarse_scores(
+    def score_places(
         self,
         query: Descriptor,
         rows: Array,
@@ -211,31 +211,31 @@ class CoHog:
         height_ratio: float | None = None,
         in_reach: Bools | None = None,
     ) -> tuple[Singles, Singles | None]:
-        """Score all places; for the arguments see `Technique.coarse_scores`. With a forward camera `rows` are place
+        """Score all places; for the arguments see `Technique.score_places`. With a forward camera `rows` are place
         codes uint8 (N, B), compared under shifts. With a nadir camera they are layouts uint8 (N, 1120), compared from
         the one of five heights that is nearest to `height_ratio`. Returns scores float32 (N,) in 0..1 and, with a nadir
         camera, the score of each hypothesis, float32 (N, 120): 24 rotations from each height, -inf if not tried."""
         if not self._is_nadir:
             views = self._make_views(query)
             mean_grid = np.zeros(1, np.float32) if mean is None else mean / 255
-            own = placecode.make_grid(views.blocks(1.0, 0)[0], views.seen, views.seen)
+            own = placecode.make_grid(views.make_blocks(1.0, 0)[0], views.seen, views.seen)
             asked = placecode.make_hypotheses(*own, mean_grid)
             return np.clip(placecode.scan_in_two_steps(asked, rows), 0, 1), None
         ratio = find_nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)
-        self._make_views(query).keep(ratio)
+        self._make_views(query).forget_other_heights(ratio)
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
         of_ratio = layout.scan_places(
-            lambda turn, grid: self._field(query, first + turn, grid), rows, turned_deg, in_reach
+            lambda turn, grid: self._make_field(query, first + turn, grid), rows, turned_deg, in_reach
         )
         scores = np.full((len(rows), len(HEIGHT_RATIOS) * ROTATIONS), -np.inf, np.float32)
         scores[:, first : first + ROTATIONS] = of_ratio
         return np.clip(of_ratio.max(axis=1), 0, 1), scores
 
-    def _field(self, query: Descriptor, number: int, grid: layout.Grid) -> Singles:
+    def _make_field(self, query: Descriptor, number: int, grid: layout.Grid) -> Singles:
         """Return the layout of a query under the hypothesis `number`, (C, m, m). It is cached for the newest query."""
         fields = self._make_views(query).fields
         if (number, grid.side) not in fields:
-            view = self._make_views(query).regions(number, self._patterns)
+            view = self._make_views(query).make_regions(number, self._make_patterns)
             fields[number, grid.side] = layout.make_field(grid, view.regions, view.numbers, (view.side, self._side))
         return fields[number, grid.side]
 
@@ -245,17 +245,17 @@ class CoHog:
         query is tried under `hypotheses` (None: all); the one with the highest score counts, and `fit_alignment`
         refines its shift, rotation and height. Last, the less the structures of both agree (see `overlay`), the less is
         the score."""
-        reference = self._reference(fine)
+        reference = self._restore_regions(fine)
         if self._is_nadir:
-            best, match, nearest = self._find_likest(query, reference, hypotheses)
+            best, match, nearest = self._find_best_hypothesis(query, reference, hypotheses)
             if self._votes:
-                view = self._view(query, best)
+                view = self._make_view(query, best)
                 match = fit_alignment((view.numbers, view.side), (nearest, self._side), match)
         else:
-            match, _ = self._match_view(self._view(query, self._hypotheses[0]), reference)
+            match, _ = self._match_view(self._make_view(query, self._hypotheses[0]), reference)
         if match.shift_cells is None:
             return match
-        structure = self._agreement(query, reference, match)
+        structure = self._measure_agreement(query, reference, match)
         least, most = _STRUCTURE_LIMITS[self.camera]
         counts = min(max(structure, least), most) / most
         return replace(match, score=match.score * counts, votes=match.score, structure=structure)
@@ -271,8 +271,8 @@ class CoHog:
         """See `Technique.measure_perspective`."""
         ratio, step_deg = find_nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0), 360 / ROTATIONS
         turn = round((match.rotation_deg or 0.0) / step_deg) % ROTATIONS
-        view = self._view(query, HEIGHT_RATIOS.index(ratio) * ROTATIONS + turn)
-        nearest = find_most_similar(view.regions, self._reference(fine))
+        view = self._make_view(query, HEIGHT_RATIOS.index(ratio) * ROTATIONS + turn)
+        nearest = find_most_similar(view.regions, self._restore_regions(fine))
         scale, off_deg = compute_scale(self._side + 1, ratio), (match.rotation_deg or 0.0) - turn * step_deg
         found = fit_perspective(
             locate_regions(view.numbers, view.side),
@@ -292,9 +292,9 @@ class CoHog:
 
     def match_at_rest(self, query: Descriptor, fine: Bytes) -> FineMatch:
         """See `Technique.match_at_rest`."""
-        return self._find_likest(query, self._reference(fine), [HEIGHT_RATIOS.index(1.0) * ROTATIONS])[1]
+        return self._find_best_hypothesis(query, self._restore_regions(fine), [HEIGHT_RATIOS.index(1.0) * ROTATIONS])[1]
 
-    def _find_likest(
+    def _find_best_hypothesis(
         self, query: Descriptor, reference: Singles, hypotheses: Sequence[int] | None
     ) -> tuple[int, FineMatch, Ints]:
         """Compare a nadir query with a place under `hypotheses` (None: all). Returns the number of the one with the
@@ -305,10 +305,10 @@ class CoHog:
             place = layout.make_field(layout.FINE, reference[known], known, (self._side, self._side))
         matches, nearest = dict[int, FineMatch](), dict[int, Ints]()
         for each in tried:
-            match, nearest[each] = self._match_view(self._view(query, each), reference)
+            match, nearest[each] = self._match_view(self._make_view(query, each), reference)
             if place is not None and match.shift_cells is not None:
                 shift = match.shift_cells[0] / self._side, match.shift_cells[1] / self._side
-                agrees = layout.compute_agreement(self._field(query, each, layout.FINE), place, shift)
+                agrees = layout.compute_agreement(self._make_field(query, each, layout.FINE), place, shift)
                 match = replace(match, score=min(1.0, match.score * agrees / _FULL_LAYOUT_AGREEMENT))
             matches[each] = match
         best = max(matches, key=lambda each: matches[each].score)
@@ -316,7 +316,7 @@ class CoHog:
         scale = compute_scale(self._side + 1, ratio)
         return best, replace(matches[best], rotation_deg=360 * turn / ROTATIONS, height_ratio=scale), nearest[best]
 
-    def _agreement(self, query: Descriptor, reference: Singles, match: FineMatch) -> float:
+    def _measure_agreement(self, query: Descriptor, reference: Singles, match: FineMatch) -> float:
         """Lay a query over a place as `match` says (see `overlay`); `reference` are the regions of the place. Returns
         how well their structures agree, or with a nadir camera, how far this stands out."""
         views, cells = self._make_views(query), self._side + 1
@@ -324,15 +324,17 @@ class CoHog:
         place = overlay.compute_structure(reference, known, _SURROUND_SD_CELLS[self.camera])
         if self._is_nadir:
             laid = overlay.overlay_query(*views.halved, match, cells)
-            return overlay.measure_prominence(self._structure(*self._all_blocks(*laid, len(laid[0]) // cells)), place)
+            return overlay.measure_prominence(
+                self._make_structure(*self._make_blocks(*laid, len(laid[0]) // cells)), place
+            )
         if views.structure is None:
-            views.structure = self._structure(views.blocks(1.0, 0)[0], views.seen)
+            views.structure = self._make_structure(views.make_blocks(1.0, 0)[0], views.seen)
         return overlay.compute_agreement(views.structure, place, match.shift_cells or (0.0, 0.0))
 
-    def _structure(self, blocks: Singles, seen: Bools) -> Singles:
+    def _make_structure(self, blocks: Singles, seen: Bools) -> Singles:
         """Return the structure of a picture (see `overlay`) that has these blocks, float32 (n, n, 4 bins)."""
         return overlay.compute_structure(
-            self._patterns(blocks.reshape(-1, 4 * self.bins)), seen, _SURROUND_SD_CELLS[self.camera]
+            self._make_patterns(blocks.reshape(-1, 4 * self.bins)), seen, _SURROUND_SD_CELLS[self.camera]
         )
 
     def score_quickly(
@@ -340,34 +342,34 @@ class CoHog:
     ) -> tuple[float, list[int] | None]:
         """Estimate the score of `match`: with a forward camera from a quarter of the good regions, with a nadir camera
         from the vote and the layouts. See `Technique.score_quickly`."""
-        reference = self._reference(fine)
+        reference = self._restore_regions(fine)
         if self._is_nadir:
-            best, match, _ = self._find_likest(query, reference, hypotheses)
+            best, match, _ = self._find_best_hypothesis(query, reference, hypotheses)
             return match.score, [best]
-        view = self._view(query, self._hypotheses[0])
+        view = self._make_view(query, self._hypotheses[0])
         nearest = find_most_similar(view.regions[::_QUICK_STEP], reference)
         return compute_vote_share(
             view.numbers[::_QUICK_STEP], nearest, (view.side, self._side), _VOTE_WEIGHTS[self.camera]
         ), None
 
-    def _reference(self, fine: Bytes) -> Singles:
+    def _restore_regions(self, fine: Bytes) -> Singles:
         """Restore the vectors that are compared from the `fine` part of a place, which holds square roots of blocks."""
         return self._comparable(np.square(fine, dtype=np.float32))
 
-    def _view(self, query: Descriptor, number: int) -> ViewRegions:
+    def _make_view(self, query: Descriptor, number: int) -> ViewRegions:
         """Return the good regions of a query under the hypothesis `number`."""
-        return self._make_views(query).regions(number, self._comparable)
+        return self._make_views(query).make_regions(number, self._comparable)
 
     def _make_views(self, query: Descriptor) -> QueryViews:
         if query is not self._query or self._views is None:
             if query.regions is None or query.good is None or query.picture is None:
                 raise ValueError("a place that was read from a map is no query")
             own = query.regions.reshape(self._side, self._side, -1), query.good.reshape(self._side, -1)
-            self._views = QueryViews(query.picture, own, self.w2, lambda *view: self._blocks(*view)[::2])
+            self._views = QueryViews(query.picture, own, self.w2, lambda *view: self._make_good_blocks(*view)[::2])
             self._query = query
         return self._views
 
-    def _patterns(self, regions: Singles) -> Singles:
+    def _make_patterns(self, regions: Singles) -> Singles:
         """Reduce regions, float32 (N, 4 bins), to patterns (N, patterns) of length 1 (see `make_slow_patterns`)."""
         return normalise_rows(regions @ make_slow_patterns(self.bins))
 

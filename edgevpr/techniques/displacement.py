@@ -93,7 +93,7 @@ def match_view(
     found = find_displacement(view.numbers, best, (view.side, math.isqrt(len(reference))), counts)
     asks_all = with_support and len(best)
     backed = measure_support(view.numbers, view.regions, reference, best, found.shift_cells) if asks_all else None
-    return replace(found, score=min(1.0, found.score * view.worth), support=backed), best
+    return replace(found, score=min(1.0, found.score * view.factor), support=backed), best
 
 
 def measure_support(

@@ -42,7 +42,7 @@ class NetworkVector(VectorTechnique):
         spec = {"margins": _MARGINS.get(name, (UNREACHABLE_MARGIN,) * 3), "model_sha256": backbone.sha256, **spec}
         super().__init__(name, length, **spec)
 
-    def vector(self, image: Image, mask: Mask | None) -> Singles:
+    def make_vector(self, image: Image, mask: Mask | None) -> Singles:
         return self._head(self._backbone.run(image, mask))
 
 

@@ -51,21 +51,21 @@ class SeqSlam:
         size = (self._width, self._height)
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         seen = np.ones(image.shape[:2], np.uint8) if mask is None else mask.astype(np.uint8)
-        pixels = self._patches(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
-        allowed = self._patches(cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST))
+        pixels = self._cut_patches(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
+        allowed = self._cut_patches(cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST))
         z, spread = normalise_patches(pixels, allowed)
         levels = np.clip(np.rint(_LEVELS_PER_SD * z) + _MEAN_LEVEL, 0, 255).astype(np.uint8)
         rows, columns = self._height // self._patch, self._width // self._patch
         coarse = levels.reshape(rows, columns, self._patch, self._patch).swapaxes(1, 2).ravel()
         return Descriptor(coarse=coarse, quality=float(np.mean(spread >= _MIN_PATCH_SD_LEVELS)))
 
-    def _patches(self, picture: Array) -> Singles:
+    def _cut_patches(self, picture: Array) -> Singles:
         """Cut a picture into patches: (height, width) to float32 (patches, patch * patch)."""
         rows, columns = self._height // self._patch, self._width // self._patch
         blocks = picture.astype(np.float32).reshape(rows, self._patch, columns, self._patch).swapaxes(1, 2)
         return blocks.reshape(rows * columns, self._patch * self._patch)
 
-    def coarse_scores(self, query: Descriptor, rows: Array, mean: None = None) -> tuple[Singles, None]:
+    def score_places(self, query: Descriptor, rows: Array, mean: None = None) -> tuple[Singles, None]:
         """Score each place by how much better the query fits it than the places around it in the map. `rows` are uint8
         (N, length). Returns scores float32 (N,) in 0..1, and None, since there are no hypotheses. 0.5 means that the
         place fits as well as those around it. The score is linear in the enhanced difference (see `enhance_contrast`),

@@ -28,7 +28,7 @@ _CODE_BLOCK_BYTES = 1 << 20  # of binary vectors compared together: about a seco
 
 class VectorTechnique:
     """Base class of the techniques that compare one vector with those of all places in RAM; a subclass implements
-    `vector`. `form` says how the vectors are kept in RAM, see above.
+    `make_vector`. `form` says how the vectors are kept in RAM, see above.
 
     All scores are 0 to 1. With `similarity` "cosine", the score in the form `float` is the cosine (0 if negative), and
     in `8bit` (1 + cosine) / 2 of the vectors less the map's mean. With "l1" it is 1 / (1 + distance). In `1bit` it is
@@ -72,7 +72,7 @@ class VectorTechnique:
             forms=FORMS,
         )
 
-    def vector(self, image: Image, mask: Mask | None) -> Singles:
+    def make_vector(self, image: Image, mask: Mask | None) -> Singles:
         """Make the vector of a uint8 image (H, W[, 3]): float32 (D,). Pixels where `mask` bool (H, W) is False must
         have no influence (None: all count)."""
         raise NotImplementedError
@@ -80,7 +80,7 @@ class VectorTechnique:
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]) to coarse float16 (D,), of length 1 if the similarity is the cosine. The quality is
         1, or 0 if all numbers are 0 in half precision. Raises ModelError for numbers beyond half precision."""
-        vector = self.vector(image, mask)
+        vector = self.make_vector(image, mask)
         length = float(np.linalg.norm(vector))
         if self._similarity == "cosine":
             vector = vector / max(length, _TINY)
@@ -111,7 +111,7 @@ class VectorTechnique:
             rows[block, self._length :] = np.stack([step, length], axis=1).astype("<f4").view(np.int8)
         return rows
 
-    def coarse_scores(self, query: Descriptor, rows: Array, mean: Singles | None = None) -> tuple[Singles, None]:
+    def score_places(self, query: Descriptor, rows: Array, mean: Singles | None = None) -> tuple[Singles, None]:
         """Compare a query with all places, `rows` (N, *row shape): scores float32 (N,), all 0 for a query of zeros, and
         None (no hypotheses). `mean` (D,) is the map's."""
         vector = query.coarse.astype(np.float32)
@@ -120,7 +120,7 @@ class VectorTechnique:
         if mean is not None and self.spec.form != "float":
             vector -= mean
         if self.spec.form == "1bit":
-            return self._equal_bits(vector, rows), None
+            return self._score_bits(vector, rows), None
         scores = np.empty(len(rows), np.float32)
         values = np.empty((min(self._at_once, len(rows)), self._length), np.float32)
         for start in range(0, len(rows), self._at_once):
@@ -130,7 +130,7 @@ class VectorTechnique:
             scores[start : start + len(part)] = self._compare_vectors(vector, values[: len(part)], beside)
         return scores, None
 
-    def _equal_bits(self, vector: Singles, rows: Bytes) -> Singles:
+    def _score_bits(self, vector: Singles, rows: Bytes) -> Singles:
         """Return the share of the bits in which n places, uint8 (n, B), are equal to a vector: float32 (n,)."""
         code = np.zeros(self.spec.row.shape, np.uint8)
         code[: -(-self._length // 8)] = np.packbits(vector > 0)
@@ -178,7 +178,7 @@ class Hog(VectorTechnique):
         margins = (0.03, 0.03, 0.02)
         super().__init__("hog", length, parameters={"w1": w1, "cell": cell, "bins": bins}, form=form, margins=margins)
 
-    def vector(self, image: Image, mask: Mask | None) -> Singles:
+    def make_vector(self, image: Image, mask: Mask | None) -> Singles:
         """Encode uint8 (H, W[, 3]) to float32 (length,); gradients where `mask` bool (H, W) is False are left out."""
         grey = make_grey_square(image, self._w1)
         allowed = make_mask_square(mask, self._w1)

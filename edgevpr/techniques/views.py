@@ -32,13 +32,13 @@ Describe = Callable[[Singles], Singles]
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewRegions:
     """The good regions of a view, to be compared with a place: their `numbers` int (G,), row by row on a grid of `side`
-    x `side` regions, and their vectors `regions` float32 (G, P), each of length 1. `worth`: factor by which the share
+    x `side` regions, and their vectors `regions` float32 (G, P), each of length 1. `factor`: factor by which the share
     of agreeing votes is multiplied to give the score (see above)."""
 
     numbers: Ints
     regions: Singles
     side: int
-    worth: float
+    factor: float
 
 
 def decode_hypothesis(number: int) -> tuple[float, int]:
@@ -73,14 +73,14 @@ class QueryViews:
         self._regions: dict[tuple[int, Describe], ViewRegions] = {}
         self.fields: dict[tuple[int, int], Singles] = {}  # layouts, by the number of the hypothesis and the grid's side
 
-    def keep(self, ratio: float) -> None:
+    def forget_other_heights(self, ratio: float) -> None:
         """Forget the views of other height ratios than this, but for the unchanged one: they take megabytes."""
         self._encoded = {key: view for key, view in self._encoded.items() if key[0] == ratio or key == (1.0, 0)}
         self._scaled = {each: picture for each, picture in self._scaled.items() if each == ratio}
         self._regions = {key: view for key, view in self._regions.items() if decode_hypothesis(key[0])[0] == ratio}
         self.fields = {key: field for key, field in self.fields.items() if decode_hypothesis(key[0])[0] == ratio}
 
-    def blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
+    def make_blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
         """Return the view of the height ratio `ratio` and the rotation `turn`, in steps of 15 degrees: its blocks,
         float32 (n, n, 4 bins), and bool (n, n), True for good blocks."""
         quarters, within = divmod(turn, STEPS_PER_QUARTER)
@@ -89,34 +89,34 @@ class QueryViews:
         blocks, good = self._encoded[ratio, within]
         return rotate_blocks(blocks, -quarters), np.rot90(good, -quarters)
 
-    def regions(self, number: int, described: Describe) -> ViewRegions:
-        """Return all good regions of the view of the hypothesis `number`. `described` converts blocks float32 (G, 4
+    def make_regions(self, number: int, describe: Describe) -> ViewRegions:
+        """Return all good regions of the view of the hypothesis `number`. `describe` converts blocks float32 (G, 4
         bins) to the vectors (G, P) that are compared."""
-        if (number, described) not in self._regions:
+        if (number, describe) not in self._regions:
             ratio, turn = decode_hypothesis(number)
-            blocks, good = self.blocks(ratio, turn)
+            blocks, good = self.make_blocks(ratio, turn)
             side = max(count_cells(self._side + 1, ratio) - 1, self._side)  # regions along a side, at least a place's
             if ratio > 1:
                 ground = compute_scale(self._side + 1, ratio) ** 2  # over that of the place
-                worth = ground * _LARGER_VIEW_FACTORS[ratio]  # no more than one in `ground` of the votes can agree
+                factor = ground * _LARGER_VIEW_FACTORS[ratio]  # no more than one in `ground` of the votes can agree
             else:
-                worth = 1.0 if ratio == 1 else min(1.0, (int(good.sum()) / self._good) ** _CHANCE_EXPONENT)
-            self._regions[number, described] = ViewRegions(
+                factor = 1.0 if ratio == 1 else min(1.0, (int(good.sum()) / self._good) ** _CHANCE_EXPONENT)
+            self._regions[number, describe] = ViewRegions(
                 numbers=np.flatnonzero(np.pad(good, (side - len(good)) // 2)),  # on a grid with the same middle
-                regions=described(blocks[good]),
+                regions=describe(blocks[good]),
                 side=side,
-                worth=worth,
+                factor=factor,
             )
-        return self._regions[number, described]
+        return self._regions[number, describe]
 
     @cached_property
     def halved(self) -> tuple[Array, Mask]:
         """The picture in half as many pixels along a side, at least two a cell: grey float32 (side, side), and bool
         (side, side), True for allowed pixels."""
-        grey, allowed = self._resize((self._side + 1) * max(2, self._cell_px // 2))
+        grey, allowed = self._resize_picture((self._side + 1) * max(2, self._cell_px // 2))
         return grey, allowed.astype(bool)
 
-    def _resize(self, side: int) -> tuple[Array, Array]:
+    def _resize_picture(self, side: int) -> tuple[Array, Array]:
         """Return the picture with `side` pixels along a side: grey float32, and uint8, 1 for allowed pixels."""
         if self._picture.grey is None or self._picture.allowed is None:
             raise ValueError("a picture that is not kept cannot be turned")
@@ -133,7 +133,7 @@ class QueryViews:
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
         side = count_cells(self._side + 1, ratio) * cell_px
         if ratio not in self._scaled:
-            self._scaled[ratio] = self._resize(side)
+            self._scaled[ratio] = self._resize_picture(side)
         grey, allowed = self._scaled[ratio]
         if within:
             middle = (side - 1) / 2

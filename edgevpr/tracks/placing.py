@@ -115,7 +115,7 @@ def place_video(record: Record, video: Path, offset_s: float | None) -> Placemen
         shift_s, how = -(offset_s or 0.0), "by the time of the video"
     track = replace(record.track, t_s=tuple((np.array(record.track.t_s) + shift_s).tolist()))
     if lasts_s:
-        track.require_within(video, lasts_s)
+        track.require_overlap(video, lasts_s)
     return Placement(how=how, track=track, offset_s=offset_s)
 
 

@@ -72,8 +72,8 @@ def test_two_threads_convert_the_pictures_of_one_stream(pixel_format, tmp_path):
 
     def convert() -> None:
         for picture in itertools.islice(itertools.cycle(pictures), 400):
-            whole.look(picture)
-            whole.conversion(picture)()
+            whole.make_thumbnail(picture)
+            whole.prepare_conversion(picture)()
         finished.append(True)
 
     before_mb = psutil.Process().memory_info().rss / 1e6
@@ -174,7 +174,7 @@ def test_coarse_copies_of_a_frozen_picture_of_counts_are_equal(tmp_path):
     flight = [*thermal_flight(), *[thermal_flight()[3]] * 3]
     video = [av.VideoFrame.from_ndarray(counts, "gray16le") for counts in flight]
     whole, pictures = decoded(write_video(tmp_path / "a.nut", video, "gray16le"))
-    looks = [whole.look(picture) for picture in pictures]
+    looks = [whole.make_thumbnail(picture) for picture in pictures]
     assert (looks[-1] == looks[-2]).all()
     assert np.abs(looks[0].astype(int) - looks[1]).mean() > 3
 
@@ -204,8 +204,8 @@ def test_v4l2_camera_of_16_bits_shows_what_a_folder_of_its_images_does(tmp_path)
     capture = DeviceCapture(ThermalCamera(thermal_flight()), clock=lambda: 1.0)
     for image in frames_of(tmp_path):
         shot = capture.read()
-        assert (shot.pixels() == image).all()
-        assert shot.look.std() > 50
+        assert (shot.convert() == image).all()
+        assert shot.thumbnail.std() > 50
 
 
 @pytest.mark.parametrize("extension", [".mkv", ".ts", ".mp4"])

@@ -20,7 +20,7 @@ def feed(time, taken_s, came_s, *, rate=1.0, sizes=None, stamp_s=100.0):
     for taken, came, size in zip(taken_s, came_s, sizes, strict=True):
         stamp, now = stamp_s + rate * taken, START_S + came
         time.record_arrival(stamp, stamp, now, int(size))
-        found = time.taken(stamp, now)
+        found = time.estimate(stamp, now)
         ages_s.append(math.nan if found is None else now - found.t_s)
         sds_s.append(math.nan if found is None else found.sd_s)
     return np.array(ages_s), np.array(sds_s)
@@ -121,7 +121,7 @@ def test_a_camera_that_runs_slow_and_then_right_is_followed():
     came_s = np.maximum.accumulate(taken_s + rng.exponential(0.005, len(taken_s)))
     for number, came in enumerate(came_s):
         time.record_arrival(number / 25, number / 25, came, int(sizes[number]))
-        found = time.taken(number / 25, came)
+        found = time.estimate(number / 25, came)
         ages_s.append(math.nan if found is None else came - found.t_s)
     assert np.nanmax(ages_s[60:]) < 0.2
     assert np.isnan(ages_s[60:]).mean() < 0.05
@@ -142,7 +142,7 @@ def test_pictures_that_have_waited_for_the_opening_have_no_time():
 def test_no_picture_is_taken_after_it_has_arrived():
     time = StampedTime()
     feed_delayed(time, np.zeros(20))
-    assert time.taken(500.0, START_S + 1).t_s == START_S + 1
+    assert time.estimate(500.0, START_S + 1).t_s == START_S + 1
 
 
 def test_a_delay_that_wavers_is_age_for_as_long_as_it_lasts():
@@ -175,7 +175,7 @@ def test_pictures_that_are_sent_out_of_turn_are_no_new_beginning():
     for turn, number in enumerate(order):
         now = START_S + turn * STEP_S
         time.record_arrival(number * STEP_S, (turn - 1) * STEP_S, now)
-    assert time.taken(11 * STEP_S, now) is not None
+    assert time.estimate(11 * STEP_S, now) is not None
 
 
 @pytest.mark.parametrize(("rate", "least_sd_s"), [(1.0, FRAME_TIME_SD_S), (0.48, 0.5)])
@@ -193,20 +193,20 @@ def test_age_is_less_certain_where_stamps_are_counted(rate, least_sd_s):
 
 def test_without_stamps_a_picture_that_was_there_already_is_as_old_as_the_last_wait():
     time = UnstampedTime(opened_s=10.0)
-    assert time.taken(asked_s=10.5, t_mono_s=10.5001).t_s == 10.0
-    assert time.taken(asked_s=10.5, t_mono_s=10.6).t_s == 10.5, "it was waited for since then"
-    waited = time.taken(asked_s=13.0, t_mono_s=13.0005)
+    assert time.estimate(request_s=10.5, t_mono_s=10.5001).t_s == 10.0
+    assert time.estimate(request_s=10.5, t_mono_s=10.6).t_s == 10.5, "it was waited for since then"
+    waited = time.estimate(request_s=13.0, t_mono_s=13.0005)
     assert waited.t_s == 10.5, "it may have come at any moment since"
     assert waited.sd_s == pytest.approx(2.5 / math.sqrt(3), rel=0.01)
 
 
 def test_without_stamps_one_that_comes_when_it_is_due_is_new_and_one_that_was_held_up_may_be_old():
     time = UnstampedTime(opened_s=0.0)
-    taken = [time.taken(0.2 * number, 0.2 * number + 0.19) for number in range(20)]
+    taken = [time.estimate(0.2 * number, 0.2 * number + 0.19) for number in range(20)]
     taken_s = [each.t_s for each in taken]
     assert taken_s[:9] == pytest.approx([0.2 * number for number in range(9)]), "what is usual is not known yet"
     assert taken_s[9:] == pytest.approx([0.2 * number + 0.19 for number in range(9, 20)])
     assert [each.sd_s for each in taken[9:]] == [FRAME_TIME_SD_S] * 11
-    assert time.taken(4.0, 6.0).t_s == 4.0
-    assert time.taken(6.0, 6.0005).t_s == 4.0, "it was held up with it"
-    assert time.taken(6.1, 6.25).t_s == 6.25
+    assert time.estimate(4.0, 6.0).t_s == 4.0
+    assert time.estimate(6.0, 6.0005).t_s == 4.0, "it was held up with it"
+    assert time.estimate(6.1, 6.25).t_s == 6.25

@@ -55,10 +55,10 @@ def test_arrivals_keep_times_and_order_and_know_whether_a_key_frame_waits(sender
     sender.end()
     sender.has_ended.wait(PATIENCE_S)
     first = arrivals.next()
-    assert arrivals.can_begin_anew()
+    assert arrivals.has_key_frame()
     rest = list(iter(arrivals.next, None))
-    assert not arrivals.can_begin_anew()
-    assert [(each.asked_s, each.came_s) for each in (first, *rest)] == [(10.0, 11.0), (11.0, 12.0), (12.0, 13.0)]
+    assert not arrivals.has_key_frame()
+    assert [(each.request_s, each.arrival_s) for each in (first, *rest)] == [(10.0, 11.0), (11.0, 12.0), (12.0, 13.0)]
     assert arrivals.next() is None, "the stream is still lost"
 
 
@@ -80,12 +80,12 @@ def test_arrivals_are_bounded_and_go_on_with_a_key_frame(sender, arrivals, monke
         sender.send(11.0 + number, is_keyframe=number % 60 == 0, size=size)
     sender.end()
     while not sender.has_ended.is_set():
-        most = max(most, len(arrivals._waiting))
+        most = max(most, len(arrivals._queued))
     assert most <= 102
     found = list(iter(arrivals.next, None))
     assert [each.is_after_gap for each in found] == [True] + [False] * (len(found) - 1)
     assert found[0].packet.is_keyframe
-    assert found[-1].came_s == 1010.0, "the newest are kept"
+    assert found[-1].arrival_s == 1010.0, "the newest are kept"
 
 
 def test_arrivals_close_the_stream_by_the_thread_that_fetches_once_its_fetch_has_returned(sender, arrivals):

@@ -130,7 +130,7 @@ def test_stream_that_is_not_there_at_the_start_is_waited_for_in_silence(opened, 
 def shot(number, t_mono_s=None):
     picture = np.random.default_rng(number).integers(0, 255, (48, 64), np.uint8)
     t_mono_s = time.monotonic() if t_mono_s is None else t_mono_s
-    return Shot(t_mono_s=t_mono_s, look=picture, pixels=lambda: picture)
+    return Shot(t_mono_s=t_mono_s, thumbnail=picture, convert=lambda: picture)
 
 
 class Camera:
@@ -149,7 +149,7 @@ class Camera:
         self.step("read")
         given = next(self._shots, None)
         if isinstance(given, Shot):
-            return replace(given, pixels=lambda: self.step("pixels") or given.pixels())
+            return replace(given, convert=lambda: self.step("pixels") or given.convert())
         if given is None:
             self.is_cancelled.wait(PATIENCE_S)
         return given
@@ -197,7 +197,7 @@ def test_read_gives_the_newest_frame_and_counts_the_others(live):
     wait_until(lambda: source.dropped == 4)
     clock.now_s += 1.5
     frame = next_frame(source)
-    assert (frame.image == shot(4).pixels()).all()
+    assert (frame.image == shot(4).convert()).all()
     assert (frame.name, frame.t_mono_s) == ("frame 000004 t=0.000 s", 1000.0)
     assert source.read(0) is None
     wait_until(lambda: source.latency_s == 1.5)  # it grows while no newer picture comes
@@ -276,7 +276,7 @@ def test_error_of_a_driver_is_a_loss_with_its_words():
 
 
 def test_picture_that_cannot_be_converted_is_left_out(live):
-    broken = replace(shot(1), pixels=lambda: 1 / 0)
+    broken = replace(shot(1), convert=lambda: 1 / 0)
     assert next_frame(live(Camera(paced([broken, *map(shot, range(2, 20))], 20))))
 
 
@@ -294,7 +294,7 @@ def test_wait_before_reopening_doubles_up_to_ten_seconds(monkeypatch, live):
     source = live()
     source.close()
     monkeypatch.setattr(source, "_closing", Closing())
-    source._keep_open()
+    source._supervise()
     assert waits_s == [0.5, 1, 2, 4, 8, 10, 10]
 
 

@@ -18,7 +18,7 @@ def view(number):
 
 def refusals(pictures):
     newness = RepeatDetector()
-    return [newness.refusal(make_thumbnail(picture)) for picture in pictures]
+    return [newness.find_repeat(make_thumbnail(picture)) for picture in pictures]
 
 
 NOISY = [

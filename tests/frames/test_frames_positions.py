@@ -92,10 +92,10 @@ def test_parse_time_refuses(text):
         ("b.jpg,ref,46,2,,,,1466699519000", "line 3: time is `1466699519000`: write 2016-06-23T16:31:59Z"),  # ms
         ("b.jpg,ref,46,2,,,,0001-01-01T00:00:00+14:00", "line 3: time is"),
         ("b.jpg,ref,46,,,,,", "line 3 has only one of lat and lon"),
-        ("b.jpg,46,2", "line 3 has not as many values"),
-        ("b.jpg,ref,46,84,2,0,,,,", "line 3 has not as many values"),
+        ("b.jpg,46,2", "line 3 has another number of values"),
+        ("b.jpg,ref,46,84,2,0,,,,", "line 3 has another number of values"),
         (",ref,46,2,,,,", "line 3 names no image"),
-        ("0000.jpg,ref,46,2,,,,", "one of an earlier line (`0000.jpg`)"),
+        ("0000.jpg,ref,46,2,,,,", "that of an earlier line (`0000.jpg`)"),
     ],
 )
 def test_read_positions_names_line_and_value_of_a_wrong_row(row, complaint, written):

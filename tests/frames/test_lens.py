@@ -80,7 +80,7 @@ def test_script_of_the_docs_calibrates_a_lens_that_is_known(tmp_path, monkeypatc
     lens = read_lens("lens.yaml")
     assert lens.focal_px == pytest.approx([camera.matrix[0, 0]] * 2, rel=0.002)
     rows, columns = np.mgrid[24:456:8, 32:608:8]
-    found_px = lens.projected(camera.rays[rows, columns].reshape(-1, 2))
+    found_px = lens.project(camera.rays[rows, columns].reshape(-1, 2))
     assert np.linalg.norm(found_px - np.column_stack([columns.ravel(), rows.ravel()]), axis=1).max() < 1.0
 
 

@@ -9,9 +9,9 @@ from edgevpr.frames.shot import Condition, Refusal
 def liveness(*new_s, opened_s=0.0):
     """That of a source opened at `opened_s`, with new pictures at these times."""
     found = Liveness()
-    found.open(opened_s)
+    found.record_opening(opened_s)
     for t_s in new_s:
-        assert found.take(t_s) is None
+        assert found.record_picture(t_s) is None
     return found
 
 
@@ -19,8 +19,8 @@ def begins_s(watched, wanted, start_s=0.0, refusal=None, every_s=0.1):
     """Seconds from `start_s` until a fault is `wanted`, of a source of which every picture is refused so."""
     for step in range(1, 1000):
         if refusal:
-            watched.refuse(refusal, start_s + step * every_s)
-        if (fault := watched.fault(start_s + step * every_s)) and wanted(fault):
+            watched.record_refusal(refusal, start_s + step * every_s)
+        if (fault := watched.find_fault(start_s + step * every_s)) and wanted(fault):
             return pytest.approx(step * every_s, abs=1.5 * every_s)
     return None
 
@@ -63,16 +63,16 @@ LOST, DAMAGED, LATE = is_(Condition.LOST), is_(Condition.DAMAGED), is_(Condition
 def test_source_without_a_usable_picture_has_a_fault_in_time(new_s, opened_s, refusal, wanted, after_s):
     watched = liveness(*new_s)
     if opened_s is not None:
-        watched.open(opened_s)
+        watched.record_opening(opened_s)
     assert begins_s(watched, wanted, opened_s or max(new_s, default=0.0), refusal) == after_s
 
 
 def test_source_opened_anew_keeps_its_rate():
     watched = liveness(0.0, 0.1, 0.2)
-    watched.open(20.0)
-    watched.take(25.0)
+    watched.record_opening(20.0)
+    watched.record_picture(25.0)
     assert begins_s(watched, is_(Condition.LOST), 25.0) == 3.0
-    assert liveness(0.0, 5.0).fault(10.0) is None
+    assert liveness(0.0, 5.0).find_fault(10.0) is None
 
 
 @pytest.mark.parametrize(
@@ -82,21 +82,21 @@ def test_source_opened_anew_keeps_its_rate():
 def test_picture_that_repeats_for_a_second_and_three_times_is_frozen(repeats, step_s, is_frozen):
     watched = liveness(0.0, 0.1)
     for _ in range(repeats):
-        watched.refuse(Refusal.FROZEN, 0.1)
-    fault = watched.fault(0.1 + repeats * step_s)
+        watched.record_refusal(Refusal.FROZEN, 0.1)
+    fault = watched.find_fault(0.1 + repeats * step_s)
     assert (fault is not None and fault.condition is Condition.FROZEN) == is_frozen
 
 
 def test_frozen_source_is_opened_anew_after_growing_times_until_it_gives_new_pictures():
     watched, waits_s = liveness(0.0, 0.1), []
     for _ in range(5):
-        watched.open(0.0)
+        watched.record_opening(0.0)
         waits_s.append(begins_s(watched, must_reopen, 0.0, Refusal.FROZEN))
-        watched.reopen(watched.fault(100.0))
+        watched.record_reopening(watched.find_fault(100.0))
     assert waits_s == [5.0, 10.0, 20.0, 30.0, 30.0]
-    watched.open(0.0)
-    assert watched.take(0.1) is Refusal.FROZEN, "it may be the frozen picture, coded in another way"
-    assert watched.take(0.2) is None
+    watched.record_opening(0.0)
+    assert watched.record_picture(0.1) is Refusal.FROZEN, "it may be the frozen picture, coded in another way"
+    assert watched.record_picture(0.2) is None
     assert begins_s(watched, must_reopen, 0.2, Refusal.FROZEN) == 5.0
 
 
@@ -104,7 +104,7 @@ def test_new_picture_ends_every_fault():
     for refusal in (Refusal.FROZEN, Refusal.DAMAGED, Refusal.PATCHED, Refusal.LATE):
         watched = liveness(0.0, 0.1)
         for _ in range(20):
-            watched.refuse(refusal, 9.9)
-        assert watched.fault(10.0)
-        watched.take(10.1)
-        assert watched.fault(10.2) is None
+            watched.record_refusal(refusal, 9.9)
+        assert watched.find_fault(10.0)
+        watched.record_picture(10.1)
+        assert watched.find_fault(10.2) is None

@@ -32,7 +32,7 @@ def test_mask_is_known_by_its_pixels(tmp_path):
 
 @pytest.mark.parametrize("share", [0.61, 1.0])
 def test_mask_that_leaves_too_little_is_refused(tmp_path, share):
-    with pytest.raises(UsageError, match=f"masks {share:.0%} of the frame, and 60% is the most"):
+    with pytest.raises(UsageError, match=f"masks {share:.0%} of the frame, at most 60% is allowed"):
         load_mask(written(tmp_path / "m.png", masked(share, 100, 100)))
     assert load_mask(written(tmp_path / "m.png", masked(0.6, 100, 100))).allowed.mean() == 0.4
 
@@ -45,5 +45,5 @@ def test_mask_that_is_no_image_is_refused(tmp_path):
 
 
 def test_mask_is_fitted_to_a_picture_of_another_size(tmp_path):
-    fitted = load_mask(written(tmp_path / "m.png", masked(0.5))).fitted(np.zeros((240, 320), np.uint8))
+    fitted = load_mask(written(tmp_path / "m.png", masked(0.5))).fit_to(np.zeros((240, 320), np.uint8))
     assert np.array_equal(fitted, masked(0.5, 240, 320))

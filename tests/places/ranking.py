@@ -18,7 +18,7 @@ class Ruler:
     def encode(self, number):
         return Descriptor(coarse=np.array([round(number, -1)], "<f4"), fine=np.array([float(number)]))
 
-    def coarse_scores(self, query, rows, mean):
+    def score_places(self, query, rows, mean):
         return 1 / (1 + abs(rows[:, 0] - query.coarse[0])), None
 
     def match(self, query, fine, hypotheses):

@@ -160,8 +160,8 @@ class Turned(Ruler):
     def __init__(self):
         self.tried = []
 
-    def coarse_scores(self, query, rows, mean):
-        scores, _ = super().coarse_scores(query, rows, mean)
+    def score_places(self, query, rows, mean):
+        scores, _ = super().score_places(query, rows, mean)
         return scores, np.stack([scores / 3, scores / 2, scores], axis=1)
 
     def match(self, query, fine, hypotheses):
@@ -199,8 +199,8 @@ def test_in_a_large_map_more_are_compared_where_no_heading_is_known(ruler_map, m
     class Tall(Turned):
         spec = dataclasses.replace(Ruler.spec, height_ratios=(1.0,))
 
-        def coarse_scores(self, query, rows, mean, **hints):
-            return super().coarse_scores(query, rows, mean)
+        def score_places(self, query, rows, mean, **hints):
+            return super().score_places(query, rows, mean)
 
     monkeypatch.setattr(retrieve, "_LARGE", large)
     _, place_map = ruler_map
@@ -218,8 +218,8 @@ def test_a_ranking_says_how_many_rotations_were_not_ruled_out(ruler_map):
     _, place_map = ruler_map
 
     class Known(Turned):
-        def coarse_scores(self, query, rows, mean):
-            scores, each = super().coarse_scores(query, rows, mean)
+        def score_places(self, query, rows, mean):
+            scores, each = super().score_places(query, rows, mean)
             return scores, np.where([True, False, True], each, -np.inf)
 
     class Tall(Turned):
@@ -227,8 +227,8 @@ def test_a_ranking_says_how_many_rotations_were_not_ruled_out(ruler_map):
 
         spec = dataclasses.replace(Ruler.spec, height_ratios=(0.8, 1.0))
 
-        def coarse_scores(self, query, rows, mean, **hints):
-            scores, _ = Ruler.coarse_scores(self, query, rows, mean)
+        def score_places(self, query, rows, mean, **hints):
+            scores, _ = Ruler.score_places(self, query, rows, mean)
             is_left = np.ones((len(rows), 4), bool)
             is_left[1::2, 1:] = False
             return scores, np.where(is_left, scores[:, None], -np.inf)
@@ -286,7 +286,7 @@ def test_where_the_scan_counts_it_is_part_of_the_score(ruler, candidates):
     technique, place_map, index = ruler
     query = technique.encode(43)
     plain = rank(technique, query, place_map, index, candidates)
-    scanned, _ = technique.coarse_scores(query, index.rows, index.mean)
+    scanned, _ = technique.score_places(query, index.rows, index.mean)
     technique.spec = dataclasses.replace(technique.spec, scan_counts=True)
     ranking = rank(technique, query, place_map, index, candidates)
     assert sorted(ranking.slots) == sorted(plain.slots)

@@ -68,6 +68,6 @@ def test_hog_is_the_cosine_of_whole_image_histograms():
         vector = literal.blocks(cells).ravel()
         vectors.append(vector / np.linalg.norm(vector))
     query, other = (technique.encode(image) for image in images)
-    scores, _ = technique.coarse_scores(query, np.stack([query.coarse, other.coarse]))
+    scores, _ = technique.score_places(query, np.stack([query.coarse, other.coarse]))
     np.testing.assert_allclose(query.coarse, vectors[0], atol=2e-4)  # half precision
     np.testing.assert_allclose(scores, [1.0, vectors[0] @ vectors[1]], atol=1e-3)

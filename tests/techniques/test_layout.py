@@ -41,7 +41,7 @@ def test_layouts_agree_on_the_shift_between_them():
 def test_a_turned_and_moved_camera_finds_the_place_and_its_rotation(town, step):
     technique, rows = town
     query = technique.encode(view(step % PLACES, 15 * step, *SHIFTS_PX[step % len(SHIFTS_PX)]))
-    scores, by_hypothesis = technique.coarse_scores(query, rows, None)
+    scores, by_hypothesis = technique.score_places(query, rows, None)
     assert scores.argmax() == step % PLACES
     assert by_hypothesis[step % PLACES].argmax() % layout.ROTATIONS == step
 
@@ -49,9 +49,9 @@ def test_a_turned_and_moved_camera_finds_the_place_and_its_rotation(town, step):
 def test_only_likely_places_are_looked_at_closer(town):
     technique, rows = town
     query = technique.encode(view(1))
-    _, by_hypothesis = technique.coarse_scores(query, rows, None)
+    _, by_hypothesis = technique.score_places(query, rows, None)
     likely = np.arange(PLACES) % 2 == 0
-    scores, restricted = technique.coarse_scores(query, rows, None, in_reach=likely)
+    scores, restricted = technique.score_places(query, rows, None, in_reach=likely)
     np.testing.assert_allclose(restricted[likely], by_hypothesis[likely], atol=1e-6)
     unlikely = restricted[~likely]
     assert (unlikely[np.isfinite(unlikely)] < 0).all()
@@ -66,14 +66,14 @@ def test_in_a_large_map_the_places_in_reach_are_all_scored_and_of_the_others_som
     large = np.repeat(rows, 12_000 // PLACES, axis=0)
     turned_deg = np.where(np.arange(len(large)) % 3, 0.0, np.nan) if headings else None
     likely = np.arange(len(large)) % 100 == 7
-    scores, of_some = technique.coarse_scores(query, large, None, turned_deg, in_reach=likely)
-    _, of_all = technique.coarse_scores(query, large, None, turned_deg)
+    scores, of_some = technique.score_places(query, large, None, turned_deg, in_reach=likely)
+    _, of_all = technique.score_places(query, large, None, turned_deg)
     np.testing.assert_array_equal(np.isfinite(of_some[likely]), np.isfinite(of_all[likely]))
     rivals = np.isfinite(of_some[~likely]).any(axis=1)
     assert 2048 <= rivals.sum() <= 4096
     assert np.diff(np.flatnonzero(rivals)).max() <= 5
     few = np.repeat(rows, 4000 // PLACES, axis=0)
-    _, of_few = technique.coarse_scores(query, few, None, in_reach=np.arange(len(few)) == 7)
+    _, of_few = technique.score_places(query, few, None, in_reach=np.arange(len(few)) == 7)
     assert np.isfinite(of_few).any(axis=1).all()
     assert (scores[~likely] == 0).all()
 
@@ -82,7 +82,7 @@ def test_rows_of_any_bytes_have_finite_scores(town):
     technique, _ = town
     damaged = np.random.default_rng(2).integers(0, 256, (4, PLACE_BYTES), np.uint8)
     damaged[1:] = np.array([[0], [255], [NOTHING + 1]])
-    scores, by_hypothesis = technique.coarse_scores(technique.encode(view(2)), damaged, None)
+    scores, by_hypothesis = technique.score_places(technique.encode(view(2)), damaged, None)
     assert np.isfinite(scores).all()
     assert np.isfinite(by_hypothesis).sum() == layout.ROTATIONS * len(damaged)
 
@@ -92,8 +92,8 @@ def test_a_picture_without_a_good_region_has_no_layout_and_is_like_no_place(town
     empty = technique.encode(np.full((SIDE_PX, SIDE_PX), 90, np.uint8))
     assert (empty.coarse == NOTHING).all()
     with_empty = np.stack([*rows[:2], empty.coarse])
-    assert (technique.coarse_scores(empty, with_empty, None)[0] == 0).all()
-    scores, by_hypothesis = technique.coarse_scores(technique.encode(view(0)), with_empty, None)
+    assert (technique.score_places(empty, with_empty, None)[0] == 0).all()
+    scores, by_hypothesis = technique.score_places(technique.encode(view(0)), with_empty, None)
     assert scores.argmax() == 0
     assert scores[2] == 0
     assert np.isfinite(by_hypothesis).sum() == layout.ROTATIONS * 3
@@ -109,11 +109,11 @@ def test_only_the_rotation_expected_and_those_beside_it_are_possible(town):
     technique, rows = town
     query, rows = technique.encode(view(0)), np.resize(rows, (8, PLACE_BYTES))
     turned_deg = np.array([0, 7, 8, 100, 352, 353, 359.9, np.nan])
-    scores, by_rotation = technique.coarse_scores(query, rows, None, turned_deg)
+    scores, by_rotation = technique.score_places(query, rows, None, turned_deg)
     sets = possible(by_rotation)
     assert sets[:3] == [[0, 15, 345], [0, 15, 345], [0, 15, 30]]
     assert sets[3:7] == [[90, 105, 120], [0, 330, 345], [0, 15, 345], [0, 15, 345]]
-    everything, by_rotation = technique.coarse_scores(query, rows, None)
+    everything, by_rotation = technique.score_places(query, rows, None)
     assert sets[7] == possible(by_rotation)[7] == list(range(0, 360, 15))
     assert (scores <= everything + 1e-6).all()
     np.testing.assert_allclose(scores[[0, 7]], everything[[0, 7]], atol=1e-6)

@@ -43,7 +43,7 @@ def test_a_picture_without_any_region_says_nothing(tmp_path, monkeypatch):
         it = create(name, {"model": "dim", "words": count})
         night, day = it.encode(np.zeros((32, 32), np.uint8)), it.encode(textured(1))
         assert (night.quality, day.quality) == (0, 1)
-        scores, _ = it.coarse_scores(night, np.stack([day.coarse, night.coarse]), None)
+        scores, _ = it.score_places(night, np.stack([day.coarse, night.coarse]), None)
         assert scores.tolist() == [0, 0]
         if it.spec.fine:
             assert it.match(night, day.fine).score == it.match(day, night.fine).score == 0

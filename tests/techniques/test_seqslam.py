@@ -65,7 +65,7 @@ def test_scores_are_the_enhanced_mean_absolute_differences_of_the_paper():
     technique = SeqSlam()
     rows = rows_of(technique, 40)
     query = technique.encode(cv2.convertScaleAbs(textured(17), alpha=0.7))
-    scores, hypotheses = technique.coarse_scores(query, rows, None)
+    scores, hypotheses = technique.score_places(query, rows, None)
     differences = [sum(abs(int(a) - int(b)) for a, b in zip(row, query.coarse, strict=True)) / 2048 for row in rows]
     np.testing.assert_allclose(scores, 0.5 - literal_enhanced(differences) / (2 * 10 / math.sqrt(11)), atol=1e-6)
     assert hypotheses is None

@@ -17,7 +17,7 @@ def test_an_image_is_most_like_itself(name):
     rows = technique.pack(coarse, mean) if technique.spec.packed else coarse
     assert rows.shape[1:] == technique.spec.row.shape
     for at, query in enumerate(descriptors):
-        scores, _ = technique.coarse_scores(query, rows, mean)
+        scores, _ = technique.score_places(query, rows, mean)
         assert scores.argmax() == at
         assert (scores >= 0).all()
         assert (scores <= 1).all()

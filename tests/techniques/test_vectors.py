@@ -17,7 +17,7 @@ class Given(VectorTechnique):
     def __init__(self, form="float", similarity="cosine", length=LENGTH):
         super().__init__("given", length, form=form, margins=(0.1, 0.2, 0.3), similarity=similarity)
 
-    def vector(self, image, mask):
+    def make_vector(self, image, mask):
         return image
 
 
@@ -58,7 +58,7 @@ def literal_score(form, similarity, query, place, mean):
 def test_scores_are_those_of_a_literal_loop(form, similarity):
     technique, coarse, mean, rows = made(form, similarity, places())
     query = technique.encode(places(1, seed=5)[0])
-    scores, hypotheses = technique.coarse_scores(query, rows, mean)
+    scores, hypotheses = technique.score_places(query, rows, mean)
     assert hypotheses is None
     assert scores.dtype == np.float32
     expected = [literal_score(form, similarity, query.coarse, place, mean) for place in coarse]
@@ -69,7 +69,7 @@ def test_scores_are_those_of_a_literal_loop(form, similarity):
 def test_a_map_of_one_place_or_of_the_same_place_has_finite_scores(form):
     technique, coarse, mean, rows = made(form, "cosine", np.repeat(places(1), 3, axis=0))
     for query in (coarse[0], places(1, seed=3)[0], np.zeros(LENGTH)):
-        scores, _ = technique.coarse_scores(technique.encode(query.astype(np.float32)), rows, mean)
+        scores, _ = technique.score_places(technique.encode(query.astype(np.float32)), rows, mean)
         assert np.isfinite(scores).all()
         assert ((scores >= 0) & (scores <= 1)).all()
 
@@ -98,7 +98,7 @@ def test_a_picture_of_nothing_is_like_no_place_not_even_like_another_of_nothing(
     coarse = np.stack([nothing.coarse, *(technique.encode(place).coarse for place in places(5))])
     mean = coarse.astype(np.float32).mean(axis=0)
     rows = coarse if form == "float" else technique.pack(coarse, mean)
-    assert not technique.coarse_scores(nothing, rows, mean)[0].any()
+    assert not technique.score_places(nothing, rows, mean)[0].any()
 
 
 @pytest.mark.parametrize("similarity", ["cosine", "l1"])
@@ -108,7 +108,7 @@ def test_scoring_takes_little_beside_the_rows(form, similarity):
     many = np.resize(rows, (8192, rows.shape[1]))  # as float32 all of them would be 134 MB
     query = technique.encode(places(1, length=4096)[0])
     tracemalloc.start()
-    scores, _ = technique.coarse_scores(query, many, mean)
+    scores, _ = technique.score_places(query, many, mean)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     np.testing.assert_array_equal(scores[:16], scores[-16:])

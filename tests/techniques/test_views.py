@@ -48,7 +48,7 @@ def test_a_query_from_another_height_is_found_with_its_height_rotation_and_shift
     query = technique.encode(seen(3, height_ratio, turned_deg, right_px=24))
     matches = {}
     for ratio in technique.spec.height_ratios:
-        _, by_hypothesis = technique.coarse_scores(query, rows, None, height_ratio=ratio)
+        _, by_hypothesis = technique.score_places(query, rows, None, height_ratio=ratio)
         for at in np.argsort(-by_hypothesis.ravel())[:8].tolist():  # of 144
             slot, chosen = divmod(at, by_hypothesis.shape[1])
             matches[slot, chosen] = technique.match(query, places[slot].fine, [chosen])
@@ -72,7 +72,7 @@ def test_one_height_is_looked_from_and_the_others_left_out(town):
     technique, _, rows = town
     query = technique.encode(seen(2, 0.7))
     for expected, number in ((None, 2), (0.66, 1), (1.1, 2), (3.0, 4)):
-        scores, known = technique.coarse_scores(query, rows, None, None, expected)
+        scores, known = technique.score_places(query, rows, None, None, expected)
         of_height = np.arange(5 * ROTATIONS) // ROTATIONS == number
         assert np.isfinite(known[:, of_height]).all()
         assert np.isneginf(known[:, ~of_height]).all()
@@ -83,6 +83,6 @@ def test_the_score_of_the_thesis_is_tried_from_one_height():
     technique = create("cohog", {"camera": "nadir", "matching": "thesis"})
     assert not technique.spec.height_ratios
     query = technique.encode(seen(1))
-    _, by_hypothesis = technique.coarse_scores(query, query.coarse[None], None)
+    _, by_hypothesis = technique.score_places(query, query.coarse[None], None)
     assert np.flatnonzero(np.isfinite(by_hypothesis[0])).tolist() == list(range(48, 72))
     assert technique.match(query, query.fine).height_ratio == 1.0

@@ -213,7 +213,7 @@ class FrozenWatch:
     def _is_same(self, then: CoarsePicture, now: CoarsePicture, learns: bool = False) -> bool | None:
         """Tell whether two pictures show the same, unmoved; None if their texture cannot show a motion. Blocks that
         always stay, as those of a display or of the airframe, are not used; with `learns`, they are learnt."""
-        textured, unmoved = then.is_textured, then.is_unmoved(now)
+        textured, unmoved = then.is_textured, then.find_unmoved_blocks(now)
         judged = textured & (self._stays < _MAX_STAY)
         if learns and unmoved.sum() <= _MAX_STAY * textured.sum():
             self._stays += textured * (unmoved - self._stays) / _BLOCK_MEMORY

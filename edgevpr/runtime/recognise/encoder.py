@@ -47,7 +47,7 @@ class FrameEncoder:
         self, frame: Frame, vehicle: Vehicle | None = None, *, layers: Layers | None = None, scale: float = 1.0
     ) -> LevelledImage:
         """Return the levelled picture of a frame, with its mask and view. See `Levelling.prepare` for the rest."""
-        mask = self.mask.fitted(frame.image) if self.mask else None
+        mask = self.mask.fit_to(frame.image) if self.mask else None
         if self.levelling is None:
             return enlarge_image(LevelledImage(frame.image, mask, UNKNOWN_VIEW), scale)
         return self.levelling.prepare(frame, vehicle, mask, layers=layers, scale=scale)

@@ -173,7 +173,7 @@ class Recogniser:
 
     def _measure_stride(self, frame: Frame, view: View, verifier: Verifier) -> Stride | None:
         """Measure the stride of a frame from the one before, if its picture lies on the ground."""
-        if self._strides is None or not view.is_laid:
+        if self._strides is None or not view.is_georeferenced:
             return None
         with self.meter.step("stride"):
             return self._strides.to(frame.t_mono_s, view, verifier.landmarks)

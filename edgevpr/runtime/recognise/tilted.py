@@ -32,8 +32,8 @@ def measure_again(picture: LevelledImage, technique: Technique, fine: Array, fou
     corners = cut_polygon(corners, (out_from_pixel @ corners)[2] - _MIN_SCALE)
     scale = math.sqrt(math.prod(found.scales))
     warp = Homography(out_from_pixel, corners, side, longest / (side * scale))
-    mask = warp.shown if picture.mask is None else warp.shown & warp.overlay(picture.mask)
-    laid = technique.encode(warp.picture(picture.image), mask)
+    mask = warp.shown if picture.mask is None else warp.shown & warp.warp_mask(picture.mask)
+    laid = technique.encode(warp.warp_image(picture.image), mask)
     again = technique.measure_perspective(laid, fine, _AT_REST)
     if again is None or again.regions < _MIN_LEFT * found.regions:
         return None

@@ -29,9 +29,9 @@ def test_a_flights_charge_is_the_closed_form(make_flight, clock):
 
     flight = make_flight(**{"board": "rpi-4b", "source.rate_hz": 0.5, "match.candidates": 1})
     technique = flight.recogniser.technique
-    encode, scan = technique.encode, technique.coarse_scores
+    encode, scan = technique.encode, technique.score_places
     technique.encode = lambda *seen: (work(), encode(*seen))[1]
-    technique.coarse_scores = lambda *asked: (work(), scan(*asked))[1]
+    technique.score_places = lambda *asked: (work(), scan(*asked))[1]
     begin_s = clock.now_s
     lines = flight.fly(FakeSource([PICTURE] * 150, clock, work=work))
     totals, elapsed_s = flight.end, clock.now_s - begin_s

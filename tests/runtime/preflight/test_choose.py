@@ -76,7 +76,7 @@ class TinyTechnique:
         self.shapes.add((image.shape, image.dtype))
         return Descriptor(coarse=np.ones(4, np.float32), fine=np.ones((6, 2), np.float32) if self.spec.fine else None)
 
-    def coarse_scores(self, query, rows, mean):
+    def score_places(self, query, rows, mean):
         return rows @ query.coarse, None
 
     def match(self, query, fine, hypotheses=None):

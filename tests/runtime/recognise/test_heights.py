@@ -36,13 +36,13 @@ def opened(tmp_path_factory):
 def recogniser(opened, monkeypatch, prior=None):
     """A recogniser, and the heights that its scans are asked to look from."""
     technique, place_map = opened
-    heights, scan = [], type(technique).coarse_scores
+    heights, scan = [], type(technique).score_places
 
-    def coarse_scores(query, rows, mean, **hints):
+    def score_places(query, rows, mean, **hints):
         heights.append(hints["height_ratio"])
         return scan(technique, query, rows, mean, **hints)
 
-    monkeypatch.setattr(technique, "coarse_scores", coarse_scores, raising=False)
+    monkeypatch.setattr(technique, "score_places", score_places, raising=False)
     return walk_over(place_map, technique, prior=prior), heights
 
 
@@ -96,10 +96,10 @@ def cut_twice(tmp_path_factory):
 def test_of_a_map_of_two_footprints_the_places_are_looked_among_that_suit_the_height(cut_twice, height_m):
     """By the height, where it is told, from the first picture on; else by the last match."""
     technique, place_map = cut_twice
-    scan, looked = type(technique).coarse_scores, []
+    scan, looked = type(technique).score_places, []
 
     class Noting(type(technique)):
-        def coarse_scores(self, query, rows, mean, **hints):
+        def score_places(self, query, rows, mean, **hints):
             looked.append(hints["in_reach"])
             return scan(self, query, rows, mean, **hints)
 

@@ -56,9 +56,9 @@ def test_the_event_of_a_place_that_is_recognised_says_everything(walk):
 
 
 def test_every_step_is_metered(walk, clock):
-    encode, scan, match = walk.technique.encode, walk.technique.coarse_scores, walk.technique.match
+    encode, scan, match = walk.technique.encode, walk.technique.score_places, walk.technique.match
     walk.technique.encode = lambda *asked: (clock.work(0.010), encode(*asked))[1]
-    walk.technique.coarse_scores = lambda *asked: (clock.work(0.020, 2.0), scan(*asked))[1]
+    walk.technique.score_places = lambda *asked: (clock.work(0.020, 2.0), scan(*asked))[1]
     walk.technique.match = lambda *asked: (clock.work(0.001), match(*asked))[1]
     event = walk.step(frame(3))
     steps = event.steps
@@ -75,7 +75,7 @@ class Wrong(Exception):
 @pytest.mark.parametrize(
     "error", [ModelError("no."), MapError("gone."), Wrong("x"), MemoryError(), ZeroDivisionError()]
 )
-@pytest.mark.parametrize("where", ["encode", "coarse_scores", "match"])
+@pytest.mark.parametrize("where", ["encode", "score_places", "match"])
 def test_whatever_a_technique_raises_is_a_refusal_with_its_reason(walk, error, where):
     def broken(*asked, **more):
         raise error
