@@ -22,9 +22,9 @@ from big_map import make_big_map
 from edgevpr.core.contract import Technique
 from edgevpr.core.types import Position
 from edgevpr.lab.simulate.landscape import make_scene
-from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import NOTHING, Expectation, Query, compare, scan
+from edgevpr.places.retrieve import NO_EXPECTATION, Expectation, Query, compare_places, scan_index
 from edgevpr.techniques import create
 
 PLACES = 10_000
@@ -116,15 +116,15 @@ def query_rows() -> Iterator[Row]:
     """Ask one query, encoding included, in a large map: the scan and the vote over the best places, looking ahead
     against the vote over all (`exact_s`); looking down with what may be known beforehand, which `beside` tells."""
     with opened("forward") as large:
-        yield _query(large, "forward", "", NOTHING)
+        yield _query(large, "forward", "", NO_EXPECTATION)
     with opened("nadir") as large:
         index = large[2]
         # A map as it is flown, on parallel legs to and fro, with some sway.
         rng = np.random.default_rng(0)
         turned_deg = (rng.choice([0, 180], len(index)) + rng.normal(0, 5, len(index))) % 360
-        near = index.within(Position(float(index.lat_deg.mean()), float(index.lon_deg.mean())), REACH_M)
+        near = index.find_within(Position(float(index.lat_deg.mean()), float(index.lon_deg.mean())), REACH_M)
         in_reach = f"{np.count_nonzero(near)} places within {REACH_M:.0f} m"
-        yield _query(large, "nadir", "24 rotations", NOTHING)
+        yield _query(large, "nadir", "24 rotations", NO_EXPECTATION)
         yield _query(large, "nadir, heading known", "3 rotations", Expectation(turned_deg=turned_deg))
         yield _query(large, "nadir, in reach", in_reach, Expectation(in_reach=near))
         yield _query(large, "nadir, both", f"{in_reach}, 3 rotations", Expectation(near, turned_deg))
@@ -141,7 +141,7 @@ def _query(large: tuple[Technique, PlaceMap, PlaceIndex], camera: str, beside: s
             index=index,
             expected=expected,
         )
-        compare(asked, scan(asked), candidates)
+        compare_places(asked, scan_index(asked), candidates)
 
     query(technique.candidates)
     encode_s = statistics.median(timed_s(technique.encode, picture) for _ in range(QUERY_TURNS))
@@ -159,7 +159,7 @@ def _query(large: tuple[Technique, PlaceMap, PlaceIndex], camera: str, beside: s
         "two_stage_ms": 1000 * two_stage,
         "exact_s": exact,  # None where it would take minutes
         "ratio": exact / two_stage if exact else None,
-        "bytes_per_place": bytes_per_place(technique.spec),
+        "bytes_per_place": compute_place_bytes(technique.spec),
     }
 
 

@@ -98,7 +98,7 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
         frames = list(walks.frames_of(folder / "ref"))
         order = np.random.default_rng(15).permutation(len(frames))
         frames = [frames[at] for at in np.resize(order, min(query_altered_copies(technique), 6 * len(frames)))]
-        ids = {place.source_image: place.place_id for place in place_map.places()}
+        ids = {place.source_image: place.place_id for place in place_map.read_places()}
         pictures = ((ids[frame.name], LevelledImage(frame.image, None, UNKNOWN_VIEW)) for frame in frames)
         for answer in ask(technique, place_map, index, rule, walks.meter(), pictures):
             if answer.evidence is not None:

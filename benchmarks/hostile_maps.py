@@ -20,7 +20,7 @@ from edgevpr.core.errors import EdgevprError
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.mapping import build_map
-from edgevpr.places.geopackage import point_blob
+from edgevpr.places.geopackage import encode_point
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.encoder import FrameEncoder
@@ -56,10 +56,10 @@ def _position(path: Path, rng: Rng) -> None:
     """Flip bits of positions in the file, which no trigger sees."""
     data = bytearray(path.read_bytes())
     number = int(rng.integers(_PLACES))
-    at = data.find(point_blob(*_where(number)))
+    at = data.find(encode_point(*_where(number)))
     while at >= 0:  # also where SQLite has left an old copy of the page
         data[at + 13 + int(rng.integers(16))] ^= 1 << int(rng.integers(8))
-        at = data.find(point_blob(*_where(number)), at + 1)
+        at = data.find(encode_point(*_where(number)), at + 1)
     path.write_bytes(data)
 
 

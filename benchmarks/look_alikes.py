@@ -40,9 +40,10 @@ def measure(name: str) -> base.Row:
                 row["right" if is_right else "wrong"] += 1
                 landmarks = with_landmarks.step(walks.frame(query.path)).evidence.landmarks
                 row["unproven"] += is_right and landmarks <= np.log1p(INLIERS_BY_CHANCE)
-            known = [slot for slot in slots if dataset.references[slot] in {*query.right, *query.ignored}]
-            kept = np.all([outside_neighbourhood(index, slot, slots, 0.0, beside=beside) for slot in known], axis=0)
-            without = walks.walk(place_map, index.only(kept), technique, rule=walk.rule)
+            right_slots = [slot for slot in slots if dataset.references[slot] in {*query.right, *query.ignored}]
+            away = [outside_neighbourhood(index, slot, slots, 0.0, max_slots=beside) for slot in right_slots]
+            kept = np.all(away, axis=0)
+            without = walks.walk(place_map, index.select(kept), technique, rule=walk.rule)
             row["left_out"] += without.step(walks.frame(query.path)).accepted
     return row
 

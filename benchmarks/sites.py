@@ -34,8 +34,8 @@ from run_sets import join
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
 from edgevpr.lab.evaluate.metrics import wilson_interval
 from edgevpr.mapmaking.mapping import build_map
-from edgevpr.places.examine import examine
-from edgevpr.places.index import bytes_per_place
+from edgevpr.places.examine import check_places
+from edgevpr.places.index import compute_place_bytes
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.encoder import FrameEncoder
@@ -145,10 +145,10 @@ def part_of(dataset: Dataset, camera: str, count: int) -> Path:
     path = WORK / f"{camera}_{count}.gpkg"
     path.unlink(missing_ok=True)
     with PlaceMap.open(WORK / f"{camera}.gpkg") as whole:
-        names = {place.place_id: place.source_image for place in whole.places()}
+        names = {place.place_id: place.source_image for place in whole.read_places()}
         kept = chosen(dataset, list(names.values()), count)
         with PlaceMap.create(path, whole.spec) as part, part.transaction():
-            for each in examine(whole):
+            for each in check_places(whole):
                 if names.get(each.place_id) in kept:
                     part.insert(each.content)
     return path
@@ -201,7 +201,7 @@ def measured(camera: str, count: int) -> Row:
         "t_scan_ms": t_scan_ms,
         "t_query_ms": t_query_ms,
         "t_query_p90_ms": round(1000 * float(np.percentile([each[2] for each in costs], 90)), 1),
-        "bytes_per_place": bytes_per_place(spec),
+        "bytes_per_place": compute_place_bytes(spec),
         "row_bytes": spec.row.nbytes,
         "peak_mb": round(peak_mb, 1),
         "map_mb": round(path.stat().st_size / 1e6, 1),

@@ -106,7 +106,7 @@ def ranked(event: Recognition, names: list[str] | tuple[str, ...]) -> list[str]:
 
 def names_of(place_map: PlaceMap, index: PlaceIndex) -> list[str]:
     """Return the names of the pictures of the places, by slot."""
-    names = {place.place_id: place.source_image for place in place_map.places()}
+    names = {place.place_id: place.source_image for place in place_map.read_places()}
     return [names[place_id] for place_id in index.place_ids.tolist()]
 
 

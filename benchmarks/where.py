@@ -109,7 +109,7 @@ def measure(folder: Path, work: Path) -> tuple[Row, dict[str, Place], Set]:
         built = base.edgevpr("map", "build", path, "--images", folder / "ref", *NADIR, *flags)
         matches[how] = base.edgevpr("match", path, "--images", folder / "query")
     with PlaceMap.open(path) as place_map:
-        places = {place.source_image: place for place in place_map.places()}
+        places = {place.source_image: place for place in place_map.read_places()}
     errors, variances = _errors(of, matches, places)
     tag_var = (built["refined"]["recorded_sd_m"] or 0.0) ** 2
     row = {

@@ -123,7 +123,7 @@ class Map:
 
     def places(self) -> Iterator[Place]:
         """Yield the places as they are read from the file: number, picture, position, heading and pose of each."""
-        yield from self._recogniser.place_map.places()
+        yield from self._recogniser.place_map.read_places()
 
     def match(
         self,

@@ -39,8 +39,8 @@ def _rows(spec: TechniqueSpec, places: int, rng: np.random.Generator) -> Iterato
     for number in range(places):
         point = [corner + _STEP_DEG * steps for corner, steps in zip(_CORNER_DEG, divmod(number, side), strict=True)]
         coarse, fine = _blob(spec.coarse, rng), _blob(spec.fine, rng) if spec.fine else None
-        time, name = geopackage.utc_text(1.7e9 + number), f"{number:06d}.jpg"
-        yield geopackage.point_blob(*point), time, 500.0, 0.0, name, 0.8, coarse, fine
+        time, name = geopackage.format_utc(1.7e9 + number), f"{number:06d}.jpg"
+        yield geopackage.encode_point(*point), time, 500.0, 0.0, name, 0.8, coarse, fine
 
 
 def _blob(part: PartSpec, rng: np.random.Generator) -> bytes:

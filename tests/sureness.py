@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from edgevpr.core.contract import PartSpec, TechniqueSpec
-from edgevpr.places.index import PlaceIndex, empty_index
+from edgevpr.places.index import PlaceIndex, allocate_index
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Figures
 from edgevpr.runtime.recognise.evidence import OF_MAP
@@ -47,7 +47,7 @@ def sure_rule(confidence: Callable[[Figures], float], needed: float = NEEDED, **
 
 def bare_index(places: int) -> PlaceIndex:
     """An index of places without positions: neighbours are those beside each other."""
-    return empty_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), places, None)
+    return allocate_index(TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4")), places, None)
 
 
 def agreed(inliers: int, shift_share: tuple[float, float] = (0.1, 0.0), **more) -> Agreement:

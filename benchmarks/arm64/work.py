@@ -17,7 +17,7 @@ from edgevpr.core.arrays import Image
 from edgevpr.frames.level import View
 from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import NOTHING, Expectation, Query, compare, scan
+from edgevpr.places.retrieve import NO_EXPECTATION, Expectation, Query, compare_places, scan_index
 from edgevpr.power.speed import make_pass_round, make_product_round
 from edgevpr.runtime.recognise.landmarks import OF_QUERY, describe
 from edgevpr.runtime.recognise.stride import Strides
@@ -50,27 +50,27 @@ def of_camera(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable
         index = load_index(place_map, technique, 100_000_000)
         small = replace(index, **{each: getattr(index, each)[:SMALL] for each in PER_PLACE})
         known = Expectation(turned_deg=rng.choice([0.0, 180.0], len(index)))
-        fine, _ = place_map.fine_part(index.place_ids[0])
+        fine, _ = place_map.read_fine_part(index.place_ids[0])
         asked, one = technique.encode(picture), [0] if camera == "nadir" else None
 
-        def encoded(places: PlaceIndex, expected: Expectation = NOTHING) -> Query:
+        def encoded(places: PlaceIndex, expected: Expectation = NO_EXPECTATION) -> Query:
             seen = technique.encode(picture)
             return Query(technique=technique, descriptor=seen, place_map=place_map, index=places, expected=expected)
 
         def scanned(places: PlaceIndex) -> object:
-            return scan(encoded(places))
+            return scan_index(encoded(places))
 
         def query(expected: Expectation) -> object:
             one = encoded(index, expected)
-            return compare(one, scan(one), technique.candidates)
+            return compare_places(one, scan_index(one), technique.candidates)
 
         yield f"{name}: encode a frame", lambda: technique.encode(picture)
-        yield f"{name}: read a place", lambda: place_map.fine_part(index.place_ids[1])
+        yield f"{name}: read a place", lambda: place_map.read_fine_part(index.place_ids[1])
         yield f"{name}: glance at a place", lambda: technique.score_quickly(asked, fine, one)
         yield f"{name}: compare a place in full", lambda: technique.match(asked, fine, one)
         yield f"{name}: encode, and scan {len(small)} places", lambda: scanned(small)
         yield f"{name}: encode, and scan {len(index)} places", lambda: scanned(index)
-        yield f"{name}: a query", lambda: query(NOTHING)
+        yield f"{name}: a query", lambda: query(NO_EXPECTATION)
         if camera == "nadir":
             yield f"{name}: a query, heading known", lambda: query(known)
 

@@ -115,10 +115,10 @@ def moved_map(place_map: Path, east_m: float, up_m: float) -> Path:
         unfinished = path.with_name(f"{os.getpid()}-{path.name}")
         shutil.copy(place_map, unfinished)
         with PlaceMap.open_for_adding(unfinished) as places, places.transaction():
-            for place in list(places.places()):
+            for place in list(places.read_places()):
                 at = place.position
                 lat_deg, lon_deg = offset_position(at.lat_deg, at.lon_deg, east_m, 0.0)
-                places.lay(place.place_id, Position(lat_deg, lon_deg, at.alt_m + up_m), place.pose)
+                places.move_place(place.place_id, Position(lat_deg, lon_deg, at.alt_m + up_m), place.pose)
         unfinished.rename(path)
     return path
 

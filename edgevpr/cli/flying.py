@@ -125,7 +125,7 @@ def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recognise
     else:
         table = positions or find_track(source)
         queries = list(read_track(table).tags) if table else []
-    if why := explain_useless(known, queries, list(recogniser.place_map.places()), recogniser.sequence):
+    if why := explain_useless(known, queries, list(recogniser.place_map.read_places()), recogniser.sequence):
         raise UsageError(why)
 
 

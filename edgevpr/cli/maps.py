@@ -222,7 +222,7 @@ def run_map_calibrate(args: Namespace) -> int:
 
 def run_map_info(args: Namespace) -> int:
     """Run `map info`: print what a map holds, and what it takes on disk and in RAM; with --page, make a page of it."""
-    from edgevpr.places.index import bytes_per_place
+    from edgevpr.places.index import compute_place_bytes
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import describe_map
     from edgevpr.runtime.recognise.calibration import not_calibrated, read_calibration_for
@@ -232,7 +232,7 @@ def run_map_info(args: Namespace) -> int:
         check_output(args.page, args.map)
     with PlaceMap.open(args.map) as place_map:
         info, calibration = describe_map(place_map), read_calibration_for(place_map)
-    each_bytes = bytes_per_place(info.spec)
+    each_bytes = compute_place_bytes(info.spec)
     if calibration:
         confidence: str | None = f"calibrated {calibration.made}: {calibration.described()}"
     else:
@@ -256,7 +256,7 @@ def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, flo
 
     lens = read_camera_lens(load_command_config(args, args.config).source)
     with PlaceMap.open(args.map) as place_map:
-        places = list(place_map.places())
+        places = list(place_map.read_places())
         pictures = make_map_album(args.map_images, places)
         asked = places[:: -(-len(places) // MAX_QUERIES) or 1] if pictures else []
         level = ((place.place_id, pictures.level(place, lens)) for place in progress(asked, len(asked), "look-alikes"))
@@ -271,19 +271,19 @@ def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, flo
 
 def run_map_check(args: Namespace) -> int:
     """Run `map check`: read everything in a map and print what is damaged. The exit code is 1 if anything is."""
-    from edgevpr.places.examine import check
+    from edgevpr.places.examine import check_map
 
-    found = check(args.map, progress)
+    found = check_map(args.map, progress)
     print_result({**asdict(found), "is_whole": found.is_whole}, args.json, format_check(found))
     return 0 if found.is_whole else 1
 
 
 def run_map_repair(args: Namespace) -> int:
     """Run `map repair`: drop what is damaged in a map, and keep the original file."""
-    from edgevpr.places.examine import check, repair
+    from edgevpr.places.examine import check_map, repair_map
 
-    found = check(args.map, progress)
-    original = None if found.is_whole else repair(args.map, progress)
+    found = check_map(args.map, progress)
+    original = None if found.is_whole else repair_map(args.map, progress)
     dropped = found.total - found.places
     done = {"path": args.map, "kept": found.places, "dropped": dropped, "original": original and str(original)}
     last = f"{args.map}: repaired, {found.places} places kept, {dropped} dropped; the original is {original}"
@@ -294,10 +294,10 @@ def run_map_repair(args: Namespace) -> int:
 
 def run_map_merge(args: Namespace) -> int:
     """Run `map merge`: make one map of several."""
-    from edgevpr.places.examine import merge
-    from edgevpr.places.mapfiles import map_path
+    from edgevpr.places.examine import merge_maps
+    from edgevpr.places.mapfiles import parse_map_path
 
-    counts, were_calibrated = merge(args.maps, map_path(args.out), progress)
+    counts, were_calibrated = merge_maps(args.maps, parse_map_path(args.out), progress)
     parts = [
         {"map": path, "copied": copied, "already_here": already_here}
         for path, (copied, already_here) in zip(args.maps, counts, strict=True)
@@ -313,10 +313,10 @@ def run_map_merge(args: Namespace) -> int:
 
 def run_map_shrink(args: Namespace) -> int:
     """Run `map shrink`: make a smaller map of the most useful places of a map."""
-    from edgevpr.places.examine import shrink
-    from edgevpr.places.mapfiles import map_path
+    from edgevpr.places.examine import shrink_map
+    from edgevpr.places.mapfiles import parse_map_path
 
-    kept, places = shrink(args.map, map_path(args.out), args.places, progress)
+    kept, places = shrink_map(args.map, parse_map_path(args.out), args.places, progress)
     print_result({"map": args.out, "kept": kept, "of": places}, args.json, f"{args.out}: {kept} of {places} places")
     return 0
 

@@ -37,9 +37,9 @@ def run_map_subset(args: Namespace) -> int:
     """Run `map subset`: make the map of a mission, and print what is left out."""
     from edgevpr.mapmaking.missions import read_area
     from edgevpr.mapmaking.subset import subset
-    from edgevpr.places.mapfiles import map_path
+    from edgevpr.places.mapfiles import parse_map_path
 
-    area, out = read_area(args.mission), map_path(args.out)
+    area, out = read_area(args.mission), parse_map_path(args.out)
     found = subset(Path(args.map), area, args.margin_m, out, args.mb and 1e6 * args.mb, progress)
     print_result({"map": str(out), **asdict(found)}, args.json)
     return 0

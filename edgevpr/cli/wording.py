@@ -94,7 +94,7 @@ def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Itera
     if info.of_low_quality:
         yield f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps"
     if info.one_way_deg is not None:
-        yield f"  one way     {info.described_way}"
+        yield f"  one way     {info.one_way_warning}"
     if info.attribution:
         yield f"  cut from    {info.attribution}"
     if confidence:

@@ -28,10 +28,10 @@ from edgevpr.frames.level import LevelledImage
 from edgevpr.mapmaking.changes import change_picture
 from edgevpr.mapmaking.look_alikes import MapSearch, measure_look_alikes
 from edgevpr.mapmaking.mapping import Watch
-from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import outside_neighbourhood
-from edgevpr.places.rows import readable
+from edgevpr.places.rows import escape_name
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import MIN_PLACES, MapCalibration, calibration_text
 from edgevpr.runtime.recognise.confidence import Figures, Logistic, Model, prior
@@ -96,7 +96,7 @@ def ask(
         if (slot := search.slots.get(place_id)) is None:
             continue
         may_be_same = search.same_ground(slot)
-        ways = ((THERE, picture, index), (LEFT_OUT, picture, index.only(~may_be_same)))
+        ways = ((THERE, picture, index), (LEFT_OUT, picture, index.select(~may_be_same)))
         for way, seen, among in (*ways, (MIRRORED, _mirror(picture), index)):
             if not len(among):
                 continue
@@ -109,7 +109,7 @@ def ask(
             beside = count_neighbours(rule.look_alikes)
             right = (
                 way == THERE
-                and not outside_neighbourhood(index, slot, np.array([best]), search.near_m, beside=beside)[0]
+                and not outside_neighbourhood(index, slot, np.array([best]), search.near_m, max_slots=beside)[0]
             )
             if way == THERE and not right and may_be_same[best] and not np.isnan(index.lat_deg[best]):
                 continue  # the two pictures may overlap: it is unknown whether the match is right
@@ -141,7 +141,7 @@ def calibrate(
     technique = encoder.technique
     kinds = list_evidence_kinds(technique.spec)
     require(kinds, f"matches of {technique.spec.name} are judged by score and margin; only `cohog` has a confidence")
-    index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
+    index = load_index(place_map, technique, len(place_map) * compute_place_bytes(technique.spec))
     require(len(index) >= MIN_PLACES, f"it has {len(index)} places, and {MIN_PLACES} are needed")
     is_placed = not technique.spec.looks_down or np.isnan(index.lat_deg).mean() <= _MAX_WITHOUT_POSITION
     require(is_placed, "its places have no positions, so nobody knows which of them show the same ground")
@@ -186,7 +186,7 @@ def _read_mapped(
     frames = (frame for done in range(0, count, len(names)) for frame in pictures(names[: count - done]))
     for frame in watch(frames, count):
         encoded = encoder.encode(frame)
-        of_name = ids_by_image.get(readable(frame.name), ())
+        of_name = ids_by_image.get(escape_name(frame.name), ())
         if (
             place_id := next((at for at in of_name if place_map.has_descriptor(at, encoded.descriptor.coarse)), None)
         ) is not None:

@@ -17,10 +17,10 @@ from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Frame
 from edgevpr.frames.mask import OverlayMask
-from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import MAX_BESIDE, Query, compare, outside_neighbourhood, scan
+from edgevpr.places.retrieve import MAX_NEIGHBOUR_SLOTS, Query, compare_places, outside_neighbourhood, scan_index
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import read_calibration_for
@@ -92,7 +92,7 @@ def measure_look_alikes(
     all_slots = np.arange(len(index))
 
     def find_elsewhere(slot: int, beside: int) -> Bools:
-        is_elsewhere: Bools = outside_neighbourhood(index, slot, all_slots, near_m, beside=beside)
+        is_elsewhere: Bools = outside_neighbourhood(index, slot, all_slots, near_m, max_slots=beside)
         return np.asarray(is_elsewhere & (all_slots != slot))
 
     def is_beside(slot: int) -> Bools:
@@ -107,7 +107,7 @@ def measure_look_alikes(
     for place_id, descriptor in pictures:
         if (slot := slots.get(place_id)) is None:
             continue
-        far = find_elsewhere(slot, MAX_BESIDE) & ~is_beside(slot)
+        far = find_elsewhere(slot, MAX_NEIGHBOUR_SLOTS) & ~is_beside(slot)
         near = ~far & (all_slots != slot)
         for other, found in _compare_among(technique, place_map, index, descriptor, (far, near, is_opposite(slot))):
             for one, two in ((slot, other), (other, slot)):
@@ -119,7 +119,7 @@ def measure_look_alikes(
     overlap = usual >= max(chance, float(np.median(best_opposite)) + SMALL_LEAD)
     places = {}
     for slot, others in agree.items():
-        twin, found = _find_best(others, find_elsewhere(slot, MAX_BESIDE if overlap else 0))
+        twin, found = _find_best(others, find_elsewhere(slot, MAX_NEIGHBOUR_SLOTS if overlap else 0))
         own = max(usual, best_beside[slot]) if overlap else chance
         if twin is not None:
             twin_id = int(index.place_ids[twin])
@@ -142,9 +142,9 @@ def _compare_among(
     for part in parts:
         slots = np.flatnonzero(part)
         if len(slots):
-            among = index.only(slots)
+            among = index.select(slots)
             query = Query(technique=technique, descriptor=descriptor, place_map=place_map, index=among)
-            for at, match in compare(query, scan(query), technique.candidates, 0.0).compared.items():
+            for at, match in compare_places(query, scan_index(query), technique.candidates, 0.0).compared.items():
                 yield int(slots[at]), log_share(compute_share(match))
 
 
@@ -167,14 +167,14 @@ def find_look_alikes(
     technique = create_technique(place_map)
     if not list_evidence_kinds(technique.spec):
         return
-    index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
+    index = load_index(place_map, technique, len(place_map) * compute_place_bytes(technique.spec))
     rule = accept_rule(technique, MatchConfig(), 1, read_calibration_for(place_map))
     search = MapSearch(technique, place_map, index, rule, meter=QueryMeter(load_board("this")))
     for place_id, image, mask in pictures:
         slot = search.slots.get(place_id)
         if slot is None or np.isnan(index.lat_deg[slot]):
             continue
-        away = index.only(~search.same_ground(slot))
+        away = index.select(~search.same_ground(slot))
         if not len(away) or not place_map.has_descriptor(place_id, technique.encode(image, mask).coarse):
             continue
         event = search.find(place_id, image, mask, away)

@@ -20,7 +20,7 @@ from edgevpr.mapmaking.headings import find_headings
 from edgevpr.mapmaking.mapping import Covered, Gaps, MappingResult, build_map, measure_ground
 from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapfiles import map_path, remove
+from edgevpr.places.mapfiles import parse_map_path, remove_map
 from edgevpr.places.mapinfo import describe_map
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight.pick import make_camera_setting, pick_technique
@@ -79,7 +79,7 @@ class MadeMap:
 def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], None], shown: Shown) -> MadeMap:
     """Make the map that `order` describes, or continue it. `unusable` is called with an error for each picture that
     cannot be used. `shown` shows progress. Raises EdgevprError."""
-    path, here, pictures = map_path(order.path), load_board("this"), order.pictures
+    path, here, pictures = parse_map_path(order.path), load_board("this"), order.pictures
     flown, salience = config.source, config.salience
     is_new = not (order.append and path.exists())
     place_map = None if is_new else PlaceMap.open_for_adding(path)
@@ -125,7 +125,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             )
         except EdgevprError:
             if is_new and not len(place_map):  # such as a full disk: an empty file would block the next attempt
-                remove(path)
+                remove_map(path)
             raise
         if covered := measure_ground(place_map):
             _log.info("%s", covered.described(is_flown=isinstance(pictures, FlownPictures)))
@@ -134,7 +134,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
         )
         info = describe_map(place_map)
         if info.one_way_deg is not None:
-            _log.warning("%s", info.described_way)
+            _log.warning("%s", info.one_way_warning)
         return MadeMap(
             technique=technique.spec.name,
             places=len(place_map),

@@ -16,7 +16,7 @@ from edgevpr.core.geodesy import distance_m, offset_position, project_to_metres
 from edgevpr.core.types import Frame, Position, Salience
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.rows import readable
+from edgevpr.places.rows import escape_name
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, explain_failure
 from edgevpr.runtime.recognise.judge import says_nothing
 from edgevpr.runtime.recognise.levelling import place_at_middle
@@ -100,7 +100,7 @@ class Covered:
 
 def measure_ground(place_map: PlaceMap) -> Covered | None:
     """Measure the ground that a map covers; None with fewer than two positions."""
-    points = np.array([(lat_deg, lon_deg) for _, lat_deg, lon_deg, _ in place_map.outlines()]).reshape(-1, 2)
+    points = np.array([(lat_deg, lon_deg) for _, lat_deg, lon_deg, _ in place_map.read_outlines()]).reshape(-1, 2)
     lat_deg, lon_deg = points[~np.isnan(points).any(axis=1)].T
     if len(lat_deg) < 2:
         return None
@@ -151,7 +151,7 @@ def build_map(
     cannot be encoded, `unusable` is called with an error; with `unusable` None, ModelError is raised. Of pictures cut
     from an orthophoto (surveyed ones), those that hold too little to be recognised are left out.
     """
-    place_map.require(encoder.technique.spec)
+    place_map.require_technique(encoder.technique.spec)
     gaps = gaps or Gaps()
     ids_by_image = place_map.select_ids("source_image")
     result, layers = MappingResult(), read_layers(place_map)
@@ -178,7 +178,7 @@ def build_map(
         if encoded.view.reason:
             result.tilted += 1
             continue
-        of_name = ids_by_image.get((readable(frame.name),), ())
+        of_name = ids_by_image.get((escape_name(frame.name),), ())
         if says_nothing(encoded.descriptor, min_quality):
             result.says_nothing += 1
         elif any(place_map.has_descriptor(place_id, encoded.descriptor.coarse) for place_id in of_name):

@@ -56,13 +56,13 @@ def move_map(place_map: PlaceMap, log: str | Path) -> MapMove:
             "which the heading changes."
         )
     with place_map.transaction():
-        for place in list(place_map.places()):
+        for place in list(place_map.read_places()):
             pose = place.pose
             if pose:  # the recorded position moves too: another refinement must not bring it back
                 recorded = pose.recorded and move.apply(pose.recorded)
                 pose = replace(pose, footprint_m=pose.footprint_m / (1 + (move.scale or 0.0)), recorded=recorded)
             if place.position:
-                place_map.lay(place.place_id, move.apply(place.position), pose)
+                place_map.move_place(place.place_id, move.apply(place.position), pose)
     return move
 
 

@@ -195,9 +195,9 @@ def _misses(recorded: Complexes, solved: Solved, some: slice) -> float:
 
 
 def _readable(place_map: PlaceMap) -> Iterator[Place]:
-    for place_id, *_ in place_map.outlines():
+    for place_id, *_ in place_map.read_outlines():
         with suppress(PlaceError):
-            yield from place_map.places([place_id])
+            yield from place_map.read_places([place_id])
 
 
 def _write(place_map: PlaceMap, placed: list[Place], recorded_at: list[Position], solved: Solved, sure: Bools) -> None:
@@ -217,7 +217,7 @@ def _write(place_map: PlaceMap, placed: list[Place], recorded_at: list[Position]
                     recorded=recorded_at[at],
                 )
             if pose or place.pose is None or place.pose.recorded:
-                place_map.lay(place.place_id, position, pose)
+                place_map.move_place(place.place_id, position, pose)
 
 
 def _median(values: Floats) -> float | None:
@@ -268,7 +268,7 @@ def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], imag
     (None: none is found). `images` is the folder of their pictures (None: they are not at hand, so only landmarks are
     compared)."""
     paths = {decode_name(path.name): path for path in list_images(images)} if images else {}
-    coarse = {place_id: part for place_id, *_, part in place_map.coarse_parts()}
+    coarse = {place_id: part for place_id, *_, part in place_map.read_coarse_parts()}
 
     @lru_cache(_KEPT)
     def landmarks(at: int) -> Landmarks | None:
@@ -303,7 +303,7 @@ def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], imag
         if asking is None or part is None:
             return None
         try:
-            fine, _ = place_map.fine_part(places[place].place_id)
+            fine, _ = place_map.read_fine_part(places[place].place_id)
         except EdgevprError:
             return None
         match = technique.match(asking, fine, _rank_hypotheses(technique, asking, part))

@@ -10,7 +10,7 @@ from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import offset_m
 from edgevpr.mapmaking.missions import Area, shapely
 from edgevpr.places import mapfiles
-from edgevpr.places.examine import Watch, merge, read_place_positions, select, shrink
+from edgevpr.places.examine import ShowProgress, copy_places, merge_maps, read_place_positions, shrink_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.calibration import (
     MapCalibration,
@@ -33,7 +33,9 @@ class Subset:
     is_calibrated: bool
 
 
-def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: float | None, watch: Watch) -> Subset:
+def subset(
+    source: Path, area: Area, margin_m: float, out: Path, most_bytes: float | None, show_progress: ShowProgress
+) -> Subset:
     """Make the map `out` of the places of `source`, a map or a folder of maps, that are within `margin_m` metres of an
     area: as many as fit into `most_bytes` (None: all), the best, spread over the ground. Raises UsageError if there are
     none or none fits, and MapError for a map that cannot be read."""
@@ -52,12 +54,13 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
                 ids_near[path] = there
                 calibrations.append(read_calibration_for(place_map))
     paths = list(ids_near)
-    with mapfiles.whole_or_none(out) as unfinished, tempfile.TemporaryDirectory(dir=out.parent) as scratch:
+    with mapfiles.write_atomically(out) as unfinished, tempfile.TemporaryDirectory(dir=out.parent) as scratch:
         whole, made = Path(scratch) / "near.gpkg", Path(scratch) / "small.gpkg"
         if len(paths) == 1:
-            near = select(paths[0], whole, ids_near[paths[0]])
-        else:  # as numbers of places copied, and of those that were there already
-            near = sum(copied for copied, _ in merge(paths, whole, watch, list(ids_near.values()))[0]) if paths else 0
+            near = copy_places(paths[0], whole, ids_near[paths[0]])
+        else:
+            counts = merge_maps(paths, whole, show_progress, list(ids_near.values()))[0] if paths else []
+            near = sum(copied for copied, _ in counts)
         if not near:
             raise UsageError(
                 f"No place of {source} is within {margin_m:g} m of the mission: check both, or the margin."
@@ -70,7 +73,7 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
             count = int(near * most_bytes / file_bytes)
             if not count:
                 raise UsageError(f"A place takes {file_bytes / near / 1e6:.3f} MB, and {most_bytes / 1e6:g} hold none.")
-            shrink(whole, made, count, watch)
+            shrink_map(whole, made, count, show_progress)
         shutil.move(made if count < near else whole, unfinished)
         with PlaceMap.open(unfinished) as place_map:
             is_calibrated = place_map.calibration is not None
@@ -81,7 +84,7 @@ def subset(source: Path, area: Area, margin_m: float, out: Path, most_bytes: flo
 def _list_maps(source: Path) -> list[Path]:
     """Return the maps to look into: one map, or those of a folder. Raises MapError if there is none."""
     if not source.is_dir():
-        return [mapfiles.existing(source)]
+        return [mapfiles.require_map_file(source)]
     if not (paths := sorted(source.glob("*.gpkg"))):
         raise MapError(f"{source} holds no map (*.gpkg): give a folder of maps, or one map.")
     return paths

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.places import geopackage, mapfiles, rows
-from edgevpr.places.mapfiles import is_of_one_row, sentences
+from edgevpr.places.mapfiles import is_row_error, translate_errors
 from edgevpr.places.mapspec import read_spec, read_stored, write_spec
 from edgevpr.places.rows import Content, Values
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-_BESIDE_BLOBS_BYTES = 100_000  # most bytes of a row besides its descriptor: mainly the image's name
+_MAX_METADATA_BYTES = 100_000  # of a row without its descriptor: mainly the image's name
 
 
 class MapConnection:
@@ -34,28 +34,28 @@ class MapConnection:
         self.spec = read_spec(path, self.stored)
         self._lock = lock  # file descriptor of the lock for adding places; None: open for reading only
         self.left_out: dict[int, str] = {}  # see `mapfile.PlaceMap`
-        self._wait_s = mapfiles.WAIT_S
-        self._take(db)
-        self._state = self._state_now()
+        self._wait_s = mapfiles.MAX_WAIT_S
+        self._use_connection(db)
+        self._file_state = self._read_file_state()
 
     @classmethod
     def create(cls, path: str | Path, spec: TechniqueSpec) -> "Self":
         """Create an empty map for descriptors of `spec`; if writing fails, remove the file. Raises MapError if the file
         has content already or cannot be written, and UsageError for a name that no file can have."""
-        path = mapfiles.map_path(path)
+        path = mapfiles.parse_map_path(path)
         mapfiles.require_regular(path)
         with ExitStack() as undo:
-            lock = mapfiles.lock(path, make=True)
+            lock = mapfiles.lock_map(path, make=True)
             undo.callback(os.close, lock)
             if os.fstat(lock).st_size:
-                raise MapError(f"{path} is there already: choose another name, or add to it with --append.")
-            undo.callback(mapfiles.remove, path)
-            with sentences(path):
+                raise MapError(f"{path} exists already: choose another name, or add to it with --append.")
+            undo.callback(mapfiles.remove_map, path)
+            with translate_errors(path):
                 db = mapfiles.connect(path, "rw")
                 undo.callback(db.close)
                 db.execute(f"PRAGMA application_id = {geopackage.APPLICATION_ID}")
                 db.execute(f"PRAGMA user_version = {geopackage.USER_VERSION}")
-                mapfiles.start_log(db)
+                mapfiles.enable_write_ahead_log(db)
                 db.executescript("BEGIN;" + geopackage.SCHEMA)
                 write_spec(db, spec)
                 db.execute("COMMIT")
@@ -67,20 +67,20 @@ class MapConnection:
     def open(cls, path: str | Path) -> "Self":
         """Open a map for reading. Raises MapError if the file is missing, damaged, not a place map, or of an unknown
         format version, and UsageError for a name that no file can have."""
-        path = mapfiles.existing(path)
-        mapfiles.settle_left_log(path)
-        return cls._opened(path, adds=False)
+        path = mapfiles.require_map_file(path)
+        mapfiles.merge_leftover_log(path)
+        return cls._open(path, adds=False)
 
     @classmethod
     def open_for_adding(cls, path: str | Path) -> "Self":
         """Open an existing map to add places to it. Raises the errors of `open`, and MapBusyError while another program
         adds places to the map."""
-        return cls._opened(mapfiles.existing(path), adds=True)
+        return cls._open(mapfiles.require_map_file(path), adds=True)
 
     @classmethod
-    def _opened(cls, path: Path, adds: bool) -> "Self":
-        with ExitStack() as undo, sentences(path):
-            lock = mapfiles.lock(path) if adds else None
+    def _open(cls, path: Path, adds: bool) -> "Self":
+        with ExitStack() as undo, translate_errors(path):
+            lock = mapfiles.lock_map(path) if adds else None
             if lock is not None:
                 undo.callback(os.close, lock)
             db = mapfiles.connect(path, "rw" if adds else "ro")
@@ -99,7 +99,7 @@ class MapConnection:
         """Close the file. If it was open for adding, first merge SQLite's log into it: one file, also readable from a
         read-only medium, is left."""
         if self._lock is not None:
-            mapfiles.settle(self.db)
+            mapfiles.merge_write_ahead_log(self.db)
         self.db.close()
         if self._lock is not None:
             os.close(self._lock)
@@ -109,23 +109,23 @@ class MapConnection:
         """Raise MapError if the file is gone, cannot be read, or has been replaced by another map since it was opened.
         Only when another program has touched the file is it opened again, and its map_id and technique compared: the
         old connection may have cached pages of a replaced file."""
-        with sentences(self.path):
-            state = self._state_now()
-            if state == self._state:
+        with translate_errors(self.path):
+            state = self._read_file_state()
+            if state == self._file_state:
                 return
-            mapfiles.existing(self.path)
+            mapfiles.require_map_file(self.path)
             fresh = mapfiles.connect(self.path, "ro" if self._lock is None else "rw", self._wait_s)
             try:
                 if read_stored(self.path, fresh) != self.stored:
-                    raise MapError(f"{self.path} is another map than the one that was opened: put that one back.")
+                    raise MapError(f"{self.path} was replaced by another map since it was opened: restore it.")
             except BaseException:
                 fresh.close()
                 raise
             self.db.close()
-            self._take(fresh)
-            self._state = self._version(), *state[1:]
+            self._use_connection(fresh)
+            self._file_state = self._read_data_version(), *state[1:]
 
-    def wait_at_most(self, wait_s: float) -> None:
+    def set_max_wait(self, wait_s: float) -> None:
         """Set how many seconds to wait for another program that is writing, before MapBusyError is raised."""
         self._wait_s = wait_s
         self.db.execute(f"PRAGMA busy_timeout = {round(1000 * wait_s)}")
@@ -134,7 +134,7 @@ class MapConnection:
     def transaction(self) -> Iterator[None]:
         """Run the body of `with` as one transaction: commit all it writes, or nothing if it raises an exception. Raises
         MapError for errors of SQLite."""
-        with sentences(self.path):
+        with translate_errors(self.path):
             self.db.execute("BEGIN IMMEDIATE")
             try:
                 yield
@@ -144,48 +144,48 @@ class MapConnection:
                     self.db.execute("ROLLBACK")
                 raise
 
-    def scan(self, columns: str) -> Iterator[tuple[int, Values | None]]:
+    def scan_rows(self, columns: str) -> Iterator[tuple[int, Values | None]]:
         """Yield (place id, values of `columns` or None if unreadable) of every place (see `rows.scan`). Raises
         MapError."""
-        with sentences(self.path):
-            yield from rows.scan(self.db, columns)
+        with translate_errors(self.path):
+            yield from rows.scan_rows(self.db, columns)
 
-    def row(self, place_id: int, columns: str) -> Content:
+    def read_row(self, place_id: int, columns: str) -> Content:
         """Return the values of `columns` of one place, by name. Raises PlaceError if it does not exist, or SQLite
         cannot read its row."""
-        with sentences(self.path):
+        with translate_errors(self.path):
             try:
-                found = self.db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (place_id,)).fetchone()
+                row = self.db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (place_id,)).fetchone()
             except sqlite3.Error as error:
-                if not is_of_one_row(error):
+                if not is_row_error(error):
                     raise
                 raise PlaceError(self.path, place_id, f"SQLite says: {error}") from error
-        if not found:
+        if not row:
             raise PlaceError(self.path, place_id, "its row is gone")
-        return rows.read_columns(columns, found)
+        return rows.read_columns(columns, row)
 
     def __len__(self) -> int:
         """Return the number of places; in a damaged file, count only the readable ones. Raises MapError."""
-        with sentences(self.path):
+        with translate_errors(self.path):
             try:  # total(1) and not count(*), which no progress handler ends in a table that refers to itself
                 return int(self.db.execute("SELECT total(1) FROM places").fetchone()[0])
             except sqlite3.Error as error:
-                if not is_of_one_row(error):
+                if not is_row_error(error):
                     raise
-        return sum(row is not None for _, row in self.scan("1"))
+        return sum(row is not None for _, row in self.scan_rows("1"))
 
-    def _take(self, connection: sqlite3.Connection) -> None:
+    def _use_connection(self, connection: sqlite3.Connection) -> None:
         """Make `connection` the current one. From Python 3.11 on, also make SQLite refuse values larger than any row of
         this map can hold, such as those of a damaged file."""
         self.db = connection
         if self._lock is not None:
-            mapfiles.start_log(connection)
+            mapfiles.enable_write_ahead_log(connection)
         if sys.version_info >= (3, 11):
             fine_bytes = self.spec.fine.nbytes if self.spec.fine else 0
-            most_bytes = self.spec.coarse.nbytes + fine_bytes + _BESIDE_BLOBS_BYTES
-            connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, most_bytes)
+            max_bytes = self.spec.coarse.nbytes + fine_bytes + _MAX_METADATA_BYTES
+            connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max_bytes)
 
-    def _version(self) -> int | None:
+    def _read_data_version(self) -> int | None:
         """Return SQLite's data_version, which changes when others write; None if the file can no longer be read."""
         try:
             return int(self.db.execute("PRAGMA data_version").fetchone()[0])
@@ -194,11 +194,11 @@ class MapConnection:
                 raise
             return None
 
-    def _state_now(self) -> tuple[int | None, ...]:
+    def _read_file_state(self) -> tuple[int | None, ...]:
         """Return numbers about the file that differ from those of an earlier call if another program has written to the
         file or replaced it in the meantime."""
         try:
             file = self.path.stat()
         except OSError as error:
-            raise MapError(f"{self.path} is gone ({error.strerror}): put it back.") from error
-        return self._version(), file.st_dev, file.st_ino, file.st_size, file.st_mtime_ns
+            raise MapError(f"{self.path} is gone ({error.strerror}): restore it.") from error
+        return self._read_data_version(), file.st_dev, file.st_ino, file.st_size, file.st_mtime_ns

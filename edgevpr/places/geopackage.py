@@ -67,22 +67,22 @@ WHERE table_name = :table
 
 # "GP", version 0, flags: little-endian, no envelope; srs_id; then well-known binary: little-endian, Point, x, y.
 _POINT = struct.Struct("<2sBBiBIdd")
-_FORM = (b"GP", 0, 1, 1, 1)  # all of these but the reference system and the coordinates
+_POINT_HEADER = (b"GP", 0, 1, 1, 1)  # all of these but the reference system and the coordinates
 
 
-def point_blob(lat_deg: float, lon_deg: float) -> bytes:
+def encode_point(lat_deg: float, lon_deg: float) -> bytes:
     """Encode a WGS-84 point, in degrees, as the bytes of a GeoPackage geometry."""
     return _POINT.pack(b"GP", 0, 1, WGS84, 1, 1, lon_deg, lat_deg)
 
 
-def read_point(blob: object) -> tuple[float, float]:
-    """Decode a GeoPackage point, as `point_blob`, QGIS and GDAL write it, as (lat_deg, lon_deg). Raises ValueError with
-    a short message for anything that is not a WGS-84 point on the Earth."""
+def decode_point(blob: object) -> tuple[float, float]:
+    """Decode a GeoPackage point (of `encode_point`, QGIS or GDAL) as (lat_deg, lon_deg). Raises ValueError with a short
+    message for anything that is not a WGS-84 point on the Earth."""
     if not isinstance(blob, bytes) or len(blob) != _POINT.size:
-        raise ValueError("its geometry is no point")
+        raise ValueError("its geometry is not a point")
     *start, srs_id, order, kind, lon_deg, lat_deg = _POINT.unpack(blob)
-    if (*start, order, kind) != _FORM:
-        raise ValueError("its geometry is no point")
+    if (*start, order, kind) != _POINT_HEADER:
+        raise ValueError("its geometry is not a point")
     if srs_id != WGS84:
         raise ValueError(f"its position is in the reference system {srs_id}, not in WGS 84")
     if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
@@ -90,15 +90,15 @@ def read_point(blob: object) -> tuple[float, float]:
     return lat_deg, lon_deg
 
 
-def point_or_none(geom: object) -> tuple[float, float] | None:
-    """Decode a point like `read_point`, but return None for anything that is not a WGS-84 point."""
+def decode_point_or_none(geom: object) -> tuple[float, float] | None:
+    """Decode a point like `decode_point`, but return None for anything that is not a WGS-84 point."""
     try:
-        return read_point(geom)
+        return decode_point(geom)
     except ValueError:
         return None
 
 
-def utc_text(t_utc_s: float | None) -> str | None:
+def format_utc(t_utc_s: float | None) -> str | None:
     """Format seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds; None for None and for an impossible
     time."""
     if t_utc_s is None:
@@ -110,8 +110,8 @@ def utc_text(t_utc_s: float | None) -> str | None:
     return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def utc_seconds(text: object) -> float | None:
-    """Parse a time as `utc_text` writes it; return seconds since 1970, or None for anything else."""
+def parse_utc(text: object) -> float | None:
+    """Parse a time as `format_utc` writes it; return seconds since 1970, or None for anything else."""
     try:
         return datetime.fromisoformat(text.replace("Z", "+00:00")).timestamp() if isinstance(text, str) else None
     except (ValueError, OverflowError):

@@ -19,12 +19,12 @@ from edgevpr.core.types import Position
 from edgevpr.places.mapfile import PlaceMap
 
 _log = logging.getLogger(__name__)
-_BYTES_BESIDE_ROW = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
-_PACKED_AT_ONCE = 32  # places
-_BLOCK = 256  # places in a block; the least worth in each block is stored, to find the least of all quickly
-_OUTLINE = np.dtype([("id", np.int64), ("lat_deg", float), ("lon_deg", float), ("quality", float)])
+_METADATA_BYTES = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
+_PACK_BATCH = 32  # places
+_BLOCK_PLACES = 256  # the least value in each block is stored, to find the least of all quickly
+_OUTLINE_DTYPE = np.dtype([("id", np.int64), ("lat_deg", float), ("lon_deg", float), ("quality", float)])
 
-CoarsePart = tuple[int, LatLon | None, float | None, Array]  # one item of `PlaceMap.coarse_parts`
+CoarsePart = tuple[int, LatLon | None, float | None, Array]  # one item of `PlaceMap.read_coarse_parts`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,12 +60,8 @@ class PlaceIndex:
         """True if at least one place has a heading."""
         return not np.isnan(self.heading_deg).all()
 
-    def first(self, count: int) -> "PlaceIndex":
-        """Return the index of the first `count` places, as views of these arrays."""
-        return self.only(slice(count))
-
-    def only(self, slots: slice | Array) -> "PlaceIndex":
-        """Return the index of only the places at `slots`. Its arrays are views if `slots` is a slice, and copies if it
+    def select(self, slots: slice | Array) -> "PlaceIndex":
+        """Return the index of the places at `slots` only. Its arrays are views if `slots` is a slice, and copies if it
         is an array of slots or a mask, bool (N,)."""
         return replace(self, **{name: array[slots] for name, array in self.arrays.items()})
 
@@ -73,61 +69,61 @@ class PlaceIndex:
         """Return the median distance in metres between successive places; None if no two successive places have
         positions."""
         away_m = distance_m(self.lat_deg[:-1], self.lon_deg[:-1], self.lat_deg[1:], self.lon_deg[1:])
-        known = away_m[~np.isnan(away_m)]
-        return float(np.median(known)) if len(known) else None
+        away_m = away_m[~np.isnan(away_m)]
+        return float(np.median(away_m)) if len(away_m) else None
 
-    def within(self, position: Position, radius_m: float) -> Bools:
+    def find_within(self, position: Position, radius_m: float) -> Bools:
         """Return bool (N,), True for each place within `radius_m` metres of `position`; False for those without a
         position."""
         return distance_m(position.lat_deg, position.lon_deg, self.lat_deg, self.lon_deg) <= radius_m
 
 
-def bytes_per_place(spec: TechniqueSpec) -> int:
+def compute_place_bytes(spec: TechniqueSpec) -> int:
     """Return how many bytes of RAM one place of the index takes."""
-    return spec.row.nbytes + _BYTES_BESIDE_ROW
+    return spec.row.nbytes + _METADATA_BYTES
 
 
-def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int, beside_bytes: int = 0) -> PlaceIndex:
+def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int, extra_bytes: int = 0) -> PlaceIndex:
     """Load the coarse parts of a map, packed by the technique. Return the index of the places that were loaded.
 
-    If `budget_bytes` is too small for all, only the `best_places` are loaded. Per place, `beside_bytes` of the budget
-    stay free for other arrays that grow with the index (see `sequence`). Places that cannot be read are noted in
-    `PlaceMap.left_out`. Raises MapError if there is no place that can be read, or if the budget is too small for
-    one."""
+    If `budget_bytes` is too small for all, only the places of `choose_places` are loaded. `extra_bytes` of
+    the budget stay free for other arrays that grow with the index (see `sequence`). Places that cannot be read are
+    entered in `PlaceMap.left_out`. Raises MapError if no place can be read, or if the budget is too small for one."""
     spec = technique.spec
-    places, each = len(place_map), bytes_per_place(spec) + beside_bytes
+    places, place_bytes = len(place_map), compute_place_bytes(spec) + extra_bytes
     if not places:
-        raise MapError(f"{place_map.path} holds no place yet: add some with `edgevpr map build --append`.")
-    if budget_bytes < each:
+        raise MapError(f"{place_map.path} is empty: add places with `edgevpr map build --append`.")
+    if budget_bytes < place_bytes:
         raise MapError(
-            f"{place_map.path}: a place takes {each} bytes in RAM and the budget is {budget_bytes}: raise --budget-mb."
+            f"{place_map.path}: the budget of {budget_bytes} bytes of RAM is too small for one place ({place_bytes}): "
+            "raise --budget-mb."
         )
-    capacity = min(places, budget_bytes // each)
-    index = empty_index(spec, capacity, place_map.mean_coarse() if spec.packed else None)
+    capacity = min(places, budget_bytes // place_bytes)
+    index = allocate_index(spec, capacity, place_map.compute_mean_coarse() if spec.packed else None)
     # Another program may have added places since they were counted: those are left out until the next load.
-    parts: Iterator[CoarsePart] = islice(place_map.coarse_parts(), places)
+    parts: Iterator[CoarsePart] = islice(place_map.read_coarse_parts(), places)
     if capacity < places:
         _log.warning(
-            f"{place_map.path} needs {places * each / 1e6:.1f} MB in RAM for its {places} places and the budget is "
-            f"{budget_bytes / 1e6:g} MB: the {capacity} best are used; raise --budget-mb to "
-            f"{np.ceil(places * each / 1e5) / 10:g} for all."
+            f"{place_map.path}: its {places} places need {places * place_bytes / 1e6:.1f} MB of RAM, and the budget is "
+            f"{budget_bytes / 1e6:g} MB: only the {capacity} best are loaded; raise --budget-mb to "
+            f"{np.ceil(places * place_bytes / 1e5) / 10:g} for all."
         )
-        seen = np.fromiter(islice(place_map.outlines(), places), _OUTLINE)
-        kept = seen["id"][best_places(seen["lat_deg"], seen["lon_deg"], seen["quality"], capacity)]
-        parts = _only(parts, kept)
-    loaded = _fill(index, parts, technique)
+        rows = np.fromiter(islice(place_map.read_outlines(), places), _OUTLINE_DTYPE)
+        kept = rows["id"][choose_places(rows["lat_deg"], rows["lon_deg"], rows["quality"], capacity)]
+        parts = _filter_parts(parts, kept)
+    loaded = _fill_index(index, parts, technique)
     if not loaded:
         raise MapError(f"{place_map.path}: none of its {places} places can be read: restore a copy, or build it again.")
     if place_map.left_out:
         _log.warning(
-            "%s: %d places are damaged and left out: `edgevpr map check` names them, `edgevpr map repair` drops them.",
+            "%s: %d damaged places are left out: `edgevpr map check` lists them, `edgevpr map repair` removes them.",
             place_map.path,
             len(place_map.left_out),
         )
-    return index.first(loaded)
+    return index.select(slice(loaded))
 
 
-def empty_index(spec: TechniqueSpec, capacity: int, mean: Singles | None) -> PlaceIndex:
+def allocate_index(spec: TechniqueSpec, capacity: int, mean: Singles | None) -> PlaceIndex:
     """Allocate the arrays of `capacity` places, with `mean` as in `PlaceIndex`. The operating system provides memory
     for `place_ids` and `rows` only when they are written."""
     return PlaceIndex(
@@ -140,39 +136,39 @@ def empty_index(spec: TechniqueSpec, capacity: int, mean: Singles | None) -> Pla
     )
 
 
-def _fill(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -> int:
-    """Write coarse parts (as `PlaceMap.coarse_parts` yields them), packed by the technique, to the slots of `index` in
-    blocks, until parts or slots run out. Return how many slots are written."""
+def _fill_index(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Technique) -> int:
+    """Write coarse parts (of `PlaceMap.read_coarse_parts`), packed by the technique, to the slots of `index` in blocks,
+    until parts or slots run out. Return the number of slots written."""
     spec = technique.spec
-    waiting = np.empty((_PACKED_AT_ONCE, *spec.coarse.shape), spec.coarse.dtype)
+    batch = np.empty((_PACK_BATCH, *spec.coarse.shape), spec.coarse.dtype)
     filled = 0
-    while block := list(islice(parts, min(_PACKED_AT_ONCE, len(index) - filled))):
-        for at, (*_, coarse) in enumerate(block):
-            waiting[at] = coarse
-        rows = waiting[: len(block)] if index.mean is None else technique.pack(waiting[: len(block)], index.mean)
+    while block := list(islice(parts, min(_PACK_BATCH, len(index) - filled))):
+        for row, (*_, coarse) in enumerate(block):
+            batch[row] = coarse
+        rows = batch[: len(block)] if index.mean is None else technique.pack(batch[: len(block)], index.mean)
         index.rows[filled : filled + len(block)] = rows
-        for at, (place_id, point, heading_deg, _) in enumerate(block, start=filled):
-            index.place_ids[at] = place_id
-            index.lat_deg[at], index.lon_deg[at] = point or (np.nan, np.nan)
-            index.heading_deg[at] = np.nan if heading_deg is None else heading_deg
+        for slot, (place_id, point, heading_deg, _) in enumerate(block, start=filled):
+            index.place_ids[slot] = place_id
+            index.lat_deg[slot], index.lon_deg[slot] = point or (np.nan, np.nan)
+            index.heading_deg[slot] = np.nan if heading_deg is None else heading_deg
         filled += len(block)
     return filled
 
 
-def _only(parts: Iterator[CoarsePart], ascending: Ints) -> Iterator[CoarsePart]:
+def _filter_parts(parts: Iterator[CoarsePart], ascending: Ints) -> Iterator[CoarsePart]:
     """Yield the parts of the places whose ids are in `ascending`."""
     for part in parts:
-        at = int(np.searchsorted(ascending, part[0]))
-        if at < len(ascending) and ascending[at] == part[0]:
+        number = int(np.searchsorted(ascending, part[0]))
+        if number < len(ascending) and ascending[number] == part[0]:
             yield part
 
 
-def best_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: int) -> Ints:
+def choose_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: int) -> Ints:
     """Choose `capacity` of N places, given in the order they were mapped; return their indices, int, ascending.
     `lat_deg`, `lon_deg` (NaN: unknown) and `quality` (0..1) are float (N,).
 
-    Places are dropped one at a time, always the one of least worth: its quality times the distance to the nearer of its
-    two remaining neighbours along the track. So gaps stay small, and places of high quality stay. The first and the
+    Places are dropped one at a time, always the one of the least value: its quality times the distance to the nearer of
+    its two remaining neighbours along the track. So gaps stay small, and places of high quality stay. The first and the
     last are kept."""
     count = len(quality)
     if count <= capacity:
@@ -180,35 +176,35 @@ def best_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: int
     east_m, north_m = project_to_metres(lat_deg, lon_deg)
     # If a position is unknown, the median distance of successive places is used instead.
     steps_m = np.hypot(np.diff(east_m), np.diff(north_m))
-    usual_m = (float(np.nanmedian(steps_m)) if np.isfinite(steps_m).any() else 0.0) or 1.0
+    median_m = (float(np.nanmedian(steps_m)) if np.isfinite(steps_m).any() else 0.0) or 1.0
 
-    def apart_m(a: int, b: int) -> float:
+    def measure_distance_m(a: int, b: int) -> float:
         away_m = math.hypot(east_m[b] - east_m[a], north_m[b] - north_m[a])
-        return usual_m * (b - a) if math.isnan(away_m) else away_m
+        return median_m * (b - a) if math.isnan(away_m) else away_m
 
-    def worth(before: int, at: int, after: int) -> float:
+    def rate_place(before: int, place: int, after: int) -> float:
         if before < 0 or after >= count:
             return math.inf
         # A tiny share of the distance between its neighbours decides among places at the same position.
-        nearer_m = min(apart_m(before, at), apart_m(at, after))
-        return (nearer_m + 1e-6 * apart_m(before, after)) * max(float(quality[at]), 1e-3)
+        nearer_m = min(measure_distance_m(before, place), measure_distance_m(place, after))
+        return (nearer_m + 1e-6 * measure_distance_m(before, after)) * max(float(quality[place]), 1e-3)
 
     # No lists, and few arrays: a map may have a million places.
     before, after = np.arange(-1, count - 1, dtype=np.int32), np.arange(1, count + 1, dtype=np.int32)
-    worths = np.full(-(-count // _BLOCK) * _BLOCK, np.inf)  # places that were dropped have infinite worth too
-    for at in range(count):
-        worths[at] = worth(at - 1, at, at + 1)
-    blocks = worths.reshape(-1, _BLOCK)
+    values = np.full(-(-count // _BLOCK_PLACES) * _BLOCK_PLACES, np.inf)  # infinite for dropped places too
+    for place in range(count):
+        values[place] = rate_place(place - 1, place, place + 1)
+    blocks = values.reshape(-1, _BLOCK_PLACES)
     least = blocks.min(axis=1)
     kept = np.ones(count, bool)
     for _ in range(count - max(capacity, 2)):
         block = int(least.argmin())
-        at = block * _BLOCK + int(blocks[block].argmin())
-        kept[at], worths[at] = False, np.inf
-        ends = int(before[at]), int(after[at])
+        place = block * _BLOCK_PLACES + int(blocks[block].argmin())
+        kept[place], values[place] = False, np.inf
+        ends = int(before[place]), int(after[place])
         after[ends[0]], before[ends[1]] = ends[1], ends[0]
         for end in ends:
-            worths[end] = worth(int(before[end]), end, int(after[end]))
-        for touched in {block, *(end // _BLOCK for end in ends)}:
-            least[touched] = blocks[touched].min()
+            values[end] = rate_place(int(before[end]), end, int(after[end]))
+        for changed in {block, *(end // _BLOCK_PLACES for end in ends)}:
+            least[changed] = blocks[changed].min()
     return np.flatnonzero(kept)[:capacity]

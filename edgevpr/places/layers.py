@@ -14,9 +14,9 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation
 
-# Footprint of the places that a picture is found among best, as a share of its own, by benchmarks/results/from_space.md
-_BEST_SHARE = 0.92
-_ALIKE = 1.2  # ratio of two footprints below which they are one layer
+# Footprint of the places that match a picture best, as a share of its own, by benchmarks/results/from_space.md
+_BEST_FOOTPRINT_RATIO = 0.92
+_MAX_LAYER_RATIO = 1.2  # ratio of two footprints below which they are one layer
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,31 +30,31 @@ class Layers:
     place_ids: Ints
     layer: Ints
 
-    def fitting(self, seen_m: float | None) -> float | None:
-        """Return the footprint to look among for a picture that shows `seen_m` of ground; None if either is unknown."""
+    def choose_footprint(self, seen_m: float | None) -> float | None:
+        """Return the footprint of the layer to search for a picture that shows `seen_m` of ground; None: unknown."""
         if not seen_m or not self.footprints_m:
             return None
-        return self.footprints_m[int(_find_nearest(self.footprints_m, _BEST_SHARE * seen_m))]
+        return self.footprints_m[int(_find_nearest(self.footprints_m, _BEST_FOOTPRINT_RATIO * seen_m))]
 
-    def narrow(self, expected: Expectation, index: PlaceIndex, footprint_m: float | None) -> Expectation:
+    def narrow_search(self, expected: Expectation, index: PlaceIndex, footprint_m: float | None) -> Expectation:
         """Narrow a search to the places of the index that were cut at about `footprint_m` (None: search all layers), if
         any of them is in reach. Places that were not cut stay."""
         if footprint_m is None or len(self.footprints_m) < 2:
             return expected
-        at = np.minimum(np.searchsorted(self.place_ids, index.place_ids), len(self.place_ids) - 1)
-        is_known, wanted = self.place_ids[at] == index.place_ids, _find_nearest(self.footprints_m, footprint_m)
-        is_other = is_known & (self.layer[at] != wanted)
+        rows = np.minimum(np.searchsorted(self.place_ids, index.place_ids), len(self.place_ids) - 1)
+        is_cut, layer = self.place_ids[rows] == index.place_ids, _find_nearest(self.footprints_m, footprint_m)
+        is_other = is_cut & (self.layer[rows] != layer)
         in_reach = ~is_other if expected.in_reach is None else expected.in_reach & ~is_other
         return replace(expected, in_reach=in_reach) if in_reach.any() else expected
 
 
 def read_layers(place_map: PlaceMap) -> Layers:
     """Read the layers of a map. Raises MapError."""
-    place_ids, length_m, is_cut = place_map.footprints()
+    place_ids, length_m, is_cut = place_map.read_footprints()
     footprints_m: list[float] = []
-    for each_m in np.unique(length_m[is_cut]).tolist():
-        if not footprints_m or each_m > _ALIKE * footprints_m[-1]:
-            footprints_m.append(each_m)
+    for footprint_m in np.unique(length_m[is_cut]).tolist():
+        if not footprints_m or footprint_m > _MAX_LAYER_RATIO * footprints_m[-1]:
+            footprints_m.append(footprint_m)
     median_m = float(np.median(length_m)) if len(length_m) else None
     if len(footprints_m) < 2:
         return Layers(median_m, (median_m,) if median_m else (), np.zeros(0, int), np.zeros(0, int))

@@ -21,13 +21,13 @@ from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.types import Frame, Place, Pose, Position, Salience
 from edgevpr.places import geopackage, mapspec, rows
 from edgevpr.places.connection import MapConnection
-from edgevpr.places.mapfiles import is_of_one_row, sentences
-from edgevpr.places.rows import Content, Unreadable, Values
+from edgevpr.places.mapfiles import is_row_error, translate_errors
+from edgevpr.places.rows import Content, RowError, Values
 
-_OF_COARSE = f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"
-_OWNERS = "; "  # between the words of several owners
-_OTHERS = 0.05  # share of the numbers of two coarse parts of one picture that may differ
-_SAME_PICTURE = 0.01  # norm of their difference, relative: far above rounding, far below another picture's
+_COARSE_COLUMNS = f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"
+_OWNER_SEPARATOR = "; "
+_MAX_DIFFERENT_SHARE = 0.05  # of the numbers of two coarse parts of one picture
+_MAX_RELATIVE_DIFFERENCE = 0.01  # norm of their difference: far above rounding, far below another picture's
 
 
 class Footprints(NamedTuple):
@@ -46,7 +46,7 @@ class _StoredText:
         self._key = key
 
     def __get__(self, place_map: "PlaceMap", owner: type) -> str | None:
-        with sentences(place_map.path):
+        with translate_errors(place_map.path):
             try:
                 row = place_map.db.execute("SELECT value FROM edgevpr_map WHERE key = ?", (self._key,)).fetchone()
                 value = json.loads(row[0]) if row else None
@@ -54,7 +54,7 @@ class _StoredText:
             except (ValueError, TypeError, RecursionError):
                 return None
             except sqlite3.Error as error:
-                if is_of_one_row(error):
+                if is_row_error(error):
                     return None
                 raise
 
@@ -73,11 +73,11 @@ class PlaceMap(MapConnection):
     attribution = _StoredText(mapspec.ATTRIBUTION)
     calibration = _StoredText(mapspec.CALIBRATION)
 
-    def require(self, spec: TechniqueSpec) -> None:
+    def require_technique(self, spec: TechniqueSpec) -> None:
         """Raise MapError, naming what differs, unless the map's descriptors were made by exactly `spec`."""
-        if different := mapspec.differences(self.spec, spec):
+        if differences := mapspec.list_differences(self.spec, spec):
             raise MapError(
-                f"{self.path} was made differently ({'; '.join(different)}): use it with its own technique and "
+                f"{self.path} was made differently ({'; '.join(differences)}): use it with its own technique and "
                 "parameters, or build a map with these."
             )
 
@@ -89,7 +89,7 @@ class PlaceMap(MapConnection):
         `salience` and `landmarks` (encoded bytes) are None if there are none. An impossible time or altitude is stored
         as unknown. Characters of the frame's name that UTF-8 cannot encode are stored as escapes.
         """
-        content = rows.frame_content(frame, descriptor, self.spec, salience, landmarks)
+        content = rows.make_content(frame, descriptor, self.spec, salience, landmarks)
         with self.transaction():
             return self.insert(content)
 
@@ -100,16 +100,17 @@ class PlaceMap(MapConnection):
         marks = ", ".join("?" * len(row))
         cursor = self.db.execute(f"INSERT INTO places ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
         if row["geom"] is not None:
-            self._grow_extent(*geopackage.read_point(row["geom"]))
+            self._grow_extent(*geopackage.decode_point(row["geom"]))
         return int(cursor.lastrowid or 0)
 
-    def lay(self, place_id: int, position: Position, pose: Pose | None) -> None:
+    def move_place(self, place_id: int, position: Position, pose: Pose | None) -> None:
         """Replace the position and the pose (None: unknown) of an existing place, inside a `transaction`. Raises
         sqlite3.Error."""
-        geom, content = geopackage.point_blob(position.lat_deg, position.lon_deg), rows.pose_content(pose)
+        geom, content = geopackage.encode_point(position.lat_deg, position.lon_deg), rows.make_pose_content(pose)
         # The trigger `places_moved` sets columns to NULL when geom changes, so they are written in a second statement.
         self.db.execute("UPDATE places SET geom = ? WHERE place_id = ?", (geom, place_id))
-        row = {**content, "geom_crc32": rows.crc32(geom), "pose_crc32": rows.pose_crc32(tuple(content.values()))}
+        pose_crc32 = rows.compute_pose_crc32(tuple(content.values()))
+        row = {**content, "geom_crc32": rows.compute_crc32(geom), "pose_crc32": pose_crc32}
         columns = ", ".join(f"{name} = ?" for name in row)
         self.db.execute(f"UPDATE places SET {columns} WHERE place_id = ?", (*row.values(), place_id))
         self._grow_extent(position.lat_deg, position.lon_deg)
@@ -127,48 +128,48 @@ class PlaceMap(MapConnection):
     def add_attribution(self, text: str | None) -> None:
         """Store an owner's words with those that are there (None: nothing is stored). Raises MapError."""
         if text:
-            words = [*(self.attribution or text).split(_OWNERS), *text.split(_OWNERS)]
-            self._record_text(mapspec.ATTRIBUTION, _OWNERS.join(dict.fromkeys(words)))
+            owners = [*(self.attribution or text).split(_OWNER_SEPARATOR), *text.split(_OWNER_SEPARATOR)]
+            self._record_text(mapspec.ATTRIBUTION, _OWNER_SEPARATOR.join(dict.fromkeys(owners)))
 
     def record_calibration(self, text: str | None) -> None:
         """Store the map's calibration of confidences, as text (None: not calibrated). Raises MapError."""
         self._record_text(mapspec.CALIBRATION, text)
 
-    def places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
+    def read_places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
         """Yield the places with `place_ids` in the order given (None: all places, in the order they were added). Raises
         PlaceError for a place that is missing or damaged."""
-        for place_id in [place_id for place_id, _ in self.scan("1")] if place_ids is None else map(int, place_ids):
+        for place_id in [place_id for place_id, _ in self.scan_rows("1")] if place_ids is None else map(int, place_ids):
             with self._name_unreadable(place_id):
-                place = rows.parse_place(place_id, self.row(place_id, rows.OF_PLACE))
+                place = rows.parse_place(place_id, self.read_row(place_id, rows.PLACE_COLUMNS))
             yield place
 
-    def coarse_parts(self) -> Iterator[tuple[int, LatLon | None, float | None, Array]]:
+    def read_coarse_parts(self) -> Iterator[tuple[int, LatLon | None, float | None, Array]]:
         """Yield (place_id, (lat_deg, lon_deg) or None, heading_deg or None, coarse part as array of `spec.coarse`) of
         every readable place, in the order they were added. Note the other places in `left_out`."""
-        for place_id, row in self.scan(_OF_COARSE):
+        for place_id, row in self.scan_rows(_COARSE_COLUMNS):
             with self._leave_out_unreadable(place_id):
-                content = rows.read_columns(_OF_COARSE, row)
-                point, heading_deg = rows.parse_where(content)
+                content = rows.read_columns(_COARSE_COLUMNS, row)
+                point, heading_deg = rows.parse_position(content)
                 part = rows.decode_part(content, "coarse", self.spec.coarse)
                 yield place_id, point, heading_deg, part
 
-    def mean_coarse(self) -> Singles:
+    def compute_mean_coarse(self) -> Singles:
         """Return the mean of all coarse parts that can be read, float32 of the shape of one part."""
         mean, count = np.zeros(self.spec.coarse.shape), 0
-        for _, row in self.scan(columns := "coarse, coarse_crc32"):
-            with suppress(Unreadable):
+        for _, row in self.scan_rows(columns := "coarse, coarse_crc32"):
+            with suppress(RowError):
                 part = rows.decode_part(rows.read_columns(columns, row), "coarse", self.spec.coarse)
                 count += 1
                 mean += (part - mean) / count
         return mean.astype(np.float32)
 
-    def fine_part(self, place_id: int) -> tuple[Array, LatLon | None]:
+    def read_fine_part(self, place_id: int) -> tuple[Array, LatLon | None]:
         """Read one place from the file: return its fine part, a read-only array of `spec.fine`, and its (lat_deg,
         lon_deg), None if it has no position. Raises PlaceError for a place that is missing or damaged."""
         with self._name_unreadable(place_id):
             if self.spec.fine is None:
-                raise Unreadable("it has no fine part")
-            content = self.row(int(place_id), "geom, geom_crc32, fine, fine_crc32")
+                raise RowError("it has no fine part")
+            content = self.read_row(int(place_id), "geom, geom_crc32, fine, fine_crc32")
             point = rows.parse_point(content)
             return rows.decode_part(content, "fine", self.spec.fine), point
 
@@ -176,13 +177,13 @@ class PlaceMap(MapConnection):
         """Read the encoded landmarks of one place from the file; None if it has none. Raises PlaceError if the place
         is missing or damaged."""
         with self._name_unreadable(place_id):
-            return rows.read_landmarks(self.row(int(place_id), "landmarks, landmarks_crc32"))
+            return rows.read_landmarks(self.read_row(int(place_id), "landmarks, landmarks_crc32"))
 
-    def footprints(self) -> Footprints:
+    def read_footprints(self) -> Footprints:
         """Read the footprints of all places that have one, in the order they were added. Raises MapError."""
-        known = [(place_id, *row) for place_id, row in self.scan("footprint_m, is_surveyed") if row]
-        known = [each for each in known if isinstance(each[1], float) and 0 < each[1] < math.inf]
-        ids, length_m, is_cut = zip(*known, strict=True) if known else ((), (), ())
+        places = [(place_id, *row) for place_id, row in self.scan_rows("footprint_m, is_surveyed") if row]
+        places = [place for place in places if isinstance(place[1], float) and 0 < place[1] < math.inf]
+        ids, length_m, is_cut = zip(*places, strict=True) if places else ((), (), ())
         return Footprints(
             np.array(ids, np.int64), np.array(length_m, float), np.array([bool(cut) for cut in is_cut], bool)
         )
@@ -190,7 +191,7 @@ class PlaceMap(MapConnection):
     def select_ids(self, columns: str) -> dict[Values, list[int]]:
         """Group the readable places by their values in `columns`: return the list of ids for each tuple of values."""
         ids: dict[Values, list[int]] = {}
-        for place_id, row in self.scan(columns):
+        for place_id, row in self.scan_rows(columns):
             if row:
                 ids.setdefault(row, []).append(place_id)
         return ids
@@ -199,18 +200,18 @@ class PlaceMap(MapConnection):
         """Return True if a place's coarse part nearly equals `coarse`, so that both are of one picture; False if the
         place cannot be read. Between two runs of a program the last bits of numbers may differ, or a few elements."""
         try:
-            there = rows.decode_part(self.row(place_id, "coarse"), "coarse", self.spec.coarse).astype(np.float32)
-        except (Unreadable, PlaceError):
+            stored = rows.decode_part(self.read_row(place_id, "coarse"), "coarse", self.spec.coarse).astype(np.float32)
+        except (RowError, PlaceError):
             return False
-        here = np.asarray(coarse, np.float32).reshape(there.shape)
-        near = np.linalg.norm(there - here) <= _SAME_PICTURE * np.linalg.norm(there)
-        return bool(near or np.mean(there != here) <= _OTHERS)
+        given = np.asarray(coarse, np.float32).reshape(stored.shape)
+        is_near = np.linalg.norm(stored - given) <= _MAX_RELATIVE_DIFFERENCE * np.linalg.norm(stored)
+        return bool(is_near or np.mean(stored != given) <= _MAX_DIFFERENT_SHARE)
 
-    def outlines(self) -> Iterator[tuple[int, float, float, float]]:
+    def read_outlines(self) -> Iterator[tuple[int, float, float, float]]:
         """Yield (place_id, lat_deg, lon_deg, quality 0..1) of every readable place, NaN for an unknown position. Note
         the other places in `left_out`."""
         columns = "geom, quality, geom_crc32"
-        for place_id, row in self.scan(columns):
+        for place_id, row in self.scan_rows(columns):
             with self._leave_out_unreadable(place_id):
                 content = rows.read_columns(columns, row)
                 lat_deg, lon_deg = rows.parse_point(content) or (math.nan, math.nan)
@@ -225,16 +226,16 @@ class PlaceMap(MapConnection):
 
     @contextmanager
     def _name_unreadable(self, place_id: int) -> Iterator[None]:
-        """Turn the exception `Unreadable`, raised in the body of `with`, into a PlaceError with the place's id."""
+        """Turn the exception `RowError`, raised in the body of `with`, into a PlaceError with the place's id."""
         try:
             yield
-        except Unreadable as error:
+        except RowError as error:
             raise PlaceError(self.path, place_id, str(error)) from error
 
     @contextmanager
     def _leave_out_unreadable(self, place_id: int) -> Iterator[None]:
-        """If the body of `with` raises `Unreadable`, enter the place and the reason in `left_out`, and go on."""
+        """If the body of `with` raises `RowError`, enter the place and the reason in `left_out`, and go on."""
         try:
             yield
-        except Unreadable as error:
+        except RowError as error:
             self.left_out.setdefault(place_id, str(error))

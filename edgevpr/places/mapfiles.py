@@ -9,13 +9,13 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from edgevpr.core.errors import MapBusyError, MapError, UsageError
-from edgevpr.places.geopackage import point_or_none
+from edgevpr.places.geopackage import decode_point_or_none
 
-_BESIDE = ("-wal", "-shm", "-journal")
-WAIT_S = 5.0  # longest wait for another program that is writing
+_SQLITE_SUFFIXES = ("-wal", "-shm", "-journal")
+MAX_WAIT_S = 5.0  # longest wait for another program that is writing
 # Instructions of SQLite after which a statement is interrupted. A table of a million places takes a tenth of this; a
 # view, or a damaged table that refers to itself, may never end.
-_MAX_STEPS = 500_000_000
+_MAX_SQLITE_STEPS = 500_000_000
 
 # Words of SQLite's messages, and advice to the user.
 _ADVICE = {
@@ -23,16 +23,16 @@ _ADVICE = {
     "not a database": "this is not a place map: give a .gpkg file made by `edgevpr map build`",
     "readonly": "it may not be written: check its permissions and those of its folder",
     "unable to open": "it cannot be opened: check the path, and the permissions of the file and its folder",
-    "": "the file or its disk is damaged, or it is no place map ({said}): restore a copy or build it again",
+    "": "the file or its disk is damaged, or it is not a place map ({message}): restore a copy or build it again",
 }
 
 
 def list_sqlite_files(path: Path) -> list[Path]:
     """Return the paths of the files that SQLite may keep beside a map file, whether they exist or not."""
-    return [path.with_name(path.name + end) for end in _BESIDE]
+    return [path.with_name(path.name + end) for end in _SQLITE_SUFFIXES]
 
 
-def map_path(name: str | Path) -> Path:
+def parse_map_path(name: str | Path) -> Path:
     """Return `name` as a path. Raises UsageError for a name that no file can have."""
     text = str(name)
     with suppress(UnicodeEncodeError):
@@ -41,11 +41,11 @@ def map_path(name: str | Path) -> Path:
     raise UsageError(f"{text!r} cannot be the name of a map: give the path of a file, e.g. valley.gpkg.")
 
 
-def existing(name: str | Path) -> Path:
-    """Return the path of an existing map file. Raises UsageError as `map_path` does, and MapError if the file is
+def require_map_file(name: str | Path) -> Path:
+    """Return the path of an existing map file. Raises UsageError as `parse_map_path` does, and MapError if the file is
     missing or is not a regular file."""
-    path = map_path(name)
-    with sentences(path):
+    path = parse_map_path(name)
+    with translate_errors(path):
         if not path.exists():
             raise MapError(f"There is no map {path}: make one with `edgevpr map build {path} --images DIR`.")
         require_regular(path)
@@ -60,19 +60,19 @@ def require_regular(path: Path) -> None:
             f"{path} is a folder, and a map is one file: cut the map of a mission out of a folder of maps with "
             f"`edgevpr map subset {path} --mission FILE --out flight.gpkg`."
         )
-    for each in (path, *list_sqlite_files(path)):
-        if each.exists() and not each.is_file():
-            raise MapError(f"{each} is no regular file but a folder, pipe or device: give the path of a map file.")
+    for file in (path, *list_sqlite_files(path)):
+        if file.exists() and not file.is_file():
+            raise MapError(f"{file} is not a regular file but a folder, pipe or device: give the path of a map file.")
 
 
-def lock(path: Path, make: bool = False) -> int:
+def lock_map(path: Path, make: bool = False) -> int:
     """Lock a map for the one program that may add places; return a file descriptor, whose closing ends the lock.
 
     Readers need no lock. SQLite's own lock is not enough, since it lasts for one transaction only: two programs that
     map the same pictures would add every place twice. `make` creates a missing file. Raises MapBusyError if another
     program has the lock, and MapError if the file cannot be opened.
     """
-    with sentences(path):
+    with translate_errors(path):
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if make else 0), 0o644)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -87,27 +87,27 @@ def lock(path: Path, make: bool = False) -> int:
 
 
 @contextmanager
-def whole_or_none(out: Path) -> Iterator[Path]:
-    """Yield the path of a temporary file to write a new map to, and rename it to `out` at the end of `with`. Remove it
-    if the body fails: half a map would look like a complete one. Raises MapError if `out` has content already."""
+def write_atomically(out: Path) -> Iterator[Path]:
+    """Yield the path of a temporary file for a new map, and rename it to `out` at the end of `with`. Remove it if the
+    body fails: half a map would look like a complete one. Raises MapError if `out` has content already."""
     require_regular(out)
     if out.exists() and out.stat().st_size:
-        raise MapError(f"{out} is there already: choose another name.")
+        raise MapError(f"{out} exists already: choose another name.")
     unfinished = out.with_name(f".{out.name}.{os.getpid()}")
     try:
         yield unfinished
         unfinished.replace(out)
     finally:
-        remove(unfinished)
+        remove_map(unfinished)
 
 
-def remove(path: Path) -> None:
+def remove_map(path: Path) -> None:
     """Delete a map file, if it exists, and the files that SQLite keeps beside it."""
-    for each in (path, *list_sqlite_files(path)):
-        each.unlink(missing_ok=True)
+    for file in (path, *list_sqlite_files(path)):
+        file.unlink(missing_ok=True)
 
 
-def connect(path: Path, mode: str, wait_s: float = WAIT_S) -> sqlite3.Connection:
+def connect(path: Path, mode: str, wait_s: float = MAX_WAIT_S) -> sqlite3.Connection:
     """Open a map file in SQLite's `mode`, ro or rw. `wait_s` seconds is the longest wait for another program that is
     writing. Raises sqlite3.Error."""
     # Autocommit: transactions are begun explicitly, so that nothing is ever half committed.
@@ -118,43 +118,43 @@ def connect(path: Path, mode: str, wait_s: float = WAIT_S) -> sqlite3.Connection
         timeout=wait_s,
         check_same_thread=False,
     )
-    db.text_factory = _text
-    db.set_progress_handler(lambda: 1, _MAX_STEPS)
+    db.text_factory = _decode_text
+    db.set_progress_handler(lambda: 1, _MAX_SQLITE_STEPS)
     # The triggers of the spatial index (OGC 12-128r18, annex F.3) call these functions, which SQLite itself lacks. QGIS
     # or GDAL may have added such an index. A damaged geometry is treated as an empty one.
-    db.create_function("ST_IsEmpty", 1, lambda geom: point_or_none(geom) is None)
+    db.create_function("ST_IsEmpty", 1, lambda geom: decode_point_or_none(geom) is None)
     for name, axis in {"ST_MinX": 1, "ST_MaxX": 1, "ST_MinY": 0, "ST_MaxY": 0}.items():
-        db.create_function(name, 1, lambda geom, axis=axis: (point_or_none(geom) or (None, None))[axis])
+        db.create_function(name, 1, lambda geom, axis=axis: (decode_point_or_none(geom) or (None, None))[axis])
     return db
 
 
-def start_log(db: sqlite3.Connection) -> None:
+def enable_write_ahead_log(db: sqlite3.Connection) -> None:
     # A write-ahead log, synced at every commit: a confirmed place survives a power loss.
     db.execute("PRAGMA journal_mode = WAL")
     db.execute("PRAGMA synchronous = FULL")
 
 
-def settle(db: sqlite3.Connection) -> None:
-    """Merge SQLite's log into the map file and remove it. If another program has the map open, it stays: no harm."""
+def merge_write_ahead_log(db: sqlite3.Connection) -> None:
+    """Merge SQLite's log into the map file and remove it. It stays, harmless, while another program uses the map."""
     with suppress(sqlite3.Error):
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.execute("PRAGMA journal_mode = DELETE")
 
 
-def settle_left_log(path: Path) -> None:
+def merge_leftover_log(path: Path) -> None:
     """Merge the log that a killed program left into the map file; do nothing if that may not be written."""
     if list_sqlite_files(path)[0].exists():
         with suppress(sqlite3.Error), closing(connect(path, "rw")) as db:
-            settle(db)
+            merge_write_ahead_log(db)
 
 
-def is_of_one_row(error: sqlite3.Error) -> bool:
+def is_row_error(error: sqlite3.Error) -> bool:
     """Return True if other rows may still be readable: a damaged page, a lost sector, or a value too large."""
     return any(words in str(error) for words in ("malformed", "disk I/O", "too big"))
 
 
 @contextmanager
-def sentences(path: Path) -> Iterator[None]:
+def translate_errors(path: Path) -> Iterator[None]:
     """Turn errors of SQLite and of the file system in the body of `with` into a MapError that tells the user what to
     do; into a MapBusyError if another program is writing."""
     try:
@@ -162,16 +162,16 @@ def sentences(path: Path) -> Iterator[None]:
     except OSError as error:
         raise MapError(f"{path}: {_ADVICE['unable to open']} ({error.strerror}).") from error
     except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter if SQLite's message quotes a damaged schema
-        said = str(error)
-        if "locked" in said:
+        message = str(error)
+        if "locked" in message:
             raise MapBusyError(
                 f"{path}: another program is writing to it: close that program and try again."
             ) from error
-        advice = next(advice for words, advice in _ADVICE.items() if words in said)
-        raise MapError(f"{path}: {advice.format(said=said)}.") from error
+        advice = next(advice for words, advice in _ADVICE.items() if words in message)
+        raise MapError(f"{path}: {advice.format(message=message)}.") from error
 
 
-def _text(raw: bytes) -> str | bytes:
+def _decode_text(raw: bytes) -> str | bytes:
     """Decode a text value of the file. If it is not UTF-8, return the bytes, which the checks of `rows` refuse."""
     try:
         return raw.decode()

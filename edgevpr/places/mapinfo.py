@@ -13,7 +13,7 @@ from edgevpr.core.geodesy import Extent, offset_m
 from edgevpr.places import rows
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.mapfiles import sentences
+from edgevpr.places.mapfiles import translate_errors
 
 _SUMMARY = """
 SELECT count(*), count(geom), total(is_low_quality = 1), count(up_deg),
@@ -21,9 +21,9 @@ SELECT count(*), count(geom), total(is_low_quality = 1), count(up_deg),
     max(CASE typeof(time) WHEN 'text' THEN time END)
 FROM places
 """
-_MIN_COURSES = 10  # fewer say nothing of how a map was flown
-_SAME_PASS_STEPS = 3.0  # longest time from one place to the next of the same pass, in median steps
-_SAME_COURSE = 0.9  # length of the mean of unit vectors along the courses, from which on all are one direction
+_MIN_COURSES = 10
+_MAX_PASS_STEPS = 3.0  # longest time from one place to the next of the same pass, in median steps
+_MIN_COURSE_LENGTH = 0.9  # of the mean of unit vectors along the courses, for courses in one direction
 _EXTENT = "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name = 'places'"
 
 
@@ -34,8 +34,8 @@ class MapInfo:
     `of_low_quality` is the number added only because there would have been too wide a gap. Of the places with a pose,
     `footprints_m` are the lengths on the ground of a picture's longest side (see `Layers`), and `position_sd_m` is the
     standard deviation of the positions along one axis, as root mean square. `attribution` names the owners of
-    orthophotos. `one_way_deg` is the course of a map that looks down and was flown in X
-    shifts such a map along it, and nothing in the map shows that."""
+    orthophotos. `one_way_deg` is the course of a map that looks down and was flown in one direction: a camera that
+    triggers late shifts such a map along it, and nothing in the map shows that."""
 
     path: str
     spec: TechniqueSpec
@@ -53,11 +53,11 @@ class MapInfo:
     file_bytes: int
 
     @property
-    def described_way(self) -> str:
-        """What a map that was flown in one direction cannot show, as a sentence."""
+    def one_way_warning(self) -> str:
+        """A warning of the error that a map flown in one direction cannot show, in a sentence."""
         return (
-            f"all places were flown over at a course of about {self.one_way_deg:.0f} degrees: a camera that triggers "
-            "late has shifted them all by its delay times the speed, which only lines flown the other way show"
+            f"all places were flown on a course of about {self.one_way_deg:.0f} degrees: if the camera triggers late, "
+            "all positions are shifted by its delay times the speed, which only lines flown the other way would show"
         )
 
 
@@ -74,7 +74,7 @@ class MapIdentity:
 
 def describe_map(place_map: PlaceMap) -> MapInfo:
     """Return the summary of a map. Raises MapError if it cannot be read."""
-    with sentences(place_map.path):
+    with translate_errors(place_map.path):
         summary = place_map.db.execute(_SUMMARY).fetchone()
     places, with_position, of_low_quality, with_pose, var_m2, first, last = summary
     return MapInfo(
@@ -97,7 +97,7 @@ def describe_map(place_map: PlaceMap) -> MapInfo:
 
 def _read_extent(place_map: PlaceMap) -> Extent | None:
     """Return the bounding box that the file states for its places (None: it states none). Raises MapError."""
-    with sentences(place_map.path):
+    with translate_errors(place_map.path):
         extent = place_map.db.execute(_EXTENT).fetchone()
     is_extent = extent and all(isinstance(side, (int, float)) and math.isfinite(side) for side in extent)
     return extent if is_extent else None
@@ -105,10 +105,10 @@ def _read_extent(place_map: PlaceMap) -> Extent | None:
 
 def _find_one_way_deg(place_map: PlaceMap) -> float | None:
     """Return the course over ground, degrees, if all places were flown over in about one direction; None if not, or if
-    that is not known, as their times are not."""
+    their times are unknown."""
     tags: list[tuple[float, float, float]] = []
     with suppress(PlaceError):  # those before a damaged place say enough
-        for place in place_map.places():
+        for place in place_map.read_places():
             if place.t_utc_s is not None and place.position:
                 tags.append((place.t_utc_s, place.position.lat_deg, place.position.lon_deg))
     if len(tags) <= _MIN_COURSES:
@@ -117,11 +117,11 @@ def _find_one_way_deg(place_map: PlaceMap) -> float | None:
     step_s = np.diff(t_s)
     east_m, north_m = offset_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])
     step_m = east_m + 1j * north_m
-    courses = step_m[(step_s <= _SAME_PASS_STEPS * np.median(step_s)) & (step_m != 0)]
+    courses = step_m[(step_s <= _MAX_PASS_STEPS * np.median(step_s)) & (step_m != 0)]
     if len(courses) < _MIN_COURSES:
         return None
     mean = np.mean(courses / np.abs(courses))
-    return math.degrees(math.atan2(mean.real, mean.imag)) % 360 if abs(mean) >= _SAME_COURSE else None
+    return math.degrees(math.atan2(mean.real, mean.imag)) % 360 if abs(mean) >= _MIN_COURSE_LENGTH else None
 
 
 def read_identity(place_map: PlaceMap) -> MapIdentity:
@@ -131,10 +131,10 @@ def read_identity(place_map: PlaceMap) -> MapIdentity:
     before them in the file, so they are read quickly, and change whenever a descriptor changes.
     """
     digest, places = hashlib.sha256(), 0
-    with sentences(place_map.path):
+    with translate_errors(place_map.path):
         for row in place_map.db.execute("SELECT key, value FROM edgevpr_map ORDER BY key"):
             digest.update(repr(row).encode("utf-8", "backslashreplace"))
-    for place in place_map.scan(f"{rows.VALUES}, {rows.SALIENCE}, {rows.POSE}, {rows.CHECKSUMS}"):
+    for place in place_map.scan_rows(f"{rows.VALUES}, {rows.SALIENCE}, {rows.POSE}, {rows.CHECKSUMS}"):
         digest.update(repr(place).encode("utf-8", "backslashreplace"))
         places += 1
     map_id = place_map.stored.get("map_id")

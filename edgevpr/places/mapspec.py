@@ -16,13 +16,16 @@ from edgevpr.core.errors import MapError
 from edgevpr.places import geopackage, rows
 
 FORMAT_VERSION = 1
-_BEFORE_RELEASE = 4  # format version in maps made before the first release; their format is the same
+_PRERELEASE_VERSION = 4  # format version in maps made before the first release; their format is the same
 _DTYPES = ("|i1", "|u1", "<i1", "<u1", *(f"<{kind}{size}" for kind in "iu" for size in "248"), "<f2", "<f4", "<f8")
 _MAX_PART_BYTES = 64_000_000
 _PARTS = ("coarse", "fine", "packed")
 # Keys of texts that a map may lack.
-MASK, LENS, ATTRIBUTION, CALIBRATION = "mask_sha256", "lens", "attribution", "calibration"
-BESIDE = MASK, LENS, ATTRIBUTION, CALIBRATION
+MASK = "mask_sha256"
+LENS = "lens"
+ATTRIBUTION = "attribution"
+CALIBRATION = "calibration"
+OPTIONAL_KEYS = (MASK, LENS, ATTRIBUTION, CALIBRATION)
 _MAX_STORED = 1000  # rows read from the table, and characters of a damaged one in a message
 
 Stored = dict[str, Any]  # the JSON values of the table, by key
@@ -30,7 +33,7 @@ Stored = dict[str, Any]  # the JSON values of the table, by key
 
 def write_spec(db: sqlite3.Connection, spec: TechniqueSpec) -> None:
     """Fill the table edgevpr_map, which must exist and be empty, for a new map of `spec`. Raises sqlite3.Error."""
-    described = {
+    values = {
         "format_version": FORMAT_VERSION,
         "map_id": uuid.uuid4().hex,
         "made_by": f"edgevpr {__version__}",
@@ -39,12 +42,12 @@ def write_spec(db: sqlite3.Connection, spec: TechniqueSpec) -> None:
         "model_sha256": spec.model_sha256,
         **{part: getattr(spec, part) and asdict(getattr(spec, part)) for part in _PARTS},
     }
-    rows = [(key, json.dumps(value)) for key, value in described.items()]
+    rows = [(key, json.dumps(value)) for key, value in values.items()]
     db.executemany("INSERT INTO edgevpr_map (key, value) VALUES (?, ?)", rows)
 
 
 def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
-    """Return the values of edgevpr_map by key, without those of `BESIDE`, and check the columns of `places`. Raises
+    """Return the values of edgevpr_map by key, without `OPTIONAL_KEYS`, and check the columns of `places`. Raises
     MapError for a file that is not a place map or has an unknown format version, and sqlite3.Error."""
     (application_id,) = db.execute("PRAGMA application_id").fetchone()
     # A view or virtual table, which has no page of its own in the file, is refused: a query of it may never end.
@@ -53,17 +56,17 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
         raise MapError(f"{path}: this is not a place map: give a .gpkg file made by `edgevpr map build`.")
     try:
         # The others are read only when they are needed: a map can be used without them.
-        said = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?, ?)", BESIDE)
-        stored = {key: json.loads(value) for key, value in said.fetchmany(_MAX_STORED)}
+        rows = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?, ?)", OPTIONAL_KEYS)
+        stored = {key: json.loads(value) for key, value in rows.fetchmany(_MAX_STORED)}
         version = stored["format_version"]
         if not isinstance(version, int) or version < 1:
             raise ValueError(f"format version {version}")
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise _damaged_error(path, error) from error
-    if version not in (FORMAT_VERSION, _BEFORE_RELEASE):
+        raise _make_damage_error(path, error) from error
+    if version not in (FORMAT_VERSION, _PRERELEASE_VERSION):
         raise MapError(
-            f"{path} has the map format {version}, and this edgevpr reads {FORMAT_VERSION}: update edgevpr, or build "
-            "the map again."
+            f"{path} has map format {version}, and this version of edgevpr reads {FORMAT_VERSION}: update edgevpr, or "
+            "build the map again."
         )
     _require_columns(path, db)
     return stored
@@ -73,48 +76,47 @@ def read_spec(path: Path, stored: Stored) -> TechniqueSpec:
     """Return the specification of the technique that made the map, from `stored`. Raises MapError if it is invalid."""
     try:
         name, parameters, model = stored["technique"], dict(stored["parameters"]), stored["model_sha256"]
-        coarse, fine, packed = (_part_spec(stored[part]) for part in _PARTS)
+        coarse, fine, packed = (_parse_part_spec(stored[part]) for part in _PARTS)
         if coarse is None or not isinstance(name, str) or not isinstance(model, str | None):
             raise ValueError("no coarse part, or names that are no text")
         if not all(isinstance(value, int | str) or math.isfinite(value) for value in parameters.values()):
             raise ValueError(f"the parameters {parameters!r}")
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise _damaged_error(path, error) from error
+        raise _make_damage_error(path, error) from error
     return TechniqueSpec(name=name, parameters=parameters, coarse=coarse, fine=fine, model_sha256=model, packed=packed)
 
 
-def differences(theirs: TechniqueSpec, ours: TechniqueSpec) -> list[str]:
+def list_differences(theirs: TechniqueSpec, ours: TechniqueSpec) -> list[str]:
     """Return one phrase for each difference between the technique of a map and ours; empty if they are equal."""
     if theirs.name != ours.name:
         return [f"technique is {theirs.name}, not {ours.name}"]
-    there, here = (
+    old, new = (
         {**spec.parameters, "model sha256": spec.model_sha256, "coarse part": spec.coarse, "fine part": spec.fine}
         for spec in (theirs, ours)
     )
-    different = [name for name in {**there, **here} if there.get(name) != here.get(name)]
-    return [f"{name} is {there.get(name)}, not {here.get(name)}" for name in different]
+    return [f"{name} is {old.get(name)}, not {new.get(name)}" for name in old | new if old.get(name) != new.get(name)]
 
 
 def _require_columns(path: Path, db: sqlite3.Connection) -> None:
     """Raise MapError unless the table of places has the columns that every map has."""
     # Generated columns are not in this list: they are computed when read, so their size has no limit.
-    there = {name: (kind, key) for _, name, kind, _, _, key in db.execute("PRAGMA table_info(places)")}
-    lacking = [name for name in rows.ALL.split(", ") if name not in there]
-    if there.get("place_id") != ("INTEGER", 1):
-        lacking.append("place_id")
-    if lacking:
+    columns = {name: (kind, key) for _, name, kind, _, _, key in db.execute("PRAGMA table_info(places)")}
+    missing = [name for name in rows.ALL_COLUMNS.split(", ") if name not in columns]
+    if columns.get("place_id") != ("INTEGER", 1):
+        missing.append("place_id")
+    if missing:
         raise MapError(
-            f"{path}: its table of places has not the columns of a map ({', '.join(lacking)}): restore a copy or build "
-            "the map again."
+            f"{path}: its table of places lacks columns of a map ({', '.join(missing)}): restore a copy or build the "
+            "map again."
         )
 
 
-def _damaged_error(path: Path, error: Exception) -> MapError:
-    shown = repr(error)[:_MAX_STORED]
-    return MapError(f"{path}: its table edgevpr_map is damaged ({shown}): restore a copy or build the map again.")
+def _make_damage_error(path: Path, error: Exception) -> MapError:
+    problem = repr(error)[:_MAX_STORED]
+    return MapError(f"{path}: its table edgevpr_map is damaged ({problem}): restore a copy or build the map again.")
 
 
-def _part_spec(value: Any) -> PartSpec | None:
+def _parse_part_spec(value: Any) -> PartSpec | None:
     if value is None:
         return None
     shape, dtype = value["shape"], value["dtype"]

@@ -25,22 +25,22 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 
 Choice = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all)
-Glance = tuple[float, Choice]  # approximate score, and the slot with its best hypothesis
+QuickScore = tuple[float, Choice]  # approximate score, and the slot with its best hypothesis
 # Scan scores of each place, float32 (N,), and each hypothesis, float32 (N, H), -inf if ruled out (None: there is none).
 Scan = tuple[Singles, Singles | None]
 
-MAX_BESIDE = 2  # places before and after one without a position that are its neighbours
-_COMPARED_ELSEWHERE = 5
-_TRIED_EACH = 3  # hypotheses per place
-_ASKED_UNMOVED = 9  # places elsewhere, at most
-# Among so many places, where no heading is known, so many times the candidates are compared: of the sets from the air
-# this finds 0.832 of the queries over 10,000 places, where it was 0.802. Twice as many find fewer of 1,000 places.
-_LARGE = 2000
-_OF_LARGE = 1.6
-_MANY = 3  # unreadable places in one query, from which on the file may be at fault
+MAX_NEIGHBOUR_SLOTS = 2  # places before and after one without a position that are its neighbours
+_ELSEWHERE_PLACES = 5
+_MAX_HYPOTHESES = 3  # per place
+_MAX_UNMOVED_PLACES = 9
+# Factor on the candidates in a map of so many places without a known heading: on the sets from the air it finds 0.832
+# of the queries over 10,000 places (without: 0.802). Twice as many find fewer of 1,000 places.
+_LARGE_MAP_PLACES = 2000
+_LARGE_MAP_FACTOR = 1.6
+_MIN_UNREADABLE = 3  # in one query: with so many the file may be at fault
 # In the data set corridor (tune), if the right places were left out and a wrong one had enough margin to be accepted,
 # one of the right ones always had at least the scan score of the wrong one, or one of the two best scan scores.
-_LIKELY = 3
+_LIKELY_PLACES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class Expectation:
     height_ratio: float | None = None
 
 
-NOTHING = Expectation()
+NO_EXPECTATION = Expectation()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,16 +65,16 @@ class Query:
     descriptor: Descriptor
     place_map: PlaceMap
     index: PlaceIndex
-    expected: Expectation = NOTHING
+    expected: Expectation = NO_EXPECTATION
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ranking:
     """The places that a query may show, best first: their `slots` in the index, int (K,), and their `scores`, float32
     (K,). `compared` maps the slot of each place that was compared in full to the match found, which has this score;
-    those compared in part only (see `Technique.glance`) come last. `unread` int (U,): slots of places that cannot be
-    read from the file, but that the query may show as well, because the scan scored their row (see `Scan`) at least as
-    high as the best place's, or among the three best. `tried`: share (0..1) of the rotations under which the query
+    those only scored quickly (see `Technique.score_quickly`) come last. `unread` int (U,): slots of places that cannot
+    be read from the file, but that the query may show as well, because the scan scored their row (see `Scan`) at least
+    as high as the best place's, or among the three best. `tried`: share (0..1) of the rotations under which the query
     could match that were not ruled out."""
 
     slots: Ints
@@ -94,7 +94,7 @@ class Ranking:
         return replace(self, slots=self.slots[order], scores=self.scores[order])
 
 
-def scan(query: Query) -> Scan:
+def scan_index(query: Query) -> Scan:
     """Scan the index: compare the query with the rows of all places, which are in RAM."""
     technique, index, expected = query.technique, query.index, query.expected
     hints: dict[str, Any] = {} if expected.turned_deg is None else {"turned_deg": expected.turned_deg}
@@ -103,10 +103,10 @@ def scan(query: Query) -> Scan:
     return technique.score_places(query.descriptor, index.rows, index.mean, **hints)
 
 
-def compare(query: Query, scanned: Scan, candidates: int | None, apart_m: float) -> Ranking:
+def compare_places(query: Query, scanned: Scan, candidates: int | None, apart_m: float) -> Ranking:
     """Compare the `candidates` places that have the best scan scores with the query, and rank them.
 
-    Of more than the technique's `in_full`, only those with the best `Technique.glance` are compared in full. Among
+    Of more than the technique's `in_full`, only those with the best quick scores are compared in full. Among
     2,000 places and more, looking down with no heading known, 1.6 times as many are compared. If `candidates` is None,
     or at least the number of places and more than the technique's own number, all places are compared. If all
     candidates are within `apart_m` metres of the best one, the best-scanned places elsewhere are compared as well, for
@@ -118,33 +118,33 @@ def compare(query: Query, scanned: Scan, candidates: int | None, apart_m: float)
     spec, index, in_reach = query.technique.spec, query.index, query.expected.in_reach
     comparison = _Comparison(query, scanned, candidates)
     readable = comparison.readable
-    there = readable if in_reach is None else in_reach & readable
+    likely = readable if in_reach is None else in_reach & readable
     count = candidates
     if count is None or spec.fine is None or comparison.is_exact:
         count = len(index)
     elif query.expected.turned_deg is None:
-        count = round(count * times_as_many(bool(spec.height_ratios), int(np.count_nonzero(there))))
-    chosen = comparison.best(there, count, spec.in_full)
-    chosen += comparison.best(readable & ~there, _COMPARED_ELSEWHERE, spec.in_full and _COMPARED_ELSEWHERE)
+        count = round(count * compute_candidate_factor(bool(spec.height_ratios), int(np.count_nonzero(likely))))
+    chosen = comparison.choose_candidates(likely, count, spec.in_full)
+    chosen += comparison.choose_candidates(readable & ~likely, _ELSEWHERE_PLACES, spec.in_full and _ELSEWHERE_PLACES)
     if not chosen:
         raise MapError(
-            f"{query.place_map.path}: no place of it can be read any more: restore a copy or build it again."
+            f"{query.place_map.path}: none of its places can be read any more: restore a copy or build it again."
         )
-    comparison.compare(chosen)
+    comparison.compare_places(chosen)
     if len(comparison.scores) < np.count_nonzero(readable):
         compared = list(comparison.scores)
         best = max(compared, key=comparison.scores.__getitem__)
         others = outside_neighbourhood(index, best, np.arange(len(index)), apart_m)
         rivals = np.count_nonzero(others[compared])
-        if rivals < (1 if in_reach is None else _COMPARED_ELSEWHERE):
+        if rivals < (1 if in_reach is None else _ELSEWHERE_PLACES):
             others[compared] = False
-            comparison.compare(comparison.next_best(others & readable, int(_COMPARED_ELSEWHERE - rivals)))
-    return comparison.ranking()
+            comparison.compare_places(comparison.choose_more(others & readable, int(_ELSEWHERE_PLACES - rivals)))
+    return comparison.make_ranking()
 
 
-def times_as_many(tries_rotations: bool, places: int) -> float:
-    """Return how many times the candidates are compared among so many places where no heading is known."""
-    return _OF_LARGE if tries_rotations and places >= _LARGE else 1
+def compute_candidate_factor(tries_rotations: bool, places: int) -> float:
+    """Return the factor on the number of candidates in a map of so many places, if no heading is known."""
+    return _LARGE_MAP_FACTOR if tries_rotations and places >= _LARGE_MAP_PLACES else 1
 
 
 class _Comparison:
@@ -164,9 +164,9 @@ class _Comparison:
             self.readable = ~np.isin(index.place_ids, list(query.place_map.left_out))
         self.scores: dict[int, float] = {}
         self.matches: dict[int, FineMatch] = {}
-        self._passed_over: list[Glance] = []
+        self._passed_over: list[QuickScore] = []
 
-    def best(self, among: Bools, count: int, in_full: int | None) -> list[Choice]:
+    def choose_candidates(self, among: Bools, count: int, in_full: int | None) -> list[Choice]:
         """Choose up to `count` places where `among` bool (N,) is True, by scan score. If they have together more than
         `in_full` hypotheses to try, keep only the `in_full` places with the best glance (None: keep all)."""
         if self._tries_all and self._by_hypothesis is not None:
@@ -174,66 +174,67 @@ class _Comparison:
         chosen = choose_best(self._scanned, self._by_hypothesis, among, count)
         if self.is_exact or in_full is None or sum(len(tried or [None]) for _, tried in chosen) <= in_full:
             return chosen
-        glances: list[Glance] = []
-        for slot, fine, hypotheses in _read(self._query, chosen):
+        quick_scores: list[QuickScore] = []
+        for slot, fine, hypotheses in _read_fine_parts(self._query, chosen):
             score, likely = self._query.technique.score_quickly(self._query.descriptor, fine, hypotheses)
-            glances.append((self._with_scan(slot, score), (slot, likely)))
-        glances.sort(key=lambda glance: -glance[0])
-        self._passed_over += glances[in_full:]
-        return [choice for _, choice in glances[:in_full]]
+            quick_scores.append((self._weigh_by_scan(slot, score), (slot, likely)))
+        quick_scores.sort(key=lambda quick_score: -quick_score[0])
+        self._passed_over += quick_scores[in_full:]
+        return [choice for _, choice in quick_scores[:in_full]]
 
-    def next_best(self, among: Bools, count: int) -> list[Choice]:
+    def choose_more(self, among: Bools, count: int) -> list[Choice]:
         """Choose up to `count` more places where `among` is True: those passed over, or if none of them is, those
         of the best scan scores."""
         more = [choice for _, choice in self._passed_over if among[choice[0]]][:count]
         return more or choose_best(self._scanned, self._by_hypothesis, among, count)
 
-    def compare(self, chosen: list[Choice]) -> None:
-        """Compare the chosen places in full. Raises as `_read`."""
+    def compare_places(self, chosen: list[Choice]) -> None:
+        """Compare the chosen places in full. Raises as `_read_fine_parts`."""
         if self._has_one_stage:
             self.scores.update((slot, float(self._scanned[slot])) for slot, _ in chosen)
             return
-        for slot, fine, hypotheses in _read(self._query, chosen):
+        for slot, fine, hypotheses in _read_fine_parts(self._query, chosen):
             match = self._query.technique.match(self._query.descriptor, fine, hypotheses)
-            self.scores[slot] = self._with_scan(slot, match.score)
+            self.scores[slot] = self._weigh_by_scan(slot, match.score)
             self.matches[slot] = replace(match, score=self.scores[slot])
 
-    def ranking(self) -> Ranking:
+    def make_ranking(self) -> Ranking:
         """Return the ranking of the places compared so far."""
-        slots, found = np.array(list(self.scores), np.intp), np.array(list(self.scores.values()), np.float32)
-        order = np.argsort(-found, kind="stable")
-        slots, found = slots[order], found[order]
-        last = sorted((each for each in self._passed_over if each[1][0] not in self.scores), key=lambda each: -each[0])
+        slots, scores = np.array(list(self.scores), np.intp), np.array(list(self.scores.values()), np.float32)
+        order = np.argsort(-scores, kind="stable")
+        slots, scores = slots[order], scores[order]
+        rest = [(score, slot) for score, (slot, _) in self._passed_over if slot not in self.scores]
+        rest.sort(key=lambda scored: -scored[0])
         unread: Ints = np.flatnonzero(~self.readable)
         if len(unread):
-            likely = min(_LIKELY, len(self._scanned))
-            least = min(self._scanned[slots[0]], np.partition(self._scanned, -likely)[-likely])
-            unread = unread[self._scanned[unread] >= least]
+            likely = min(_LIKELY_PLACES, len(self._scanned))
+            min_score = min(self._scanned[slots[0]], np.partition(self._scanned, -likely)[-likely])
+            unread = unread[self._scanned[unread] >= min_score]
         tried = 1.0
         if self._every_hypothesis is not None:
             heights = max(len(self._query.technique.spec.height_ratios), 1)
-            of_slot = np.isfinite(self._every_hypothesis[slots]).mean(axis=1) * heights
-            tried = float(np.minimum(of_slot, 1.0).mean())
+            tried_of_slot = np.isfinite(self._every_hypothesis[slots]).mean(axis=1) * heights
+            tried = float(np.minimum(tried_of_slot, 1.0).mean())
         return Ranking(
-            slots=np.append(slots, [slot for _, (slot, _) in last]).astype(np.intp),
-            scores=np.append(found, np.minimum([score for score, _ in last], found[-1])).astype(np.float32),
+            slots=np.append(slots, [slot for _, slot in rest]).astype(np.intp),
+            scores=np.append(scores, np.minimum([score for score, _ in rest], scores[-1])).astype(np.float32),
             compared=self.matches,
             unread=unread,
             tried=tried,
         )
 
-    def _with_scan(self, slot: int, score: float) -> float:
+    def _weigh_by_scan(self, slot: int, score: float) -> float:
         return score * (1 + float(self._scanned[slot])) / 2 if self._query.technique.spec.scan_counts else score
 
 
-def _read(query: Query, chosen: list[Choice]) -> Iterator[tuple[int, Array, list[int] | None]]:
+def _read_fine_parts(query: Query, chosen: list[Choice]) -> Iterator[tuple[int, Array, list[int] | None]]:
     """Yield the slots of the chosen places with their fine parts and hypotheses. Raises PlaceError if a place cannot be
     read, after all have been tried; it is then left out. Raises MapError if the file cannot be read."""
     unreadable, place_map, index = [], query.place_map, query.index
     for slot, hypotheses in chosen:
         try:
-            fine, point = place_map.fine_part(index.place_ids[slot])
-            _require_there(place_map, index, slot, point)
+            fine, point = place_map.read_fine_part(index.place_ids[slot])
+            _require_position(place_map, index, slot, point)
         except PlaceError as error:
             unreadable.append(error)
         else:
@@ -241,28 +242,25 @@ def _read(query: Query, chosen: list[Choice]) -> Iterator[tuple[int, Array, list
     if not unreadable:
         return
     first = unreadable[0]
-    if len(unreadable) >= _MANY and 2 * len(unreadable) > len(chosen):
+    if len(unreadable) >= _MIN_UNREADABLE and 2 * len(unreadable) > len(chosen):
         raise MapError(
             f"{place_map.path}: {len(unreadable)} of the {len(chosen)} places compared cannot be read (place "
             f"{first.place_id}: {first.problem}): the file is damaged or another map; restore a copy."
         )
-    for lost in unreadable:
-        place_map.left_out.setdefault(lost.place_id, lost.problem)
+    for failure in unreadable:
+        place_map.left_out.setdefault(failure.place_id, failure.problem)
     raise first
 
 
-def unmoved_outside_neighbourhood(query: Query, best: int, apart_m: float) -> list[FineMatch]:
+def match_unmoved_places(query: Query, best: int, apart_m: float) -> list[FineMatch]:
     """Compare a query, looking down, with a few places elsewhere than the slot `best`, all over the map, as if it had
-    been taken from their height and not turned (see `Technique.unmoved`). Raises as `compare` does."""
+    been taken from their height and not turned (see `Technique.unmoved`). Raises as `compare_places` does."""
     index, left_out = query.index, list(query.place_map.left_out)
     slots = np.flatnonzero(
         outside_neighbourhood(index, best, np.arange(len(index)), apart_m) & ~np.isin(index.place_ids, left_out)
     )
-    some = slots[:: -(-len(slots) // _ASKED_UNMOVED) or 1].tolist()
-    return [
-        query.technique.match_at_rest(query.descriptor, fine)
-        for _, fine, _ in _read(query, [(at, None) for at in some])
-    ]
+    choices: list[Choice] = [(slot, None) for slot in slots[:: -(-len(slots) // _MAX_UNMOVED_PLACES) or 1].tolist()]
+    return [query.technique.match_at_rest(query.descriptor, fine) for _, fine, _ in _read_fine_parts(query, choices)]
 
 
 def merge_rankings(one: Ranking, other: Ranking) -> Ranking:
@@ -278,8 +276,8 @@ def merge_rankings(one: Ranking, other: Ranking) -> Ranking:
             if slot not in compared:
                 rest[slot] = max(score, rest.get(slot, score))
     scores = {slot: compared[slot].score for slot in sorted(compared, key=lambda slot: -compared[slot].score)}
-    least = min(scores.values())
-    scores |= {slot: min(rest[slot], least) for slot in sorted(rest, key=lambda slot: -rest[slot])}
+    lowest = min(scores.values())
+    scores |= {slot: min(rest[slot], lowest) for slot in sorted(rest, key=lambda slot: -rest[slot])}
     return Ranking(
         slots=np.array(list(scores), np.intp),
         scores=np.array(list(scores.values()), np.float32),
@@ -290,12 +288,17 @@ def merge_rankings(one: Ranking, other: Ranking) -> Ranking:
 
 
 def outside_neighbourhood(
-    index: PlaceIndex, best: int, slots: Ints, neighbour_m: float, same: Collection[int] = (), beside: int = MAX_BESIDE
+    index: PlaceIndex,
+    best: int,
+    slots: Ints,
+    neighbour_m: float,
+    same: Collection[int] = (),
+    max_slots: int = MAX_NEIGHBOUR_SLOTS,
 ) -> Bools:
     """Return bool (K,), True for each of `slots` (K,) that is no neighbour of the slot `best`: it is more than
-    `neighbour_m` metres or, without a position, `beside` slots away, and its id is not in `same`."""
+    `neighbour_m` metres or, without a position, `max_slots` slots away, and its id is not in `same`."""
     away_m = distance_m(index.lat_deg[best], index.lon_deg[best], index.lat_deg[slots], index.lon_deg[slots])
-    away = np.where(np.isnan(away_m), abs(slots - best) > beside, away_m > neighbour_m)
+    away = np.where(np.isnan(away_m), abs(slots - best) > max_slots, away_m > neighbour_m)
     return away & ~np.isin(index.place_ids[slots], tuple(same)) if same else away
 
 
@@ -320,9 +323,9 @@ def load_candidates(
         try:
             if place_id in place_map.left_out:
                 raise PlaceError(place_map.path, place_id, place_map.left_out[place_id])
-            (place,) = place_map.places([place_id])
+            (place,) = place_map.read_places([place_id])
             position = place.position
-            _require_there(place_map, index, slot, (position.lat_deg, position.lon_deg) if position else None)
+            _require_position(place_map, index, slot, (position.lat_deg, position.lon_deg) if position else None)
         except PlaceError as error:
             place_map.left_out.setdefault(place_id, error.problem)
             raise
@@ -339,13 +342,13 @@ def choose_best(scores: Singles, by_hypothesis: Singles | None, among: Bools, co
     if by_hypothesis is None or not len(slots):
         return [(slot, None) for slot in slots[np.sort(_find_largest(scores[slots], count))].tolist()]
     slots = slots[np.sort(_find_largest(by_hypothesis.max(axis=1)[slots], count))]
-    each = by_hypothesis[slots]
-    of_place = np.argsort(np.argsort(-each, axis=1, kind="stable"), axis=1)
-    each = np.where(of_place < max(_TRIED_EACH, count // len(slots)), each, -np.inf)
-    tried = np.zeros(each.shape, bool)
-    tried.flat[_find_largest(each.ravel(), count)] = True
-    tried &= np.isfinite(each)
-    return [(int(slots[at]), np.flatnonzero(tried[at]).tolist()) for at in np.flatnonzero(tried.any(axis=1))]
+    pairs = by_hypothesis[slots]
+    rank_in_place = np.argsort(np.argsort(-pairs, axis=1, kind="stable"), axis=1)
+    pairs = np.where(rank_in_place < max(_MAX_HYPOTHESES, count // len(slots)), pairs, -np.inf)
+    tried = np.zeros(pairs.shape, bool)
+    tried.flat[_find_largest(pairs.ravel(), count)] = True
+    tried &= np.isfinite(pairs)
+    return [(int(slots[row]), np.flatnonzero(tried[row]).tolist()) for row in np.flatnonzero(tried.any(axis=1))]
 
 
 def _find_largest(scores: Singles, count: int) -> Ints:
@@ -353,7 +356,7 @@ def _find_largest(scores: Singles, count: int) -> Ints:
     return np.argpartition(-scores, count)[:count] if count < len(scores) else np.arange(len(scores))
 
 
-def _require_there(place_map: PlaceMap, index: PlaceIndex, slot: int, point: LatLon | None) -> None:
+def _require_position(place_map: PlaceMap, index: PlaceIndex, slot: int, point: LatLon | None) -> None:
     """Raise PlaceError unless `point`, the position in the file, is that in the index (None: no position)."""
     lat_deg = float(index.lat_deg[slot])
     if (None if math.isnan(lat_deg) else (lat_deg, float(index.lon_deg[slot]))) != point:

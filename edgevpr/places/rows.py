@@ -19,7 +19,7 @@ from edgevpr.core.arrays import Array, LatLon
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.types import Frame, Place, Pose, Position, Salience
 from edgevpr.places import geopackage
-from edgevpr.places.mapfiles import is_of_one_row
+from edgevpr.places.mapfiles import is_row_error
 
 # Lists of columns, as SQL queries name them.
 VALUES = "geom, time, alt_m, heading_deg, source_image, quality"
@@ -29,9 +29,9 @@ POSE = (
 )
 BLOBS = "coarse, fine, landmarks"
 CHECKSUMS = "geom_crc32, coarse_crc32, fine_crc32, pose_crc32, landmarks_crc32"
-OF_PLACE = f"{VALUES}, {SALIENCE}, {POSE}, geom_crc32, pose_crc32"
-ALL = f"{VALUES}, {SALIENCE}, {POSE}, {BLOBS}, {CHECKSUMS}"
-BUT_LANDMARKS = f"{VALUES}, {SALIENCE}, {POSE}, coarse, fine, geom_crc32, coarse_crc32, fine_crc32, pose_crc32"
+PLACE_COLUMNS = f"{VALUES}, {SALIENCE}, {POSE}, geom_crc32, pose_crc32"
+ALL_COLUMNS = f"{VALUES}, {SALIENCE}, {POSE}, {BLOBS}, {CHECKSUMS}"
+COLUMNS_WITHOUT_LANDMARKS = f"{PLACE_COLUMNS}, coarse, fine, coarse_crc32, fine_crc32"
 MAX_LANDMARK_BYTES = 10_000  # per place
 
 _POSE = tuple(POSE.split(", "))
@@ -46,88 +46,88 @@ _RANGES: dict[str, tuple[float, float]] = {  # least and greatest number of a co
     "recorded_lat_deg": (-90, 90),
     "recorded_lon_deg": (-180, 180),
 }
-_MAX_UNREADABLE = 100_000  # successive ids without a readable place, after which a scan ends
+_MAX_UNREADABLE = 100_000  # successive ids without a readable place that end a scan
 
 # Values of some columns of a row as SQLite returns them; their types are not checked yet.
 Values = tuple[Any, ...]
 Content = Mapping[str, Any]  # such values by column name
 
 
-class Unreadable(ValueError):
+class RowError(ValueError):
     """Raised if a value of a row is missing or invalid; the message says which, in a few words."""
 
 
 def read_columns(columns: str, row: Values | None) -> Content:
-    """Return the values of a row by the names in `columns`, of the form "a, b". Raises Unreadable if it is None."""
+    """Return the values of a row by the names in `columns`, of the form "a, b". Raises RowError if it is None."""
     if row is None:
-        raise Unreadable("its row is gone")
+        raise RowError("its row is gone")
     return dict(zip(columns.split(", "), row, strict=True))
 
 
 def parse_point(content: Content) -> LatLon | None:
-    """Decode `geom` as (lat_deg, lon_deg); None for a place without a position. Raises Unreadable."""
+    """Decode `geom` as (lat_deg, lon_deg); None for a place without a position. Raises RowError."""
     if content["geom"] is None:
         if content["geom_crc32"] is not None:
-            raise Unreadable("its position is gone")
+            raise RowError("its position is gone")
         return None
     try:
-        point = geopackage.read_point(content["geom"])
+        point = geopackage.decode_point(content["geom"])
     except ValueError as error:
-        raise Unreadable(str(error)) from error
-    _hold(content, "geom", "position")
+        raise RowError(str(error)) from error
+    _require_checksum(content, "geom", "position")
     return point
 
 
 def decode_part(content: Content, name: str, spec: PartSpec) -> Array:
     """Decode the part `name` ("coarse", "fine") of a descriptor as a read-only array of `spec`. Its checksum is checked
-    if it is in `content`. Raises Unreadable."""
+    if it is in `content`. Raises RowError."""
     blob = content[name]
     if not isinstance(blob, bytes) or len(blob) != spec.nbytes:
-        raise Unreadable(f"its {name} part has a wrong size")
-    _hold(content, name, f"{name} part")
+        raise RowError(f"its {name} part has a wrong size")
+    _require_checksum(content, name, f"{name} part")
     part: Array = np.frombuffer(blob, spec.dtype).reshape(spec.shape)
     if part.dtype.kind == "f" and not np.isfinite(part).all():
-        raise Unreadable(f"its {name} part is not finite")
+        raise RowError(f"its {name} part is not finite")
     return part
 
 
 def read_landmarks(content: Content) -> bytes | None:
-    """Return the encoded landmarks of a place; None if there are none. Raises Unreadable."""
+    """Return the encoded landmarks of a place; None if there are none. Raises RowError."""
     blob = content["landmarks"]
     if blob is None:
         return None
     if not isinstance(blob, bytes) or len(blob) > MAX_LANDMARK_BYTES:
-        raise Unreadable("its landmarks have a wrong size")
-    _hold(content, "landmarks", "set of landmarks")
+        raise RowError("its landmarks have a wrong size")
+    _require_checksum(content, "landmarks", "set of landmarks")
     return blob
 
 
 def parse_quality(content: Content) -> float:
-    """Return the quality of a place, 0 to 1. Raises Unreadable."""
-    quality = _number(content, "quality")
+    """Return the quality of a place, 0 to 1. Raises RowError."""
+    quality = _parse_number(content, "quality")
     if quality is None:
-        raise Unreadable("its quality is gone")
+        raise RowError("its quality is gone")
     return quality
 
 
-def parse_where(content: Content) -> tuple[LatLon | None, float | None]:
+def parse_position(content: Content) -> tuple[LatLon | None, float | None]:
     """Check the `VALUES` of a row; return its (lat_deg, lon_deg), and its heading in degrees, 0 up to 360. Each is
-    None if unknown. Raises Unreadable."""
-    point, heading_deg, _ = parse_point(content), _number(content, "heading_deg"), _number(content, "alt_m")
+    None if unknown. Raises RowError."""
+    point, heading_deg, _ = parse_point(content), _parse_number(content, "heading_deg"), _parse_number(content, "alt_m")
     if not isinstance(content["source_image"], str):
-        raise Unreadable("its source_image is no text")
+        raise RowError("its source_image is not text")
     parse_quality(content)
     return point, None if heading_deg is None else heading_deg % 360
 
 
 def parse_place(place_id: int, content: Content) -> Place:
-    """Make a Place from the columns `OF_PLACE` of its row. Raises Unreadable."""
-    point, _ = parse_where(content)
+    """Make a Place from the columns `PLACE_COLUMNS` of its row. Raises RowError."""
+    point, _ = parse_position(content)
     return Place(
         place_id=place_id,
         source_image=content["source_image"],
         position=Position(*point, content["alt_m"]) if point else None,
-        t_utc_s=geopackage.utc_seconds(content["time"]),
+        t_utc_s=geopackage.parse_utc(content["time"]),
         heading_deg=content["heading_deg"],
         quality=content["quality"],
         salience=_make_salience([content[name] for name in SALIENCE.split(", ")]),
@@ -135,29 +135,29 @@ def parse_place(place_id: int, content: Content) -> Place:
     )
 
 
-def frame_content(
+def make_content(
     frame: Frame, descriptor: Descriptor, spec: TechniqueSpec, salience: Salience | None, landmarks: bytes | None
 ) -> Content:
     """Return the row of a new place, by columns, without checksums. An impossible time or altitude becomes NULL."""
     position, scores = frame.position, salience.scores if salience else {}
     altitude = position.alt_m if position else None
     return {
-        "geom": geopackage.point_blob(position.lat_deg, position.lon_deg) if position else None,
-        "time": geopackage.utc_text(frame.t_utc_s),
+        "geom": geopackage.encode_point(position.lat_deg, position.lon_deg) if position else None,
+        "time": geopackage.format_utc(frame.t_utc_s),
         "alt_m": altitude if altitude is not None and _ALTITUDES_M[0] <= altitude <= _ALTITUDES_M[1] else None,
         "heading_deg": frame.heading_deg,
-        "source_image": readable(frame.name),
+        "source_image": escape_name(frame.name),
         "quality": descriptor.quality,
         **scores,
         "is_low_quality": int(salience.is_low) if salience else None,
-        **pose_content(frame.pose),
+        **make_pose_content(frame.pose),
         "coarse": _encode_part(descriptor.coarse, spec.coarse),
         "fine": _encode_part(descriptor.fine, spec.fine),
         "landmarks": landmarks,
     }
 
 
-def pose_content(pose: Pose | None) -> Content:
+def make_pose_content(pose: Pose | None) -> Content:
     """Return the columns `POSE` of a row, all None for an unknown pose."""
     if pose is None:
         return dict.fromkeys(_POSE)
@@ -168,23 +168,23 @@ def pose_content(pose: Pose | None) -> Content:
 
 def compute_checksums(content: Content) -> dict[str, int | None]:
     """Return the columns `CHECKSUMS` of a row. The checksum of a value that is None is None."""
-    sums = {f"{name}_crc32": crc32(content[name]) for name in ("geom", "coarse", "fine", "landmarks")}
-    return sums | {"pose_crc32": pose_crc32([content[name] for name in _POSE])}
+    sums = {f"{name}_crc32": compute_crc32(content[name]) for name in ("geom", "coarse", "fine", "landmarks")}
+    return sums | {"pose_crc32": compute_pose_crc32([content[name] for name in _POSE])}
 
 
-def pose_crc32(values: Sequence[Any]) -> int | None:
+def compute_pose_crc32(values: Sequence[Any]) -> int | None:
     """Return the checksum of the values of `POSE`, in this order; None if all are None."""
     if all(value is None for value in values):
         return None
     return zlib.crc32(struct.pack("<8d", *(math.nan if value is None else float(value) for value in values)))
 
 
-def readable(name: str) -> str:
+def escape_name(name: str) -> str:
     """Return a name in which characters that UTF-8 cannot encode are replaced by escapes."""
     return name.encode("utf-8", "backslashreplace").decode()
 
 
-def scan(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Values | None]]:
+def scan_rows(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Values | None]]:
     """Yield (place id, values of `columns`) of every place in the order added; None for values SQLite cannot read. From
     a damaged page on, each place is read by its id. Raises sqlite3.Error if nothing can be read."""
     last = -(2**63)
@@ -199,17 +199,17 @@ def scan(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Values | N
         highest = _find_highest_id(db, error)
     missing = 0
     for place_id in range(max(last, 0) + 1, highest + 1):
-        found: Values | None = None
+        values: Values | None = None
         try:
-            found = db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (place_id,)).fetchone()
-            is_there = found is not None
+            values = db.execute(f"SELECT {columns} FROM places WHERE place_id = ?", (place_id,)).fetchone()
+            exists = values is not None
         except sqlite3.Error as error:
-            if not is_of_one_row(error):
+            if not is_row_error(error):
                 raise
-            is_there = True
-        if is_there:
-            yield place_id, found
-        missing = 0 if found else missing + 1
+            exists = True
+        if exists:
+            yield place_id, values
+        missing = 0 if values else missing + 1
         if missing == _MAX_UNREADABLE:
             return
 
@@ -219,7 +219,7 @@ def _find_highest_id(db: sqlite3.Connection, error: sqlite3.Error) -> int:
     for query in ("SELECT max(place_id) FROM places", "SELECT seq FROM sqlite_sequence WHERE name = 'places'"):
         with suppress(sqlite3.Error):
             (highest,) = db.execute(query).fetchone() or (None,)
-            if is_of_one_row(error) and isinstance(highest, int):
+            if is_row_error(error) and isinstance(highest, int):
                 return highest
     raise error
 
@@ -229,23 +229,23 @@ def _make_salience(values: Sequence[Any]) -> Salience | None:
     *scores, is_low = values
     if is_low is None:
         return None
-    known = (score if isinstance(score, float) and 0 <= score <= 1 else None for score in scores)
-    memorability, staticity, entropy = known
+    valid = (score if isinstance(score, float) and 0 <= score <= 1 else None for score in scores)
+    memorability, staticity, entropy = valid
     return Salience(memorability, staticity, entropy, is_low=is_low == 1)
 
 
 def _make_pose(content: Content) -> Pose | None:
-    """Make a Pose from the columns `POSE`; None if they are unknown. Raises Unreadable: a wrong pose misleads fixes."""
-    values, checksum = [_number(content, name) for name in _POSE], content["pose_crc32"]
-    if checksum is not None and checksum != pose_crc32(values):
-        raise Unreadable("its pose does not match its checksum")
+    """Make a Pose from the columns `POSE`; None if they are unknown. Raises RowError: a wrong pose misleads fixes."""
+    values, checksum = [_parse_number(content, name) for name in _POSE], content["pose_crc32"]
+    if checksum is not None and checksum != compute_pose_crc32(values):
+        raise RowError("its pose does not match its checksum")
     if all(value is None for value in values):
         return None
     up_deg, footprint_m, var_east, cov, var_north, is_surveyed, lat_deg, lon_deg = values
     if up_deg is None or footprint_m is None or var_east is None or cov is None or var_north is None:
-        raise Unreadable("its pose is not whole")
+        raise RowError("its pose is incomplete")
     if not cov**2 <= var_east * var_north:
-        raise Unreadable("its pose has no covariance")
+        raise RowError("its pose has an impossible covariance")
     return Pose(
         up_deg=up_deg % 360,
         footprint_m=footprint_m,
@@ -262,19 +262,19 @@ def _encode_part(part: Array | None, spec: PartSpec | None) -> bytes | None:
     return np.ascontiguousarray(part, spec.dtype).reshape(spec.shape).tobytes()
 
 
-def crc32(blob: bytes | None) -> int | None:
+def compute_crc32(blob: bytes | None) -> int | None:
     return None if blob is None else zlib.crc32(blob)
 
 
-def _hold(content: Content, name: str, called: str) -> None:
+def _require_checksum(content: Content, name: str, called: str) -> None:
     checksum = content.get(f"{name}_crc32")
     if checksum is not None and checksum != zlib.crc32(content[name]):
-        raise Unreadable(f"its {called} does not match its checksum")
+        raise RowError(f"its {called} does not match its checksum")
 
 
-def _number(content: Content, name: str) -> float | None:
-    """Return the number in a column, None for NULL. Raises Unreadable for anything else, or one out of its range."""
-    value, (least, most) = content[name], _RANGES.get(name, (-math.inf, math.inf))
-    if value is None or (isinstance(value, (int, float)) and math.isfinite(value) and least <= value <= most):
+def _parse_number(content: Content, name: str) -> float | None:
+    """Return the number in a column, None for NULL. Raises RowError for anything else, or one out of its range."""
+    value, (low, high) = content[name], _RANGES.get(name, (-math.inf, math.inf))
+    if value is None or (isinstance(value, (int, float)) and math.isfinite(value) and low <= value <= high):
         return value
-    raise Unreadable(f"its {name} is {repr(value)[:20]}")
+    raise RowError(f"its {name} is {repr(value)[:20]}")

@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 
 from edgevpr.core.arrays import Bools, Floats, Singles
-from edgevpr.core.contract import TechniqueSpec
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import Ranking
 
@@ -21,14 +20,11 @@ FOLLOWED_SPEEDS = np.linspace(0.8, 1.2, 5)  # places per query, as in the paper
 _SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places per query; ten queries can tell steps of 0.25 apart
 _OTHER_SPEEDS = _SPEEDS[(FOLLOWED_SPEEDS[0] > _SPEEDS) | (FOLLOWED_SPEEDS[-1] < _SPEEDS)]
 # After 5 s at 10 m/s the vehicle has left the neighbourhood of 50 m, and no trajectory spans the places between.
-_GAP_S = 5.0
-_NEWEST, _NEWEST_ALONE, _BEST_SHARE = 3, 2, 0.1
-_USUAL_INTERVALS = 3  # a pause is no gap if each query takes so long, e.g. 6 s
-
-
-def sequence_length(spec: TechniqueSpec, asked: int | None) -> int:
-    """Return how many queries are matched together: `asked`, or the technique's own number if that is None or 0."""
-    return asked or spec.sequence
+_MAX_PAUSE_S = 5.0
+_MAX_PAUSE_INTERVALS = 3  # a slow board may take longer for each query, e.g. 6 s
+_MIN_QUERIES_TOGETHER = 3
+_MIN_QUERIES_ALONE = 2
+_MAX_BETTER_SHARE = 0.1
 
 
 def make_sequence_search(length: int) -> "SequenceSearch | None":
@@ -37,7 +33,7 @@ def make_sequence_search(length: int) -> "SequenceSearch | None":
     return SequenceSearch(length) if length > 1 else None
 
 
-def bytes_beside_place(length: int) -> int:
+def compute_sequence_bytes(length: int) -> int:
     """Return the bytes of RAM that a sequence needs per place: a float32 score per query, and one for the rivals."""
     return 4 * (length + 1) if length > 1 else 0
 
@@ -45,18 +41,18 @@ def bytes_beside_place(length: int) -> int:
 class SequenceSearch:
     """The scores of all places for the last `length` queries, and the search for trajectories in them.
 
-    Call `follow` for each query. No place may be accepted before the number of queries, `frames`, has reached `length`.
+    Call `add_query` for each query. No place may be accepted before `frames`, the number of queries, is `length`.
     `rivals` float32 (N,) is for each place the best mean score of a trajectory that ends there at a speed outside 0.8
     to 1.2. A pause of more than five seconds, and more than three times the interval before it, begins a new
     sequence."""
 
     def __init__(self, length: int) -> None:
         self.length = length
-        self._trajectories = trajectories(length, FOLLOWED_SPEEDS)
-        self._other_trajectories = trajectories(length, _OTHER_SPEEDS)
+        self._trajectories = make_trajectories(length, FOLLOWED_SPEEDS)
+        self._other_trajectories = make_trajectories(length, _OTHER_SPEEDS)
         self.rivals: Singles = np.empty(0, np.float32)
         self._rows: deque[Singles] = deque(maxlen=length)  # newest first
-        self._usual: deque[float] = deque(maxlen=_NEWEST_ALONE)  # score of the places not compared, by query
+        self._usual: deque[float] = deque(maxlen=_MIN_QUERIES_ALONE)  # score of the places not compared, by query
         self._t_last_s: float | None = None
         self._interval_s = 0.0
 
@@ -65,7 +61,7 @@ class SequenceSearch:
         """The number of queries in the sequence so far, at most `length`."""
         return len(self._rows)
 
-    def follow(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
+    def add_query(self, ranking: Ranking, index: PlaceIndex, t_mono_s: float) -> Ranking:
         """Add the ranking of the newest query, made at `t_mono_s` (monotonic seconds). Return a ranking of the places
         by the mean score of their best trajectory, with the matches of the newest query. A place that was not compared
         gets the median score of those that were (0 would score rivals too low); slots before the first place of the map
@@ -79,30 +75,31 @@ class SequenceSearch:
         row = np.full(len(index), usual, np.float32)
         row[ranking.slots] = ranking.scores
         self._rows.appendleft(row)
-        means = best_means(self._rows, self._trajectories)
-        self.rivals = best_means(self._rows, self._other_trajectories)
-        worth_naming = means > 0
-        worth_naming[ranking.slots] = True
-        slots = np.flatnonzero(worth_naming)
+        means = find_best_means(self._rows, self._trajectories)
+        self.rivals = find_best_means(self._rows, self._other_trajectories)
+        is_ranked = means > 0
+        is_ranked[ranking.slots] = True
+        slots = np.flatnonzero(is_ranked)
         slots = slots[np.argsort(-means[slots], kind="stable")]
         matches = {slot: replace(match, score=float(means[slot])) for slot, match in ranking.compared.items()}
         return replace(ranking, slots=slots, scores=means[slots], compared=matches)
 
-    def goes_on(self, near: Bools, min_score: float) -> bool:
+    def is_continued(self, near: Bools, min_score: float) -> bool:
         """Return True if the newest queries alone still agree with the sequence, whose mean score stays high for a
         while after a vehicle has left the mapped track.
 
         `near` bool (N,) is True in the neighbourhood of the sequence's best place. The best place of the last three
         queries together must be in `near`. And for each of the last two, the best score in `near` must be at least
         `min_score`, and so high that at most a tenth of all neighbourhoods would reach it."""
-        newest = list(self._rows)[:_NEWEST]
-        together = best_means(newest, [trajectory[:_NEWEST] for trajectory in self._trajectories])
+        newest = list(self._rows)[:_MIN_QUERIES_TOGETHER]
+        together = find_best_means(newest, [trajectory[:_MIN_QUERIES_TOGETHER] for trajectory in self._trajectories])
         if not near[together.argmax()]:
             return False
-        for row, usual in zip(newest[:_NEWEST_ALONE], self._usual, strict=False):
-            seen = float(row[near].max(initial=0))
+        for row, usual in zip(newest[:_MIN_QUERIES_ALONE], self._usual, strict=False):
+            best = float(row[near].max(initial=0))
             # The usual score, which places have that were not compared, would reach a `min_score` of 0.
-            if seen <= usual or seen < min_score or np.count_nonzero(row > seen) * near.sum() > _BEST_SHARE * len(row):
+            better = np.count_nonzero(row > best)
+            if best <= usual or best < min_score or better * near.sum() > _MAX_BETTER_SHARE * len(row):
                 return False
         return True
 
@@ -113,10 +110,10 @@ class SequenceSearch:
         if before_s is None:
             return False
         self._interval_s = t_mono_s - before_s
-        return self._interval_s > max(_GAP_S, _USUAL_INTERVALS * usual_s)
+        return self._interval_s > max(_MAX_PAUSE_S, _MAX_PAUSE_INTERVALS * usual_s)
 
 
-def trajectories(length: int, velocities: Floats) -> list[list[int]]:
+def make_trajectories(length: int, velocities: Floats) -> list[list[int]]:
     """Return the trajectories of `length` queries at `velocities` (V,), in places per query, without duplicates: for
     each query, the newest first, how many slots before the newest one's it was, such as [0, 1, 2, ...] at a velocity of
     1."""
@@ -126,7 +123,7 @@ def trajectories(length: int, velocities: Floats) -> list[list[int]]:
     return unique
 
 
-def best_means(rows: Sequence[Singles], trajectories: Sequence[Sequence[int]]) -> Singles:
+def find_best_means(rows: Sequence[Singles], trajectories: Sequence[Sequence[int]]) -> Singles:
     """Return, for each slot, the best mean score of the trajectories that end there, float32 (N,). `rows` has the
     scores (N,) of each query, newest first."""
     best, total = np.zeros_like(rows[0]), np.empty_like(rows[0])

@@ -102,7 +102,7 @@ def read_ground(path: str | Path) -> list[Place]:
     """Read the places of the map file `path` that have a position. Raises EdgevprError for a map that cannot be read,
     or is damaged."""
     with PlaceMap.open(path) as place_map:
-        return [place for place in place_map.places() if place.position]
+        return [place for place in place_map.read_places() if place.position]
 
 
 def to_point(place: Place) -> Point:

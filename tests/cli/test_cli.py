@@ -117,7 +117,7 @@ def test_main_exits_with_1_and_a_sentence_if_an_input_is_bad(capsys, flight, val
             f"edgevpr map subset {flight} --mission",
         ),
         (["profile", "--map", flight], f"edgevpr map subset {flight} --mission"),
-        (["map", "build", valley, "--images", query, "--technique", "cohog"], "is there already"),
+        (["map", "build", valley, "--images", query, "--technique", "cohog"], "exists already"),
         (["map", "build", tmp_path / "no" / "m.gpkg", "--images", query, "--technique", "cohog"], "check the path"),
         (["run", "--map", valley, "--source", query, "--log", tmp_path / "no" / "x.jsonl"], "flight log"),
     ]:

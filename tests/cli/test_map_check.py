@@ -81,17 +81,17 @@ def test_map_repair_drops_what_is_damaged_and_keeps_the_original(valley, capsys)
     assert "copying  6/6  100 %" in said.err
     assert original.read_bytes() == before
     with PlaceMap.open(original) as damaged, PlaceMap.open(valley) as repaired:
-        kept = list(repaired.places())
+        kept = list(repaired.read_places())
         assert [place.place_id for place in kept] == [1, 3, 5, 6], "the numbers stay"
-        assert kept == list(damaged.places([1, 3, 5, 6]))
+        assert kept == list(damaged.read_places([1, 3, 5, 6]))
         for place in kept:
-            assert (repaired.fine_part(place.place_id)[0] == damaged.fine_part(place.place_id)[0]).all()
-        repaired.require(damaged.spec)
+            assert (repaired.read_fine_part(place.place_id)[0] == damaged.read_fine_part(place.place_id)[0]).all()
+        repaired.require_technique(damaged.spec)
     assert main(["map", "check", str(valley)]) == 0
     assert sorted(entry.name for entry in valley.parent.iterdir()) == [valley.name, original.name]
     damage(valley, "UPDATE places SET fine = x'00' WHERE place_id = 1")
     assert main(["map", "repair", str(valley)]) == 1
-    assert "there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
     assert original.read_bytes() == before
 
 

@@ -43,7 +43,7 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
     assert (built["without_position"], built["without_data"], built["says_nothing"]) == (0, 0, 0)
     with PlaceMap.open(place_map) as opened:
         assert opened.spec.parameters["camera"] == "nadir"
-        places = list(opened.places())
+        places = list(opened.read_places())
     assert all(place.heading_deg == 0 and place.source_image.startswith("valley.tif_r0") for place in places)
 
     over = ("--orthophoto", ground, "--track", track, "--height-m", 77, "--every-m", 20)

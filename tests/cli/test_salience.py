@@ -70,7 +70,7 @@ def test_map_build_leaves_out_frames_and_bounds_gaps(recording, tmp_path, capsys
     assert main([*command, "--config", config(tmp_path), "--json"]) == 0
     built = json.loads(capsys.readouterr().out)
     with PlaceMap.open(place_map) as opened:
-        places = list(opened.places())
+        places = list(opened.read_places())
     low = [int(place.source_image[:2]) for place in places if place.salience.is_low]
     assert [int(place.source_image[:2]) for place in places if not place.salience.is_low] == [
         *range(15),

@@ -50,7 +50,7 @@ def log_of(path, *lines):
 
 def places_of(path):
     with PlaceMap.open(path) as place_map:
-        return list(place_map.places())
+        return list(place_map.read_places())
 
 
 def test_every_position_is_moved_by_what_the_flight_found_last(path, capsys):
@@ -105,4 +105,4 @@ def test_a_damaged_place_stops_the_whole_move(path):
 
 def places_of_first(path):
     with PlaceMap.open(path) as place_map:
-        return next(place_map.places([1]))
+        return next(place_map.read_places([1]))

@@ -77,7 +77,7 @@ def map_path(built, tmp_path):
 def errors_m(place_map, poses):
     """How far each place is from where it was taken, and its direction from that of the camera, in degrees."""
     off_m, turned_deg = [], []
-    for place, pose in zip(place_map.places(), poses, strict=True):
+    for place, pose in zip(place_map.read_places(), poses, strict=True):
         true = to_position(pose)
         here = place.position
         off_m.append(float(distance_m(here.lat_deg, here.lon_deg, true.lat_deg, true.lon_deg)))
@@ -98,9 +98,9 @@ def test_pictures_say_where_they_lie(flown, map_path, capsys):
     assert off_m == pytest.approx(GLITCH_M, abs=25)
     with PlaceMap.open(map_path) as place_map:
         after_m, turned_deg = errors_m(place_map, poses)
-        footprints_m = np.array([place.pose.footprint_m for place in place_map.places()])
+        footprints_m = np.array([place.pose.footprint_m for place in place_map.read_places()])
         info = describe_map(place_map)
-        recorded = [place.pose.recorded for place in place_map.places()]
+        recorded = [place.pose.recorded for place in place_map.read_places()]
     assert np.median(after_m) < np.median(before_m) / 2
     assert after_m.max() < 10
     assert abs(turned_deg).max() < 8
@@ -116,9 +116,9 @@ def test_pictures_say_where_they_lie(flown, map_path, capsys):
 def test_exchanged_lat_and_lon_and_a_lost_sign_are_noticed(map_path, capsys, wrong):
     east_deg = 120.0  # the flight is moved to where its longitude could be a latitude
     with PlaceMap.open_for_adding(map_path) as place_map, place_map.transaction():
-        for place in list(place_map.places()):
+        for place in list(place_map.read_places()):
             lat_deg, lon_deg = wrong(place.position.lat_deg, place.position.lon_deg - east_deg)
-            place_map.lay(place.place_id, Position(lat_deg, lon_deg), None)
+            place_map.move_place(place.place_id, Position(lat_deg, lon_deg), None)
     assert main(["map", "refine", str(map_path), "--json"]) == 0
     refined = json.loads(capsys.readouterr().out)
     assert (refined["refined"], refined["is_mirrored"]) == (0, True)
@@ -127,7 +127,7 @@ def test_exchanged_lat_and_lon_and_a_lost_sign_are_noticed(map_path, capsys, wro
 def test_refining_again_begins_with_what_was_recorded(map_path, capsys):
     def positions():
         with PlaceMap.open(map_path) as place_map:
-            return [(place.position, place.pose) for place in place_map.places()]
+            return [(place.position, place.pose) for place in place_map.read_places()]
 
     main(["map", "refine", str(map_path)])
     first = positions()
@@ -142,9 +142,9 @@ def some_of(built, path, numbers, position=lambda number, place: place.position)
     """A map of some places of another, in this order, at other positions."""
     with PlaceMap.open(built) as there, PlaceMap.create(path, there.spec) as place_map:
         technique = create_technique(there)
-        for place in there.places(numbers):
-            fine, _ = there.fine_part(place.place_id)
-            (coarse,) = (part for place_id, *_, part in there.coarse_parts() if place_id == place.place_id)
+        for place in there.read_places(numbers):
+            fine, _ = there.read_fine_part(place.place_id)
+            (coarse,) = (part for place_id, *_, part in there.read_coarse_parts() if place_id == place.place_id)
             frame = Frame(
                 image=np.zeros((8, 8), np.uint8),
                 name=place.source_image,
@@ -160,7 +160,7 @@ def some_of(built, path, numbers, position=lambda number, place: place.position)
 def refined_of(path, images=None):
     with PlaceMap.open_for_adding(path) as place_map:
         technique = create_technique(place_map)
-        return refine(place_map, technique, lambda pairs, total: pairs, images), list(place_map.places())
+        return refine(place_map, technique, lambda pairs, total: pairs, images), list(place_map.read_places())
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_maps_of_any_kind_are_refined_as_far_as_they_can_be(
 ):
     path = some_of(built, tmp_path / "m.gpkg", numbers, *([position] if position else []))
     with PlaceMap.open(path) as place_map:
-        before = [place.position for place in place_map.places()]
+        before = [place.position for place in place_map.read_places()]
     found, places = refined_of(path)
     assert (found.places, found.refined, found.without_position) == (len(before), refined, without_position)
     for place, was in zip(places, before, strict=True):
@@ -213,7 +213,7 @@ def test_places_of_a_surveyed_picture_stay(built, tmp_path):
 
     with PlaceMap.open(built) as there, PlaceMap.create(tmp_path / "m.gpkg", there.spec) as place_map:
         lies = Pose(up_deg=0.0, footprint_m=80.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
-        (first, *_) = there.places([1])
+        (first, *_) = there.read_places([1])
         descriptor = create_technique(there).encode(np.zeros((64, 64), np.uint8))
         frame = Frame(image=np.zeros((8, 8), np.uint8), name="1", t_mono_s=0.0, position=first.position, pose=lies)
         place_map.add(frame, descriptor)

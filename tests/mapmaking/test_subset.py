@@ -12,7 +12,7 @@ from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.missions import Area, Waypoint
 from edgevpr.mapmaking.subset import subset
-from edgevpr.places.examine import iterate_silently, merge
+from edgevpr.places.examine import iterate_silently, merge_maps
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.calibration import MapCalibration, calibration_text, read_calibration_for
 from edgevpr.runtime.recognise.confidence import prior
@@ -45,13 +45,13 @@ def tiles(tmp_path_factory):
 def whole(tiles, tmp_path_factory):
     """One map of them all."""
     path = tmp_path_factory.mktemp("whole") / "whole.gpkg"
-    merge(sorted(map(str, tiles.iterdir())), path)
+    merge_maps(sorted(map(str, tiles.iterdir())), path)
     return path
 
 
 def names_in(path):
     with PlaceMap.open(path) as place_map:
-        return sorted(place.source_image for place in place_map.places())
+        return sorted(place.source_image for place in place_map.read_places())
 
 
 def path_over(*points):

@@ -235,7 +235,7 @@ def test_a_map_of_an_address_resumes_and_keeps_its_owner_but_no_key(tmp_path, se
     assert "km2 of ground" in caplog.text
     with PlaceMap.open(path) as place_map:
         assert place_map.attribution == "Survey of X"
-        assert all(place.source_image.startswith("127.0.0.1_r") for place in place_map.places())
+        assert all(place.source_image.startswith("127.0.0.1_r") for place in place_map.read_places())
     assert SECRET.encode() not in path.read_bytes()
     capsys.readouterr()
     asked = len(server.asked)

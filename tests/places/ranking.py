@@ -3,8 +3,8 @@
 import numpy as np
 
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
-from edgevpr.places.index import PlaceIndex, empty_index
-from edgevpr.places.retrieve import Expectation, Query, Ranking, compare, scan
+from edgevpr.places.index import PlaceIndex, allocate_index
+from edgevpr.places.retrieve import Expectation, Query, Ranking, compare_places, scan_index
 
 
 class Ruler:
@@ -30,11 +30,11 @@ def rank(technique, query, place_map, index, candidates=None, apart_m=0.0, in_re
     """Scan all places, and compare `candidates` of them in full."""
     expected = Expectation(in_reach, turned_deg)
     asked = Query(technique=technique, descriptor=query, place_map=place_map, index=index, expected=expected)
-    return compare(asked, scan(asked), candidates, apart_m)
+    return compare_places(asked, scan_index(asked), candidates, apart_m)
 
 
 def index_of(place_ids) -> PlaceIndex:
     """An index of these places, somewhere."""
-    index = empty_index(Ruler.spec, len(place_ids), None)
+    index = allocate_index(Ruler.spec, len(place_ids), None)
     index.place_ids[:] = place_ids
     return index

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from edgevpr.places.index import best_places
+from edgevpr.places.index import choose_places
 
 
 def track(east_m):
@@ -14,7 +14,7 @@ def track(east_m):
 def test_gaps_stay_even_however_densely_a_stretch_was_mapped():
     crowded = np.concatenate((np.arange(0, 100, 10), 100 + np.arange(0, 10, 0.1), np.arange(120, 220, 10)))
     lat, lon = track(crowded)
-    kept = best_places(lat, lon, np.ones(len(crowded)), 22)
+    kept = choose_places(lat, lon, np.ones(len(crowded)), 22)
     gaps = np.diff(crowded[kept])
     assert len(kept) == 22
     assert gaps.max() <= 21
@@ -23,14 +23,14 @@ def test_gaps_stay_even_however_densely_a_stretch_was_mapped():
 
 def test_of_two_places_side_by_side_the_one_that_says_more_stays():
     lat, lon = track([0, 50, 51, 100])
-    assert 1 in best_places(lat, lon, np.array([1, 0.9, 0.2, 1]), 3)
-    assert 2 in best_places(lat, lon, np.array([1, 0.2, 0.9, 1]), 3)
+    assert 1 in choose_places(lat, lon, np.array([1, 0.9, 0.2, 1]), 3)
+    assert 2 in choose_places(lat, lon, np.array([1, 0.2, 0.9, 1]), 3)
 
 
 @pytest.mark.parametrize("capacity", [1, 2, 7])
 def test_places_without_positions_are_thinned_along_their_order(capacity):
     nowhere = np.full(20, np.nan)
-    kept = best_places(nowhere, nowhere, np.ones(20), capacity)
+    kept = choose_places(nowhere, nowhere, np.ones(20), capacity)
     assert len(kept) == capacity
     if capacity > 2:
         assert np.diff(kept).max() <= 8

@@ -15,10 +15,10 @@ import pytest
 from map_writer import SPEC, descriptor, frame, make_map, write_sql
 
 from edgevpr.core.errors import MapError, UsageError
-from edgevpr.places.examine import examine
+from edgevpr.places.examine import check_places
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapinfo import describe_map
-from edgevpr.places.rows import readable
+from edgevpr.places.rows import escape_name
 
 PLACES = 40
 
@@ -65,11 +65,11 @@ TAMPERED = {
     ),
     "DROP TABLE places; CREATE VIRTUAL TABLE places USING rtree(id, a, b)": "not a place map",
     "DROP TABLE places": "not a place map",
-    "ALTER TABLE places RENAME COLUMN fine TO fein": "has not the columns of a map .fine.",
+    "ALTER TABLE places RENAME COLUMN fine TO fein": "lacks columns of a map .fine.",
     "ALTER TABLE places DROP COLUMN fine; ALTER TABLE places ADD COLUMN fine AS (zeroblob(1000000000))": (
-        "has not the columns of a map .fine."
+        "lacks columns of a map .fine."
     ),
-    "ALTER TABLE places RENAME COLUMN geom_crc32 TO other": "has not the columns of a map .geom_crc32.",
+    "ALTER TABLE places RENAME COLUMN geom_crc32 TO other": "lacks columns of a map .geom_crc32.",
     "DELETE FROM edgevpr_map": "edgevpr_map is damaged",
     "UPDATE edgevpr_map SET value = CAST(x'ff' AS TEXT) WHERE key = 'fine'": "edgevpr_map is damaged",
 }
@@ -121,8 +121,8 @@ def test_bits_flipped_in_the_header_are_a_sentence(map_path):
         # A file that is still a map is read; any other is a MapError, and nothing else.
         with contextlib.suppress(MapError), PlaceMap.open(map_path) as place_map:
             describe_map(place_map)
-            for place_id, *_ in list(place_map.coarse_parts()):
-                place_map.fine_part(place_id)
+            for place_id, *_ in list(place_map.read_coarse_parts()):
+                place_map.read_fine_part(place_id)
 
 
 def test_a_damaged_page_hides_only_the_places_on_it(map_path):
@@ -133,7 +133,7 @@ def test_a_damaged_page_hides_only_the_places_on_it(map_path):
         map_path.write_bytes(damaged)
         try:
             with PlaceMap.open(map_path) as place_map:
-                found = list(examine(place_map))
+                found = list(check_places(place_map))
         except MapError:
             continue  # a page that every map needs
         whole = [each for each in found if not each.problem]
@@ -150,7 +150,7 @@ def test_a_large_value_is_not_read(map_path):
         pytest.skip("this Python cannot ask SQLite for it")
     write_sql(map_path, "UPDATE places SET source_image = CAST(zeroblob(300000) AS TEXT) WHERE place_id = 3")
     with PlaceMap.open(map_path) as place_map:
-        assert [place_id for place_id, *_ in place_map.coarse_parts()] == [1, 2, *range(4, PLACES + 1)]
+        assert [place_id for place_id, *_ in place_map.read_coarse_parts()] == [1, 2, *range(4, PLACES + 1)]
         assert list(place_map.left_out) == [3]
 
 
@@ -160,9 +160,9 @@ def test_a_name_and_a_time_that_cannot_be_written_cost_no_place(map_path):
     with PlaceMap.open_for_adding(map_path) as place_map:
         for number, each in ((41, odd), (42, later)):
             place_map.add(each, descriptor(number))
-            (place_id,) = place_map.select_ids("source_image")[(readable(each.name),)]
+            (place_id,) = place_map.select_ids("source_image")[(escape_name(each.name),)]
             assert place_map.has_descriptor(place_id, descriptor(number).coarse)
-        *_, first, second = place_map.places()
+        *_, first, second = place_map.read_places()
     assert (first.source_image, first.t_utc_s) == ("\\udcff\\udcfe.jpg", None)
     assert (second.source_image, second.t_utc_s) == ("\\ud800.jpg", None)
 
@@ -191,7 +191,7 @@ def test_one_bit_flipped_in_the_file_is_damage(map_path, part):
     data[at + 15] ^= 1
     map_path.write_bytes(data)
     with PlaceMap.open(map_path) as place_map:
-        (broken,) = [each for each in examine(place_map) if each.problem]
+        (broken,) = [each for each in check_places(place_map) if each.problem]
     assert broken.place_id == 7
     assert "checksum" in broken.problem
 

@@ -11,15 +11,15 @@ from edgevpr.core.contract import FineMatch
 from edgevpr.core.errors import MapError
 from edgevpr.core.types import Frame, Position
 from edgevpr.places import retrieve
-from edgevpr.places.index import bytes_per_place, load_index
+from edgevpr.places.index import compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import (
     Query,
+    compute_candidate_factor,
     load_candidates,
     margin,
+    match_unmoved_places,
     outside_neighbourhood,
-    times_as_many,
-    unmoved_outside_neighbourhood,
 )
 
 
@@ -52,14 +52,14 @@ def ruler(ruler_map):
 def test_the_index_is_contiguous_and_of_the_size_promised(ruler):
     technique, _, index = ruler
     assert len(index) == 25
-    assert index.nbytes == 25 * bytes_per_place(technique.spec)
+    assert index.nbytes == 25 * compute_place_bytes(technique.spec)
     assert index.rows.flags.c_contiguous
     assert index.spacing_m() == pytest.approx(44.5, abs=0.1)
 
 
 def test_a_map_beyond_the_budget_keeps_its_best_places_in_ram_and_all_on_disk(ruler_map, caplog):
     technique, place_map = ruler_map
-    each = bytes_per_place(technique.spec)
+    each = compute_place_bytes(technique.spec)
     index = load_index(place_map, technique, 25 * each)
     assert len(index) == 25
     assert not caplog.messages
@@ -76,8 +76,8 @@ def test_a_map_beyond_the_budget_keeps_its_best_places_in_ram_and_all_on_disk(ru
 def test_a_budget_that_holds_no_place_and_an_empty_map_are_refused(ruler_map, tmp_path):
     technique, place_map = ruler_map
     with pytest.raises(MapError, match="budget"):
-        load_index(place_map, technique, bytes_per_place(technique.spec) - 1)
-    with PlaceMap.create(tmp_path / "empty.gpkg", Ruler.spec) as place_map, pytest.raises(MapError, match="no place"):
+        load_index(place_map, technique, compute_place_bytes(technique.spec) - 1)
+    with PlaceMap.create(tmp_path / "empty.gpkg", Ruler.spec) as place_map, pytest.raises(MapError, match="is empty"):
         load_index(place_map, Ruler(), 10_000)
 
 
@@ -150,8 +150,8 @@ def test_the_index_knows_distances_and_headings(tmp_path):
         index = load_index(place_map, technique, 10_000)
     expected = [0.0, 359.99, 123.4, np.nan, 270.0, 0.5]
     np.testing.assert_allclose(index.heading_deg, expected, atol=0.13)  # half a step of half precision
-    assert index.within(Position(0.0, -179.999), 120.0).tolist() == [False, True, True, False, False, False]
-    assert index.within(Position(0.0, -179.999), 180.0).tolist() == [True, True, True, True, False, False]
+    assert index.find_within(Position(0.0, -179.999), 120.0).tolist() == [False, True, True, False, False, False]
+    assert index.find_within(Position(0.0, -179.999), 180.0).tolist() == [True, True, True, True, False, False]
 
 
 class Turned(Ruler):
@@ -202,7 +202,7 @@ def test_in_a_large_map_more_are_compared_where_no_heading_is_known(ruler_map, m
         def score_places(self, query, rows, mean, **hints):
             return super().score_places(query, rows, mean)
 
-    monkeypatch.setattr(retrieve, "_LARGE", large)
+    monkeypatch.setattr(retrieve, "_LARGE_MAP_PLACES", large)
     _, place_map = ruler_map
     technique = Tall()
     rank(technique, technique.encode(43), place_map, load_index(place_map, technique, 10_000), 14, **known)
@@ -210,8 +210,8 @@ def test_in_a_large_map_more_are_compared_where_no_heading_is_known(ruler_map, m
 
 
 def test_more_are_compared_from_two_thousand_places_on():
-    assert [times_as_many(True, places) for places in (1999, 2000)] == [1, 1.6]
-    assert times_as_many(False, 2000) == 1
+    assert [compute_candidate_factor(True, places) for places in (1999, 2000)] == [1, 1.6]
+    assert compute_candidate_factor(False, 2000) == 1
 
 
 def test_a_ranking_says_how_many_rotations_were_not_ruled_out(ruler_map):
@@ -336,8 +336,8 @@ def test_a_few_places_all_over_the_map_are_asked_unmoved(ruler):
     query = Query(technique=technique, descriptor=technique.encode(0), place_map=place_map, index=index)
     place_map.left_out[25] = "gone"
     for apart_m, numbers in ((200.0, range(20, 96, 12)), (250.0, range(24, 96, 8))):
-        asked = [match.score for match in unmoved_outside_neighbourhood(query, 0, apart_m)]
+        asked = [match.score for match in match_unmoved_places(query, 0, apart_m)]
         assert asked == list(numbers), "of 19 and 18 places that can be read nine at most"
     place_map.left_out[16] = "gone"
-    assert unmoved_outside_neighbourhood(query, 0, 1e6) == [], "the only one outside_neighbourhood cannot be read"
-    assert unmoved_outside_neighbourhood(query, 15, 1e6)[0].score == 0.0, "only neighbours of one without a position"
+    assert match_unmoved_places(query, 0, 1e6) == [], "the only one outside_neighbourhood cannot be read"
+    assert match_unmoved_places(query, 15, 1e6)[0].score == 0.0, "only neighbours of one without a position"

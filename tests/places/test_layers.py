@@ -35,20 +35,20 @@ def test_a_map_has_a_layer_for_each_footprint_that_it_was_cut_at(tmp_path):
 
 @pytest.mark.parametrize(("seen_m", "among_m"), [(60, 100), (125, 100), (150, 150), (400, 150), (None, None)])
 def test_a_picture_is_looked_for_among_places_that_show_a_little_less(tmp_path, seen_m, among_m):
-    assert layers(tmp_path / "m.gpkg", CUT).fitting(seen_m) == among_m
+    assert layers(tmp_path / "m.gpkg", CUT).choose_footprint(seen_m) == among_m
 
 
 def test_a_search_leaves_out_what_was_cut_otherwise(tmp_path):
     found = layers(tmp_path / "m.gpkg", CUT)
     whole = index_of([1, 2, 3, 4, 5, 9])  # 9 was learnt since
-    assert found.narrow(Expectation(), whole, 150.0).in_reach.tolist() == [True, False, False, True, True, True]
-    assert found.narrow(Expectation(), whole, 90.0).in_reach.tolist() == [False, True, True, False, True, True]
+    assert found.narrow_search(Expectation(), whole, 150.0).in_reach.tolist() == [True, False, False, True, True, True]
+    assert found.narrow_search(Expectation(), whole, 90.0).in_reach.tolist() == [False, True, True, False, True, True]
     near = Expectation(in_reach=np.array([True, True, False, False, False, False]))
-    assert found.narrow(near, whole, 150.0).in_reach.tolist() == [True, False, False, False, False, False]
-    assert found.narrow(near, whole, None) is near
-    assert found.narrow(Expectation(), index_of([2, 3]), 150.0).in_reach is None, "none of them is in reach"
+    assert found.narrow_search(near, whole, 150.0).in_reach.tolist() == [True, False, False, False, False, False]
+    assert found.narrow_search(near, whole, None) is near
+    assert found.narrow_search(Expectation(), index_of([2, 3]), 150.0).in_reach is None, "none of them is in reach"
 
 
 def test_a_map_of_one_layer_is_searched_whole(tmp_path):
     expected = Expectation()
-    assert layers(tmp_path / "m.gpkg", CUT[1:3]).narrow(expected, index_of([1, 2]), 300.0) is expected
+    assert layers(tmp_path / "m.gpkg", CUT[1:3]).narrow_search(expected, index_of([1, 2]), 300.0) is expected

@@ -10,7 +10,7 @@ from ranking import Ruler, rank
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
-from edgevpr.places.geopackage import point_blob
+from edgevpr.places.geopackage import encode_point
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import load_candidates, margin
@@ -68,9 +68,9 @@ DAMAGE = {
     "fine = NULL": "its fine part has a wrong size",
     "fine = 7": "its fine part has a wrong size",
     "fine = x'000000000000f07f', fine_crc32 = NULL": "its fine part is not finite",
-    f"geom = x'{point_blob(1.0, 1.0).hex()}'": "its position has changed",
+    f"geom = x'{encode_point(1.0, 1.0).hex()}'": "its position has changed",
     "geom = NULL": "its position has changed",
-    "geom = 'text'": "its geometry is no point",
+    "geom = 'text'": "its geometry is not a point",
     "place_id = 1000": "its row is gone",
 }
 
@@ -163,7 +163,7 @@ def test_rivals_elsewhere_are_found_among_the_places_that_can_be_read(ruler):
 
 def test_of_one_stage_a_place_left_out_is_still_a_rival_and_never_named(short):
     technique, place_map, index = short
-    damage(place_map, f"geom = x'{point_blob(1.0, 1.0).hex()}'", 140)
+    damage(place_map, f"geom = x'{encode_point(1.0, 1.0).hex()}'", 140)
     ranking = rank(technique, technique.encode(142), place_map, index)
     with pytest.raises(PlaceError, match="position"):
         load_candidates(ranking, index, place_map, 1)

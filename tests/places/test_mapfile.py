@@ -14,8 +14,8 @@ from edgevpr.core.contract import PartSpec
 from edgevpr.core.errors import MapError, PlaceError
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Position
-from edgevpr.places.examine import merge, repair, shrink
-from edgevpr.places.geopackage import point_blob
+from edgevpr.places.examine import merge_maps, repair_map, shrink_map
+from edgevpr.places.geopackage import encode_point
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import connect
 from edgevpr.places.mapinfo import describe_map, read_identity
@@ -34,15 +34,15 @@ def map_path(valley, tmp_path):
 def test_what_is_added_comes_back(map_path):
     with PlaceMap.open(map_path) as place_map:
         assert place_map.spec == SPEC
-        places = list(place_map.places())
+        places = list(place_map.read_places())
         for number, place in enumerate(places):
             added = frame(number)
             assert place.source_image == added.name
             assert place.t_utc_s == pytest.approx(added.t_utc_s, abs=1e-3)
             assert place.heading_deg == added.heading_deg
             assert place.position == added.position
-            np.testing.assert_array_equal(place_map.fine_part(place.place_id)[0], descriptor(number).fine)
-        for number, (_, position, _, coarse) in enumerate(place_map.coarse_parts()):
+            np.testing.assert_array_equal(place_map.read_fine_part(place.place_id)[0], descriptor(number).fine)
+        for number, (_, position, _, coarse) in enumerate(place_map.read_coarse_parts()):
             np.testing.assert_array_equal(coarse, descriptor(number).coarse)
             assert (position is None) == (frame(number).position is None)
         info = describe_map(place_map)
@@ -93,14 +93,14 @@ def test_sqlite_full_says_make_room(map_path):
 def test_another_technique_or_parameter_is_refused_by_name(map_path):
     with PlaceMap.open(map_path) as place_map:
         with pytest.raises(MapError, match="seed"):
-            place_map.require(dataclasses.replace(SPEC, parameters={"seed": 2}))
+            place_map.require_technique(dataclasses.replace(SPEC, parameters={"seed": 2}))
         with pytest.raises(MapError, match="hog"):
-            place_map.require(dataclasses.replace(SPEC, name="hog"))
+            place_map.require_technique(dataclasses.replace(SPEC, name="hog"))
         with pytest.raises(MapError, match="abc"):
-            place_map.require(dataclasses.replace(SPEC, model_sha256="abc"))
+            place_map.require_technique(dataclasses.replace(SPEC, model_sha256="abc"))
         with pytest.raises(MapError, match="12x12x8"):
-            place_map.require(dataclasses.replace(SPEC, coarse=PartSpec((12, 12, 8), "<f2")))
-        place_map.require(SPEC)
+            place_map.require_technique(dataclasses.replace(SPEC, coarse=PartSpec((12, 12, 8), "<f2")))
+        place_map.require_technique(SPEC)
 
 
 def test_a_map_from_before_the_release_is_read_and_one_of_another_format_refused(map_path):
@@ -112,7 +112,7 @@ def test_a_map_from_before_the_release_is_read_and_one_of_another_format_refused
 
 def test_an_existing_map_is_never_overwritten(map_path):
     before = map_path.read_bytes()
-    with pytest.raises(MapError, match="there already"):
+    with pytest.raises(MapError, match="exists already"):
         PlaceMap.create(map_path, SPEC)
     assert map_path.read_bytes() == before
 
@@ -121,15 +121,15 @@ def test_merging_copies_what_is_new_and_refuses_what_differs(map_path, tmp_path)
     with PlaceMap.create(tmp_path / "other.gpkg", SPEC) as other:
         for number in (8, 9, 10, 11):
             other.add(frame(number), descriptor(number))
-    assert merge([map_path, other.path], tmp_path / "both.gpkg") == ([(10, 0), (2, 2)], False)
+    assert merge_maps([map_path, other.path], tmp_path / "both.gpkg") == ([(10, 0), (2, 2)], False)
     with PlaceMap.open(tmp_path / "both.gpkg") as both:
         assert len(both) == 12
         assert describe_map(both).extent[2] == pytest.approx(50.0011)
-        np.testing.assert_array_equal(both.fine_part(12)[0], descriptor(11).fine)
+        np.testing.assert_array_equal(both.read_fine_part(12)[0], descriptor(11).fine)
     with PlaceMap.create(tmp_path / "third.gpkg", dataclasses.replace(SPEC, parameters={"seed": 3})) as third:
         pass
     with pytest.raises(MapError, match="seed"):
-        merge([third.path, map_path], tmp_path / "none.gpkg")
+        merge_maps([third.path, map_path], tmp_path / "none.gpkg")
     assert not (tmp_path / "none.gpkg").exists()
 
 
@@ -144,7 +144,7 @@ def test_what_is_kept_beside_the_places_may_be_damaged(map_path, value):
     write_sql(map_path, f"UPDATE edgevpr_map SET value = {value} WHERE key IN ('mask_sha256', 'calibration')")
     with PlaceMap.open(map_path) as place_map:
         assert (place_map.mask_sha256, place_map.calibration) == (None, None)
-        assert len(list(place_map.places())) == 10
+        assert len(list(place_map.read_places())) == 10
 
 
 def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_known_of_them(map_path, tmp_path):
@@ -154,14 +154,14 @@ def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_kno
         place_map.record_calibration("how sure")
         for owner in ("Survey of X", None, "City of Y", "Survey of X"):
             place_map.add_attribution(owner)
-    assert shrink(map_path, tmp_path / "small.gpkg", 4) == (4, 10)
+    assert shrink_map(map_path, tmp_path / "small.gpkg", 4) == (4, 10)
     write_sql(map_path, "UPDATE places SET coarse = x'00' WHERE place_id = 2")
-    repair(map_path)
+    repair_map(map_path)
     with PlaceMap.open(map_path) as repaired, PlaceMap.open(tmp_path / "small.gpkg") as small:
         for each in (repaired, small):
             assert (each.mask_sha256, each.lens, each.calibration) == ("m", "lens.yaml", "how sure")
             assert each.attribution == "Survey of X; City of Y"
-            for place in each.places():
+            for place in each.read_places():
                 assert place.source_image == f"{place.place_id - 1:05d}.jpg"
         assert len(repaired) == 9
 
@@ -169,8 +169,8 @@ def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_kno
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ("geom = x'4750000100'", "its geometry is no point"),
-        (f"geom = x'{point_blob(50.0, 8.0).hex().replace('e6100000', '110f0000')}'", "in the reference system 3857"),
+        ("geom = x'4750000100'", "its geometry is not a point"),
+        (f"geom = x'{encode_point(50.0, 8.0).hex().replace('e6100000', '110f0000')}'", "in the reference system 3857"),
         (f"coarse = x'{'00' * 126}007c', coarse_crc32 = NULL", "its coarse part is not finite"),
         (f"coarse = x'{'00' * 128}'", "its coarse part does not match its checksum"),
         ("coarse = x'00'", "its coarse part has a wrong size"),
@@ -179,25 +179,25 @@ def test_a_smaller_and_a_repaired_map_keep_the_numbers_of_places_and_what_is_kno
         ("alt_m = 9e999", "its alt_m is inf"),
         ("alt_m = 1e18", "its alt_m is 1e[+]18"),
         ("quality = 1.5", "its quality is 1.5"),
-        ("source_image = CAST('a.jpg' AS BLOB)", "its source_image is no text"),
-        ("source_image = CAST(x'ff41' AS TEXT)", "its source_image is no text"),
+        ("source_image = CAST('a.jpg' AS BLOB)", "its source_image is not text"),
+        ("source_image = CAST(x'ff41' AS TEXT)", "its source_image is not text"),
     ],
 )
 def test_what_another_program_has_spoilt_is_named(map_path, change, says):
     write_sql(map_path, f"UPDATE places SET {change} WHERE place_id = 3")
     with PlaceMap.open(map_path) as place_map:
-        assert [place_id for place_id, *_ in place_map.coarse_parts()] == [1, 2, *range(4, 11)]
+        assert [place_id for place_id, *_ in place_map.read_coarse_parts()] == [1, 2, *range(4, 11)]
         assert list(place_map.left_out) == [3]
         assert re.search(says, place_map.left_out[3])
         if "coarse" not in change:
             with pytest.raises(PlaceError, match=f"place 3 .*{says}"):
-                list(place_map.places())
+                list(place_map.read_places())
 
 
 def test_a_time_of_another_form_is_no_time(map_path):
     write_sql(map_path, "UPDATE places SET time = '2016/06/23 10:00'")
     with PlaceMap.open(map_path) as place_map:
-        assert {place.t_utc_s for place in place_map.places()} == {None}
+        assert {place.t_utc_s for place in place_map.read_places()} == {None}
 
 
 def test_a_place_is_known_again_where_the_last_bits_differ_and_not_where_the_picture_does(map_path):
@@ -205,7 +205,7 @@ def test_a_place_is_known_again_where_the_last_bits_differ_and_not_where_the_pic
     with PlaceMap.open(map_path) as place_map:
         ids = [place_id for found in place_map.select_ids("source_image").values() for place_id in found]
         for place_id in ids:
-            coarse = next(part for number, _, _, part in place_map.coarse_parts() if number == place_id)
+            coarse = next(part for number, _, _, part in place_map.read_coarse_parts() if number == place_id)
             for off, same in ((0.0, True), (1e-4, True), (0.5, False)):
                 other = coarse + off * np.linalg.norm(coarse) * unit(rng, coarse.shape)
                 assert place_map.has_descriptor(place_id, other) is same
@@ -234,7 +234,7 @@ def test_one_map_of_several_names_the_owners_of_all(tmp_path):
         with PlaceMap.create(path, SPEC) as place_map:
             assert place_map.attribution is None
             place_map.add_attribution(None if path.stem == "None" else path.stem)
-    merge(list(map(str, paths)), tmp_path / "all.gpkg")
+    merge_maps(list(map(str, paths)), tmp_path / "all.gpkg")
     with PlaceMap.open(tmp_path / "all.gpkg") as merged:
         assert merged.attribution == "Y; X"
 

@@ -7,8 +7,8 @@ from map_writer import SPEC, descriptor, frame, write_sql
 
 from edgevpr.core.errors import PlaceError
 from edgevpr.core.types import Pose, Position
-from edgevpr.places.examine import check, examine, merge, repair
-from edgevpr.places.geopackage import point_blob
+from edgevpr.places.examine import check_map, check_places, merge_maps, repair_map
+from edgevpr.places.geopackage import encode_point
 from edgevpr.places.mapfile import PlaceMap
 
 POSE = Pose(up_deg=271.5, footprint_m=66.0, covariance_m2=(4.0, -1.0, 2.25), recorded=Position(50.1, 8.2))
@@ -26,14 +26,14 @@ def posed(tmp_path):
 
 
 def test_pose_and_landmarks_come_back_and_a_place_may_have_none(posed, tmp_path):
-    assert merge([posed], tmp_path / "copy.gpkg") == ([(2, 0)], False)
+    assert merge_maps([posed], tmp_path / "copy.gpkg") == ([(2, 0)], False)
     with PlaceMap.open(posed) as place_map, PlaceMap.open(tmp_path / "copy.gpkg") as copy:
         for each in (place_map, copy):
-            first, second = each.places()
+            first, second = each.read_places()
             assert first.pose == POSE
             assert second.pose is None
             assert (each.read_landmarks(1), each.read_landmarks(2)) == (LANDMARKS, None)
-            assert {found.problem for found in examine(each)} == {None}
+            assert {found.problem for found in check_places(each)} == {None}
             assert (
                 None not in each.db.execute("SELECT geom_crc32, coarse_crc32 FROM places WHERE place_id = 2").fetchone()
             )
@@ -47,8 +47,8 @@ def test_pose_and_landmarks_come_back_and_a_place_may_have_none(posed, tmp_path)
         ("footprint_m = -1, pose_crc32 = NULL", "its footprint_m is -?[19]"),
         ("footprint_m = 9e99, pose_crc32 = NULL", "its footprint_m is -?[19]"),
         ("up_deg = 'north', pose_crc32 = NULL", "its up_deg is 'north'"),
-        ("up_deg = NULL, pose_crc32 = NULL", "pose is not whole"),
-        ("cov_east_north_m2 = 99, pose_crc32 = NULL", "pose has no covariance"),
+        ("up_deg = NULL, pose_crc32 = NULL", "pose is incomplete"),
+        ("cov_east_north_m2 = 99, pose_crc32 = NULL", "pose has an impossible covariance"),
         ("recorded_lat_deg = 91, pose_crc32 = NULL", "its recorded_lat_deg is 91"),
         ("landmarks = x'00'", "set of landmarks does not match its checksum"),
         ("landmarks = zeroblob(20000)", "its landmarks have a wrong size"),
@@ -57,26 +57,26 @@ def test_pose_and_landmarks_come_back_and_a_place_may_have_none(posed, tmp_path)
 def test_a_pose_that_cannot_be_true_is_not_believed(posed, change, says):
     write_sql(posed, f"UPDATE places SET {change} WHERE place_id = 1")
     with PlaceMap.open(posed) as place_map:
-        (broken,) = [each for each in examine(place_map) if each.problem]
+        (broken,) = [each for each in check_places(place_map) if each.problem]
         assert broken.place_id == 1
         with pytest.raises(PlaceError, match=says):
-            [*place_map.places([1]), place_map.read_landmarks(1)]
+            [*place_map.read_places([1]), place_map.read_landmarks(1)]
 
 
 def test_repair_keeps_a_place_whose_landmarks_alone_are_damaged_without_them(posed):
     write_sql(posed, "UPDATE places SET landmarks = x'00' WHERE place_id = 1")
-    found = check(posed)
+    found = check_map(posed)
     assert (found.places, found.total, len(found.damaged)) == (2, 2, 1)
-    repair(posed)
-    assert check(posed).is_whole
+    repair_map(posed)
+    assert check_map(posed).is_whole
     with PlaceMap.open(posed) as place_map:
-        assert [place.place_id for place in place_map.places()] == [1, 2]
+        assert [place.place_id for place in place_map.read_places()] == [1, 2]
         assert place_map.read_landmarks(1) is None
 
 
 def test_a_place_moved_by_another_program_keeps_its_pose_and_forgets_where_it_was_recorded(posed):
-    write_sql(posed, f"UPDATE places SET geom = x'{point_blob(51.0, 9.0).hex()}' WHERE place_id = 1")
+    write_sql(posed, f"UPDATE places SET geom = x'{encode_point(51.0, 9.0).hex()}' WHERE place_id = 1")
     with PlaceMap.open(posed) as place_map:
-        (place,) = place_map.places([1])
+        (place,) = place_map.read_places([1])
     assert place.pose == dataclasses.replace(POSE, recorded=None)
     assert (place.position.lat_deg, place.position.lon_deg) == (51.0, 9.0)

@@ -61,10 +61,12 @@ def places_of(path: Path) -> int:
     """How many places a map has, each as it was added; the log is merged, and SQLite finds the file whole."""
     with PlaceMap.open(path) as place_map:
         assert place_map.spec == SPEC
-        places = list(place_map.places())
+        places = list(place_map.read_places())
         assert [place.source_image for place in places] == [frame(number).name for number in range(len(places))]
         for place in places:
-            np.testing.assert_array_equal(place_map.fine_part(place.place_id)[0], descriptor(place.place_id - 1).fine)
+            np.testing.assert_array_equal(
+                place_map.read_fine_part(place.place_id)[0], descriptor(place.place_id - 1).fine
+            )
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
     with contextlib.closing(sqlite3.connect(path)) as db:
         assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)

@@ -9,7 +9,7 @@ from ranking import index_of
 
 from edgevpr.core.contract import FineMatch
 from edgevpr.places.retrieve import Ranking
-from edgevpr.places.sequence import SequenceSearch, bytes_beside_place
+from edgevpr.places.sequence import SequenceSearch, compute_sequence_bytes
 
 FOLLOWED = (0.8, 0.9, 1.0, 1.1, 1.2)
 OTHERS = [quarter / 4 for quarter in range(-10, 13) if quarter != 4]
@@ -50,7 +50,7 @@ def dense(ranking, places):
 
 
 def followed(sequence, scores, index, step_s=1.0):
-    return [sequence.follow(ranked(row), index, at * step_s) for at, row in enumerate(scores)]
+    return [sequence.add_query(ranked(row), index, at * step_s) for at, row in enumerate(scores)]
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_two_stages_leave_places_out_and_are_the_same_search(scores):
     sparse = np.repeat(np.median(compared, axis=1)[:, None], 40, axis=1)  # the usual score, where none was made
     np.put_along_axis(sparse, candidates, compared, axis=1)
     sequence, index = SequenceSearch(4), index_of(range(40))
-    rankings = [sequence.follow(ranked(scores[at], candidates[at]), index, at) for at in range(25)]
+    rankings = [sequence.add_query(ranked(scores[at], candidates[at]), index, at) for at in range(25)]
     np.testing.assert_allclose(np.stack([dense(each, 40) for each in rankings]), literal(sparse, 4), rtol=1e-5)
 
 
@@ -90,8 +90,8 @@ def test_a_flight_through_lookalikes_is_told_by_what_came_before():
 
 def test_matches_keep_the_step_of_the_newest_query_and_have_the_score_of_the_sequence(scores):
     sequence, index = SequenceSearch(3), index_of(range(40))
-    sequence.follow(ranked(scores[0], range(20)), index, 0.0)
-    ranking = sequence.follow(ranked(scores[1], range(10, 30)), index, 1.0)
+    sequence.add_query(ranked(scores[0], range(20)), index, 0.0)
+    ranking = sequence.add_query(ranked(scores[1], range(10, 30)), index, 1.0)
     assert (np.diff(ranking.scores) <= 0).all()
     assert set(ranking.slots) == set(range(40))
     assert set(ranking.compared) == set(range(10, 30))
@@ -104,10 +104,10 @@ def test_a_gap_in_time_begins_a_new_sequence(scores):
     sequence, index = SequenceSearch(5), index_of(range(40))
     followed(sequence, scores[:5], index)
     assert sequence.frames == 5
-    fresh = sequence.follow(ranked(scores[5]), index, 4.0 + 5.1)
+    fresh = sequence.add_query(ranked(scores[5]), index, 4.0 + 5.1)
     assert sequence.frames == 1
     np.testing.assert_array_equal(dense(fresh, 40), scores[5])
-    sequence.follow(ranked(scores[6]), index, 10.0)
+    sequence.add_query(ranked(scores[6]), index, 10.0)
     assert sequence.frames == 2
 
 
@@ -120,24 +120,24 @@ def test_memory_is_what_the_budget_is_told_and_no_more_is_kept():
     sequence = SequenceSearch(length)
     tracemalloc.start()
     for at in range(3 * length):
-        sequence.follow(few, index, float(at))
+        sequence.add_query(few, index, float(at))
     kept, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert kept < 1.02 * places * bytes_beside_place(length) == 1.02 * places * 44
+    assert kept < 1.02 * places * compute_sequence_bytes(length) == 1.02 * places * 44
 
 
 @pytest.mark.parametrize(
-    ("queries", "least", "goes_on"),
+    ("queries", "least", "is_continued"),
     [
         ([(5, 0.5), (6, 0.4), (7, 0.3)], 0.299, True),
         ([(5, 0.5), (6, 0.4), (7, 0.3)], 0.31, False),  # too low for one query
         ([(5, 0.9), (60, 0.1), (20, 0.1)], 0.0, False),  # the newest was not compared with the place
     ],
 )
-def test_the_newest_query_must_still_see_the_place(queries, least, goes_on):
+def test_the_newest_query_must_still_see_the_place(queries, least, is_continued):
     sequence, near = SequenceSearch(3), abs(np.arange(80) - 7) <= 2
     index = index_of(range(80))
     for query, (slot, score) in enumerate(queries):
         slots, scores = np.array([slot, 40, 50]), np.array([score, 0.1, 0.1], np.float32)
-        sequence.follow(Ranking(slots=slots, scores=scores, compared={}), index, float(query))
-    assert sequence.goes_on(near, min_score=least) == goes_on
+        sequence.add_query(Ranking(slots=slots, scores=scores, compared={}), index, float(query))
+    assert sequence.is_continued(near, min_score=least) == is_continued

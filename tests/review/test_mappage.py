@@ -31,7 +31,7 @@ def mapped(tmp_path_factory):
     with PlaceMap.open_for_adding(folder / "valley.gpkg") as place_map, place_map.transaction():
         for place in places:
             recorded = Position(*position(9.0, 90.0)) if place.place_id == 3 else place.position
-            place_map.lay(place.place_id, place.position, replace(place.pose, recorded=recorded))
+            place_map.move_place(place.place_id, place.position, replace(place.pose, recorded=recorded))
     return folder
 
 

@@ -27,10 +27,10 @@ from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
 from edgevpr.mapmaking.finishing import finish_map, make_encoder
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.mapmaking.pictures import FlownPictures
-from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import outside_neighbourhood
-from edgevpr.places.sequence import make_sequence_search, sequence_length
+from edgevpr.places.sequence import make_sequence_search
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack, queries_ah
 from edgevpr.power.meter import QueryMeter, compute_query_cost
@@ -126,7 +126,7 @@ def answer_queries(
     what `options.known` asks for, ModelError for a query that fails."""
     spec = technique.spec
     prior, tags = read_prior(options.known, dataset, spec, options.sequence)
-    together = sequence_length(spec, options.sequence)
+    together = options.sequence or spec.sequence
     source, meter = open_source(str(dataset.ref_dir), live=False), QueryMeter(load_board("this"))
     frames = progress(read_frames(source), source.total, f"{spec.name}: references")
     with open_temporary_map(frames, technique, dataset.ref_dir, progress) as (place_map, index, not_done):
@@ -182,7 +182,7 @@ def open_temporary_map(
             encoder = make_encoder(SourceConfig(), pictures, technique)
             finished = finish_map(place_map, encoder, MatchConfig(), pictures, show)
         with PlaceMap.open(path) as place_map:
-            index = load_index(place_map, technique, len(place_map) * bytes_per_place(technique.spec))
+            index = load_index(place_map, technique, len(place_map) * compute_place_bytes(technique.spec))
             # The folder is gone when the sentences are read, and another one in the next run.
             yield place_map, index, tuple(sentence.replace(f"{folder}/", "") for sentence in finished.not_done)
 
@@ -197,7 +197,7 @@ def summarise(
     """Return the result of `technique`, without the PCU, from its answers to all queries, which were asked by
     `options` on a map to which something could not be done."""
     queries, references = len(answers), len(dataset.references)
-    sequence = sequence_length(technique.spec, options.sequence)
+    sequence = options.sequence or technique.spec.sequence
     battery, board = BatteryConfig(), load_board("this")
     efficiency = battery.regulator_efficiency
     encoding, matching = (
@@ -245,7 +245,7 @@ def read_prior(
     if not (parts := parse_known_fields(text)):
         return None, {}
     queries, places = read_tags(dataset.queries[0].path.parent), read_tags(dataset.ref_dir)
-    if why := explain_useless(parts, queries.values(), places.values(), sequence_length(spec, sequence)):
+    if why := explain_useless(parts, queries.values(), places.values(), sequence or spec.sequence):
         raise UsageError(why)
     query_heights_m, map_heights_m = (
         [tag.height_m for tag in tags.values() if tag.height_m is not None and tag.height_m > 0]

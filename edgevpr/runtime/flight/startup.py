@@ -61,7 +61,7 @@ def find_origin(place_map: PlaceMap, source: SourceConfig) -> Position | None:
     first, altitudes_m, lens = None, [], read_camera_lens(source)
     has_lens_of_map = place_map.lens is None or place_map.lens == (source.lens and Path(source.lens).name)
     with suppress(PlaceError):  # a damaged place ends the search
-        for place in islice((place for place in place_map.places() if place.position), _ORIGIN_PLACES):
+        for place in islice((place for place in place_map.read_places() if place.position), _ORIGIN_PLACES):
             position, pose = place.position, place.pose
             first = first or position
             if position and position.alt_m is not None and pose and not pose.is_surveyed and lens and has_lens_of_map:

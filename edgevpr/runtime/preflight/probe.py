@@ -15,11 +15,11 @@ from edgevpr.core.arrays import Image
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import ModelError
 from edgevpr.core.types import NO_COST, Frame, StageCost, StepCosts
-from edgevpr.places.index import PlaceIndex, bytes_per_place, load_index
+from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import times_as_many
+from edgevpr.places.retrieve import compute_candidate_factor
 from edgevpr.places.rows import MAX_LANDMARK_BYTES
-from edgevpr.places.sequence import bytes_beside_place, make_sequence_search, sequence_length
+from edgevpr.places.sequence import compute_sequence_bytes, make_sequence_search
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
@@ -48,7 +48,7 @@ class TechniqueCosts:
     `candidates`: number of places compared in a larger map, after all its places are scanned in RAM (None: the
     technique has one stage, and compares all). `scan_per_place`: cost of scanning one place. `scan_once`: cost of
     preparing a query for the scan.
-    `tries_rotations`: more candidates are compared in a large map (see `times_as_many`).
+    `tries_rotations`: more candidates are compared in a large map (see `compute_candidate_factor`).
     `process_mb`: peak resident memory of the process without a map.
     `is_network`: pictures go through a network. `sequence`: number of queries matched together.
     """
@@ -71,14 +71,14 @@ class TechniqueCosts:
         """Return the cost of matching one query in a map of `places` places."""
         if self.candidates is None:
             return self.match_per_place * places
-        compared = min(places, self.candidates * times_as_many(self.tries_rotations, places))
+        compared = min(places, self.candidates * compute_candidate_factor(self.tries_rotations, places))
         full = self.compare_once * min(1.0, compared / self.in_full)
         return self.scan_once + full + self.match_per_place * compared + self.scan_per_place * places
 
 
 def compute_ram_bytes(spec: TechniqueSpec, sequence: int) -> int:
     """Return the bytes of RAM that a place takes in a flight that matches `sequence` queries together."""
-    return bytes_per_place(spec) + bytes_beside_place(sequence)
+    return compute_place_bytes(spec) + compute_sequence_bytes(sequence)
 
 
 def compute_disk_bytes(spec: TechniqueSpec) -> int:
@@ -99,12 +99,12 @@ def measure_costs(technique: Technique, *, repeat_s: float = 0.0, meter: QueryMe
     with TemporaryDirectory() as folder, PlaceMap.create(Path(folder) / "trial.gpkg", spec) as trial_map:
         peak_is_new = machine.reset_peak()
         bench.fill(trial_map)
-        index = load_index(trial_map, technique, _TRIAL_PLACES * bytes_per_place(spec))
+        index = load_index(trial_map, technique, _TRIAL_PLACES * compute_place_bytes(spec))
         # For a technique with one stage the small map shows only how much memory a query takes.
         small = bench.try_map(trial_map, index, 1, _MAX_TRIES if spec.fine else 1)
         process_mb = machine.read_peak_mb() if peak_is_new else machine.read_rss_mb()
         large_index = _repeat_places(technique, index)
-        times = times_as_many(bool(spec.height_ratios), len(large_index))
+        times = compute_candidate_factor(bool(spec.height_ratios), len(large_index))
         most, fewer = (round(count / times) for count in (candidates, max(spec.in_full or 1, candidates // 2)))
         large = bench.try_map(trial_map, large_index, most)
         half = bench.try_map(trial_map, large_index, fewer) if spec.in_full else large
@@ -142,7 +142,7 @@ class _Bench:
     that the technique matches together. `repeat_s`: seconds for the repetitions."""
 
     def __init__(self, technique: Technique, meter: QueryMeter, repeat_s: float) -> None:
-        self.sequence = sequence_length(technique.spec, None)
+        self.sequence = technique.spec.sequence
         self._technique, self._meter, self._repeat_s = technique, meter, repeat_s
         rng = Random(0)  # not NumPy's: it takes 2.5 MB, and a flight needs it for nothing else
         pictures = [np.frombuffer(rng.randbytes(480 * 640), np.uint8) for _ in range(_TRIAL_PICTURES)]

@@ -16,14 +16,14 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import (
-    MAX_BESIDE,
-    NOTHING,
+    MAX_NEIGHBOUR_SLOTS,
+    NO_EXPECTATION,
     Expectation,
     Query,
     Ranking,
     load_candidates,
+    match_unmoved_places,
     outside_neighbourhood,
-    unmoved_outside_neighbourhood,
 )
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
@@ -116,13 +116,17 @@ class Verifier:
         return 0 if found is None or found.is_at_rest else found.inliers
 
     def count_rival(
-        self, ranking: Ranking, neighbour_m: float, same: Collection[int] = (), beside: int = MAX_BESIDE
+        self,
+        ranking: Ranking,
+        neighbour_m: float,
+        same: Collection[int] = (),
+        max_slots: int = MAX_NEIGHBOUR_SLOTS,
     ) -> int:
         """Return the number of landmarks of the query and of the best place elsewhere (see `places.retrieve.elsewhere`)
         that agree on the overlay of its match: 0 if there is no place elsewhere, the largest possible number if its
         landmarks are unknown. Places with the numbers `same` are not elsewhere."""
         away = ranking.slots[
-            outside_neighbourhood(self._index, int(ranking.slots[0]), ranking.slots, neighbour_m, same, beside)
+            outside_neighbourhood(self._index, int(ranking.slots[0]), ranking.slots, neighbour_m, same, max_slots)
         ]
         if not len(away):
             return 0
@@ -274,7 +278,7 @@ class Decider:
         if is_ahead and rule.sure and evidence and (self.settings.all_evidence or rule.sure.is_open(evidence)):
             with step("verify"):
                 inliers = verifier.count_inliers(ranking)
-                rival = verifier.count_rival(ranking, rule.neighbour_m, beside=count_neighbours(rule.look_alikes))
+                rival = verifier.count_rival(ranking, rule.neighbour_m, max_slots=count_neighbours(rule.look_alikes))
             evidence = replace(evidence, proof=log_times_more(inliers, rival), landmarks=log_count(inliers))
         if evidence and proof and evidence.is_hardly_ahead:
             with step("verify"):
@@ -288,7 +292,7 @@ class Decider:
         if evidence is None:
             return None
         with self.meter.step("compare"):
-            fine, _ = self.place_map.fine_part(best.place.place_id)
+            fine, _ = self.place_map.read_fine_part(best.place.place_id)
             return evidence.agree - log_share(
                 compute_share(self.technique.match_rotated(query.descriptor, fine, best.match))
             )
@@ -296,7 +300,7 @@ class Decider:
     def _measure_tilt(self, best: Candidate, query: EncodedFrame) -> ShownTilt:
         """Return the tilt of the query against the place, as both show it."""
         with self.meter.step("compare"):
-            fine, _ = self.place_map.fine_part(best.place.place_id)
+            fine, _ = self.place_map.read_fine_part(best.place.place_id)
             if found := self.technique.measure_perspective(query.descriptor, fine, best.match):
                 found = measure_again(query.picture, self.technique, fine, found)
             return convert_to_tilt(found, query.view.focal)
@@ -308,7 +312,7 @@ class Decider:
         if not is_at_rest(best):
             return 0.0
         with self.meter.step("compare"):
-            query = self.make_query(encoded.descriptor, NOTHING)
-            matches = unmoved_outside_neighbourhood(query, int(ranking.slots[0]), self.accuracy_m)
+            query = self.make_query(encoded.descriptor, NO_EXPECTATION)
+            matches = match_unmoved_places(query, int(ranking.slots[0]), self.accuracy_m)
         least = _LIKE_AT_REST * compute_share(best)
         return sum(is_at_rest(match) and compute_share(match) >= least for match in matches) / max(len(matches), 1)

@@ -27,7 +27,7 @@ import numpy as np
 
 from edgevpr.core.contract import FineMatch, TechniqueSpec
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.retrieve import MAX_BESIDE, Ranking, outside_neighbourhood
+from edgevpr.places.retrieve import MAX_NEIGHBOUR_SLOTS, Ranking, outside_neighbourhood
 from edgevpr.runtime.recognise.agreement import Agreement
 
 AHEAD, AHEAD_PROVEN, DOWN, DOWN_BARE = "ahead", "ahead_proven", "down", "down_bare"
@@ -211,7 +211,7 @@ def gather_evidence(
 
 def count_neighbours(look_alikes: LookAlikes | None) -> int:
     """Return how many places before and after one without a position, in the order of mapping, are its neighbours."""
-    return MAX_BESIDE if look_alikes is None or look_alikes.overlap else 0
+    return MAX_NEIGHBOUR_SLOTS if look_alikes is None or look_alikes.overlap else 0
 
 
 def log_times_more(inliers: int, rival: int) -> float:

@@ -232,7 +232,7 @@ class Prior(RecordedPrior):
             height_ratio, layer_m = scale * match.match.height_ratio, self.footprint_m
             if layers and len(layers.footprints_m) > 1 and match.place.pose:
                 seen_m = height_ratio * match.place.pose.footprint_m
-                layer_m = footprint_m or layers.fitting(seen_m)
+                layer_m = footprint_m or layers.choose_footprint(seen_m)
                 height_ratio = seen_m / (layer_m or seen_m)
             if layer_m != self.footprint_m or abs(math.log(height_ratio / self.height_ratio)) > math.log(_SAME_SCALE):
                 self.footprint_m, self.height_ratio = layer_m, height_ratio
@@ -275,7 +275,7 @@ def explain_useless(
 
 def _narrowing(reach: Reach | None, heading_deg: float | None, index: PlaceIndex) -> Hints | None:
     """Return what narrows a search of the index; None if nothing does. An area of all places or of none does not."""
-    if reach and not 0 < index.within(reach.position, reach.radius_m).sum() < len(index):
+    if reach and not 0 < index.find_within(reach.position, reach.radius_m).sum() < len(index):
         reach = None
     if not index.knows_headings:
         heading_deg = None
@@ -286,7 +286,7 @@ def to_expectation(hints: Hints | None, height_ratio: float, index: PlaceIndex) 
     """Convert hints and height into what a search expects of each place of the index (see `Expectation`)."""
     in_reach = turned_deg = None
     if hints and hints.reach:
-        in_reach = index.within(hints.reach.position, hints.reach.radius_m)
+        in_reach = index.find_within(hints.reach.position, hints.reach.radius_m)
     if hints and hints.heading_deg is not None:
         turned_deg = (hints.heading_deg - index.heading_deg.astype(float)) % 360
     return Expectation(in_reach, turned_deg, height_ratio)

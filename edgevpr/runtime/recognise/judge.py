@@ -290,7 +290,7 @@ def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: S
     if ranking.compared and int(ranking.slots[0]) not in ranking.compared:
         return Reason(ReasonCode.NEWEST_DISAGREES)
     away = outside_neighbourhood(index, int(ranking.slots[0]), np.arange(len(index)), rule.neighbour_m)
-    if not search.goes_on(~away, rule.min_score):
+    if not search.is_continued(~away, rule.min_score):
         return Reason(ReasonCode.NEWEST_LEFT)
     ahead_of_rivals = float(ranking.scores[0]) - float(search.rivals[away].max(initial=0))
     needed = _MARGIN_SHARE_AT_OTHER_SPEEDS * rule.min_margin

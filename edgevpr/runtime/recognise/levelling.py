@@ -82,7 +82,7 @@ class Levelling:
                 LevelledImage(frame.image, overlay, estimate_tilted_view(frame, vehicle, self.mount)), scale
             )
         own_m = compute_footprint(frame, vehicle, self.lens) if layers else None
-        footprint_m = layers.fitting(own_m and scale * own_m) if layers else None
+        footprint_m = layers.choose_footprint(own_m and scale * own_m) if layers else None
         picture = level_image(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self.below, scale=scale)
         if picture.view.reason and not self._has_warned:
             self._has_warned = True

@@ -12,7 +12,7 @@ from edgevpr.frames.mask import OverlayMask, load_mask
 from edgevpr.frames.source import is_live
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.sequence import bytes_beside_place, make_sequence_search, sequence_length
+from edgevpr.places.sequence import compute_sequence_bytes, make_sequence_search
 from edgevpr.power.boards import Board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import read_calibration_for
@@ -59,8 +59,8 @@ def open_recogniser(
         wanted = {"camera": source.camera, "matching": match.matching, "form": match.form}
         given = {name: value for name, value in wanted.items() if value}
         technique = create_technique(place_map, config.technique, given, board)
-        length = sequence_length(technique.spec, match.sequence)
-        index = load_index(place_map, technique, int(board.budget_mb * 1e6), beside_bytes=bytes_beside_place(length))
+        length = match.sequence or technique.spec.sequence
+        index = load_index(place_map, technique, int(board.budget_mb * 1e6), compute_sequence_bytes(length))
         mask = load_mask(source.mask)
         warn_of_other_pictures(place_map, mask, source.lens)
         levelling, gate = make_levelling(source, technique), open_salience_gate(config.salience, board.threads)
@@ -87,7 +87,7 @@ def open_recogniser(
             place_filter=place_filter,
         )
         if narrowed:
-            place_map.wait_at_most(_MAX_WAIT_S)
+            place_map.set_max_wait(_MAX_WAIT_S)
         on_error.pop_all()
     return recogniser
 
@@ -150,7 +150,7 @@ def create_technique(
             ) from error
     else:
         technique = make_technique(threads, name, settings)
-    place_map.require(technique.spec)
+    place_map.require_technique(technique.spec)
     return technique
 
 

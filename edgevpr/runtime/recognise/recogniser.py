@@ -15,7 +15,7 @@ from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.level import Mount, View
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Expectation, Ranking, compare, merge_rankings, scan
+from edgevpr.places.retrieve import Expectation, Ranking, compare_places, merge_rankings, scan_index
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Decider, Decision, Matcher, Verifier, WalkSettings
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, explain_failure
@@ -209,9 +209,9 @@ class Recogniser:
         height_ratio = prior.height_ratio / self._scale
         expected = to_expectation(hints, height_ratio, self.index)
         footprint_m = query.view.footprint_m or prior.footprint_m
-        ranking = self._search(query.descriptor, self._layers.narrow(expected, self.index, footprint_m))
+        ranking = self._search(query.descriptor, self._layers.narrow_search(expected, self.index, footprint_m))
         if search:
-            ranking = search.follow(ranking, self.index, query.frame.t_mono_s)
+            ranking = search.add_query(ranking, self.index, query.frame.t_mono_s)
         decision = self._decider.decide(ranking, query, hints, verifier, place_filter)
         if decision.verdict.accepted or search or not height_ratios or not prior.looks_again:
             return decision
@@ -224,11 +224,11 @@ class Recogniser:
         return self._decider.decide(ranking, query, hints, verifier, place_filter)
 
     def _search(self, descriptor: Descriptor, expected: Expectation, share: float = 1.0) -> Ranking:
-        """Search the map once for a query, with this `share` of the candidates. Raises as `compare` does."""
+        """Search the map once for a query, with this `share` of the candidates. Raises as `compare_places` does."""
         query = self._decider.make_query(descriptor, expected)
         with self.meter.step("scan"):
             self.place_map.require_unchanged()
-            scanned = scan(query)
+            scanned = scan_index(query)
         with self.meter.step("compare"):
             candidates = self.candidates and max(1, round(share * self.candidates))
-            return compare(query, scanned, candidates, max(self.rule.neighbour_m, self._footprint_m))
+            return compare_places(query, scanned, candidates, max(self.rule.neighbour_m, self._footprint_m))

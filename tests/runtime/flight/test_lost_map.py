@@ -8,7 +8,7 @@ import sqlite3
 import pytest
 from flights import PLACES, fly_acts, nothing, of_kind
 
-from edgevpr.places.geopackage import point_blob
+from edgevpr.places.geopackage import encode_point
 from edgevpr.places.mapfile import PlaceMap
 
 SAID = [(4, "edgevpr: map cannot be read, see the log"), (6, "edgevpr: map can be read again")]
@@ -92,7 +92,7 @@ def test_another_map_in_its_place_is_refused_and_said_once(recording, tmp_path, 
     shutil.copy(place_map, other)
     with sqlite3.connect(other) as db:
         for place in range(1, PLACES + 1):
-            db.execute("UPDATE places SET geom = ? WHERE place_id = ?", (point_blob(10.0, place), place))
+            db.execute("UPDATE places SET geom = ? WHERE place_id = ?", (encode_point(10.0, place), place))
         db.execute("UPDATE edgevpr_map SET value = '\"another\"' WHERE key = 'map_id'")
     db.close()
 

@@ -206,7 +206,7 @@ def test_a_sequence_is_not_at_a_place_that_its_newest_query_was_not_compared_wit
 def test_a_sequence_leads_over_those_at_other_speeds_by_half_the_margin(rival, accepted):
     rivals = np.zeros(30, np.float32)
     rivals[10] = rival
-    search = SimpleNamespace(frames=2, length=2, rivals=rivals, goes_on=lambda near, least: True)
+    search = SimpleNamespace(frames=2, length=2, rivals=rivals, is_continued=lambda near, least: True)
     ranking = Ranking(slots=np.array([20, 10]), scores=np.array([0.5, 0.0], np.float32), compared={})
     verdict = judge(Findings(ranking), bare_index(30), replace(RULE, min_margin=0.5), search)
     assert verdict.accepted is accepted
@@ -288,7 +288,7 @@ def flown(velocity, start, leaves=18, seed=3):
         scores = (0.3 + 0.4 * here + 0.02 * noise.random(PLACES)).astype(np.float32)
         slots = np.argsort(-scores)
         ranking = Ranking(slots=slots, scores=scores[slots], compared={})
-        ranking = sequence.follow(ranking, index, float(query))
+        ranking = sequence.add_query(ranking, index, float(query))
         verdict = judge(Findings(ranking), index, RULE_OF_SEQUENCE, sequence)
         found.append((verdict.accepted, verdict.reason.code, int(ranking.slots[0])))
     return found

@@ -10,7 +10,7 @@ from sureness import told
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.core.geodesy import distance_m, offset_m, offset_position
 from edgevpr.core.types import Frame, Pose, Position
-from edgevpr.places.index import PlaceIndex, empty_index
+from edgevpr.places.index import PlaceIndex, allocate_index
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
@@ -34,7 +34,7 @@ def at(place):
 
 def index_of(positions):
     """An index of places with these positions (None: unknown), numbered from 101."""
-    index = empty_index(SPEC, len(positions), None)
+    index = allocate_index(SPEC, len(positions), None)
     index.place_ids[:] = 101 + np.arange(len(positions))
     for slot, position in enumerate(positions):
         index.lat_deg[slot], index.lon_deg[slot] = (position.lat_deg, position.lon_deg) if position else (np.nan,) * 2

@@ -8,7 +8,7 @@ import pytest
 from big_map import file_bytes, make_big_map
 from flight_process import start, watch_memory, write_frames
 
-from edgevpr.places.index import bytes_per_place, load_index
+from edgevpr.places.index import compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.flight.flightlog import read_log
 from edgevpr.techniques import create
@@ -83,10 +83,10 @@ def test_flight_loads_no_library_that_it_does_not_need(flight):
 
 
 # Choosing which places stay takes lists of all of them, for a moment.
-@pytest.mark.parametrize(("share", "beside_bytes"), [(1.0, 1_000_000), (0.5, 2_500_000)])
-def test_load_index_stays_within_its_budget(big_map, share, beside_bytes):
+@pytest.mark.parametrize(("share", "extra_bytes"), [(1.0, 1_000_000), (0.5, 2_500_000)])
+def test_load_index_stays_within_its_budget(big_map, share, extra_bytes):
     technique = create("cohog")
-    budget_bytes = int(share * PLACES) * bytes_per_place(technique.spec)
+    budget_bytes = int(share * PLACES) * compute_place_bytes(technique.spec)
     with PlaceMap.open(big_map) as place_map:
         tracemalloc.start()
         index = load_index(place_map, technique, budget_bytes)
@@ -94,4 +94,4 @@ def test_load_index_stays_within_its_budget(big_map, share, beside_bytes):
         tracemalloc.stop()
     assert len(index) == share * PLACES
     assert index.nbytes <= budget_bytes
-    assert peak_bytes < budget_bytes + beside_bytes
+    assert peak_bytes < budget_bytes + extra_bytes
