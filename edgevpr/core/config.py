@@ -175,7 +175,6 @@ class MavlinkConfig:
     min_accuracy_m: float = bounded_key(1, 10_000, default=5.0)
     source_sets: SourceSetsConfig = SourceSetsConfig()
     set_origin: bool = False
-    ground: str | None = None
     signing_key: str | None = None
     signing_state: str | None = None
 

@@ -1,8 +1,7 @@
-"""Addresses of MAVLink links, parsed from the text in which the user writes them (`mavlink.link`, `mavlink.ground`)."""
+"""Addresses of MAVLink links, parsed from the text in which the user writes them (`mavlink.link`)."""
 
 from dataclasses import dataclass
 
-from edgevpr.core.config import MavlinkConfig
 from edgevpr.core.errors import LinkAddressError
 
 FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
@@ -37,11 +36,3 @@ def parse_link(url: str) -> LinkAddress:
     if not (number.isascii() and number.isdigit() and len(number) < 10 and low <= int(number) <= high):
         raise LinkAddressError(f"{url}: {what}, not {number!r}.")
     return LinkAddress(kind, where, int(number))
-
-
-def parse_links(settings: MavlinkConfig) -> tuple[LinkAddress | None, LinkAddress | None]:
-    """Parse the links to flight controller and ground station (None: no link). Raises LinkAddressError."""
-    flight, ground = settings.link, settings.ground
-    if flight is None and ground is not None:
-        raise LinkAddressError("`mavlink.ground` is a second link: name the flight controller's as `mavlink.link`.")
-    return (None if flight is None else parse_link(flight)), (None if ground is None else parse_link(ground))

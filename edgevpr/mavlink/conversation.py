@@ -6,7 +6,6 @@ import struct
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, field, replace
 
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -16,7 +15,7 @@ from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.clock import HEARTBEAT_TIMEOUT_S
 from edgevpr.mavlink.fixes import MAX_FIX_WAIT_S, Fixes, FixTransmission, compensate_lag
-from edgevpr.mavlink.ground import GCS_MESSAGES, Requests, Texts
+from edgevpr.mavlink.ground import Requests, Texts
 from edgevpr.mavlink.messages import AUTOPILOT, Fix, Health, Severity
 from edgevpr.mavlink.peer import Autopilot, Listener
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
@@ -62,7 +61,6 @@ class Conversation:
         self.interim_fixes: deque[FixTransmission] = deque(maxlen=MAX_MESSAGES)
         self.sent: Counter[str] = Counter()
         self.dropped_queue_full = 0
-        self._gcs: Conversation | None = None
         self._reports: list[tuple[Severity, str, str]] = []
         self._messages: deque[Message] = deque(maxlen=MAX_MESSAGES)
         self._clock = clock
@@ -87,18 +85,11 @@ class Conversation:
         """True if a message or a text waits to be sent, or a fix for its answer."""
         return bool(self._messages or self.texts or self.fixes)
 
-    def copy_to(self, gcs: "Conversation") -> None:
-        """From now on copy health and `GCS_MESSAGES` to a ground station, and obey its requests too."""
-        self._gcs, gcs.requests = gcs, self.requests
-        gcs._packer.srcSystem = self._packer.srcSystem
-
     def send(self, *outgoing: Message) -> None:
         """Queue messages to be sent. If the queue is full, the oldest messages are dropped and counted."""
         for message in outgoing:
             self.dropped_queue_full += len(self._messages) == MAX_MESSAGES
             self._messages.append(message)
-            if self._gcs and message.get_type() in GCS_MESSAGES:
-                self._gcs.send(copy(message))  # packing changes a message, and each link packs it
 
     def send_fix(self, fix: Fix) -> FixTransmission:
         """Queue a position fix. It is sent within `max_fix_age_s` seconds, while the autopilot is alive, or never."""
@@ -114,14 +105,10 @@ class Conversation:
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
         """Queue a status text; one is sent every five seconds. `topic`: its subject (see `Texts`)."""
         self.texts.put(severity, text, topic)
-        if self._gcs:
-            self._gcs.announce(severity, text, topic)
 
     def set_health(self, health: Health) -> None:
         """Set the health to be sent in heartbeats. It holds for ten seconds; without a new call it is then CRITICAL."""
         self._health, self._health_set_s = health, self._clock()
-        if self._gcs:
-            self._gcs.set_health(health)
 
     def request_position(self) -> None:
         """From now on request the autopilot's reports, and again whenever they stop or become rare."""
@@ -170,8 +157,6 @@ class Conversation:
             if self.autopilot.handle(message, now_s, sender):
                 beats = True
                 self._packer.srcSystem = self.autopilot.system_id
-                if self._gcs:
-                    self._gcs._packer.srcSystem = self.autopilot.system_id
                 if self.autopilot.identity.has_moved:
                     self._reset(ReasonCode.AUTOPILOT_REPLACED)
                     self.announce(Severity.WARNING, "autopilot has another address", "autopilot")
@@ -240,7 +225,7 @@ class Conversation:
         else:
             self.fixes.drop_stale(now_s)
         if text := self.texts.next(now_s):
-            return text, None  # not by `send`: the link to the ground station has its own texts
+            return text, None
         return (self._messages.popleft(), None) if self._messages else None
 
     def _next_interim_fix(self, now_s: float) -> FixTransmission | None:

@@ -6,6 +6,7 @@ import select
 import socket
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Protocol
 
@@ -43,18 +44,15 @@ class Driver(Protocol):
         """Send what is queued, wait for the answers to fixes, both for half a second at most, and close the port."""
 
 
-class DriverMaker(Protocol):
-    """Makes the driver of the link `name`."""
-
-    def __call__(self, name: str, address: LinkAddress, conversation: Conversation, turns: Turns, /) -> Driver: ...
+DriverMaker = Callable[[LinkAddress, Conversation, Turns], Driver]
 
 
 class PortDriver:
     """The driver of a real port, which it reopens whenever the connection is lost. A missing device or server is no
     error: the thread tries to open it again and again, and `state` gives the reason."""
 
-    def __init__(self, name: str, address: LinkAddress, conversation: Conversation, turns: Turns) -> None:
-        self._name, self._address, self._conversation, self._turns = name, address, conversation, turns
+    def __init__(self, address: LinkAddress, conversation: Conversation, turns: Turns) -> None:
+        self._address, self._conversation, self._turns = address, conversation, turns
         self._settings = conversation.settings
         self._writer: PacketWriter | None = None
         self._reopened = 0
@@ -115,14 +113,14 @@ class PortDriver:
         if self._closing.wait(self._retry_s):
             return
         self._retry_s = min(2 * self._retry_s, MAX_RETRY_S)
-        with self._turns.take_link_turn(self._name):
+        with self._turns.take_link_turn():
             self._conversation.drop_stale()
         self._writer = self._open()
         self._reopened += 1
 
     def _work(self, line: PacketWriter, timeout_s: float) -> None:
         """Write as much as the port accepts, wait until there is something to do or `timeout_s` is over, and read."""
-        with self._turns.take_link_turn(self._name):
+        with self._turns.take_link_turn():
             if line.port.connected:
                 self._transmit(line)
             self._conversation.announce_changes()
@@ -142,7 +140,7 @@ class PortDriver:
             if self._trouble is not None:
                 log.info("%s is back", self._address)
                 self._trouble = None
-        with self._turns.take_link_turn(self._name):
+        with self._turns.take_link_turn():
             self._count_sent_fixes(line)  # before its answer is read
             self._settings.signing.verdicts.clear()
             beats = self._conversation.handle(data, self._turns.now_s(), line.port.sender)
@@ -170,7 +168,7 @@ class PortDriver:
             self._conversation.count_sent_fixes(departed)
 
     def _handle_loss(self, error: Exception) -> None:
-        with self._turns.take_link_turn(self._name):
+        with self._turns.take_link_turn():
             self._conversation.break_off(self._close_writer())
         self._record_trouble(error)
 
@@ -194,7 +192,7 @@ class PortDriver:
                     break
 
     def _close_all(self) -> None:
-        with self._turns.take_link_turn(self._name):
+        with self._turns.take_link_turn():
             self._close_writer()
             self._conversation.end()
         self._wake_receiver.close()

@@ -1,4 +1,4 @@
-"""Requests that arrive over the links, and texts for the ground station. A command is a request that only the flight
+"""Requests that arrive over the link, and texts for the ground station. A command is a request that only the flight
 itself can carry out, such as a pause. Used by `conversation` and the flight."""
 
 import math
@@ -11,7 +11,6 @@ from edgevpr.mavlink.messages import Severity, make_status_text
 from edgevpr.mavlink.wire import Message, mavlink
 
 MAX_ANSWERS_PER_S = 50  # requests a second; the answers to a flood of them must not displace our own messages
-GCS_MESSAGES = ("STATUSTEXT", "NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "ONBOARD_COMPUTER_STATUS")  # copied to all links
 TEXT_INTERVAL_S = 5.0
 
 Announce = Callable[[Severity, str, str], None]  # reports to the ground station: severity, text and topic
@@ -32,7 +31,7 @@ class CommandRequest(NamedTuple):
 
 
 class Requests:
-    """Answers the requests of all links, and keeps the newest command until the flight's main loop takes it. Commands
+    """Answers the requests of the link, and keeps the newest command until the flight's main loop takes it. Commands
     are rejected until the flight `is_flying`. `results` counts commands by the name of their result, `ignored` the
     other messages to us, of an unknown kind or too many a second. While it `is_paused`, no fix may be sent."""
 

@@ -22,7 +22,7 @@ class LinkStats:
 
     `trouble` is why the port could not be opened or was lost; None once data arrives again. `foreign_messages` came
     from another autopilot or address. `withheld_fixes` were not sent because of unanswered ones or a pause;
-    `refused_why` is about the last refused one. `commands` and `ignored_requests` count the requests on any link.
+    `refused_why` is about the last refused one. `commands` and `ignored_requests` count the requests.
     `bad_bytes` belong to no message. `answered_s`: when a command of ours was last answered, by its number."""
 
     connected: bool
@@ -58,28 +58,23 @@ class LinkStats:
 
 class Link:
     """The link to one flight controller. Its `conversation` decides what is sent, and processes what is received; it is
-    used inside `turns` only. Those of another link are shared if given; `converse` makes the conversation, and `drive`
-    what moves its packets through the port.
+    used inside `turns` only. `drive` makes what moves its packets through the port.
 
     All methods but `start` and `close` may be called from any thread; none waits for the other end, and none raises.
     Those that are not explained here are those of `Conversation`.
     """
-
-    name = "link"
 
     def __init__(
         self,
         address: LinkAddress,
         settings: LinkSettings,
         turns: Turns | None = None,
-        *,
-        converse: type[Conversation] = Conversation,
         drive: DriverMaker = PortDriver,
     ) -> None:
         self.turns = turns or Turns(settings.clock)
         with self.turn("begin"):
-            self.conversation = converse(settings, self.turns.now_s)
-        self._driver = drive(self.name, address, self.conversation, self.turns)
+            self.conversation = Conversation(settings, self.turns.now_s)
+        self._driver = drive(address, self.conversation, self.turns)
 
     def start(self) -> None:
         """Open the port and start to send and receive. Raises LinkError for a fault that only the user can correct; a

@@ -1,5 +1,5 @@
 """Signing of MAVLink 2: the key, the signatures of sent and received messages, and their time stamps, which never go
-back, neither in a flight nor from one flight to the next. Used by the links and by `edgevpr check` and `doctor`.
+back, neither in a flight nor from one flight to the next. Used by the link and by `edgevpr check` and `doctor`.
 
 pymavlink signs what is sent. Its check of what arrives is not used: it would store the time stamp of a message before
 it compares the signature, so that one forged message from the far future would shut out all true ones.
@@ -33,8 +33,7 @@ _START_ADVANCE = _SAVE_INTERVAL + 60 * TICKS_S
 KEY_BYTES = 32
 # Link ids. A receiver checks the time stamps of each stream (system, component and link id) on their own.
 AUTOPILOT_LINK_ID = 1
-GCS_LINK_ID = 2
-CHECK_LINK_ID = 3  # of `edgevpr check` and `doctor`
+CHECK_LINK_ID = 2  # of `edgevpr check` and `doctor`
 UNSIGNED = "unsigned"
 WRONG = "wrong signature"
 OLD = "old time stamp"
@@ -128,7 +127,7 @@ class TimeStamps:
 
 
 class Signing:
-    """Signs the messages that one link sends, and admits those received that are signed with the same key and not older
+    """Signs the messages that a link sends, and admits those received that are signed with the same key and not older
     than earlier ones. `refused` counts the others by reason; `verdicts` has the reason for each message received last
     (None: admitted). Without a key (no `stamps`) nothing is signed, and every message is admitted."""
 
@@ -136,10 +135,6 @@ class Signing:
         self.refused: Counter[str] = Counter()
         self._key, self._stamps, self._link_id = key, stamps, link_id
         self.verdicts: list[str | None] = []
-
-    def make_gcs_signing(self) -> "Signing":
-        """Return the signing of the link to the ground: the same key and time stamps, but another link id."""
-        return Signing(self._key, self._stamps, GCS_LINK_ID)
 
     def stamp(self, packer: Message) -> None:
         """Make a pymavlink packer sign its next message."""

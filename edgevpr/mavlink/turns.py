@@ -30,7 +30,7 @@ class Turns:
 
     @contextmanager
     def freeze_clock(self, t_s: float) -> Iterator[None]:
-        """Context manager: let the time stand still at `t_s`; in a replay, this repeats a link's turn."""
+        """Context manager: let the time stand still at `t_s`; in a replay, this repeats the link's turn."""
         self._t_s = t_s
         try:
             yield
@@ -38,8 +38,8 @@ class Turns:
             self._t_s = None
 
     @contextmanager
-    def take_link_turn(self, name: str) -> Iterator[None]:
-        """Context manager: take a turn in the thread of the link `name`."""
+    def take_link_turn(self) -> Iterator[None]:
+        """Context manager: take a turn in the thread of the link."""
         with self._lock, self.freeze_clock(self._clock()):
             yield
 

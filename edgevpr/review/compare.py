@@ -1,5 +1,5 @@
 """Compares a flight with its replay, for `edgevpr replay`: the lines of both logs, and the packets sent on the
-links, byte by byte. In names here, "then" is the flight and "now" its replay."""
+link, byte by byte. In names here, "then" is the flight and "now" its replay."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -65,12 +65,12 @@ class PacketComparison:
     alike: int = 0
     others: list[str] = field(default_factory=list)
 
-    def compare(self, t_s: float, link: str, then: bytes | None, now: bytes | None) -> None:
-        """Compare two packets of `link` (None: none was sent) at the time `t_s` of the flight's clock."""
+    def compare(self, t_s: float, then: bytes | None, now: bytes | None) -> None:
+        """Compare two packets (None: none was sent) at the time `t_s` of the flight's clock."""
         if then and now and _strip_sequence(then) == _strip_sequence(now):
             self.alike += 1
         elif then or now:
-            self.others.append(f"{t_s:.3f} s, {link}: sent {_describe_packet(then)}, now {_describe_packet(now)}")
+            self.others.append(f"{t_s:.3f} s: sent {_describe_packet(then)}, now {_describe_packet(now)}")
 
 
 def _describe_packet(packet: bytes | None) -> str:

@@ -60,6 +60,11 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
     if not (note and note[0] == "flight" and isinstance(note[1], dict)):
         raise EdgevprError(f"{folder / TAPE} is no tape of a flight, or was cut in its first line: nothing to replay.")
     header = note[1]
+    if header["config"].get("mavlink", {}).get("ground"):
+        raise UsageError(
+            f"{folder} is of a flight with a second link (`mavlink.ground`), which this edgevpr does not have: "
+            f"replay it with edgevpr {header['version']}."
+        )
     config = build(Config, _drop_unknown_settings(header["config"]), str(folder))
     place_map = place_map or config.map
     if place_map and not Path(place_map).exists():

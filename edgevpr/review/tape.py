@@ -1,5 +1,5 @@
 """Plays back the tape of a recorded flight: the code's questions to the outside world (clock, frame, temperature) get
-the answers that they got in the flight, and its links receive what they received then. `replay` uses it.
+the answers that they got in the flight, and its link receives what it received then. `replay` uses it.
 
 `runtime.flight.boundary` says what is on the tape."""
 
@@ -26,7 +26,7 @@ from edgevpr.mavlink.signing import Signing
 from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Message
 from edgevpr.review.compare import PacketComparison
-from edgevpr.runtime.flight.boundary import SOURCE_STATE, Tape
+from edgevpr.runtime.flight.boundary import LINK, SOURCE_STATE, Tape
 from edgevpr.runtime.flight.stop import StopNow
 
 Note = list[Any]  # a line of the tape: a kind, and its values
@@ -40,17 +40,15 @@ class TapeEnded(BaseException):
 
 
 class ReplayedDriver:
-    """A driver without a port and a thread: the turns of its link come from the tape, a `Playback`."""
+    """A driver without a port and a thread: the turns of the link come from the tape, a `Playback`."""
 
-    def __init__(
-        self, playback: "Playback", name: str, address: LinkAddress, conversation: Conversation, turns: Turns
-    ) -> None:
-        self._playback, self._name, self._conversation, self._turns = playback, name, conversation, turns
+    def __init__(self, playback: "Playback", _: LinkAddress, conversation: Conversation, turns: Turns) -> None:
+        self._playback, self._conversation, self._turns = playback, conversation, turns
         self._leaving: deque[FixTransmission] = deque()
 
     def start(self) -> None:
         """Let the playback perform the link's turns from now on."""
-        self._playback.links[self._name] = self._perform
+        self._playback.perform_turn = self._perform
 
     def state(self) -> PortState:
         """Return the state that the port had in the flight."""
@@ -86,7 +84,7 @@ class ReplayedDriver:
             case ["said", then]:
                 packet, sending = conversation.next_packet() or (None, None)
                 self._leaving += [sending] if sending else []
-                self._playback.packets.compare(now_s, self._name, b64decode(then) if then else None, packet)
+                self._playback.packets.compare(now_s, b64decode(then) if then else None, packet)
             case ["departed", count]:
                 departed = [self._leaving.popleft() for _ in range(min(count, len(self._leaving)))]
                 for sending in departed:
@@ -104,10 +102,6 @@ class ReplayedDriver:
 class ReplayedSigning(Signing):
     """Signing without the key: signs nothing, and admits the messages that the flight admitted. `verdicts` has, for
     each of the next messages, why the flight refused it (None: it did not)."""
-
-    def for_ground(self) -> "ReplayedSigning":
-        """Return the signing of the link to the ground station."""
-        return ReplayedSigning()
 
     def admits(self, message: Message) -> bool:
         """Return True if the flight accepted this message's signature."""
@@ -143,9 +137,9 @@ class ReplayedSource(Source):
 
 
 class Playback(Tape):
-    """A tape that is played back. `links` has, by the name of a link, the function that performs its turns, given the
-    time and the steps of a turn; turns are performed in the order of the tape. `packets` compares the packets sent with
-    those of the flight.
+    """A tape that is played back. `perform_turn` performs a turn of the link, given its time and steps (None: the link
+    has not started); turns are performed in the order of the tape. `packets` compares the packets sent with those of
+    the flight.
 
     Code that has changed since the flight may ask more, less, or in another order. A question without an answer before
     the tape's next frame then gets the newest answer of its kind, so code and tape stay together. `guessed` counts the
@@ -153,7 +147,7 @@ class Playback(Tape):
     """
 
     def __init__(self, notes: Iterable[Note]) -> None:
-        self.links: dict[str, Callable[[float, list[Note]], None]] = {}
+        self.perform_turn: Callable[[float, list[Note]], None] | None = None
         self.packets = PacketComparison()
         self.guessed = 0
         self.t_s = 0.0  # of the newest turn or look at the clock
@@ -190,15 +184,14 @@ class Playback(Tape):
         """Return at once: the time comes from the tape."""
 
     def _peek_kind(self) -> str:
-        """Perform the turns of links that come next on the tape, and return the kind of the answer after them. Raises
+        """Perform the link's turns that come next on the tape, and return the kind of the answer after them. Raises
         TapeEnded."""
         while note := self._peek_note():
-            perform = self.links.get(note[0])
-            if perform is None:
+            if note[0] != LINK or self.perform_turn is None:
                 return cast(str, note[0])
             self._at += 1
             self.t_s = max(self.t_s, note[1])
-            perform(note[1], note[2])
+            self.perform_turn(note[1], note[2])
         raise TapeEnded
 
     def _peek_note(self) -> Note | None:

@@ -44,7 +44,7 @@ def parse_package():
         ("LOG_NOT_A_FILE", {"path": "/"}, "/ is not a file in an existing folder: correct `log: {path: ...}`"),
         (
             "LINK_OPENED_DRY",
-            {"address": "tcp:10.0.0.2:5760", "system": 1, "ground": None, "key": None},
+            {"address": "tcp:10.0.0.2:5760", "system": 1, "key": None},
             "tcp:10.0.0.2:5760, autopilot of system 1, dry run: no fix is sent",
         ),
     ],

@@ -4,9 +4,8 @@ import socket
 
 import pytest
 
-from edgevpr.core.config import MavlinkConfig
 from edgevpr.core.errors import LinkAddressError, LinkError
-from edgevpr.mavlink.address import LinkAddress, parse_link, parse_links
+from edgevpr.mavlink.address import LinkAddress, parse_link
 from edgevpr.mavlink.ports import open_port
 
 
@@ -48,11 +47,6 @@ def test_a_link_is_read_and_written_alike(url, address):
 def test_a_malformed_link_gets_one_sentence(url, says):
     with pytest.raises(LinkAddressError, match=re.escape(says)):
         parse_link(url)
-
-
-def test_a_link_to_the_ground_alone_is_refused():
-    with pytest.raises(LinkAddressError, match="second"):
-        parse_links(MavlinkConfig(ground="udpout:127.0.0.1:14550"))
 
 
 @pytest.mark.parametrize(

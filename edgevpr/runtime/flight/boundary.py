@@ -1,7 +1,7 @@
-"""The boundary of a flight, where recording and replay stand: what comes in from clocks, machine, source, links and
+"""The boundary of a flight, where recording and replay stand: what comes in from clocks, machine, source, link and
 signals passes these classes, if a flight is recorded or replayed. Nothing inside knows of it.
 
-A line of the tape is a note: the answer to a question of some kind, or a turn of a link with its time and its steps,
+A line of the tape is a note: the answer to a question of some kind, or a turn of the link with its time and its steps,
 such as bytes received or a packet sent.
 """
 
@@ -47,6 +47,7 @@ _STEPS = {
     Conversation.break_off.__name__: "lost",
     Conversation.end.__name__: "closed",
 }
+LINK = "link"  # the kind of the turns of the link
 _UNPACKED = "image", "position", "pose"  # of a frame, not on the tape as they are
 
 
@@ -162,7 +163,7 @@ class RecordedSource(Source):
 
 
 class TapedTurns(Turns):
-    """Turns that are recorded, or played back. `steps` are those of the present turn of a link."""
+    """Turns that are recorded, or played back. `steps` are those of the present turn of the link."""
 
     def __init__(self, clock: Callable[[], float], tape: Tape) -> None:
         super().__init__(clock)
@@ -170,14 +171,14 @@ class TapedTurns(Turns):
         self.steps: list[tuple[Any, ...]] = []
 
     @contextmanager
-    def take_link_turn(self, name: str) -> Iterator[None]:
-        with super().take_link_turn(name):
+    def take_link_turn(self) -> Iterator[None]:
+        with super().take_link_turn():
             self.steps = []
             try:
                 yield
             finally:
                 if self.steps:
-                    self.tape.note(name, self.now_s(), self.steps)
+                    self.tape.note(LINK, self.now_s(), self.steps)
 
     def _begin(self, what: str) -> float:
         return self.tape.read(f"turn: {what}", partial(super()._begin, what))
@@ -186,11 +187,9 @@ class TapedTurns(Turns):
 class RecordedDriver(PortDriver):
     """The driver of a port that records what it does with its conversation, and its state whenever that is read."""
 
-    def __init__(
-        self, turns: TapedTurns, name: str, address: LinkAddress, conversation: Conversation, _: Turns
-    ) -> None:
+    def __init__(self, turns: TapedTurns, address: LinkAddress, conversation: Conversation, _: Turns) -> None:
         recorded = cast(Conversation, _RecordedConversation(conversation, turns))
-        super().__init__(name, address, recorded, turns)
+        super().__init__(address, recorded, turns)
         self._tape = turns.tape
 
     def state(self) -> PortState:

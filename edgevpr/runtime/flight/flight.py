@@ -14,9 +14,8 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import Mount
 from edgevpr.frames.source import read_intervals
-from edgevpr.mavlink.address import parse_links
+from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.conversation import LinkSettings
-from edgevpr.mavlink.groundlink import GroundLink
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight import systemd
@@ -101,7 +100,7 @@ class Flight:
 
     @classmethod
     def open(cls, config: Config, io: FlightIO) -> "Flight":
-        """Open map, log, links and source. Raises EdgevprError, and StopNow if a signal ends the flight before it
+        """Open map, log, link and source. Raises EdgevprError, and StopNow if a signal ends the flight before it
         begins."""
         systemd.notify(EXTEND_TIMEOUT_USEC=systemd.MAX_START_US)
         with ExitStack() as stack:
@@ -113,7 +112,7 @@ class Flight:
             step_s, settings, camera = 1 / io.board.rate_hz, config.mavlink, config.source
             navigator = Navigator(settings.min_accuracy_m, step_s, not settings.send_fixes, camera.gimbal)
             origin = find_origin(recogniser.place_map, camera) if settings.set_origin else None
-            link, ground = open_links(settings, io, navigator, origin, stack)
+            link = open_link(settings, io, navigator, origin, stack)
             source = io.open_source(step_s)
             stack.callback(source.close)
             if link and not source.is_live and settings.send_fixes:
@@ -130,7 +129,6 @@ class Flight:
                 recogniser=recogniser,
                 source=source,
                 link=link,
-                ground=ground,
                 autopilot=autopilot,
                 flight_log=flight_log,
                 notifier=notifier,
@@ -289,7 +287,6 @@ class Flight:
             unusable=self._tally.unusable + self._tally.failed,
             **totals,
             mavlink=parts.link.stats() if parts.link else None,
-            **({"ground": parts.ground.stats()} if parts.ground else {}),
         )
         fixes = f", {parts.autopilot.summary}" if parts.autopilot else ""
         counts = f"{self._tally.queries} queries, {self._tally.accepted} accepted{fixes}"
@@ -301,13 +298,12 @@ def _open_log(io: FlightIO) -> FlightLog:
     return FlightLog(log.path, clock.mono_s, clock.utc_s, wait=is_service, max_mb=log.max_mb)
 
 
-def open_links(
+def open_link(
     settings: MavlinkConfig, io: FlightIO, navigator: Navigator, origin: Position | None, stack: ExitStack
-) -> tuple[Link | None, Link | None]:
-    """Open the links to flight controller and ground station (None: not configured), which `stack` closes."""
-    address, ground_address = parse_links(settings)
-    if address is None:
-        return None, None
+) -> Link | None:
+    """Open the link to the flight controller (None: not configured), which `stack` closes."""
+    if settings.link is None:
+        return None
     link_settings = LinkSettings(
         component_id=settings.component_id,
         system_id=settings.system_id,
@@ -316,6 +312,6 @@ def open_links(
         origin=origin,
         signing=io.signing,
     )
-    link = stack.enter_context(Link(address, link_settings, io.turns, drive=io.drive))
+    link = stack.enter_context(Link(parse_link(settings.link), link_settings, io.turns, io.drive))
     link.request_position()
-    return link, stack.enter_context(GroundLink(ground_address, link, io.drive)) if ground_address else None
+    return link

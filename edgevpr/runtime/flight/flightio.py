@@ -1,5 +1,5 @@
 """All that a flight reads from outside and sends outside. In the air (`open_real_io`) these are real cameras, clocks
-and links, with a recording if one is configured; in a replay they come from the recording."""
+and a link, with a recording if one is configured; in a replay they come from the recording."""
 
 import ctypes
 import logging
@@ -17,7 +17,7 @@ from edgevpr import __version__
 from edgevpr.core.config import Config, LogConfig
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.frames.source import Source, open_source
-from edgevpr.mavlink.address import parse_links
+from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.driver import DriverMaker, PortDriver
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.signing import Signing, open_signing
@@ -57,7 +57,7 @@ _END_S = 4.0  # from a signal to the end of the process, if it does not end by i
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightIO:
     """Inputs and outputs of a flight: `place_map`, the path of its map; settings of its `log`; `open_source`, given the
-    seconds between two frames; the `turns` of the links, what makes their drivers (`drive`), `signing` of their
+    seconds between two frames; the `turns` of the link, what makes its driver (`drive`), `signing` of its
     packets; the `status` file; and the folder of the `recording`. None: there is none. All that comes in passes here;
     where it is recorded or played back, `boundary` does so."""
 
@@ -82,7 +82,6 @@ class FlightParts:
     recogniser: Recogniser
     source: Source
     link: Link | None = None
-    ground: Link | None = None
     autopilot: ToAutopilot | None = None
     flight_log: FlightLog
     notifier: Notifier
@@ -98,7 +97,8 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
     source = config.source
     if (uri := source.uri) is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
-    parse_links(config.mavlink)
+    if config.mavlink.link is not None:
+        parse_link(config.mavlink.link)
     board = resolve_board(load_board(config.board), source, config.memory)
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # musl has none
         for parameter, value in _MALLOC.items():

@@ -13,7 +13,7 @@ from edgevpr.core.text import show_waiting
 from edgevpr.core.types import MAX_FIX_AGE_S
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import find_missing_cause, is_live, open_source, read_intervals
-from edgevpr.mavlink.address import parse_links
+from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.asking import RequestLink
 from edgevpr.mavlink.signing import open_signing
 from edgevpr.power.boards import Board, load_board, resolve_board
@@ -83,17 +83,13 @@ def _check_source(what: str, settings: SourceConfig, offline: bool) -> Finding:
 
 
 def _check_link(what: str, settings: MavlinkConfig, offline: bool) -> Finding:
-    address, ground = parse_links(settings)
-    if address is None:
+    if settings.link is None:
         return report_ok(what, ReasonCode.NO_LINK)
+    address = parse_link(settings.link)
     signing = open_signing(settings, is_read_only=True)
     with RequestLink(address, settings.component_id, settings.system_id, signing) as inquiry:
         if not offline and inquiry.heartbeat() is None:
             return explain_silence(address, inquiry)
-    if ground:
-        with RequestLink(ground, settings.component_id, settings.system_id):
-            pass  # it can be opened
     code = FindingCode.LINK_OPENED if settings.send_fixes else FindingCode.LINK_OPENED_DRY
     system = None if offline else inquiry.system_id
-    extras = {"ground": str(ground) if ground else None, "key": settings.signing_key}
-    return report_ok(what, code, address=str(address), system=system, **extras)
+    return report_ok(what, code, address=str(address), system=system, key=settings.signing_key)

@@ -4,7 +4,7 @@ reports too has a code of `edgevpr.core.reasons`."""
 from edgevpr.core.reasons import Code
 
 _DEVICE = "{path}, group {group}, mode {mode}"
-_LINK = ("{address}", ", autopilot of system {system:.0f}", ", ground station at {ground}", ", signed with {key}")
+_LINK = ("{address}", ", autopilot of system {system:.0f}", ", signed with {key}")
 _AUTOPILOT = "{address}: {firmware}, system {system:.0f}, {state}"
 _NO_HEARTBEAT = "{address}: no heartbeat of an autopilot in {waited_s:g} s: "
 _SET_PORT = "set the port of the flight controller to MAVLink 2 at this baud rate, and reboot it"

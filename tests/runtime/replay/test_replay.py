@@ -118,24 +118,20 @@ def test_a_flight_that_was_killed_is_replayed_to_where_its_tape_ends(fly, tmp_pa
         assert len(shorter.lines) <= len(again.lines)
 
 
-def test_signed_packets_and_the_link_to_the_ground_are_the_same_but_for_the_signature(fly, tmp_path):
+def test_signed_packets_are_the_same_but_for_the_signature(fly, tmp_path):
     key = tmp_path / "key"
     key.write_bytes(bytes(range(32)))
     key.chmod(0o600)
     config = tmp_path / "c.yaml"
-    ground, flight_port = UdpPort(), UdpPort()
+    port = UdpPort()
     settings = {"signing_key": str(key), "signing_state": str(tmp_path / "time")}
-    settings["ground"] = f"udpout:127.0.0.1:{ground.number}"
-    config.write_text(yaml.safe_dump({"mavlink": settings | {"link": f"udpout:127.0.0.1:{flight_port.number}"}}))
+    config.write_text(yaml.safe_dump({"mavlink": settings | {"link": f"udpout:127.0.0.1:{port.number}"}}))
     flight = fly("--config", str(config), "--rate-hz", "5")
-    station = Peer(ground)
-    assert station.expect("HEARTBEAT").get_header().incompat_flags == mavlink.MAVLINK_IFLAG_SIGNED
-    unsigned = Peer(flight_port)
-    unsigned.expect("HEARTBEAT")
+    unsigned = Peer(port)
+    assert unsigned.expect("HEARTBEAT").get_header().incompat_flags == mavlink.MAVLINK_IFLAG_SIGNED
     unsigned.heartbeat()
     ended(flight)
-    ground.close()
-    flight_port.close()
+    port.close()
     again, _ = is_the_same(tmp_path / "flight.jsonl")
     assert (tmp_path / "time").exists()
     assert again.packets.alike > 0
@@ -182,6 +178,10 @@ def test_what_is_missing_is_said(fly, recording, tmp_path, capsys):
     frame.write_bytes(frame.read_bytes()[:100])
     assert main(["replay", moved, "--map", str(tmp_path / "elsewhere.gpkg")]) == 0
     assert "cut short" in capsys.readouterr().out
+    (tape,) = (there / "recorded").glob(f"*/{TAPE}")
+    tape.write_text(tape.read_text().replace('"mavlink": {', '"mavlink": {"ground": "udpout:10.0.0.2:14550", ', 1))
+    assert main(["replay", moved]) == 2
+    assert "second link" in capsys.readouterr().err
     shutil.rmtree(there / "recorded")
     assert main(["replay", moved]) == 2
     assert "neither at" in capsys.readouterr().err

@@ -79,17 +79,14 @@ def test_check_finds_a_query_too_slow_for_any_fix_unless_it_is_a_dry_run(setting
     assert wrong(config_file, settings) == []
 
 
-def test_check_opens_the_ground_link_and_the_signing_key(settings, config_file, tmp_path):
+def test_check_opens_the_signing_key(settings, config_file, tmp_path):
     key = tmp_path / "key"
     key.write_bytes(bytes(32))
     key.chmod(0o600)
-    settings["mavlink"] |= {"ground": "udpout:127.0.0.1:9", "signing_key": str(key)}
+    settings["mavlink"]["signing_key"] = str(key)
     assert wrong(config_file, settings) == []
     assert not key.with_name("key.time").exists(), "root must not make what the service is to write"
     key.chmod(0o640)
-    (finding,) = wrong(config_file, settings)
-    assert finding.what == "link"
-    settings["mavlink"] = {"ground": "udpout:127.0.0.1:9"}
     (finding,) = wrong(config_file, settings)
     assert finding.what == "link"
 

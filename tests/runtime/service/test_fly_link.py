@@ -13,18 +13,18 @@ from edgevpr.mavlink.driver import PortDriver
 from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.signing import NOT_SIGNING
 from edgevpr.mavlink.turns import Turns
-from edgevpr.runtime.flight.flight import open_links
+from edgevpr.runtime.flight.flight import open_link
 from edgevpr.runtime.flight.navigator import Navigator
 
 
-def test_open_links_uses_the_keys_of_the_configuration():
+def test_open_link_uses_the_keys_of_the_configuration():
     keys = {"mavlink.system_id": 5, "mavlink.component_id": 191, "mavlink.max_fix_age_s": 0.2}
     config = load_config(None, keys)
     world = SimpleNamespace(turns=Turns(time.monotonic), drive=PortDriver, signing=NOT_SIGNING)
     with ExitStack() as stack:
         port = stack.enter_context(closing(UdpPort()))
         settings = replace(config.mavlink, link=f"udpout:127.0.0.1:{port.number}")
-        link, _ = open_links(settings, world, Navigator(5.0, 1.0), None, stack)
+        link = open_link(settings, world, Navigator(5.0, 1.0), None, stack)
         heartbeat = Peer(port).expect("HEARTBEAT")
         assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (5, 191)
         sending = link.send_fix(Fix(50.0, 8.0, 20.0, link.turns.now_s()))
