@@ -14,7 +14,7 @@ from edgevpr.cli.shared import (
     add_keys,
     add_known,
     add_parameters,
-    load_command_config,
+    make_config,
     parse_parameters,
     parse_positive,
     parse_value,
@@ -38,11 +38,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--ref", metavar="FOLDER", help="folder of reference images")
     parser.add_argument("--ground-truth", metavar="FILE", help="CSV: query_file,ref_files (else: what is near)")
     parser.add_argument(
-        "--within-m",
-        type=parse_positive,
-        default=25.0,
-        metavar="M",
-        help="distance in metres that counts as near (default: 25)",
+        "--within-m", type=parse_positive, default=25.0, metavar="M", help="metres that count as near (default: 25)"
     )
     parser.add_argument(
         "--out", metavar="FOLDER", help="folder for results.json and results.csv; an interrupted run resumes"
@@ -72,7 +68,7 @@ def run_eval(args: Namespace) -> int:
     from edgevpr.lab.evaluate.runs import Plan, measure, write_results
     from edgevpr.lab.evaluate.tables import format_results
 
-    config, rows, sets = load_command_config(args, args.config), _list_rows(args), _open_sets(args)
+    config, rows, sets = make_config(args, args.config), _list_rows(args), _open_sets(args)
     options = MatchOptions(
         candidates=config.match.candidates,
         sequence=config.match.sequence,
@@ -91,7 +87,7 @@ def run_eval(args: Namespace) -> int:
         content["techniques"] = {row["row"]: row for row in content.pop("results")}
     tables = [
         f"{sanitize(name)}\n\n{format_results([row.result for row in measured])}\n"
-        for name, measured in outcome.found.items()
+        for name, measured in outcome.measured.items()
         if measured
     ]
     print_result(content, args.json, "\n".join(tables))
@@ -143,22 +139,22 @@ def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
     from edgevpr import techniques
     from edgevpr.runtime.preflight.pick import make_camera_setting
 
-    wanted = [name.strip() for name in args.techniques.split(",") if name.strip()]
-    if not wanted:
+    names = [name.strip() for name in args.techniques.split(",") if name.strip()]
+    if not names:
         raise UsageError(f"--techniques names none: use some of {', '.join(techniques.list_techniques())}.")
     forms = [form.strip() for form in args.form.split(",")]
     if unknown := [form for form in forms if form not in FORMS]:
         raise UsageError(f"--form names `{unknown[0]}`: use some of {', '.join(FORMS)}.")
-    settings = {name: make_camera_setting(name, parse_value(args, "source.camera")) for name in wanted}
+    settings = {name: make_camera_setting(name, parse_value(args, "source.camera")) for name in names}
     for key, value in parse_parameters(args.param).items():
         name, _, parameter = key.partition(".")
         if name not in settings or not parameter:
             raise UsageError(f"--param {key}: write TECHNIQUE.KEY=VALUE with a technique of --techniques.")
         settings[name][parameter] = value
-    if any("camera" in techniques.read_parameters(name) and "camera" not in settings[name] for name in wanted):
-        print_notes("the camera is taken to look ahead: where it looks straight down, say `--camera nadir`")
+    if any("camera" in techniques.read_parameters(name) and "camera" not in settings[name] for name in names):
+        print_notes("camera assumed to look ahead: if it looks straight down, give `--camera nadir`")
     rows = {}
-    for name in wanted:
+    for name in names:
         has_forms = "form" in techniques.read_parameters(name) and "form" not in settings[name]
         for form in forms if has_forms else [None]:
             chosen = {**settings[name], "form": form} if form else settings[name]

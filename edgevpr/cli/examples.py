@@ -12,12 +12,12 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
         ("photographs that look straight down", "valley.gpkg --images photos/ --camera nadir"),
         ("a video, a place each second", "road.gpkg --images flight.mp4 --rate-hz 1"),
         (
-            "a picture from space, for a camera that shows 120 m",
+            "a satellite image, for a camera that shows 120 m",
             "town.gpkg --orthophoto town.tif --footprint-m 120 --spacing-m 30",
         ),
     ),
     "map refine": (("after a merge", "valley.gpkg --images photos/"),),
-    "map move": (("to where GPS has it, after a flight with it", "valley.gpkg --by flight.jsonl"),),
+    "map move": (("by the GPS of a flight with this map", "valley.gpkg --by flight.jsonl"),),
     "map calibrate": (("after a merge", "valley.gpkg --images photos/"),),
     "map info": (
         ("what is in it", "valley.gpkg"),
@@ -28,27 +28,27 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "map merge": (("two flights as one map", "all.gpkg monday.gpkg tuesday.gpkg"),),
     "map shrink": (("the 500 best places, spread over the map", "valley.gpkg small.gpkg --places 500"),),
     "map subset": (
-        ("of a folder of maps what a mission needs", "valley/ --mission plan.waypoints --out flight.gpkg"),
-        ("in a file of 50 MB at most", "valley/ --mission plan.plan --margin-m 300 --mb 50 --out flight.gpkg"),
+        ("the part of a folder of maps that a mission needs", "valley/ --mission plan.waypoints --out flight.gpkg"),
+        ("the same in at most 50 MB", "valley/ --mission plan.plan --margin-m 300 --mb 50 --out flight.gpkg"),
     ),
-    "salience": (("what of a picture is worth remembering", "photos/0042.jpg"),),
+    "salience": (("how memorable an image is", "photos/0042.jpg"),),
     "match": (
         ("where later pictures were taken", "valley.gpkg --images later/"),
-        ("with what a flight knows beside them", "valley.gpkg --images later/ --known heading,height"),
+        ("with the heading and height that a flight knows", "valley.gpkg --images later/ --known heading,height"),
     ),
     "run": (
         (
             "a flight that sends nothing yet",
             "--map valley.gpkg --source /dev/video0 --link udpin:0.0.0.0:14550 --dry-run",
         ),
-        ("as a configuration says", "--config flight.yaml"),
+        ("by a configuration file", "--config flight.yaml"),
     ),
-    "check": (("whether that flight could start", "--config flight.yaml"),),
+    "check": (("whether that flight can start", "--config flight.yaml"),),
     "service print": (("the unit, with the limits of a board", "--board rpi-zero-2w"),),
     "doctor": (("what is wrong with autopilot and board", "--link serial:/dev/ttyAMA0:921600"),),
     "top": (("watch the flight of the service", ""),),
     "report": (("a page of a flight", "flight.jsonl --out report.html --images later/ --map-images photos/"),),
-    "replay": (("fly it again, and compare each line", "flight.jsonl --map valley.gpkg"),),
+    "replay": (("replay it, and compare each line", "flight.jsonl --map valley.gpkg"),),
     "profile": (
         ("a map on a board", "--map valley.gpkg --board rpi-4b --battery 4S5200 --flight-min 20"),
         ("every technique on a small board", "--places 10000 --board rpi-zero-2w --camera nadir"),
@@ -60,7 +60,7 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
         ("a mission over this year's ground", "later --orthophoto now.tif --track mission.plan --height-m 120"),
     ),
     "demo": (("the whole job in a minute", "--out demo_out"),),
-    "models list": (("which networks there are, and whether they work", ""),),
+    "models list": (("the networks, and whether they work", ""),),
 }
 
 

@@ -15,7 +15,7 @@ from edgevpr.cli.shared import (
     add_known,
     add_positions,
     add_recording,
-    load_command_config,
+    make_config,
     print_result,
     report_unusable,
     skip_image,
@@ -64,9 +64,8 @@ def add(commands: Any) -> None:
         "--board", default="this", metavar="NAME", help="board that the unit is for (default: this computer)"
     )
 
-    doctor = add_command(
-        commands, "doctor", run_doctor, "check the autopilot's parameters and this computer (read-only)"
-    )
+    text = "check the autopilot's parameters and this computer (read-only)"
+    doctor = add_command(commands, "doctor", run_doctor, text)
     doctor.add_argument("--config", metavar="FILE", help="configuration of the flight; flags override it")
     add_keys(doctor, "mavlink.link")
     add_json(doctor)
@@ -83,10 +82,10 @@ def run_match(args: Namespace) -> int:
     from edgevpr.runtime.recognise.opening import open_recogniser
     from edgevpr.techniques.card import describe_weights
 
-    config, known = load_command_config(args, args.config, map=args.map), parse_known_fields(args.known)
+    config, known = make_config(args, args.config, map=args.map), parse_known_fields(args.known)
     board = resolve_board(load_board(config.board), config.source, config.memory)
     recogniser = open_recogniser(config, board, known=known, follows=args.follow)
-    found = []
+    matches = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=to_path(args.positions), live=False)
     if known:
@@ -99,17 +98,17 @@ def run_match(args: Namespace) -> int:
         if event.failed:
             skip_image(ImageError(f"{frame.name}: {event.reason}"), unusable)
             continue
-        found.append(format_match(event) | {"calibrated": is_calibrated})
+        matches.append(format_match(event) | {"calibrated": is_calibrated})
         if known:
-            found[-1]["hints"] = event.hints and event.hints.fields()
-    lines = list(format_matches(found))
+            matches[-1]["hints"] = event.hints and event.hints.fields()
+    lines = list(format_matches(matches))
     if not is_calibrated and list_evidence_kinds(place_map.spec):
         lines.append(f"The map is {not_calibrated(len(place_map))}.")
     if known:
         lines.append(f"Known of each query: {','.join(known)}.")
     if weights := describe_weights(recogniser.technique.spec):
         lines.append(f"Weights of {weights}.")
-    print_result(found, args.json, "\n".join(lines))
+    print_result(matches, args.json, "\n".join(lines))
     return report_unusable(unusable)
 
 
@@ -133,7 +132,7 @@ def run_flight(args: Namespace) -> int:
     """Run `run`: fly with a configuration, until the flight ends."""
     from edgevpr.runtime.flight.flight import fly
 
-    config = load_command_config(args, args.config)
+    config = make_config(args, args.config)
     log = resolve_log_paths(config.log, os.environ.get("LOGS_DIRECTORY", ""))
     return fly(replace(config, log=log), to_path(args.positions))
 
@@ -146,13 +145,13 @@ def run_check(args: Namespace) -> int:
 
 
 def run_doctor(args: Namespace) -> int:
-    """Run `doctor`: examine flight controller and board, and print what is fine, what is wrong, and what to change."""
+    """Run `doctor`: check autopilot and board, and print what is fine, what is wrong, and what to change."""
     from edgevpr.mavlink.address import parse_link
     from edgevpr.runtime.service.doctor import check_setup
 
-    config = load_command_config(args, args.config)
+    config = make_config(args, args.config)
     if config.mavlink.link is None:
-        raise UsageError("There is no link to the flight controller: name one with --link, or in --config.")
+        raise UsageError("No link to the autopilot is configured: name one with --link, or in --config.")
     address = parse_link(config.mavlink.link)
     findings, reading = check_setup(config, address)
     return _show_findings(findings, args.json, link=str(address), reading=reading and asdict(reading))

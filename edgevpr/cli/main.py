@@ -17,25 +17,24 @@ from edgevpr.core.text import sanitize, suggest
 
 EXIT_CODES = {
     0: "Done, and nothing is wrong.",
-    1: "Something is wrong that is no matter of the request, and may go well later. It was found (by `check`, "
-    "`doctor`, `map check`, `replay`) or left out (an image, a technique), or a map, pictures, a link or a disk cannot "
-    "be used.",
-    2: "The request is wrong: the words of the command, the configuration, or a table or a log that it names. Nothing "
-    "was begun, and trying again does not help: systemd starts the service no more. `check` ends so where `run` does.",
-    130: "Stopped by Ctrl-C. What is ended so (`run`, `top`) ends with 0 or 1.",
+    1: "A problem was found (by `check`, `doctor`, `map check`, `replay`), something was left out (an image, a "
+    "technique), or a map, images, a link or a disk cannot be used. It may work later.",
+    2: "The request is wrong: the command line, the configuration, or a table or a log that it names. Nothing was "
+    "started, and trying again does not help: systemd does not restart the service. `check` exits as `run` would.",
+    130: "Stopped by Ctrl-C. `run` and `top`, which are meant to be stopped so, exit with 0 or 1.",
 }
 _GROUPS = (positions, maps, flying, top, review, profile, evaluation, simulation, networks)
 
 
 def program() -> None:
     """Run the command in `sys.argv`, and end the process with its exit code."""
-    if "_ARGCOMPLETE" in os.environ:  # the shell asks how a line may go on
+    if "_ARGCOMPLETE" in os.environ:  # the shell asks for completions
         import argcomplete
 
         argcomplete.autocomplete(make_parser())
     code = main()
     if threading.active_count() > 1:
-        # A capture thread hangs in a stream that does not answer. In a normal exit FFmpeg would abort Python.
+        # A capture thread hangs in a stream that does not answer: in a normal exit FFmpeg would abort Python.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

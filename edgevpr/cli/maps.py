@@ -17,7 +17,7 @@ from edgevpr.cli.shared import (
     add_parameters,
     add_recording,
     check_output,
-    load_command_config,
+    make_config,
     parse_count,
     parse_parameters,
     parse_positive,
@@ -42,44 +42,45 @@ def add(commands: Any) -> None:
     """Add the commands and their flags."""
     maps = add_group(commands, "map", "build, inspect, check, repair, merge and shrink maps")
 
-    def of_map(name: str, run: Callable[[Namespace], int], text: str, more: str | None = None) -> ArgumentParser:
+    def add_to_map(name: str, run: Callable[[Namespace], int], text: str, more: str | None = None) -> ArgumentParser:
         parser = add_command(maps, name, run, text)
         parser.add_argument("map", metavar="MAP", help=more)
         return parser
 
-    _add_build(of_map("build", run_map_build, "build a map from images or from an orthophoto", "map to write (.gpkg)"))
-    refine = of_map("refine", run_map_refine, "refine the positions of the places by matching their images")
+    build = add_to_map("build", run_map_build, "build a map from images or from an orthophoto", "map to write (.gpkg)")
+    _add_build(build)
+    refine = add_to_map("refine", run_map_refine, "refine the positions of the places by matching their images")
     refine.add_argument("--images", metavar="DIR", help="images that the map was built from")
     add_json(refine)
-    move = of_map("move", run_map_move, "shift a map by the offset from GPS that a flight measured")
+    move = add_to_map("move", run_map_move, "shift a map by the offset from GPS that a flight measured")
     move.add_argument("--by", metavar="LOG", required=True, help="log of a flight with this map and with GPS")
     add_json(move)
-    calibrate = of_map("calibrate", run_map_calibrate, "calibrate match confidence from the map's own images")
+    calibrate = add_to_map("calibrate", run_map_calibrate, "calibrate match confidence from the map's own images")
     _add_pictures(calibrate)
     calibrate.add_argument("--config", metavar="FILE", help="configuration of the flight (camera, mask, precision)")
     add_keys(calibrate, "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
     add_json(calibrate)
-    info = of_map("info", run_map_info, "print what a map contains, or make a page of it")
+    info = add_to_map("info", run_map_info, "print what a map contains, or make a page of it")
     info.add_argument("--page", metavar="FILE", help="write an HTML page that opens offline")
     add_map_images(info)
     info.add_argument("--config", metavar="FILE", help="configuration of the mapping flight (its lens)")
     add_keys(info, "source.lens", "source.fov_deg", "source.up_deg")
     add_json(info)
-    add_json(of_map("check", run_map_check, "read the whole map and report what is damaged"))
-    add_json(of_map("repair", run_map_repair, "remove damaged places; keep the original as MAP.damaged"))
+    add_json(add_to_map("check", run_map_check, "read the whole map and report what is damaged"))
+    add_json(add_to_map("repair", run_map_repair, "remove damaged places; keep the original as MAP.damaged"))
     merge = add_command(maps, "merge", run_map_merge, "merge maps of the same technique")
     merge.add_argument("out", metavar="OUT", help="map to write")
     merge.add_argument("maps", metavar="MAP", nargs="+")
     add_json(merge)
-    smaller = of_map("shrink", run_map_shrink, "reduce a map to its best places, spread over its area")
-    smaller.add_argument("out", metavar="OUT", help="map to write")
-    smaller.add_argument("--places", type=parse_count, metavar="N", required=True, help="number of places to keep")
-    add_json(smaller)
-    subset.add(of_map)
-    worth = add_command(commands, "salience", run_salience, "print how memorable each image is")
-    worth.add_argument("image", metavar="IMAGE")
-    worth.add_argument("--config", metavar="FILE", help="configuration file; its section `salience` is used")
-    add_json(worth)
+    shrink = add_to_map("shrink", run_map_shrink, "reduce a map to its best places, spread over its area")
+    shrink.add_argument("out", metavar="OUT", help="map to write")
+    shrink.add_argument("--places", type=parse_count, metavar="N", required=True, help="number of places to keep")
+    add_json(shrink)
+    subset.add(add_to_map)
+    salience = add_command(commands, "salience", run_salience, "print how memorable each image is")
+    salience.add_argument("image", metavar="IMAGE")
+    salience.add_argument("--config", metavar="FILE", help="configuration file; its section `salience` is used")
+    add_json(salience)
 
 
 def _add_build(build: ArgumentParser) -> None:
@@ -117,7 +118,7 @@ def _add_pictures(parser: ArgumentParser) -> None:
         "--spacing-m",
         type=float,
         metavar="M",
-        help=("distance between places in metres, for example a quarter of the footprint"),
+        help="distance between places in metres, for example a quarter of the footprint",
     )
     flags.add_argument(
         "--area",
@@ -157,7 +158,7 @@ def run_map_build(args: Namespace) -> int:
     """Run `map build`: make a map from a recording or an orthophoto, or add to one."""
     from edgevpr.mapmaking.making import MapOrder, make_map
 
-    config = load_command_config(args, args.config)
+    config = make_config(args, args.config)
     order = MapOrder(
         path=args.map,
         pictures=_parse_pictures(args),
@@ -170,14 +171,15 @@ def run_map_build(args: Namespace) -> int:
     )
     unusable: list[ImageError] = []
     made = make_map(order, config, lambda error: skip_image(error, unusable), progress)
-    more: dict[str, Any] = {"covered": asdict(made.covered)} if made.covered else {}
-    more |= {"refined": asdict(made.refined)} if made.refined else {}
-    more |= {"calibration": made.calibration.figures()} if made.calibration else {}
-    more |= {"not_done": made.not_done} if made.not_done else {}
-    about = {"map": args.map, "technique": made.technique, "places": made.places}
-    print_result(
-        {**about, **asdict(made.result), **more}, args.json, format_build(args.map, made, args.orthophoto is not None)
-    )
+    parts = {
+        "covered": made.covered and asdict(made.covered),
+        "refined": made.refined and asdict(made.refined),
+        "calibration": made.calibration and made.calibration.figures(),
+        "not_done": made.not_done,
+    }
+    fields = {"map": args.map, "technique": made.technique, "places": made.places, **asdict(made.result)}
+    fields |= {name: part for name, part in parts.items() if part}
+    print_result(fields, args.json, format_build(args.map, made, args.orthophoto is not None))
     return report_unusable(unusable)
 
 
@@ -199,8 +201,8 @@ def run_map_move(args: Namespace) -> int:
     from edgevpr.places.mapfile import PlaceMap
 
     with PlaceMap.open_for_adding(args.map) as place_map:
-        done = move_map(place_map, args.by)
-    print_result({"map": args.map, **asdict(done)}, args.json, format_move(args.map, done))
+        move = move_map(place_map, args.by)
+    print_result({"map": args.map, **asdict(move)}, args.json, format_move(args.map, move))
     return 0
 
 
@@ -210,13 +212,12 @@ def run_map_calibrate(args: Namespace) -> int:
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.runtime.recognise.opening import create_technique
 
-    config, pictures = load_command_config(args, args.config), _parse_pictures(args)
+    config, pictures = make_config(args, args.config), _parse_pictures(args)
     with PlaceMap.open_for_adding(args.map) as place_map:
         encoder = make_encoder(config.source, pictures, create_technique(place_map))
-        found = calibrate_map(place_map, encoder, config.match, pictures, progress)
-    print_result(
-        {"map": args.map, "calibration": found.figures()}, args.json, [f"{args.map}: calibrated: {found.described()}"]
-    )
+        calibration = calibrate_map(place_map, encoder, config.match, pictures, progress)
+    fields = {"map": args.map, "calibration": calibration.figures()}
+    print_result(fields, args.json, [f"{args.map}: calibrated: {calibration.described()}"])
     return 0
 
 
@@ -232,38 +233,41 @@ def run_map_info(args: Namespace) -> int:
         check_output(args.page, args.map)
     with PlaceMap.open(args.map) as place_map:
         info, calibration = describe_map(place_map), read_calibration_for(place_map)
-    each_bytes = compute_place_bytes(info.spec)
+    place_bytes = compute_place_bytes(info.spec)
     if calibration:
         confidence: str | None = f"calibrated {calibration.made}: {calibration.described()}"
     else:
         confidence = not_calibrated(info.places) if info.spec.name == CONFIDENCE_TECHNIQUE else None
-    ram_mb = info.places * each_bytes / 1e6
-    known = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": each_bytes}
-    said = list(format_info(info, confidence, ram_mb))
-    print_result({**asdict(info), **known, "ram_mb": ram_mb}, args.json, said)
+    ram_mb = info.places * place_bytes / 1e6
+    known = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": place_bytes}
+    lines = list(format_info(info, confidence, ram_mb))
+    print_result({**asdict(info), **known, "ram_mb": ram_mb}, args.json, lines)
     if args.page:
-        _write_page(args, said, calibration.recognisable if calibration else {})
+        _write_page(args, lines, calibration.recognisable if calibration else {})
     return 0
 
 
-def _write_page(args: Namespace, said: list[str], recognisable: Mapping[int, float]) -> None:
-    """Write the page of a map. `said` are the lines of `map info`."""
+def _write_page(args: Namespace, lines: list[str], recognisable: Mapping[int, float]) -> None:
+    """Write the page of a map. `lines` are those of `map info`."""
     from edgevpr.mapmaking.look_alikes import find_look_alikes
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.review.album import make_map_album
     from edgevpr.review.mappage import MAX_QUERIES, make_map_page
     from edgevpr.runtime.recognise.levelling import read_camera_lens
 
-    lens = read_camera_lens(load_command_config(args, args.config).source)
+    lens = read_camera_lens(make_config(args, args.config).source)
     with PlaceMap.open(args.map) as place_map:
         places = list(place_map.read_places())
         pictures = make_map_album(args.map_images, places)
-        asked = places[:: -(-len(places) // MAX_QUERIES) or 1] if pictures else []
-        level = ((place.place_id, pictures.level(place, lens)) for place in progress(asked, len(asked), "look-alikes"))
-        found = find_look_alikes(place_map, ((place_id, each.image, each.mask) for place_id, each in level if each))
-        alike = list(found)
+        queried = places[:: -(-len(places) // MAX_QUERIES) or 1] if pictures else []
+        queries = (
+            (place.place_id, picture.image, picture.mask)
+            for place in progress(queried, len(queried), "look-alikes")
+            if (picture := pictures.level_picture(place, lens))
+        )
+        look_alikes = list(find_look_alikes(place_map, queries))
     name = Path(args.map).name
-    page = make_map_page(name, said, places, recognisable, alike, pictures, lens)
+    page = make_map_page(name, lines, places, recognisable, look_alikes, pictures, lens)
     write_output(args.page, args.map, lambda out: out.write(page))
     if not args.json:
         print(f"{args.page}: {len(places)} places of {args.map}")
@@ -273,22 +277,22 @@ def run_map_check(args: Namespace) -> int:
     """Run `map check`: read everything in a map and print what is damaged. The exit code is 1 if anything is."""
     from edgevpr.places.examine import check_map
 
-    found = check_map(args.map, progress)
-    print_result({**asdict(found), "is_whole": found.is_whole}, args.json, format_check(found))
-    return 0 if found.is_whole else 1
+    result = check_map(args.map, progress)
+    print_result({**asdict(result), "is_whole": result.is_whole}, args.json, format_check(result))
+    return 0 if result.is_whole else 1
 
 
 def run_map_repair(args: Namespace) -> int:
     """Run `map repair`: drop what is damaged in a map, and keep the original file."""
     from edgevpr.places.examine import check_map, repair_map
 
-    found = check_map(args.map, progress)
-    original = None if found.is_whole else repair_map(args.map, progress)
-    dropped = found.total - found.places
-    done = {"path": args.map, "kept": found.places, "dropped": dropped, "original": original and str(original)}
-    last = f"{args.map}: repaired, {found.places} places kept, {dropped} dropped; the original is {original}"
-    text = "nothing is damaged: the map is as it was" if original is None else last
-    print_result(done, args.json, [*format_check(found), text])
+    result = check_map(args.map, progress)
+    original = None if result.is_whole else repair_map(args.map, progress)
+    dropped = result.total - result.places
+    fields = {"path": args.map, "kept": result.places, "dropped": dropped, "original": original and str(original)}
+    repaired = f"{args.map}: repaired, {result.places} places kept, {dropped} dropped; the original is {original}"
+    text = "no damage: the map is unchanged" if original is None else repaired
+    print_result(fields, args.json, [*format_check(result), text])
     return 0
 
 
@@ -303,10 +307,12 @@ def run_map_merge(args: Namespace) -> int:
         for path, (copied, already_here) in zip(args.maps, counts, strict=True)
     ]
     merged = {"map": args.out, "places": sum(copied for copied, _ in counts), "of": parts}
-    text = [f"{part['map']}: {part['copied']} places copied, {part['already_here']} there already" for part in parts]
+    text = [f"{part['map']}: {part['copied']} places copied, {part['already_here']} already there" for part in parts]
     text.append(f"{args.out}: {merged['places']} places")
     if were_calibrated:
-        text.append(f"  not calibrated: how sure the maps were does not hold for it: edgevpr map calibrate {args.out}")
+        text.append(
+            f"  not calibrated: the confidence of its parts does not apply; run edgevpr map calibrate {args.out}"
+        )
     print_result({**merged, "lost_calibration": were_calibrated}, args.json, text)
     return 0
 
@@ -327,9 +333,9 @@ def run_salience(args: Namespace) -> int:
     from edgevpr.runtime.recognise.opening import open_salience_gate
     from edgevpr.runtime.recognise.salience_gate import compute_memorability
 
-    gate = open_salience_gate(load_command_config(args, args.config, **{"salience.use": True}).salience)
+    gate = open_salience_gate(make_config(args, args.config, **{"salience.use": True}).salience)
     assert gate is not None  # salience.use is set
-    worth = compute_memorability(gate.scores(read_image(Path(args.image))), gate.config)
-    known = {"kept": worth.reason is None, "reason": worth.reason and worth.reason.fields()}
-    print_result({"image": args.image, **asdict(worth.salience), **known}, args.json)
+    memorability = compute_memorability(gate.scores(read_image(Path(args.image))), gate.config)
+    outcome = {"kept": memorability.reason is None, "reason": memorability.reason and memorability.reason.fields()}
+    print_result({"image": args.image, **asdict(memorability.salience), **outcome}, args.json)
     return 0

@@ -17,55 +17,56 @@ _FIX_HEADINGS = ("lat", "lon", "± m", "m from its GPS tag")
 
 
 def format_match(event: "Recognition") -> dict[str, Any]:
-    """Return what `match --json` says of a query: the fields of its event, but `position` is the fix (null: none), and
-    the best place is one object (null: none was found). `of_place`: the fix is the place's own position, since nothing
-    is known of the way from there. `from_gps_tag_m`: distance of the fix from the query's own tag, null without both.
+    """Return a query for `match --json`: the fields of its event, but `position` is the fix (null: none), and the best
+    place is one object (null: none was found). `of_place`: the fix is the position of the place itself, as the offset
+    from it is unknown. `from_gps_tag_m`: distance of the fix from the query's own tag, null without both.
     """
     from edgevpr.core.geodesy import distance_m
     from edgevpr.runtime.recognise.recognition import to_fields
 
     fields = to_fields(event, exact=True)
-    number, image, at = (fields.pop(name) for name in ("place", "reference_image", "position"))
-    accuracy_m, fix, where = fields.pop("accuracy_m"), fields.pop("located"), event.located
+    place_id, image, position = (fields.pop(name) for name in ("place", "reference_image", "position"))
+    accuracy_m, fix, located = fields.pop("accuracy_m"), fields.pop("located"), event.located
     tag, from_tag_m = event.frame and event.frame.position, None
-    if fix and where:
-        fix |= {"accuracy_m": accuracy_m, "on_map_m": round(where.accuracy_m, 2), "of_place": not fix["places"]}
+    if fix and located:
+        fix |= {"accuracy_m": accuracy_m, "on_map_m": round(located.accuracy_m, 2), "of_place": not fix["places"]}
         if tag:
             from_tag_m = round(float(distance_m(tag.lat_deg, tag.lon_deg, fix["lat_deg"], fix["lon_deg"])), 2)
-    nowhere = dict.fromkeys(("lat_deg", "lon_deg", "alt_m"))
+    unknown = dict.fromkeys(("lat_deg", "lon_deg", "alt_m"))
     first = {
         "query": fields.pop("query"),
         "accepted": fields.pop("accepted"),
         "reason": fields.pop("reason"),
         "position": fix,
         "from_gps_tag_m": from_tag_m,
-        "place": None if number is None else {"number": number, "image": image, **(at or nowhere)},
+        "place": None if place_id is None else {"number": place_id, "image": image, **(position or unknown)},
     }
     return first | fields
 
 
-def format_matches(found: Sequence[dict[str, Any]]) -> Iterator[str]:
-    """Yield the table of the queries `found` (see `format_match`), and its summary."""
-    sure = "confidence" if any("confidence" in each for each in found) else "score"
+def format_matches(matches: Sequence[dict[str, Any]]) -> Iterator[str]:
+    """Yield the table of the queries `matches` (see `format_match`), and its summary."""
+    measure = "confidence" if any("confidence" in match for match in matches) else "score"
     rows = align_table(
-        [("query", "accepted", sure, "place, picture"), *(_format_place(each, sure) for each in found)], left=4
+        [("query", "accepted", measure, "place, picture"), *(_format_place(match, measure) for match in matches)],
+        left=4,
     )
-    fixes = [each for each in found if each["position"]]
-    headings = _FIX_HEADINGS if any(each["from_gps_tag_m"] is not None for each in fixes) else _FIX_HEADINGS[:3]
-    heading, *where = align_table([headings, *map(_format_fix, fixes)], left=0) if fixes else [""]
-    width, at = max(map(len, rows)), iter(where)
+    fixes = [match for match in matches if match["position"]]
+    headings = _FIX_HEADINGS if any(match["from_gps_tag_m"] is not None for match in fixes) else _FIX_HEADINGS[:3]
+    heading, *fix_rows = align_table([headings, *map(_format_fix, fixes)], left=0) if fixes else [""]
+    width, remaining = max(map(len, rows)), iter(fix_rows)
     yield f"{rows[0]:<{width}}  {heading}".rstrip()
-    for row, each in zip(rows[1:], found, strict=True):
-        yield f"{row:<{width}}  {next(at) if each['position'] else _format_refusal(each)}".rstrip()
-    yield from _summarise(found, fixes)
+    for row, match in zip(rows[1:], matches, strict=True):
+        yield f"{row:<{width}}  {next(remaining) if match['position'] else _format_refusal(match)}".rstrip()
+    yield from _summarise(matches, fixes)
 
 
-def _format_place(match: dict[str, Any], sure: str) -> tuple[str, ...]:
+def _format_place(match: dict[str, Any], measure: str) -> tuple[str, ...]:
     """Return the left part of a row: the query, and the place that was found."""
-    place, by = match["place"], match.get(sure)
-    certain = "-" if by is None else format_probability(by) if sure == "confidence" else f"{by:.3f}"
-    named = f"{place['number']} {_shorten_name(place['image'])}" if place else "-"
-    return _shorten_name(match["query"]), "yes" if match["accepted"] else "no", certain, named
+    place, value = match["place"], match.get(measure)
+    certainty = "-" if value is None else format_probability(value) if measure == "confidence" else f"{value:.3f}"
+    label = f"{place['number']} {_shorten_name(place['image'])}" if place else "-"
+    return _shorten_name(match["query"]), "yes" if match["accepted"] else "no", certainty, label
 
 
 def _format_fix(match: dict[str, Any]) -> tuple[str, ...]:
@@ -87,17 +88,17 @@ def _shorten_name(name: str) -> str:
     return name if len(name) <= _NAME_COLUMNS else f"...{name[3 - _NAME_COLUMNS :]}"
 
 
-def _summarise(found: Sequence[dict[str, Any]], fixes: Sequence[dict[str, Any]]) -> Iterator[str]:
-    refused = Counter(ReasonCode[each["reason"]["code"]] for each in found if not each["accepted"])
+def _summarise(matches: Sequence[dict[str, Any]], fixes: Sequence[dict[str, Any]]) -> Iterator[str]:
+    refused = Counter(ReasonCode[match["reason"]["code"]] for match in matches if not match["accepted"])
     counts = ", ".join(f"{count} {code.summary}" for code, count in refused.most_common())
     why = f"; refused: {counts}" if refused else ""
-    yield f"{len(found)} queries, {len(found) - refused.total()} accepted{why}"
+    yield f"{len(matches)} queries, {len(matches) - refused.total()} accepted{why}"
     if not fixes:
         return
-    in_world_m, on_map_m = (median(each["position"][key] for each in fixes) for key in ("accuracy_m", "on_map_m"))
-    said = f"± m: 1 sigma of the fix in the world, {in_world_m:.1f} m in the median; on the map {on_map_m:.1f} m"
-    if away_m := [each["from_gps_tag_m"] for each in fixes if each["from_gps_tag_m"] is not None]:
-        said += f"; {median(away_m):.1f} m from the GPS tags, which have errors of their own"
-    yield said
-    if of_place := sum(each["position"]["of_place"] for each in fixes):
+    in_world_m, on_map_m = (median(match["position"][key] for match in fixes) for key in ("accuracy_m", "on_map_m"))
+    text = f"± m: 1 sigma of the fix in the world, {in_world_m:.1f} m in the median; on the map {on_map_m:.1f} m"
+    if away_m := [match["from_gps_tag_m"] for match in fixes if match["from_gps_tag_m"] is not None]:
+        text += f"; {median(away_m):.1f} m from the GPS tags, which have errors of their own"
+    yield text
+    if of_place := sum(match["position"]["of_place"] for match in fixes):
         yield f"*: {of_place} positions are those of the places: how far the query was from its place is not known"

@@ -10,9 +10,7 @@ from edgevpr.cli.shared import add_command, add_group, add_json, format_fields, 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
     models = add_group(commands, "models", "list and try neural networks")
-    add_json(
-        add_command(models, "list", run_models_list, "run each network once, and list their origin and what uses them")
-    )
+    add_json(add_command(models, "list", run_models_list, "run each network once, and list its origin and its uses"))
 
 
 def run_models_list(args: Namespace) -> int:
@@ -20,7 +18,7 @@ def run_models_list(args: Namespace) -> int:
     from edgevpr.core.files import list_model_folders
     from edgevpr.runtime.preflight.networks import list_models
 
-    found = [asdict(each) for each in list_models()]
-    text = {each["name"]: {name: value for name, value in each.items() if name != "name"} for each in found}
-    print_result(found, args.json, format_fields({**text, "folders": list(map(str, list_model_folders()))}))
+    models = [asdict(model) for model in list_models()]
+    text = {model["name"]: {name: value for name, value in model.items() if name != "name"} for model in models}
+    print_result(models, args.json, format_fields({**text, "folders": list(map(str, list_model_folders()))}))
     return 0

@@ -14,24 +14,18 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "record",
         metavar="RECORD",
-        help=(
-            "ArduPilot .bin, .tlog, PX4 .ulg, DJI .SRT, .gpx, the flight log (.jsonl) of a recorded flight, or a "
-            "table from exiftool, Pix4D, Metashape or OpenDroneMap"
-        ),
+        help="ArduPilot .bin, .tlog, PX4 .ulg, DJI .SRT, .gpx, the flight log (.jsonl) of a recorded flight, or a "
+        "table from exiftool, Pix4D, Metashape or OpenDroneMap",
     )
     parser.add_argument("--images", required=True, metavar="SOURCE", help="folder of images, or video file")
     parser.add_argument(
         "--offset-s",
         type=float,
         metavar="S",
-        help=(
-            "seconds to add to the camera's clock (default: the time zone that fits), or to the video time of subtitles"
-        ),
+        help="seconds to add to the camera's clock (default: the time zone that fits), or to the time of subtitles",
     )
     parser.add_argument(
-        "--out",
-        metavar="CSV",
-        help=("file to write (default: positions.csv in the folder, or the video's name with .csv)"),
+        "--out", metavar="CSV", help="file to write (default: positions.csv in the folder, or VIDEO.csv)"
     )
     add_json(parser)
 
@@ -46,7 +40,7 @@ def run_positions(args: Namespace) -> int:
 
     source, is_folder = Path(args.images), Path(args.images).is_dir()
     if not source.exists():
-        raise UsageError(f"There is nothing at {source}: give the folder of the pictures, or the video.")
+        raise UsageError(f"{source} does not exist: give the folder of the images, or the video.")
     out = Path(args.out) if args.out else source / "positions.csv" if is_folder else source.with_suffix(".csv")
     if out.exists():
         raise UsageError(f"{out} exists already: move it away, or name another with --out.")
@@ -60,7 +54,7 @@ def run_positions(args: Namespace) -> int:
             write_positions(out, placed.tags)
     except OSError as error:
         raise UsageError(f"{out} cannot be written ({error.strerror}): name another file with --out.") from error
-    found = {
+    fields = {
         "record": record.kind,
         "how": placed.how,
         "offset_s": placed.offset_s,
@@ -69,5 +63,5 @@ def run_positions(args: Namespace) -> int:
         "rounded_m": find_rounding_m(placed),
         "out": str(out),
     }
-    print_result(found, args.json)
+    print_result(fields, args.json)
     return 0

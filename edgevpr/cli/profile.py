@@ -3,15 +3,7 @@
 from argparse import Namespace
 from typing import TYPE_CHECKING, Any
 
-from edgevpr.cli.shared import (
-    add_command,
-    add_json,
-    add_keys,
-    load_command_config,
-    parse_count,
-    parse_positive,
-    print_result,
-)
+from edgevpr.cli.shared import add_command, add_json, add_keys, make_config, parse_count, parse_positive, print_result
 from edgevpr.core.config import Config
 from edgevpr.core.text import progress
 
@@ -24,22 +16,13 @@ if TYPE_CHECKING:
 def add(commands: Any) -> None:
     """Add the command and its flags."""
     parser = add_command(commands, "profile", run_profile, "estimate memory, rate and battery use before take-off")
-    asked = parser.add_mutually_exclusive_group(required=True)
-    asked.add_argument("--list", action="store_true", help="list the boards")
-    asked.add_argument("--map", metavar="MAP", help="map of the flight: estimate its technique")
-    asked.add_argument("--places", type=parse_count, metavar="N", help="number of places: estimate every technique")
+    subject = parser.add_mutually_exclusive_group(required=True)
+    subject.add_argument("--list", action="store_true", help="list the boards")
+    subject.add_argument("--map", metavar="MAP", help="map of the flight: estimate its technique")
+    subject.add_argument("--places", type=parse_count, metavar="N", help="number of places: estimate every technique")
+    parser.add_argument("--board", default="this", metavar="NAME", help="board; see --list (default: this computer)")
     parser.add_argument(
-        "--board",
-        default="this",
-        metavar="NAME",
-        help="board; see --list (default: this computer)",
-    )
-    parser.add_argument(
-        "--flight-min",
-        type=parse_positive,
-        default=20.0,
-        metavar="MIN",
-        help="length of the flight in minutes (default: 20)",
+        "--flight-min", type=parse_positive, default=20.0, metavar="MIN", help="flight length in minutes (default: 20)"
     )
     add_keys(parser, "source.camera", "source.rate_hz", "memory.budget_mb", "battery.pack")
     add_json(parser)
@@ -58,7 +41,7 @@ def run_profile(args: Namespace) -> int:
         for name in ("this", *list_boards()):
             print(f"{name:<20} {load_board(name).title}")
         return 0
-    config = load_command_config(args)
+    config = make_config(args)
     board = resolve_board(load_board(args.board), config.source, config.memory)
     list_preferred(board)  # raises if the profile names a technique that is not there
     plan, trials = _make_plan(args, config, board)
@@ -69,8 +52,7 @@ def run_profile(args: Namespace) -> int:
 
 
 def _make_plan(args: Namespace, config: Config, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ...]]":
-    """Make two things from the flags: the plan of the flight, and the techniques to try in all their forms: that of
-    --map, else every one."""
+    """Return the plan of the flight, and the techniques to try in all their forms: that of --map, else every one."""
     from edgevpr import techniques
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.equations import parse_pack

@@ -14,7 +14,7 @@ _LAYOUT_CHARACTERS = "\n\r\t"  # control characters that pass: tables and progre
 
 @contextmanager
 def guard_output() -> Iterator[None]:
-    """Context manager: all that is written to stdout and stderr inside it passes through `core.text.shown`."""
+    """Context manager: all that is written to stdout and stderr inside it passes through `core.text.sanitize`."""
     with redirect_stdout(_GuardedStream(sys.stdout)), redirect_stderr(_GuardedStream(sys.stderr)):
         yield
 

@@ -16,7 +16,7 @@ from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import sanitize, suggest
 
 T = TypeVar("T")
-_KEY_PREFIX = "key "  # prefix of the attribute names of `Namespace` that hold keys of the configuration
+_PREFIX = "key "  # prefix of the attribute names of `Namespace` that hold keys of the configuration
 _HELP_COLUMNS = 78
 _UNITS = {
     "s": " s", "ms": " ms", "m": " m", "mb": " MB", "bytes": " bytes", "c": " °C", "deg": "°", "mah": " mAh", "w": " W"
@@ -68,14 +68,8 @@ def add_json(parser: ArgumentParser) -> None:
 
 def add_recording(parser: ArgumentParser, required: bool = True) -> None:
     """Add the flags for the images or the video that frames come from, and for their positions."""
-    parser.add_argument(
-        "--images",
-        "--source",
-        dest="source",
-        required=required,
-        metavar="SOURCE",
-        help="folder of images, or video file",
-    )
+    text = "folder of images, or video file"
+    parser.add_argument("--images", "--source", dest="source", required=required, metavar="SOURCE", help=text)
     add_positions(parser)
 
 
@@ -105,10 +99,8 @@ def add_known(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--known",
         metavar="A,B",
-        help=(
-            "what is known of each query, as in flight: heading (yaw_deg of positions.csv), height (height_m "
-            "of queries and places, or that of the map), reach (a position within 300 m)"
-        ),
+        help="what is known of each query, as in flight: heading (yaw_deg of positions.csv), height (height_m of "
+        "queries and places, or that of the map), reach (a position within 300 m)",
     )
 
 
@@ -125,19 +117,19 @@ def add_keys(parser: ArgumentParser, *names: str) -> None:
         form: dict[str, Any] = {"type": key.kind, "metavar": key.metavar, "choices": key.choices or None}
         if key.kind is bool:
             form = {"action": "store_const", "const": key.sets}
-        parser.add_argument(*key.flags, dest=_KEY_PREFIX + key.name, help=key.text, **form)
+        parser.add_argument(*key.flags, dest=_PREFIX + key.name, help=key.text, **form)
 
 
 def parse_value(args: Namespace, name: str) -> Any:
     """Return the value that the flags give for the configuration key `name`; None if they give none."""
-    return getattr(args, _KEY_PREFIX + name)
+    return getattr(args, _PREFIX + name)
 
 
-def load_command_config(args: Namespace, path: str | None = None, **others: Any) -> Config:
+def make_config(args: Namespace, path: str | None = None, **others: Any) -> Config:
     """Make the configuration from the file `path` (None: the defaults). Flags override the file, and the values
     `others`, by configuration key, override both."""
-    said = {name.removeprefix(_KEY_PREFIX): value for name, value in vars(args).items() if name.startswith(_KEY_PREFIX)}
-    return load_config(path, said | others)
+    flags = {name.removeprefix(_PREFIX): value for name, value in vars(args).items() if name.startswith(_PREFIX)}
+    return load_config(path, flags | others)
 
 
 def parse_parameters(pairs: list[str]) -> dict[str, str]:
@@ -173,9 +165,8 @@ def print_result(value: Any, as_json: bool, text: str | Iterable[str] | None = N
     if as_json:
         print(json.dumps(fields, indent=2, default=str))
     else:
-        print(
-            text if isinstance(text, str) else "\n".join(map(sanitize, format_fields(fields) if text is None else text))
-        )
+        lines = format_fields(fields) if text is None else text
+        print(lines if isinstance(lines, str) else "\n".join(map(sanitize, lines)))
 
 
 def format_fields(fields: dict[str, Any], indent: str = "") -> Iterator[str]:
@@ -186,13 +177,13 @@ def format_fields(fields: dict[str, Any], indent: str = "") -> Iterator[str]:
         unit = _UNITS.get(ending, "") if words else ""
         label = (words if unit else name).replace("_", " ")
         # The texts of dictionaries and of rows have spaces too.
-        is_list = isinstance(value, list | tuple) and any(" " in str(each) for each in value)
-        for each in value if is_list else [value]:
-            if isinstance(each, dict) and each:
+        is_list = isinstance(value, list | tuple) and any(" " in str(item) for item in value)
+        for item in value if is_list else [value]:
+            if isinstance(item, dict) and item:
                 yield f"{indent}{label}:"
-                yield from format_fields(each, f"{indent}  ")
-            elif each not in (None, "", (), [], {}):
-                yield f"{indent}{label:<18} {_format_value(each)}{unit}"
+                yield from format_fields(item, f"{indent}  ")
+            elif item not in (None, "", (), [], {}):
+                yield f"{indent}{label:<18} {_format_value(item)}{unit}"
 
 
 def _format_value(value: Any) -> str:
@@ -234,7 +225,7 @@ def check_output(target: str, source: str) -> Path:
 
     path = Path(target)
     if path.exists() and Path(source).exists() and path.samefile(source):
-        raise UsageError(f"{target} is what was read: give another name.")
+        raise UsageError(f"{target} is the input: give another name.")
     require_folder(path)
     return path
 
@@ -246,8 +237,8 @@ def write_output(target: str, source: str, write: Callable[[TextIO], T]) -> T:
 
     path = check_output(target, source)
 
-    def written(unfinished: Path) -> T:
+    def write_text(unfinished: Path) -> T:
         with open(unfinished, "w", encoding="utf-8", errors="backslashreplace", newline="") as out:
             return write(out)
 
-    return write_atomically(path, written)
+    return write_atomically(path, write_text)

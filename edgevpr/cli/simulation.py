@@ -8,7 +8,7 @@ from typing import Any
 from edgevpr.cli.shared import add_command, add_group
 from edgevpr.core.errors import UsageError
 
-# Number flags of a flight over an orthophoto: (default, least, greatest, help text).
+# Number flags of a flight over an orthophoto: (default, minimum, maximum, help text).
 _NUMBER_FLAGS: dict[str, tuple[float | None, float, float, str]] = {
     "height_m": (None, 1.0, 10_000.0, "height above ground in metres (default: that of the track)"),
     "every_m": (20.0, 1.0, 1e6, "distance between images of a mission in metres (default: 20)"),
@@ -48,8 +48,8 @@ def _parse_seed(text: str) -> int:
 def run_simulate_flight(args: Namespace) -> int:
     """Run `simulate flight`: write images and positions.csv of a flight over generated ground or an orthophoto."""
     if args.orthophoto is None:
-        if said := [name for name in ("track", *_NUMBER_FLAGS) if getattr(args, name) is not None]:
-            raise UsageError(f"--{said[0].replace('_', '-')} goes with --orthophoto: leave it out.")
+        if flags := [name for name in ("track", *_NUMBER_FLAGS) if getattr(args, name) is not None]:
+            raise UsageError(f"--{flags[0].replace('_', '-')} goes with --orthophoto: leave it out.")
         from edgevpr.lab.simulate.generated import write_generated_flight
 
         print(write_generated_flight(Path(args.out), args.which or "map", args.seed))
@@ -61,10 +61,10 @@ def run_simulate_flight(args: Namespace) -> int:
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
     numbers: dict[str, Any] = {}
-    for name, (usual, least, most, _) in _NUMBER_FLAGS.items():
-        numbers[name] = value = usual if getattr(args, name) is None else getattr(args, name)
-        if value is not None and not least <= value <= most:  # false for NaN
-            raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {least:g} to {most:g}.")
+    for name, (default, low, high, _) in _NUMBER_FLAGS.items():
+        numbers[name] = value = default if getattr(args, name) is None else getattr(args, name)
+        if value is not None and not low <= value <= high:  # false for NaN
+            raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {low:g} to {high:g}.")
     shots = read_shots(args.track, numbers["height_m"], numbers["every_m"])
     orthophoto = Orthophoto(args.orthophoto, compute_ground(shots, numbers["fov_deg"]))
     taken = write_overflight(Path(args.out), orthophoto, shots, numbers["fov_deg"], args.seed)

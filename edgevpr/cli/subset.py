@@ -12,9 +12,9 @@ from edgevpr.core.text import progress
 _MARGIN_M = 500.0
 
 
-def add(of_map: Callable[..., Any]) -> None:
-    """Add the command and its flags. `of_map` adds a command that begins with a map."""
-    parser = of_map("subset", run_map_subset, "cut out the part that a mission needs", "map, or folder of maps")
+def add(add_to_map: Callable[..., Any]) -> None:
+    """Add the command and its flags. `add_to_map` adds a command that begins with a map."""
+    parser = add_to_map("subset", run_map_subset, "cut out the part that a mission needs", "map, or folder of maps")
     parser.add_argument(
         "--mission",
         metavar="FILE",
@@ -40,6 +40,6 @@ def run_map_subset(args: Namespace) -> int:
     from edgevpr.places.mapfiles import parse_map_path
 
     area, out = read_area(args.mission), parse_map_path(args.out)
-    found = subset(Path(args.map), area, args.margin_m, out, args.mb and 1e6 * args.mb, progress)
-    print_result({"map": str(out), **asdict(found)}, args.json)
+    result = subset(Path(args.map), area, args.margin_m, out, args.mb and 1e6 * args.mb, progress)
+    print_result({"map": str(out), **asdict(result)}, args.json)
     return 0

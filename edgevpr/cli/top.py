@@ -14,10 +14,8 @@ from edgevpr.core.text import escape_unprintable, format_probability
 
 _STATUS_FILE = "/run/edgevpr/status.json"
 _REFRESH_S = 1.0  # the flight writes its status once a second
-# Age of a status after which the flight is called silent (a slow frame may delay it), and after which --once takes it
-# for the last status of a flight that was killed.
-_LATE_STATUS_S = 2.5
-_STALE_STATUS_S = 10.0
+_LATE_STATUS_S = 2.5  # from this age on a warning is shown; a slow frame may delay a status
+_STALE_STATUS_S = 10.0  # from this age on --once takes it for the last of a flight that was killed
 _COARSE_AGE_S = 3.0  # age of a picture from which on seconds are enough
 _CLEAR = "\x1b[H\x1b[J"
 _CHANNELS = {"COMMAND": "command 43003", "SENSOR": "message 296"}  # other channels are shown by their own names
@@ -26,9 +24,8 @@ _CHANNELS = {"COMMAND": "command 43003", "SENSOR": "message 296"}  # other chann
 def add(commands: Any) -> None:
     """Add the command and its flags."""
     parser = add_command(commands, "top", run_top, "show the running flight")
-    parser.add_argument(
-        "--file", default=_STATUS_FILE, metavar="PATH", help=f"the flight's status.file ({_STATUS_FILE})"
-    )
+    text = f"the flight's status.file (default: {_STATUS_FILE})"
+    parser.add_argument("--file", default=_STATUS_FILE, metavar="PATH", help=text)
     parser.add_argument("--once", action="store_true", help="print the status once")
     add_json(parser)
 
@@ -48,7 +45,7 @@ def run_top(args: Namespace) -> int:
             found = read_status(args.file)
             lines = format_status(found[0]) if found else list(_explain_no_flight(args.file))
             if found and found[1] > _LATE_STATUS_S:
-                lines.insert(0, f"the flight has said nothing for {found[1]:.0f} s")
+                lines.insert(0, f"no status from the flight for {found[1]:.0f} s")
             columns, height = shutil.get_terminal_size()
             sys.__stdout__.write(_CLEAR)  # type: ignore[union-attr]  # past the guard, which lets no escapes through
             rows = lines if found else [row for line in lines for row in textwrap.wrap(line, columns - 1)]
@@ -59,7 +56,7 @@ def run_top(args: Namespace) -> int:
 
 
 def _explain_no_flight(file: str) -> tuple[str, str]:
-    """Return what to say, in two lines, where no flight tells its status in `file`."""
+    """Return two lines for the user where no flight writes its status to `file`."""
     return (
         f"No running flight writes its status to {file}:",
         "start one (edgevpr run) with `status: {file: PATH}` in its configuration, and name that PATH with --file.",
@@ -69,10 +66,9 @@ def _explain_no_flight(file: str) -> tuple[str, str]:
 def format_status(status: dict[str, Any]) -> list[str]:
     """Return the status of a flight (see `runtime.flight.vitals`) for people, as lines of a label and a text."""
     age_s, heat = status["latency_s"], _format_optional("{:.0f} °C", status["temperature_c"])
-    latency = _format_optional(
-        ", {:.2f} s old" if (age_s or 0) < _COARSE_AGE_S else ", newest picture {:.0f} s old", age_s
-    )
-    hot, throttled = ", hot" * bool(status["hot"]), ", the board slows itself down" * bool(status["throttled"])
+    form = ", {:.2f} s old" if (age_s or 0) < _COARSE_AGE_S else ", newest image {:.0f} s old"
+    latency = _format_optional(form, age_s)
+    hot, throttled = ", hot" * bool(status["hot"]), ", throttled" * bool(status["throttled"])
     ram = f"{status['machine_ram_mb']:.0f} of {status['machine_ram_total_mb']:.0f} MB by all programs"
     rows = [
         ("edgevpr", f"{status['version']}, {status['elapsed_s']:.0f} s of flight, {status['health'].lower()}"),
@@ -102,17 +98,17 @@ def _format_query(query: dict[str, Any] | None, now_s: float) -> str:
     ago = f"{now_s - query['t_frame_s']:.0f} s ago"
     if not query["accepted"]:
         return f"{ago}, refused: {read_reason(query['reason']) or 'unknown'}"
-    sure = "" if query["confidence"] is None else f", confidence {format_probability(query['confidence'])}"
-    sure += _format_optional(", score {:.3f}", query["score"])
-    good = _format_optional(", good to {:.0f} m", query["accuracy_m"])
-    return f"{ago}, place {query['place']} ({query['reference_image']}){sure}{good}"
+    certainty = "" if query["confidence"] is None else f", confidence {format_probability(query['confidence'])}"
+    certainty += _format_optional(", score {:.3f}", query["score"])
+    accuracy = _format_optional(", accurate to {:.0f} m", query["accuracy_m"])
+    return f"{ago}, place {query['place']} ({query['reference_image']}){certainty}{accuracy}"
 
 
 def _format_link(link: dict[str, Any]) -> list[tuple[str, str]]:
     channel = _CHANNELS.get(link["channel"], link["channel"])
-    heard = _format_optional(f"flight controller {{:.0f}}, told by {channel}", link["autopilot"])
+    autopilot = _format_optional(f"autopilot {{:.0f}}, positions by {channel}", link["autopilot"])
     return [
-        ("link", f"{link['trouble'] or 'open'}, {heard or 'no flight controller is heard'}"),
+        ("link", f"{link['trouble'] or 'open'}, {autopilot or 'no telemetry from an autopilot'}"),
         ("fixes", link["fixes"]),
-        ("navigation", _format_optional("position known to {:.1f} m", link["accuracy_m"]) or "position unknown"),
+        ("navigation", _format_optional("position accurate to {:.1f} m", link["accuracy_m"]) or "position unknown"),
     ]

@@ -22,9 +22,9 @@ NO_POSITIONS_NOTE = (
 )
 # By benchmarks/results/from_space.md, a raster of half a metre a pixel.
 _OTHER_SEASON_NOTE = (
-    "of another day fewer are: of pictures months and an earthquake later 48 % were accepted alone, with heading and "
-    "height known (3 to 8 of twelve in a line), and 23 % without (0 to 6); `match` of pictures that `simulate flight` "
-    "takes of another orthophoto says it of this ground"
+    "fewer of another day: months and an earthquake later 48 % of images were accepted alone with heading and height "
+    "known (3 to 8 of twelve in a line), 23 % without (0 to 6); to measure this ground, `match` images that `simulate "
+    "flight` takes of another orthophoto"
 )
 _MAX_DIFFERENCES = 20  # differences of a replay at most
 
@@ -68,11 +68,11 @@ def format_refinement(path: str, refined: "Refined") -> Iterator[str]:
         yield f"  position    {moved}; the GPS tags scatter by {refined.recorded_sd_m:.1f} m"
         yield f"  footprint   an image shows {refined.footprint_m:.0f} m of ground along its longest side (median)"
     if refined.surveyed:
-        yield f"  surveyed    {refined.surveyed} were cut from a geo-referenced picture, and stay as they are"
+        yield f"  surveyed    {refined.surveyed} cut from an orthophoto keep their position"
     if not_tied := refined.places - refined.without_position - refined.surveyed - refined.refined:
         yield f"  not linked  {not_tied} keep their recorded position: a fix there is as accurate as the spacing"
     for place_id, image, off_m in refined.contradictory:
-        yield f"  amiss       place {place_id} ({sanitize(image)}): recorded {off_m:.0f} m from where its picture lies"
+        yield f"  GPS tag     place {place_id} ({sanitize(image)}): recorded {off_m:.0f} m from where its image lies"
 
 
 def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[str]:
@@ -88,9 +88,9 @@ def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Itera
     if info.first_time:
         yield f"  time        {info.first_time} to {info.last_time}"
     if info.with_pose:
-        shown = " or ".join(f"{each:.0f}" for each in info.footprints_m)
-        seen = f"an image shows {shown} m of ground along its longest side"
-        yield f"  pose        of {info.with_pose} places, accurate to {info.position_sd_m:.1f} m; {seen}"
+        lengths = " or ".join(f"{footprint_m:.0f}" for footprint_m in info.footprints_m)
+        footprint = f"an image shows {lengths} m of ground along its longest side"
+        yield f"  pose        of {info.with_pose} places, accurate to {info.position_sd_m:.1f} m; {footprint}"
     if info.of_low_quality:
         yield f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps"
     if info.one_way_deg is not None:
@@ -102,27 +102,27 @@ def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Itera
     yield f"  size        {info.file_bytes / 1e6:.1f} MB on disk, {ram_mb:.2f} MB in RAM"
 
 
-def format_move(path: str, done: "MapMove") -> Iterator[str]:
+def format_move(path: str, move: "MapMove") -> Iterator[str]:
     """Yield how `map move` has moved a map."""
-    yield f"{path}: {done.places} places moved {format_offset(done.east_m, done.north_m)}, +-{done.sd_m:.1f} m"
-    if done.scale is not None:
-        yield f"  scale       divided by {1 + done.scale:.4f}, around {done.middle[0]:.6f}, {done.middle[1]:.6f}"
+    yield f"{path}: {move.places} places moved {format_offset(move.east_m, move.north_m)}, +-{move.sd_m:.1f} m"
+    if move.scale is not None:
+        yield f"  scale       divided by {1 + move.scale:.4f}, around {move.middle[0]:.6f}, {move.middle[1]:.6f}"
 
 
-def format_check(found: "MapCheck") -> Iterator[str]:
+def format_check(result: "MapCheck") -> Iterator[str]:
     """Yield the result of `map check`: the places that can be read, and what is damaged."""
-    yield f"{found.path}: {found.places} of {found.total} places can be read"
-    yield from (f"  damaged     place {place_id}: {problem}" for place_id, problem in found.damaged)
-    yield from (f"  SQLite      {fault}" for fault in found.faults or ("the file is sound",))
+    yield f"{result.path}: {result.places} of {result.total} places can be read"
+    yield from (f"  damaged     place {place_id}: {problem}" for place_id, problem in result.damaged)
+    yield from (f"  SQLite      {fault}" for fault in result.faults or ("the file is sound",))
 
 
 def format_replay(again: "ReplayResult", lines: "LineComparison", packets: "PacketComparison") -> Iterator[str]:
     """Yield how a replay differs from its flight: in the `lines` of the log, in the `packets` sent, and in its end."""
     yield from _limit_differences([*map(_format_difference, lines.others), *packets.others])
     yield from (f"The program differs: {name} was {then}, is {now}" for name, (then, now) in lines.program.items())
-    yield f"{sum(line.get('kind') == 'query' for line in again.lines)} queries flown again"
-    yield f"log      {lines.alike} lines are the same, {len(lines.others)} differ"
-    yield f"MAVLink  {packets.alike} packets are the same, {len(packets.others)} differ"
+    yield f"{sum(line.get('kind') == 'query' for line in again.lines)} queries replayed"
+    yield f"log      {lines.alike} lines are equal, {len(lines.others)} differ"
+    yield f"MAVLink  {packets.alike} packets are equal, {len(packets.others)} differ"
     if again.guessed:
         yield f"{again.guessed} inputs are not on the tape where this program reads them: its costs differ."
     if again.why_ended:

@@ -55,13 +55,13 @@ class Album:
         """Return True if there is anywhere to look for pictures."""
         return bool(self._finders or self._kept)
 
-    def keep(self, name: str, image: Image) -> None:
+    def cache_copy(self, name: str, image: Image) -> None:
         """Keep a small copy of the picture `name`, uint8 (H, W[, 3]): no file has to be read for it any more."""
         from edgevpr.frames.images import encode_small_jpeg
 
         self._kept[name] = encode_small_jpeg(image, _SIDES_PX[0])
 
-    def image(self, name: str) -> Image | None:
+    def find_image(self, name: str) -> Image | None:
         """Return the picture `name`, uint8 (H, W[, 3]); None if there is none that can be read."""
         if name in self._kept:
             from edgevpr.frames.images import decode_jpeg
@@ -70,13 +70,12 @@ class Album:
         picture = self._find(name)
         return picture.image if picture else None
 
-    def level(self, place: Place, lens: "Lens | None") -> AlbumPicture | None:
-        """Return the picture of a place as its pose lays it on the ground: levelled, if the `lens` is known. None if
-        there is no such picture."""
+    def level_picture(self, place: Place, lens: "Lens | None") -> AlbumPicture | None:
+        """Return the picture of a place, levelled if the `lens` is known; None if there is none."""
         picture = self._find(place.source_image)
         if picture is None:
             return None
-        self.keep(place.source_image, picture.image)  # photographs take long to decode
+        self.cache_copy(place.source_image, picture.image)  # photographs are slow to decode
         tag = picture.tag() if lens and picture.tag else None
         if lens is None or tag is None:
             return picture
@@ -86,19 +85,19 @@ class Album:
         level = level_image(make_frame(picture.image, place.source_image, 0.0, tag), None, lens, below=True)
         return AlbumPicture(level.image, level.mask)
 
-    def lay(self, place: Place, lens: "Lens | None") -> AlbumPicture | None:
+    def align_picture(self, place: Place, lens: "Lens | None") -> AlbumPicture | None:
         """Return the picture of a place whose top points where its pose says: levelled, as in a map made with the
         `lens`, whose tops point north, or as it is. None if there is none, or its heading contradicts both."""
         picture = self._find(place.source_image)
         tag = picture.tag() if picture and picture.tag else None
         if not tag or tag.heading_deg is None or not place.pose:
-            return self.level(place, lens)
+            return self.level_picture(place, lens)
         is_raw, is_level = (
             abs(wrap_deg(place.pose.up_deg - up_deg)) < _MAX_HEADING_ERROR_DEG
             for up_deg in (tag.heading_deg + (lens.up_deg if lens else 0.0), 0.0)
         )
         if lens and is_level:
-            return self.level(place, lens)
+            return self.level_picture(place, lens)
         return picture if is_raw else None
 
     def _find(self, name: str) -> AlbumPicture | None:
@@ -134,31 +133,31 @@ def _read_folder_tags(folder: Path) -> Mapping[Path, GeoTag]:
 
 
 class _VideoFinder:
-    """Finds the pictures of a film by the names of its frames. Raises EdgevprError for a file that is no film, and for
+    """Finds the pictures of a video by the names of its frames. Raises EdgevprError for a file that is no video or has
     an unusable table of positions beside it."""
 
-    def __init__(self, film: Path) -> None:
+    def __init__(self, video: Path) -> None:
         from edgevpr.frames.positions import find_track, read_track
         from edgevpr.frames.source import open_source
 
-        table = find_track(film)
+        table = find_track(video)
         self._track = read_track(table) if table else None
-        self._open = partial(open_source, str(film), live=False)
+        self._open = partial(open_source, str(video), live=False)
         self._source, self._passed = self._open(), ""
 
     def __call__(self, name: str) -> AlbumPicture | None:
         from edgevpr.frames.source import read_to_end
 
-        named = _FRAME_NAME.fullmatch(name)
-        if not named:
+        match = _FRAME_NAME.fullmatch(name)
+        if not match:
             return None
-        if name <= self._passed:  # names are in the order of the film, which is read forwards
+        if name <= self._passed:  # names are in the order of the video, which is read forwards
             self._source.close()
             self._source, self._passed = self._open(), ""
         for frame in filter(None, read_to_end(self._source, lambda error: None)):
             self._passed = frame.name
             if frame.name >= name:
-                tag = partial(self._track.interpolate_tag, float(named[1])) if self._track else None
+                tag = partial(self._track.interpolate_tag, float(match[1])) if self._track else None
                 return AlbumPicture(frame.image, tag=tag) if frame.name == name else None
         return None
 
@@ -170,9 +169,8 @@ def _open_orthophoto(source: str | Path, places: Sequence[Place]) -> Finder:
     from edgevpr.mapmaking.tiles import surround
 
     cut = {place.source_image: (place.position, place.pose) for place in places if place.position and place.pose}
-    known = [(position, pose) for position, pose in cut.values() if position and pose]
-    points = [(position.lat_deg, position.lon_deg) for position, _ in known]
-    orthophoto = Orthophoto(source, surround(points, max(pose.footprint_m for _, pose in known)))
+    points = [(position.lat_deg, position.lon_deg) for position, _ in cut.values()]
+    orthophoto = Orthophoto(source, surround(points, max(pose.footprint_m for _, pose in cut.values())))
 
     def find(name: str) -> AlbumPicture | None:
         position, pose = cut.get(name, (None, None))
@@ -184,21 +182,21 @@ def _open_orthophoto(source: str | Path, places: Sequence[Place]) -> Finder:
 
 
 def make_album(sources: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({})) -> Album:
-    """Return the album of the pictures in `sources`: folders, or one film; and first those of a recording, `recorded`,
+    """Return the album of the pictures in `sources`: folders, or one video; and first those of a recording, `recorded`,
     by the names of its frames. Raises EdgevprError for a source that cannot be used."""
     finders: list[Finder] = [partial(_find_recorded, recorded)] if recorded else []
     if len(sources) == 1 and Path(sources[0]).is_file():
         return Album(*finders, _VideoFinder(Path(sources[0])))
     for folder in map(Path, sources):
         if not folder.is_dir():
-            raise UsageError(f"{folder}: there is no such folder: give one that holds pictures, or a film.")
+            raise UsageError(f"{folder}: there is no such folder: give a folder of images, or a video.")
         finders.append(partial(_find_in_folder, folder.resolve()))
     return Album(*finders)
 
 
 def make_map_album(sources: Sequence[str | Path], places: Sequence[Place]) -> Album:
-    """Return the album of a map's pictures. `sources` are folders of pictures, or a film; of a map that was cut from an
-    orthophoto, the orthophoto. Raises EdgevprError for one that cannot be used."""
+    """Return the album of a map's pictures. `sources` are folders of pictures, or a video, or the orthophoto that the
+    map was cut from. Raises EdgevprError for one that cannot be used."""
     if sources and any(place.position and place.pose and place.pose.is_surveyed for place in places):
         return Album(_open_orthophoto(sources[0], places))
     return make_album(sources)
@@ -216,9 +214,9 @@ def embed_pictures(
     every = max(1, -(-len(keys) * _MIN_BYTES // max(1, int(room_bytes))))
     keys = list(dict.fromkeys(key for step in steps[::every] for key in step if albums[key[0]]))
     pictures: dict[Key, str] = {}
-    are_left_out = every > 1
-    for number, (of, name) in enumerate(progress(keys, len(keys), "pictures")):
-        image = albums[of].image(name)
+    some_left_out = every > 1
+    for number, (album, name) in enumerate(progress(keys, len(keys), "pictures")):
+        image = albums[album].find_image(name)
         if image is None:
             continue
         for side_px in _SIDES_PX:
@@ -226,8 +224,8 @@ def embed_pictures(
             if len(address) <= room_bytes / (len(keys) - number):
                 break
         if len(address) <= room_bytes:
-            pictures[of, name] = address
+            pictures[album, name] = address
             room_bytes -= len(address)
         else:
-            are_left_out = True
-    return pictures, "Only some steps have pictures: with more the page would be too large." * are_left_out
+            some_left_out = True
+    return pictures, "Only some steps have pictures: the page would be too large with more." * some_left_out

@@ -1,5 +1,5 @@
-"""Reads a flight log into checked values, for the report. A field that a log lacks, or that is damaged
-or of another type, becomes None."""
+"""Reads a flight log into checked values, for the report. A field that is missing, damaged or of another type becomes
+None."""
 
 import logging
 from dataclasses import dataclass, field
@@ -22,13 +22,13 @@ _MAX_NUMBER = 1e15  # larger numbers are damage; the comparison also excludes Na
 
 class FixOutcome(Enum):
     """Outcome of a fix, in the words of the report. CONTINUOUS: the fix became part of the position that is sent many
-    times a second, and is not answered. KEPT: it was not sent, see its `why`."""
+    times a second, and is not answered. NOT_SENT: it was not sent, see its `why`."""
 
     TAKEN = "fix taken"
     REFUSED = "fix refused"
     UNANSWERED = "fix not answered"
     CONTINUOUS = "in continuous position"
-    KEPT = "fix not sent"
+    NOT_SENT = "fix not sent"
 
 
 SENT_OUTCOMES = (FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.UNANSWERED)
@@ -36,12 +36,12 @@ SENT_OUTCOMES = (FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.UNANSWERED)
 
 @dataclass(slots=True, kw_only=True)
 class LoggedFix:
-    """The fix of a query: its outcome, `why` it was not sent or not taken (None: unknown), and its position
-    `at` (None: there was nothing to send)."""
+    """The fix of a query: its outcome, `why` it was not sent or not taken (None: unknown), and its `position`
+    (None: there was nothing to send)."""
 
     outcome: FixOutcome
     why: Reason | None
-    at: Point | None
+    position: Point | None
     accuracy_m: float | None
 
 
@@ -49,10 +49,10 @@ class LoggedFix:
 class LoggedQuery:
     """One query, whose frame was taken `t_s` seconds after the start of the flight. None in any field: unknown.
 
-    `line` is its line of the log. `at` is the position of an accepted match, `place_at` that of the place found.
-    `autopilot_at` and `gps_at` are the aircraft's positions at that time by autopilot and GPS receiver; `true_at`, by
-    which a match is judged, is `autopilot_at` if the autopilot has GPS, else `gps_at`. `has_link`: a report of the
-    autopilot arrived within a second."""
+    `line` is its line of the log. `position` is that of an accepted match, `place_position` that of the place found.
+    `autopilot_position` and `gps_position` are those of the aircraft at that time by autopilot and GPS receiver.
+    `true_position`, by which a match is judged, is the autopilot's if it has GPS, else that of the receiver.
+    `has_link`: a report of the autopilot arrived within a second."""
 
     line: dict[str, Any]
     name: str
@@ -62,27 +62,26 @@ class LoggedQuery:
     confidence: float | None
     place: int | None
     reference_image: str | None
-    at: Point | None
+    position: Point | None
     accuracy_m: float | None
-    place_at: Point | None
-    autopilot_at: Point | None
-    gps_at: Point | None
-    true_at: Point | None
+    place_position: Point | None
+    autopilot_position: Point | None
+    gps_position: Point | None
+    true_position: Point | None
     fix: LoggedFix | None
     has_link: bool | None
 
     @property
     def off_m(self) -> float | None:
-        """Distance from the match to `true_at`."""
-        return float(distance_m(*self.true_at, *self.at)) if self.true_at and self.at else None
+        """Distance from the match to `true_position`."""
+        return float(distance_m(*self.true_position, *self.position)) if self.true_position and self.position else None
 
 
 @dataclass(slots=True, kw_only=True)
 class LoggedFlight:
     """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `remarks` are the
     lines with a text for people: time, kind and text. `unusable` is the number of frames that never became queries,
-    `between` the lines of fixes sent between matches. Times are
-    seconds after its start; it is `span_s` long."""
+    `between` the lines of fixes sent between matches. Times are seconds after its start; it is `span_s` long."""
 
     path: Path
     start: dict[str, Any] = field(default_factory=dict)
@@ -141,28 +140,29 @@ def _read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
     """Read a log line of kind "query"."""
     t_frame_s = get_number(line, "t_frame_s")
     accepted = line.get("accepted") is True
-    gps_at = _locate_gps(line, t_frame_s)
+    gps_position = _locate_gps(line, t_frame_s)
     has_link = _is_fresh(get_number(line, "vehicle", "t_heard_s"), t_frame_s)
-    autopilot_at = get_point(line, "vehicle") if has_link else None
+    autopilot_position = get_point(line, "vehicle") if has_link else None
     # The confidence by which a match was judged: its own, or that of the flight so far where it is higher.
     confidences = get_number(line, "confidence"), get_number(line, "followed", "confidence")
     place, fix = get_number(line, "place"), get_value(line, "fix")
+    has_gps = get_value(line, "vehicle", "has_gps") is True
     return LoggedQuery(
         line=line,
         name=get_text(line, "query") or "",
         t_s=t_s,
         accepted=accepted,
         reason=read_reason(line.get("reason")),
-        confidence=max((known for known in confidences if known is not None), default=None),
+        confidence=max((confidence for confidence in confidences if confidence is not None), default=None),
         place=None if place is None else int(place),
         reference_image=get_text(line, "reference_image"),
-        at=get_point(line, "located") or get_point(line, "position") if accepted else None,
+        position=get_point(line, "located") or get_point(line, "position") if accepted else None,
         accuracy_m=get_number(line, "accuracy_m"),
-        place_at=get_point(line, "position"),
-        autopilot_at=autopilot_at,
-        gps_at=gps_at,
+        place_position=get_point(line, "position"),
+        autopilot_position=autopilot_position,
+        gps_position=gps_position,
         # An autopilot that has GPS knows by how much its receiver lags: at 20 m/s that is metres.
-        true_at=autopilot_at if gps_at and get_value(line, "vehicle", "has_gps") is True else gps_at,
+        true_position=autopilot_position if gps_position and has_gps else gps_position,
         fix=_read_fix(fix) if isinstance(fix, dict) else None,
         has_link=has_link if "vehicle" in line else None,
     )
@@ -170,13 +170,13 @@ def _read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
 
 def _read_fix(fix: dict[str, Any]) -> LoggedFix:
     outcome, why = _read_outcome(fix, fix.get("answer")), read_reason(fix.get("why"))
-    return LoggedFix(outcome=outcome, why=why, at=get_point(fix), accuracy_m=get_number(fix, "accuracy_m"))
+    return LoggedFix(outcome=outcome, why=why, position=get_point(fix), accuracy_m=get_number(fix, "accuracy_m"))
 
 
 def _read_outcome(fix: dict[str, Any], answer: object) -> FixOutcome:
     if fix.get("sent") is False:
         why = read_reason(fix.get("why"))
-        return FixOutcome.CONTINUOUS if why and why.code is ReasonCode.CONTINUOUS else FixOutcome.KEPT
+        return FixOutcome.CONTINUOUS if why and why.code is ReasonCode.CONTINUOUS else FixOutcome.NOT_SENT
     if answer is None:
         return FixOutcome.UNANSWERED
     return FixOutcome.TAKEN if answer == "ACCEPTED" else FixOutcome.REFUSED
@@ -189,24 +189,24 @@ def _is_fresh(t_s: float | None, t_frame_s: float | None) -> bool:
 def _locate_gps(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
     """Return where the GPS receiver was when the frame was taken: its newest position, moved on by the velocity. None
     if it is unknown or its time is further than `_MAX_REPORT_AGE_S` from the frame's."""
-    at, t_s = get_point(line, "vehicle", "gps"), get_number(line, "vehicle", "gps", "t_s")
-    if at is None or t_s is None or t_frame_s is None or not _is_fresh(t_s, t_frame_s):
+    position, t_s = get_point(line, "vehicle", "gps"), get_number(line, "vehicle", "gps", "t_s")
+    if position is None or t_s is None or t_frame_s is None or not _is_fresh(t_s, t_frame_s):
         return None
     match get_value(line, "vehicle", "velocity_m_s"):
         case [int() | float() as east_m_s, int() | float() as north_m_s]:
-            return offset_position(*at, (t_frame_s - t_s) * east_m_s, (t_frame_s - t_s) * north_m_s)
-    return at
+            return offset_position(*position, (t_frame_s - t_s) * east_m_s, (t_frame_s - t_s) * north_m_s)
+    return position
 
 
 def _read_text(line: dict[str, Any]) -> str:
     reasons = [str(reason) for key in _REASON_FIELDS if (reason := read_reason(line.get(key)))]
-    words = next(iter([*reasons, *(known for key in _TEXT_FIELDS if (known := get_text(line, key)))]), None)
+    words = next(iter([*reasons, *(text for key in _TEXT_FIELDS if (text := get_text(line, key)))]), None)
     match line:
         case {"from": dict() as before, "to": dict() as after}:  # of the governor
             changed = [f"{key} {before.get(key)} to {now}" for key, now in after.items() if before.get(key) != now]
             return f"{', '.join(changed)}: {words}"
     others = {"kind", "time", "t_mono_s"}
-    return words or ", ".join(f"{key} {known}" for key, known in line.items() if key not in others)
+    return words or ", ".join(f"{key} {field_value}" for key, field_value in line.items() if key not in others)
 
 
 def get_value(record: Any, *keys: str) -> Any:
@@ -218,15 +218,15 @@ def get_value(record: Any, *keys: str) -> Any:
 
 def get_number(record: Any, *keys: str) -> float | None:
     """Return the number at `keys`, as `get_value` does; None if it is missing or no plausible number."""
-    found = get_value(record, *keys)
-    is_number = isinstance(found, (int, float)) and not isinstance(found, bool)
-    return float(found) if is_number and -_MAX_NUMBER < found < _MAX_NUMBER else None
+    value = get_value(record, *keys)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return float(value) if is_number and -_MAX_NUMBER < value < _MAX_NUMBER else None
 
 
 def get_text(record: Any, *keys: str) -> str | None:
     """Return the text at `keys`, as `get_value` does; None if it is missing, empty or no text."""
-    found = get_value(record, *keys)
-    return found if isinstance(found, str) and found else None
+    value = get_value(record, *keys)
+    return value if isinstance(value, str) and value else None
 
 
 def get_point(record: Any, *keys: str) -> Point | None:

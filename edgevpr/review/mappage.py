@@ -17,12 +17,12 @@ from edgevpr.review.webpage import UNKNOWN, Layer, Section, Step, format_number,
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
-MAX_QUERIES = 100  # pictures of a map that are looked for among the places elsewhere: each takes half a second
+MAX_QUERIES = 100  # images of a map that are searched among the places elsewhere; each takes half a second
 _QUALITY_CLASSES = {"low": 0.4, "fair": 0.6, "good": 0.8, "best": 1.01}  # below which value it is called so
 _MAX_HARD_CONFIDENCE = 0.5  # mean confidence of a place that is hard to recognise
 _MAX_TAG_SIGMA = 4.0  # times the usual distance of a tag from where its picture lies, as in refinement
-_MEDIAN_PER_SIGMA = 1.1774  # of the length of a normally distributed vector, over the standard deviation of an axis
-_MIN_TAG_OFF_M = 5.0  # less is no more than the receiver's error
+_MEDIAN_PER_SIGMA = 1.1774  # median length of a normally distributed vector over the standard deviation of an axis
+_MIN_TAG_OFF_M = 5.0  # less is the receiver's error
 _CELLS_PER_FOOTPRINT = 24  # of a footprint
 _MAX_CELLS = 4_000_000  # of the whole ground
 _COVERED_SHARE = 0.75  # of a footprint: the short side of a picture of 4:3
@@ -34,8 +34,8 @@ _NOTES = (
     "A GPS tag is inconsistent if it is four times farther from its picture than is usual in this map.",
 )
 _NO_PICTURES = (
-    "Places that look alike are looked for with --map-images, in a map of `cohog`, if its places were made of these "
-    "pictures, with the lens of --config."
+    "Look-alikes are searched with --map-images, in a map of `cohog`, if its places were made from these images with "
+    "the lens of --config."
 )
 
 
@@ -54,11 +54,11 @@ def make_map_page(
     its camera (None: unknown)."""
     ground = [place for place in places if place.position]
     points = {place.place_id: to_point(place) for place in ground}
-    tags_off_m, alike = find_inconsistent_tags(ground), {each.place_id: each for each in look_alikes if each}
+    tags_off_m, twins = find_inconsistent_tags(ground), {alike.place_id: alike for alike in look_alikes if alike}
     hard = {place_id for place_id, confidence in recognisable.items() if confidence < _MAX_HARD_CONFIDENCE}
     gaps, covered_m2, gaps_m2 = find_gaps(ground)
-    steps = list(_make_steps(places, recognisable, tags_off_m, alike, points))
-    pairs = [(points.get(each.place_id), points.get(each.other_id)) for each in alike.values()]
+    steps = list(_make_steps(places, recognisable, tags_off_m, twins, points))
+    pairs = [(points.get(twin.place_id), points.get(twin.other_id)) for twin in twins.values()]
     tags = [(read_recorded_position(place), to_point(place)) for place in ground if place.place_id in tags_off_m]
     layers = [
         Layer("coverage gaps", "hole", gaps, "area"),
@@ -67,74 +67,73 @@ def make_map_page(
         make_layer(steps, "hard to recognise", "weak"),
         *(make_layer(steps, f"{quality} quality", quality) for quality in _QUALITY_CLASSES),
     ]
-    known = {
+    figures = {
         "places": str(len(places)),
         "ground seen": format_number(covered_m2 / 1e4 if covered_m2 else None, "ha"),
         "coverage gaps": format_number(gaps_m2 / 1e4 if covered_m2 else None, "ha"),
         "inconsistent GPS tags": str(len(tags_off_m)),
         "hard to recognise": str(len(hard)) if recognisable else UNKNOWN,
-        "look alike": f"{len(alike)} of {len(look_alikes)}" if look_alikes else UNKNOWN,
+        "look alike": f"{len(twins)} of {len(look_alikes)}" if look_alikes else UNKNOWN,
     }
     notes = [*_NOTES, *([] if look_alikes else [_NO_PICTURES])]
     head = {
         "title": f"Map {name}",
         "known": [f"{len(places)} places"],
-        "figures": known,
+        "figures": figures,
         "warnings": [],
         "span_s": None,
     }
-    held = Section("What it holds", [line.strip() for line in lines])
+    content = Section("Content", [line.strip() for line in lines])
     albums = {"place": pictures}
-    return make_page(head, steps, ground, layers, albums, lens=lens, notes=notes if ground else [], sections=[held])
+    return make_page(head, steps, ground, layers, albums, lens=lens, notes=notes if ground else [], sections=[content])
 
 
 def _classify_quality(place: Place) -> str:
-    return next(name for name, below in _QUALITY_CLASSES.items() if place.quality < below)
+    return next(name for name, limit in _QUALITY_CLASSES.items() if place.quality < limit)
 
 
 def _make_steps(
     places: Sequence[Place],
     recognisable: Mapping[int, float],
     tags_off_m: Mapping[int, float],
-    alike: Mapping[int, FoundLookAlike],
+    twins: Mapping[int, FoundLookAlike],
     points: Mapping[int, Point],
 ) -> Iterable[Step]:
     images = {place.place_id: place.source_image for place in places}
     for place in places:
         place_id, pose = place.place_id, place.pose
-        confidence, twin = recognisable.get(place_id), alike.get(place_id)
-        is_hard, own = confidence is not None and confidence < _MAX_HARD_CONFIDENCE, points.get(place_id)
+        confidence, twin = recognisable.get(place_id), twins.get(place_id)
+        is_hard, position = confidence is not None and confidence < _MAX_HARD_CONFIDENCE, points.get(place_id)
         groups = {
             f"{_classify_quality(place)} quality": True,
             "looks like another place": twin,
             "inconsistent GPS tag": place_id in tags_off_m,
             "hard to recognise": is_hard,
-            "not laid by its neighbours": own and not pose,
+            "not aligned with its neighbours": position and not pose,
             "kept to bound a gap": place.salience and place.salience.is_low,
-            "without a position": not own,
+            "without a position": not position,
         }
         sd_m = float(np.sqrt(sum(pose.covariance_m2[::2]) / 2)) if pose else None
-        said = [f"quality {place.quality:.2f}: the share of its picture that holds information"]
-        said += (
-            [f"known to {format_number(sd_m, 'm')}; its picture shows {pose.footprint_m:.3g} m of ground"]
+        texts = [f"quality {place.quality:.2f}: usable share of its image"]
+        texts += (
+            [f"position accurate to {format_number(sd_m, 'm')}; its image shows {pose.footprint_m:.3g} m of ground"]
             if pose
             else []
         )
-        said += [f"its tag lies {tags_off_m[place_id]:.0f} m from its picture"] if place_id in tags_off_m else []
-        said += (
-            [] if confidence is None else [f"mean confidence of its altered pictures: {format_probability(confidence)}"]
-        )
+        texts += [f"its GPS tag lies {tags_off_m[place_id]:.0f} m from its image"] if place_id in tags_off_m else []
+        if confidence is not None:
+            texts.append(f"mean confidence of altered copies of its image: {format_probability(confidence)}")
         pictures = [("place", place.source_image, f"place {place_id}: {place.source_image}")]
-        at = {"alike": points.get(twin.other_id) if twin else None, "weak": own if is_hard else None}
+        marks = {"alike": points.get(twin.other_id) if twin else None, "weak": position if is_hard else None}
         if twin:
             image = images.get(twin.other_id, "")
-            said.append(f"looks like place {twin.other_id}: confidence {format_probability(twin.confidence)}")
+            texts.append(f"looks like place {twin.other_id}: confidence {format_probability(twin.confidence)}")
             pictures.append(("place", image, f"looks alike: place {twin.other_id}: {image}"))
         yield Step(
             title=f"Place {place_id}: {place.source_image}",
-            said=said,
+            texts=texts,
             groups={name: "places" for name, is_so in groups.items() if is_so},
-            at={name: point for name, point in {**at, _classify_quality(place): own}.items() if point},
+            points={name: point for name, point in {**marks, _classify_quality(place): position}.items() if point},
             circle_m=sd_m,
             place=place,
             pictures=[picture for picture in pictures if picture[1]],

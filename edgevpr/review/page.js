@@ -1,4 +1,4 @@
-// Draws the page and moves it. All that there is to show is in the data block "page", by `webpage.py`. Texts become text
+// Draws the page and moves it. Its content is in the data block "page", by `webpage.py`. Texts become text
 // nodes, never HTML.
 "use strict";
 (() => {
@@ -135,13 +135,13 @@
     const shape = Math.min(Math.max(wide / high, 0.56), 1.8), width = Math.max(wide, high * shape), height = width / shape;
     return [left - (width - wide) / 2, top - (height - high) / 2, width, height];
   }
-  const MOST = 60; // times
+  const MAX_ZOOM = 60;
   const whole = ground ? fit(ground.box) : [0, 0, 1000, 1000];
   let box = whole;
   const zoomed = () => whole[2] / box[2];
 
   function look(x, y, wide) {
-    wide = Math.min(Math.max(wide, whole[2] / MOST), whole[2]);
+    wide = Math.min(Math.max(wide, whole[2] / MAX_ZOOM), whole[2]);
     const high = wide * whole[3] / whole[2];
     const within = (least, most, value) => Math.min(Math.max(value, least), most);
     box = [within(whole[0], whole[0] + whole[2] - wide, x), within(whole[1], whole[1] + whole[3] - high, y), wide, high];
@@ -156,7 +156,7 @@
   }
   // Zoom about the point that is [right, down] of the view, 0 to 1 each.
   const zoom = (by, right = 0.5, down = 0.5) => {
-    const wide = Math.min(Math.max(box[2] / by, whole[2] / MOST), whole[2]);
+    const wide = Math.min(Math.max(box[2] / by, whole[2] / MAX_ZOOM), whole[2]);
     look(box[0] + right * (box[2] - wide), box[1] + down * (box[3] - wide * whole[3] / whole[2]), wide);
   };
   const pan = (right, down) => look(box[0] + right * box[2], box[1] + down * box[3], box[2]);
@@ -226,13 +226,13 @@
     slider.value = at;
     document.getElementById("which").textContent = shown.length ? `${at + 1} of ${shown.length}` : "none";
     find("h3", panel).textContent = step ? step.title : "Nothing is left: show more below.";
-    const said = find("div", panel), pair = find(".pair", panel);
-    said.textContent = pair.textContent = "";
+    const texts = find("div", panel), pair = find(".pair", panel);
+    texts.textContent = pair.textContent = "";
     nowAt && (nowAt.textContent = "");
     for (const line of all(".cursor")) line.remove();
     if (!step) return;
     slider.setAttribute("aria-valuetext", step.title);
-    said.append(...step.said.map((each) => html("p", {}, each)));
+    texts.append(...step.texts.map((text) => html("p", {}, text)));
     pair.append(...step.pictures.map(([caption, number]) => html("figure", {},
       html("img", { src: pictures[number], alt: caption }), html("figcaption", {}, caption))));
     if (has_times) {
@@ -241,7 +241,7 @@
       }
     }
     if (nowAt) {
-      const points = Object.entries(step.at), last = points.length && points[points.length - 1][1];
+      const points = Object.entries(step.points), last = points.length && points[points.length - 1][1];
       if (step.square) nowAt.append(svg("rect", { class: "square", ...square(step.square) }));
       if (last && step.circle) nowAt.append(svg("circle", { class: "claimed", cx: last[0], cy: last[1], r: step.circle }));
       nowAt.append(...points.map(([name, [x, y]]) => svg("path", { class: `spot ${name}`, d: `M${x} ${y}h0` })));
@@ -254,7 +254,7 @@
   };
   function choose([right, down]) {
     const [x, y] = [box[0] + right * box[2], box[1] + down * box[3]];
-    const away = (step) => Math.min(...Object.values(step.at).map((point) => Math.hypot(point[0] - x, point[1] - y)));
+    const away = (step) => Math.min(...Object.values(step.points).map((point) => Math.hypot(point[0] - x, point[1] - y)));
     const near = nearest(shown, away);
     if (near && away(near) < 40 * box[2] / view.clientWidth) show(near);
   }
@@ -267,9 +267,9 @@
     const wanted = new Set(all("[data-group]:checked").map((each) => +each.dataset.group));
     shown = wanted.size ? steps.filter((step) => step.groups.some((group) => wanted.has(group))) : steps;
     slider.max = Math.max(0, shown.length - 1);
-    for (const name of new Set(steps.flatMap((step) => Object.keys(step.at)))) {
+    for (const name of new Set(steps.flatMap((step) => Object.keys(step.points)))) {
       const dots = view && find(`.dots.layer-${name}`, view);
-      dots && dots.setAttribute("d", shown.filter((step) => step.at[name]).map(({ at }) => `M${at[name].join(" ")}h0`).join(""));
+      dots && dots.setAttribute("d", shown.filter((step) => step.points[name]).map(({ points }) => `M${points[name].join(" ")}h0`).join(""));
     }
     for (const marks of all("[data-lane]")) {
       marks.setAttribute("d", inLane(marks).map((step) => `M${across(step.t_s).toFixed(1)} 0v20`).join(""));

@@ -41,13 +41,13 @@ if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
 _MAX_REMARKS = 200
-_MAX_GPS_ERROR_M = 15.0  # from GPS: less is the error of a receiver, and no danger
+_MAX_GPS_ERROR_M = 15.0  # less is the error of a receiver, and no danger
 _FIX_COLOURS = {
     FixOutcome.TAKEN: "taken",
     FixOutcome.UNANSWERED: "unanswered",
     FixOutcome.REFUSED: "refused",
     FixOutcome.CONTINUOUS: "taken",
-    FixOutcome.KEPT: "places",
+    FixOutcome.NOT_SENT: "places",
 }
 _HEAD_FIELDS = (("map", "map"), ("technique", "technique"), ("board", "board"), ("edgevpr", "version"))
 
@@ -59,7 +59,7 @@ def make_flight_page(
     `no_ground` is a sentence on why there is no `ground`."""
     queries = flight.queries
     time = get_text(flight.start, "time") or next((get_text(query.line, "time") for query in queries), None)
-    start = [f"{name} {known}" for name, key in _HEAD_FIELDS if (known := get_text(flight.start, key))]
+    start = [f"{name} {value}" for name, key in _HEAD_FIELDS if (value := get_text(flight.start, key))]
     head = {
         "title": f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time",
         "known": [f"{format_duration(flight.span_s)} long", *start, str(flight.path)],
@@ -107,31 +107,31 @@ def _make_step(query: LoggedQuery, place: Place | None, has_times: bool, has_lin
     """Return the step of a query. `has_times`: its flight lasted. `has_link`: the flight had a link to an autopilot."""
     fix, verdict = query.fix, "accepted" if query.accepted else "refused"
     points = {
-        "found": query.place_at,
-        "missed": None if query.accepted else query.true_at or query.autopilot_at,
-        "gps": query.gps_at,
-        "autopilot": query.autopilot_at,
+        "found": query.place_position,
+        "missed": None if query.accepted else query.true_position or query.autopilot_position,
+        "gps": query.gps_position,
+        "autopilot": query.autopilot_position,
     }
     refused = f"match refused: {query.reason.code.summary}" if query.reason else "match refused"
     groups = {"match accepted": "accepted"} if query.accepted else {refused: "refused"}
-    fixed = f"{fix.outcome.value}{f': {fix.why}' if fix.why else ''}" if fix else ""
+    outcome = f"{fix.outcome.value}{f': {fix.why}' if fix.why else ''}" if fix else ""
     if fix:
-        in_short = f": {fix.why.code.summary}" if fix.why else ""
-        groups[f"{fix.outcome.value}{in_short}"] = _FIX_COLOURS[fix.outcome]
+        summary = f": {fix.why.code.summary}" if fix.why else ""
+        groups[f"{fix.outcome.value}{summary}"] = _FIX_COLOURS[fix.outcome]
         if fix.outcome in SENT_OUTCOMES:
-            points[_FIX_COLOURS[fix.outcome]] = fix.at
+            points[_FIX_COLOURS[fix.outcome]] = fix.position
     if (query.off_m or 0.0) > _MAX_GPS_ERROR_M:
         groups[f"match over {_MAX_GPS_ERROR_M:.0f} m from GPS"] = "refused"
     if has_link and query.has_link is False:
         groups["autopilot silent"] = "refused"
-    pictures = [("seen", query.name, f"seen: {query.name}")]
+    pictures = [("seen", query.name, f"query: {query.name}")]
     pictures.append(("place", query.reference_image or "", f"place found: {query.reference_image}"))
     return Step(
         title=f"{f'{format_duration(query.t_s)} – ' if has_times else ''}{query.name}: {verdict}",
-        said=[_format_place(query), _format_position(query), str(query.reason or ""), fixed],
+        texts=[_format_place(query), _format_position(query), str(query.reason or ""), outcome],
         groups=groups,
-        at={name: at for name, at in {**points, "accepted": query.at}.items() if at},  # the last has the circle
-        circle_m=query.accuracy_m if query.at else None,
+        points={name: point for name, point in {**points, "accepted": query.position}.items() if point},  # circle last
+        circle_m=query.accuracy_m if query.position else None,
         place=place,
         t_s=query.t_s,
         pictures=[picture for picture in pictures if picture[1]],
@@ -147,11 +147,11 @@ def _format_place(query: LoggedQuery) -> str:
 
 
 def _format_position(query: LoggedQuery) -> str:
-    if not query.at:
+    if not query.position:
         return ""
     accuracy = "" if query.accuracy_m is None else f", accurate to {format_number(query.accuracy_m, 'm')}"
     off = "" if query.off_m is None else f", {format_number(query.off_m, 'm')} from GPS"
-    return f"position {query.at[0]:.6f}, {query.at[1]:.6f}{accuracy}{off}"
+    return f"position {query.position[0]:.6f}, {query.position[1]:.6f}{accuracy}{off}"
 
 
 def _read_lens(start: Mapping[str, Any]) -> "Lens | None":
@@ -197,19 +197,19 @@ def _find_highest(flight: LoggedFlight, *keys: str) -> float | None:
 
 def _list_warnings(flight: LoggedFlight, has_ground: bool, no_ground: str) -> list[str]:
     queries = flight.queries
-    has_places = has_ground or any(query.place_at for query in queries)
-    known = [
-        (flight.start, "The log lacks the first line of this flight: how it was set is not known."),
-        (flight.end, "The log has no last line: it was cut off (power, full disk), or the flight still goes on."),
-        (queries, "No picture became a query in this flight: there is nothing to show of one."),
-        (not queries or has_places, "No place has a position: nothing can be drawn over ground, and no fix was sent."),
+    has_places = has_ground or any(query.place_position for query in queries)
+    warnings = [
+        (flight.start, "The log lacks the first line of this flight: its configuration is unknown."),
+        (flight.end, "The log has no last line: it was cut off (power, full disk), or the flight is still running."),
+        (queries, "This flight had no query."),
+        (not queries or has_places, "No place has a position: there is no drawing, and no fix was sent."),
         (
             not queries or any(query.has_link for query in queries),
-            "The log has no report of the autopilot's position: its track and the distance from GPS are not known.",
+            "The log has no report of the autopilot's position: its track and the distance from GPS are unknown.",
         ),
         (not no_ground, no_ground),
     ]
-    return [sentence for is_there, sentence in known if not is_there]
+    return [sentence for is_known, sentence in warnings if not is_known]
 
 
 def _make_charts(flight: LoggedFlight) -> list[Chart]:
@@ -250,7 +250,7 @@ def _make_remarks(flight: LoggedFlight) -> list[Section]:
     rows = [(format_duration(t_s), kind, sentence) for t_s, kind, sentence in flight.remarks[:_MAX_REMARKS]]
     left_out = len(flight.remarks) - len(rows)
     lines = [f"{left_out} more lines are in the log."] if left_out else []
-    return [Section("What was said", lines, [("time", "of", "said"), *rows])] if rows else []
+    return [Section("Messages", lines, [("time", "source", "message"), *rows])] if rows else []
 
 
 def _make_settings(flight: LoggedFlight) -> list[Section]:
@@ -258,4 +258,4 @@ def _make_settings(flight: LoggedFlight) -> list[Section]:
     reason, config = get_text(flight.start, "decided", "reason"), get_value(flight.start, "config")
     if not isinstance(config, dict):
         return []
-    return [Section("How it was set", [reason] if reason else [], folded=json.dumps(config, indent=1))]
+    return [Section("Configuration", [reason] if reason else [], folded=json.dumps(config, indent=1))]

@@ -1,5 +1,5 @@
-"""Makes a page of a flight, of matches or of a map: one HTML file that needs no network. Python says what there is to
-show, as data; `page.js` draws and moves it. All texts reach the page as text, never as HTML."""
+"""Makes a page of a flight, of matches or of a map: one HTML file that needs no network. Python gives the content as
+data; `page.js` draws and moves it. All texts reach the page as text, never as HTML."""
 
 import base64
 import hashlib
@@ -28,13 +28,13 @@ Form = Literal["dots", "line", "area"]
 UNKNOWN = "–"
 MAX_PAGE_BYTES = 15_000_000
 _MAX_TEXT_BYTES = 3_000_000  # of the texts of all steps
-_SPARE_BYTES = 400_000  # for what is not measured: style, script, the frame of the page
-_MAX_PLACES = 6000  # drawn: more are a whole page of dots; then every second, third, ... is
+_SPARE_BYTES = 400_000  # for style, script and the frame of the page
+_MAX_PLACES = 6000  # drawn; of more, every second, third, ... is drawn
 _MARGIN_M = 30.0  # around what is drawn, where no place knows how much ground its picture shows
 
 _NO_PICTURE = (
-    "No picture of --map-images is laid on the ground: none is of this map, or their headings contradict the map. Are "
-    "they those that it was made of, with positions.csv and the lens that it was made with?"
+    "No image of --map-images is drawn on the ground: none is of this map, or their headings contradict it. Give the "
+    "images that the map was built from, with their positions.csv, and the lens of the build."
 )
 _NO_IMAGES = "With --map-images the page shows the map's own pictures under the drawing."
 
@@ -63,15 +63,15 @@ class Layer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
-    """One step, a query of a flight or a place of a map: its `title`, the sentences `said` of it, and the reasons and
-    outcomes (`groups`) by which the reader chooses steps, with the colour of each. `at`: positions by the colour of
-    their layer. `circle_m`: radius around the last of them. `place`: the place whose ground is outlined. `pictures`:
+    """One step, a query of a flight or a place of a map: its `title`, sentences about it (`texts`), and the reasons and
+    outcomes (`groups`) by which the reader chooses steps, with the colour of each. `points`: positions by the colour
+    of their layer. `circle_m`: radius around the last of them. `place`: the place whose ground is outlined. `pictures`:
     (which album, name, caption) of each. `t_s`: its time (None: it has none)."""
 
     title: str
-    said: Sequence[str]
+    texts: Sequence[str]
     groups: Mapping[str, str]
-    at: Mapping[str, Point]
+    points: Mapping[str, Point]
     circle_m: float | None = None
     place: Place | None = None
     t_s: float | None = None
@@ -113,8 +113,8 @@ def to_point(place: Place) -> Point:
 
 def make_layer(steps: Sequence[Step], name: str, colour: str, form: Form = "dots") -> Layer:
     """Return the layer of the positions that steps have under `colour`: a line ends where a step has none."""
-    runs = groupby((step.at.get(colour) for step in steps), bool)
-    return Layer(name, colour, [[at for at in run if at] for is_known, run in runs if is_known], form)
+    runs = groupby((step.points.get(colour) for step in steps), bool)
+    return Layer(name, colour, [[point for point in run if point] for is_known, run in runs if is_known], form)
 
 
 def make_page(
@@ -144,19 +144,23 @@ def make_page(
     if (every := -(-len(_dump(rows)) // _MAX_TEXT_BYTES)) > 1:
         steps, rows = steps[::every], rows[::every]
         notes.append(f"The page would be too large with all steps: one in {every} is shown.")
-    laid = ground[:: -(-len(ground) // _MAX_PLACES) or 1]
-    wanted = [[picture[:2] for picture in step.pictures] for step in steps]
-    wanted += [[("ground", place.source_image)] for place in laid if place.pose]
-    levelled = _make_ground_album(albums["place"], laid, lens)
+    shown = ground[:: -(-len(ground) // _MAX_PLACES) or 1]
+    keys = [[picture[:2] for picture in step.pictures] for step in steps]
+    keys += [[("ground", place.source_image)] for place in shown if place.pose]
+    levelled = _make_ground_album(albums["place"], shown, lens)
     room_bytes = MAX_PAGE_BYTES - _SPARE_BYTES - len(_dump([rest, rows, drawing.layers]))
-    pictures, left_out = embed_pictures(wanted, {**albums, "ground": levelled}, room_bytes)
+    pictures, left_out = embed_pictures(keys, {**albums, "ground": levelled}, room_bytes)
     notes += [left_out] if left_out else []
-    if any(place.pose for place in laid) and not any(of == "ground" for of, _ in pictures):
+    if any(place.pose for place in shown) and not any(album == "ground" for album, _ in pictures):
         notes.append(_NO_PICTURE if albums["place"] else _NO_IMAGES)
-    at = {key: number for number, key in enumerate(pictures)}
+    indices = {key: index for index, key in enumerate(pictures)}
     for step, row in zip(steps, rows, strict=True):
-        row["pictures"] = [(caption, at[of, name]) for of, name, caption in step.pictures if (of, name) in at]
-    squares = [(*square, at.get(("ground", place.source_image))) for place in laid if (square := drawing.square(place))]
+        row["pictures"] = [
+            (caption, indices[album, name]) for album, name, caption in step.pictures if (album, name) in indices
+        ]
+    squares = [
+        (*square, indices.get(("ground", place.source_image))) for place in shown if (square := drawing.square(place))
+    ]
     return _render({
         **rest,
         "notes": notes,
@@ -172,23 +176,23 @@ class _Drawing:
 
     def __init__(self, ground: Sequence[Place], layers: Sequence[Layer], steps: Sequence[Step]) -> None:
         layers = [layer for layer in layers if any(layer.ways)]
-        points = [at for layer in layers for way in layer.ways for at in way]
-        points += [at for step in steps for at in step.at.values()]
+        points = [point for layer in layers for way in layer.ways for point in way]
+        points += [point for step in steps for point in step.points.values()]
         self._origin = points[0] if points else (0.0, 0.0)
         self.box: list[float] | None = None
         if points:
-            drawn = np.array([self.convert(at) for at in points])
+            drawn = np.array([self.convert(point) for point in points])
             margin_m = max((place.pose.footprint_m for place in ground if place.pose), default=_MARGIN_M)
             low, high = drawn.min(axis=0) - margin_m, drawn.max(axis=0) + margin_m
-            self.box = [round(each, 2) for each in (*low.tolist(), *(high - low).tolist())]
+            self.box = [round(edge_m, 2) for edge_m in (*low.tolist(), *(high - low).tolist())]
         self.layers = [
-            {**asdict(layer), "ways": [[self.convert(at) for at in way] for way in layer.ways if way]}
+            {**asdict(layer), "ways": [[self.convert(point) for point in way] for way in layer.ways if way]}
             for layer in layers
         ]
 
-    def convert(self, at: Point) -> tuple[float, float]:
+    def convert(self, point: Point) -> tuple[float, float]:
         """Return the point (x, y) of a position."""
-        east_m, north_m = offset_m(*self._origin, *at)
+        east_m, north_m = offset_m(*self._origin, *point)
         return round(float(east_m), 2), round(-float(north_m), 2)
 
     def square(self, place: Place) -> tuple[float, ...] | None:
@@ -203,9 +207,9 @@ def _serialise_step(step: Step, drawing: _Drawing, numbers: Mapping[str, int]) -
     """Return a step as the script reads it, without its pictures. `numbers` are those of the groups."""
     return {
         "title": step.title,
-        "said": [sentence for sentence in step.said if sentence],
+        "texts": [sentence for sentence in step.texts if sentence],
         "groups": [numbers[group] for group in step.groups],
-        "at": {name: drawing.convert(at) for name, at in step.at.items()},
+        "points": {name: drawing.convert(point) for name, point in step.points.items()},
         "circle": step.circle_m,
         "square": step.place and drawing.square(step.place),
         "t_s": step.t_s,
@@ -217,7 +221,7 @@ def _make_ground_album(album: Album, places: Sequence[Place], lens: "Lens | None
     by_name = {place.source_image: place for place in places if place.pose}
 
     def find(name: str) -> AlbumPicture | None:
-        picture = album.lay(by_name[name], lens)
+        picture = album.align_picture(by_name[name], lens)
         if picture is None or picture.mask is None:
             return picture
         colours = np.broadcast_to(np.atleast_3d(picture.image)[..., :3], (*picture.image.shape[:2], 3))
@@ -235,8 +239,8 @@ def _clean(value: Any) -> Any:
     if isinstance(value, str):
         return value if value.startswith("data:image/") else sanitize(value, keep="\n")
     if isinstance(value, dict):
-        return {key: _clean(each) for key, each in value.items()}
-    return [_clean(each) for each in value] if isinstance(value, (list, tuple)) else value
+        return {key: _clean(item) for key, item in value.items()}
+    return [_clean(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def _render(data: Mapping[str, Any]) -> str:

@@ -1,9 +1,9 @@
-"""Estimates how far the clock of a camera is off that of a track, by the pictures, if it looks straight down.
+"""Estimates the offset between the clocks of a camera that looks straight down and a track, from the pictures.
 
 Two neighbouring pictures that show the same ground say how the aircraft moved between them, in the frame of the first;
 three say how its movement changed: by which factor it became longer, and by which angle it turned. Mounting, heading
-and footprint cancel out. The track says the same of any three times: where both agree, the clock is right. An
-aircraft that only flies straight on says nothing.
+and footprint cancel out. The track gives the same for any three times: where both agree, the clock is right. A
+straight flight gives no estimate.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -34,13 +34,13 @@ Move = tuple[complex, complex]  # step, and logarithm of scale and turn, as thos
 
 def estimate_clock_offset_s(track: Track, times_s: Sequence[float], paths: Iterable[Path]) -> float | None:
     """Estimate what is to be added to `times_s`, those of the pictures of `paths` in their order, to get times of the
-    track: at most three minutes. None: the pictures do not tell."""
-    at, changes = _find_changes(paths)
-    if len(at) < _MIN_TURNS:
+    track: at most three minutes. None: the pictures do not show it."""
+    numbers, changes = _find_changes(paths)
+    if len(numbers) < _MIN_TURNS:
         return None
     offsets_s = np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + _STEP_S, _STEP_S)
     places = _interpolate_track(track, np.array(times_s) + offsets_s[:, None])
-    costs, turning = np.array([_compute_cost(there, at, changes) for there in places]).T
+    costs, turning = np.array([_compute_cost(points, numbers, changes) for points in places]).T
     best = int(np.argmin(costs))
     further = abs(offsets_s - offsets_s[best]) > _MIN_RIVAL_OFFSET_S
     if turning[best] < _MIN_TURNS or costs[best] > _MAX_COST_RATIO * costs[further].min():
@@ -48,29 +48,29 @@ def estimate_clock_offset_s(track: Track, times_s: Sequence[float], paths: Itera
     return float(offsets_s[best])
 
 
-def _compute_cost(there: Complexes, at: Ints, changes: Complexes) -> tuple[float, float]:
-    """Return by how much the changes of movement differ, 0..1, and how many turns agree, if the pictures were taken
-    `there`, complex (N,). `at`, int (C,), are the numbers of the first of three pictures each."""
+def _compute_cost(points: Complexes, numbers: Ints, changes: Complexes) -> tuple[float, float]:
+    """Return by how much the changes of movement differ, 0..1, and how many turns agree, if the pictures were taken at
+    `points`, complex (N,). `numbers`, int (C,), are those of the first of three pictures each."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        expected = np.log((there[at + 2] - there[at + 1]) / (there[at + 1] - there[at]))
-        off = changes - expected
-    off = np.hypot(off.real, (off.imag + np.pi) % (2 * np.pi) - np.pi)
-    known = np.isfinite(off)
+        expected = np.log((points[numbers + 2] - points[numbers + 1]) / (points[numbers + 1] - points[numbers]))
+        error = changes - expected
+    error = np.hypot(error.real, (error.imag + np.pi) % (2 * np.pi) - np.pi)
+    is_known = np.isfinite(error)
     return (
-        float(np.where(known, np.minimum(off, _MAX_CHANGE), _MAX_CHANGE).mean()),
-        float(np.count_nonzero(known & (abs(expected.imag) > _MIN_TURN_RAD) & (off < _MAX_CHANGE / 2))),
+        float(np.where(is_known, np.minimum(error, _MAX_CHANGE), _MAX_CHANGE).mean()),
+        float(np.count_nonzero(is_known & (abs(expected.imag) > _MIN_TURN_RAD) & (error < _MAX_CHANGE / 2))),
     )
 
 
 def _interpolate_track(track: Track, t_s: Doubles) -> Complexes:
     """Return where the track is at each of `t_s`, east + i north in metres: complex of its shape, NaN outside the track
     and in its gaps."""
-    known_s = np.array(track.t_s)
+    track_s = np.array(track.t_s)
     lat_deg, lon_deg = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in track.tags if tag.position]).T
     east_m, north_m = project_to_metres(lat_deg, lon_deg)
-    after = np.clip(np.searchsorted(known_s, t_s), 1, max(len(known_s) - 1, 1))
-    is_known = (t_s >= known_s[0]) & (t_s <= known_s[-1]) & (known_s[after] - known_s[after - 1] <= MAX_GAP_S)
-    return np.where(is_known, np.interp(t_s, known_s, east_m + 1j * north_m), np.nan)
+    after = np.clip(np.searchsorted(track_s, t_s), 1, max(len(track_s) - 1, 1))
+    is_known = (t_s >= track_s[0]) & (t_s <= track_s[-1]) & (track_s[after] - track_s[after - 1] <= MAX_GAP_S)
+    return np.where(is_known, np.interp(t_s, track_s, east_m + 1j * north_m), np.nan)
 
 
 def _find_changes(paths: Iterable[Path]) -> tuple[Ints, Complexes]:
@@ -95,7 +95,7 @@ def _describe_landmarks(paths: Iterable[Path]) -> Iterator[Landmarks | None]:
 
 def _measure_move(one: Landmarks | None, other: Landmarks | None) -> Move | None:
     """Return how the middle moves from picture `one` to the `other`, in the frame of `one`, and how it turns."""
-    seen = measure_agreement(other, one) if one is not None and other is not None else None
-    if seen is None or seen.inliers < PROVEN or seen.shift_share is None or seen.rotation_deg is None:
+    match = measure_agreement(other, one) if one is not None and other is not None else None
+    if match is None or match.inliers < PROVEN or match.shift_share is None or match.rotation_deg is None:
         return None
-    return Overlay(seen.shift_share, seen.rotation_deg, seen.scale).step_and_turn
+    return Overlay(match.shift_share, match.rotation_deg, match.scale).step_and_turn

@@ -21,8 +21,8 @@ def read_flight(path: Path) -> Record:
     lines, folder = read_recorded(path)
     if not has_live_source(folder):
         raise UsageError(
-            f"{path}: its pictures were no camera's but a folder's or a film's, and the aircraft was elsewhere: place "
-            "those pictures by what was recorded with them."
+            f"{path}: its images came from a folder or a video, not from a camera of that flight: place them by the "
+            "record of their own flight."
         )
     files, named = list_frames(folder), dict[str, GeoTag]()
     for line in lines:

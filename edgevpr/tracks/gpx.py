@@ -6,7 +6,7 @@ from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import parse_time
 from edgevpr.tracks.record import Record, make_tag, make_track, require_package
 
-_FIRST_YEAR = 1990  # receivers that have lost the time write others
+_FIRST_YEAR = 1990  # a receiver without the time writes earlier years
 
 
 def read_gpx(path: Path) -> Record:
@@ -16,13 +16,13 @@ def read_gpx(path: Path) -> Record:
     from gpxpy.gpx import GPXException
 
     try:
-        found = gpxpy.parse(path.read_bytes())
+        content = gpxpy.parse(path.read_bytes())
     except (OSError, GPXException, UnicodeDecodeError, ValueError) as error:
-        raise UsageError(f"{path} is no GPX file that can be read ({error}): export it again.") from error
-    points = [point for point, *_ in found.walk()]
+        raise UsageError(f"{path} cannot be read as GPX ({error}): export it again.") from error
+    points = [point for point, *_ in content.walk()]
     timed = [point for point in points if point.time and point.time.year >= _FIRST_YEAR]
     if points and not timed:
-        raise UsageError(f"{path} has no times: export the track with them, for pictures are placed by time.")
+        raise UsageError(f"{path} has no times: export the track with times, by which pictures are placed.")
     lines = [
         (parse_time(point.time.isoformat()), make_tag(point.latitude, point.longitude, point.elevation))
         for point in timed

@@ -38,11 +38,11 @@ def read_ardupilot(path: Path) -> Record:
             attitude = message.Yaw, message.Roll, message.Pitch
         elif kind != "GPS" or message.Status >= _FIX_3D:
             height_m = getattr(message, "RelHomeAlt", getattr(message, "RelAlt", None))
-            own = attitude
+            angles_deg = attitude
             if kind in ("CAM", "TRIG"):  # older logs write the names out
                 is_long = hasattr(message, "Yaw")
-                own = tuple(getattr(message, name if is_long else name[0]) for name in ("Yaw", "Roll", "Pitch"))
-            tag = make_tag(message.Lat, message.Lng, message.Alt, own, None if kind == "GPS" else height_m)
+                angles_deg = tuple(getattr(message, name if is_long else name[0]) for name in ("Yaw", "Roll", "Pitch"))
+            tag = make_tag(message.Lat, message.Lng, message.Alt, angles_deg, None if kind == "GPS" else height_m)
             lines[kind].append((message._timestamp, tag))
     shots = tuple(tag for _, tag in lines["CAM"] or lines["TRIG"])
     return Record(kind="ArduPilot log", track=make_track(path, lines["POS"] or lines["GPS"]), shots=shots)
@@ -50,12 +50,12 @@ def read_ardupilot(path: Path) -> Record:
 
 def read_telemetry(path: Path) -> Record:
     """Read a telemetry log of a ground station: GLOBAL_POSITION_INT, ATTITUDE and CAMERA_FEEDBACK of the first vehicle
-    that tells its position. Times are those of the ground station's clock."""
+    that reports its position. Times are those of the ground station's clock."""
     from pymavlink import mavutil
 
-    wanted = ["GLOBAL_POSITION_INT", "ATTITUDE", "CAMERA_FEEDBACK"]
+    kinds = ["GLOBAL_POSITION_INT", "ATTITUDE", "CAMERA_FEEDBACK"]
     lines, shots, vehicle, attitude = [], [], None, None
-    for message in _read_messages(mavutil.mavlink_connection, path, wanted):
+    for message in _read_messages(mavutil.mavlink_connection, path, kinds):
         kind, sender = message.get_type(), message.get_srcSystem()
         if kind == "GLOBAL_POSITION_INT":
             vehicle = sender if vehicle is None else vehicle
@@ -64,8 +64,8 @@ def read_telemetry(path: Path) -> Record:
         if kind == "ATTITUDE":
             attitude = degrees(message.yaw), degrees(message.roll), degrees(message.pitch)
         elif kind == "CAMERA_FEEDBACK":
-            turned = message.yaw, message.roll, message.pitch
-            shots.append(make_tag(message.lat / 1e7, message.lng / 1e7, message.alt_msl, turned, message.alt_rel))
+            angles = message.yaw, message.roll, message.pitch
+            shots.append(make_tag(message.lat / 1e7, message.lng / 1e7, message.alt_msl, angles, message.alt_rel))
         else:
             heading = attitude or (None if message.hdg == _NO_HEADING else (message.hdg / 100, None, None))
             tag = make_tag(
@@ -78,20 +78,18 @@ def read_telemetry(path: Path) -> Record:
 def _read_messages(open_log: Callable[[str], Any], path: Path, kinds: list[str]) -> list[Any]:
     """Return the messages of these kinds to the end of a log, or to where it is damaged."""
     os.environ["PYMAVLINK_FAST_INDEX"] = "0"  # the compiled index prints, past Python, each byte that it skips
-    found = []
+    messages = []
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # pymavlink prints what it skips
         try:
             log = open_log(str(path))
         except Exception as error:  # files of any content
-            raise UsageError(
-                f"{path} is no log that can be read ({error}): copy it from the autopilot again."
-            ) from error
+            raise UsageError(f"{path} cannot be read as a log ({error}): copy it from the autopilot again.") from error
         with suppress(Exception):  # what is cut off or damaged is not read
             while message := log.recv_match(type=kinds):
-                found.append(message)
+                messages.append(message)
         with suppress(AttributeError):  # of a log as text
             log.close()
-    return found
+    return messages
 
 
 def read_px4(path: Path) -> Record:
@@ -104,8 +102,8 @@ def read_px4(path: Path) -> Record:
         with open(path, "rb") as file:
             datasets = ULog(file, list(_PX4_TOPICS), disable_str_exceptions=True).data_list
     except Exception as error:  # files of any content
-        raise UsageError(f"{path} is no log of PX4 ({error}): copy it again from the autopilot.") from error
-    data = {each.name: each.data for each in reversed(datasets) if len(each.data["timestamp"])}  # the first of each
+        raise UsageError(f"{path} cannot be read as a PX4 log ({error}): copy it from the autopilot again.") from error
+    data = {topic.name: topic.data for topic in reversed(datasets) if len(topic.data["timestamp"])}  # the first of each
     shots = tuple(tag for _, tag in _read_positions(data, "camera_capture"))
     return Record(kind="PX4 log", track=make_track(path, _read_positions(data, "vehicle_global_position")), shots=shots)
 
@@ -130,9 +128,9 @@ def _read_utc_offset_s(data: Topics) -> float:
     """Return what is to be added to seconds since the start of the autopilot to get those since 1970; 0 if no receiver
     has the time."""
     for receiver in filter(None, map(data.get, _RECEIVERS)):
-        if (known := receiver["time_utc_usec"] > 0).any():
-            utc_us = receiver["time_utc_usec"][known].astype(np.float64)
-            return float(np.median(utc_us - receiver["timestamp"][known])) / 1e6
+        if (has_time := receiver["time_utc_usec"] > 0).any():
+            utc_us = receiver["time_utc_usec"][has_time].astype(np.float64)
+            return float(np.median(utc_us - receiver["timestamp"][has_time])) / 1e6
     return 0.0
 
 

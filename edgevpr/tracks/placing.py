@@ -52,12 +52,12 @@ def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Plac
         return _match_times(record.track, folder, own, offset_s)
     elif record.shots:
         raise UsageError(
-            f"{len(record.shots)} pictures were triggered, and {folder} holds {len(own)}: leave only these in it."
+            f"{len(record.shots)} images were triggered, and {folder} holds {len(own)}: remove the others from it."
         )
     else:
         raise UsageError(f"These positions ({record.kind}) are those of a video: give it as --images.")
     if not found:
-        raise UsageError(f"No picture of {folder} is named there ({record.kind}): give the folder of these pictures.")
+        raise UsageError(f"No image of {folder} is named in the {record.kind}: give the folder of its images.")
     tags = {name: _fill_tag(tag, own[name]) for name, tag in found.items()}
     return Placement(how=how, tags=tags, pictures=len(own))
 
@@ -66,20 +66,20 @@ def _match_names(named: Mapping[str, GeoTag], names: list[str]) -> dict[str, Geo
     """Find the pictures by their whole names, or by what stands before the ending, in letters of either case."""
     whole = {name.casefold(): tag for name, tag in named.items()}
     stems = {Path(name).stem.casefold(): tag for name, tag in named.items()}
-    found = {name: whole.get(name.casefold(), stems.get(Path(name).stem.casefold())) for name in names}
-    return {name: tag for name, tag in found.items() if tag and tag.position}
+    tags = {name: whole.get(name.casefold(), stems.get(Path(name).stem.casefold())) for name in names}
+    return {name: tag for name, tag in tags.items() if tag and tag.position}
 
 
 def _match_times(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s: float | None) -> Placement:
     times = {name: tag.t_utc_s for name, tag in own.items() if tag.t_utc_s is not None}
     if not times:
-        raise UsageError("The pictures have no times (EXIF DateTimeOriginal): give those that the camera wrote.")
+        raise UsageError("The images have no times (EXIF DateTimeOriginal): give the original files of the camera.")
     how, times_s = "by time", np.array(list(times.values()))
     if offset_s is None:
         offset_s = _estimate_zone_offset_s(track, times_s, "the pictures")
-        looked_at = sorted(times, key=times.__getitem__)[:_MAX_COMPARED]
-        paths = progress([folder / name for name in looked_at], len(looked_at), "comparing pictures")
-        fine_s = estimate_clock_offset_s(track, [times[name] + offset_s for name in looked_at], paths)
+        earliest = sorted(times, key=times.__getitem__)[:_MAX_COMPARED]
+        paths = progress([folder / name for name in earliest], len(earliest), "comparing pictures")
+        fine_s = estimate_clock_offset_s(track, [times[name] + offset_s for name in earliest], paths)
         offset_s += fine_s or 0.0
         how += ", the camera's clock set by " + ("its time zone" if fine_s is None else "how the pictures move")
     found = {
@@ -95,7 +95,7 @@ def _match_times(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s
 
 def _fill_tag(tag: GeoTag, own: GeoTag) -> GeoTag:
     """Return `tag`, with what it does not know taken from `own`."""
-    missing = [each.name for each in fields(GeoTag) if getattr(tag, each.name) is None]
+    missing = [item.name for item in fields(GeoTag) if getattr(tag, item.name) is None]
     return replace(tag, **{name: getattr(own, name) for name in missing})
 
 
@@ -107,7 +107,7 @@ def place_video(record: Record, video: Path, offset_s: float | None) -> Placemen
     began_s, lasts_s = read_start_s(video)
     if record.is_utc:
         if began_s is None:
-            raise UsageError(f"{video} does not say when it was begun: give a recording that goes by the video's time.")
+            raise UsageError(f"{video} has no start time: give a recording with times of the video.")
         if offset_s is None:
             offset_s = _estimate_zone_offset_s(record.track, np.linspace(began_s, began_s + lasts_s, 60), str(video))
         shift_s, how = -began_s - offset_s, "by time"
@@ -124,22 +124,22 @@ def _estimate_zone_offset_s(track: Track, times_s: Doubles, what: str) -> float:
     (N,), lie within the track: whole hours, else half hours, else quarters."""
     offsets_s = np.arange(-_MAX_ZONE_STEPS, _MAX_ZONE_STEPS + 1) * _ZONE_STEP_S
     first_s, last_s = track.t_s[0], track.t_s[-1]
-    within = np.array([np.mean((times_s + each >= first_s) & (times_s + each <= last_s)) for each in offsets_s])
+    within = np.array([np.mean((times_s + by_s >= first_s) & (times_s + by_s <= last_s)) for by_s in offsets_s])
     if within.max() < _MIN_SHARE_IN_TRACK:
         raise UsageError(f"No time zone brings {what} into the track: {_format_spans(track, times_s)}")
     fitting_s = offsets_s[within == within.max()].tolist()
     for unit_s in (4 * _ZONE_STEP_S, 2 * _ZONE_STEP_S, _ZONE_STEP_S):
-        of_unit = sorted((each for each in fitting_s if each % unit_s == 0), key=abs)
+        of_unit = sorted((offset_s for offset_s in fitting_s if offset_s % unit_s == 0), key=abs)
         if len(of_unit) > 1:
-            some = ", ".join(f"{each:g}" for each in of_unit[:4])
-            raise UsageError(f"The camera's clock may be off by {some} s: say which with --offset-s (0: it is right).")
+            choices = ", ".join(f"{offset_s:g}" for offset_s in of_unit[:4])
+            raise UsageError(f"The camera's clock may be off by {choices} s: set one with --offset-s (0: it is right).")
         if of_unit:
             return float(of_unit[0])
     raise AssertionError("the smallest unit fits")
 
 
 def _format_spans(track: Track, times_s: Doubles) -> str:
-    """Say from when to when the camera and the track last."""
+    """Return the time spans of camera and track as text."""
     ends_s = np.array([times_s.min(), times_s.max(), track.t_s[0], track.t_s[-1]])
     return "the camera says {} to {}, the track lasts from {} to {} (UTC): give --offset-s.".format(
         *ends_s.astype("datetime64[s]").astype(str)

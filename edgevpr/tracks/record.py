@@ -20,7 +20,7 @@ class Record:
 
     `kind`: what it is, in words. `track`: position and attitude over time (None: it has no times). `is_utc`: the times
     of the track are seconds since 1970; else seconds from the first frame of the video that it belongs to.
-    `shots`: what the autopilot wrote down for each picture that it triggered, in this order. `named`: position and
+    `shots`: what the autopilot logged for each picture that it triggered, in this order. `named`: position and
     attitude by the name of the picture, of a table that names pictures.
     """
 
@@ -37,7 +37,7 @@ def read_record(path: Path) -> Record:
     from edgevpr.tracks import flown, gpx, logs, srt, tables
 
     if not path.is_file():
-        raise UsageError(f"There is no file {path}: name a log, a track, subtitles or a table.")
+        raise UsageError(f"{path} does not exist: name a log, a track, subtitles or a table.")
     readers: dict[str, Callable[[Path], Record]] = {
         ".bin": logs.read_ardupilot,
         ".log": logs.read_ardupilot,
@@ -49,7 +49,7 @@ def read_record(path: Path) -> Record:
     }
     record = readers.get(path.suffix.lower(), tables.read_table)(path)
     if not (record.track or record.shots or record.named):
-        raise UsageError(f"{path} ({record.kind}) has no position: was there a fix of GPS?")
+        raise UsageError(f"{path} ({record.kind}) has no position: did the receiver have a GPS fix?")
     return record
 
 
@@ -62,9 +62,8 @@ def make_tag(
 ) -> GeoTag:
     """Make a tag of what a recording says. None and what is impossible, NaN too, are unknown."""
     heading_deg, roll_deg, pitch_deg = attitude or _UNKNOWN
-    alt_m, height_m = (
-        each if each is not None and ALT_LIMITS_M[0] <= each <= ALT_LIMITS_M[1] else None for each in (alt_m, height_m)
-    )
+    low_m, high_m = ALT_LIMITS_M
+    alt_m, height_m = (m if m is not None and low_m <= m <= high_m else None for m in (alt_m, height_m))
     position = None
     if lat_deg is not None and lon_deg is not None and abs(lat_deg) <= 90 and abs(lon_deg) <= 180:
         position = make_position(float(lat_deg), float(lon_deg), alt_m)
@@ -91,4 +90,4 @@ def make_track(path: Path, lines: Iterable[tuple[float, GeoTag]]) -> Track | Non
 def require_package(module: str, package: str, what: str) -> None:
     """Raise UsageError if the module that reads `what` is not installed; `package` is its name on PyPI."""
     if find_spec(module) is None:
-        raise UsageError(f"{what} is read by {package}, which is not here: run `pip install {package}`.")
+        raise UsageError(f"{what} needs {package}, which is not installed: run `pip install {package}`.")

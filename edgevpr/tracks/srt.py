@@ -36,7 +36,7 @@ def read_subtitles(path: Path) -> Record:
 def _read_blocks(text: str) -> Iterator[tuple[float, GeoTag]]:
     """Yield the time of each subtitle in the video, in seconds, and what it says."""
     starts = list(_START_TIME.finditer(text))
-    ends = [each.start() for each in starts[1:]] + [len(text)]
+    ends = [start.start() for start in starts[1:]] + [len(text)]
     for start, end in zip(starts, ends, strict=False):  # one end more in an empty file
         hours, minutes, seconds, fraction = start.groups()
         t_s = 3600 * int(hours) + 60 * int(minutes) + int(seconds) + float(f"0.{fraction}")
@@ -55,8 +55,8 @@ def _parse_block(block: str) -> GeoTag:
         height_m = float(height[1])
     attitude: Attitude = (named.get("drone_yaw", named.get("yaw")), None, None)
     gimbal = [named[name] for name in ("gb_pitch", "gb_roll", "gb_yaw") if name in named]
-    if told := _GIMBAL.search(block):
-        gimbal = list(map(float, told.groups()))
+    if match := _GIMBAL.search(block):
+        gimbal = list(map(float, match.groups()))
     if len(gimbal) == 3 and any(gimbal):
         pitch, roll, yaw = gimbal
         attitude = to_nadir_angles(yaw, pitch, roll)

@@ -1,5 +1,5 @@
 """Tables of pictures and their positions that other programs write: exiftool (-csv), Pix4D, Metashape, OpenDroneMap
-(geo.txt). Separators and columns are guessed, and said."""
+(geo.txt). Separators and columns are guessed, and reported."""
 
 import csv
 import re
@@ -49,13 +49,13 @@ def read_table(path: Path) -> Record:
     try:
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path} is no text that can be read ({error}): save the table as CSV in UTF-8.") from error
+        raise UsageError(f"{path} cannot be read as text ({error}): save the table as CSV in UTF-8.") from error
     lines, order = [line for line in text.splitlines() if line.strip(" \t;,")], _DEFAULT_COLUMNS
     if lines and _PROJECTION.match(lines[0]):
         if not _WGS84.match(lines[0]):
             raise UsageError(f"{path} is in `{lines[0]:.40}`: export it in latitude and longitude (WGS 84).")
         lines, order = lines[1:], _OPENDRONEMAP_COLUMNS
-    for separator, spoken in _SEPARATORS.items():
+    for separator, divider in _SEPARATORS.items():
         rows = list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
         if layout := _find_columns(rows):
             columns, first, names = layout
@@ -66,9 +66,9 @@ def read_table(path: Path) -> Record:
         else:
             continue
         needed = ", ".join(f"`{names[column]}`" for part, column in columns.items() if part in _REQUIRED_COLUMNS)
-        return Record(kind=f"table of {needed}, {spoken} between them", named=_read_rows(rows[first:], columns, path))
+        return Record(kind=f"table of {needed}, {divider} between them", named=_read_rows(rows[first:], columns, path))
     raise UsageError(
-        f"{path}: no columns of the picture, latitude and longitude were found: name them file, lat and lon in line 1."
+        f"{path}: no columns of image, latitude and longitude were found: name them file, lat and lon in line 1."
     )
 
 
@@ -76,18 +76,19 @@ def _find_columns(rows: Rows) -> Layout | None:
     """Find the row with the names of the columns."""
     for number, row in enumerate(rows[:_MAX_HEADING_ROWS]):
         names = [_NO_LETTERS.sub("", cell.lower()) for cell in row]
-        found = {part: _find_column(known, names) for part, known in _COLUMN_NAMES.items()}
-        columns = {part: column for part, column in found.items() if column is not None}
+        numbers = {part: _find_column(choices, names) for part, choices in _COLUMN_NAMES.items()}
+        columns = {part: column for part, column in numbers.items() if column is not None}
         is_split = not any(separator in cell for cell in row for separator in ",;\t")
         if is_split and columns.keys() >= set(_REQUIRED_COLUMNS):
             return columns, number + 1, row
     return None
 
 
-def _find_column(known: Sequence[str], names: Sequence[str]) -> int | None:
-    """Return the column of the first `known` name, or of `vehicle latitude` and the like."""
-    exact = [names.index(name) for name in known if name in names]
-    angles = [at for at, name in enumerate(names) if known[0] in ("latitude", "longitude") and name.endswith(known[0])]
+def _find_column(choices: Sequence[str], names: Sequence[str]) -> int | None:
+    """Return the column of the first of `choices`, or of `vehicle latitude` and the like."""
+    exact = [names.index(name) for name in choices if name in names]
+    is_angle = choices[0] in ("latitude", "longitude")
+    angles = [column for column, name in enumerate(names) if is_angle and name.endswith(choices[0])]
     return next(iter([*exact, *angles]), None)
 
 
@@ -98,7 +99,7 @@ def _read_rows(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, 
         try:
             named[PureWindowsPath(cells["file"]).name] = _parse_row(cells)
         except (KeyError, ValueError) as error:
-            raise UsageError(f"{path}: `{' '.join(row):.80}` is not understood ({error}): correct the line.") from error
+            raise UsageError(f"{path}: `{' '.join(row):.80}` cannot be read ({error}): correct the line.") from error
     if named and not any(tag.position for tag in named.values()):
         raise UsageError(f"{path} has no possible position: are latitude and longitude exchanged, or not in degrees?")
     return named

@@ -57,7 +57,7 @@ def test_map_repair_leaves_a_whole_map_alone(valley, capsys):
     assert said.out.splitlines()[1:] == ["  SQLite      the file is sound"]
     assert "checking  6/6  100 %" in said.err
     assert main(["map", "repair", str(valley)]) == 0
-    assert "nothing" in capsys.readouterr().out
+    assert "no damage" in capsys.readouterr().out
     assert main(["map", "repair", str(valley), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"path": str(valley), "kept": 6, "dropped": 0, "original": None}
     assert valley.read_bytes() == before

@@ -13,30 +13,30 @@ from edgevpr.review.album import embed_pictures, make_album, make_map_album
 LENS = Lens(60.0)
 
 
-def test_lay_gives_the_picture_whose_top_points_where_the_pose_says(tmp_path):
+def test_align_picture_gives_the_picture_whose_top_points_where_the_pose_says(tmp_path):
     places = places_in(tmp_path)
     write_positions(tmp_path / "positions.csv", places)
     album, turned = make_album([tmp_path]), places[4]
     north_up = replace(turned, pose=replace(turned.pose, up_deg=0.0))
-    assert album.lay(turned, None).mask is None
-    assert album.lay(turned, LENS).mask is None, "the map was made without the lens"
-    assert album.lay(north_up, LENS).mask is not None, "it was made with it"
-    assert album.lay(north_up, None) is None, "its heading contradicts the map"
-    assert album.lay(replace(turned, source_image="gone.png"), LENS) is None
+    assert album.align_picture(turned, None).mask is None
+    assert album.align_picture(turned, LENS).mask is None, "the map was made without the lens"
+    assert album.align_picture(north_up, LENS).mask is not None, "it was made with it"
+    assert album.align_picture(north_up, None) is None, "its heading contradicts the map"
+    assert album.align_picture(replace(turned, source_image="gone.png"), LENS) is None
 
 
-def test_the_pictures_of_a_map_of_an_orthophoto_are_cut_from_it_again(tmp_path):
+def test_make_map_album_cuts_the_pictures_of_an_orthophoto_again(tmp_path):
     pytest.importorskip("rasterio")
     pose = Pose(up_deg=0.0, footprint_m=60.0, covariance_m2=(1.0, 0.0, 1.0), is_surveyed=True)
     places = [Place(place_id=1, source_image="town.tif_r000_c000", position=HOME, pose=pose)]
     album = make_map_album([textured_raster(tmp_path / "town.tif")], places)
-    assert album.image("town.tif_r000_c000").std() > 10
-    assert album.image("town.tif_r000_c001") is None
-    assert album.lay(places[0], None).image.std() > 10
-    assert make_map_album([], places).image("town.tif_r000_c000") is None
+    assert album.find_image("town.tif_r000_c000").std() > 10
+    assert album.find_image("town.tif_r000_c001") is None
+    assert album.align_picture(places[0], None).image.std() > 10
+    assert make_map_album([], places).find_image("town.tif_r000_c000") is None
 
 
-def test_pictures_get_smaller_and_then_fewer_until_they_fit(tmp_path):
+def test_embed_pictures_makes_them_smaller_and_then_fewer_until_they_fit(tmp_path):
     keys = [[("seen", place.source_image)] for place in places_in(tmp_path)]
     albums = {"seen": make_album([tmp_path])}
     sizes = []

@@ -35,4 +35,4 @@ def test_a_log_that_was_cut_at_any_byte_is_read_up_to_its_last_whole_line(log, t
         assert len(flight.queries) == sum(is_query[:there])
         if cut + 1 in ends:
             make_flight_page(flight, [], Album(), Album())
-        assert all(query.at == (-33.5, 151.25) for query in flight.queries)
+        assert all(query.position == (-33.5, 151.25) for query in flight.queries)

@@ -22,7 +22,7 @@ def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):
         for query, result, why in (("a", "ACCEPTED", None), ("b", "DENIED", refused), ("c", None, superseded))
     ]
     flight = read_flight(write_log(tmp_path / "log", *lines, *answers))
-    assert outcomes(flight) == [FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.KEPT, FixOutcome.UNANSWERED]
+    assert outcomes(flight) == [FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.NOT_SENT, FixOutcome.UNANSWERED]
     assert flight.queries[1].fix.why.code is ReasonCode.WRONG_FORM
 
 
@@ -62,5 +62,5 @@ def test_values_of_a_wrong_type_are_unknown(tmp_path):
     log = tmp_path / "log"
     log.write_text(json.dumps({"kind": "query", "t_mono_s": 5.0} | query("a", **wrong)) + "\n")
     (only,) = read_flight(log).queries
-    known = only.at, only.confidence, only.autopilot_at, only.gps_at, only.place, only.fix
+    known = only.position, only.confidence, only.autopilot_position, only.gps_position, only.place, only.fix
     assert known == (None,) * 6

@@ -37,12 +37,12 @@ def mapped(tmp_path_factory):
 
 @pytest.mark.process
 @pytest.mark.slow
-def test_the_page_of_a_map_shows_its_places_and_what_is_amiss_with_them(browser, mapped):
+def test_map_page_shows_places_and_their_problems(browser, mapped):
     out = mapped / "map.html"
     argv = ["map", "info", mapped / "valley.gpkg", "--page", out, "--map-images", mapped / "ref"]
     assert main(list(map(str, argv))) == 0
     data = json.loads(re.search(r'id="page">(.*?)</script>', out.read_text("utf-8"))[1])
-    alike = {each["title"]: each["said"][-1] for each in data["steps"] if "looks like" in each["said"][-1]}
+    alike = {step["title"]: step["texts"][-1] for step in data["steps"] if "looks like" in step["texts"][-1]}
     assert "looks like place 13: " in alike["Place 6: 05.png"]
     assert "looks like place 6: " in alike[f"Place 13: {TWIN}"]
     assert all("place 13: " in said for title, said in alike.items() if TWIN not in title), "they overlap with its twin"

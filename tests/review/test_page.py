@@ -58,7 +58,7 @@ def test_query_and_match_stand_side_by_side_though_their_pictures_have_one_name(
         (caption, cv2.imdecode(np.frombuffer(base64.b64decode(data["pictures"][at].partition(",")[2]), np.uint8), 0))
         for caption, at in data["steps"][2]["pictures"]
     )
-    assert (seen_as, found_as) == ("seen: 02.png", "place found: 02.png")
+    assert (seen_as, found_as) == ("query: 02.png", "place found: 02.png")
     assert abs(seen.mean() - cv2.imread(str(flown / "seen" / "02.png"), 0).mean()) < 2
     assert abs(found.mean() - cv2.imread(str(flown / "ref" / "02.png"), 0).mean()) < 2
     assert abs(seen.astype(int) - found).mean() > 20
@@ -71,9 +71,9 @@ def test_only_pictures_of_the_folders_that_are_given_are_shown(tmp_path):
     cv2.imwrite(str(folder / "one.png"), np.full((20, 20), 90, np.uint8))
     (folder / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     album = make_album([folder])
-    assert album.image("one.png") is not None
+    assert album.find_image("one.png") is not None
     for name in ("../secret.png", str(tmp_path / "secret.png"), "broken.png", "a\0b", "\ud800", "x" * 5000, ""):
-        assert album.image(name) is None
+        assert album.find_image(name) is None
 
 
 def test_names_in_the_log_are_text_and_nothing_else(tmp_path):
@@ -111,7 +111,7 @@ def test_a_map_that_is_not_there_is_no_reason_to_have_no_page(flown, tmp_path, c
     ("argv", "code", "said"),
     [
         (["LOG", "--out", "LOG"], 2, "give another name"),
-        (["LOG", "--out", "no/such/out.html"], 2, "there is no such folder: make it first"),
+        (["LOG", "--out", "no/such/out.html"], 2, "there is no such folder: create it first"),
         (["gone", "--out", "out.html"], 2, "there is no such flight log"),
         (["LOG", "--out", "out.html", "--map", "gone.gpkg"], 1, "There is no map"),
         (["LOG", "--out", "out.html", "--images", "gone"], 2, "there is no such folder"),

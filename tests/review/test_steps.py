@@ -48,14 +48,14 @@ def test_slider_moves_texts_pictures_and_marks_by_keyboard(page, made):
         assert page.inner_text(".now h3") == steps[at]["title"]
         assert page.inner_text("#which") == f"{at + 1} of {COUNT}"
         pictures = page.eval_on_selector_all(".now img", "all => all.map(each => [each.alt, each.naturalWidth])")
-        assert [alt for alt, _ in pictures] == [f"seen: 0{at}.png", f"place found: 0{at}.png"]
+        assert [alt for alt, _ in pictures] == [f"query: 0{at}.png", f"place found: 0{at}.png"]
         assert all(width > 100 for _, width in pictures)
-        accepted = "accepted" in steps[at]["at"]
+        accepted = "accepted" in steps[at]["points"]
         assert page.locator(".spot.accepted").count() == page.locator(".claimed").count() == accepted
         seen.add(page.get_attribute(".spot.found", "d") + page.get_attribute(".square", "transform"))
         page.keyboard.press("ArrowRight")
     assert len(seen) == 3, "the marks move"
-    assert "missed" in steps[2]["at"], "a refused query is shown where GPS says it was"
+    assert "missed" in steps[2]["points"], "a refused query is shown where GPS says it was"
     assert page.locator("image.layer-ground").count() == 12, "the map's own pictures"
     assert page.inner_text(".ruler") == "20 m"
 

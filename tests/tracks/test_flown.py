@@ -62,5 +62,5 @@ def test_a_flight_that_was_not_recorded_gets_a_sentence(tmp_path):
 
 def test_a_flight_over_a_folder_of_pictures_gets_a_sentence(tmp_path):
     log, _ = fly(tmp_path, is_live=False)
-    with pytest.raises(UsageError, match="no camera's"):
+    with pytest.raises(UsageError, match="not from a camera"):
         read_record(log)

@@ -147,7 +147,7 @@ def test_tables_of_other_programs_are_understood_and_said(tmp_path, text, expect
     [
         ("t.csv", b"file,x,y\na.jpg,1,2\n", "line 1"),
         ("t.csv", b"EPSG:32632\na.jpg 1 2 3\n", "WGS 84"),
-        ("t.csv", b"file,lat,lon\na.jpg,here,8\n", "understood"),
+        ("t.csv", b"file,lat,lon\na.jpg,here,8\n", "cannot be read"),
         ("t.csv", b"file,lat,lon\na.jpg,150,200\n", "exchanged"),
         ("t.csv", bytes(range(256)), "UTF-8"),
         ("t.bin", b"", "log"),
@@ -164,5 +164,5 @@ def test_what_is_no_recording_gets_a_sentence(tmp_path, name, content, said):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UsageError, match=said):
         read_record(tmp_path / name)
-    with pytest.raises(UsageError, match="no file"):
+    with pytest.raises(UsageError, match="does not exist"):
         read_record(tmp_path / "nothing.bin")

@@ -66,12 +66,12 @@ def make_dataset(query_dir: str | Path, ref_dir: str | Path, truth: GroundTruth,
     a name that is not in its folder, and where no query is scored."""
     paths = {decode_name(path.name): path for path in list_images(query_dir)}
     references = list_names(ref_dir)
-    for name, judged in truth.items():
+    for name, answers in truth.items():
         if name not in paths:
             raise UsageError(f"{origin}: the query `{name}` is not in {query_dir}: correct its name, or drop the row.")
-        if judged and (unknown := sorted(frozenset.union(*judged).difference(references))):
+        if answers and (unknown := sorted(frozenset.union(*answers).difference(references))):
             raise UsageError(f"{origin}: the reference `{unknown[0]}` is not in {ref_dir}: correct its name.")
-    queries = tuple(ScoredQuery(paths[name], *judged) for name, judged in truth.items() if judged)
+    queries = tuple(ScoredQuery(paths[name], *answers) for name, answers in truth.items() if answers)
     if not queries:
         raise UsageError(f"{origin} scores no query: it needs a row with the status `ok` or `novel`.")
     return Dataset(queries, Path(ref_dir), references, len(paths) - len(queries))
@@ -110,8 +110,8 @@ def _read_rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
             where = f"{path}, line {reader.line_num}"
             if None in row or None in row.values():
                 raise UsageError(
-                    f"{where}: the row has not as many fields as the first line: separate columns by commas, and file "
-                    "names inside a column by spaces."
+                    f"{where}: the row has another number of fields than the first line: separate columns by commas, "
+                    "and file names inside a column by spaces."
                 )
             yield where, {column: value.strip() for column, value in row.items()}
     except OSError as error:
@@ -133,7 +133,7 @@ def open_folder(folder: str | Path, within_m: float) -> Dataset:
             return _read_utm_names(outer / "queries", outer / "database", within_m)
     if query.is_dir() and ref.is_dir():
         return match_positions(query, ref, within_m)
-    raise UsageError(f"{folder} is no folder of a data set that is known: it needs {_LAYOUTS}.")
+    raise UsageError(f"{folder} has no known layout of a data set: it needs {_LAYOUTS}.")
 
 
 def match_positions(query_dir: Path, ref_dir: Path, within_m: float) -> Dataset:
@@ -144,15 +144,13 @@ def match_positions(query_dir: Path, ref_dir: Path, within_m: float) -> Dataset:
         for folder in (query_dir, ref_dir)
     )
     if not queries or not references:
-        raise UsageError(
-            "There are no positions to tell which places are right: give --ground-truth, or positions.csv."
-        )
+        raise UsageError("No positions, and no ground truth: give --ground-truth, or positions.csv.")
     query_deg, reference_deg = (
         np.array([(position.lat_deg, position.lon_deg) for position in positions.values()])
         for positions in (queries, references)
     )
     query_m, reference_m = (
-        np.transpose(offset_m(*reference_deg[0], *at_deg.T)) for at_deg in (query_deg, reference_deg)
+        np.transpose(offset_m(*reference_deg[0], *points_deg.T)) for points_deg in (query_deg, reference_deg)
     )
     truth = _find_near(list(queries), query_m, list(references), reference_m, within_m)
     return make_dataset(query_dir, ref_dir, truth, query_dir)
@@ -170,9 +168,7 @@ def _parse_utm_m(path: Path) -> tuple[float, float]:
         _, east, north, *_ = path.name.split("@")
         return float(east), float(north)
     except ValueError:
-        raise UsageError(
-            f"{path}: its name does not say @EASTING@NORTHING@ in metres: rename it, or leave it out."
-        ) from None
+        raise UsageError(f"{path}: its name lacks @EASTING@NORTHING@ in metres: rename it, or leave it out.") from None
 
 
 def _find_near(
@@ -185,6 +181,6 @@ def _find_near(
     for path, position_m in zip(queries, query_m, strict=True):
         near = np.flatnonzero(np.hypot(*(reference_m - position_m).T) <= within_m)
         truth[decode_name(path.name)] = frozenset(names[index] for index in near), frozenset()
-    if not any(judged and judged[0] for judged in truth.values()):
+    if not any(answers and answers[0] for answers in truth.values()):
         raise UsageError(f"No query was taken within {within_m:g} m of a reference: allow more with --within-m.")
     return truth

@@ -57,7 +57,7 @@ class MatchOptions:
     """Options of matching. `candidates`: how many places are compared in full (None: the technique's own number, as in
     flight); with `exact` all are, without a scan. `sequence`: how many successive queries, in the order of their names,
     are matched together (None: the technique's own number). `follow`: the filter follows them as one flight's frames.
-    `known`: what is known of each beside its picture, such as "heading,height" (None: nothing, `hints.RecordedPrior`).
+    `known`: what is known of each besides its image, like "heading,height" (None: nothing, `hints.RecordedPrior`).
     """
 
     candidates: int | None = bounded_key(1, 1_000_000, default=None)
@@ -70,7 +70,7 @@ class MatchOptions:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryAnswer:
     """The judged answer to one query. `has_match`: its place is in the map. `found` is the name of the best reference
-    that is not ignored (None: there is none) and `score` its score (-inf); `rank_first_right` is the rank of the first
+    that is not ignored (None: there is none) and `score` its score (-inf); `first_right` is the rank of the first
     right reference, from 0 (infinite: none).
 
     `accepted`: a flight would have accepted the match; `accepted_wrong`: and it is wrong; `accepted_off_map`: and the
@@ -126,12 +126,12 @@ def answer_queries(
     what `options.known` asks for, ModelError for a query that fails."""
     spec = technique.spec
     prior, tags = read_prior(options.known, dataset, spec, options.sequence)
-    together = options.sequence or spec.sequence
+    sequence = options.sequence or spec.sequence
     source, meter = open_source(str(dataset.ref_dir), live=False), QueryMeter(load_board("this"))
     frames = progress(read_frames(source), source.total, f"{spec.name}: references")
     with open_temporary_map(frames, technique, dataset.ref_dir, progress) as (place_map, index, not_done):
-        rule = accept_rule(technique, MatchConfig(), together, read_calibration_for(place_map))
-        follows = options.follow and together == 1 and rule.sure is not None
+        rule = accept_rule(technique, MatchConfig(), sequence, read_calibration_for(place_map))
+        follows = options.follow and sequence == 1 and rule.sure is not None
 
         def open_recogniser(length: int, follows: bool) -> Recogniser:
             return Recogniser(
@@ -150,9 +150,9 @@ def answer_queries(
         _recognise(open_recogniser(1, False), paths[0], _NO_TAG)
         if gate:
             gate.forget()
-        if together > 1 or follows:  # those that are not scored are part of a sequence as well
+        if sequence > 1 or follows:  # queries that are not scored are part of a sequence too
             paths = list_images(paths[0].parent)
-        recogniser, answers = open_recogniser(together, follows), []
+        recogniser, answers = open_recogniser(sequence, follows), []
         for path in progress(paths, len(paths), f"{spec.name}: queries"):
             event = _recognise(recogniser, path, tags.get(path, _NO_TAG))
             if query := scored.get(path.name):
@@ -280,15 +280,15 @@ def _judge(event: Recognition, query: ScoredQuery, references: Sequence[str], in
     ranking = None if discarded else event.ranking
     slots = ranking.slots if ranking else np.empty(0, np.intp)
     right, ignored = (np.array([name in names for name in references]) for names in (query.right, query.ignored))
-    counted = np.flatnonzero(~ignored[slots])
+    scored = np.flatnonzero(~ignored[slots])
     wrong = event.accepted and not (right | ignored)[slots[0]]
     away = wrong and outside_neighbourhood(index, slots[0], np.flatnonzero(right | ignored), 0.0).all()
     return QueryAnswer(
         query=query.path.name,
         has_match=bool(query.right),
-        found=references[slots[counted[0]]] if len(counted) else None,
-        score=float(ranking.scores[counted[0]]) if ranking and len(counted) else -math.inf,
-        first_right=metrics.rank_first_right(slots[counted], right),
+        found=references[slots[scored[0]]] if len(scored) else None,
+        score=float(ranking.scores[scored[0]]) if ranking and len(scored) else -math.inf,
+        first_right=metrics.rank_first_right(slots[scored], right),
         accepted=event.accepted,
         accepted_wrong=bool(wrong),
         accepted_off_map=bool(wrong and not query.right),

@@ -111,9 +111,9 @@ def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarra
     if not len(order):
         return np.zeros(1), np.zeros(1)
     falling = scores[order]
-    last_of_its_score = np.append(np.flatnonzero(falling[1:] != falling[:-1]), len(order) - 1)
-    true_positives = np.cumsum(correct[order])[last_of_its_score]
-    accepted = last_of_its_score + 1
+    last = np.append(np.flatnonzero(falling[1:] != falling[:-1]), len(order) - 1)
+    true_positives = np.cumsum(correct[order])[last]
+    accepted = last + 1
     return true_positives / accepted, true_positives / max(int(correct.sum()), 1)
 
 
@@ -169,18 +169,18 @@ def compute_figures(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray
     """Compute the figures of one query or more."""
     correct = ranks == 0
     precision, recall = precision_recall(scores, correct)
-    certain = recall_at_100_precision(precision, recall)
+    recall_at_100 = recall_at_100_precision(precision, recall)
     recalls: dict[str, Any] = {f"recall_at_{k}": float(np.mean(ranks < k)) for k in (1, 5, 10)}
     recalls |= {f"recall_at_{k}_interval": wilson_interval(ranks < k) for k in (1, 5, 10)}
     return Figures(
         queries=len(scores),
         **recalls,
         precision_at_100_recall=precision_at_100_recall(precision, recall),
-        recall_at_100_precision_vpr_bench=certain,
-        recall_at_100_precision_vpr_tutorial=certain * int(correct.sum()) / max(int(has_match.sum()), 1),
+        recall_at_100_precision_vpr_bench=recall_at_100,
+        recall_at_100_precision_vpr_tutorial=recall_at_100 * int(correct.sum()) / max(int(has_match.sum()), 1),
         auc_from_zero=auc_from_zero(precision, recall),
         auc_2_3=auc_2_3(precision, recall),
-        ep=(float(precision[0]) + certain) / 2,
+        ep=(float(precision[0]) + recall_at_100) / 2,
         roc_auc=roc_auc(scores, correct),
         precision_recall=tuple(zip(precision.round(5).tolist(), recall.round(5).tolist(), strict=True)),
     )
@@ -189,12 +189,12 @@ def compute_figures(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray
 def compute_quality(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray) -> dict[str, Any]:
     """Return the fields of a `Quality`, by name, that follow from the answers: the figures of all queries, and of those
     whose place is in the map."""
-    every = compute_figures(scores, ranks, has_match)
+    figures = compute_figures(scores, ranks, has_match)
     is_mixed = has_match.any() and not has_match.all()
     return {
-        **{field.name: getattr(every, field.name) for field in fields(Figures)},
+        **{field.name: getattr(figures, field.name) for field in fields(Figures)},
         "queries_off_map": int((~has_match).sum()),
-        "with_match": compute_figures(*(each[has_match] for each in (scores, ranks, has_match))) if is_mixed else None,
+        "with_match": compute_figures(*(part[has_match] for part in (scores, ranks, has_match))) if is_mixed else None,
     }
 
 
@@ -209,5 +209,5 @@ def add_pcu(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
 
 def read_result(row: dict[str, Any]) -> TechniqueResult:
     """Return the result whose fields are in `row`, as read from JSON. Other keys of `row` are left out."""
-    known = {field.name: row[field.name] for field in fields(TechniqueResult) if field.name in row}
-    return TechniqueResult(**{**known, "with_match": known.get("with_match") and Figures(**known["with_match"])})
+    values = {field.name: row[field.name] for field in fields(TechniqueResult) if field.name in row}
+    return TechniqueResult(**{**values, "with_match": values.get("with_match") and Figures(**values["with_match"])})

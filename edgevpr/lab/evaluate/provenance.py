@@ -1,5 +1,4 @@
-"""Provenance of a measurement, which is stored with every result: the date, the machine and the versions. And keys by
-which finished work is found again."""
+"""Provenance of a measurement, stored with every result: date, machine and versions. And keys of finished work."""
 
 import hashlib
 import json
@@ -24,13 +23,13 @@ def format_date() -> str:
 @cache
 def read_versions() -> dict[str, str | None]:
     """Return the versions of edgevpr, Python and the libraries that decide a figure; None for one that is missing."""
-    found: dict[str, str | None] = {"edgevpr": edgevpr.__version__, "python": platform.python_version()}
+    versions: dict[str, str | None] = {"edgevpr": edgevpr.__version__, "python": platform.python_version()}
     for name, package in _PACKAGES.items():
         try:
-            found[name] = version(package)
+            versions[name] = version(package)
         except PackageNotFoundError:
-            found[name] = None
-    return found
+            versions[name] = None
+    return versions
 
 
 def describe_machine() -> dict[str, Any]:

@@ -46,14 +46,14 @@ class MeasuredRow:
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """Outcome of a run: the rows that were measured (`found`), by set, and why others `failed`, by set and label."""
+    """Outcome of a run: the rows `measured`, by set, and why others `failed`, by set and label."""
 
-    found: dict[str, list[MeasuredRow]]
+    measured: dict[str, list[MeasuredRow]]
     failed: dict[tuple[str, str], EdgevprError]
 
     def as_json(self) -> dict[str, Any]:
         """Return all results, with date, machine and versions, for `json.dumps`."""
-        results = [(name, row) for name, rows in self.found.items() for row in rows]
+        results = [(name, row) for name, rows in self.measured.items() for row in rows]
         return {
             **describe_origin(),
             "results": [
@@ -67,7 +67,7 @@ class Measurements:
 def measure(plan: Plan, folder: Path | None, progress: Progress) -> Measurements:
     """Measure every row on every set. Results are kept in `folder` (None: nowhere). Raises UsageError for an unknown
     technique or parameter. A network or picture that cannot be used only makes its row fail."""
-    found: dict[str, list[MeasuredRow]] = {name: [] for name in plan.sets}
+    measured: dict[str, list[MeasuredRow]] = {name: [] for name in plan.sets}
     failed: dict[tuple[str, str], EdgevprError] = {}
     for name, dataset in plan.sets.items():
         for label, (technique, settings) in plan.rows.items():
@@ -77,8 +77,8 @@ def measure(plan: Plan, folder: Path | None, progress: Progress) -> Measurements
                 failed[name, label] = error
             else:
                 result = replace(metrics.read_result(content["result"]), technique=label)
-                found[name].append(MeasuredRow(result=result, made=content["made"]))
-    return Measurements({name: _add_pcu(rows) for name, rows in found.items()}, failed)
+                measured[name].append(MeasuredRow(result=result, made=content["made"]))
+    return Measurements({name: _add_pcu(rows) for name, rows in measured.items()}, failed)
 
 
 def _add_pcu(rows: Sequence[MeasuredRow]) -> list[MeasuredRow]:

@@ -42,25 +42,22 @@ def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequenc
     """Compute the quality of `scores`, float (queries, references), which `label` names in messages. Rows are the
     queries of `truth`, in its order, and columns `references` (None: all that `truth` names, in counting order). Raises
     UsageError where the counts do not fit."""
-    named = frozenset[str]().union(*(names for judged in truth.values() for names in judged or ()))
+    named = frozenset[str]().union(*(names for answers in truth.values() for names in answers or ()))
     names = list(references or sorted(named, key=make_sort_key))
     if scores.shape != (len(truth), len(names)) or not named <= set(names):
         raise UsageError(
             f"{label} has scores of {scores.shape[0]} queries and {scores.shape[1]} references, and the ground truth "
-            f"is of {len(truth)} and {len(names)}: give the one that belongs to it, or the folders of all images with "
-            "--query and --ref."
+            f"has {len(truth)} and {len(names)}: give the matching one, or all images with --query and --ref."
         )
-    answers = []
-    for row, judged in zip(scores, truth.values(), strict=True):
-        if judged:
-            right, ignored = (np.array([name in group for name in names], bool) for group in judged)
+    best = []
+    for row, answers in zip(scores, truth.values(), strict=True):
+        if answers:
+            right, ignored = (np.array([name in group for name in names], bool) for group in answers)
             ranked = np.argsort(-row, kind="stable")
             ranked = ranked[~ignored[ranked]]
-            best = row[ranked[0]] if len(ranked) else -math.inf
-            answers.append((best, rank_first_right(ranked, right), bool(right.any())))
-    if not answers:
-        raise UsageError(f"{label}: the ground truth scores none of its queries: give the one that belongs to it.")
-    columns = map(np.array, zip(*answers, strict=True))
-    return Quality(
-        technique=label, references=len(names), unscored=len(truth) - len(answers), **compute_quality(*columns)
-    )
+            score = row[ranked[0]] if len(ranked) else -math.inf
+            best.append((score, rank_first_right(ranked, right), bool(right.any())))
+    if not best:
+        raise UsageError(f"{label}: the ground truth scores none of its queries: give the matching one.")
+    columns = map(np.array, zip(*best, strict=True))
+    return Quality(technique=label, references=len(names), unscored=len(truth) - len(best), **compute_quality(*columns))

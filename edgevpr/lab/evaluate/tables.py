@@ -77,9 +77,9 @@ COSTS: tuple[Column, ...] = (
 def make_rows(result: Quality, columns: Sequence[Column], both: bool = True) -> Iterator[list[str]]:
     """Yield the row of a result, and with `both` a second one of the queries whose place is in the map, if these are
     not all."""
-    yield [result.technique, *(text_of(result) for _, text_of in columns)]
+    yield [result.technique, *(format_cell(result) for _, format_cell in columns)]
     if both and result.with_match:
-        yield [f"{result.technique}, in map", *(text_of(result.with_match) for _, text_of in columns)]
+        yield [f"{result.technique}, in map", *(format_cell(result.with_match) for _, format_cell in columns)]
 
 
 def list_headings(columns: Sequence[Column]) -> list[str]:

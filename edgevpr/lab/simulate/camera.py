@@ -145,6 +145,6 @@ def photograph(
         frame = cv2.blur(frame, (1, round(camera.blur_px) + 1))  # the ground runs down the picture
     tone = np.linspace(0, 1, 256, dtype=np.float32) ** light.gamma * light.exposure
     tone = tone * (1 - light.haze_frac) + 0.62 * light.haze_frac
-    seen: Array = cv2.LUT(frame, (255 * tone).astype(np.float32))
-    seen += camera.noise_sigma * rng.standard_normal((camera.height, camera.width, 1), np.float32)
-    return np.clip(seen, 0, 255).astype(np.uint8)
+    frame_levels: Array = cv2.LUT(frame, (255 * tone).astype(np.float32))
+    frame_levels += camera.noise_sigma * rng.standard_normal((camera.height, camera.width, 1), np.float32)
+    return np.clip(frame_levels, 0, 255).astype(np.uint8)

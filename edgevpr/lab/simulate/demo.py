@@ -36,8 +36,11 @@ _CAMERA = ("--camera", "nadir", "--fov-deg", 66)  # that of the generated flight
 MAX_RIGHT_M = 55.0
 _PICTURE_PX = (1600, 1050)
 # Colours (blue, green, red) of the places, of the later flight, and of the matches by their outcome.
-_MAPPED, _LATER = (255, 255, 255), (10, 214, 255)
-_RIGHT, _WRONG, _REJECTED = (91, 191, 47), (59, 56, 229), (36, 165, 245)
+_MAPPED = (255, 255, 255)
+_LATER = (10, 214, 255)
+_RIGHT = (91, 191, 47)
+_WRONG = (59, 56, 229)
+_REJECTED = (36, 165, 245)
 _LEGEND = {
     "places of flight 1": _MAPPED,
     "flight 2": _LATER,
@@ -76,35 +79,30 @@ page              edgevpr report {log_path} --out {folder / "report.html"}"""
 
 def run_command(*words: object) -> None:
     """Run a command of edgevpr to its end. Raises EdgevprError if it fails."""
-    done = subprocess.run(_command(*words), stdout=subprocess.DEVNULL)
-    if done.returncode:
-        raise EdgevprError(
-            f"`{' '.join(done.args[2:])}` ended with exit code {done.returncode}: see its message above."
-        )
-
-
-def _command(*words: object) -> list[str]:
-    return [sys.executable, "-m", "edgevpr", *map(str, words)]
+    command = list(map(str, words))
+    code = subprocess.run([sys.executable, "-m", "edgevpr", *command], stdout=subprocess.DEVNULL).returncode
+    if code:
+        raise EdgevprError(f"`edgevpr {' '.join(command)}` ended with exit code {code}: see its message above.")
 
 
 def read_queries(log_path: Path, mapped: Path, flown: Path) -> tuple[list[LoggedQuery], list[LatLon]]:
     """Read the queries of a flight log, judged by the positions.csv in the folder of its flight, and the positions of
     the places, from that of the mapping flight."""
-    taken_at, places = (
+    true_positions, places = (
         {name: (tag.position.lat_deg, tag.position.lon_deg) for name, tag in tags.items() if tag.position}
         for tags in (read_positions(folder / "positions.csv") for folder in (flown, mapped))
     )
     queries = [
-        replace(query, gps_at=taken_at[query.name], true_at=taken_at[query.name])
+        replace(query, gps_position=true_positions[query.name], true_position=true_positions[query.name])
         for query in read_flight(log_path).queries
-        if query.name in taken_at
+        if query.name in true_positions
     ]
     return queries, list(places.values())
 
 
 def is_right(query: LoggedQuery) -> bool:
     """Return True if the place that was found is near enough to where the picture was taken."""
-    return _are_near(query.true_at, query.place_at)
+    return _are_near(query.true_position, query.place_position)
 
 
 def _are_near(point: LatLon | None, other: LatLon | None) -> bool:
@@ -113,7 +111,7 @@ def _are_near(point: LatLon | None, other: LatLon | None) -> bool:
 
 def summarise(queries: Sequence[LoggedQuery], places: Sequence[LatLon]) -> str:
     """Return the results as text."""
-    on_map = [query for query in queries if any(_are_near(query.true_at, place) for place in places)]
+    on_map = [query for query in queries if any(_are_near(query.true_position, place) for place in places)]
     accepted = [query for query in queries if query.accepted]
     errors_m = [query.off_m or 0.0 for query in accepted] or [np.nan]
     off_map = len(queries) - len(on_map)
@@ -142,26 +140,26 @@ def _draw(path: Path, ground: Image, mapping: GeneratedFlight, queries: Sequence
     def pixels(points_m: ArrayLike) -> list[tuple[int, int]]:
         return [(round(east * scale), round(_PICTURE_PX[1] - north * scale)) for east, north in np.asarray(points_m)]
 
-    seen = np.zeros(_PICTURE_PX[::-1], np.uint8)
+    covered = np.zeros(_PICTURE_PX[::-1], np.uint8)
     for pose in mapping.poses:
         if (corners_m := view_on_ground(pose, mapping.camera)) is not None:
-            cv2.fillConvexPoly(seen, np.array(pixels(corners_m)), 1)
+            cv2.fillConvexPoly(covered, np.array(pixels(corners_m)), 1)
     picture = cv2.resize(ground, _PICTURE_PX, interpolation=cv2.INTER_AREA)
-    picture = np.where(seen[..., None] > 0, picture, picture // 3 + 20).astype(np.uint8)
+    picture = np.where(covered[..., None] > 0, picture, picture // 3 + 20).astype(np.uint8)
     places = pixels([(pose.east_m, pose.north_m) for pose in mapping.poses])
-    found = [query for query in queries if query.true_at and query.place_at]
-    taken = pixels([to_metres(*query.true_at) for query in found if query.true_at])
-    matched = pixels([to_metres(*query.place_at) for query in found if query.place_at])
+    matches = [query for query in queries if query.true_position and query.place_position]
+    taken = pixels([to_metres(*query.true_position) for query in matches if query.true_position])
+    matched = pixels([to_metres(*query.place_position) for query in matches if query.place_position])
     for track, colour in ((places, _MAPPED), (taken, _LATER)):
         cv2.polylines(picture, [np.array(track)], False, colour, 2, cv2.LINE_AA)
     for place in places:
         cv2.circle(picture, place, 4, _MAPPED, -1, cv2.LINE_AA)
-    for query, here, there in zip(found, taken, matched, strict=True):
-        cv2.line(picture, here, there, _choose_colour(query), 3 if query.accepted else 1, cv2.LINE_AA)
-        cv2.circle(picture, here, 7, _choose_colour(query), -1, cv2.LINE_AA)
+    for query, start, end in zip(matches, taken, matched, strict=True):
+        cv2.line(picture, start, end, _choose_colour(query), 3 if query.accepted else 1, cv2.LINE_AA)
+        cv2.circle(picture, start, 7, _choose_colour(query), -1, cv2.LINE_AA)
     for row, (text, colour) in enumerate(_LEGEND.items()):
         cv2.putText(picture, text, (20, 920 + 28 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 2, cv2.LINE_AA)
-    cv2.imwrite(str(path), np.hstack([picture, _draw_pairs(path.parent, found)]))
+    cv2.imwrite(str(path), np.hstack([picture, _draw_pairs(path.parent, matches)]))
 
 
 def _draw_pairs(folder: Path, queries: Sequence[LoggedQuery]) -> Image:

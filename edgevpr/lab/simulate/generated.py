@@ -20,9 +20,11 @@ from edgevpr.lab.simulate.landscape import make_scene
 # The south-west corner of every scene: the home of ArduPilot's simulator (its Tools/autotest/locations.txt, CMAC).
 _ORIGIN_ALT_M = 584.0
 ORIGIN = Position(-35.363261, 149.165230, _ORIGIN_ALT_M)
-SCENE_WIDTH_M, SCENE_DEPTH_M = 640.0, 420.0  # what the flights below need
+SCENE_WIDTH_M = 640.0  # as the flights below need
+SCENE_DEPTH_M = 420.0
 
-_LEG_START_M, _LEG_END_M = 65.0, 345.0  # east; the land east of a leg's end is in no map
+_LEG_START_M = 65.0  # east
+_LEG_END_M = 345.0  # the land east of it is in no map
 _LEGS_NORTH_M = (70.0, 140.0, 210.0, 280.0, 350.0)
 _HEIGHT_M = 80.0
 

@@ -28,20 +28,27 @@ from edgevpr.lab.simulate.brush import (
 )
 
 # Colours under even white light, BGR.
-_GRAVEL, _ASPHALT, _WATER, _STONE = (160, 178, 190), (120, 122, 122), (50, 56, 46), (150, 154, 156)
+_GRAVEL = (160, 178, 190)
+_ASPHALT = (120, 122, 122)
+_WATER = (50, 56, 46)
+_STONE = (150, 154, 156)
 _ROOFS = ((62, 78, 142), (58, 68, 104), (112, 104, 98), (190, 186, 180), (150, 148, 132), (88, 104, 150))
 # Along and beside the road from the middle of the yard, length, width (metres), quarter turns of the ridge.
 _BUILDINGS = ((-9, 8, 17, 8.5, 0), (8, 9, 12, 7, 0), (10, -6, 18, 8, 1), (-8, -8, 11, 7.5, 0), (-16, -1, 5, 4, 0))
 _LEAVES = np.array([(42, 84, 62), (36, 72, 50), (50, 100, 84), (60, 106, 98), (46, 76, 68)], float)
-GRASS, LUSH, DRY, STRAW = (60, 118, 106), (44, 96, 74), (96, 144, 150), (118, 172, 196)
-SOIL, MUD = (78, 100, 126), (92, 130, 156)
+_GRASS = (60, 118, 106)
+_LUSH = (44, 96, 74)
+_DRY = (96, 144, 150)
+_STRAW = (118, 172, 196)
+_SOIL = (78, 100, 126)
+_MUD = (92, 130, 156)
 
 
 def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: float = 0.16) -> Scene:
     """Generate a scene: fields, hedges, woods, a river, a road, lanes and farms. The same seed gives the same scene."""
     rng = np.random.default_rng(seed)
     shape = round(depth_m / metres_per_pixel), round(width_m / metres_per_pixel)
-    canvas = Scene(np.full((*shape, 3), GRASS, np.uint8), np.full(shape, BASE_CM, np.uint16), metres_per_pixel)
+    canvas = Scene(np.full((*shape, 3), _GRASS, np.uint8), np.full(shape, BASE_CM, np.uint16), metres_per_pixel)
     river_m = make_winding(rng, (width_m * 0.55, depth_m * 1.1), (width_m * 0.45, -depth_m * 0.1), 30)
     road_m = make_winding(rng, (-width_m * 0.1, depth_m * 0.42), (width_m * 1.1, depth_m * 0.60), 14)
     bend = LineBender(rng, width_m, depth_m, by_m=2.5)
@@ -63,11 +70,11 @@ def _paint_border(rng: np.random.Generator, canvas: Scene, line_m: Doubles, leve
         return np.empty((0, 4))
     away_m = canvas.distance_m(box, line_m)
     verge = smooth_step(away_m + 0.4 * make_noise(rng, away_m.shape, 25, 2), 3.4, 1.8)
-    canvas.paint(box, verge * 0.8, DRY if rng.random() < 0.5 else LUSH)
+    canvas.paint(box, verge * 0.8, _DRY if rng.random() < 0.5 else _LUSH)
     canvas.height_cm[box] = np.where(verge > 0.5, BASE_CM, canvas.height_cm[box])
     kind = "lane" if level <= 1 else rng.choice(["hedge", "wall", "strip"], p=[0.6, 0.15, 0.25])
     if kind == "lane":
-        canvas.paint(box, smooth_step(away_m, 1.9, 1.4), MUD)
+        canvas.paint(box, smooth_step(away_m, 1.9, 1.4), _MUD)
         canvas.paint(box, smooth_step(np.abs(away_m - 0.85), 0.5, 0.2), _GRAVEL)
     if kind == "wall":
         wall = smooth_step(away_m, 0.6, 0.4)
@@ -95,12 +102,10 @@ def _make_trees(rng: np.random.Generator, line_m: Doubles, step_m: float, spread
 def _paint_river(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> Doubles:
     box = canvas.box(line_m, 24.0)
     shape = canvas.height_cm[box].shape
-    wide, fine = (
-        make_noise(rng, shape, 40 / canvas.metres_per_pixel, 2),
-        make_noise(rng, shape, 5 / canvas.metres_per_pixel),
-    )
+    wide = make_noise(rng, shape, 40 / canvas.metres_per_pixel, 2)
+    fine = make_noise(rng, shape, 5 / canvas.metres_per_pixel)
     away_m = canvas.distance_m(box, line_m) + 1.3 * wide + 0.5 * fine
-    canvas.paint(box, 0.85 * smooth_step(away_m, 15, 9), LUSH)
+    canvas.paint(box, 0.85 * smooth_step(away_m, 15, 9), _LUSH)
     canvas.paint(box, smooth_step(away_m, 7.2, 6.2) * smooth_step(fine, -3, 1), _GRAVEL)
     bars = smooth_step(wide + 0.3 * fine, 1.2, 1.5) * smooth_step(away_m, 1.0, 2.5)
     water = smooth_step(away_m, 5.6, 5.0) * (1 - bars)
@@ -117,7 +122,7 @@ def _paint_road(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> Non
     box = canvas.box(line_m, 7.0)
     away_m = canvas.distance_m(box, line_m)
     worn = make_noise(rng, away_m.shape, 12 / canvas.metres_per_pixel)
-    canvas.paint(box, 0.9 * smooth_step(away_m + 0.3 * worn, 5.5, 4.2), DRY)
+    canvas.paint(box, 0.9 * smooth_step(away_m + 0.3 * worn, 5.5, 4.2), _DRY)
     canvas.paint(box, smooth_step(away_m, 2.95, 2.75), _ASPHALT)
     canvas.paint(box, 0.3 * smooth_step(away_m, 2.95, 2.75) * smooth_step(worn, -1, 2), _STONE)
     canvas.paint(box, 0.3 * smooth_step(np.abs(away_m - 1.3), 0.7, 0.2), (146, 148, 150))
@@ -146,7 +151,7 @@ def _farm(rng: np.random.Generator, canvas: Scene, middle: Doubles, turn_rad: fl
     box = canvas.box(yard, 4.0)
     cover = canvas.polygon(box, yard)
     ragged = smooth_step(cv2.GaussianBlur(cover, (0, 0), 8) + 0.16 * make_noise(rng, cover.shape, 30), 0.42, 0.58)
-    canvas.paint(box, ragged, np.array(_GRAVEL if rng.random() < 0.6 else MUD) * rng.uniform(0.8, 0.95))
+    canvas.paint(box, ragged, np.array(_GRAVEL if rng.random() < 0.6 else _MUD) * rng.uniform(0.8, 0.95))
     canvas.height_cm[box] = np.where(ragged > 0.3, BASE_CM, canvas.height_cm[box])
     for u_m, v_m, length_m, width_m, quarter_turns in _BUILDINGS:
         if rng.random() < 0.8:
@@ -158,9 +163,8 @@ def _farm(rng: np.random.Generator, canvas: Scene, middle: Doubles, turn_rad: fl
     for _ in range(rng.integers(2, 7)):
         centre = middle + rng.uniform(-14, 14) * along + rng.uniform(-2, 3) * beside
         colour = rng.uniform(60, 225) * rng.uniform(0.6, 1.2, 3)
-        paint_building(
-            canvas, centre, 4.3, 1.9, turn_rad + rng.integers(2) * np.pi / 2 + rng.normal(0, 0.2), 1.4, colour
-        )
+        ridge_rad = turn_rad + rng.integers(2) * np.pi / 2 + rng.normal(0, 0.2)
+        paint_building(canvas, centre, 4.3, 1.9, ridge_rad, 1.4, colour)
 
 
 def _vary_brightness(rng: np.random.Generator, canvas: Scene) -> None:
@@ -198,7 +202,7 @@ FieldTexture = tuple[Array, Array]  # colour (H, W, 3) BGR, relief (H, W) cm
 
 def _texture_plough(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
     furrow = np.sin(across_m * (2 * np.pi / 1.2) + 0.5 * tufts)
-    return mix_colours(SOIL, MUD, smooth_step(patches + 0.7 * tufts + 0.25 * furrow, -2, 2.4)), 2 * furrow + 2 * tufts
+    return mix_colours(_SOIL, _MUD, smooth_step(patches + 0.7 * tufts + 0.25 * furrow, -2, 2.4)), 2 * furrow + 2 * tufts
 
 
 def _texture_cereal(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
@@ -206,20 +210,20 @@ def _texture_cereal(patches: Singles, tufts: Singles, across_m: Array) -> FieldT
     laid = smooth_step(patches + 0.5 * tufts, 1.2, 1.7)
     drilled = np.sin(across_m * (2 * np.pi / 0.9))
     share = 0.6 * wheels + 0.2 * smooth_step(tufts - 0.6 * patches + 0.4 * drilled, -1.5, 2.5) + 0.2 * laid
-    return mix_colours(STRAW, SOIL, share), 50 - 35 * wheels - 12 * laid + 3 * tufts
+    return mix_colours(_STRAW, _SOIL, share), 50 - 35 * wheels - 12 * laid + 3 * tufts
 
 
 def _texture_row_crop(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
     plants = smooth_step(np.sin(across_m * (2 * np.pi / 1.8)) + 0.6 * tufts, -0.9, 0.7)
     plants = plants * smooth_step(patches + 0.4 * tufts, 1.9, 1.3)
-    return mix_colours(SOIL, LUSH, 0.9 * plants), 20 * plants + 2 * tufts
+    return mix_colours(_SOIL, _LUSH, 0.9 * plants), 20 * plants + 2 * tufts
 
 
 def _texture_meadow(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
     swath = smooth_step(np.sin(across_m * (2 * np.pi / 6.5)), -0.5, 0.5)
     heap = smooth_step(np.abs(across_m % 6.5 - 3.2) + 0.15 * tufts, 0.8, 0.3)
     share = 0.15 + 0.3 * swath + 0.12 * patches + 0.2 * tufts + 0.2 * heap
-    return mix_colours(GRASS, DRY, share), 8 * heap + 2 * tufts
+    return mix_colours(_GRASS, _DRY, share), 8 * heap + 2 * tufts
 
 
 def _texture_pasture(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
@@ -228,12 +232,12 @@ def _texture_pasture(patches: Singles, tufts: Singles, across_m: Array) -> Field
     rushes = smooth_step(tufts + 0.9 * patches, 1.4, 2.8)
     # Cattle walk one behind the other: narrow paths wind along the lines of equal noise.
     path = smooth_step(np.abs(patches + 0.02 * across_m % 2 - 0.9), 0.05, 0.02)
-    colour = mix_colours(GRASS, DRY, 0.35 + 0.3 * worn - 0.3 * wet + 0.2 * tufts + 0.45 * path)
+    colour = mix_colours(_GRASS, _DRY, 0.35 + 0.3 * worn - 0.3 * wet + 0.2 * tufts + 0.45 * path)
     return colour * (1 - 0.3 * rushes[..., None]), 2 * tufts + 10 * rushes
 
 
 def _texture_forest_floor(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
-    return 0.75 * mix_colours(LUSH, SOIL, 0.35 + 0.2 * tufts), 10 * tufts
+    return 0.75 * mix_colours(_LUSH, _SOIL, 0.35 + 0.2 * tufts), 10 * tufts
 
 
 # Kinds of fields: how frequent, how they look, and their trees (spacing, scatter and radius in metres; None: no trees).

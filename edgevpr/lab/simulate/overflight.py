@@ -22,7 +22,7 @@ from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.mapmaking.tiles import Ground, surround
 
 SPEED_M_S = 10.0
-_SWAY_DEG = 2.0  # the most roll, pitch and yaw off a track that tells none
+_SWAY_DEG = 2.0  # largest roll, pitch and yaw error on a track without attitude
 _START_UTC_S = 1_771_029_000.0
 _LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)  # the shadows stay those of the orthophoto
 _MAX_CORNER_HEIGHTS = (
@@ -42,20 +42,20 @@ def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list
     if not shots:
         raise UsageError(f"{path} has no path: a track needs waypoints, or lines with lat and lon.")
     places = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
-    flown, t_s, course_deg = [], _START_UTC_S, 0.0
+    timed, t_s, course_deg = [], _START_UTC_S, 0.0
     for number, shot in enumerate(shots):
         over_m = height_m or shot.height_m
         if not (over_m and over_m > 0):
-            raise UsageError(f"{path} does not say all heights over the ground (height_m > 0): give --height-m.")
+            raise UsageError(f"{path} lacks heights above ground (height_m > 0): give --height-m.")
         # The first picture looks along the way to the second one.
-        here, there = places[max(0, number - 1)], places[number or min(1, len(places) - 1)]
-        if (way_m := float(distance_m(*here, *there))) > 0:
-            east_m, north_m = offset_m(*here, *there)
+        start, end = places[max(0, number - 1)], places[number or min(1, len(places) - 1)]
+        if (way_m := float(distance_m(*start, *end))) > 0:
+            east_m, north_m = offset_m(*start, *end)
             course_deg = float(np.degrees(np.arctan2(east_m, north_m)) % 360)
         t_s += way_m / SPEED_M_S if number else 0.0
         heading_deg = course_deg if shot.heading_deg is None else shot.heading_deg
-        flown.append(replace(shot, height_m=over_m, heading_deg=heading_deg, t_utc_s=t_s))
-    return flown
+        timed.append(replace(shot, height_m=over_m, heading_deg=heading_deg, t_utc_s=t_s))
+    return timed
 
 
 def _plan_mission_shots(path: str | Path, every_m: float) -> list[GeoTag]:
@@ -66,10 +66,10 @@ def _plan_mission_shots(path: str | Path, every_m: float) -> list[GeoTag]:
     way_m = np.append(0, np.cumsum(distance_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])))
     at_m = np.arange(0, way_m[-1] + 1e-6, every_m)
     heights_m = np.array([way.height_m for way in waypoints], float)  # NaN: home and landings have none
-    known = np.isfinite(heights_m)
-    over_m = np.interp(at_m, way_m[known], heights_m[known]).tolist() if known.any() else [None] * len(at_m)
+    is_known = np.isfinite(heights_m)
+    over_m = np.interp(at_m, way_m[is_known], heights_m[is_known]).tolist() if is_known.any() else [None] * len(at_m)
     places = zip(np.interp(at_m, way_m, lat_deg).tolist(), np.interp(at_m, way_m, lon_deg).tolist(), strict=True)
-    return [GeoTag(position=Position(*at), height_m=height) for at, height in zip(places, over_m, strict=True)]
+    return [GeoTag(position=Position(*place), height_m=height) for place, height in zip(places, over_m, strict=True)]
 
 
 def compute_ground(shots: Sequence[GeoTag], fov_deg: float) -> Ground:
@@ -86,8 +86,8 @@ def make_poses(shots: list[GeoTag], seed: int) -> list[CameraPose]:
     sways = _SWAY_DEG * np.stack([make_oscillation(rng, len(shots)) for _ in range(3)])
     poses = []
     for shot, sway in zip(shots, sways.T.tolist(), strict=True):
-        is_told = shot.roll_deg is not None or shot.pitch_deg is not None
-        roll_deg, pitch_deg, yaw_deg = (shot.roll_deg or 0.0, shot.pitch_deg or 0.0, 0.0) if is_told else sway
+        has_attitude = shot.roll_deg is not None or shot.pitch_deg is not None
+        roll_deg, pitch_deg, yaw_deg = (shot.roll_deg or 0.0, shot.pitch_deg or 0.0, 0.0) if has_attitude else sway
         heading_deg = ((shot.heading_deg or 0.0) + yaw_deg) % 360
         over_m = shot.height_m or 0.0
         poses.append(CameraPose(height_m=over_m, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg))
@@ -95,9 +95,9 @@ def make_poses(shots: list[GeoTag], seed: int) -> list[CameraPose]:
 
 
 def photograph_ground(
-    orthophoto: Orthophoto, at: Position, pose: CameraPose, camera: Camera, light: Light, rng: np.random.Generator
+    orthophoto: Orthophoto, position: Position, pose: CameraPose, camera: Camera, light: Light, rng: np.random.Generator
 ) -> Image | None:
-    """Take one picture over `at`, uint8 (camera.height, camera.width, 3) BGR. Returns None if the orthophoto lacks a
+    """Take one picture over `position`, uint8 (camera.height, camera.width, 3) BGR; None if the orthophoto lacks a
     tenth or more of the ground in the picture. Raises UsageError if the picture shows the horizon."""
     corners_m = view_on_ground(pose, camera)
     if corners_m is None or (reach_m := float(np.abs(corners_m).max())) > _MAX_CORNER_HEIGHTS * pose.height_m:
@@ -108,7 +108,7 @@ def photograph_ground(
     side_px = int(np.ceil(2 * reach_m * camera.focal_px / pose.height_m)) + 4
     metres_per_pixel = pose.height_m / camera.focal_px
     half_m = side_px * metres_per_pixel / 2
-    ground, valid = orthophoto.cut(at, 2 * half_m, side_px)
+    ground, valid = orthophoto.cut(position, 2 * half_m, side_px)
     view = np.zeros(valid.shape, np.uint8)
     in_pixels = (corners_m * (1, -1) + half_m) / metres_per_pixel - 0.5
     cv2.fillConvexPoly(view, in_pixels.round().astype(np.int32), 1)
@@ -127,13 +127,13 @@ def write_overflight(
     camera = replace(camera, focal_px=float(camera.width / 2 / np.tan(np.radians(fov_deg / 2))))
     rng = np.random.default_rng((seed, 3))
 
-    def taken() -> Iterator[tuple[GeoTag, Image | None]]:
+    def take_shots() -> Iterator[tuple[GeoTag, Image | None]]:
         for shot, pose in zip(shots, make_poses(shots, seed), strict=True):
             picture = photograph_ground(orthophoto, shot.position, pose, camera, _LIGHT, rng) if shot.position else None
             tag = replace(shot, heading_deg=pose.heading_deg, roll_deg=pose.roll_deg, pitch_deg=pose.pitch_deg)
             yield tag, picture
 
-    names = write_shots(folder, taken(), camera.jpeg_quality)
+    names = write_shots(folder, take_shots(), camera.jpeg_quality)
     first = next(names, None)
     if first is None:
         raise UsageError(

@@ -124,5 +124,5 @@ def test_open_folder_matches_positions_by_distance(tmp_path):
     with pytest.raises(UsageError, match="--within-m"):
         open_folder(tmp_path, 0.1)
     (tmp_path / "ref" / "positions.csv").unlink()
-    with pytest.raises(UsageError, match="no positions"):
+    with pytest.raises(UsageError, match="No positions"):
         open_folder(tmp_path, 25)

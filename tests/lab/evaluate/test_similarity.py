@@ -46,7 +46,7 @@ def test_measure_gives_the_published_figures_of_eight_matrices(capsys):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (np.zeros((2, 3)), "scores of 2 queries and 3 references, and the ground truth is of 3 and 3"),
+        (np.zeros((2, 3)), "scores of 2 queries and 3 references, and the ground truth has 3 and 3"),
         (np.zeros(3), "a row of numbers for each query"),
         (np.full((3, 3), np.nan), "no NaN"),
         (np.array([[None]]), "holds no similarities"),

@@ -144,7 +144,7 @@ def test_another_answer_of_a_technique_is_a_difference_that_is_told(fly, tmp_pat
     ended(fly(*QUICK))
     log = str(tmp_path / "flight.jsonl")
     assert main(["replay", log]) == 0
-    assert " lines are the same, 0 differ" in capsys.readouterr().out
+    assert " lines are equal, 0 differ" in capsys.readouterr().out
     monkeypatch.setattr("edgevpr.runtime.recognise.recognition.round", lambda value, digits=0: 7.0, raising=False)
     assert main(["replay", log]) == 1
     assert ": score was " in capsys.readouterr().out
