@@ -321,8 +321,9 @@ def test_out_of_reach_five_are_compared_however_few_in_full(ruler):
 )
 def test_rivals_are_compared_where_no_candidate_is_one(ruler, candidates, apart_m, reach, compared):
     technique, place_map, index = ruler
-    rank(technique, technique.encode(41), place_map, index, candidates, apart_m, reach and within(index, *reach))
-    assert technique.compared == compared
+    in_reach = reach and within(index, *reach)
+    ranking = rank(technique, technique.encode(41), place_map, index, candidates, apart_m, in_reach)
+    assert len(ranking.slots) == technique.compared == compared
 
 
 class Unmoved(Ruler):

@@ -84,4 +84,4 @@ def test_positions_are_withdrawn_until_a_match_or_gps_proves_them(known, output)
 @pytest.mark.parametrize("output", Output)
 def test_text_of_an_output_fits_a_status_text(output):
     assert isinstance(output.severity, Severity)
-    assert len(f"edgevpr: {output.text}") <= MAX_TEXT_BYTES
+    assert len("edgevpr: " + output.text) <= MAX_TEXT_BYTES
