@@ -128,7 +128,7 @@ def rounded(value: Any) -> Any:
 
 def made_line(found: Row, command: str) -> str:
     """Return the sentence that ends a page."""
-    return f"Commit {found['commit']}, {found['date']}, {found['describe_machine']['cpu']}. Made by `{command}`."
+    return f"Commit {found['commit']}, {found['date']}, {found['machine']['cpu']}. Made by `{command}`."
 
 
 def told(doc: str, until: str | None = None) -> str:
