@@ -20,7 +20,7 @@ from edgevpr.mavlink.link import LinkStats
 from edgevpr.mavlink.messages import Fix, Health, Severity, make_status_text
 from edgevpr.mavlink.peer import Listener
 from edgevpr.mavlink.vehicle import Readiness
-from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.autopilot import AutopilotOutput
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flightlog import FlightLog
 from edgevpr.runtime.flight.notifier import Notifier
@@ -128,10 +128,12 @@ class FakeSource:
         self._leave.clear()
 
 
-def to_autopilot(link, navigator, clock: "FakeClock", flight_log: FlightLog | None = None, **settings) -> ToAutopilot:
+def to_autopilot(
+    link, navigator, clock: "FakeClock", flight_log: FlightLog | None = None, **settings
+) -> AutopilotOutput:
     """An autopilot at a link, with keys of the section `mavlink`."""
     config = load_config(None, {f"mavlink.{key}": value for key, value in settings.items()}).mavlink
-    return ToAutopilot(
+    return AutopilotOutput(
         link, navigator, Notifier(flight_log or FlightLog(None), link), settings=config, cores=4, clock=clock.clock
     )
 

@@ -26,7 +26,7 @@ from edgevpr.mavlink.signing import Signing
 from edgevpr.mavlink.turns import Turns
 from edgevpr.mavlink.wire import Message
 from edgevpr.review.compare import PacketComparison
-from edgevpr.runtime.flight.boundary import LINK, SOURCE_STATE, Tape
+from edgevpr.runtime.flight.boundary import LINK, SOURCE_STATE_DEFAULTS, Tape
 from edgevpr.runtime.flight.stop import StopNow
 
 Note = list[Any]  # a line of the tape: a kind, and its values
@@ -120,9 +120,9 @@ class ReplayedSource(Source):
         self._tape, self._picture = tape, picture
 
     def __getattr__(self, name: str) -> Any:
-        if name not in SOURCE_STATE:
+        if name not in SOURCE_STATE_DEFAULTS:
             raise AttributeError(name)
-        value: Any = self._tape.read(name, lambda: SOURCE_STATE[name])
+        value: Any = self._tape.read(name, lambda: SOURCE_STATE_DEFAULTS[name])
         return Condition[value] if name == "condition" else value
 
     def read(self, timeout_s: float) -> Frame | None:

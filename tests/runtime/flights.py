@@ -11,7 +11,7 @@ from edgevpr.core.arrays import Image
 from edgevpr.core.config import Config, load_config
 from edgevpr.power.boards import load_board, resolve_board
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.autopilot import AutopilotOutput
 from edgevpr.runtime.flight.flight import Flight as FlightItself
 from edgevpr.runtime.flight.flightio import FlightParts
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
@@ -59,7 +59,7 @@ class Flight:
             notifier, autopilot = Notifier(flight_log, self.link), None
             if self.link:
                 navigator = self.link.listener = Navigator(settings.min_accuracy_m, 1.0)
-                autopilot = ToAutopilot(
+                autopilot = AutopilotOutput(
                     self.link, navigator, notifier, settings=settings, cores=self.board.cores, clock=clock
                 )
             parts = FlightParts(

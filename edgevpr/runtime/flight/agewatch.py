@@ -22,18 +22,18 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 DELAYS_S = np.arange(-1.0, 6.05, 0.1)  # those that are tried
 
-_KEPT_S = 60.0  # of the motion; matches of that time are compared with it
-_MAX_GAP_S = 1.0  # between two reports
-_EVERY_S = 0.9  # matches nearer to each other say the same
+_HISTORY_S = 60.0  # of the motion; matches of that time are compared with it
+_MAX_MOTION_GAP_S = 1.0  # between two reports
+_MIN_INTERVAL_S = 0.9  # matches nearer to each other say the same
 _MAX_MATCHES = 20
 _MIN_MATCHES = 4  # that say anything of a delay
 # What the usual delay counts against another one, as chi-square: at most this, since a delay of seconds is possible;
 # pictures that are newer than they claim are so many times less usual than older ones, without this limit.
-_MAX_AGAINST = 30.0
-_NEWER = 4.0
+_MAX_PRIOR_CHI2 = 30.0
+_NEGATIVE_FACTOR = 4.0
 # By how much reported motion and matches may differ, beside the accuracy that a match says of itself: velocity by an
 # unknown wind (m/s), which changes (m/s in one second), or with GPS; direction by compass and mounting, which wanders.
-_ANYWHERE_M = 1e3
+_START_SD_M = 1e3
 _WIND_SD_M_S = 8.0
 _GUST_SD_M_S = 0.5
 _GPS_SD_M_S = 0.2
@@ -42,23 +42,23 @@ _MATCH_SD_M = 1.5
 _COMPASS_WANDER_DEG = 0.3
 _DIRECTION_SD_DEG = 2.0
 _COMPASS_GAIN = 0.25
-_ANY_COMPASS = 0.0, 30.0
+_UNKNOWN_COMPASS = 0.0, 30.0
 # A match contradicts the delay so far if that explains it badly, and another one far better; it agrees with it if that
 # explains it, and another one does not: chi-square with three degrees of freedom. From one opening of a stream to the
 # next a delay may change by so much; one that differs by 1.5 s is another one.
-_CONTRADICTS = 14.0
-_EXPLAINS = 10.0
-_AGREES = 9.0
-_AGREES_BETTER = 6.0
-_MAY_CHANGE_S = 0.5
-_OF_ANOTHER_AGE_S = 1.5
-_COMPARED = 12  # matches
-_DETERMINED_S = 0.3  # standard deviation of a delay that is known
+_CONTRADICTION_CHI2 = 14.0
+_MIN_GAIN_CHI2 = 10.0
+_AGREEMENT_CHI2 = 9.0
+_MIN_LEAD_CHI2 = 6.0
+_MAX_DELAY_CHANGE_S = 0.5
+_MIN_OTHER_DELAY_S = 1.5
+_MAX_COMPARED = 12  # matches
+_MAX_DELAY_SD_S = 0.3  # standard deviation of a delay that is known
 _MAX_COST = 3.0  # chi-square of each match, of those that have one delay
-_SHOW_ANOTHER = 8  # matches that may show a delay that is another one
-_REMEMBERED = 0.9  # share of what was learnt half a minute ago that still counts
-_AGREEING = 2  # matches in a row after which pictures count as before
-_OUTLIERS = 3  # contradictions in a row that no delay explains: then the reported motion is wrong
+_MIN_OTHER_MATCHES = 8  # matches that may show a delay that is another one
+_MEMORY_SHARE = 0.9  # share of what was learnt half a minute ago that still counts
+_MIN_AGREEING = 2  # matches in a row after which pictures count as before
+_MAX_OUTLIERS = 3  # contradictions in a row that no delay explains: then the reported motion is wrong
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +88,7 @@ class Comparison(Enum):
 
     AGREES = auto()
     UNKNOWN = auto()
-    OF_ANOTHER_AGE = auto()
+    OTHER_DELAY = auto()
     OUTLIER = auto()
 
 
@@ -118,7 +118,7 @@ class AgeWatch:
         not, and heading of the aircraft."""
         if self._motion and t_s <= self._motion[-1][0]:
             return
-        if self._motion and t_s - self._motion[-1][0] > _MAX_GAP_S:
+        if self._motion and t_s - self._motion[-1][0] > _MAX_MOTION_GAP_S:
             self._motion.clear()
             self._sightings, self._others = [], []
         heading_deg = math.nan if heading_deg is None else heading_deg
@@ -134,7 +134,7 @@ class AgeWatch:
             if math.isfinite(before_deg):
                 heading_deg = before_deg + float(wrap_deg(heading_deg - before_deg))  # without a step at north
         self._motion.append((t_s, east_m, north_m, heading_deg, east_m_s, north_m_s, grown, start))
-        while t_s - self._motion[0][0] > _KEPT_S + DELAYS_S[-1]:
+        while t_s - self._motion[0][0] > _HISTORY_S + DELAYS_S[-1]:
             self._motion.popleft()
 
     def correct(self, frame: Frame) -> Frame:
@@ -148,37 +148,38 @@ class AgeWatch:
         """Learn from the accepted match of the frame that `correct` returned last; it is not to be used if the age is
         unknown then."""
         self._drop_old()
-        seen = self._see(event)
+        seen = self._observe(event)
         if seen is None:
             return
         found, own = self._compare(seen)
         self._agreeing = self._agreeing + 1 if found is Comparison.AGREES else 0
         self._outliers = self._outliers + 1 if found is Comparison.OUTLIER else 0
-        self.is_unknown |= found is Comparison.OF_ANOTHER_AGE
+        self.is_unknown |= found is Comparison.OTHER_DELAY
         if self.is_unknown:
             self._others.append(seen)
-            if own and own.sd_s < _MAY_CHANGE_S and found is not Comparison.OUTLIER:
+            if own and own.sd_s < _MAX_DELAY_CHANGE_S and found is not Comparison.OUTLIER:
                 self._sightings = [*self._sightings[1 - _MAX_MATCHES :], replace(seen, delay_s=own.s)]
             self._resume()
-        elif self._outliers == _OUTLIERS:
+        elif self._outliers == _MAX_OUTLIERS:
             self._sightings, self._outliers = [seen], 0
-        elif not self._outliers and (not self._sightings or seen.t_s - self._sightings[-1].t_s >= _EVERY_S):
+        elif not self._outliers and (not self._sightings or seen.t_s - self._sightings[-1].t_s >= _MIN_INTERVAL_S):
             self._sightings = [*self._sightings[1 - _MAX_MATCHES :], seen]
             self._learn(seen.t_s)
             self._compare_compass(seen)
 
     def _learn(self, now_s: float) -> None:
         """Estimate the delay anew with one match more."""
-        new = [each for each in self._sightings if each.t_s > self._learnt_s and each.delay_s is None]
+        new = [sighting for sighting in self._sightings if sighting.t_s > self._learnt_s and sighting.delay_s is None]
         if len(new) < _MIN_MATCHES:
             return
         shown = self._learnt + self._cost(new, np.tile(DELAYS_S[:, None], len(new)))
         if shown.min() > _MAX_COST * len(new):
             return
         over = DELAYS_S / self._usual_s
-        self._delay = _estimate(shown + np.where(over < 0, (_NEWER * over) ** 2, np.minimum(over**2, _MAX_AGAINST)))
-        if now_s - new[0].t_s > _KEPT_S / 2 or len(new) == _MAX_MATCHES:
-            self._learnt_s, self._learnt = now_s, _REMEMBERED * (shown - shown.min())
+        prior = np.where(over < 0, (_NEGATIVE_FACTOR * over) ** 2, np.minimum(over**2, _MAX_PRIOR_CHI2))
+        self._delay = _estimate_delay(shown + prior)
+        if now_s - new[0].t_s > _HISTORY_S / 2 or len(new) == _MAX_MATCHES:
+            self._learnt_s, self._learnt = now_s, _MEMORY_SHARE * (shown - shown.min())
 
     def _compare_compass(self, seen: Sighting) -> None:
         """Learn by how much the headings of pictures and compass differ, while the delay is as usual."""
@@ -192,29 +193,33 @@ class AgeWatch:
 
     def _resume(self) -> None:
         """Use pictures again if they are as old as before, or have shown by themselves how old they are now."""
-        if self._agreeing >= _AGREEING:
+        if self._agreeing >= _MIN_AGREEING:
             self._others, self.is_unknown = [], False
-        if len(self._others) < _SHOW_ANOTHER:
+        if len(self._others) < _MIN_OTHER_MATCHES:
             return
         shown = self._cost(self._others, np.tile(DELAYS_S[:, None], len(self._others)))
-        found = _estimate(shown)
-        if shown.min() < _MAX_COST * len(self._others) and found.sd_s < _DETERMINED_S and found.s > -_MAY_CHANGE_S:
+        found = _estimate_delay(shown)
+        if (
+            shown.min() < _MAX_COST * len(self._others)
+            and found.sd_s < _MAX_DELAY_SD_S
+            and found.s > -_MAX_DELAY_CHANGE_S
+        ):
             self._sightings, self._others, self._delay, self.is_unknown = self._others, [], found, False
             self._learnt_s, self._learnt = -math.inf, np.zeros(len(DELAYS_S))
 
     def _drop_old(self) -> None:
         """Forget matches from before the motion that is kept."""
         from_s = self._motion[0][0] + DELAYS_S[-1] if self._motion else math.inf
-        self._sightings = [each for each in self._sightings if each.t_s >= from_s]
-        self._others = [each for each in self._others if each.t_s >= from_s][-_MAX_MATCHES:]
+        self._sightings = [sighting for sighting in self._sightings if sighting.t_s >= from_s]
+        self._others = [sighting for sighting in self._others if sighting.t_s >= from_s][-_MAX_MATCHES:]
 
-    def _see(self, event: Recognition) -> Sighting | None:
+    def _observe(self, event: Recognition) -> Sighting | None:
         """Return what a match says of the aircraft; None if the motion at that time is not known."""
         where, frame = event.located, event.frame
         if where is None or frame is None or not self._motion:
             return None
         t_s, here = frame.t_mono_s + self._taken_out_s, where.position
-        if not self._motion[0][0] <= t_s - DELAYS_S[-1] <= t_s <= self._motion[-1][0] + _MAX_GAP_S:
+        if not self._motion[0][0] <= t_s - DELAYS_S[-1] <= t_s <= self._motion[-1][0] + _MAX_MOTION_GAP_S:
             return None
         self._origin = self._origin or here
         east_m, north_m = offset_m(self._origin.lat_deg, self._origin.lon_deg, here.lat_deg, here.lon_deg)
@@ -228,36 +233,37 @@ class AgeWatch:
 
     def _compare(self, seen: Sighting) -> tuple[Comparison, Delay | None]:
         """Compare a match with the delay of those before it; return also its own delay (None: none fits)."""
-        before = self._sightings[-_COMPARED:]
+        before = self._sightings[-_MAX_COMPARED:]
         if self._delay is None or len(before) < _MIN_MATCHES:
             return Comparison.UNKNOWN, None
         usual_s = self._delay.s
-        delays_s = np.tile([usual_s if each.delay_s is None else each.delay_s for each in before], (len(DELAYS_S), 1))
+        row_s = [usual_s if sighting.delay_s is None else sighting.delay_s for sighting in before]
+        delays_s = np.tile(row_s, (len(DELAYS_S), 1))
         since_s = max(0.0, before[0].t_s - self._compass_s)
         known = self._compass_deg, math.hypot(_DIRECTION_SD_DEG, _COMPASS_WANDER_DEG * math.sqrt(since_s))
-        compass = known if math.isfinite(self._compass_deg) else _ANY_COMPASS
+        compass = known if math.isfinite(self._compass_deg) else _UNKNOWN_COMPASS
         more = self._cost([*before, seen], np.column_stack([delays_s, DELAYS_S]), compass)
         more = more - self._cost(before, delays_s[:1], compass)
-        apart_s, own = np.abs(DELAYS_S - usual_s), _estimate(more) if more.min() < _AGREES else None
-        near, far = more[apart_s <= _MAY_CHANGE_S].min(), more[apart_s > _OF_ANOTHER_AGE_S].min()
-        if near > _CONTRADICTS:
-            return (Comparison.OF_ANOTHER_AGE if more.min() < near - _EXPLAINS else Comparison.OUTLIER), own
-        return (Comparison.AGREES if near < min(_AGREES, far - _AGREES_BETTER) else Comparison.UNKNOWN), own
+        apart_s, own = np.abs(DELAYS_S - usual_s), _estimate_delay(more) if more.min() < _AGREEMENT_CHI2 else None
+        near, far = more[apart_s <= _MAX_DELAY_CHANGE_S].min(), more[apart_s > _MIN_OTHER_DELAY_S].min()
+        if near > _CONTRADICTION_CHI2:
+            return (Comparison.OTHER_DELAY if more.min() < near - _MIN_GAIN_CHI2 else Comparison.OUTLIER), own
+        return (Comparison.AGREES if near < min(_AGREEMENT_CHI2, far - _MIN_LEAD_CHI2) else Comparison.UNKNOWN), own
 
     def _cost(
-        self, sightings: list[Sighting], delays_s: Doubles, compass: tuple[float, float] = _ANY_COMPASS
+        self, sightings: list[Sighting], delays_s: Doubles, compass: tuple[float, float] = _UNKNOWN_COMPASS
     ) -> Doubles:
         """Return how badly matches fit the reported motion with delays (k, n), in each of k cases: chi-square (k,).
         `compass`: by how much headings seen exceed those reported, and the standard deviation, degrees."""
         moved_s, east_m, north_m, turned_deg, _, _, grown, start = np.array(self._motion).T
-        rows = [(each.t_s, each.east_m, each.north_m, each.heading_deg, each.sd_m) for each in sightings]
+        rows = [(seen.t_s, seen.east_m, seen.north_m, seen.heading_deg, seen.sd_m) for seen in sightings]
         t_s, *seen_m, seen_deg, sd_m = np.array(rows).T
         taken_s = t_s - delays_s
         since_s = taken_s - taken_s.min()
         first_s = np.minimum(since_s[:, :, None], since_s[:, None, :])
         drift_m2 = _sum_drift(moved_s - taken_s.min(), grown, since_s, first_s)
         drift_m2 += float(np.interp(taken_s.min(), moved_s, start)) * since_s[:, :, None] * since_s[:, None, :]
-        inverse = np.linalg.inv(_ANYWHERE_M**2 + drift_m2 + np.diag(sd_m**2))
+        inverse = np.linalg.inv(_START_SD_M**2 + drift_m2 + np.diag(sd_m**2))
         cost = np.zeros(len(delays_s))
         for seen, moved in zip(seen_m, (east_m, north_m), strict=True):
             off_m = seen - np.interp(taken_s, moved_s, moved)
@@ -271,7 +277,7 @@ class AgeWatch:
         return cost
 
 
-def _estimate(against: Doubles) -> Delay:
+def _estimate_delay(against: Doubles) -> Delay:
     """Return the delay, if so much (chi-square) speaks against each of DELAYS_S."""
     weights = np.exp((against.min() - against) / 2)
     weights /= weights.sum()
@@ -285,7 +291,7 @@ def _sum_drift(moved_s: Doubles, grown: Doubles, since_s: Doubles, first_s: Doub
     earlier one of each two times."""
     grown = np.where(moved_s > 0, grown, 0.0)
     sums = np.cumsum(grown), np.cumsum(grown * moved_s), np.cumsum(grown * moved_s**2)
-    zeroth, first, second = (np.interp(first_s, moved_s, each) for each in sums)
+    zeroth, first, second = (np.interp(first_s, moved_s, total) for total in sums)
     one_s, other_s = since_s[:, :, None], since_s[:, None, :]
     drift_m2: Doubles = zeroth * one_s * other_s - first * (one_s + other_s) + second
     return drift_m2

@@ -22,20 +22,20 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 # While an autopilot is heard, a fix is sent within a fraction of a millisecond. The loop waits for that, at most this
 # long, so that the log line of the query can say whether the fix was sent.
-_SETTLED_WITHIN_S = 0.02
+_MAX_SEND_WAIT_S = 0.02
 
 DRY_RUN = Reason(ReasonCode.DRY_RUN)
 
 _UNKNOWN_AGE = Reason(ReasonCode.AGE_UNKNOWN)
-_REPORTED_DELAY_S = 0.3
+_MIN_REPORTED_DELAY_S = 0.3
 
-_ASKED_AGAIN_S = 2.0  # for a source set, while that is not answered
-_GPS_GOOD_FOR_S = 10.0  # so long GPS must be good before the source set with GPS is asked for again
+_SOURCE_SET_RETRY_S = 2.0  # for a source set, while that is not answered
+_MIN_GPS_GOOD_S = 10.0  # so long GPS must be good before the source set with GPS is asked for again
 
 _log = logging.getLogger(__name__)
 
 
-class ToAutopilot:
+class AutopilotOutput:
     """Sends fixes and other messages over an open link: a match as a fix if the `navigator` advises so; in a dry run
     only the sending is left out. `cores` is the number of the board's cores. What the link's thread uses too is
     accessed in turns only (`Link.turn`)."""
@@ -48,28 +48,26 @@ class ToAutopilot:
         self._unanswered: list[tuple[str, FixTransmission]] = []
         self._held, self._is_holding = 0, False
         self._output = Output.STARTING  # as it was last reported
-        self._unknown_age, self._delay_s = (
-            Alert(notifier, "age", _UNKNOWN_AGE, ReasonCode.AGE_KNOWN),
-            0.0,
-        )  # as last reported
+        self._unknown_age = Alert(notifier, "age", _UNKNOWN_AGE, ReasonCode.AGE_KNOWN)
+        self._delay_s = 0.0  # as last reported
 
     @property
     def summary(self) -> str:
         """Counts of fixes so far, and of refused messages from other systems, in a few words."""
         stats = self._link.stats()
-        taken = f"{stats.fixes_sent} fixes sent, {stats.acks.get('ACCEPTED', 0)} taken"
+        taken = f"{stats.fixes_sent} fixes sent, {stats.acks.get('ACCEPTED', 0)} accepted"
         if stats.positions_sent:
-            told = "does not say whether it uses them"
+            use = "does not report whether it uses them"
             if stats.used_share is not None:
-                told = f"used them by {stats.used_share:.0%} of its reports"
-            taken = f"{stats.positions_sent} positions sent, the autopilot {told}"
+                use = f"used them in {stats.used_share:.0%} of its reports"
+            taken = f"{stats.positions_sent} positions sent, the autopilot {use}"
         sent = taken if self._send_fixes else str(DRY_RUN)
         counts = (
             (sum(stats.acks.values()) - stats.acks.get("ACCEPTED", 0), f"refused ({stats.refused_why})"),
             (stats.unanswered_fixes, "unanswered"),
             (self._held, "held back"),
-            (stats.dropped_stale_fixes, "too late to be sent"),
-            (stats.withheld_fixes, "withheld for want of answers"),
+            (stats.dropped_stale_fixes, "too late to send"),
+            (stats.withheld_fixes, "withheld: no answers"),
             (stats.foreign_messages, "foreign messages refused"),
         )
         return ", ".join([sent, *(f"{count} {what}" for count, what in counts if count)])
@@ -113,7 +111,7 @@ class ToAutopilot:
     def report_match(self, event: Recognition, used_mah: float) -> Recognition:
         """Send the fix of an event, if there is one to send, and its figures. Return the event with the report of this
         fix. `used_mah` is the charge that the board has drawn so far."""
-        with self._link.turn("told"):
+        with self._link.turn("use"):
             fix, sending = None, None
             if event.accepted:
                 fix, sending = self._send_match(event)
@@ -121,8 +119,8 @@ class ToAutopilot:
                 self._navigator.handle_frame(event)
             is_heard = self._link.listens()
         if sending and is_heard:
-            sending.wait(_SETTLED_WITHIN_S)
-        with self._link.turn("told of its fix"):
+            sending.wait(_MAX_SEND_WAIT_S)
+        with self._link.turn("use of its fix"):
             if sending:
                 if sending.sent is not False:  # a fix that was not sent gets no answer; the line of its query says why
                     self._unanswered.append((event.name, sending))
@@ -142,7 +140,7 @@ class ToAutopilot:
             age = self._navigator.age
             age.judge(event)
         self._unknown_age.update(age.is_unknown)
-        if abs(age.delay_s - self._delay_s) > _REPORTED_DELAY_S:
+        if abs(age.delay_s - self._delay_s) > _MIN_REPORTED_DELAY_S:
             self._delay_s = age.delay_s
             note = self._delay_note or Reason(ReasonCode.DELAY_GONE)
             self._notifier.report("age", messages.Severity.INFO, note, delay_s=age.delay_s)
@@ -158,7 +156,7 @@ class ToAutopilot:
 
     @property
     def _delay_note(self) -> Reason | None:
-        is_late = self._delay_s > _REPORTED_DELAY_S
+        is_late = self._delay_s > _MIN_REPORTED_DELAY_S
         return Reason(ReasonCode.DELAY_FOUND, {"delay_s": self._delay_s}) if is_late else None
 
     def add_motion(self, event: Recognition) -> None:
@@ -167,7 +165,7 @@ class ToAutopilot:
             self._navigator.handle_frame(event, is_query=False)
 
     def needs_motion_frames(self) -> bool:
-        """Tell whether the position rests on matches, so that the motion between two of them is of use."""
+        """Return True if the position rests on matches, so that the motion between two of them is useful."""
         with self._link.turn("wants strides"):
             return not self._navigator.has_gps
 
@@ -204,10 +202,10 @@ class ToAutopilot:
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
         """Send health, load and temperature (None: unknown) of this computer, and ask for another source set if that is
-        wanted. Call it once a second."""
+        number. Call it once a second."""
         with self._link.turn("report"):
             self._link.set_health(health)
-            self._ask_for_sources()
+            self._request_source_set()
             self._report_output()
             self._link.send(
                 messages.make_computer_status(
@@ -215,7 +213,7 @@ class ToAutopilot:
                 )
             )
 
-    def _ask_for_sources(self) -> None:
+    def _request_source_set(self) -> None:
         vehicle, now_s = self._link.vehicle(), self._clock.mono_s()
         if vehicle is None or not vehicle.is_fresh(now_s) or not self._send_fixes or not self._source_sets.are_set:
             return
@@ -265,8 +263,8 @@ class SourceSets:
 
     def __init__(self, settings: SourceSetsConfig) -> None:
         self._with_gps, self._without = settings.gps, settings.no_gps
-        self._asked: int | None = None
-        self._asked_s = math.inf
+        self._requested: int | None = None
+        self._requested_s = math.inf
         self._bad_s = -math.inf
 
     @property
@@ -279,14 +277,14 @@ class SourceSets:
         `has_own`: our own position is known well enough; `answered_s`: when such a question was last answered."""
         if not has_gps:
             self._bad_s = now_s
-        wanted = self._without if not has_gps and has_own else None
-        if self._asked is not None and now_s - self._bad_s > _GPS_GOOD_FOR_S:
-            wanted = self._with_gps
-        is_heard = answered_s >= self._asked_s or now_s - self._asked_s < _ASKED_AGAIN_S
-        if wanted is None or (wanted == self._asked and is_heard):
+        number = self._without if not has_gps and has_own else None
+        if self._requested is not None and now_s - self._bad_s > _MIN_GPS_GOOD_S:
+            number = self._with_gps
+        is_heard = answered_s >= self._requested_s or now_s - self._requested_s < _SOURCE_SET_RETRY_S
+        if number is None or (number == self._requested and is_heard):
             return None
-        self._asked, self._asked_s = wanted, now_s
-        return wanted
+        self._requested, self._requested_s = number, now_s
+        return number
 
 
 def _make_report(query: str, sending: FixTransmission) -> FixReport:

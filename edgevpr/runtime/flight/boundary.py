@@ -29,7 +29,7 @@ from edgevpr.runtime.flight.stop import Stop
 T = TypeVar("T")
 
 # The attributes of a source that change, and what a replay takes them for where the tape has none.
-SOURCE_STATE = {
+SOURCE_STATE_DEFAULTS = {
     "ended": False,
     "dropped": 0,
     "refused": {},
@@ -48,7 +48,7 @@ _STEPS = {
     Conversation.end.__name__: "closed",
 }
 LINK = "link"  # the kind of the turns of the link
-_UNPACKED = "image", "position", "pose"  # of a frame, not on the tape as they are
+_UNRECORDED_FIELDS = "image", "position", "pose"  # of a frame, not on the tape as they are
 
 
 class Tape:
@@ -90,9 +90,9 @@ class _TapedMachine:
 
     def __getattr__(self, name: str) -> Any:
         kind, made = _QUESTIONS[name]
-        return partial(self._ask, kind, made, getattr(self._machine, name))
+        return partial(self._answer, kind, made, getattr(self._machine, name))
 
-    def _ask(self, kind: str, made: type[Any] | None, measure: Callable[..., Any], *args: Any) -> Any:
+    def _answer(self, kind: str, made: type[Any] | None, measure: Callable[..., Any], *args: Any) -> Any:
         if made is None:
             return self._tape.read(kind, partial(measure, *args))
         values = self._tape.read(kind, lambda: astuple(measure(*args)))
@@ -133,7 +133,7 @@ class RecordedSource(Source):
         tape.note("is_live", self.is_live)
 
     def __getattr__(self, name: str) -> Any:
-        if name not in SOURCE_STATE:
+        if name not in SOURCE_STATE_DEFAULTS:
             raise AttributeError(name)
         value = getattr(self._source, name)
         self._tape.note(name, value.name if isinstance(value, Condition) else value)
@@ -149,7 +149,7 @@ class RecordedSource(Source):
             self._tape.note("frame", None)
             return None
         jpeg = encode_jpeg(frame.image)
-        known = {name: getattr(frame, name) for name in Frame.__slots__ if name not in _UNPACKED}
+        known = {name: getattr(frame, name) for name in Frame.__slots__ if name not in _UNRECORDED_FIELDS}
         position = frame.position and asdict(frame.position)
         self._tape.note("frame", known | {"number": self._keep(jpeg), "position": position} | self._step())
         return replace(frame, image=decode_jpeg(jpeg))

@@ -1,4 +1,4 @@
-"""Observers of the events of a flight that say how its pictures differ from what map and configuration say of them."""
+"""Observers of a flight's events that report turned or mirrored pictures."""
 
 import cmath
 import math
@@ -18,7 +18,9 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 # Accepted matches in a row by which pictures are turned, and the least turn; with this length of the mean of their
 # directions they agree to some ten degrees. A compass is rarely wrong by so much, a camera is by 90 or 180.
-_TURNED_BY, _TURNED_DEG, _AGREE = 10, 20.0, 0.97
+_TURN_MATCHES = 10
+_MIN_TURN_DEG = 20.0
+_MIN_MEAN_LENGTH = 0.97
 _MISSES_TO_TRY = 15  # queries without a match before a mirrored picture is tried; over poor ground ten are usual
 _MISSES_TO_TRY_AGAIN = 30
 _MAX_TRIES = 8  # each costs two queries
@@ -26,25 +28,24 @@ _MIRRORED_TO_REPORT = 2  # tries in a row that match: one may be wrong
 
 
 class TurnWatch:
-    """Says once if pictures are turned against the autopilot's heading: then each is levelled along wrong axes, and the
-    heading keeps matches from being found. Either the camera's top points elsewhere than `source.up_deg` says, or the
-    compass is wrong."""
+    """Reports once if pictures are turned against the autopilot's heading: they are then levelled along wrong axes, and
+    the heading keeps matches from being found. Either `source.up_deg` is wrong, or the compass."""
 
     def __init__(self, notifier: Notifier, source: SourceConfig) -> None:
-        self._notifier, self._up_deg, self._is_said = notifier, source.up_deg, False
-        self._turned: deque[complex] = deque(maxlen=_TURNED_BY)  # each of length 1
+        self._notifier, self._up_deg, self._has_reported = notifier, source.up_deg, False
+        self._turns: deque[complex] = deque(maxlen=_TURN_MATCHES)  # each of length 1
 
     def update(self, event: Recognition) -> None:
         """Take the direction that the match of an event shows."""
-        where, told_deg = event.located, event.view.up_deg
-        if self._is_said or where is None or where.heading_deg is None or told_deg is None or event.view.reason:
+        where, view_up_deg = event.located, event.view.up_deg
+        if self._has_reported or where is None or where.heading_deg is None or view_up_deg is None or event.view.reason:
             return
-        self._turned.append(cmath.rect(1.0, math.radians(where.heading_deg - told_deg)))
-        mean = sum(self._turned) / _TURNED_BY
+        self._turns.append(cmath.rect(1.0, math.radians(where.heading_deg - view_up_deg)))
+        mean = sum(self._turns) / _TURN_MATCHES
         turn_deg = math.degrees(cmath.phase(mean))
-        if len(self._turned) < _TURNED_BY or abs(mean) < _AGREE or abs(turn_deg) < _TURNED_DEG:
+        if len(self._turns) < _TURN_MATCHES or abs(mean) < _MIN_MEAN_LENGTH or abs(turn_deg) < _MIN_TURN_DEG:
             return
-        self._is_said, up_deg = True, (self._up_deg + turn_deg) % 360
+        self._has_reported, up_deg = True, (self._up_deg + turn_deg) % 360
         note = Reason(ReasonCode.PICTURES_TURNED, {"turn_deg": turn_deg, "up_deg": up_deg})
         ground = f"pictures turned {turn_deg:.0f} degrees"
         self._notifier.report("camera", Severity.WARNING, note, ground=ground, topic="turn")

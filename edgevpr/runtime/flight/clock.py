@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 # Pictures of queries further apart share too little ground to show the motion of an aeroplane. Between those so far
 # apart others show it: 100 m high, at 20 m/s, they share more than half.
-_APART_S, _STRIDE_S = 4.0, 2.0
+_MAX_QUERY_INTERVAL_S = 4.0
+_ODOMETRY_INTERVAL_S = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,8 +30,8 @@ class Pace:
     def __init__(self, rate_hz: float, clock: Clock) -> None:
         self._clock = clock
         self._due_s = clock.mono_s()
-        self.rate_hz = self._asked_hz = rate_hz
-        self._stride_s = self._due_s
+        self.rate_hz = self._requested_hz = rate_hz
+        self._odometry_due_s = self._due_s
 
     def wait_s(self) -> float:
         """Return the seconds until the next frame is due; 0 or less: it is due."""
@@ -39,14 +40,15 @@ class Pace:
     def taken(self, step_s: float | None = None) -> None:
         """Note that a frame has been taken. The next is due after `step_s` (None: by the rate), or later by as much as
         the rate has been lowered."""
-        wait_s = 1 / self.rate_hz if step_s is None else step_s * self._asked_hz / self.rate_hz
+        wait_s = 1 / self.rate_hz if step_s is None else step_s * self._requested_hz / self.rate_hz
         self._due_s = max(self._due_s + wait_s, self._clock.mono_s())
-        self._stride_s = self._clock.mono_s() + _STRIDE_S
+        self._odometry_due_s = self._clock.mono_s() + _ODOMETRY_INTERVAL_S
 
-    def is_time_for_stride(self) -> bool:
-        """Tell, once, that it is time for a picture between two frames that are far apart, to see the motion by."""
+    def is_odometry_due(self) -> bool:
+        """Return True, once, if a frame for visual odometry is due between two queries that are far apart."""
         now_s = self._clock.mono_s()
-        if self.rate_hz * _APART_S > 1 or now_s < self._stride_s or self._due_s - now_s < _STRIDE_S / 2:
+        is_early = now_s < self._odometry_due_s or self._due_s - now_s < _ODOMETRY_INTERVAL_S / 2
+        if is_early or self.rate_hz * _MAX_QUERY_INTERVAL_S > 1:
             return False
-        self._stride_s = now_s + _STRIDE_S
+        self._odometry_due_s = now_s + _ODOMETRY_INTERVAL_S
         return True

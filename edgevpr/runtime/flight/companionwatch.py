@@ -8,7 +8,7 @@ from edgevpr.power.thermal import ThermalState
 from edgevpr.runtime.flight.notifier import Notifier
 
 # Seconds between two reports of a problem at least, and without it until it counts as over: an under-voltage blinks.
-_REPORT_EVERY_S = 30.0
+_MIN_REPORT_INTERVAL_S = 30.0
 # Fields of the state that are problems, each with the notes that it has begun and that it is over.
 _NOTES = {
     "under_voltage": (ReasonCode.UNDER_VOLTAGE, ReasonCode.SUPPLY_FINE),
@@ -27,7 +27,7 @@ class CompanionWatch:
         self._holding: dict[str, str] = {}  # problems that were reported and are not over, with their texts
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def problems(self) -> tuple[str, ...]:
         """Texts of the problems that hold."""
         return tuple(self._holding.values())
 
@@ -37,8 +37,8 @@ class CompanionWatch:
             value: bool | None = getattr(state, problem)
             if value:
                 self._seen_s[problem] = now_s
-            holds = now_s - self._seen_s.get(problem, -math.inf) < _REPORT_EVERY_S
-            is_early = now_s - self._reported_s.get(problem, -math.inf) < _REPORT_EVERY_S
+            holds = now_s - self._seen_s.get(problem, -math.inf) < _MIN_REPORT_INTERVAL_S
+            is_early = now_s - self._reported_s.get(problem, -math.inf) < _MIN_REPORT_INTERVAL_S
             if not is_early and (holds or value is not None) and holds != (problem in self._holding):
                 self._report(now_s, problem, holds, state)
 

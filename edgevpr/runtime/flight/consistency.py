@@ -11,17 +11,21 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.runtime.flight.measurements import PositionedMatch
 from edgevpr.runtime.recognise.locate import mahalanobis
 
-# Limits in standard deviations. A right fix is more than _CONTRADICTS from the expected position once in 3000 times. A
-# second right fix is within _AGREES of the first seven times in eight; otherwise the one after it is.
-_CONTRADICTS, _AGREES = 4.0, 2.0
-_GOOD_FOR_S = 30.0  # a fix held back for longer is not compared: the path may have drifted too far
-_JOINED_WITHIN_S = 2.5
-_DRIFT_M_S, _FOLLOWED_DRIFT_M_S = 2.5, 0.5  # drift of the path that is allowed for between two fixes that agree
-_IN_A_ROW, _ROW_WITHIN_S, _FASTEST_M_S = 4, 10.0, 30.0  # of fixes that are believed against a path that is lost
+# In standard deviations: a right fix is farther than this from its prediction once in 3000 times.
+_MAX_INNOVATION_SIGMA = 4.0
+# A second right fix is within this of the first seven times in eight; otherwise the one after it is.
+_MAX_DISAGREEMENT_SIGMA = 2.0
+_HELD_FIX_TIMEOUT_S = 30.0  # a fix held for longer is not compared: the path may have drifted too far
+_CONFIRMATION_TIMEOUT_S = 2.5
+_DRIFT_M_S = 2.5  # of the path, that is allowed between two fixes that agree
+_TRACKED_DRIFT_M_S = 0.5  # the same, where visual odometry has tracked the path
+_FIXES_TO_OVERRULE_TRACK = 4
+_MAX_ROW_INTERVAL_S = 10.0
+_MAX_SPEED_M_S = 30.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ComparedFix:
+class PredictedFix:
     """The fix of a match (`seen`) and its prediction by the path, in metres east and north. `path_m` (2,): the point of
     the path when the frame was taken; `off_m` (2,): the offset of the fix from that point; `expected_m` (2,): the
     predicted offset; `covariance_m2` (2, 2): that of the prediction, without that of the fix."""
@@ -33,105 +37,104 @@ class ComparedFix:
     covariance_m2: Doubles
 
     @property
-    def beside_m(self) -> Doubles:
-        """Offset of the fix from where it was expected (2,)."""
+    def innovation_m(self) -> Doubles:
+        """Offset of the fix from its prediction (2,)."""
         return self.off_m - self.expected_m
 
 
 class GateResult(NamedTuple):
-    """Verdict on a fix: `why` it is not believed (None: it is). `is_against`: it contradicts the expected position,
-    and other fixes agree with it; `is_lost`: the path's velocity is wrong too."""
+    """Verdict on a fix: `why` it is not accepted (None: it is). `is_against`: it contradicts its prediction, and other
+    fixes agree with it; `is_lost`: the velocity of the path is wrong too."""
 
     why: Reason | None = None
     is_against: bool = False
     is_lost: bool = False
 
 
-BELIEVED = GateResult()
+ACCEPTED = GateResult()
 
 
 class Consistency:
-    """Holds back a fix that contradicts the expected position, until a second, independent fix agrees with it. With
-    GPS, a contradicting fix is never believed.
+    """Holds a fix that contradicts its prediction until a second, independent fix agrees with it. While GPS is trusted,
+    contradicting fixes are rejected.
 
-    The path drifts slowly: of a fix far beside it, only another fix can tell whether it is wrong or the path is. Two
-    right fixes have the same offset from the path, and two wrong ones hardly ever do. A path that is wrong by more
-    than a drift has no such fixes: there, several of different places that an aircraft can have flown through are
-    believed. Only several are believed, too, where the camera has followed the path from frame to frame, since ground
-    that repeats itself can say the same twice, and where pictures are suddenly turned against the compass."""
+    The path drifts slowly, so only another fix can tell whether a distant fix is wrong or the path. Two right fixes
+    have the same offset from the path; two wrong ones hardly ever do. A path that is wrong by more than a drift has no
+    such fixes: then four of different places that an aircraft can have flown through are accepted. Four are needed,
+    too, where visual odometry has tracked the path, since repetitive ground can give the same wrong fix twice."""
 
     def __init__(self) -> None:
-        self._agreeing: list[ComparedFix] = []  # fixes held back: one, and those after it that say the same
-        self._turn_deg: float | None = None  # of the last fix believed: that of the compass, if it is wrong
-        self._row: list[ComparedFix] = []  # fixes held back, of different places, that can have been flown through
+        self._agreeing: list[PredictedFix] = []  # held fixes: one, and later ones that agree with it
+        self._turn_deg: float | None = None  # of the last accepted fix: the error of the compass
+        self._flyable: list[PredictedFix] = []  # held fixes of different places, in a row that can be flown
 
-    def is_contradicted(self, now_s: float, is_followed: bool) -> bool:
-        """Return True while the last fix contradicts what is expected, and another one may still agree with it. Where
-        the path `is_followed` from frame to frame, one that was right would be followed by another soon."""
-        good_for_s = _JOINED_WITHIN_S if is_followed else _GOOD_FOR_S
-        return bool(self._agreeing) and now_s - self._agreeing[-1].seen.t_s <= good_for_s
+    def is_contradicted(self, now_s: float, is_tracked: bool) -> bool:
+        """Return True while the last fix contradicts its prediction and another may still confirm it. On a path that
+        `is_tracked`, a right fix would be confirmed soon."""
+        timeout_s = _CONFIRMATION_TIMEOUT_S if is_tracked else _HELD_FIX_TIMEOUT_S
+        return bool(self._agreeing) and now_s - self._agreeing[-1].seen.t_s <= timeout_s
 
-    def judge(self, fix: ComparedFix, has_gps: bool, is_followed: bool) -> GateResult:
-        """Judge a fix by its prediction. `has_gps`: the autopilot has a GPS that is believed; `is_followed`: the path
-        is known from frame to frame, so that it takes several to be wrong."""
-        step_m, is_turned = fix.beside_m, not fix.seen.is_turned_like(self._turn_deg)
-        if mahalanobis(step_m, fix.seen.covariance_m2 + fix.covariance_m2) <= _CONTRADICTS and not is_turned:
-            return self._believe(fix, BELIEVED)
-        off_m, good_to_m = math.hypot(*step_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
+    def judge(self, fix: PredictedFix, has_gps: bool, is_tracked: bool) -> GateResult:
+        """Judge a fix by its prediction. `has_gps`: the autopilot has a trusted GPS; `is_tracked`: visual odometry has
+        tracked the path."""
+        innovation_m, is_turned = fix.innovation_m, not fix.seen.is_turned_like(self._turn_deg)
+        sigmas = mahalanobis(innovation_m, fix.seen.covariance_m2 + fix.covariance_m2)
+        if sigmas <= _MAX_INNOVATION_SIGMA and not is_turned:
+            return self._accept(fix, ACCEPTED)
+        off_m, predicted_sd_m = math.hypot(*innovation_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
         turned = Reason(ReasonCode.HELD_TURNED, {"turn_deg": fix.seen.turn_deg or 0.0})
         if has_gps:
-            self._agreeing, self._row = [], []
+            self._agreeing, self._flyable = [], []
             return GateResult(turned if is_turned else Reason(ReasonCode.HELD_OFF_GPS, {"off_m": off_m}))
-        self._row = [each for each in self._row if _could_follow(each, fix)]
-        if all(fix.seen.is_of_other_places(each.seen) for each in self._row):  # neighbours share places
-            self._row.append(fix)
-        if len(self._row) == _IN_A_ROW:
-            return self._believe(fix, GateResult(is_against=True, is_lost=True))
+        self._flyable = [held for held in self._flyable if _is_flyable(held, fix)]
+        if all(fix.seen.is_of_other_places(held.seen) for held in self._flyable):  # neighbours share places
+            self._flyable.append(fix)
+        if len(self._flyable) == _FIXES_TO_OVERRULE_TRACK:
+            return self._accept(fix, GateResult(is_against=True, is_lost=True))
         if is_turned:
             return GateResult(turned)
-        drift_m_s = _FOLLOWED_DRIFT_M_S if is_followed else _DRIFT_M_S
-        if self._agreeing and _differ(self._agreeing[0], fix, drift_m_s) <= _AGREES:
+        drift_m_s = _TRACKED_DRIFT_M_S if is_tracked else _DRIFT_M_S
+        if self._agreeing and _compute_distance(self._agreeing[0], fix, drift_m_s) <= _MAX_DISAGREEMENT_SIGMA:
             self._agreeing.append(fix)
-            is_enough = not is_followed or len(self._agreeing) >= _IN_A_ROW
+            is_enough = not is_tracked or len(self._agreeing) >= _FIXES_TO_OVERRULE_TRACK
             if is_enough and _is_independent(self._agreeing[0], fix, drift_m_s):
-                return self._believe(fix, GateResult(is_against=True))
+                return self._accept(fix, GateResult(is_against=True))
         else:
             self._agreeing = [fix]
-        return GateResult(Reason(ReasonCode.HELD_OFF_PATH, {"off_m": off_m, "accuracy_m": good_to_m}))
+        return GateResult(Reason(ReasonCode.HELD_OFF_PATH, {"off_m": off_m, "accuracy_m": predicted_sd_m}))
 
-    def _believe(self, fix: ComparedFix, verdict: GateResult) -> GateResult:
-        self._agreeing, self._row = [], []
+    def _accept(self, fix: PredictedFix, verdict: GateResult) -> GateResult:
+        self._agreeing, self._flyable = [], []
         if fix.seen.turn_deg is not None:
             self._turn_deg = fix.seen.turn_deg
         return verdict
 
 
-def _differ(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> float:
-    """Return by how many standard deviations two fixes differ, each as seen from where it was expected; infinity if
-    they are 30 s apart."""
-    if abs(other.seen.t_s - one.seen.t_s) > _GOOD_FOR_S:
+def _compute_distance(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> float:
+    """Return by how many standard deviations the innovations of two fixes differ; infinity if they are 30 s apart."""
+    if abs(other.seen.t_s - one.seen.t_s) > _HELD_FIX_TIMEOUT_S:
         return math.inf
-    return mahalanobis(other.beside_m - one.beside_m, _sum_covariances(one, other, drift_m_s))
+    return mahalanobis(other.innovation_m - one.innovation_m, _sum_covariances(one, other, drift_m_s))
 
 
-def _could_follow(one: ComparedFix, other: ComparedFix) -> bool:
-    """Tell whether an aircraft can have flown from one fix to another one within some seconds."""
+def _is_flyable(one: PredictedFix, other: PredictedFix) -> bool:
+    """Return True if an aircraft can have flown from one fix to the other within ten seconds."""
     apart_s = other.seen.t_s - one.seen.t_s
-    if not 0 < apart_s <= _ROW_WITHIN_S or not other.seen.is_turned_like(one.seen.turn_deg):
+    if not 0 < apart_s <= _MAX_ROW_INTERVAL_S or not other.seen.is_turned_like(one.seen.turn_deg):
         return False
     flown_m = float(np.hypot(*(other.path_m + other.off_m - one.path_m - one.off_m)))
-    return flown_m <= _FASTEST_M_S * apart_s
+    return flown_m <= _MAX_SPEED_M_S * apart_s
 
 
-def _is_independent(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> bool:
-    """Tell whether two fixes are of different places, or so far apart that one wrong position would not agree."""
+def _is_independent(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> bool:
+    """Return True if two fixes are of different places, or so far apart that one wrong position would not agree."""
     if other.seen.is_of_other_places(one.seen):
         return True
     flown_m = other.path_m + other.expected_m - one.path_m - one.expected_m
-    return mahalanobis(flown_m, _sum_covariances(one, other, drift_m_s)) > _CONTRADICTS
+    return mahalanobis(flown_m, _sum_covariances(one, other, drift_m_s)) > _MAX_INNOVATION_SIGMA
 
 
-def _sum_covariances(one: ComparedFix, other: ComparedFix, drift_m_s: float) -> Doubles:
+def _sum_covariances(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> Doubles:
     drift_m = drift_m_s * abs(other.seen.t_s - one.seen.t_s)
     both: Doubles = one.seen.scatter_m2 + other.seen.scatter_m2 + drift_m**2 * np.eye(2)
     return both

@@ -11,26 +11,34 @@ from edgevpr.runtime.recognise.locate import mahalanobis
 GRAVITY_M_S2 = 9.80665
 # So long an error of the attitude of an autopilot that reckons lasts. Nothing but pictures shows it, and not all do: if
 # it wandered without end, every fix would be taken for a proof of it.
-_ATTITUDE_LASTS_S = 20.0
+_ATTITUDE_ERROR_TIME_S = 20.0
 # The error of the attitude wanders up to nine times as fast as that of good gyros, as in PX4's simulator: by 0.1 in
 # eight seconds after GPS was lost. Of the last twenty pictures: the mean square of the leans that they show, over their
 # variances, is 0.2 in flights of ArduPilot's simulator and 1.3 in those of PX4's.
-_ROUGHEST = 8.0
-_SHOWN_GAIN = 0.05
-_CALM, _ROUGH = 0.3, 0.8
+_MAX_NOISE_FACTOR = 8.0
+_ATTITUDE_ERROR_GAIN = 0.05
+_CALM_ERROR = 0.3
+_ROUGH_ERROR = 0.8
 # An autopilot that begins to reckon takes a new wind for a turn: the error of its attitude wanders so many times
 # faster, for about so long. In simulation, that of an ArduPilot plane was 4.5 degrees wrong after ten seconds.
-_UPSET, _UPSET_S = 6.0, 10.0
-_CONTRADICTS = 4.0  # standard deviations: a stride that differs by more is not believed
-_STRIDE_SD, _STRIDE_NOISE = 0.05, 0.003  # error of scale and direction of all strides, and its change in one second
+_GPS_LOSS_NOISE_FACTOR = 6.0
+_GPS_LOSS_TIME_S = 10.0
+_MAX_INNOVATION_SIGMA = 4.0  # standard deviations: a stride that differs by more is not believed
+_ODOMETRY_SD = 0.05  # error of scale and direction of all odometry steps
+_ODOMETRY_NOISE = 0.003  # its change in one second
 # Its heading goes wrong then too, and so the direction of strides changes so many times faster: that of an ArduPilot
 # plane by 6 degrees in 3 s. The turn of a match shows it (radians: standard deviation, and the most that counts).
-_TURNED, _TURN_SD, _MOST_TURN = 10.0, 0.035, 0.3
+_GPS_LOSS_TURN_FACTOR = 10.0
+_TURN_SD = 0.035
+_MAX_TURN = 0.3
 
 _C, _S, _B, _M, _F, _K = (slice(first, first + 2) for first in range(0, 12, 2))
-_SIZE, _EYE, _TURN = 12, np.eye(2), 11
-_OF_FRAME, _FIX = np.zeros((2, _SIZE)), np.zeros((2, _SIZE))  # what `f` is, and what the fix of a frame is
-_OF_FRAME[:, _F] = _FIX[:, _F] = _FIX[:, _M] = _EYE
+_SIZE = 12
+_EYE = np.eye(2)
+_TURN = 11
+_FRAME = np.zeros((2, _SIZE))  # measurement matrix of `f`
+_FIX = np.zeros((2, _SIZE))  # that of the fix of a frame
+_FRAME[:, _F] = _FIX[:, _F] = _FIX[:, _M] = _EYE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +60,7 @@ class Drift:
 
 # Dead reckoning by an autopilot: nearly all of the error is wind that it does not know. In simulation, an ArduPilot
 # plane in a wind of 6 m/s was 5 m/s wrong 10 s after the loss of GPS, and up to 7.5 m/s later.
-RECKONED = Drift(
+DEAD_RECKONING = Drift(
     velocity_sd=4.0, acceleration_sd=0.1, position_noise=0.3, velocity_noise=0.5, acceleration_noise=0.03,
     is_of_attitude=False,
 )  # fmt: skip
@@ -93,16 +101,16 @@ class DriftFilter:
         self._drift, self._map_sd_m = drift, map_sd_m
         self._x, self._p = np.zeros(_SIZE), np.zeros((_SIZE, _SIZE))
         self._frame = np.zeros((2, _SIZE)), 0.0  # its measurement matrix, and the variance of each axis
-        self._upset = 0.0  # 1 when GPS is lost, then less and less
+        self._gps_loss = 0.0  # 1 when GPS is lost, then less and less
         # Mean square of the leans of the last pictures, over their variances.
-        self._shown = _ROUGH if drift.attitude_follows_positions else 0.0
+        self._attitude_error = _ROUGH_ERROR if drift.attitude_follows_positions else 0.0
 
     def start(self, sd_m: float, velocity_sd_m_s: float) -> None:
         """Begin with the aircraft on the path. `sd_m` and `velocity_sd_m_s` are the standard deviations, of one axis,
         of its offset and of the error of velocity."""
         self._x = np.zeros(_SIZE)
-        of_parts = sd_m, velocity_sd_m_s, self._drift.acceleration_sd, self._map_sd_m, 0.0, _STRIDE_SD
-        self._p = np.diag(np.repeat(np.square(of_parts), 2))
+        sds = sd_m, velocity_sd_m_s, self._drift.acceleration_sd, self._map_sd_m, 0.0, _ODOMETRY_SD
+        self._p = np.diag(np.repeat(np.square(sds), 2))
 
     def predict(self, step_s: float) -> None:
         """Predict the state `step_s` seconds later."""
@@ -112,29 +120,29 @@ class DriftFilter:
             move[_C, _B] = step_s**2 / 2 * _EYE
             move[_S, _B] = step_s * _EYE
         else:
-            move[_B, _B] = math.exp(-step_s / _ATTITUDE_LASTS_S) * _EYE
+            move[_B, _B] = math.exp(-step_s / _ATTITUDE_ERROR_TIME_S) * _EYE
         drift = self._drift
-        rough = 1.0 + _ROUGHEST * self._roughness  # gyros that tilt wrongly turn wrongly too
-        wander = drift.acceleration_noise * (rough + _UPSET * self._upset)
-        noise = np.repeat((drift.position_noise, drift.velocity_noise, wander, 0.0, 0.0, _STRIDE_NOISE * rough), 2)
-        noise[_TURN] += _STRIDE_NOISE * _TURNED * self._upset
+        rough = 1.0 + _MAX_NOISE_FACTOR * self._roughness  # gyros that tilt wrongly turn wrongly too
+        wander = drift.acceleration_noise * (rough + _GPS_LOSS_NOISE_FACTOR * self._gps_loss)
+        noise = np.repeat((drift.position_noise, drift.velocity_noise, wander, 0.0, 0.0, _ODOMETRY_NOISE * rough), 2)
+        noise[_TURN] += _ODOMETRY_NOISE * _GPS_LOSS_TURN_FACTOR * self._gps_loss
         self._x = move @ self._x
         self._p = move @ self._p @ move.T + step_s * np.diag(np.square(noise))
-        self._upset *= math.exp(-step_s / _UPSET_S)
+        self._gps_loss *= math.exp(-step_s / _GPS_LOSS_TIME_S)
 
     @property
     def _roughness(self) -> float:
         """Poorness of the gyros, 0 to 1, by the leans that pictures have shown."""
-        share = (self._shown - _CALM) / (_ROUGH - _CALM)
+        share = (self._attitude_error - _CALM_ERROR) / (_ROUGH_ERROR - _CALM_ERROR)
         return min(1.0, max(0.0, share)) if self._drift.is_of_attitude else 0.0
 
     def lose_gps(self) -> None:
         """Note that GPS is lost: the error of velocity becomes more uncertain, since nothing corrects it any more, and
         so does that of the attitude of an autopilot that reckons."""
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
-        self._upset = 0.0 if self._drift.is_of_attitude else 1.0
+        self._gps_loss = 0.0 if self._drift.is_of_attitude else 1.0
         if self._drift.attitude_follows_positions:
-            self._shown = max(self._shown, _ROUGH)
+            self._attitude_error = max(self._attitude_error, _ROUGH_ERROR)
 
     def correct_by_gps(
         self, off_m: Doubles, sd_m: float, off_m_s: Doubles | None, velocity_sd_m_s: float, age_s: float = 0.0
@@ -142,39 +150,39 @@ class DriftFilter:
         """Correct the state by GPS, whose position is `off_m` (2,) metres beside the path and whose velocity exceeds
         that of the path by `off_m_s` (2,; None: unknown), as it was `age_s` seconds ago. The standard deviations are
         those of one axis."""
-        look = self._seen_motion(age_s)
+        matrix = self._measure_motion(age_s)
         off = off_m if off_m_s is None else np.concatenate([off_m, off_m_s])
         variances = [sd_m**2] * 2 + [velocity_sd_m_s**2] * 2
-        self._correct(look[: off.size], off, np.diag(variances[: off.size]))
+        self._correct(matrix[: off.size], off, np.diag(variances[: off.size]))
 
     def add_frame(self, age_s: float, lean_s2: float, sd_m: float, stride: OdometryMeasurement | None = None) -> bool:
         """Note a frame taken `age_s` ago. `sd_m` is the standard deviation, of each axis, by which its picture puts the
         aircraft wrongly, beside what `lean_s2` does. Correct the state by the `stride` from the frame before (None: it
         is unknown). Returns False if that contradicts the state, and is not used."""
-        self._frame = seen, variance_m2 = self._seen(age_s, lean_s2), sd_m**2
+        self._frame = seen, variance_m2 = self._measure_position(age_s, lean_s2), sd_m**2
         if stride is None:
             self._begin_frame()
             return True
-        (east_m, north_m), look, go_on = stride.moved_m, seen - _OF_FRAME, np.eye(_SIZE)
+        (east_m, north_m), matrix, go_on = stride.moved_m, seen - _FRAME, np.eye(_SIZE)
         go_on[_F, _K] = [[east_m, north_m], [north_m, -east_m]]
         x, p = go_on @ self._x, go_on @ self._p @ go_on.T
         x[_F] += stride.off_m
         p[_F, _F] += stride.sd_m**2 * _EYE
-        if mahalanobis(look @ x, look @ p @ look.T + variance_m2 * _EYE) > _CONTRADICTS:
+        if mahalanobis(matrix @ x, matrix @ p @ matrix.T + variance_m2 * _EYE) > _MAX_INNOVATION_SIGMA:
             self._begin_frame()
             return False
         self._x, self._p = x, p
-        self._correct(look, np.zeros(2), variance_m2 * _EYE)
+        self._correct(matrix, np.zeros(2), variance_m2 * _EYE)
         return True
 
     def correct_by_turn(self, turn: float) -> None:
         """Correct the direction of strides by a match, whose picture is turned by `turn` (radians, clockwise) against
         the compass. One that is turned by far does not count: then strides contradict the path, and are not used. Nor
         does one beside a path of accelerations, which the same compass has turned."""
-        if abs(turn) <= _MOST_TURN and not self._drift.is_of_attitude:
-            look = np.zeros((1, _SIZE))
-            look[0, _TURN] = 1.0
-            self._correct(look, np.array([turn]), np.array([[_TURN_SD**2]]))
+        if abs(turn) <= _MAX_TURN and not self._drift.is_of_attitude:
+            matrix = np.zeros((1, _SIZE))
+            matrix[0, _TURN] = 1.0
+            self._correct(matrix, np.array([turn]), np.array([[_TURN_SD**2]]))
 
     def correct_by_fix(self, off_m: Doubles, covariance_m2: Doubles) -> None:
         """Correct the state by the fix of the last frame, of covariance (2, 2), `off_m` (2,) metres from the path."""
@@ -184,10 +192,10 @@ class DriftFilter:
         """Correct the state by the error of the attitude that a picture shows (see `recognise.perspective`). Where
         pictures show more than they may be wrong by, the gyros are poor and the error wanders faster."""
         shown = float(np.mean(np.square(over_height))) / sd**2
-        self._shown += _SHOWN_GAIN * (shown - self._shown)
-        look = np.zeros((2, _SIZE))
-        look[:, _B] = _EYE / GRAVITY_M_S2
-        self._correct(look, over_height, sd**2 * _EYE)
+        self._attitude_error += _ATTITUDE_ERROR_GAIN * (shown - self._attitude_error)
+        matrix = np.zeros((2, _SIZE))
+        matrix[:, _B] = _EYE / GRAVITY_M_S2
+        self._correct(matrix, over_height, sd**2 * _EYE)
 
     def reset_to_fix(self, off_m: Doubles, covariance_m2: Doubles) -> None:
         """Correct the state by a fix that contradicts it: what was known of the position is forgotten."""
@@ -208,16 +216,16 @@ class DriftFilter:
         - error of velocity (2,), m/s
         - covariance (4, 4) of both.
         """
-        look = self._seen_motion(age_s)
-        off = look @ self._x
-        return off[:2], off[2:], look @ self._p @ look.T
+        matrix = self._measure_motion(age_s)
+        off = matrix @ self._x
+        return off[:2], off[2:], matrix @ self._p @ matrix.T
 
-    def _seen_motion(self, age_s: float) -> Doubles:
+    def _measure_motion(self, age_s: float) -> Doubles:
         """Return the matrix (4, 12) that gives offset and error of velocity of the path `age_s` seconds ago."""
-        look = np.zeros((4, _SIZE))
-        look[:2] = self._seen(age_s, 0.0)
-        look[2:, _S], look[2:, _B] = _EYE, -age_s * self._drift.is_of_attitude * _EYE
-        return look
+        matrix = np.zeros((4, _SIZE))
+        matrix[:2] = self._measure_position(age_s, 0.0)
+        matrix[2:, _S], matrix[2:, _B] = _EYE, -age_s * self._drift.is_of_attitude * _EYE
+        return matrix
 
     def _begin_frame(self) -> None:
         """Set `f` to where the aircraft was when the last frame was taken."""
@@ -227,17 +235,17 @@ class DriftFilter:
         self._x, self._p = begin @ self._x, begin @ self._p @ begin.T
         self._p[_F, _F] += variance_m2 * _EYE
 
-    def _correct(self, look: Doubles, seen: Doubles, covariance: Doubles) -> None:
-        """Do a Kalman update with the measurement matrix `look` (n, 12) and what was `seen` (n,)."""
-        gain = np.linalg.solve(look @ self._p @ look.T + covariance, look @ self._p).T
-        self._x = self._x + gain @ (seen - look @ self._x)
-        kept = np.eye(_SIZE) - gain @ look
+    def _correct(self, matrix: Doubles, seen: Doubles, covariance: Doubles) -> None:
+        """Do a Kalman update with the measurement matrix `matrix` (n, 12) and what was `seen` (n,)."""
+        gain = np.linalg.solve(matrix @ self._p @ matrix.T + covariance, matrix @ self._p).T
+        self._x = self._x + gain @ (seen - matrix @ self._x)
+        kept = np.eye(_SIZE) - gain @ matrix
         self._p = kept @ self._p @ kept.T + gain @ covariance @ gain.T  # Joseph form: keeps it positive semidefinite
 
-    def _seen(self, age_s: float, lean_s2: float) -> Doubles:
+    def _measure_position(self, age_s: float, lean_s2: float) -> Doubles:
         """Return the matrix (2, 12) that gives the offset from the path to the aircraft `age_s` seconds ago, where a
         picture puts it with an error of the attitude that counts by `lean_s2`."""
-        look = np.zeros((2, _SIZE))
-        look[:, _C], look[:, _S] = _EYE, -age_s * _EYE
-        look[:, _B] = (age_s**2 / 2 * self._drift.is_of_attitude - lean_s2) * _EYE
-        return look
+        matrix = np.zeros((2, _SIZE))
+        matrix[:, _C], matrix[:, _S] = _EYE, -age_s * _EYE
+        matrix[:, _B] = (age_s**2 / 2 * self._drift.is_of_attitude - lean_s2) * _EYE
+        return matrix

@@ -19,7 +19,7 @@ from edgevpr.mavlink.conversation import LinkSettings
 from edgevpr.mavlink.link import Link
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight import systemd
-from edgevpr.runtime.flight.autopilot import DRY_RUN, ToAutopilot, report_unsent
+from edgevpr.runtime.flight.autopilot import DRY_RUN, AutopilotOutput, report_unsent
 from edgevpr.runtime.flight.camerawatch import MirrorWatch, TurnWatch
 from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.flightio import FlightIO, FlightParts, open_real_io
@@ -31,12 +31,7 @@ from edgevpr.runtime.flight.heightwatch import HeightWatch
 from edgevpr.runtime.flight.metering import FlightMeter
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.notifier import Commands, Notifier
-from edgevpr.runtime.flight.startup import (
-    apply_recorded_rate,
-    find_origin,
-    log_start,
-    open_map,
-)
+from edgevpr.runtime.flight.startup import apply_recorded_rate, find_origin, log_start, open_map
 from edgevpr.runtime.flight.stop import StopNow
 from edgevpr.runtime.flight.vitals import Vitals
 from edgevpr.runtime.flight.watching import MapCoverageWatch, MapWatch, SurveyReporter, Tally
@@ -121,7 +116,7 @@ class Flight:
             autopilot = None
             if link:
                 cores = io.board.cores
-                autopilot = ToAutopilot(link, navigator, notifier, settings=settings, cores=cores, clock=io.clock)
+                autopilot = AutopilotOutput(link, navigator, notifier, settings=settings, cores=cores, clock=io.clock)
             if not settings.send_fixes:
                 notifier.announce(Severity.WARNING, str(DRY_RUN))
             notifier.announce(Severity.INFO, f"started, {len(recogniser.place_map)} places", topic="start")
@@ -178,7 +173,7 @@ class Flight:
         self._vitals.beat()
         self._commands.obey()
         is_paused, is_query = self._commands.is_paused, (wait_s := pace.wait_s()) <= 0
-        if (not is_query and not self._is_time_for_stride()) or (is_paused and not source.is_live):  # a recording waits
+        if (not is_query and not self._is_odometry_due()) or (is_paused and not source.is_live):  # a recording waits
             clock.sleep(_MAX_WAIT_S if is_query else min(wait_s, _MAX_WAIT_S))
             return
         with meter.measure_cost() as reading:
@@ -219,15 +214,13 @@ class Flight:
         event = (parts.recogniser.step if is_query else parts.recogniser.measure_motion)(frame, vehicle)
         return parts.autopilot.check_age(event) if is_live and parts.autopilot and event.accepted else event
 
-    def _is_time_for_stride(self) -> bool:
-        """Tell whether to take a picture that is no query, for its motion: between rare queries, without GPS. The
-        pictures of a recording are all queries."""
+    def _is_odometry_due(self) -> bool:
+        """Return True if a frame for visual odometry is due: between rare queries, without GPS. The pictures of a
+        recording are all queries."""
         parts = self._parts
         if parts.autopilot is None or not parts.source.is_live or not parts.recogniser.measures_strides:
             return False
-        return (
-            not self._commands.is_paused and self._pace.is_time_for_stride() and parts.autopilot.needs_motion_frames()
-        )
+        return not self._commands.is_paused and self._pace.is_odometry_due() and parts.autopilot.needs_motion_frames()
 
     def _publish(self, event: Recognition) -> None:
         """Report an event to the autopilot, then to all observers, with the report of its fix. An exception is logged:

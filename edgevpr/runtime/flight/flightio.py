@@ -24,7 +24,7 @@ from edgevpr.mavlink.signing import Signing, open_signing
 from edgevpr.mavlink.turns import Turns
 from edgevpr.power.boards import Board, load_board, resolve_board
 from edgevpr.runtime.flight import systemd
-from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.autopilot import AutopilotOutput
 from edgevpr.runtime.flight.boundary import (
     RecordedDriver,
     RecordedSource,
@@ -49,9 +49,9 @@ _log = logging.getLogger(__name__)
 
 # Parameters of `mallopt` (glibc's malloc.h), bytes: how much freed memory is kept, and from which size on it is given
 # back at once. Left alone, glibc raises both, and a flight over many places holds more than it uses. Half is slower.
-_MALLOC = {-1: 8_000_000, -3: 4_000_000}
-_WARN_S = 0.3
-_END_S = 4.0  # from a signal to the end of the process, if it does not end by itself: systemd waits five seconds
+_MALLOC_OPTIONS = {-1: 8_000_000, -3: 4_000_000}
+_MAX_WARNING_S = 0.3
+_MAX_END_S = 4.0  # from a signal to the end of the process, if it does not end by itself: systemd waits five seconds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +82,7 @@ class FlightParts:
     recogniser: Recogniser
     source: Source
     link: Link | None = None
-    autopilot: ToAutopilot | None = None
+    autopilot: AutopilotOutput | None = None
     flight_log: FlightLog
     notifier: Notifier
     meter: FlightMeter
@@ -101,7 +101,7 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
         parse_link(config.mavlink.link)
     board = resolve_board(load_board(config.board), source, config.memory)
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # musl has none
-        for parameter, value in _MALLOC.items():
+        for parameter, value in _MALLOC_OPTIONS.items():
             mallopt(parameter, value)
     with ExitStack() as stack:
         log, record = config.log, config.log.record
@@ -136,7 +136,7 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
             header = {"version": __version__, "config": asdict(config), "board": asdict(board), "recording": folder}
             recording.note("flight", header)
             io = record_io(io, recording)
-        with _signals(io.stop):
+        with _handle_signals(io.stop):
             yield io
 
 
@@ -166,7 +166,7 @@ def _open_optional(opened: Callable[[], T]) -> T | None:
 
 
 @contextmanager
-def _signals(stop: Stop) -> Iterator[None]:
+def _handle_signals(stop: Stop) -> Iterator[None]:
     """Context manager: SIGTERM and SIGINT call `stop`, and end the process after four seconds. SIGHUP is ignored: a
     closed terminal ends no flight."""
     handlers: dict[signal.Signals, Stop | signal.Handlers] = {signal.SIGTERM: stop, signal.SIGINT: stop}
@@ -195,10 +195,10 @@ def _end_in_time(reader: int, has_ended: threading.Event) -> None:
     """End the process if a signal comes from the pipe `reader`, and `has_ended` not soon after. The lines of the flight
     log are in its file by then."""
     while number := os.read(reader, 1):
-        if number[0] in (signal.SIGTERM, signal.SIGINT) and not has_ended.wait(_END_S):
-            text = "the flight does not end by itself: its process is ended"
+        if number[0] in (signal.SIGTERM, signal.SIGINT) and not has_ended.wait(_MAX_END_S):
+            text = "the flight does not end by itself: ending its process"
             # In a thread, as the one that hangs may be within a message.
             warning = threading.Thread(target=_log.warning, args=(text,), daemon=True)
             warning.start()
-            warning.join(_WARN_S)
+            warning.join(_MAX_WARNING_S)
             os._exit(1)

@@ -33,8 +33,8 @@ from edgevpr.core.text import format_json_line
 Line = dict[str, Any]
 
 _log = logging.getLogger(__name__)
-_PARTS = 4  # of `max_mb`: one for the file that is written, three for the numbered files
-_SYNC_EVERY_S = 1.0
+_MAX_FILES = 4  # of `max_mb`: one for the file that is written, three for the numbered files
+_SYNC_INTERVAL_S = 1.0
 
 
 class FlightLog:
@@ -68,10 +68,10 @@ class FlightLog:
         self.state: str | None = None
         self.lost_lines = 0
         self._clock, self._utc_s = clock, utc_s
-        self._at = Path(path or "")
-        self._part_bytes = math.inf if max_mb is None else 1e6 * max_mb / _PARTS
+        self._path = Path(path or "")
+        self._part_bytes = math.inf if max_mb is None else 1e6 * max_mb / _MAX_FILES
         self._file: FileIO | None = None
-        self._ours: tuple[int, int] | None = None  # device and inode of the file that has lines of this flight
+        self._own_identity: tuple[int, int] | None = None  # device and inode of the file that has lines of this flight
         self._synced_s, self._is_synced = -math.inf, True
         self._start: dict[str, Any] = {}  # the start line, for the copies in later files
         self._part = 0  # start lines written so far
@@ -98,25 +98,25 @@ class FlightLog:
         Never raises OSError."""
         if self.path is None:
             return
-        if self._file is not None and not is_same_file(self._file, self._at):
-            self._warn(f"The flight log {self._at} was deleted or moved in flight: it goes on in a new file.")
-            self._let_go()
+        if self._file is not None and not is_same_file(self._file, self._path):
+            self._warn(f"The flight log {self._path} was deleted or moved in flight: it goes on in a new file.")
+            self._close_file()
         now_s, utc_s = self._clock(), self._utc_s()
-        lines, is_start = _line(kind, utc_s, {"t_mono_s": now_s, **fields}), kind == "start"
+        lines, is_start = _make_line(kind, utc_s, {"t_mono_s": now_s, **fields}), kind == "start"
         if is_start:
             self._start, self._part = json.loads(lines), 0
         if self.state is not None:
-            gap = _line("gap", utc_s, {"t_mono_s": now_s, "lost_lines": self.lost_lines})
+            gap = _make_line("gap", utc_s, {"t_mono_s": now_s, "lost_lines": self.lost_lines})
             lines = lines + gap if is_start else gap + lines
         try:
-            file = self._writable(len(lines))
-            if self._start and not is_start and _identity(file) != self._ours:
+            file = self._prepare_file(len(lines))
+            if self._start and not is_start and _read_identity(file) != self._own_identity:
                 is_start = True
                 lines = format_json_line({**self._start, "repeated": True, "part": self._part + 1}) + lines
             _append(file, lines)
-            self._ours, self._is_synced = _identity(file), False
+            self._own_identity, self._is_synced = _read_identity(file), False
             self._part += is_start
-            if now_s - self._synced_s >= _SYNC_EVERY_S:
+            if now_s - self._synced_s >= _SYNC_INTERVAL_S:
                 self._sync(file, now_s)
         except OSError as error:
             self.lost_lines += 1
@@ -128,7 +128,7 @@ class FlightLog:
 
     def sync_due(self, now_s: float) -> None:
         """Sync lines to the disk if a second has passed since the last sync; `now_s` is the time. Never raises."""
-        if self._file is None or self._is_synced or now_s - self._synced_s < _SYNC_EVERY_S:
+        if self._file is None or self._is_synced or now_s - self._synced_s < _SYNC_INTERVAL_S:
             return
         try:
             self._sync(self._file, now_s)
@@ -146,15 +146,15 @@ class FlightLog:
             _log.warning("The end of the flight log %s may be missing (%s).", self.path, error.strerror)
         self._file = None
 
-    def _writable(self, more_bytes: int) -> FileIO:
+    def _prepare_file(self, more_bytes: int) -> FileIO:
         """Return the open file; one without room for `more_bytes`, or of an earlier flight, is set aside first. If that
         fails, it is written further: lines matter more than the limit. Raises OSError."""
         file = self._file or self._open()
-        size, is_ours = _size_of(file), _identity(file) == self._ours
+        size, is_ours = _size_of(file), _read_identity(file) == self._own_identity
         if not size or (is_ours and size + more_bytes <= self._part_bytes):
             return file
         try:
-            rotate_file(self._at)
+            rotate_file(self._path)
         except OSError as error:
             self._warn(
                 f"The flight log {self.path} cannot be set aside ({error.strerror}), so it is written on, and may "
@@ -162,22 +162,22 @@ class FlightLog:
             )
             return file
         sync_file(file)
-        self._let_go()
+        self._close_file()
         if not math.isinf(self._part_bytes):
             with suppress(OSError):
-                delete_oldest(self._at, self._part_bytes * (_PARTS - 1))
+                delete_oldest(self._path, self._part_bytes * (_MAX_FILES - 1))
         return self._open()
 
     def _open(self) -> FileIO:
         """Open and lock the file. Raises OSError, also if another process has locked it."""
-        file = open_appending(self._at)
+        file = open_appending(self._path)
         if not try_lock(file):
             file.close()
-            raise OSError(errno.EBUSY, "another edgevpr writes it", str(self._at))
+            raise OSError(errno.EBUSY, "another edgevpr writes it", str(self._path))
         self._file = file
         if not _size_of(file):  # on another medium it may have the numbers of a file before it
-            self._ours = None
-            sync_folder(self._at)
+            self._own_identity = None
+            sync_folder(self._path)
         return file
 
     def _sync(self, file: FileIO, now_s: float) -> None:
@@ -192,9 +192,9 @@ class FlightLog:
                 "the flight goes on without it."
             )
             _log.warning("%s", self.state)
-        self._let_go()
+        self._close_file()
 
-    def _let_go(self) -> None:
+    def _close_file(self) -> None:
         if self._file is not None:
             with suppress(OSError):
                 self._file.close()
@@ -216,12 +216,12 @@ def _append(file: FileIO, lines: bytes) -> None:
     append_bytes(file, lines)
 
 
-def _line(kind: str, utc_s: float, fields: dict[str, Any]) -> bytes:
+def _make_line(kind: str, utc_s: float, fields: dict[str, Any]) -> bytes:
     now = datetime.fromtimestamp(utc_s, timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     return format_json_line({"kind": kind, "time": now, **fields})
 
 
-def _identity(file: FileIO) -> tuple[int, int]:
+def _read_identity(file: FileIO) -> tuple[int, int]:
     """Return the device and inode numbers of an open file, which no other existing file has."""
     found = os.fstat(file.fileno())
     return found.st_dev, found.st_ino
@@ -268,7 +268,7 @@ class FlightLines:
             is_ours = self.flight is None
             for line in read_log(file):
                 if line.get("kind") == "start":
-                    is_ours = _flight_id(line) == self.flight
+                    is_ours = _read_flight_id(line) == self.flight
                     if is_ours and has_start:
                         continue
                     has_start |= is_ours
@@ -284,16 +284,16 @@ def select_last_flight(path: str | Path) -> FlightLines:
         raise UsageError(f"{path}: there is no such flight log: give the file that `log.path` names.")
     if not any(isinstance(line.get("kind"), str) for line in read_log(path)):
         raise EdgevprError(f"{path} holds no line of a flight log: give one that a flight has written.")
-    starts = _starts(path)
+    starts = _read_starts(path)
     if not starts:
         return FlightLines(files=(path,), flight=None, missing=None)
-    flight = _flight_id(starts[-1])
-    parts = {path: _parts(starts, flight)}
+    flight = _read_flight_id(starts[-1])
+    parts = {path: _find_parts(starts, flight)}
     if min(parts[path]) > 1:
         with suppress(OSError):
             for other in list_related(path):
                 with suppress(OSError):  # a file that may not be read counts as missing
-                    found = _parts(_starts(other), flight)
+                    found = _find_parts(_read_starts(other), flight)
                     if found and min(found) < min(parts[path]):
                         parts[other] = found
     lacking = max(parts[path]) - sum(map(len, parts.values()))
@@ -302,19 +302,19 @@ def select_last_flight(path: str | Path) -> FlightLines:
     return FlightLines(files=files, flight=flight, missing=missing if lacking > 0 else None)
 
 
-def _starts(path: Path) -> list[Line]:
+def _read_starts(path: Path) -> list[Line]:
     """Return the start lines in a file, in order. Raises OSError."""
     with open(path, "rb") as handle:
         lines = [_record_of(line) or {} for line in handle if b'"start"' in line]
     return [line for line in lines if line.get("kind") == "start"]
 
 
-def _flight_id(start: Line) -> tuple[object, object]:
+def _read_flight_id(start: Line) -> tuple[object, object]:
     return start.get("time"), start.get("t_mono_s")
 
 
-def _parts(starts: list[Line], flight: tuple[object, object]) -> list[int]:
+def _find_parts(starts: list[Line], flight: tuple[object, object]) -> list[int]:
     """Return the numbers of the parts of a flight that begin with these start lines: 1 unless it is repeated."""
-    ours = [start for start in starts if _flight_id(start) == flight]
+    ours = [start for start in starts if _read_flight_id(start) == flight]
     numbers = [start.get("part") if start.get("repeated") else 1 for start in ours]
     return [number if isinstance(number, int) and number >= 1 else 1 for number in numbers]

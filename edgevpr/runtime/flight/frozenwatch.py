@@ -20,42 +20,44 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.sameness import BLOCK_COUNT, CoarsePicture, make_coarse
 from edgevpr.mavlink.messages import Severity
-from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.autopilot import AutopilotOutput
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.levelling import read_camera_lens
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
 # Motions are shares of the picture's longest side. A picture that has moved by 0.012 is not taken for unmoved.
-WITNESS_SHARE = 0.03  # least motion by the aircraft that contradicts an unmoved picture
-PROOF_SHARE = 0.09  # sum of such motions by which pictures are frozen: one reset of an autopilot's heading is no proof
-_MAX_OF_ONE = 0.04  # that one rotation, or one repeated picture, counts for
-_PROOF_WITHIN_S = 20.0
-_LEAST_S = 2.5  # that pictures stay the same, or that lie between a picture and its repetition
+MIN_MOTION_SHARE = 0.03  # least motion by the aircraft that contradicts an unmoved picture
+MIN_PROOF_SHARE = (
+    0.09  # sum of such motions by which pictures are frozen: one reset of an autopilot's heading is no proof
+)
+_MAX_SINGLE_SHARE = 0.04  # that one rotation, or one repeated picture, counts for
+_PROOF_WINDOW_S = 20.0
+_MIN_FROZEN_S = 2.5  # that pictures stay the same, or that lie between a picture and its repetition
 # Repeated pictures in a row, in flight, that are a proof by themselves: a route that is flown again, 500 m high with a
 # gimbal, shows one picture in five as before to within the resolution.
-_REPEATS_IN_A_ROW = 8
-_ROTATION_DOUBT_DEG = 2.0  # attitude, and time of the frame
-_SPEED_DOUBT_M_S = 2.0  # less counts as hovering
-_DRIFT_M_S = 6.0  # by which a way of a minute may be wrong, as the wind changes
-_FLIES_ON_M_S = 3.0
-_HEIGHT_DOUBT = 1.5  # the ground may be lower than the height says
-_FASTEST_M_S = 100.0  # a velocity that is reported beyond is wrong
-_HIGHEST_M = 10_000.0  # and so is a height
-_LOWEST_M = 5.0  # below, a height over ground is too uncertain as a measure
+_MIN_REPEATS = 8
+_ROTATION_ERROR_DEG = 2.0  # attitude, and time of the frame
+_SPEED_ERROR_M_S = 2.0  # less counts as hovering
+_PATH_DRIFT_M_S = 6.0  # by which a way of a minute may be wrong, as the wind changes
+_MIN_FLIGHT_SPEED_M_S = 3.0
+_MAX_HEIGHT_RATIO = 1.5  # the ground may be lower than the height says
+_MAX_SPEED_M_S = 100.0  # a velocity that is reported beyond is wrong
+_MAX_HEIGHT_M = 10_000.0  # and so is a height
+_MIN_HEIGHT_M = 5.0  # below, a height over ground is too uncertain as a measure
 _MAX_STEP_S = 5.0  # from picture to picture, for which a velocity is taken
 _HEADING_JUMP_DEG = 30.0  # an autopilot that has turned by more, and by more than the next a second,
 _HEADING_JUMP_DEG_S = 60.0  # has corrected its heading
-_AXIS_SHARE = 0.36  # root mean square distance of a picture's points from its middle
-_WIDEST_FOV_DEG = 120.0  # of a lens that is unknown
-_SAME_BLOCKS = 0.75  # share of the blocks that must be unmoved
+_RMS_RADIUS_SHARE = 0.36  # root mean square distance of a picture's points from its middle
+_MAX_FOV_DEG = 120.0  # of a lens that is unknown
+_MIN_SAME_SHARE = 0.75  # share of the blocks that must be unmoved
 _MIN_BLOCKS = BLOCK_COUNT // 3  # that can be judged
 _BLOCK_MEMORY = 8  # pictures: time constant of the share of pictures in which a block stays while most others move
-_MAX_STAY = 0.5  # of the blocks, in a picture that says which ones always stay
-_REMEMBERED = 300  # pictures; 4 MB
-_REMEMBER_EVERY_S = 0.5
-_THUMB_ALIKE = 0.97  # least correlation of the coarsest copies
-_CANDIDATES = 3  # earlier pictures that are compared block by block
-_NEW_IN_A_ROW = 3  # pictures after which the camera is taken as back
+_MAX_STAY_SHARE = 0.5  # of the blocks, in a picture that says which ones always stay
+_MAX_REMEMBERED = 300  # pictures; 4 MB
+_REMEMBER_INTERVAL_S = 0.5
+_MIN_THUMB_CORRELATION = 0.97  # least correlation of the coarsest copies
+_MAX_CANDIDATES = 3  # earlier pictures that are compared block by block
+_NEW_AFTER_STAY = 3  # pictures after which the camera is taken as back
 _NEW_AFTER_REPEATS = 10  # the same, after a clip
 
 
@@ -68,31 +70,31 @@ class Optics:
     looks_down: bool
     is_level: bool
 
-    def rotation_share(self, then: Vehicle | None, now: Vehicle | None) -> float:
+    def compute_rotation_share(self, then: Vehicle | None, now: Vehicle | None) -> float:
         """Return by how much a picture moves at least by the rotation of the aircraft between two reports; 0 where it
         is unknown."""
         if then is None or now is None:
             return 0.0
         names = "roll_deg", "pitch_deg", "heading_deg"
-        roll_deg, pitch_deg, yaw_deg = (_change_deg(then, now, name) for name in names)
+        roll_deg, pitch_deg, yaw_deg = (_compute_change_deg(then, now, name) for name in names)
         if self.is_level:
             roll_deg = pitch_deg = 0.0
         across_deg, about_deg = (roll_deg, yaw_deg) if self.looks_down else (yaw_deg, roll_deg)
-        shift = self.focal_share * _exceed_doubt(math.hypot(across_deg, pitch_deg))
-        return math.hypot(min(1.0, shift), _AXIS_SHARE * _exceed_doubt(about_deg))
+        shift = self.focal_share * _subtract_error(math.hypot(across_deg, pitch_deg))
+        return math.hypot(min(1.0, shift), _RMS_RADIUS_SHARE * _subtract_error(about_deg))
 
-    def travel_share(self, moved_m: float, height_m: float | None) -> float:
+    def compute_travel_share(self, moved_m: float, height_m: float | None) -> float:
         """Return by how much a picture moves at least if the aircraft has moved by `moved_m`; 0 if the camera does not
         look down, or the height is unknown."""
-        if not self.looks_down or height_m is None or not _LOWEST_M <= height_m <= _HIGHEST_M:
+        if not self.looks_down or height_m is None or not _MIN_HEIGHT_M <= height_m <= _MAX_HEIGHT_M:
             return 0.0
-        return max(0.0, moved_m) * self.focal_share / (_HEIGHT_DOUBT * height_m)
+        return max(0.0, moved_m) * self.focal_share / (_MAX_HEIGHT_RATIO * height_m)
 
 
 def read_optics(source: SourceConfig, recogniser: Recogniser) -> Optics:
     """Return the optics of a configured camera; a lens that is unknown is taken as the widest usual one."""
     lens = read_camera_lens(source)
-    focal_share = 0.5 / math.tan(math.radians(lens.fov_deg if lens else _WIDEST_FOV_DEG) / 2)
+    focal_share = 0.5 / math.tan(math.radians(lens.fov_deg if lens else _MAX_FOV_DEG) / 2)
     looks_down = recogniser.technique.spec.looks_down
     return Optics(focal_share=focal_share, looks_down=looks_down, is_level=source.gimbal)
 
@@ -113,7 +115,7 @@ class FrozenWatch:
     (`is_frozen`) and once when they move again. Some have been recognised by then: the `autopilot` (None: there is no
     link) navigates anew, so that nothing that is sent rests on them."""
 
-    def __init__(self, notifier: Notifier, optics: Optics, autopilot: ToAutopilot | None = None) -> None:
+    def __init__(self, notifier: Notifier, optics: Optics, autopilot: AutopilotOutput | None = None) -> None:
         self.is_frozen = False
         self._notifier, self._optics, self._autopilot = notifier, optics, autopilot
         self._first: TimedPicture | None = None  # of the pictures in a row that are the same
@@ -123,7 +125,7 @@ class FrozenWatch:
         self._rotations: deque[tuple[float, float]] = deque()  # of this row: time and share of each
         self._repeats: deque[tuple[float, float]] = deque()
         self._stays = np.zeros(BLOCK_COUNT)  # share of the latest pictures in which a block stayed while others moved
-        self._remembered: deque[TimedPicture] = deque(maxlen=_REMEMBERED)
+        self._remembered: deque[TimedPicture] = deque(maxlen=_MAX_REMEMBERED)
         self._repeats_in_a_row = self._new_in_a_row = self._new_needed = 0
 
     @property
@@ -141,9 +143,9 @@ class FrozenWatch:
         now = self._locate_picture(make_coarse(frame.image), frame.t_mono_s, vehicle)
         is_same = None if self._first is None else self._is_same(self._first.picture, now.picture, learns=True)
         if self._first and is_same:
-            self._stay(self._first, now)
+            self._handle_same(self._first, now)
         else:
-            is_repeat = self._look_back(now)
+            is_repeat = self._find_repeat(now)
             if is_same is False and not is_repeat:
                 self._new_in_a_row += 1
                 self._repeats_in_a_row = 0
@@ -156,7 +158,7 @@ class FrozenWatch:
         before, path_m = self._newest, np.zeros(2)
         if before:
             path_m = before.path_m
-            was_m_s, is_m_s = _velocity(before.vehicle), _velocity(vehicle)
+            was_m_s, is_m_s = _read_velocity(before.vehicle), _read_velocity(vehicle)
             if was_m_s and is_m_s and 0 < t_s - before.t_s <= _MAX_STEP_S:
                 path_m = path_m + (t_s - before.t_s) * np.mean([was_m_s, is_m_s], axis=0)
             if _has_jumped(before, vehicle, t_s):
@@ -167,68 +169,68 @@ class FrozenWatch:
         self._first, self._turned_from, self._flown_share = now, now.vehicle, 0.0
         self._rotations.clear()
         last = self._remembered[-1] if self._remembered else None
-        if last is None or now.t_s - last.t_s >= _REMEMBER_EVERY_S:
+        if last is None or now.t_s - last.t_s >= _REMEMBER_INTERVAL_S:
             self._remembered.append(replace(now, picture=CoarsePicture(now.picture.grey)))
 
-    def _stay(self, first: TimedPicture, now: TimedPicture) -> None:
+    def _handle_same(self, first: TimedPicture, now: TimedPicture) -> None:
         """Process a picture that equals the first one of its row."""
         self._new_in_a_row = 0
-        self._flown_share = max(self._flown_share, self._flown_by(first, now, _SPEED_DOUBT_M_S))
-        turned_share = self._optics.rotation_share(self._turned_from, now.vehicle)
-        if turned_share >= WITNESS_SHARE:
-            self._rotations.append((now.t_s, min(turned_share, _MAX_OF_ONE)))
-        if turned_share >= WITNESS_SHARE or self._turned_from is None:
+        self._flown_share = max(self._flown_share, self._compute_flown_share(first, now, _SPEED_ERROR_M_S))
+        turned_share = self._optics.compute_rotation_share(self._turned_from, now.vehicle)
+        if turned_share >= MIN_MOTION_SHARE:
+            self._rotations.append((now.t_s, min(turned_share, _MAX_SINGLE_SHARE)))
+        if turned_share >= MIN_MOTION_SHARE or self._turned_from is None:
             self._turned_from = now.vehicle
 
-    def _look_back(self, now: TimedPicture) -> bool:
+    def _find_repeat(self, now: TimedPicture) -> bool:
         """Return whether a picture equals an earlier one of the flight, and count what contradicts that."""
         if not self._remembered:
             return False
         alike = np.array([each.picture.thumb for each in self._remembered]) @ now.picture.thumb
-        for number in np.argsort(alike)[: -_CANDIDATES - 1 : -1].tolist():
+        for number in np.argsort(alike)[: -_MAX_CANDIDATES - 1 : -1].tolist():
             then = self._remembered[number]
             # A copy, here and where it is kept, since the blocks of all that is remembered would take 20 MB.
-            if alike[number] >= _THUMB_ALIKE and self._is_same(CoarsePicture(then.picture.grey), now.picture):
-                self._repeat(then, now)
+            if alike[number] >= _MIN_THUMB_CORRELATION and self._is_same(CoarsePicture(then.picture.grey), now.picture):
+                self._handle_repeat(then, now)
                 return True
         return False
 
-    def _repeat(self, then: TimedPicture, now: TimedPicture) -> None:
+    def _handle_repeat(self, then: TimedPicture, now: TimedPicture) -> None:
         self._new_in_a_row = 0
-        if now.t_s - then.t_s < _LEAST_S:
+        if now.t_s - then.t_s < _MIN_FROZEN_S:
             return
-        velocity_m_s = _velocity(now.vehicle)
-        flies_on = velocity_m_s is not None and math.hypot(*velocity_m_s) >= _FLIES_ON_M_S
+        velocity_m_s = _read_velocity(now.vehicle)
+        flies_on = velocity_m_s is not None and math.hypot(*velocity_m_s) >= _MIN_FLIGHT_SPEED_M_S
         if flies_on and self._optics.looks_down:  # the horizon ahead stays for long
             self._repeats_in_a_row += 1
-        turned_share = self._optics.rotation_share(then.vehicle, now.vehicle)
-        share = max(turned_share, self._flown_by(then, now, _DRIFT_M_S))
-        if share >= WITNESS_SHARE:
-            self._repeats.append((now.t_s, min(share, _MAX_OF_ONE)))
+        turned_share = self._optics.compute_rotation_share(then.vehicle, now.vehicle)
+        share = max(turned_share, self._compute_flown_share(then, now, _PATH_DRIFT_M_S))
+        if share >= MIN_MOTION_SHARE:
+            self._repeats.append((now.t_s, min(share, _MAX_SINGLE_SHARE)))
 
-    def _flown_by(self, then: TimedPicture, now: TimedPicture, doubt_m_s: float) -> float:
+    def _compute_flown_share(self, then: TimedPicture, now: TimedPicture, doubt_m_s: float) -> float:
         moved_m = float(np.hypot(*(now.path_m - then.path_m))) - doubt_m_s * (now.t_s - then.t_s)
-        return self._optics.travel_share(moved_m, now.vehicle.height_m if now.vehicle else None)
+        return self._optics.compute_travel_share(moved_m, now.vehicle.height_m if now.vehicle else None)
 
     def _is_same(self, then: CoarsePicture, now: CoarsePicture, learns: bool = False) -> bool | None:
-        """Tell whether two pictures show the same, unmoved; None if their texture cannot show a motion. Blocks that
+        """Return True if two pictures show the same, unmoved; None if their texture cannot show a motion. Blocks that
         always stay, as those of a display or of the airframe, are not used; with `learns`, they are learnt."""
         textured, unmoved = then.is_textured, then.find_unmoved_blocks(now)
-        judged = textured & (self._stays < _MAX_STAY)
-        if learns and unmoved.sum() <= _MAX_STAY * textured.sum():
+        judged = textured & (self._stays < _MAX_STAY_SHARE)
+        if learns and unmoved.sum() <= _MAX_STAY_SHARE * textured.sum():
             self._stays += textured * (unmoved - self._stays) / _BLOCK_MEMORY
-        return None if judged.sum() < _MIN_BLOCKS else bool(unmoved[judged].mean() >= _SAME_BLOCKS)
+        return None if judged.sum() < _MIN_BLOCKS else bool(unmoved[judged].mean() >= _MIN_SAME_SHARE)
 
     def _decide(self, now_s: float) -> None:
         for witnesses in (self._rotations, self._repeats):
-            while witnesses and now_s - witnesses[0][0] > _PROOF_WITHIN_S:
+            while witnesses and now_s - witnesses[0][0] > _PROOF_WINDOW_S:
                 witnesses.popleft()
         stays_s = now_s - self._first.t_s if self._first else 0.0
         stays_share = self._flown_share + sum(share for _, share in self._rotations)
-        is_repeating = sum(share for _, share in self._repeats) >= PROOF_SHARE
-        if stays_share >= PROOF_SHARE and stays_s >= _LEAST_S:
-            self._report(_NEW_IN_A_ROW)
-        elif is_repeating or self._repeats_in_a_row >= _REPEATS_IN_A_ROW:
+        is_repeating = sum(share for _, share in self._repeats) >= MIN_PROOF_SHARE
+        if stays_share >= MIN_PROOF_SHARE and stays_s >= _MIN_FROZEN_S:
+            self._report(_NEW_AFTER_STAY)
+        elif is_repeating or self._repeats_in_a_row >= _MIN_REPEATS:
             self._report(_NEW_AFTER_REPEATS)
         elif self.is_frozen and self._new_in_a_row >= self._new_needed:
             self.is_frozen = False
@@ -246,13 +248,13 @@ class FrozenWatch:
             self._notifier.report("source", Severity.WARNING, reason, topic="frozen", state=str(reason))
 
 
-def _velocity(vehicle: Vehicle | None) -> tuple[float, float] | None:
+def _read_velocity(vehicle: Vehicle | None) -> tuple[float, float] | None:
     """Return a reported velocity; None if it is unknown or impossible."""
     velocity_m_s = vehicle.velocity_m_s if vehicle else None
-    return velocity_m_s if velocity_m_s and math.hypot(*velocity_m_s) <= _FASTEST_M_S else None
+    return velocity_m_s if velocity_m_s and math.hypot(*velocity_m_s) <= _MAX_SPEED_M_S else None
 
 
-def _change_deg(then: Vehicle, now: Vehicle, name: str) -> float:
+def _compute_change_deg(then: Vehicle, now: Vehicle, name: str) -> float:
     """Return by how much an angle has changed; 0 if it is unknown."""
     before, after = getattr(then, name), getattr(now, name)
     if before is None or after is None or not math.isfinite(before + after):
@@ -260,13 +262,13 @@ def _change_deg(then: Vehicle, now: Vehicle, name: str) -> float:
     return float(wrap_deg(after - before))
 
 
-def _exceed_doubt(angle_deg: float) -> float:
-    return math.radians(max(0.0, abs(angle_deg) - _ROTATION_DOUBT_DEG))
+def _subtract_error(angle_deg: float) -> float:
+    return math.radians(max(0.0, abs(angle_deg) - _ROTATION_ERROR_DEG))
 
 
 def _has_jumped(before: TimedPicture, vehicle: Vehicle | None, t_s: float) -> bool:
-    """Tell whether the heading has changed faster than an aircraft turns."""
+    """Return True if the heading has changed faster than an aircraft turns."""
     if before.vehicle is None or vehicle is None:
         return False
-    turned_deg = abs(_change_deg(before.vehicle, vehicle, "heading_deg"))
+    turned_deg = abs(_compute_change_deg(before.vehicle, vehicle, "heading_deg"))
     return turned_deg > _HEADING_JUMP_DEG + _HEADING_JUMP_DEG_S * max(0.0, t_s - before.t_s)

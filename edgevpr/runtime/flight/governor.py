@@ -16,17 +16,19 @@ from edgevpr.runtime.flight.clock import Pace
 from edgevpr.runtime.flight.flightio import FlightParts
 from edgevpr.runtime.flight.metering import LoadReading
 
-GOVERN_S = 1.0
-_PATIENCE_S = 3.0  # a limit must be exceeded for so long before anything changes
-_HEAT_PATIENCE_S = 20.0  # after a change: a hot board cools slowly, so its effect shows late
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 6.0, 600.0  # with room below all limits, before a step up
-_TRIAL_S = 300.0  # a step up was right if it lasts so long
-_ROOM = 0.85  # share of a limit that the load expected at the higher setting may reach
-_LATE = 0.95
-_COOLER_C = 5.0
-_NEAR_MEMORY, _MEMORY_ROOM = 0.95, 0.9
-_SLOWEST = 8  # times fewer queries per second than asked for, at most
-_OF_CANDIDATES = 0.6  # share of a query's time for comparing candidates, in a large map (benchmarks/results/arm64.md)
+GOVERN_INTERVAL_S = 1.0
+_MIN_EXCEEDED_S = 3.0  # a limit must be exceeded for so long before anything changes
+_MIN_HEAT_WAIT_S = 20.0  # after a change: a hot board cools slowly, so its effect shows late
+_MIN_WAIT_S = 6.0  # with room below all limits, before a step up
+_MAX_WAIT_S = 600.0
+_STEP_UP_TRIAL_S = 300.0  # a step up was right if it lasts so long
+_MAX_EXPECTED_SHARE = 0.85  # share of a limit that the load expected at the higher setting may reach
+_MAX_LATE_SHARE = 0.95
+_TEMPERATURE_MARGIN_C = 5.0
+_MAX_MEMORY_SHARE = 0.95
+_MEMORY_ROOM_SHARE = 0.9
+_MAX_RATE_DIVISOR = 8  # times fewer queries per second than asked for, at most
+_COMPARE_SHARE = 0.6  # share of a query's time for comparing candidates, in a large map (benchmarks/results/arm64.md)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,32 +52,32 @@ class Change:
     back: bool = False
 
 
-def steps(asked: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[Setting, ...]:
+def list_settings(asked: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[Setting, ...]:
     """Return the settings from the one `asked` for down to the lowest. First the candidates are lowered to the numbers
     in `fewer`, largest first, which accept no wrong place; then the rate is halved, down to an eighth, unless it
     `keeps_rate`."""
-    found = [asked]
-    found += [replace(asked, candidates=count) for count in fewer if count < asked.candidates]
-    while not keeps_rate and found[-1].rate_hz > asked.rate_hz / _SLOWEST:
-        found.append(replace(found[-1], rate_hz=found[-1].rate_hz / 2))
-    return tuple(found)
+    settings = [asked]
+    settings += [replace(asked, candidates=count) for count in fewer if count < asked.candidates]
+    while not keeps_rate and settings[-1].rate_hz > asked.rate_hz / _MAX_RATE_DIVISOR:
+        settings.append(replace(settings[-1], rate_hz=settings[-1].rate_hz / 2))
+    return tuple(settings)
 
 
 class Governor:
-    """Decides which of the `settings` (from `steps`, highest first) is in force: it goes down when a limit of the
-    `board`, or its temperature `limit_c` (degrees Celsius), is exceeded, and up when there is room again."""
+    """Decides which of the `settings` (highest first) is in force: it goes down when a limit of the `board`, or its
+    temperature `limit_c` (degrees Celsius), is exceeded, and up when there is room again."""
 
     def __init__(self, board: Board, limit_c: float, settings: Sequence[Setting]) -> None:
-        self._board, self._limit_c, self._settings, self._at = board, limit_c, list(settings), 0
+        self._board, self._limit_c, self._settings, self._index = board, limit_c, list(settings), 0
         self._since_s: dict[str, float] = {}  # when each condition that holds has begun to hold
         self._changed_s = self._raised_s = -math.inf
-        self._wait_s = _FIRST_WAIT_S
+        self._wait_s = _MIN_WAIT_S
         self._reported: set[str] = set()
 
     @property
     def setting(self) -> Setting:
         """The setting in force."""
-        return self._settings[self._at]
+        return self._settings[self._index]
 
     @property
     def held(self) -> str | None:
@@ -90,45 +92,46 @@ class Governor:
     def update(self, now_s: float, reading: LoadReading) -> Change | None:
         """Judge the measurement of a second, which must cover a whole number of queries; return the change to be
         made."""
-        hot, over = self._load(reading)
+        hot, over = self._check_load(reading)
         most_mb = self._board.memory_max_mb
-        has_room = self._has_room(reading, self._settings[max(0, self._at - 1)])
-        over_s, room_s = self._held_s("over", now_s, over is not None), self._held_s("room", now_s, has_room)
-        full_s = self._held_s("full", now_s, reading.rss_mb >= _NEAR_MEMORY * most_mb)
+        has_room = self._has_room(reading, self._settings[max(0, self._index - 1)])
+        over_s = self._measure_held_s("over", now_s, over is not None)
+        room_s = self._measure_held_s("room", now_s, has_room)
+        full_s = self._measure_held_s("full", now_s, reading.rss_mb >= _MAX_MEMORY_SHARE * most_mb)
         if has_room:
             self._reported.discard("load")
-        if reading.rss_mb <= _MEMORY_ROOM * most_mb:
+        if reading.rss_mb <= _MEMORY_ROOM_SHARE * most_mb:
             self._reported.discard("memory")
-        if full_s >= _PATIENCE_S and "memory" not in self._reported:
-            return self._nothing_left(
+        if full_s >= _MIN_EXCEEDED_S and "memory" not in self._reported:
+            return self._report_limit(
                 "memory", Reason(ReasonCode.MEMORY_TAKEN, {"taken_mb": reading.rss_mb, "allowed_mb": most_mb})
             )
-        if over is not None and over_s >= _PATIENCE_S and not (hot and now_s - self._changed_s < _HEAT_PATIENCE_S):
+        if over is not None and over_s >= _MIN_EXCEEDED_S and not (hot and now_s - self._changed_s < _MIN_HEAT_WAIT_S):
             if hot:
-                self._wait_s = max(self._wait_s, _HEAT_PATIENCE_S)
-            below = self._below(hot)
+                self._wait_s = max(self._wait_s, _MIN_HEAT_WAIT_S)
+            below = self._find_lower(hot)
             if below is not None:
-                return self._down(now_s, below, over)
-            return None if "load" in self._reported else self._nothing_left("load", over)
-        if self._at > 0 and room_s >= self._wait_s:
+                return self._step_down(now_s, below, over)
+            return None if "load" in self._reported else self._report_limit("load", over)
+        if self._index > 0 and room_s >= self._wait_s:
             self._raised_s = now_s
-            return self._changed(now_s, self._at - 1, Reason(ReasonCode.ROOM_AGAIN), back=True)
+            return self._change(now_s, self._index - 1, Reason(ReasonCode.ROOM_AGAIN), back=True)
         return None
 
-    def _held_s(self, what: str, now_s: float, holds: bool) -> float:
+    def _measure_held_s(self, what: str, now_s: float, holds: bool) -> float:
         """Note whether the condition `what` holds now. Return for how many seconds it has held without a break."""
         if not holds:
             self._since_s.pop(what, None)
             return 0.0
         return now_s - self._since_s.setdefault(what, now_s)
 
-    def _below(self, hot: bool) -> int | None:
+    def _find_lower(self, hot: bool) -> int | None:
         """Return the index of the next lower setting; for a `hot` board, one of a lower rate, which cools sooner."""
-        below = range(self._at + 1, len(self._settings))
+        below = range(self._index + 1, len(self._settings))
         slower = [at for at in below if self._settings[at].rate_hz < self.setting.rate_hz]
         return next(iter(slower if hot and slower else below), None)
 
-    def _load(self, reading: LoadReading) -> tuple[bool, Reason | None]:
+    def _check_load(self, reading: LoadReading) -> tuple[bool, Reason | None]:
         """Return True if the board is too hot, and the limit that is exceeded (None: none is)."""
         allowed, temperature_c = self._board.cpu_share, reading.temperature_c
         if temperature_c is not None and temperature_c >= self._limit_c:
@@ -137,39 +140,39 @@ class Governor:
             return True, Reason(ReasonCode.BOARD_SLOW)
         if reading.cpu_share > allowed:
             return False, Reason(ReasonCode.CORES_TAKEN, {"taken": reading.cpu_share, "allowed": allowed})
-        if reading.late_share > _LATE:
+        if reading.late_share > _MAX_LATE_SHARE:
             return False, Reason(ReasonCode.QUERIES_LATE)
         return False, None
 
     def _has_room(self, reading: LoadReading, then: Setting) -> bool:
-        """Tell whether the load would stay clearly below all limits with the setting `then`."""
+        """Return True if the load would stay clearly below all limits with the setting `then`."""
         now, board = self.setting, self._board
-        more = 1 + _OF_CANDIDATES * (then.candidates / now.candidates - 1)
+        more = 1 + _COMPARE_SHARE * (then.candidates / now.candidates - 1)
         more *= then.rate_hz / now.rate_hz
         return (
-            reading.cpu_share * more <= _ROOM * board.cpu_share
-            and reading.late_share * more <= _ROOM
+            reading.cpu_share * more <= _MAX_EXPECTED_SHARE * board.cpu_share
+            and reading.late_share * more <= _MAX_EXPECTED_SHARE
             and not reading.throttled
-            and (reading.temperature_c is None or reading.temperature_c <= self._limit_c - _COOLER_C)
-            and reading.rss_mb <= _MEMORY_ROOM * board.memory_max_mb
+            and (reading.temperature_c is None or reading.temperature_c <= self._limit_c - _TEMPERATURE_MARGIN_C)
+            and reading.rss_mb <= _MEMORY_ROOM_SHARE * board.memory_max_mb
         )
 
-    def _nothing_left(self, what: str, why: Reason) -> Change:
+    def _report_limit(self, what: str, why: Reason) -> Change:
         """Return a change between equal settings: a limit ("memory" or "load") is exceeded, and nothing is lowered."""
         self._reported.add(what)
         return Change(self.setting, self.setting, why)
 
-    def _down(self, now_s: float, at: int, why: Reason) -> Change:
-        if now_s - self._raised_s < _TRIAL_S:
-            self._wait_s = min(2 * self._wait_s, _LONGEST_WAIT_S)
+    def _step_down(self, now_s: float, at: int, why: Reason) -> Change:
+        if now_s - self._raised_s < _STEP_UP_TRIAL_S:
+            self._wait_s = min(2 * self._wait_s, _MAX_WAIT_S)
             self._raised_s = -math.inf  # further steps down for the same reason are no new failure
-        elif now_s - self._changed_s >= max(_TRIAL_S, 2 * self._wait_s):
-            self._wait_s = _FIRST_WAIT_S
-        return self._changed(now_s, at, why, back=False)
+        elif now_s - self._changed_s >= max(_STEP_UP_TRIAL_S, 2 * self._wait_s):
+            self._wait_s = _MIN_WAIT_S
+        return self._change(now_s, at, why, back=False)
 
-    def _changed(self, now_s: float, at: int, why: Reason, back: bool) -> Change:
+    def _change(self, now_s: float, at: int, why: Reason, back: bool) -> Change:
         before = self.setting
-        self._at, self._changed_s = at, now_s
+        self._index, self._changed_s = at, now_s
         self._since_s.clear()  # readings before a change say nothing of the time after it
         return Change(before, self.setting, why, back)
 
@@ -183,13 +186,13 @@ class GovernorActuator:
         recogniser, technique = parts.recogniser, parts.recogniser.technique
         in_sequence = recogniser.sequence > 1
         asked = Setting(pace.rate_hz, recogniser.candidates or technique.candidates, technique.spec.form)
-        settings = steps(asked, in_sequence, () if in_sequence else fewer_candidates)
+        settings = list_settings(asked, in_sequence, () if in_sequence else fewer_candidates)
         self.governor = Governor(recogniser.meter.board, parts.meter.limit_c, settings)
 
     def update(self) -> None:
         """Measure the load, at most once a second, and change the settings if needed."""
         parts = self._parts
-        if parts.meter.load.age_s < GOVERN_S:
+        if parts.meter.load.age_s < GOVERN_INTERVAL_S:
             return
         change = self.governor.update(parts.io.clock.mono_s(), parts.meter.reading())
         if change is None:

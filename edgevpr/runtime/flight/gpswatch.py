@@ -1,4 +1,4 @@
-"""The watch over GPS: it is held against the matches, and a GPS that is wrong is neither navigated by nor believed."""
+"""The watch over GPS: compares it with the matches. A GPS that is wrong is neither navigated by nor trusted."""
 
 import math
 
@@ -9,7 +9,7 @@ from edgevpr.core.geodesy import offset_m
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.receivers import extrapolate
-from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.autopilot import AutopilotOutput
 from edgevpr.runtime.flight.measurements import PositionedMatch, measure_for_gps, worst_sd
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -17,16 +17,21 @@ from edgevpr.runtime.recognise.recognition import Recognition
 # In standard deviations of match and receiver together. Errors of map and receiver last for minutes, so that averaging
 # does not reduce them: they are so large in one flight of 3000. With a standard deviation of 5 m for the map, the limit
 # is 23 m for good matches and a good receiver.
-_GPS_CONTRADICTS = 4.0
-_GPS_LEAST_M = 15.0  # less is no danger, and may be a few bad seconds of the receiver
+_MAX_GPS_SIGMA = 4.0
+_MIN_GPS_ERROR_M = 15.0  # less is no danger, and may be a few bad seconds of the receiver
 # Beside the offset that matches and receiver had so far, in which the errors that last cancel out.
-_GPS_MOVED, _GPS_MOVED_M = 3.5, 7.0  # standard deviations, and the least that counts
-_USUAL_OF, _USUAL_OVER = 10, 60  # matches before it is known, and in its mean
-_GPS_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; at 1 a second it costs 3 s
-_GPS_WITHIN_S = 30.0  # the matches in a row must be no older
-_GPS_IN_TURN, _GPS_IN_TURN_S = 5, 20.0  # so many, with others between them that agree
-_GPS_LED_AWAY_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
-_REPORTED_AGAIN = 2.0  # times the distance that was last reported
+_MAX_MOVE_SIGMA = 3.5
+_MIN_MOVE_M = 7.0
+_MIN_USUAL_MATCHES = 10
+_MAX_USUAL_MATCHES = 60
+_MIN_MATCHES_IN_A_ROW = (
+    3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; at 1 a second it costs 3 s
+)
+_MAX_MATCH_AGE_S = 30.0  # the matches in a row must be no older
+_MIN_DOUBTS = 5  # with others between them that agree
+_DOUBT_WINDOW_S = 20.0
+_MAX_DRIFT_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
+_REPORT_FACTOR = 2.0  # times the distance that was last reported
 
 
 class GpsWatch:
@@ -40,12 +45,12 @@ class GpsWatch:
     twenty seconds, whatever lies between, and GPS is not right again before there are fewer. `map_sd_m` is the standard
     deviation of the error that all matches share."""
 
-    def __init__(self, map_sd_m: float, notifier: Notifier, autopilot: ToAutopilot | None) -> None:
+    def __init__(self, map_sd_m: float, notifier: Notifier, autopilot: AutopilotOutput | None) -> None:
         self._map_sd_m, self._notifier, self._autopilot = map_sd_m, notifier, autopilot
         self._against: list[tuple[PositionedMatch, Doubles]] = []  # matches with their offset (2,) from GPS
         self._doubts: list[PositionedMatch] = []  # the last matches that contradicted it
         self._agreeing = 0
-        self._usual_m, self._usual_of = np.zeros(2), 0  # the mean offset of matches that agreed, and their number
+        self._usual_m, self._usual_count = np.zeros(2), 0  # the mean offset of matches that agreed, and their number
         self._agreed: set[int] = set()  # places of the last match that agreed
         self._reported_m = math.inf  # the distance that was last reported
         self._have_agreed = False  # GPS and map, in this flight
@@ -55,7 +60,7 @@ class GpsWatch:
         """Forget the offsets from GPS so far, since matches err otherwise from now on."""
         self._against.clear()
         self._doubts.clear()
-        self._usual_m, self._usual_of = np.zeros(2), 0
+        self._usual_m, self._usual_count = np.zeros(2), 0
 
     def update(self, event: Recognition) -> None:
         """Compare GPS with the match of an event, if that has a position."""
@@ -67,13 +72,13 @@ class GpsWatch:
             return
         gps_deg = extrapolate(vehicle.gps, seen.t_s, vehicle.velocity_m_s or (0.0, 0.0))
         off_m = np.array(offset_m(*gps_deg, seen.position.lat_deg, seen.position.lon_deg))
-        was_wrong, tilted_m = self.is_wrong, (vehicle.height_m or 0.0) * _attitude_error_shown(seen)
+        was_wrong, tilted_m = self.is_wrong, (vehicle.height_m or 0.0) * _compute_attitude_error(seen)
         sd_m = math.hypot(worst_sd(seen.covariance_m2), vehicle.gps.sd_m, seen.frame.sd_m, tilted_m)
-        self._weigh(seen, off_m, sd_m)
+        self._judge(seen, off_m, sd_m)
         away_m = math.hypot(*off_m)
         if self._autopilot:
             self._autopilot.compare_gps(away_m, self.is_wrong, self._have_agreed)
-        has_grown = self.is_wrong and away_m > _REPORTED_AGAIN * self._reported_m
+        has_grown = self.is_wrong and away_m > _REPORT_FACTOR * self._reported_m
         if self.is_wrong != was_wrong or has_grown:
             self._reported_m = away_m
             severity = Severity.WARNING if self.is_wrong else Severity.INFO
@@ -82,19 +87,20 @@ class GpsWatch:
                 note = Reason(ReasonCode.GPS_DIFFERS, {"off_m": away_m})
             self._notifier.report("gps", severity, note, off_m=round(away_m, 1), is_wrong=self.is_wrong)
 
-    def _weigh(self, seen: PositionedMatch, off_m: Doubles, sd_m: float) -> None:
+    def _judge(self, seen: PositionedMatch, off_m: Doubles, sd_m: float) -> None:
         """Judge GPS anew by a match that is `off_m` (2,) metres from it, with a standard deviation of `sd_m` but for
         the error that all matches share."""
-        is_far = _is_beyond(off_m, _GPS_LEAST_M, _GPS_CONTRADICTS * math.hypot(sd_m, self._map_sd_m))
-        has_moved = self._usual_of >= _USUAL_OF and _is_beyond(off_m - self._usual_m, _GPS_MOVED_M, _GPS_MOVED * sd_m)
-        self._doubts = [other for other in self._doubts if seen.t_s - other.t_s <= _GPS_IN_TURN_S]
+        is_far = _is_beyond(off_m, _MIN_GPS_ERROR_M, _MAX_GPS_SIGMA * math.hypot(sd_m, self._map_sd_m))
+        is_usual_known = self._usual_count >= _MIN_USUAL_MATCHES
+        has_moved = is_usual_known and _is_beyond(off_m - self._usual_m, _MIN_MOVE_M, _MAX_MOVE_SIGMA * sd_m)
+        self._doubts = [other for other in self._doubts if seen.t_s - other.t_s <= _DOUBT_WINDOW_S]
         if not is_far and not has_moved:
             self._against.clear()
             self._agreeing += 1
-            self._usual_of = min(self._usual_of + 1, _USUAL_OVER)
-            self._usual_m = self._usual_m + (off_m - self._usual_m) / self._usual_of
+            self._usual_count = min(self._usual_count + 1, _MAX_USUAL_MATCHES)
+            self._usual_m = self._usual_m + (off_m - self._usual_m) / self._usual_count
             self._agreed = set(seen.places)
-            if self._agreeing >= _GPS_IN_A_ROW and len(self._doubts) < _GPS_IN_TURN:
+            if self._agreeing >= _MIN_MATCHES_IN_A_ROW and len(self._doubts) < _MIN_DOUBTS:
                 self.is_wrong, self._have_agreed = False, True
             return
         places, has_agreed = set(seen.places), bool(self._agreed & set(seen.places))
@@ -108,16 +114,16 @@ class GpsWatch:
         self._against = [
             (other, other_m)
             for other, other_m in self._against
-            if seen.t_s - other.t_s <= _GPS_WITHIN_S
-            and math.hypot(*(off_m - other_m)) <= 2 * math.hypot(2 * sd_m, _GPS_LED_AWAY_M_S * (seen.t_s - other.t_s))
+            if seen.t_s - other.t_s <= _MAX_MATCH_AGE_S
+            and math.hypot(*(off_m - other_m)) <= 2 * math.hypot(2 * sd_m, _MAX_DRIFT_M_S * (seen.t_s - other.t_s))
             and is_news_beside(other)
         ]
         self._against.append((seen, off_m))
-        is_proven = len(self._against) >= _GPS_IN_A_ROW or len(self._doubts) >= _GPS_IN_TURN
+        is_proven = len(self._against) >= _MIN_MATCHES_IN_A_ROW or len(self._doubts) >= _MIN_DOUBTS
         self.is_wrong = self.is_wrong or is_proven
 
 
-def _attitude_error_shown(seen: PositionedMatch) -> float:
+def _compute_attitude_error(seen: PositionedMatch) -> float:
     """Return the tangent of the least error of the reported attitude that the picture of a match shows: a match is off
     GPS by as much of the height."""
     return max(0.0, math.hypot(*seen.lean.over_height) - seen.lean.sd) if seen.lean else 0.0

@@ -6,15 +6,15 @@ from collections import deque
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
-from edgevpr.runtime.flight.autopilot import ToAutopilot
+from edgevpr.runtime.flight.autopilot import AutopilotOutput
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.recognition import Recognition
 
-CONTRADICTION_RATIO = 1.25
-CORRECTION_RATIO = 1.1  # a height that is farther off than this is corrected by; five matches scatter by less
+MIN_CONTRADICTION_RATIO = 1.25
+MIN_CORRECTION_RATIO = 1.1  # a height that is farther off than this is corrected by; five matches scatter by less
 MATCHES_IN_A_ROW = 5
-_GOES_ON = 0.3  # share of the height by which ground that has begun to change may go on, unseen by matches
-LOWEST_M = 1.0  # a height below this, as on the ground, is compared as this
+_GROUND_CHANGE_SHARE = 0.3  # share of the height by which ground that has begun to change may go on, unseen by matches
+MIN_HEIGHT_M = 1.0  # a height below this, as on the ground, is compared as this
 
 
 class HeightWatch:
@@ -23,7 +23,7 @@ class HeightWatch:
 
     `by_pictures_m`, `by_autopilot_m`: medians of the last five matches (None: they do not contradict each other)."""
 
-    def __init__(self, notifier: Notifier, autopilot: ToAutopilot | None = None) -> None:
+    def __init__(self, notifier: Notifier, autopilot: AutopilotOutput | None = None) -> None:
         self.by_pictures_m: float | None = None
         self.by_autopilot_m: float | None = None
         self._notifier, self._autopilot = notifier, autopilot
@@ -35,7 +35,7 @@ class HeightWatch:
         """Height by the pictures over that by the autopilot, median of the last five matches; 1.0 unless all are
         off."""
         ratios = self._ratios
-        is_off = len(ratios) == MATCHES_IN_A_ROW and _are_beyond(CORRECTION_RATIO, ratios)
+        is_off = len(ratios) == MATCHES_IN_A_ROW and _are_beyond(MIN_CORRECTION_RATIO, ratios)
         return statistics.median(ratios) if is_off else 1.0
 
     @property
@@ -43,7 +43,11 @@ class HeightWatch:
         """By how much that ratio may be wrong, a share: by what the newest match contradicts it, as over ground that
         has begun to fall or rise, and by what it may go on to. 0.0: by no more than matches scatter."""
         change = self._ratios[-1] / self.ratio if self._heights_m else 1.0
-        return 0.0 if 1 / CORRECTION_RATIO <= change <= CORRECTION_RATIO else abs(change - 1.0) + _GOES_ON
+        return (
+            0.0
+            if 1 / MIN_CORRECTION_RATIO <= change <= MIN_CORRECTION_RATIO
+            else abs(change - 1.0) + _GROUND_CHANGE_SHARE
+        )
 
     @property
     def _ratios(self) -> list[float]:
@@ -58,7 +62,7 @@ class HeightWatch:
         if not is_known or frame.t_mono_s == self._last_s or not vehicle.is_fresh(frame.t_mono_s):
             return
         self._last_s = frame.t_mono_s
-        self._heights_m.append((max(LOWEST_M, where.height_m or 0.0), max(LOWEST_M, vehicle.height_m or 0.0)))
+        self._heights_m.append((max(MIN_HEIGHT_M, where.height_m or 0.0), max(MIN_HEIGHT_M, vehicle.height_m or 0.0)))
         if self._autopilot:
             self._autopilot.correct_height(self.ratio, self.ratio_sd)
         self._judge()
@@ -68,9 +72,9 @@ class HeightWatch:
         if len(ratios) < MATCHES_IN_A_ROW:
             return
         was_so = self.by_pictures_m is not None
-        if all(1 / CONTRADICTION_RATIO <= ratio <= CONTRADICTION_RATIO for ratio in ratios):
+        if all(1 / MIN_CONTRADICTION_RATIO <= ratio <= MIN_CONTRADICTION_RATIO for ratio in ratios):
             self.by_pictures_m = self.by_autopilot_m = None
-        elif was_so or _are_beyond(CONTRADICTION_RATIO, ratios):
+        elif was_so or _are_beyond(MIN_CONTRADICTION_RATIO, ratios):
             self.by_pictures_m, self.by_autopilot_m = map(statistics.median, zip(*self._heights_m, strict=True))
         if was_so != (self.by_pictures_m is not None):
             self._report()
@@ -85,5 +89,5 @@ class HeightWatch:
 
 
 def _are_beyond(limit: float, ratios: list[float]) -> bool:
-    """Tell whether all ratios are greater than `limit`, or all less than its inverse."""
+    """Return True if all ratios are greater than `limit`, or all less than its inverse."""
     return min(ratios) > limit or max(ratios) < 1 / limit

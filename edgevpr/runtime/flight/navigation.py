@@ -9,7 +9,7 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Position, Receiver, Vehicle
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S, extrapolate
-from edgevpr.runtime.flight.consistency import BELIEVED, ComparedFix, GateResult
+from edgevpr.runtime.flight.consistency import ACCEPTED, GateResult, PredictedFix
 from edgevpr.runtime.flight.drift import Drift, DriftFilter, OdometryMeasurement
 from edgevpr.runtime.flight.measurements import RECEIVER_LAG_SD_S, FrameMeasurement, PositionedMatch, worst_sd
 from edgevpr.runtime.flight.output import MATCH_PROOF_S
@@ -225,7 +225,7 @@ class Navigation:
             self._strides_since_fix.add(strode.moved_m, stride.zoom, frame)
             self._strode_s = frame.t_s
 
-    def compare(self, seen: PositionedMatch) -> ComparedFix | None:
+    def compare(self, seen: PositionedMatch) -> PredictedFix | None:
         """Compare the fix of a match with its prediction; None if the path at that time is not known. The match is of
         the last frame heard, or of a new one."""
         if self._framed is None or self._framed.t_s != seen.t_s:
@@ -235,11 +235,11 @@ class Navigation:
             return None
         expected_m, covariance_m2 = self._filter.predict_fix()
         off_m = path.compute_offset_m(seen.position.lat_deg, seen.position.lon_deg) - there.position_m
-        return ComparedFix(
+        return PredictedFix(
             seen=seen, path_m=there.position_m, off_m=off_m, expected_m=expected_m, covariance_m2=covariance_m2
         )
 
-    def correct_by_fix(self, fix: ComparedFix, verdict: GateResult = BELIEVED) -> None:
+    def correct_by_fix(self, fix: PredictedFix, verdict: GateResult = ACCEPTED) -> None:
         """Correct our position by a fix of which `Consistency` has given a verdict."""
         if self._path and verdict.is_lost and self._drift.is_of_attitude:
             self.begin(fix.seen.position, worst_sd(fix.seen.scatter_m2), fix.seen.t_s, self._path.now.t_s)
@@ -251,7 +251,7 @@ class Navigation:
             self._fixed_s = max(self._fixed_s, fix.seen.t_s)
             self._strides_since_fix = _StridesSinceFix(self._fixed_s)
 
-    def _repetition_factor(self, fix: ComparedFix) -> float:
+    def _repetition_factor(self, fix: PredictedFix) -> float:
         """Return the factor of the covariance of a fix: the nearer it is to the last one, the more it repeats of its
         error. It is 1 without a stride: then the last one does not last, since nothing carries it on."""
         at_m, before_m = fix.path_m + fix.off_m, self._fixed_m

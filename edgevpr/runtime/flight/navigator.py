@@ -17,7 +17,7 @@ from edgevpr.mavlink.receivers import MAX_PLAUSIBLE_SD_M
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.agewatch import AgeWatch
 from edgevpr.runtime.flight.consistency import Consistency
-from edgevpr.runtime.flight.drift import INERTIAL, INERTIAL_PX4, RECKONED, Drift
+from edgevpr.runtime.flight.drift import DEAD_RECKONING, INERTIAL, INERTIAL_PX4, Drift
 from edgevpr.runtime.flight.measurements import (
     FrameMeasurement,
     measure_frame,
@@ -79,7 +79,7 @@ class Navigator(Listener):
     def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False, is_level: bool = False) -> None:
         self._is_muted, self._is_level = is_muted, is_level
         self._map_sd_m, self._next_s = map_sd_m, min(every_s, INTERIM_FIX_INTERVAL_S)  # from one fix to the next
-        self._navigation = Navigation(RECKONED, map_sd_m)
+        self._navigation = Navigation(DEAD_RECKONING, map_sd_m)
         self._consistency, self.age = Consistency(), AgeWatch()
         self._slew = Slew()
         self._vehicle: Vehicle | None = None
@@ -326,7 +326,7 @@ def _choose_drift(channel: Channel) -> Drift:
     """Return the errors of the path beside an autopilot that is told positions by a channel."""
     if channel in _PX4_CHANNELS:
         return INERTIAL_PX4
-    return INERTIAL if channel.is_continuous else RECKONED
+    return INERTIAL if channel.is_continuous else DEAD_RECKONING
 
 
 def _in_radians(attitude: Attitude) -> tuple[float, float, float]:

@@ -38,7 +38,7 @@ class Vitals:
     """Pings the watchdog of systemd while queries come, or their absence is explained by something that is reported.
     Reports the state once a second, and once a minute also to a terminal. It notifies once when the camera is lost,
     frozen, damaged or blank, when recognition keeps failing, when this computer is hot, throttled or short of voltage,
-    and when each of these is over. `remarks` returns sentences for the status (None: left out)."""
+    and when each of these is over. `problems` returns sentences for the status (None: left out)."""
 
     def __init__(
         self,
@@ -148,8 +148,8 @@ class Vitals:
         - `t_mono_s`: the `time` on the clock of the frames; `latency_s`: age of the newest picture
         - `asked_rate_hz`: queries per second that the flight tries to keep
         - `machine_cpu_share` (0..1), `machine_ram_mb` (of `machine_ram_total_mb`): those of all programs
-        - `newest`: the last query; `match`: the last accepted one; `link`: see `ToAutopilot.state` (null: no link)
-        - `remarks`: further sentences for operators; `summary`: the most important values in one line.
+        - `newest`: the last query; `match`: the last accepted one; `link`: see `AutopilotOutput.state` (null: no link)
+        - `problems`: further sentences for operators; `summary`: the most important values in one line.
         """
         parts, tally, thermal = self._parts, self._tally, self._parts.meter.thermal
         totals, now_s = parts.meter.totals(), parts.io.clock.mono_s()
@@ -179,7 +179,7 @@ class Vitals:
             "newest": self._newest,
             "match": self._match,
             "link": parts.autopilot.state() if parts.autopilot else None,
-            "remarks": [remark for remark in (*self._companion.remarks, *self._remarks()) if remark],
+            "remarks": [remark for remark in (*self._companion.problems, *self._remarks()) if remark],
         }
         counts = f"{tally.queries} queries, {tally.accepted} accepted, {totals['used_mah']:.2f} mAh"
         fixes = [status["link"]["fixes"]] if status["link"] else []

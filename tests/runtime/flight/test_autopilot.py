@@ -31,7 +31,7 @@ def test_every_answer_has_its_own_line_before_the_next_query(make_flight, clock,
     queries, answers = of_kind(lines, "query"), of_kind(lines, "answer")
     assert [line["query"] for line in answers] == [line["query"] for line in queries]
     assert {(line["sent"], line["result"], line["why"]["code"]) for line in answers} == {(True, "FAILED", "GPS_IN_USE")}
-    assert "3 fixes sent, 0 taken, 3 refused (GPS in use)" in statuses[-1]
+    assert "3 fixes sent, 0 accepted, 3 refused (GPS in use)" in statuses[-1]
 
 
 def test_what_was_never_sent_waits_for_no_answer(make_flight, clock):

@@ -10,7 +10,7 @@ from pictures import textured
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Position
-from edgevpr.runtime.flight.consistency import ComparedFix, Consistency
+from edgevpr.runtime.flight.consistency import Consistency, PredictedFix
 from edgevpr.runtime.flight.measurements import FrameMeasurement, PositionedMatch
 
 HOME = 50.0, 8.0
@@ -53,7 +53,7 @@ def compared(off_m, t_s, places=1, *, path_m=0.0, expected_m=0.0, turn_deg=None)
     said = {"position": Position(*HOME), "accuracy_m": 1.0, "places": places, "turn_deg": turn_deg}
     path, off, expected = (np.array([each, 0.0]) for each in (700.0 + path_m, off_m, expected_m))
     seen = PositionedMatch(frame=frame, covariance_m2=5.5 * np.eye(2), **said)
-    return ComparedFix(seen=seen, path_m=path, off_m=off, expected_m=expected, covariance_m2=30.5 * np.eye(2))
+    return PredictedFix(seen=seen, path_m=path, off_m=off, expected_m=expected, covariance_m2=30.5 * np.eye(2))
 
 
 def verdict_of(result):
@@ -63,7 +63,7 @@ def verdict_of(result):
 
 
 @pytest.mark.parametrize(
-    ("fixes", "is_followed", "verdicts"),
+    ("fixes", "is_tracked", "verdicts"),
     [
         ([(24.0, 0)], False, "."),
         ([(24.1, 0)], False, "h"),
@@ -96,10 +96,10 @@ def verdict_of(result):
         ([(0, second, second, {"turn_deg": 140}) for second in range(3)], False, "..."),
     ],
 )
-def test_consistency_believes_what_others_prove_within_limits(fixes, is_followed, verdicts):
+def test_consistency_believes_what_others_prove_within_limits(fixes, is_tracked, verdicts):
     judge = Consistency()
     results = [
-        judge.judge(compared(*each[:3], **dict(*each[3:])), has_gps=False, is_followed=is_followed) for each in fixes
+        judge.judge(compared(*each[:3], **dict(*each[3:])), has_gps=False, is_tracked=is_tracked) for each in fixes
     ]
     assert "".join(map(verdict_of, results)) == verdicts
 
@@ -107,28 +107,28 @@ def test_consistency_believes_what_others_prove_within_limits(fixes, is_followed
 def test_consistency_believes_no_fix_against_gps():
     judge = Consistency()
     for second in range(6):
-        why = judge.judge(compared(500.0, second, second), has_gps=True, is_followed=False).why
+        why = judge.judge(compared(500.0, second, second), has_gps=True, is_tracked=False).why
         assert why == Reason(ReasonCode.HELD_OFF_GPS, {"off_m": 500.0})
-    assert not judge.is_contradicted(START_S + 5, is_followed=False)
+    assert not judge.is_contradicted(START_S + 5, is_tracked=False)
 
 
-@pytest.mark.parametrize(("is_followed", "good_for_s"), [(True, 2.5), (False, 30.0)])
-def test_consistency_is_in_doubt_until_another_should_have_agreed(is_followed, good_for_s):
+@pytest.mark.parametrize(("is_tracked", "good_for_s"), [(True, 2.5), (False, 30.0)])
+def test_consistency_is_in_doubt_until_another_should_have_agreed(is_tracked, good_for_s):
     judge = Consistency()
-    assert not judge.is_contradicted(START_S, is_followed)
+    assert not judge.is_contradicted(START_S, is_tracked)
     for t_s in range(8):
-        why = judge.judge(compared(-100, t_s), has_gps=False, is_followed=is_followed).why
+        why = judge.judge(compared(-100, t_s), has_gps=False, is_tracked=is_tracked).why
         assert why == Reason(ReasonCode.HELD_OFF_PATH, {"off_m": 100.0, "accuracy_m": math.sqrt(30.5)})
-    assert judge.is_contradicted(START_S + 7 + good_for_s, is_followed)
-    assert not judge.is_contradicted(START_S + 7.1 + good_for_s, is_followed), "no other has agreed"
-    assert judge.judge(compared(0.0, 9), has_gps=False, is_followed=is_followed).why is None
-    assert not judge.is_contradicted(START_S + 9, is_followed)
+    assert judge.is_contradicted(START_S + 7 + good_for_s, is_tracked)
+    assert not judge.is_contradicted(START_S + 7.1 + good_for_s, is_tracked), "no other has agreed"
+    assert judge.judge(compared(0.0, 9), has_gps=False, is_tracked=is_tracked).why is None
+    assert not judge.is_contradicted(START_S + 9, is_tracked)
 
 
 @pytest.mark.parametrize(("before_deg", "turn_deg"), [(100.0, 0.0), (0.0, 100.0)])
 def test_consistency_reports_by_how_much_a_picture_is_turned(before_deg, turn_deg):
     judge = Consistency()
-    judge.judge(compared(0.0, 0, turn_deg=before_deg), has_gps=True, is_followed=False)
+    judge.judge(compared(0.0, 0, turn_deg=before_deg), has_gps=True, is_tracked=False)
     for has_gps in (True, False):
-        why = judge.judge(compared(0.0, 1, turn_deg=turn_deg), has_gps=has_gps, is_followed=False).why
+        why = judge.judge(compared(0.0, 1, turn_deg=turn_deg), has_gps=has_gps, is_tracked=False).why
         assert why == Reason(ReasonCode.HELD_TURNED, {"turn_deg": turn_deg})

@@ -16,8 +16,8 @@ from edgevpr.core.types import FRAME_TIME_SD_S, Position
 from edgevpr.frames.level import LevelledImage, View
 from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.vehicle import Attitude
-from edgevpr.runtime.flight.consistency import ComparedFix
-from edgevpr.runtime.flight.drift import INERTIAL, INERTIAL_PX4, RECKONED
+from edgevpr.runtime.flight.consistency import PredictedFix
+from edgevpr.runtime.flight.drift import DEAD_RECKONING, INERTIAL, INERTIAL_PX4
 from edgevpr.runtime.flight.navigation import NavState
 from edgevpr.runtime.flight.navigator import Navigator
 from edgevpr.runtime.flight.output import Output
@@ -56,7 +56,7 @@ class Known:
         if self.contradicts_m is None:
             return None
         here, off_m = np.zeros(2), np.array([self.contradicts_m, 0.0])
-        return ComparedFix(seen=seen, path_m=here, off_m=off_m, expected_m=here, covariance_m2=np.eye(2))
+        return PredictedFix(seen=seen, path_m=here, off_m=off_m, expected_m=here, covariance_m2=np.eye(2))
 
     def begin(self, *how):
         self.begun.append(how)
@@ -347,4 +347,4 @@ def test_navigation_begins_anew_where_the_path_errs_otherwise():
         navigator.handle_channel(channel)
         seen.append(navigator._navigation)
     assert [one is other for one, other in pairwise(seen)] == [True, False, True, False, True]
-    assert [each._drift for each in seen[::2]] == [RECKONED, INERTIAL_PX4, INERTIAL]
+    assert [each._drift for each in seen[::2]] == [DEAD_RECKONING, INERTIAL_PX4, INERTIAL]

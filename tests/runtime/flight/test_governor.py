@@ -7,7 +7,7 @@ import pytest
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.flight.governor import Change, Governor, Setting, steps
+from edgevpr.runtime.flight.governor import Change, Governor, Setting, list_settings
 from edgevpr.runtime.flight.metering import LoadReading
 
 BOARD, LIMIT_C = replace(load_board("rpi-4b"), cpu_share=0.5, memory_max_mb=512), 80
@@ -27,7 +27,7 @@ class Flight:
     """Looks once a second; `reading` says what is measured of a setting at a time."""
 
     def __init__(self, reading, settings=None):
-        self.settings = settings or steps(ASKED, keeps_rate=False, fewer=(20,))
+        self.settings = settings or list_settings(ASKED, keeps_rate=False, fewer=(20,))
         self.governor = Governor(BOARD, LIMIT_C, self.settings)
         self.reading, self.now_s = reading, 0.0
         self.changes = []
@@ -49,7 +49,7 @@ def load(setting):
 
 
 def test_the_candidates_are_lowered_first_then_the_rate():
-    settings = steps(Setting(1.0, 40, "float"), keeps_rate=False, fewer=(20,))
+    settings = list_settings(Setting(1.0, 40, "float"), keeps_rate=False, fewer=(20,))
     rates_hz = 1.0, 0.5, 0.25, 0.125
     assert settings == (Setting(1.0, 40, "float"), *(Setting(rate_hz, 20, "float") for rate_hz in rates_hz))
     flight = Flight(lambda setting, now_s: BUSY, settings)
@@ -71,12 +71,12 @@ def test_it_goes_back_in_the_opposite_order():
 
 
 def test_a_sequence_keeps_its_rate_and_a_technique_of_one_stage_has_no_candidates():
-    assert steps(ASKED, keeps_rate=True, fewer=(20,)) == (ASKED, Setting(2.0, 20))
-    assert steps(ASKED, keeps_rate=True) == (ASKED,)
-    assert steps(Setting(2.0, 15), keeps_rate=True, fewer=(20,)) == (Setting(2.0, 15),)
-    fewer = steps(Setting(2.0, 42), keeps_rate=True, fewer=(50, 42, 20, 10))
+    assert list_settings(ASKED, keeps_rate=True, fewer=(20,)) == (ASKED, Setting(2.0, 20))
+    assert list_settings(ASKED, keeps_rate=True) == (ASKED,)
+    assert list_settings(Setting(2.0, 15), keeps_rate=True, fewer=(20,)) == (Setting(2.0, 15),)
+    fewer = list_settings(Setting(2.0, 42), keeps_rate=True, fewer=(50, 42, 20, 10))
     assert [each.candidates for each in fewer] == [42, 20, 10]
-    assert [each.rate_hz for each in steps(ASKED, keeps_rate=False)] == [2.0, 1.0, 0.5, 0.25]
+    assert [each.rate_hz for each in list_settings(ASKED, keeps_rate=False)] == [2.0, 1.0, 0.5, 0.25]
 
 
 def test_what_it_cannot_help_is_said_once():
@@ -119,7 +119,7 @@ def wait_s(flight, trouble_s):
 
 
 def test_the_wait_doubles_with_each_failure_and_begins_anew_when_all_was_well_for_long():
-    flight = Flight(lambda setting, now_s: CALM, settings=steps(ASKED, keeps_rate=False))
+    flight = Flight(lambda setting, now_s: CALM, settings=list_settings(ASKED, keeps_rate=False))
     assert [wait_s(flight, 5) for _ in range(3)] == [7, 13, 25]
     assert wait_s(flight, 13) == 3 * 49, "one failure, however many steps it takes"
     flight.fly(600)

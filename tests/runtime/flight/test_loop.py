@@ -104,13 +104,13 @@ def test_between_frames_that_are_far_apart_pictures_are_due_for_their_strides(cl
     pace.taken()
     for _ in range(100):
         clock.now_s += 0.1
-        if pace.is_time_for_stride():
+        if pace.is_odometry_due():
             due_s.append(10.0 - pace.wait_s())
     assert due_s == pytest.approx([2.0, 4.0, 6.0, 8.0], abs=0.15)
     pace.taken()
     pace.rate_hz = 0.5
     clock.now_s += 3.0
-    assert not pace.is_time_for_stride(), "queries show it themselves"
+    assert not pace.is_odometry_due(), "queries show it themselves"
 
 
 def test_frames_of_a_recording_come_by_its_steps_and_slower_as_the_rate_is_lowered(clock):

@@ -10,7 +10,7 @@ from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.runtime.flight import drift
-from edgevpr.runtime.flight.drift import GRAVITY_M_S2, INERTIAL, RECKONED
+from edgevpr.runtime.flight.drift import DEAD_RECKONING, GRAVITY_M_S2, INERTIAL
 from edgevpr.runtime.flight.measurements import FrameMeasurement, PositionedMatch
 from edgevpr.runtime.flight.navigation import Navigation
 from edgevpr.runtime.recognise.perspective import AttitudeError
@@ -96,7 +96,7 @@ def lengths(errors_m):
 
 
 def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopilot_that_reckons():
-    flown = Flown(RECKONED, fix_sd_m=0.5)
+    flown = Flown(DEAD_RECKONING, fix_sd_m=0.5)
     flown.fly(10, has_gps=True, fixes=False)
     lean_s2, wrong = 100 / GRAVITY_M_S2, np.array([0.06, 0.0])  # of the height: 3.4 degrees
 
@@ -114,7 +114,7 @@ def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopi
 def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_reckon_is_allowed_for(upset, monkeypatch):
     """4.5 degrees within ten seconds, 100 m high: fixes and strides lead 8 m away, and claim a metre."""
     monkeypatch.setattr(drift, "_UPSET", upset)
-    flown, frames = Flown(RECKONED, wind=(5.0, 0.0), fix_sd_m=0.5), []
+    flown, frames = Flown(DEAD_RECKONING, wind=(5.0, 0.0), fix_sd_m=0.5), []
     flown.fly(30, has_gps=True, fixes=False)
     loss_s, lean_s2 = flown.t_s, 100 / GRAVITY_M_S2
 
@@ -134,7 +134,7 @@ def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_rec
 
 
 def test_where_no_picture_shows_an_error_of_the_attitude_a_fix_is_not_taken_for_one():
-    flown = Flown(RECKONED, wind=(5.0, 0.0), fix_sd_m=2.0)
+    flown = Flown(DEAD_RECKONING, wind=(5.0, 0.0), fix_sd_m=2.0)
     flown.fly(10, has_gps=True, fixes=False)
     flown.fix = lambda: flown.take(flown.see(), lean_s2=18.0)
     flown.fly(60)
