@@ -28,16 +28,16 @@ _FACTORIES = {
     "region_vlad": "network:region_vlad",
     "cross_region_bow": "regions:cross_region_bow",
 }
-# Chosen without being asked for: the first that fits the board. Networks must be asked for: they need onnxruntime in
-# RAM, and weights that a person has chosen. So must `seqslam`: a sequence needs a flight along the mapped route.
+# The default is the first of these that fits the board. Networks are never the default: they need onnxruntime in RAM,
+# and weights that a person has chosen. Nor is `seqslam`: a sequence needs a flight along the mapped route.
 DEFAULT_TECHNIQUES = ("cohog", "hog")
-CONFIDENCE_TECHNIQUE = "cohog"  # whose matches have a confidence, where its spec is not at hand
+CONFIDENCE_TECHNIQUE = "cohog"  # the one whose matches have a confidence
 _TYPE_NAMES = {int: "a whole number", float: "a number", str: "a word"}
 
 
 def list_techniques() -> tuple[str, ...]:
-    """Return the names of all techniques: those of edgevpr, then the networks whose cards make a vector by themselves.
-    A card that cannot be read is left out."""
+    """Return the names of all techniques: those of edgevpr, then the networks whose cards give a descriptor. Cards that
+    cannot be read are left out."""
     from edgevpr.techniques.card import list_cards, load_card
 
     def is_technique(card: str) -> bool:
@@ -74,8 +74,8 @@ def format_name(name: str, form: str | None) -> str:
 
 
 def find_network_output(name: str) -> str | None:
-    """Return the output, "features" or "descriptor", that a technique of edgevpr uses of the network which its
-    parameter `model` names. None for a technique without this parameter."""
+    """Return the output, "features" or "descriptor", that a technique uses of the network of its parameter `model`;
+    None if it has no such parameter."""
     if "model" not in read_parameters(name):
         return None
     return "descriptor" if name == "calc" else "features"
@@ -83,8 +83,8 @@ def find_network_output(name: str) -> str | None:
 
 def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
     """Make the technique `name`. `settings` are values of its parameters by name (None: all defaults); a text is
-    converted to the type of its parameter. Raises UsageError for an unknown technique or parameter, a value that cannot
-    be read, or one out of range, and ModelError for a network that cannot be used."""
+    converted to the type of its parameter. Raises UsageError for an unknown technique or parameter and for a wrong
+    value, and ModelError for a network that cannot be used."""
     defaults = read_parameters(name)
     values = {}
     for key, value in (settings or {}).items():
@@ -104,8 +104,8 @@ def _find_factory(name: str) -> Callable[..., Any]:
     """Return the class or function that makes the technique `name`; its arguments are the technique's parameters.
     Raises as `read_parameters` does."""
     if is_builtin(name):
-        own: Callable[..., Any] = resolve_name(f"edgevpr.techniques.{_FACTORIES[name]}")
-        return own
+        factory: Callable[..., Any] = resolve_name(f"edgevpr.techniques.{_FACTORIES[name]}")
+        return factory
     if not is_known(name):
         raise UsageError(f"There is no technique `{name}`: use one of {', '.join(list_techniques())}.")
     from edgevpr.techniques.card import load_card

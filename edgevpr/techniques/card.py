@@ -17,7 +17,7 @@ from edgevpr.core.files import find_model, list_model_folders
 from edgevpr.core.text import suggest
 from edgevpr.core.yamlfile import read_yaml
 
-_LATER_KEYS = ("pad", "boxes", "memorability")  # keys, see _used
+_LATER_KEYS = ("pad", "boxes", "memorability")  # see `_drop_unknown_keys`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,15 +120,14 @@ def load_card(name: str) -> Card:
             return read_card(path)
         except ConfigError as error:  # one network cannot be used; the user's request is not wrong
             raise ModelError(str(error)) from error
-    known = ", ".join(list_cards()) or "there are none yet"
-    raise ModelError(
-        f"There is no model `{name}`: " + suggest(name, list_cards(), f"use one of `edgevpr models list` ({known}).")
-    )
+    names = ", ".join(list_cards()) or "there are none yet"
+    hint = suggest(name, list_cards(), f"use one of `edgevpr models list` ({names}).")
+    raise ModelError(f"There is no model `{name}`: {hint}")
 
 
 def describe_weights(spec: TechniqueSpec) -> str | None:
-    """Return a line for people on the weights that a technique uses: name, title, licence and source of the network's
-    card. None: the technique has no network."""
+    """Return one line on the weights that a technique uses: name, title, licence and source of the network's card; None
+    if it has no network."""
     if spec.model_sha256 is None:
         return None
     card = load_card(str(spec.parameters.get("model", spec.name)))
@@ -156,7 +155,7 @@ def _find_problems(card: Card) -> Iterator[str]:
     if card.file.lower().endswith((".yaml", ".yml")):
         yield f"`file` is `{card.file}`, which is the name of a card: write that of the ONNX file."
     if not any(asdict(card.outputs).values()):
-        yield "`outputs` names none: write the ONNX output of a descriptor, of features, of boxes or of memorability."
+        yield "`outputs` is empty: write the ONNX output of a descriptor, of features, of boxes or of memorability."
     if (boxes is None) != (rule is None):
         yield "a detector needs both `outputs.boxes` and the section `detector`: write both."
     if boxes is not None and not (boxes and all(isinstance(name, str) for name in boxes)):
@@ -172,4 +171,4 @@ def _find_problems(card: Card) -> Iterator[str]:
 
 def _are_per_channel(values: list[float], channels: int, above: float) -> bool:
     """Tell whether `values` are one number or one per channel, all larger than `above` and less than 1e9."""
-    return len(values) in (1, channels) and all(type(each) in (int, float) and above < each < 1e9 for each in values)
+    return len(values) in (1, channels) and all(type(value) in (int, float) and above < value < 1e9 for value in values)

@@ -52,39 +52,39 @@ from edgevpr.techniques.views import HEIGHT_RATIOS, QueryViews, ViewRegions, com
 
 # The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
 _DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
-# Weight of a vote that is 0, 1, 2 ... cells off the peak. With a forward camera, near and far ground move by different
-# steps; with a nadir camera (one that looks straight down) the step is known more exactly.
+# Weight of a vote that is 0, 1, 2 ... cells off the peak. With a forward camera near and far ground shift differently;
+# with a nadir camera (one that looks straight down) the shift is known more exactly.
 _VOTE_WEIGHTS = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
 # (min_score, min_margin), by which sequences are judged: of corridor, the seasons and nordland_tiny no sequence of ten
 # was accepted elsewhere. The thesis's score has no safe threshold: its margin rejects queries of two other sites in the
 # map of aerial_caliterra, and most right matches too.
 _ACCEPT_LIMITS = {"forward": (0.02, 0.01), "nadir": (0.02, 0.01), "thesis": (0.0, 0.02)}
-# Least quality. On the tuning sets, accepted pictures that show nothing had .39 or less, and real ones, washed out or
-# covered, that were taken for a wrong place .43 or less; right matches had .91 or more (on the other sites .72 or more,
-# and .47 where pictures have 64 x 32 pixels). With `filled_bins` it was .14, .18 and .30.
+# On the tuning sets, accepted pictures without texture had 0.39 or less, and washed-out or covered ones that matched a
+# wrong place 0.43 or less; right matches had 0.91 or more (on the other sites 0.72 or more, and 0.47 with pictures of
+# 64 x 32 pixels). With `filled_bins` it was 0.14, 0.18 and 0.30.
 _MIN_QUALITY = {"shannon": 0.4, "filled_bins": 0.2}
-# (kept, wanted, sigma_pixels), see `stretch_contrast`. No place of any set lies below `kept` (aerial_copr has one of 45
-# levels, nordland_tiny one of 81), so none changed. Chosen on corridor, aerial_caliterra and aerial_garfield28, with
-# aerial_swindale: looking ahead, noise harms more.
+# (min_levels, target_levels, sigma_pixels), see `stretch_contrast`. No place of any set lies below `min_levels`
+# (aerial_copr has one of 45, nordland_tiny one of 81), so none changed. Chosen on corridor, aerial_caliterra and
+# aerial_garfield28, with aerial_swindale: looking ahead, noise harms more.
 _CONTRAST = {"forward": (75, 200, 0.4), "nadir": (40, 40, 0.25)}
 _MATCHINGS = ("displacement", "thesis")
-# Places or, looking down, pairs of a place and a rotation.
+# Places or, with a nadir camera, pairs of a place and a rotation.
 _CANDIDATES = {"forward": 42, "nadir": 30}
-# Places compared in full, those with the best `score_quickly`. Ahead it looks at one of so many good regions: on
-# corridor, the seasons and nordland_tiny 12 of 42 find as many places as all of them compared in full (of the 994 of
+# Places compared in full, those with the best `score_quickly`. With a forward camera it uses every fourth good region:
+# on corridor, the seasons and nordland_tiny 12 of 42 find as many places as all compared in full (of the 994 of
 # nordland_tiny four fewer). Looking down 6 of 30 find as many as 10 on sat_marash, aerial_swindale and kite_ochota.
 _MAX_FULL_MATCHES = {"forward": 12, "nadir": 6}
 _QUICK_STEP = 4
 _NADIR_BINS = 8  # orientations of the regions whose patterns make a layout
 # Agreement of the layouts of query and place at which the share of votes alone is the score. Right matches on
-# sat_marash have .18 to .38, those of one season up to .5. At .35 one foreign picture was accepted in the map of
-# aerial_caliterra, from .4 on none in the maps of sat_marash, kite_ochota, aerial_swindale and aerial_caliterra.
+# sat_marash have 0.18 to 0.38, those of one season up to 0.5. At 0.35 one foreign picture was accepted in the map of
+# aerial_caliterra, from 0.4 on none in the maps of sat_marash, kite_ochota, aerial_swindale and aerial_caliterra.
 _FULL_LAYOUT_AGREEMENT = 0.45
-# What counts as around a region in the structure of a picture (see `overlay`). Ahead, things are larger.
+# Surroundings of a region in the structure of a picture (see `overlay`). Looking ahead, things are larger.
 _SURROUND_SD_CELLS = {"forward": 5.0, "nadir": 3.0}
-_MIN_ROTATED_DEG = 45.0  # a rotation from which on a picture lies otherwise
-# A match whose structures agree by the second figure keeps its score; below the first one they count as this much.
-# Foreign pictures have at most 4.9 ahead and 2.7 looking down; in corridor, built alike all along, wrong places 9.9.
+_MIN_ROTATED_DEG = 45.0  # from which a rotation counts as another one
+# A match whose structures agree by the second figure keeps its score; an agreement below the first one counts as it.
+# Foreign pictures have at most 4.9 ahead and 2.7 looking down; wrong places in the uniform corridor have 9.9.
 _STRUCTURE_LIMITS = {"forward": (1.0, 6.0), "nadir": (1.0, 3.0)}
 _MAX_HEADING_OFF_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on either side
 
@@ -114,13 +114,13 @@ class CoHog:
             self.gt = _DEFAULT_GT[self.entropy]
         self._side = self.w1 // self.w2 - 1  # blocks along one side
         self._is_nadir, self._votes = self.camera == "nadir", self.matching == "displacement"
-        tells_height = self._is_nadir and self._votes  # the thesis's score does not say which of two heights is right
+        finds_height = self._is_nadir and self._votes  # the thesis's score does not tell two heights apart
         self.min_score, self.min_margin = _ACCEPT_LIMITS[self.camera if self._votes else "thesis"]
         self.min_quality = _MIN_QUALITY[self.entropy]
         self.candidates = _CANDIDATES[self.camera]
-        as_it_is = HEIGHT_RATIOS.index(1.0) * ROTATIONS
-        self._hypotheses = range(as_it_is, as_it_is + (ROTATIONS if self._is_nadir else 1))
-        if tells_height:
+        unchanged = HEIGHT_RATIOS.index(1.0) * ROTATIONS
+        self._hypotheses = range(unchanged, unchanged + (ROTATIONS if self._is_nadir else 1))
+        if finds_height:
             self._hypotheses = range(len(HEIGHT_RATIOS) * ROTATIONS)
         # Converts blocks, float32 (N, 4 bins), to the vectors of length 1 that `matching` compares.
         self._comparable: Callable[[Singles], Singles] = self._make_patterns if self._votes else normalise_rows
@@ -136,8 +136,8 @@ class CoHog:
             scan_counts=self._votes and not self._is_nadir,
             heading_within_deg=_MAX_HEADING_OFF_DEG if self._is_nadir else None,
             cells=self.w1 // self.w2 if self._votes else None,
-            looks_down=tells_height,
-            height_ratios=HEIGHT_RATIOS if tells_height else (),
+            looks_down=finds_height,
+            height_ratios=HEIGHT_RATIOS if finds_height else (),
             in_full=_MAX_FULL_MATCHES[self.camera] if self._votes else None,
         )
 
@@ -153,7 +153,7 @@ class CoHog:
                 f"{placecode.SIDE} regions of at least 2 pixels, at most 4096 pixels), bins 2 to 64."
             )
         if self.camera == "nadir" and bins != _NADIR_BINS:
-            raise UsageError(f"cohog looking down uses {_NADIR_BINS} bins, and not {bins}.")
+            raise UsageError(f"cohog with `camera` nadir uses {_NADIR_BINS} bins, not {bins}: leave `bins` out.")
         if self.gt > 1:
             raise UsageError(f"cohog: gt is {self.gt:g}; it is a share of the largest entropy, 0 to 1.")
 
@@ -218,9 +218,9 @@ class CoHog:
         if not self._is_nadir:
             views = self._make_views(query)
             mean_grid = np.zeros(1, np.float32) if mean is None else mean / 255
-            own = placecode.make_grid(views.make_blocks(1.0, 0)[0], views.seen, views.seen)
-            asked = placecode.make_hypotheses(*own, mean_grid)
-            return np.clip(placecode.scan_in_two_steps(asked, rows), 0, 1), None
+            grid = placecode.make_grid(views.make_blocks(1.0, 0)[0], views.seen, views.seen)
+            signs = placecode.make_hypotheses(*grid, mean_grid)
+            return np.clip(placecode.scan_in_two_steps(signs, rows), 0, 1), None
         ratio = find_nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)
         self._make_views(query).forget_other_heights(ratio)
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
@@ -262,9 +262,9 @@ class CoHog:
 
     def match_rotated(self, query: Descriptor, fine: Bytes, match: FineMatch) -> FineMatch:
         """See `Technique.match_rotated`."""
-        ratio, at_deg = find_nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0), match.rotation_deg or 0.0
+        ratio = find_nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0)
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
-        off_deg = np.abs(wrap_deg(360 * np.arange(ROTATIONS) / ROTATIONS - at_deg))
+        off_deg = np.abs(wrap_deg(360 * np.arange(ROTATIONS) / ROTATIONS - (match.rotation_deg or 0.0)))
         return self.match(query, fine, (first + np.flatnonzero(off_deg >= _MIN_ROTATED_DEG)).tolist())
 
     def measure_perspective(self, query: Descriptor, fine: Bytes, match: FineMatch) -> Perspective | None:
@@ -299,19 +299,19 @@ class CoHog:
     ) -> tuple[int, FineMatch, Ints]:
         """Compare a nadir query with a place under `hypotheses` (None: all). Returns the number of the one with the
         highest score, its match, and the most similar region of the place for each region of this view."""
-        tried, place = self._hypotheses if hypotheses is None else hypotheses, None
+        place = None
         if self._votes:
-            known = np.flatnonzero(reference.any(axis=1))
-            place = layout.make_field(layout.FINE, reference[known], known, (self._side, self._side))
+            numbers = np.flatnonzero(reference.any(axis=1))
+            place = layout.make_field(layout.FINE, reference[numbers], numbers, (self._side, self._side))
         matches, nearest = dict[int, FineMatch](), dict[int, Ints]()
-        for each in tried:
-            match, nearest[each] = self._match_view(self._make_view(query, each), reference)
+        for number in self._hypotheses if hypotheses is None else hypotheses:
+            match, nearest[number] = self._match_view(self._make_view(query, number), reference)
             if place is not None and match.shift_cells is not None:
                 shift = match.shift_cells[0] / self._side, match.shift_cells[1] / self._side
-                agrees = layout.compute_agreement(self._make_field(query, each, layout.FINE), place, shift)
-                match = replace(match, score=min(1.0, match.score * agrees / _FULL_LAYOUT_AGREEMENT))
-            matches[each] = match
-        best = max(matches, key=lambda each: matches[each].score)
+                agreement = layout.compute_agreement(self._make_field(query, number, layout.FINE), place, shift)
+                match = replace(match, score=min(1.0, match.score * agreement / _FULL_LAYOUT_AGREEMENT))
+            matches[number] = match
+        best = max(matches, key=lambda number: matches[number].score)
         ratio, turn = decode_hypothesis(best)
         scale = compute_scale(self._side + 1, ratio)
         return best, replace(matches[best], rotation_deg=360 * turn / ROTATIONS, height_ratio=scale), nearest[best]
@@ -320,8 +320,8 @@ class CoHog:
         """Lay a query over a place as `match` says (see `overlay`); `reference` are the regions of the place. Returns
         how well their structures agree, or with a nadir camera, how far this stands out."""
         views, cells = self._make_views(query), self._side + 1
-        known = reference.any(axis=1).reshape(self._side, self._side)
-        place = overlay.compute_structure(reference, known, _SURROUND_SD_CELLS[self.camera])
+        is_known = reference.any(axis=1).reshape(self._side, self._side)
+        place = overlay.compute_structure(reference, is_known, _SURROUND_SD_CELLS[self.camera])
         if self._is_nadir:
             laid = overlay.overlay_query(*views.halved, match, cells)
             return overlay.measure_prominence(
@@ -364,8 +364,8 @@ class CoHog:
         if query is not self._query or self._views is None:
             if query.regions is None or query.good is None or query.picture is None:
                 raise ValueError("a place that was read from a map is no query")
-            own = query.regions.reshape(self._side, self._side, -1), query.good.reshape(self._side, -1)
-            self._views = QueryViews(query.picture, own, self.w2, lambda *view: self._make_good_blocks(*view)[::2])
+            square = query.regions.reshape(self._side, self._side, -1), query.good.reshape(self._side, -1)
+            self._views = QueryViews(query.picture, square, self.w2, lambda *view: self._make_good_blocks(*view)[::2])
             self._query = query
         return self._views
 

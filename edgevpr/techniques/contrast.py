@@ -1,9 +1,9 @@
-"""Contrast of pictures taken in little light or in fog, for `cohog`.
+"""Stretches the contrast of pictures taken in low light or fog, for `cohog`.
 
 The entropy of dim ground is that of a blank wall. Such a picture is *stretched* to more grey levels, and smoothed
-before, since the sensor's noise grows with it; one with contrast enough, or with next to none, is not touched: noise
-must not pass for ground. All is rounded alike on every processor (see `gradients`): means of whole grey levels are
-exact, and products and sums are computed one by one."""
+before, since the stretch amplifies the sensor's noise. A picture with enough contrast, or with next to none, is left as
+it is: noise must not pass for ground. Results are rounded alike on every processor (see `gradients`): means of whole
+grey levels are exact, and products and sums are computed one by one."""
 
 import math
 
@@ -13,42 +13,47 @@ import numpy as np
 from edgevpr.core.arrays import Array, Mask, Singles
 from edgevpr.techniques.gradients import round_levels
 
-_BLOCKS_PER_SIDE = 64  # the contrast is that of the means of so many blocks along a side: they hold little of the noise
-_CLIPPED_SHARE = 0.01  # share of the blocks that may be darker than the range, and share that may be brighter
-# Least contrast of ground, in grey levels: this, or what noise of 3 levels has in means of few pixels.
+_BLOCKS_PER_SIDE = 64  # whose means give the contrast: they hold little of the noise
+_CLIPPED_SHARE = 0.01  # of the blocks, darker than the range, and brighter
+# Least contrast of ground, in grey levels: this, or that of noise of 3 levels in means of few pixels.
 _MIN_CONTRAST_LEVELS = 4.0
 _NOISE_LEVELS = 3 * 4.65  # between the hundredths of a normal distribution
-_MAX_SIGMA = 1.4
-_SMOOTHING_ROUNDS = 4  # of smoothing: fewer cannot reach that much
+_MAX_SIGMA_PIXELS = 1.4
+_SMOOTHING_ROUNDS = 4  # fewer cannot reach `_MAX_SIGMA_PIXELS`
 
 
 def stretch_contrast(
-    grey: Singles, allowed: Mask | None, pixel_px: tuple[float, float], kept: float, wanted: float, sigma_pixels: float
+    grey: Singles,
+    allowed: Mask | None,
+    pixel_px: tuple[float, float],
+    min_levels: float,
+    target_levels: float,
+    sigma_pixels: float,
 ) -> Singles:
-    """Return a square picture, stretched if its contrast is below `kept`: at half of it or less to `wanted`, which is
-    at most four times `kept`. For each doubling of the contrast it is blurred by a sigma of `sigma_pixels`, in pixels
-    of the picture as it came.
+    """Return a square picture, stretched if its contrast is below `min_levels`: at half of it or less to
+    `target_levels`, which is at most four times `min_levels`. For each doubling of the contrast it is blurred by
+    `sigma_pixels`, in pixels of the original picture.
 
     Contrast is the range of grey levels, without the darkest and the brightest hundredth, of the means of small blocks
     of pixels that are `allowed`, bool (side, side) (None: all). `grey` is float32 (side, side), 0 to 255; the same
-    array is returned where its contrast is enough or too low. `pixel_px`: width and height, in pixels of the square, of
-    a pixel of the picture as it came."""
+    array is returned if its contrast is enough or too low. `pixel_px`: width and height, in pixels of the square, of a
+    pixel of the original picture."""
     low, high = _find_range(grey, allowed)
-    found = high - low
-    of_noise = _NOISE_LEVELS * math.sqrt(pixel_px[0] * pixel_px[1]) * _BLOCKS_PER_SIDE / len(grey)
-    if not max(_MIN_CONTRAST_LEVELS, of_noise) <= found < kept:
+    range_levels = high - low
+    noise_levels = _NOISE_LEVELS * math.sqrt(pixel_px[0] * pixel_px[1]) * _BLOCKS_PER_SIDE / len(grey)
+    if not max(_MIN_CONTRAST_LEVELS, noise_levels) <= range_levels < min_levels:
         return grey
-    lacks = kept / found
-    gain = min(lacks * lacks * lacks, wanted / found)  # from 1 on: no jump
-    # Nothing of a bright display may bleed into the ground beside it.
+    ratio = min_levels / range_levels
+    gain = min(ratio * ratio * ratio, target_levels / range_levels)  # from 1 on: no jump
+    # A bright display must not bleed into the ground beside it.
     picture = grey.copy() if allowed is None else np.where(allowed, grey, np.float32((low + high) / 2))
-    sigma = min(_MAX_SIGMA, sigma_pixels * math.log2(gain))
-    across, down = (min(max(1, round(each)), len(grey) // 4) for each in pixel_px)
+    sigma = min(_MAX_SIGMA_PIXELS, sigma_pixels * math.log2(gain))
+    across, down = (min(max(1, round(pixels)), len(grey) // 4) for pixels in pixel_px)
     _smooth_rows(picture, sigma, across)
     _smooth_rows(picture.T, sigma, down)
     picture -= np.float32(low)
     picture *= np.float32(gain)
-    picture += np.float32(min(low, 255 - wanted))
+    picture += np.float32(min(low, 255 - target_levels))
     clipped: Singles = np.clip(picture, 0, 255, out=picture)
     return clipped
 

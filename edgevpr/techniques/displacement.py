@@ -1,9 +1,9 @@
 """The displacement vote of `cohog`: regions that show the same place have all moved by the same shift.
 
-Every good region of the query finds its most similar region of the place, the *reference*. The shift between the two,
-in cells, is its vote. If the place is the same, the votes pile up on one shift. The regions of a picture of another
-kind (a test card) may all resemble the same few of the place, so the different regions that the agreeing votes lead to
-are counted as well. Regions are numbered row by row."""
+Every good region of the query has a most similar region in the place, the *reference*. The shift between the two, in
+cells, is its vote. If the place is the same, the votes pile up on one shift. The regions of a picture of another kind
+(a test card) may all resemble the same few of the place, so the different regions among the agreeing votes are counted
+as well. Regions are numbered row by row."""
 
 import math
 from dataclasses import replace
@@ -17,9 +17,9 @@ from edgevpr.core.contract import FineMatch, Support
 from edgevpr.core.geodesy import fit_similarity
 from edgevpr.techniques.views import ViewRegions
 
-_SHIFT_SPREAD_CELLS = 3  # cells by which the shifts of near and far ground differ, where the camera looks ahead
-_RANK_STEP = 4  # one of so many regions is ranked: ranks cost more than all the rest
-_REGIONS_PER_PRODUCT = 256  # regions compared with all of a place: their likeness, a megabyte, stays in the cache
+_SHIFT_SPREAD_CELLS = 3  # between near and far ground, if the camera looks ahead
+_RANK_STEP = 4  # every fourth region is ranked: ranks cost more than all the rest
+_REGIONS_PER_PRODUCT = 256  # compared with all of a place: their similarities, a megabyte, stay in the cache
 _FIT_ROUNDS = 8
 _MAX_RESIDUAL_CELLS = 1.5  # largest distance of an agreeing region from the fit
 # Beyond these another hypothesis is nearer, or the pairs are of different places.
@@ -29,22 +29,23 @@ _MIN_PAIRS = 8
 _Grid = tuple[Ints, int]  # numbers of regions, row by row, and the regions along one side
 
 
-def find_displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> FineMatch:
-    """Find the shift on which most regions agree. `asking` and `best` are int (G,): the good regions of the query, and
-    for each the most similar region of the reference. `sides` are the regions along one side of the query's grid and of
-    the reference's, both even or both odd. A shift is counted from the middle of one grid to that of the other.
+def find_displacement(numbers: Ints, nearest: Ints, sides: tuple[int, int], weights: tuple[float, ...]) -> FineMatch:
+    """Find the shift on which most regions agree. `numbers` and `nearest` are int (G,): the good regions of the query,
+    and for each the most similar region of the reference. `sides` are the regions along one side of the query's grid
+    and of the reference's, both even or both odd. A shift is counted from the middle of one grid to that of the other.
 
-    A vote that is n cells off a shift, along rows or columns, has the weight `counts[n]`; one further off has none. The
-    peak is the shift with the largest sum of weights. The score is its share of all votes, 0 without any region.
+    A vote that is n cells off a shift, along rows or columns, has the weight `weights[n]`; one further off has none.
+    The peak is the shift with the largest sum of weights. The score is its share of all votes, 0 without any region.
     """
-    if not len(asking):
+    if not len(numbers):
         return FineMatch(0.0, shift_cells=(0.0, 0.0), covariance_cells2=(0.0, 0.0, 0.0), coverage=0.0)
-    room = len(counts) - 1
-    step, votes, around = _count_votes(asking, best, sides, counts)
+    room = len(weights) - 1
+    step, votes, around = _count_votes(numbers, nearest, sides, weights)
     wide = len(votes)
-    weights = _make_peak_weights(counts)
+    peak_weights = _make_peak_weights(weights)
     peak_y, peak_x = divmod(int(around.argmax()), around.shape[1])
-    agreeing = votes[peak_y : peak_y + len(weights), peak_x : peak_x + len(weights)] * weights
+    size = len(peak_weights)
+    agreeing = votes[peak_y : peak_y + size, peak_x : peak_x + size] * peak_weights
     count = float(agreeing.sum())
     shares_x, shares_y = agreeing.sum(axis=0) / count, agreeing.sum(axis=1) / count
     off = np.arange(-room, room + 1)
@@ -57,60 +58,61 @@ def find_displacement(asking: Ints, best: Ints, sides: tuple[int, int], counts: 
     )
     none = sum(sides) // 2 - 1  # the index of a shift of 0, along one side
     near = np.zeros((wide, wide), bool)
-    near[peak_y : peak_y + len(weights), peak_x : peak_x + len(weights)] = True
+    near[peak_y : peak_y + size, peak_x : peak_x + size] = True
     agreed = np.zeros(sides[1] ** 2, bool)
-    agreed[best[near.ravel().take(step)]] = True
+    agreed[nearest[near.ravel().take(step)]] = True
     return FineMatch(
-        count / len(asking),
+        count / len(numbers),
         shift_cells=(peak_x - none + mean_x, peak_y - none + mean_y),
         covariance_cells2=covariance,
         coverage=np.count_nonzero(agreed) / len(agreed),
     )
 
 
-def compute_vote_share(asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]) -> float:
+def compute_vote_share(numbers: Ints, nearest: Ints, sides: tuple[int, int], weights: tuple[float, ...]) -> float:
     """Return only the score of `find_displacement` for these arguments, in half the time."""
-    return float(_count_votes(asking, best, sides, counts)[2].max()) / len(asking) if len(asking) else 0.0
+    return float(_count_votes(numbers, nearest, sides, weights)[2].max()) / len(numbers) if len(numbers) else 0.0
 
 
 def find_most_similar(regions: Singles, reference: Singles) -> Ints:
     """Return the number of the most similar region of a place, whose regions are `reference` (N, P), for each of
     `regions` (G, P): int (G,)."""
-    best = np.empty(len(regions), np.intp)
+    nearest = np.empty(len(regions), np.intp)
     for first in range(0, len(regions), _REGIONS_PER_PRODUCT):
-        some = slice(first, first + _REGIONS_PER_PRODUCT)
-        best[some] = (regions[some] @ reference.T).argmax(axis=1)
-    return best
+        block = slice(first, first + _REGIONS_PER_PRODUCT)
+        nearest[block] = (regions[block] @ reference.T).argmax(axis=1)
+    return nearest
 
 
 def match_view(
-    view: ViewRegions, reference: Singles, counts: tuple[float, ...], with_support: bool
+    view: ViewRegions, reference: Singles, weights: tuple[float, ...], with_support: bool
 ) -> tuple[FineMatch, Ints]:
-    """Match a view of the query with a place, whose regions are `reference` float32 (side * side, P), by vote. `counts`
-    is that of `find_displacement`, and `with_support` tells whether the match gets its `support`. Returns the match,
-    and the number of the most similar region of the place for each region of the view, int (G,)."""
-    best = find_most_similar(view.regions, reference)
-    found = find_displacement(view.numbers, best, (view.side, math.isqrt(len(reference))), counts)
-    asks_all = with_support and len(best)
-    backed = measure_support(view.numbers, view.regions, reference, best, found.shift_cells) if asks_all else None
-    return replace(found, score=min(1.0, found.score * view.factor), support=backed), best
+    """Match a view of the query with a place, whose regions are `reference` float32 (side * side, P), by vote.
+    `weights` is that of `find_displacement`, and `with_support` tells whether the match gets its `support`. Returns the
+    match, and the number of the most similar region of the place for each region of the view, int (G,)."""
+    nearest = find_most_similar(view.regions, reference)
+    match = find_displacement(view.numbers, nearest, (view.side, math.isqrt(len(reference))), weights)
+    if with_support and len(nearest):
+        support = measure_support(view.numbers, view.regions, reference, nearest, match.shift_cells)
+        match = replace(match, support=support)
+    return replace(match, score=min(1.0, match.score * view.factor)), nearest
 
 
 def measure_support(
-    asking: Ints, regions: Singles, reference: Singles, best: Ints, shift_cells: tuple[float, float] | None
+    numbers: Ints, regions: Singles, reference: Singles, nearest: Ints, shift_cells: tuple[float, float] | None
 ) -> Support:
-    """Measure how all regions of query and place support the shift that a vote has found. `asking` int (G,) and
+    """Measure how all regions of query and place support the shift that a vote has found. `numbers` int (G,) and
     `regions` float32 (G, P) are the numbers and vectors of the query's good regions. `reference` float32 (side * side,
-    P) are all regions of the place, `best` int (G,) the most similar of them for each. The grids have one size."""
+    P) are all regions of the place, `nearest` int (G,) the most similar of them for each. The grids have one size."""
     side = math.isqrt(len(reference))
     back = (reference @ regions.T).argmax(axis=1)
-    of_y, of_x = np.divmod(asking, side)
+    of_y, of_x = np.divmod(numbers, side)
     step_x, step_y = (round(step) for step in shift_cells or (0.0, 0.0))
     y, x = np.divmod(np.arange(len(reference)), side)
     off = np.maximum(abs(x - of_x[back] - step_x), abs(y - of_y[back] - step_y))
     return Support(
         back=float((off <= _SHIFT_SPREAD_CELLS).mean()),
-        likeness=float(np.einsum("ij,ij->i", regions, reference[best]).mean()),
+        likeness=float(np.einsum("ij,ij->i", regions, reference[nearest]).mean()),
         log_rank=_compute_log_rank(
             regions[::_RANK_STEP], reference, of_x[::_RANK_STEP] + step_x, of_y[::_RANK_STEP] + step_y, side
         ),
@@ -124,30 +126,30 @@ def _compute_log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, si
     rows = np.flatnonzero((x >= 0) & (x < side) & (y >= 0) & (y < side))
     if not len(rows):
         return math.log(len(reference))
-    alike = regions[rows] @ reference.T
-    there = np.full(len(rows), -np.inf, np.float32)
+    similarities = regions[rows] @ reference.T
+    local = np.full(len(rows), -np.inf, np.float32)
     for off_y in (-1, 0, 1):
         for off_x in (-1, 0, 1):
             near = np.clip(y[rows] + off_y, 0, side - 1) * side + np.clip(x[rows] + off_x, 0, side - 1)
-            np.maximum(there, alike[np.arange(len(rows)), near], out=there)
-    return float(np.log(1 + np.count_nonzero(alike > there[:, None], axis=1)).mean())
+            np.maximum(local, similarities[np.arange(len(rows)), near], out=local)
+    return float(np.log(1 + np.count_nonzero(similarities > local[:, None], axis=1)).mean())
 
 
 def _count_votes(
-    asking: Ints, best: Ints, sides: tuple[int, int], counts: tuple[float, ...]
+    numbers: Ints, nearest: Ints, sides: tuple[int, int], weights: tuple[float, ...]
 ) -> tuple[Ints, Singles, Array]:
     """Count the votes for each shift; for the arguments see `find_displacement`. Returns the number of the shift that
     each region votes for, int (G,); the number of votes for each shift, on a grid with a border, float32 (n, n); and
     the weighted sum of the votes around each shift, on a grid without this border."""
     # Both are numbered on a grid as wide as there are shifts, so that their difference is the number of the shift. A
     # border around the possible shifts leaves room for the square around the peak.
-    room = len(counts) - 1
+    room = len(weights) - 1
     of_query, of_reference = sides
     wide = of_query + of_reference - 1 + 2 * room
     first = (of_query - 1 + room) * (wide + 1)
-    step = _number_regions(of_reference, wide)[best] - _number_regions(of_query, wide)[asking] + first
+    step = _number_regions(of_reference, wide)[nearest] - _number_regions(of_query, wide)[numbers] + first
     votes = np.bincount(step, minlength=wide * wide).reshape(wide, wide).astype(np.float32)
-    around = cv2.filter2D(votes, -1, _make_peak_weights(counts), borderType=cv2.BORDER_CONSTANT)
+    around = cv2.filter2D(votes, -1, _make_peak_weights(weights), borderType=cv2.BORDER_CONSTANT)
     return step, votes, around[room : wide - room, room : wide - room]
 
 
@@ -158,37 +160,35 @@ def _number_regions(side: int, wide: int) -> Ints:
 
 
 @lru_cache
-def _make_peak_weights(counts: tuple[float, ...]) -> Singles:
+def _make_peak_weights(weights: tuple[float, ...]) -> Singles:
     """Return the weights of the votes for the shifts around a peak, with the peak in the middle: float32 (2 n - 1, 2 n
-    - 1) for n `counts`, see `find_displacement`."""
-    off = np.abs(np.arange(1 - len(counts), len(counts)))
-    return np.array(counts, np.float32)[np.maximum.outer(off, off)]
+    - 1) for n `weights`, see `find_displacement`."""
+    off = np.abs(np.arange(1 - len(weights), len(weights)))
+    return np.array(weights, np.float32)[np.maximum.outer(off, off)]
 
 
-def fit_alignment(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
-    """Fit a shift, a rotation and a scale, by least squares, to pairs of a region of the query and its most similar
-    region of the place. `asking` and `best` each hold the numbers of these regions, int (G,), and the side of their
-    grid. The fit is repeated, each time with the pairs that agree with the last one, at first with the shift of the
-    `match`.
+def fit_alignment(query: _Grid, place: _Grid, match: FineMatch) -> FineMatch:
+    """Fit a shift, a rotation and a scale, by least squares, to pairs of a region of the `query` and its most similar
+    region of the `place`: the numbers of these regions, int (G,), and the side of their grid. The fit is repeated, each
+    time with the pairs that agree with the last one, at first with the shift of the `match`.
 
-    Returns the match with the exact position: turned and scaled, the query's picture lies with its middle at the shift
-    from that of the place's. The covariance is that of the distances by which single regions miss. Returns the match as
-    it is if fewer than 8 pairs agree, or if the rotation or scale found belongs to another hypothesis."""
-    mine, there = locate_regions(*asking), locate_regions(*best)
-    turned, shift = 1 + 0j, complex(*(match.shift_cells or (0.0, 0.0)))
+    Returns the match with the exact position; the covariance is that of the residuals of single regions. Returns the
+    match as it is if fewer than 8 pairs agree, or if the rotation or scale belongs to another hypothesis."""
+    points, targets = locate_regions(*query), locate_regions(*place)
+    rotation, shift = 1 + 0j, complex(*(match.shift_cells or (0.0, 0.0)))
     for again in range(_FIT_ROUNDS + 1):
-        off = there - turned * mine - shift
+        off = targets - rotation * points - shift
         near = np.maximum(abs(off.real), abs(off.imag)) <= _MAX_RESIDUAL_CELLS
         if np.count_nonzero(near) < _MIN_PAIRS:
             return match
         if again == _FIT_ROUNDS:
             break
-        if np.ptp(mine[near].real) == np.ptp(mine[near].imag) == 0:
+        if np.ptp(points[near].real) == np.ptp(points[near].imag) == 0:
             return match  # one point has no rotation
-        turned, shift = fit_similarity(mine[near], there[near])
-        if not 1 / _MAX_SCALE < abs(turned) < _MAX_SCALE:
+        rotation, shift = fit_similarity(points[near], targets[near])
+        if not 1 / _MAX_SCALE < abs(rotation) < _MAX_SCALE:
             return match
-        if abs(np.angle(turned, deg=True)) > _MAX_ROTATION_DEG:
+        if abs(np.angle(rotation, deg=True)) > _MAX_ROTATION_DEG:
             return match
     x, y = off[near].real, off[near].imag
     # A region is matched to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
@@ -197,8 +197,8 @@ def fit_alignment(asking: _Grid, best: _Grid, match: FineMatch) -> FineMatch:
         match,
         shift_cells=(float(shift.real), float(shift.imag)),
         covariance_cells2=covariance,
-        rotation_deg=((match.rotation_deg or 0.0) + float(np.angle(turned, deg=True))) % 360,
-        height_ratio=(match.height_ratio or 1.0) * float(abs(turned)),
+        rotation_deg=((match.rotation_deg or 0.0) + float(np.angle(rotation, deg=True))) % 360,
+        height_ratio=(match.height_ratio or 1.0) * float(abs(rotation)),
     )
 
 

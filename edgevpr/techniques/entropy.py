@@ -45,8 +45,9 @@ def compute_shannon(grey: Bytes) -> Array:
 def average_blocks(per_pixel: Array, cell_px: int) -> Array:
     """Average values of pixels over every block of 2x2 cells of `cell_px` pixels. The blocks start one cell apart:
     float32 (H, W) to (H/cell_px - 1, W/cell_px - 1)."""
-    cell = _cell_means(per_pixel, cell_px)
-    means: Array = (cell[:-1, :-1] + cell[:-1, 1:] + cell[1:, :-1] + cell[1:, 1:]) / 4
+    height, width = per_pixel.shape
+    cells = cv2.resize(per_pixel, (width // cell_px, height // cell_px), interpolation=cv2.INTER_AREA)
+    means: Array = (cells[:-1, :-1] + cells[:-1, 1:] + cells[1:, :-1] + cells[1:, 1:]) / 4
     return means
 
 
@@ -55,8 +56,8 @@ def find_good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, am
     entropy: "filled_bins" or "shannon". `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool
     (H/cell_px - 1, W/cell_px - 1), False where `among`, bool of this shape, is False (True: consider all).
 
-    Of the Shannon entropy, cheap bounds decide nearly every block, and it is computed only at the pixels that the
-    others depend on. The result is that of the whole map."""
+    Cheap bounds of the Shannon entropy decide nearly every block; it is computed only at the pixels that the others
+    depend on. The result is that of the whole map."""
     if which == "filled_bins":
         return (average_blocks(compute_filled_bins(grey), cell_px) >= threshold) & among
     small = _make_shannon_copy(grey)
@@ -76,11 +77,6 @@ def find_good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, am
         if (np.abs(means(entropy)[undecided] - threshold) < _MAX_ROUNDING).any():
             return (average_blocks(compute_shannon(grey), cell_px) >= threshold) & among
     return (means(entropy) >= threshold) & among
-
-
-def _cell_means(per_pixel: Array, cell_px: int) -> Array:
-    height, width = per_pixel.shape
-    return cv2.resize(per_pixel, (width // cell_px, height // cell_px), interpolation=cv2.INTER_AREA)
 
 
 def _make_shannon_copy(grey: Bytes) -> Array:
@@ -118,15 +114,15 @@ def _count_different(padded: Array) -> Array:
 def _compute_shannon_map(small: Array) -> Singles:
     """Compute the Shannon entropy of the disc of every pixel, in bits over 8: uint8 (H, W) to float32 (H, W)."""
     padded = np.pad(small.astype(np.int16), DISC_RADIUS_PX, constant_values=-1)  # -1: outside, no intensity
-    of_counts = np.zeros(small.shape, np.float32)
+    sums = np.zeros(small.shape, np.float32)
     present = np.flatnonzero(np.bincount(small.ravel()))[:, None, None]
     for start in range(0, len(present), _STRIP_INTENSITIES):
         one_hot = (padded == present[start : start + _STRIP_INTENSITIES]).view(np.uint8)
         counts = _combine_over_disc(one_hot, np.add)
-        of_counts += _COUNT_LOG2.take(counts).sum(axis=0)
+        sums += _COUNT_LOG2.take(counts).sum(axis=0)
     in_disc = _combine_over_disc((padded >= 0).view(np.uint8), np.add)
     # -sum p log2 p with p = c/n is log2 n - (sum c log2 c)/n.
-    entropy: Singles = (_COUNT_LOG2[in_disc] - of_counts) / in_disc / 8
+    entropy: Singles = (_COUNT_LOG2[in_disc] - sums) / in_disc / 8
     return entropy
 
 
@@ -145,8 +141,8 @@ def _compute_shannon_pixels(small: Bytes, pixels: Bools) -> Singles:
         bins = padded.take(strip + disc) + 257 * np.arange(len(strip))[:, None]
         counts = np.bincount(bins.ravel(), minlength=257 * len(strip)).reshape(-1, 257)[:, :256]
         in_disc = counts.sum(axis=1)
-        of_counts = _COUNT_LOG2.take(counts).sum(axis=1)
-        entropy[start : start + _STRIP_PIXELS] = (_COUNT_LOG2[in_disc] - of_counts) / in_disc / 8
+        sums = _COUNT_LOG2.take(counts).sum(axis=1)
+        entropy[start : start + _STRIP_PIXELS] = (_COUNT_LOG2[in_disc] - sums) / in_disc / 8
     return entropy
 
 

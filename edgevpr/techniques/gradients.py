@@ -102,10 +102,10 @@ def orient_cells(grey: Array, cell_px: int, bins: int, signed: bool, allowed: Ma
 def _sum_angles(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) -> Array:
     """Sum the gradients `dx` and `dy`, float32 (H, W), by cell and orientation: float (H/cell_px, W/cell_px, bins)."""
     magnitude, _ = _compute_magnitude(dx, dy)
-    at = np.arctan2(dy, dx)
-    at *= np.float32(bins / (2 * np.pi if signed else np.pi))  # in bins; whole numbers are the centres of orientations
-    low = np.floor(at)
-    to_high = at - low
+    angle = np.arctan2(dy, dx)
+    angle *= np.float32(bins / (2 * np.pi if signed else np.pi))  # in bins; whole numbers are centres of orientations
+    low = np.floor(angle)
+    to_high = angle - low
     low = low.astype(np.intp) % bins
     high = (low + 1) % bins
 
@@ -148,10 +148,10 @@ def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
     sums = np.empty((8, height // cell_px, width), np.float32)
     flipped = size_g.view(np.uint32)
 
-    def add_up(at: int, plane: Singles, flip: Array | None = None) -> None:
+    def add_up(row: int, plane: Singles, flip: Array | None = None) -> None:
         if flip is not None:
             plane = np.bitwise_xor(plane.view(np.uint32), flip, out=flipped).view(np.float32)
-        np.add.reduce(plane.reshape(-1, cell_px, width), axis=1, out=sums[at])
+        np.add.reduce(plane.reshape(-1, cell_px, width), axis=1, out=sums[row])
 
     add_up(0, twice_x)
     add_up(1, twice_x, sign_x)
@@ -161,8 +161,8 @@ def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
     add_up(5, diagonal, sign_x)
     add_up(6, diagonal, sign_y)
     add_up(7, diagonal, sign_x ^ sign_y)
-    of_cells = np.add.reduce(sums.reshape(8, 1, -1, cell_px), axis=3)
-    votes = np.add.reduce(of_cells * _ORIENTATIONS[:, :, None], axis=0)
+    cell_sums = np.add.reduce(sums.reshape(8, 1, -1, cell_px), axis=3)
+    votes = np.add.reduce(cell_sums * _ORIENTATIONS[:, :, None], axis=0)
     oriented: Singles = np.maximum(votes, 0, out=votes).T.reshape(height // cell_px, width // cell_px, 8)
     return oriented
 
@@ -202,8 +202,8 @@ def make_slow_patterns(bins: int) -> Singles:
         [
             np.kron(np.array(cells) / 2, wave)
             for cells, kept in _PATTERN_WAVES
-            for at, wave in zip(frequency, make_waves(bins), strict=True)
-            if kept is None or at in kept
+            for periods, wave in zip(frequency, make_waves(bins), strict=True)
+            if kept is None or periods in kept
         ]
     ).T.astype(np.float32, order="C")
 

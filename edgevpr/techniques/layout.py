@@ -1,11 +1,10 @@
 """The coarse stage of `cohog` for a camera that looks straight down: a place is the *layout* of its structures.
 
-The patterns of a picture's good regions (see `make_slow_patterns`) are averaged in the cells of a square grid, less
-what the cells around have in common. A query is laid over a place under each of 24 rotations, 15 degrees apart, and
-every shift by whole cells under which enough of the place is covered. The score is the correlation of the two fields
-where they overlap, over what two independent fields of that strength would scatter by. All places are compared by a
-coarse grid, under every second rotation, and only the best pairs of a place and a rotation by a fine one. A place keeps
-both in RAM, in 4 bits a number."""
+The patterns of a picture's good regions (see `make_slow_patterns`) are averaged in the cells of a square grid, less the
+mean of the surroundings. A query is laid over a place under each of 24 rotations, 15 degrees apart, and every shift by
+whole cells that covers enough of the place. The score is the correlation of the two fields where they overlap, over the
+scatter of independent fields of that strength. All places are compared by a coarse grid, under every second rotation,
+and only the best pairs of a place and a rotation by a fine one. A place keeps both in RAM, in 4 bits a number."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,33 +18,33 @@ from edgevpr.core.arrays import Array, Bools, Bytes, Doubles, Ints, Singles
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A grid of `side` x `side` cells over a place, and the numbers of the `channels`, those of the patterns that are
-    averaged: the ones that vary most from cell to cell."""
+    """A grid of `side` x `side` cells over a place. `channels`: numbers of the patterns that are averaged, those that
+    vary most from cell to cell."""
 
     side: int
     channels: tuple[int, ...]
 
     @property
-    def numbers(self) -> int:
-        """The number of numbers in the field of a place."""
+    def size(self) -> int:
+        """The number of values in the field of a place."""
         return self.side**2 * len(self.channels)
 
 
 COARSE = Grid(8, (0, 1, 2, 3, 4, 7, 8, 13))
 FINE = Grid(12, (0, 1, 2, 3, 4, 7, 8, 9, 12, 13, 15, 17))
-PLACE_BYTES = (COARSE.numbers + FINE.numbers) // 2  # of a place
+PLACE_BYTES = (COARSE.size + FINE.size) // 2  # of a place
 ROTATIONS = 24
-_SURROUND_SD = 0.25  # standard deviation of what counts as around a cell, as a share of the place's side
-_MIN_SEEN_SHARE = 0.1  # share of a cell that good regions must cover
+_SURROUND_SD = 0.25  # standard deviation of the surroundings of a cell, as a share of the place's side
+_MIN_SEEN_SHARE = 0.1  # of a cell that good regions must cover
 _MIN_STRENGTH = 0.01  # of a cell; weaker ones are noise
 _MAX_LEVEL = 7  # of a stored number, on either side of 0
 _LEVEL_PERCENTILE = 99  # percentile of a place's numbers that becomes the highest level
 _MIN_OVERLAP = {8: 0.5, 12: 0.35}  # share of the place that the query covers, by the side of the grid
 _MIN_LARGER_OVERLAP = {8: 1.0, 12: 0.75}  # the same, for a query that shows more ground than a place
-_MIN_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
+_MIN_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to count
 # Pairs of a place and a rotation that are compared by the fine grid, if headings are known for all places, and if not.
 _FINE_PAIRS = (1000, 2000)
-_RIVAL_PLACES = 2048  # unlikely places that are scored
+_RIVAL_PLACES = 2048  # out of reach that are scored
 _ROWS_PER_PRODUCT = 256
 _TINY = 1e-9
 
@@ -63,18 +62,19 @@ def make_field(grid: Grid, patterns: Array, numbers: Ints, sides: tuple[int, int
     (G,), row by row of `sides[0]` x `sides[0]` regions; a place has `sides[1]` along a side, and the same middle.
     Returns the field (C, m, m) of C channels. m is `grid.side` or, for a picture of more ground, larger by an even
     number."""
-    side, of_place = sides
+    side, place_side = sides
     whole = np.zeros((side * side, len(grid.channels) + 1), patterns.dtype)
     whole[numbers, :-1] = patterns[:, grid.channels]
     whole[numbers, -1] = 1
-    pooled = _apply_weights(_make_pooling(side, of_place, grid.side), whole.reshape(side, side, -1).transpose(2, 0, 1))
+    pooling = _make_pooling(side, place_side, grid.side)
+    pooled = _apply_weights(pooling, whole.reshape(side, side, -1).transpose(2, 0, 1))
     values, weight = pooled[:-1], pooled[-1]
     values = values - weight * (values.sum(axis=(1, 2)) / max(float(weight.sum()), _TINY))[:, None, None]
     near = _make_distance_weights(len(weight), _SURROUND_SD * grid.side)
     values -= weight * _apply_weights(near, values) / np.maximum(_apply_weights(near, weight), _TINY)
     values /= np.sqrt(np.maximum(np.sqrt((values**2).sum(axis=0)), _MIN_STRENGTH))
-    laid: Array = values * (weight > _MIN_SEEN_SHARE)
-    return laid
+    field: Array = values * (weight > _MIN_SEEN_SHARE)
+    return field
 
 
 def encode_place(patterns: Array, good: Bools, side: int) -> Bytes:
@@ -101,32 +101,32 @@ def scan_places(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely:
     1. Of the places that are not likely some two thousand are scored, evenly chosen, as rivals."""
     scores = np.full((len(rows), ROTATIONS), -np.inf, np.float32)
     if likely is not None and (step := np.count_nonzero(~likely) // _RIVAL_PLACES) > 1:
-        some = likely.copy()
-        some[np.flatnonzero(~likely)[::step]] = True
-        of_some = None if turned_deg is None else turned_deg[some]
-        scores[some] = scan_places(fields, rows[some], of_some, likely[some])
+        sample = likely.copy()
+        sample[np.flatnonzero(~likely)[::step]] = True
+        sample_deg = None if turned_deg is None else turned_deg[sample]
+        scores[sample] = scan_places(fields, rows[sample], sample_deg, likely[sample])
         return scores
     turns = np.full(len(rows), -1)
     if turned_deg is not None:
         turns = np.nan_to_num(np.rint(turned_deg * (ROTATIONS / 360)) % ROTATIONS, nan=-1).astype(np.intp)
-    of_coarse = rows[:, : COARSE.numbers // 2]
+    coarse = rows[:, : COARSE.size // 2]
     for turn in np.unique(turns):
         group = slice(None) if turned_deg is None else np.flatnonzero(turns == turn)
         tried = np.arange(0, ROTATIONS, 2) if turn < 0 else np.arange(turn - 1, turn + 2) % ROTATIONS
-        found = _compare_fields(COARSE, [fields(int(each), COARSE) for each in tried], of_coarse[group])
+        pairs = _compare_fields(COARSE, [fields(int(number), COARSE) for number in tried], coarse[group])
         if turn < 0:
-            found = np.stack([found, (found + np.roll(found, -1, axis=1)) / 2], axis=2).reshape(len(found), -1)
+            pairs = np.stack([pairs, (pairs + np.roll(pairs, -1, axis=1)) / 2], axis=2).reshape(len(pairs), -1)
             tried = np.arange(ROTATIONS)
-        scores[np.arange(len(rows))[group][:, None], tried] = found
+        scores[np.arange(len(rows))[group][:, None], tried] = pairs
     scores -= 1
     chances = scores if likely is None else np.where(likely[:, None], scores, -np.inf)
     count = min(_FINE_PAIRS[int(turns.min() < 0)], chances.size)
     best = np.argpartition(-chances, count - 1, axis=None)[:count]
-    slots, turned = np.divmod(best[np.isfinite(chances.flat[best])], ROTATIONS)
-    for turn in np.unique(turned):
-        there = np.sort(slots[turned == turn])
-        found = _compare_fields(FINE, [fields(int(turn), FINE)], rows[there, COARSE.numbers // 2 :])
-        scores[there, turn] = np.clip(found[:, 0], 0, 1)
+    slots, best_turns = np.divmod(best[np.isfinite(chances.flat[best])], ROTATIONS)
+    for turn in np.unique(best_turns):
+        best_slots = np.sort(slots[best_turns == turn])
+        pairs = _compare_fields(FINE, [fields(int(turn), FINE)], rows[best_slots, COARSE.size // 2 :])
+        scores[best_slots, turn] = np.clip(pairs[:, 0], 0, 1)
     return scores
 
 
@@ -135,42 +135,42 @@ def compute_agreement(query: Array, place: Array, shift: tuple[float, float]) ->
     n), if the query's middle lies `shift` (dx, dy) from the place's, as shares of the place's side, or up to a cell
     off."""
     n = place.shape[1]
-    dx, dy = (round(each * n) for each in shift)
+    dx, dy = (round(share * n) for share in shift)
     padded = _pad_field(query, n)
     first = (padded.shape[1] - n) // 2
     steps = [(first - dy - y, first - dx - x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
     inside = [(y, x) for y, x in steps if 0 <= y <= padded.shape[1] - n and 0 <= x <= padded.shape[1] - n]
     if not inside:
         return 0.0
-    laid = np.stack([padded[:, y : y + n, x : x + n] for y, x in inside])
-    of_place = (place**2).sum(axis=0)
-    scatter = ((laid**2).sum(axis=1) * of_place).sum(axis=(1, 2))
-    scatter = np.maximum(scatter, _MIN_SCATTER**2 * _measure_strength(query) * of_place.sum())
-    found = np.einsum("scij,cij->s", laid, place) / (np.sqrt(scatter + _TINY) * n)
-    return float(np.clip(found.max(), 0, 1))
+    shifted = np.stack([padded[:, y : y + n, x : x + n] for y, x in inside])
+    strength = (place**2).sum(axis=0)
+    scatter = ((shifted**2).sum(axis=1) * strength).sum(axis=(1, 2))
+    scatter = np.maximum(scatter, _MIN_SCATTER**2 * _measure_strength(query) * strength.sum())
+    scores = np.einsum("scij,cij->s", shifted, place) / (np.sqrt(scatter + _TINY) * n)
+    return float(np.clip(scores.max(), 0, 1))
 
 
 def _compare_fields(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
     """Compare R fields of the query with N places, uint8 (N, B): the best score over all shifts, float32 (N, R). The
     scatter is estimated from the query's cells that lie on the place, and the mean strength of the place's."""
-    laid = [_shift_field(each, grid.side) for each in queries]
-    asked = np.concatenate(laid) if len(laid) > 1 else laid[0]  # a megabyte: no copy that is not needed
-    strengths = [(each**2).sum(axis=0, keepdims=True) for each in queries]
-    scatter = np.concatenate([_shift_field(each, grid.side).sum(axis=1) for each in strengths])
-    least = [_MIN_SCATTER**2 * float(each.mean()) * grid.side**2 for each in strengths]
-    asked /= np.sqrt(np.maximum(scatter, np.repeat(least, [len(each) for each in laid])) + _TINY)[:, None]
+    shifted = [_shift_field(query, grid.side) for query in queries]
+    fields = np.concatenate(shifted) if len(shifted) > 1 else shifted[0]  # a megabyte: no needless copy
+    strengths = [(query**2).sum(axis=0, keepdims=True) for query in queries]
+    scatter = np.concatenate([_shift_field(strength, grid.side).sum(axis=1) for strength in strengths])
+    least = [_MIN_SCATTER**2 * float(strength.mean()) * grid.side**2 for strength in strengths]
+    fields /= np.sqrt(np.maximum(scatter, np.repeat(least, [len(query) for query in shifted])) + _TINY)[:, None]
     best = np.empty((len(packed), len(queries)), np.float32)
-    was, kept = None, asked
+    last_filled, kept = None, fields
     for start in range(0, len(packed), _ROWS_PER_PRODUCT):
         part = packed[start : start + _ROWS_PER_PRODUCT]
         # Wide pictures leave the same cells of every place empty.
         filled = (part != _EMPTY_BYTE).any(axis=0)
-        if was is None or (filled != was).any():
-            was, kept = filled, asked.compress(np.repeat(filled, 2), axis=1)
+        if last_filled is None or (filled != last_filled).any():
+            last_filled, kept = filled, fields.compress(np.repeat(filled, 2), axis=1)
         places = np.take(_BYTE_NUMBERS, part[:, filled], axis=0).reshape(len(part), -1)
-        found = (kept @ places.T).reshape(len(queries), -1, len(part)).max(axis=1)
+        scores = (kept @ places.T).reshape(len(queries), -1, len(part)).max(axis=1)
         strength = np.einsum("nd,nd->n", places, places)
-        best[start : start + len(part)] = (found / np.sqrt(strength + _TINY)).T
+        best[start : start + len(part)] = (scores / np.sqrt(strength + _TINY)).T
     return best
 
 
@@ -180,7 +180,7 @@ def _measure_strength(field: Array) -> float:
 
 
 def _pad_field(query: Array, n: int) -> Array:
-    """Put `n` empty cells around a field (C, m, m). It is `np.pad` in a tenth of the time, and asked for often."""
+    """Put `n` empty cells around a field (C, m, m), in a tenth of the time of `np.pad`."""
     m = query.shape[1]
     bordered = np.zeros((len(query), m + 2 * n, m + 2 * n), query.dtype)
     bordered[:, n : n + m, n : n + m] = query
@@ -206,10 +206,10 @@ def _list_shifts(m: int, n: int) -> tuple[Ints, Ints]:
 
 
 @lru_cache
-def _make_pooling(side: int, of_place: int, cells: int) -> Singles:
+def _make_pooling(side: int, place_side: int, cells: int) -> Singles:
     """Return the weights, float32 (m, side), by which `side` regions in a row are averaged in m cells with the same
     middle, of which `cells` are as long as the `encode_place` regions of a place."""
-    pitch = of_place / cells
+    pitch = place_side / cells
     m = cells + 2 * max(0, int(np.ceil((side / pitch - cells) / 2 - _TINY)))
     begins = (np.arange(m)[:, None] - m / 2) * pitch
     region = np.arange(side) - side / 2

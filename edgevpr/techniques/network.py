@@ -18,9 +18,9 @@ from edgevpr.techniques.session import Backbone, open_backbone
 from edgevpr.techniques.vectors import UNREACHABLE_MARGIN, VectorTechnique
 from edgevpr.techniques.words import compute_sharpness, compute_vlad, load_words, make_local_descriptors
 
-# Minimum margins in the forms `float`, `8bit` and `1bit`. Beside them the largest margin of a wrong match, with the
-# shipped weights: on corridor and aerial_caliterra (the data sets used for tuning), and with the queries of one of them
-# in the map of the other. Other weights need other values.
+# Minimum margins in the forms `float`, `8bit` and `1bit`; the comments give the largest margin of a wrong match, with
+# the shipped weights, on corridor and aerial_caliterra (the data sets used for tuning), and with the queries of one in
+# the map of the other. Other weights need other values.
 _MARGINS = {
     "calc": (0.11, 0.15, 0.10),  # 0.089, 0.12, 0.078, also with the original weights
     "alexnet": (0.15, 0.12, 0.1),  # 0.117, 0.094, 0.080
@@ -130,13 +130,12 @@ def make_from_card(card: Card, form: str = "float", threads: int = 1) -> Network
     """Make the technique of a card: the vector of its network. A map records no parameters, since the hash of the
     network covers them. No match is accepted until the configuration sets a minimum margin."""
     backbone = Backbone(card, "descriptor", threads)
-    sha256 = compute_digest(
-        [backbone.sha256, None, card.similarity, None]
-    )  # None: maps of earlier versions have more here
-    made = NetworkVector(card.name, backbone, None, form=form, similarity=card.similarity, model_sha256=sha256)
+    # None: in maps of earlier versions more was hashed here.
+    sha256 = compute_digest([backbone.sha256, None, card.similarity, None])
+    technique = NetworkVector(card.name, backbone, None, form=form, similarity=card.similarity, model_sha256=sha256)
     noise = np.random.default_rng(0).integers(0, 256, (card.input.height, card.input.width), np.uint8)
-    made.encode(noise)  # raises ModelError for numbers that half precision cannot hold
-    return made
+    technique.encode(noise)  # raises ModelError for numbers that half precision cannot hold
+    return technique
 
 
 def _make_pyramid(name: str, model: str, form: str, threads: int, levels: int) -> NetworkVector:
@@ -188,11 +187,11 @@ def make_gaussian_projection(size: int, length: int, seed: int) -> Callable[[Sin
     row, signs = make_gaussian_row(size, seed)
     spectrum = np.conj(np.fft.rfft(row))  # row j of the matrix is the Gaussian vector shifted by j: a correlation
 
-    def projected(features: Singles) -> Singles:
+    def project(features: Singles) -> Singles:
         shifted = np.fft.irfft(spectrum * np.fft.rfft(features.ravel() * signs, size), size)
         return np.asarray(shifted[:length] / np.sqrt(length), np.float32)
 
-    return projected
+    return project
 
 
 def make_gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:

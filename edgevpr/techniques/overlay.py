@@ -1,10 +1,10 @@
-"""The last step of `cohog`: the query is laid over a place as its match says.
+"""The last step of `cohog`: the query is laid over a place by its match.
 
-If the match is right, the structures of both pictures coincide, also of changed ground. The *structure* of a picture is
-the patterns of its regions less what those around have in common. The *agreement* of two structures is their
-correlation over what independent ones would scatter by. With a camera that looks ahead, it is taken at the shift that
-was voted for. With one that looks straight down, the query's picture is first turned, scaled and shifted, and it counts
-how far the agreement exceeds that at other shifts: a road agrees nearly as well if pushed along it."""
+If the match is right, the structures of both pictures coincide, even of changed ground. The *structure* of a picture is
+the patterns of its regions less the mean of their surroundings. The *agreement* of two structures is their correlation
+over the scatter of independent ones. With a camera that looks ahead, it is taken at the shift of the vote. With one
+that looks straight down, the query's picture is first turned, scaled and shifted, and the result is the *prominence*:
+how far the agreement exceeds that at other shifts. A road agrees nearly as well if shifted along itself."""
 
 import math
 
@@ -18,45 +18,45 @@ _MIN_STRENGTH = 0.02  # of a region's patterns; weaker ones are noise
 _MAX_SHIFT_CELLS = 7  # of the shifts that are compared
 _MAX_MISS_CELLS = 2  # by which a match may miss
 _PEAK_RADIUS_CELLS = 2
-_MIN_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to say anything
+_MIN_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to count
 _TINY = 1e-9
 
 
 def overlay_query(grey: Array, allowed: Mask, match: FineMatch, cells: int) -> tuple[Array, Mask]:
-    """Turn, scale and shift a query's picture, float32 (side, side), as its match with a place says, so that it lies
-    over the place's, which has `cells` cells along a side. `allowed`, bool of the same shape, is True for pixels that
-    may be used. Returns both as they lie over the place."""
+    """Turn, scale and shift a query's picture, float32 (side, side), and `allowed`, bool of the same shape, True for
+    pixels that may be used, by the query's match with a place. Returns both as they lie over the place, which has
+    `cells` cells along a side."""
     side = len(grey)
     middle = np.full(2, (side - 1) / 2)
-    turned = np.deg2rad(match.rotation_deg or 0.0)
-    turn = (match.height_ratio or 1.0) * np.array([[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]])
+    angle = np.deg2rad(match.rotation_deg or 0.0)
+    turn = (match.height_ratio or 1.0) * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     shift = middle + np.array(match.shift_cells) * (side / cells) - turn @ middle
     matrix = np.column_stack([turn, shift])
-    there: Array = cv2.warpAffine(grey, matrix, (side, side), borderMode=cv2.BORDER_REPLICATE)
+    warped: Array = cv2.warpAffine(grey, matrix, (side, side), borderMode=cv2.BORDER_REPLICATE)
     seen: Array = cv2.warpAffine(allowed.astype(np.uint8), matrix, (side, side), flags=cv2.INTER_NEAREST)
-    return there, seen.astype(bool)
+    return warped, seen.astype(bool)
 
 
 def compute_structure(patterns: Array, seen: Bools, around_cells: float) -> Singles:
     """Return the structure of a picture, float32 (n, n, P), from the patterns of its regions (n * n, P), of which those
-    count that are `seen`, bool (n, n). `around_cells` is the standard deviation of what counts as around a region."""
+    count that are `seen`, bool (n, n). `around_cells`: standard deviation of the surroundings of a region."""
     weight = seen.astype(np.float32)
     values = patterns.reshape(*seen.shape, -1).astype(np.float32) * weight[..., None]
     near = _blur_cells(values, around_cells) / np.maximum(_blur_cells(weight, around_cells), _TINY)[..., None]
     values -= near * weight[..., None]
     strength = np.sqrt((values**2).sum(axis=2))
-    found: Singles = values / np.sqrt(np.maximum(strength, _MIN_STRENGTH))[..., None]
-    return found
+    structure: Singles = values / np.sqrt(np.maximum(strength, _MIN_STRENGTH))[..., None]
+    return structure
 
 
 def measure_prominence(query: Singles, place: Singles) -> float:
-    """Return by how much the agreement of two structures (n, n, P), the query's as it lies over the place, stands out
-    from that at other shifts, in standard deviations of independent structures."""
+    """Return by how much the agreement of two structures (n, n, P), the query's as it lies over the place, exceeds that
+    at other shifts, in standard deviations of independent structures."""
     border = ((_MAX_SHIFT_CELLS, _MAX_SHIFT_CELLS), (_MAX_SHIFT_CELLS, _MAX_SHIFT_CELLS))
     common = cv2.matchTemplate(np.pad(query, (*border, (0, 0))), place, cv2.TM_CCORR)
-    of_query, of_place, least = _measure_strengths(query, place)
-    scatter = cv2.matchTemplate(np.pad(of_query, border), of_place, cv2.TM_CCORR)
-    agree = common / np.sqrt(np.maximum(scatter, least) + _TINY)  # at all shifts of up to `_MAX_SHIFT_CELLS` cells
+    query_strength, place_strength, least = _measure_strengths(query, place)
+    scatter = cv2.matchTemplate(np.pad(query_strength, border), place_strength, cv2.TM_CCORR)
+    agree = common / np.sqrt(np.maximum(scatter, least) + _TINY)  # at all shifts of up to `_MAX_SHIFT_CELLS`
     first, last = _MAX_SHIFT_CELLS - _MAX_MISS_CELLS, _MAX_SHIFT_CELLS + _MAX_MISS_CELLS + 1
     at_y, at_x = np.divmod(int(agree[first:last, first:last].argmax()), last - first)
     y, x = at_y + first, at_x + first
@@ -68,24 +68,28 @@ def measure_prominence(query: Singles, place: Singles) -> float:
 
 def compute_agreement(query: Singles, place: Singles, shift_cells: tuple[float, float]) -> float:
     """Return the agreement of two structures (n, n, P), in standard deviations of independent ones, with the query's
-    middle at the shift (dx, dy) from that of the place, or up to two cells beside."""
+    middle at the shift (dx, dy) from that of the place, or up to two cells off."""
     n = len(place)
-    of_query, of_place, least = _measure_strengths(query, place)
-    x, y = (min(max(round(each), _MAX_MISS_CELLS - n), n - _MAX_MISS_CELLS) for each in shift_cells)
+    query_strength, place_strength, least = _measure_strengths(query, place)
+    x, y = (min(max(round(cells), _MAX_MISS_CELLS - n), n - _MAX_MISS_CELLS) for cells in shift_cells)
     best = 0.0
     for dy in range(y - _MAX_MISS_CELLS, y + _MAX_MISS_CELLS + 1):
         for dx in range(x - _MAX_MISS_CELLS, x + _MAX_MISS_CELLS + 1):
-            asked = np.s_[max(0, -dy) : n - max(0, dy), max(0, -dx) : n - max(0, dx)]
-            known = np.s_[max(0, dy) : n + min(0, dy), max(0, dx) : n + min(0, dx)]
-            scatter = max(float(np.einsum("ij,ij", of_query[asked], of_place[known])), least)
-            best = max(best, float(np.einsum("ijk,ijk", query[asked], place[known])) / math.sqrt(scatter + _TINY))
+            in_query = np.s_[max(0, -dy) : n - max(0, dy), max(0, -dx) : n - max(0, dx)]
+            in_place = np.s_[max(0, dy) : n + min(0, dy), max(0, dx) : n + min(0, dx)]
+            scatter = max(float(np.einsum("ij,ij", query_strength[in_query], place_strength[in_place])), least)
+            best = max(best, float(np.einsum("ijk,ijk", query[in_query], place[in_place])) / math.sqrt(scatter + _TINY))
     return best
 
 
 def _measure_strengths(query: Singles, place: Singles) -> tuple[Singles, Singles, float]:
     """Return the squared strengths of two structures in each cell, (n, n), and the least scatter of their agreement."""
-    of_query, of_place = (query**2).sum(axis=2), (place**2).sum(axis=2)
-    return of_query, of_place, _MIN_SCATTER**2 * float(of_query.sum()) * float(of_place.sum()) / of_place.size
+    query_strength, place_strength = (query**2).sum(axis=2), (place**2).sum(axis=2)
+    return (
+        query_strength,
+        place_strength,
+        _MIN_SCATTER**2 * float(query_strength.sum()) * float(place_strength.sum()) / place_strength.size,
+    )
 
 
 def _blur_cells(values: Singles, cells: float) -> Singles:

@@ -1,8 +1,8 @@
 """The coarse stage of `cohog` for a camera that looks ahead: a place is 144 bytes, found even if the camera has moved.
 
 The block-normalised HOG is averaged over 12x12 cells (its *grid*), less the map's mean grid. The L orientations of each
-cell are written as a Fourier series, since neighbouring ones rise and fall together, and only the signs of its numbers
-are kept. A query is compared under every shift of its grid, a *hypothesis*: hypotheses and places are two matrices,
+cell are written as a Fourier series, since neighbouring ones are correlated, and only the signs of its coefficients are
+kept. A query is compared under every shift of its grid, a *hypothesis*: hypotheses and places are two matrices,
 compared by one product."""
 
 from functools import lru_cache
@@ -14,11 +14,11 @@ from edgevpr.techniques.gradients import make_waves
 
 SIDE = 12  # cells along one side
 _SAMPLES_PER_SIDE = 3  # along one side of a cell: about one per block, for 31 blocks
-_MIN_OVERLAP = 0.5  # a smaller overlap costs more shifts, and found no further place on any data set
-_FULL_SCAN_PLACES = 500  # places compared under all shifts: a tenth of the time of a scan of 10 000
+_MIN_OVERLAP = 0.5  # a smaller overlap costs more shifts, and found no more places on any data set
+_FULL_SCAN_PLACES = 500  # compared under all shifts: a tenth of the time of a scan of 10,000
 _BITS_PER_PRODUCT = 1 << 19  # of places: 2 MB as float32
 
-# Each byte as its eight bits, first bit first, +1 or -1: one look-up instead of `unpackbits`, conversion and offset.
+# The eight bits of each byte, first bit first, as +1 or -1: one look-up instead of `unpackbits` and arithmetic.
 _BYTE_SIGNS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).astype(np.float32) * 2 - 1
 
 
@@ -45,8 +45,8 @@ def make_grid(blocks: Singles, seen: Bools, counted: Bools) -> tuple[Singles, Bo
 def compute_deviations(grids: Floats, mean: Floats) -> Array:
     """Subtract the map's mean (12, 12, L) from `grids` (..., 12, 12, L) and write the orientations of each cell as a
     Fourier series: float32 of the shape of `grids`."""
-    apart: Array = (np.asarray(grids, np.float32) - mean) @ make_waves(grids.shape[-1]).T
-    return apart
+    deviations: Array = (np.asarray(grids, np.float32) - mean) @ make_waves(grids.shape[-1]).T
+    return deviations
 
 
 def pack_grids(grids: Floats, mean: Floats) -> Bytes:
@@ -59,39 +59,39 @@ def make_hypotheses(grid: Singles, seen: Bools, mean: Floats) -> Singles:
     """Make the hypotheses of a query, float32 (S, 144 L), from its `grid` and `seen` (see `make_grid`) and the map's
     mean (12, 12, L). Row s is the signs of the query (0 where nothing is seen), moved by shift s of `SHIFTS`."""
     signs = np.where(compute_deviations(grid, mean) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
-    asked = np.zeros((len(SHIFTS), *signs.shape), np.float32)
+    queries = np.zeros((len(SHIFTS), *signs.shape), np.float32)
     for at, (dx, dy) in enumerate(SHIFTS.tolist()):
-        asked[at, _slice_target(dy), _slice_target(dx)] = signs[_slice_target(-dy), _slice_target(-dx)]
-    return asked.reshape(len(SHIFTS), -1)
+        queries[at, _slice_target(dy), _slice_target(dx)] = signs[_slice_target(-dy), _slice_target(-dx)]
+    return queries.reshape(len(SHIFTS), -1)
 
 
-def scan_codes(asked: Singles, codes: Bytes) -> Singles:
-    """Compare every hypothesis, `asked` float32 (S, 8 B), with every place, `codes` uint8 (N, B). Returns the best
+def scan_codes(queries: Singles, codes: Bytes) -> Singles:
+    """Compare every hypothesis, `queries` float32 (S, 8 B), with every place, `codes` uint8 (N, B). Returns the best
     score of each place, float32 (N,): the share of equal bits less that of different ones (1: the same picture, 0:
     chance)."""
-    by_bit = asked.T
+    by_bit = queries.T
     best = np.empty(len(codes), np.float32)
-    at_once = max(1, _BITS_PER_PRODUCT // asked.shape[1])
-    bits = np.empty((at_once, codes.shape[1], 8), np.float32)
-    scores = np.empty((at_once, len(asked)), np.float32)
-    for start in range(0, len(codes), at_once):
-        part = codes[start : start + at_once]
+    block = max(1, _BITS_PER_PRODUCT // queries.shape[1])
+    bits = np.empty((block, codes.shape[1], 8), np.float32)
+    scores = np.empty((block, len(queries)), np.float32)
+    for start in range(0, len(codes), block):
+        part = codes[start : start + block]
         count = len(part)
         np.take(_BYTE_SIGNS, part, axis=0, out=bits[:count], mode="clip")
         np.matmul(bits[:count].reshape(count, -1), by_bit, out=scores[:count])
         np.max(scores[:count], axis=1, out=best[start : start + count])
-    best /= asked.shape[1]
+    best /= queries.shape[1]
     return best
 
 
-def scan_in_two_steps(asked: Singles, codes: Bytes) -> Singles:
+def scan_in_two_steps(queries: Singles, codes: Bytes) -> Singles:
     """Compare as `scan_codes` does, but faster: all places under a quarter of the shifts, each averaged with the shifts
     around it, then only the best 500 places under all shifts."""
     if len(codes) <= _FULL_SCAN_PLACES:
-        return scan_codes(asked, codes)
-    scores = scan_codes(_make_blur_weights() @ asked, codes)
+        return scan_codes(queries, codes)
+    scores = scan_codes(_make_blur_weights() @ queries, codes)
     best = np.argpartition(-scores, _FULL_SCAN_PLACES)[:_FULL_SCAN_PLACES]
-    scores[best] = scan_codes(asked, codes[best])
+    scores[best] = scan_codes(queries, codes[best])
     return scores
 
 

@@ -70,13 +70,13 @@ def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTe
     backbone = open_backbone(model, "features", threads)
     squares = make_square_regions(*backbone.shape[1:])
 
-    def described(features: Singles) -> tuple[Singles, Singles]:
+    def describe_picture(features: Singles) -> tuple[Singles, Singles]:
         vectors = pool_squares(features, squares)
         return normalise_rows(vectors.sum(axis=0)), vectors
 
     # With the shipped weights every wrong match had a margin below 0.147 (see `network`).
     spec = {"name": "rmac", "parameters": {"model": model}, "model_sha256": backbone.sha256}
-    return RegionTechnique(backbone, described, np.mean, **spec, form=form, margins=(0.185,) * 3)
+    return RegionTechnique(backbone, describe_picture, np.mean, **spec, form=form, margins=(0.185,) * 3)
 
 
 def cross_region_bow(
@@ -91,16 +91,16 @@ def cross_region_bow(
     backbone = open_region_backbone("cross_region_bow", model, threads, regions)
     learned, sha256 = load_words(model, "bow", words)
 
-    def described(features: Singles) -> tuple[Singles, Singles]:
-        found = describe_regions(features, find_regions(features, regions))
+    def describe_picture(features: Singles) -> tuple[Singles, Singles]:
+        vectors = describe_regions(features, find_regions(features, regions))
         padded = np.zeros((regions, len(features)), np.float32)
-        padded[: len(found)] = found
-        return compute_bag_of_words(found, learned), padded
+        padded[: len(vectors)] = vectors
+        return compute_bag_of_words(vectors, learned), padded
 
     # With the shipped weights every wrong match had a margin below 0.056 in every form (see `network`).
     parameters = {"model": model, "regions": regions, "words": words}
     spec = {"name": "cross_region_bow", "parameters": parameters, "model_sha256": sha256}
-    return RegionTechnique(backbone, described, np.any, **spec, form=form, margins=(0.07,) * 3)
+    return RegionTechnique(backbone, describe_picture, np.any, **spec, form=form, margins=(0.07,) * 3)
 
 
 def open_region_backbone(technique: str, model: str, threads: int, regions: int) -> Backbone:
@@ -121,11 +121,9 @@ def make_square_regions(height: int, width: int) -> list[Square]:
             f"A feature map of {height}x{width} is too small for the regions of R-MAC: it must be at least 2 wide."
         )
     # A square feature map has one region at the first scale; for others 2 to 7 are tried, as in the authors' code.
-    m = (
-        1
-        if long == short
-        else min(range(2, 8), key=lambda n: abs(1 - (long - short) / (n - 1) / short - _RMAC_OVERLAP_SHARE))
-    )
+    m = 1
+    if long > short:
+        m = min(range(2, 8), key=lambda n: abs(1 - (long - short) / (n - 1) / short - _RMAC_OVERLAP_SHARE))
     regions = []
     for scale in range(1, _RMAC_SCALES + 1):
         side = 2 * short // (scale + 1)
@@ -158,9 +156,9 @@ def find_regions(features: Singles, count: int) -> Ints:
     tall = np.zeros((channels, height + 1, width), np.float32)
     np.maximum(features, 0, out=tall[:, :height])
     tall = tall.reshape(-1, width)
-    found, labels, stats, _ = cv2.connectedComponentsWithStats((tall > 0).view(np.uint8), connectivity=8)
+    count_found, labels, stats, _ = cv2.connectedComponentsWithStats((tall > 0).view(np.uint8), connectivity=8)
     left, top, wide, high, area = stats[1:].T
-    sums = np.bincount(labels.ravel(), weights=tall.ravel(), minlength=found)[1:]
+    sums = np.bincount(labels.ravel(), weights=tall.ravel(), minlength=count_found)[1:]
     energy = (sums / area).astype(np.float32)
     channel, row = np.divmod(top, height + 1)
     best = np.lexsort((left, row, channel, -energy))[:count]
@@ -176,9 +174,8 @@ def describe_regions(features: Singles, boxes: Ints) -> Singles:
     np.cumsum(sums, axis=0, out=sums)
     np.cumsum(sums, axis=1, out=sums)
     top, left, bottom, right = boxes.T
-    under = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    under /= np.maximum(np.linalg.norm(under, axis=1, keepdims=True), _TINY)
-    regions: Singles = under.astype(np.float32)
+    boxed = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    regions: Singles = normalise_rows(boxed).astype(np.float32)
     return regions
 
 
@@ -186,14 +183,14 @@ def score_mutual_pairs(query: Singles, place: Singles) -> float:
     """Score two sets of regions of length 1, `query` (N, D) and `place` (M, D), from 0 to 1: the sum of the cosines of
     the pairs of which each is the other's best match, over the larger number of regions (by which the papers do not
     divide). Negative cosines count 0; all-zero rows are not regions."""
-    regions_of_query, regions_of_place = (int(regions.any(axis=1).sum()) for regions in (query, place))
-    if not regions_of_query or not regions_of_place:
+    query_regions, place_regions = (int(regions.any(axis=1).sum()) for regions in (query, place))
+    if not query_regions or not place_regions:
         return 0.0
     cosines = query @ place.T
     best = cosines.argmax(axis=1)
     mutual = cosines.argmax(axis=0)[best] == np.arange(len(query))
     total = np.maximum(cosines[np.arange(len(query)), best], 0)[mutual].sum()
-    return float(min(total / max(regions_of_query, regions_of_place), 1.0))
+    return float(min(total / max(query_regions, place_regions), 1.0))
 
 
 def to_bytes(vectors: Singles) -> Array:

@@ -16,8 +16,8 @@ from edgevpr.core.errors import UsageError
 
 _SEQUENCE_QUERIES = 10  # queries that are matched together, unless the configuration sets another number
 _WINDOW_PLACES = 10  # R_window of the paper: five places before and five after
-_MEAN_LEVEL = 128  # a pixel as bright as the mean of its patch
-_LEVELS_PER_SD = 28  # levels per standard deviation: eight bits reach 4.5 of them either way
+_MEAN_LEVEL = 128  # of a pixel as bright as the mean of its patch
+_LEVELS_PER_SD = 28  # eight bits reach 4.5 standard deviations either way
 _MIN_PATCH_SD_LEVELS = 1.0  # grey levels: a patch with a smaller standard deviation does not describe the place
 
 

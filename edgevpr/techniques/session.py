@@ -1,6 +1,5 @@
-"""Running a network, from a picture to its outputs. It is the only module that uses onnxruntime in flight, and imports
-it only with the first network. A model file is not trusted: it is run once before it may fly, and every result is
-checked."""
+"""Runs a network, from a picture to its outputs. This is the only module that uses onnxruntime in flight, imported with
+the first network. A model file is not trusted: it is run once before the flight, and every result is checked."""
 
 import os
 from functools import cache
@@ -19,7 +18,7 @@ _OUTPUT_SHAPES = {"descriptor": (2, "(1, D)"), "features": (4, "(1, C, H, W)")}
 _NOISE_SEED = 7
 MAX_FILE_BYTES = 2**31  # protobuf, in which ONNX files are written, allows no more
 _MAX_THREADS = 256
-_MAX_VALUE = 1e12  # with much larger numbers the length of a vector overflows float32, and the unit vector is zero
+_MAX_VALUE = 1e12  # of much larger values the length of a vector overflows float32, and the unit vector is zero
 _INTERPOLATIONS = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR_EXACT, "cubic": cv2.INTER_CUBIC}
 
 
@@ -40,7 +39,7 @@ class Backbone:
             )
         self.card, self.output, self.sha256 = card, output, card.fingerprint
         self.session = open_session(card, threads)
-        # Noise, not a uniform picture: many a correct network gives only zeros for that.
+        # Noise: for a uniform picture many correct networks give only zeros.
         noise = np.random.default_rng(_NOISE_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
         self.shape = self.run(noise).shape
 
@@ -59,8 +58,8 @@ class Backbone:
         values: Singles = result[0].astype(np.float32, copy=False)
         if not values.any():
             raise ModelError(
-                f"{card.file_path} gives nothing but zeros for `{name}`: its weights or `input` of its card are wrong, "
-                "or the picture shows nothing at all."
+                f"{card.file_path} gives only zeros for `{name}`: correct its weights or `input` of its card, unless "
+                "the picture is blank."
             )
         return values
 
@@ -84,18 +83,18 @@ def hash_model_file(path: Path) -> str:
         return compute_sha256(path, MAX_FILE_BYTES)
     except OSError as error:
         raise ModelError(
-            f"{path} cannot be read ({error.strerror}): put the weights there, or take the card away."
+            f"{path} cannot be read ({error.strerror}): put the weights there, or remove the card."
         ) from error
 
 
 @cache
 def _load_session(path: Path, sha256: str, threads: int) -> Any:
     """Check the hash of a network's file and open its session, one in the process for all techniques that use it."""
-    found = hash_model_file(path)
-    if found != sha256:
+    file_sha256 = hash_model_file(path)
+    if file_sha256 != sha256:
         raise ModelError(
-            f"{path} is not the file of its card: its SHA-256 is {found} and the card says {sha256}; get the right "
-            "file, or correct the card."
+            f"{path} is not the file of its card: its SHA-256 is {file_sha256} and the card says {sha256}; get the "
+            "right file, or correct the card."
         )
     runtime = import_onnxruntime()
     options = runtime.SessionOptions()
@@ -103,8 +102,8 @@ def _load_session(path: Path, sha256: str, threads: int) -> Any:
     options.log_severity_level = 4  # fatal messages only: edgevpr reports errors itself
     # Threads that wait for work by spinning draw power and do nothing.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Weights in a second file are refused, since the hash would not cover them. For a model given as bytes onnxruntime
-    # would look for them in the working directory, so a folder is named that does not exist.
+    # Weights in a second file are refused, since the hash does not cover them. For a model given as bytes onnxruntime
+    # would search the working directory for them, so a folder is named that does not exist.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", str(path))
     try:
         return runtime.InferenceSession(read_file(path, MAX_FILE_BYTES), options, providers=["CPUExecutionProvider"])
@@ -116,7 +115,7 @@ def _load_session(path: Path, sha256: str, threads: int) -> Any:
 
 def import_onnxruntime() -> Any:
     """Import onnxruntime and return it. Raises ModelError if it cannot be imported."""
-    # Else a thread of it reports its use to its maker, and keeps a file for that in the home folder (1.31 and 1.32).
+    # Else it reports its use to its maker, and keeps a file for that in the home folder (1.31 and 1.32).
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     try:
         import onnxruntime
@@ -144,8 +143,8 @@ def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -
         # Written with `not`, so that NaN is refused as well.
         if result.size and not max(result.max(), -result.min()) <= _MAX_VALUE:
             raise ModelError(
-                f"{card.file_path} gives numbers that are not finite, or beyond {_MAX_VALUE:g}, for `{name}`: its "
-                "weights or `input` of its card are wrong."
+                f"{card.file_path} gives numbers that are not finite, or beyond {_MAX_VALUE:g}, for `{name}`: correct "
+                "its weights or `input` of its card."
             )
     return results
 
@@ -194,7 +193,7 @@ def compute_fill_shares(image: Array, rule: InputRule) -> tuple[float, float]:
 
 def fill_masked(image: Image, mask: Mask | None) -> Array:
     """Set every pixel where the bool (H, W) `mask` is False to the mean of the others (128 if there are none): a
-    uniform patch adds the least to what a network gives."""
+    uniform patch affects the output of a network least."""
     if mask is None or mask.all():
         return image
     filled = image.copy()

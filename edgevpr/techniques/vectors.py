@@ -1,8 +1,8 @@
-"""Base of the techniques that describe a picture by one vector: the three forms of a vector in RAM, and the comparison
-of vectors. `hog` needs no network.
+"""Base of the techniques that describe a picture by one vector: its three forms in RAM, and the comparison of vectors.
+`hog` needs no network.
 
-The map file and the form `float` keep half precision. `8bit` and `1bit` are one byte or one bit per number, after the
-mean of all vectors of the map, which tells no places apart, is subtracted."""
+The map file and the form `float` keep half precision. `8bit` and `1bit` are one byte or one bit per number of the
+vector less the mean of all vectors of the map, which is common to all places."""
 
 from typing import Any
 
@@ -14,8 +14,8 @@ from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.techniques.gradients import make_grey_square, make_mask_square, normalise_blocks, orient_cells
 
-# A margin that no match can reach. The margins of wrong matches are known for the weights that edgevpr ships. With
-# other weights no match is accepted until the configuration sets a minimum margin.
+# No match reaches it. The margins of wrong matches are known for the shipped weights only. With other weights no match
+# is accepted until the configuration sets a minimum margin.
 UNREACHABLE_MARGIN = 2.0
 _SHIPPED_MODEL = "calc"
 _TINY = 1e-6
@@ -99,13 +99,13 @@ class VectorTechnique:
         rows = np.zeros((len(coarse), *self.spec.row.shape), self.spec.row.dtype)
         for start in range(0, len(coarse), self._at_once):
             block = slice(start, start + self._at_once)
-            left = coarse[block].astype(np.float32)
-            left -= mean
+            deviations = coarse[block].astype(np.float32)
+            deviations -= mean
             if self.spec.form == "1bit":
-                rows[block, : -(-self._length // 8)] = np.packbits(left > 0, axis=1)
+                rows[block, : -(-self._length // 8)] = np.packbits(deviations > 0, axis=1)
                 continue
-            step = np.maximum(np.abs(left).max(axis=1), np.finfo(np.float32).tiny) / 127
-            whole = np.rint(np.divide(left, step[:, None], out=left), out=left)
+            step = np.maximum(np.abs(deviations).max(axis=1), np.finfo(np.float32).tiny) / 127
+            whole = np.rint(np.divide(deviations, step[:, None], out=deviations), out=deviations)
             length = step * np.sqrt(np.einsum("nd,nd->n", whole, whole))
             rows[block, : self._length] = whole
             rows[block, self._length :] = np.stack([step, length], axis=1).astype("<f4").view(np.int8)
@@ -115,7 +115,7 @@ class VectorTechnique:
         """Compare a query with all places, `rows` (N, *row shape): scores float32 (N,), all 0 for a query of zeros, and
         None (no hypotheses). `mean` (D,) is the map's."""
         vector = query.coarse.astype(np.float32)
-        if not vector.any():  # less the mean, zeros would resemble some place, and equal another picture of zeros
+        if not vector.any():  # less the mean, zeros would resemble some place, and equal other zeros
             return np.zeros(len(rows), np.float32), None
         if mean is not None and self.spec.form != "float":
             vector -= mean
@@ -126,36 +126,36 @@ class VectorTechnique:
         for start in range(0, len(rows), self._at_once):
             part = rows[start : start + self._at_once]
             np.copyto(values[: len(part)], part[:, : self._length])
-            beside = np.ascontiguousarray(part[:, self._length :]).view("<f4").T
-            scores[start : start + len(part)] = self._compare_vectors(vector, values[: len(part)], beside)
+            suffix = np.ascontiguousarray(part[:, self._length :]).view("<f4").T
+            scores[start : start + len(part)] = self._compare_vectors(vector, values[: len(part)], suffix)
         return scores, None
 
     def _score_bits(self, vector: Singles, rows: Bytes) -> Singles:
         """Return the share of the bits in which n places, uint8 (n, B), are equal to a vector: float32 (n,)."""
         code = np.zeros(self.spec.row.shape, np.uint8)
         code[: -(-self._length // 8)] = np.packbits(vector > 0)
-        asked, places = code.view(np.uint64), np.ascontiguousarray(rows).view(np.uint64)
+        query, places = code.view(np.uint64), np.ascontiguousarray(rows).view(np.uint64)
         different: Ints = np.empty(len(rows), np.uint16 if 8 * len(code) < 1 << 16 else np.uint32)
-        ones = np.ones(len(asked), np.float32)  # a product is the fastest sum, and exact for whole numbers below 2^24
+        ones = np.ones(len(query), np.float32)  # a product is the fastest sum, and exact for whole numbers below 2^24
         at_once = max(1, _CODE_BLOCK_BYTES // len(code))
         for start in range(0, len(rows), at_once):
             block = slice(start, start + at_once)
-            different[block] = np.bitwise_count(places[block] ^ asked).astype(np.float32) @ ones
+            different[block] = np.bitwise_count(places[block] ^ query).astype(np.float32) @ ones
         return np.asarray(1 - different / np.float32(self._length), np.float32)
 
-    def _compare_vectors(self, vector: Singles, values: Singles, beside: Singles) -> Singles:
-        """Score n places by their vectors `values`, float32 (n, D), which are overwritten. `beside` (2, n) are the
+    def _compare_vectors(self, vector: Singles, values: Singles, suffix: Singles) -> Singles:
+        """Score n places by their vectors `values`, float32 (n, D), which are overwritten. `suffix` (2, n) are the
         places' steps and lengths in the form `8bit`; in `float` it is empty, (0, n)."""
         if self._similarity == "cosine":
             scores: Singles = values @ vector
-            if not len(beside):
+            if not len(suffix):
                 return np.clip(scores, 0, 1, out=scores)
-            step, length = beside
+            step, length = suffix
             scores *= step
             scores /= np.maximum(length * np.linalg.norm(vector), np.finfo(np.float32).tiny)
             return np.clip((1 + scores) / 2, 0, 1)
-        if len(beside):
-            values *= beside[0][:, None]
+        if len(suffix):
+            values *= suffix[0][:, None]
         values -= vector
         return np.asarray(1 / (1 + np.abs(values, out=values).sum(axis=1)))
 

@@ -1,9 +1,9 @@
-"""Views of a query: its picture as it would look from other heights and under other headings, for `cohog`.
+"""Views of a query: its picture as seen from other heights and under other headings, for `cohog`.
 
 A query of a camera that looks straight down is compared with a place under several *hypotheses*: a height ratio (the
 camera's height above the ground over that when the place was mapped) and a rotation of the camera since then, in steps
-of 15 degrees. A view undoes both. Few regions agree by chance more easily than many: factors, from foreign pictures of
-the tuning sets from the air, make the shares of agreeing votes comparable."""
+of 15 degrees. A view undoes both. Few regions agree by chance more easily than many: factors, measured with foreign
+pictures of the tuning sets from the air, make the shares of agreeing votes comparable."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -76,7 +76,7 @@ class QueryViews:
     def forget_other_heights(self, ratio: float) -> None:
         """Forget the views of other height ratios than this, but for the unchanged one: they take megabytes."""
         self._encoded = {key: view for key, view in self._encoded.items() if key[0] == ratio or key == (1.0, 0)}
-        self._scaled = {each: picture for each, picture in self._scaled.items() if each == ratio}
+        self._scaled = {key: picture for key, picture in self._scaled.items() if key == ratio}
         self._regions = {key: view for key, view in self._regions.items() if decode_hypothesis(key[0])[0] == ratio}
         self.fields = {key: field for key, field in self.fields.items() if decode_hypothesis(key[0])[0] == ratio}
 
@@ -119,7 +119,7 @@ class QueryViews:
     def _resize_picture(self, side: int) -> tuple[Array, Array]:
         """Return the picture with `side` pixels along a side: grey float32, and uint8, 1 for allowed pixels."""
         if self._picture.grey is None or self._picture.allowed is None:
-            raise ValueError("a picture that is not kept cannot be turned")
+            raise ValueError("the query has no picture to turn")
         grey: Array = self._picture.grey
         allowed: Array = self._picture.allowed.astype(np.uint8)
         if side == len(grey):

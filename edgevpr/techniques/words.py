@@ -33,15 +33,13 @@ def load_words(model: str, kind: str, count: int) -> tuple[Singles, str]:
         words = arrays["words"].astype(np.float32)
     except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile) as error:
         raise ModelError(f"{path} cannot be read as words ({error}): {command}.") from error
-    learned_on, wanted = str(arrays.get("model_sha256")), load_card(model).fingerprint
-    if learned_on != wanted:
-        raise ModelError(
-            f"{name} was learned on another network ({learned_on[:12]}...) than `{model}` is now ({wanted[:12]}...): "
-            f"{command}."
-        )
+    learned_on, fingerprint = str(arrays.get("model_sha256")), load_card(model).fingerprint
+    if learned_on != fingerprint:
+        networks = f"({learned_on[:12]}...) than `{model}` is now ({fingerprint[:12]}...)"
+        raise ModelError(f"{name} was learned on another network {networks}: {command}.")
     if words.ndim != 2 or len(words) != count or not np.isfinite(words).all():
         raise ModelError(f"{name} must hold {count} words, and holds an array {words.shape}: {command}.")
-    sha256 = hashlib.sha256((wanted + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
+    sha256 = hashlib.sha256((fingerprint + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
     return words, sha256
 
 
@@ -84,9 +82,9 @@ def compute_sharpness(words: Singles) -> float:
     """Compute the sharpness for `compute_soft_weights` with which a descriptor equal to a word gives it, on average,
     100 times the weight of the next word. NetVLAD (section 5, "Training") asks that of the training descriptors."""
     squares = np.einsum("kd,kd->k", words, words)
-    apart = squares[:, None] + squares - 2 * words @ words.T
-    np.fill_diagonal(apart, np.inf)
-    return float(np.log(100) / max(apart.min(axis=1).mean(), _TINY)) if len(words) > 1 else 1.0
+    distances = squares[:, None] + squares - 2 * words @ words.T
+    np.fill_diagonal(distances, np.inf)
+    return float(np.log(100) / max(distances.min(axis=1).mean(), _TINY)) if len(words) > 1 else 1.0
 
 
 def compute_bag_of_words(local: Singles, words: Singles) -> Singles:

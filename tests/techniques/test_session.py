@@ -39,7 +39,7 @@ def test_a_batch_of_any_size_counts_as_one(models):
         ("weights outside", "cannot be opened as an ONNX model with its weights inside"),
         ("other size", r"Got: 32 Expected: 40"),
         ("nan", "not finite, or beyond .* for `features`"),
-        ("zeros", "nothing but zeros for `features`"),
+        ("zeros", "gives only zeros for `features`"),
     ],
 )
 def test_a_file_that_must_not_fly_is_one_sentence(models, monkeypatch, fault, says):
