@@ -22,9 +22,8 @@ class Homography:
 
     def warp_mask(self, overlay: Mask) -> Mask:
         size = (self._side, self._side)
-        return cv2.warpPerspective(overlay.view(np.uint8), self._out_from_pixel, size, flags=cv2.INTER_NEAREST).view(
-            bool
-        )
+        pixels = overlay.view(np.uint8)
+        return cv2.warpPerspective(pixels, self._out_from_pixel, size, flags=cv2.INTER_NEAREST).view(bool)
 
     def warp_image(self, image: Image) -> Image:
         small, out_from_pixel = shrink_image(image, self._shrink), self._out_from_pixel

@@ -145,49 +145,45 @@ def level_image(
     if frame.pose is not None:
         view = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
         return LevelledImage(frame.image, overlay, view)
-    geometry = _CameraGeometry(frame, vehicle, lens)
-    if geometry.is_too_tilted:
-        view = View(up_deg=geometry.top_deg, reason=Reason(ReasonCode.TILTED, {"tilt_deg": geometry.tilt_deg}))
+    camera = _CameraGeometry(frame, vehicle, lens)
+    if camera.is_too_tilted:
+        view = View(up_deg=camera.top_deg, reason=Reason(ReasonCode.TILTED, {"tilt_deg": camera.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
-    if below and geometry.tilt_deg > MAX_TILT_UNLEVELLED_DEG and geometry.heading_deg is None:
+    if below and camera.tilt_deg > MAX_TILT_UNLEVELLED_DEG and camera.heading_deg is None:
         # The ground that it shows lies far from the aircraft, in a direction that only a match can tell.
-        view = View(reason=Reason(ReasonCode.TILTED_WITHOUT_HEADING, {"tilt_deg": geometry.tilt_deg}))
+        view = View(reason=Reason(ReasonCode.TILTED_WITHOUT_HEADING, {"tilt_deg": camera.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
-    image_m = geometry.footprint_m and scale * geometry.footprint_m
+    image_m = camera.footprint_m and scale * camera.footprint_m
     zoom = image_m / footprint_m if image_m and footprint_m else scale
     if not _ZOOM_LIMITS[0] <= zoom <= _ZOOM_LIMITS[1]:
         zoom = 1.0
-    turn_deg = abs(wrap_deg(geometry.top_deg or 0.0))
-    if geometry.tilt_deg < _MIN_TILT_DEG and turn_deg < _MIN_TURN_DEG and abs(zoom - 1) < _MIN_ZOOM_CHANGE:
-        aside, focal = geometry.aside(geometry.straight, 1.0), geometry.focal_px / geometry.longest_px
-        view = View(
-            up_deg=geometry.top_deg, footprint_m=image_m, aside=aside, aside_sd=geometry.aside_sd(1.0), focal=focal
-        )
+    turn_deg = abs(wrap_deg(camera.top_deg or 0.0))
+    if camera.tilt_deg < _MIN_TILT_DEG and turn_deg < _MIN_TURN_DEG and abs(zoom - 1) < _MIN_ZOOM_CHANGE:
+        aside, focal = camera.aside(camera.straight, 1.0), camera.focal_px / camera.longest_px
+        view = View(up_deg=camera.top_deg, footprint_m=image_m, aside=aside, aside_sd=camera.aside_sd(1.0), focal=focal)
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
 
-    below &= geometry.tilt_deg <= MAX_TILT_UNLEVELLED_DEG
-    side = min(geometry.longest_px, _MAX_SIDE_PX)
-    out_px = geometry.focal_px * zoom * side / geometry.longest_px  # focal length of the output, in its pixels
-    out_from_lens = (
-        geometry.straight if geometry.heading_deg is None else geometry.level_from_lens(-geometry.heading_deg)
-    )
+    below &= camera.tilt_deg <= MAX_TILT_UNLEVELLED_DEG
+    side = min(camera.longest_px, _MAX_SIDE_PX)
+    out_px = camera.focal_px * zoom * side / camera.longest_px  # focal length of the output, in its pixels
+    out_from_lens = camera.straight if camera.heading_deg is None else camera.level_from_lens(-camera.heading_deg)
     middle = np.zeros(2) if below else out_from_lens[:2, 2] / out_from_lens[2, 2] * out_px
     right, down = (side - 1) / 2 - middle
     out_from_ray = np.array([[out_px, 0, right], [0, out_px, down], [0, 0, 1]]) @ out_from_lens
-    warp = geometry.warp(out_from_ray, out_px, side)
+    warp = camera.warp(out_from_ray, out_px, side)
 
-    width, height = (min(1.0, zoom * px / geometry.longest_px) for px in geometry.size_px)
+    width, height = (min(1.0, zoom * px / camera.longest_px) for px in camera.size_px)
     if (filled := warp.shown.mean() / (height * width)) < _MIN_FILLED_SHARE:
-        reason = Reason(ReasonCode.TILTED_OFF_GROUND, {"shown": float(filled), "tilt_deg": geometry.tilt_deg})
-        view = View(up_deg=geometry.top_deg, reason=reason)
+        reason = Reason(ReasonCode.TILTED_OFF_GROUND, {"shown": float(filled), "tilt_deg": camera.tilt_deg})
+        view = View(up_deg=camera.top_deg, reason=reason)
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     view = View(
-        up_deg=None if geometry.heading_deg is None else 0.0,
+        up_deg=None if camera.heading_deg is None else 0.0,
         footprint_m=image_m and image_m / zoom,
         zoom=zoom,
         focal=out_px / side,
-        aside=(0.0, 0.0) if below and geometry.is_tilt_known else geometry.aside(out_from_lens, zoom),
-        aside_sd=geometry.aside_sd(zoom),
+        aside=(0.0, 0.0) if below and camera.is_tilt_known else camera.aside(out_from_lens, zoom),
+        aside_sd=camera.aside_sd(zoom),
     )
     return _warp_image(frame.image, overlay, warp, view)
 
