@@ -45,7 +45,6 @@ GATES = {
 }
 SAME_SITE = {"grief_stromovka_monthly": "grief_stromovka_seasons"}
 _SEED = 1
-DETECTOR = "yolox_nano"
 # The answer to a query: the slots of the places, best first, their scores, and which slots are right or to be ignored.
 Answer = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -59,10 +58,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="edgevpr-salience-") as temporary:
         os.environ["EDGEVPR_MODELS"] = temporary
         judged = fit_each([each.name for each in folders], Path(temporary))
-        there = [name for name in detectors.NAMES if detectors.is_there(name)]
-        for name in there:
-            detectors.write_card(name, Path(temporary))
-        detector = Detector(load_card(DETECTOR)) if DETECTOR in there else None
+        there = [detectors.NAME] if detectors.is_there() else []
+        if there:
+            detectors.write_card(Path(temporary))
+        detector = Detector(load_card(detectors.NAME)) if there else None
         speed = speeds(f"without_{folders[0].name}", there)
         rows = []
         for folder in folders:

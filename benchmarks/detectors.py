@@ -1,6 +1,5 @@
-"""Cards of two object detectors. Their files are no part of edgevpr: they are looked for in
-$EDGEVPR_DETECTORS, by default ../shared/models beside the project.
-"""
+"""The card of an object detector. Its file is no part of edgevpr: it is looked for in $EDGEVPR_DETECTORS, by default
+../shared/models beside the project."""
 
 import json
 import os
@@ -9,7 +8,7 @@ from pathlib import Path
 from edgevpr.techniques.session import hash_model_file
 
 FILES = Path(os.environ.get("EDGEVPR_DETECTORS") or Path(__file__).resolve().parents[2] / "shared" / "models")
-NAMES = ("fastestdet", "yolox_nano")
+NAME = "yolox_nano"
 # Of the eighty classes of COCO those that move (thesis 3.2.2), with their numbers.
 _DYNAMIC = {
     "person": 0, "bicycle": 1, "car": 2, "motorcycle": 3, "aeroplane": 4, "bus": 5, "train": 6, "truck": 7, "boat": 8,
@@ -17,36 +16,28 @@ _DYNAMIC = {
     "giraffe": 23, "backpack": 24, "umbrella": 25,
 }  # fmt: skip
 _INPUT = {"layout": "NCHW", "colour": "bgr", "equalise": False, "resize": "linear", "mean": [0.0]}
-_SAID = {
-    "fastestdet": {
-        "input": {**_INPUT, "height": 352, "width": 352, "scale": 1 / 255},
-        "outputs": {"boxes": ["758"]},
-        # On views from the air it finds much below that which is not there.
-        "detector": {"family": "fastestdet", "min_score": 0.65, "dynamic": _DYNAMIC},
-    },
-    "yolox_nano": {
-        "input": {**_INPUT, "height": 416, "width": 416, "scale": 1.0, "pad": 114},
-        "outputs": {"boxes": ["output"]},
-        "detector": {"family": "yolox", "min_score": 0.3, "dynamic": _DYNAMIC},
-    },
-}  # fmt: skip
+_CARD = {
+    "input": {**_INPUT, "height": 416, "width": 416, "scale": 1.0, "pad": 114},
+    "outputs": {"boxes": ["output"]},
+    "detector": {"family": "yolox", "min_score": 0.3, "dynamic": _DYNAMIC},
+}
 
 
-def is_there(name: str) -> bool:
-    """Tell whether the file of a detector is on this machine."""
-    return (FILES / name / "model.onnx").is_file()
+def is_there() -> bool:
+    """Tell whether the file of the detector is on this machine."""
+    return (FILES / NAME / "model.onnx").is_file()
 
 
-def write_card(name: str, folder: Path) -> None:
-    """Put a detector and its card into a folder of models."""
-    file = FILES / name / "model.onnx"
-    (folder / f"{name}.onnx").symlink_to(file.resolve())
+def write_card(folder: Path) -> None:
+    """Put the detector and its card into a folder of models."""
+    file = FILES / NAME / "model.onnx"
+    (folder / f"{NAME}.onnx").symlink_to(file.resolve())
     card = {
-        "title": name,
-        "file": f"{name}.onnx",
+        "title": NAME,
+        "file": f"{NAME}.onnx",
         "sha256": hash_model_file(file),
         "licence": "see the file's own",
         "source": "an ONNX file beside the project",
-        **_SAID[name],
+        **_CARD,
     }
-    (folder / f"{name}.yaml").write_text(json.dumps(card))
+    (folder / f"{NAME}.yaml").write_text(json.dumps(card))
