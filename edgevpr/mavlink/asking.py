@@ -13,7 +13,7 @@ from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.channel import VehicleKind, classify_vehicle
 from edgevpr.mavlink.messages import AUTOPILOT, Health
-from edgevpr.mavlink.parameters import find_alternative
+from edgevpr.mavlink.parameters import ALTERNATIVES
 from edgevpr.mavlink.ports import open_port
 from edgevpr.mavlink.signing import NOT_SIGNING, Signing
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink, read_parameter_value
@@ -219,7 +219,7 @@ def read_autopilot(asking: RequestLink, wanted: Mapping[str, Iterable[str]]) -> 
     # Without an answer each question would take three seconds. Of the last two it only counts that they are heard.
     filter_state, first, second, origin, clock, *_ = (asking.message(each) if answers else None for each in numbers)
     parameters = asking.parameters(names, is_px4)
-    others = (find_alternative(name) for name in names if name not in parameters)
+    others = (ALTERNATIVES.get(name) for name in names if name not in parameters)
     parameters |= asking.parameters(filter(None, others), is_px4)
     packed = said.flight_sw_version if said else 0
     version = packed >> 24, packed >> 16 & 255, packed >> 8 & 255

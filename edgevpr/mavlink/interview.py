@@ -11,7 +11,7 @@ from edgevpr.mavlink.ardupilot_parameters import ARDUPILOT_TABLE
 from edgevpr.mavlink.channel import Channel, ChannelChoice, VehicleKind, classify_vehicle
 from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Severity
-from edgevpr.mavlink.parameters import Decision, ParameterTable, find_alternative
+from edgevpr.mavlink.parameters import ALTERNATIVES, Decision, ParameterTable
 from edgevpr.mavlink.px4_parameters import PX4_TABLE
 from edgevpr.mavlink.wire import Message, mavlink, read_parameter_value
 
@@ -154,7 +154,7 @@ class Interview:
         return self._table.all_names if self._table else frozenset()
 
     def _is_known(self, name: str) -> bool:
-        names = {name, find_alternative(name) or name}
+        names = {name, ALTERNATIVES.get(name) or name}
         return not names.isdisjoint(self._values) or names <= self._absent
 
     def _find_missing(self) -> list[str]:
@@ -167,7 +167,7 @@ class Interview:
         missing: list[tuple[int, int, str]] = []
         for name in table.names:
             if not self._is_known(name):
-                other = find_alternative(name)
+                other = ALTERNATIVES.get(name)
                 names = (name, other) if other and self._requests[name] else (name,)
                 missing += [(rank.get(name, 2), self._requests[key], key) for key in names if key not in self._absent]
         return [name for *_, name in sorted(missing)]
@@ -177,7 +177,7 @@ class Interview:
         answers may have been lost."""
         names = list(self._values)
         if is_alone:
-            names += [name for name in self._absent if find_alternative(name) not in self._values]
+            names += [name for name in self._absent if ALTERNATIVES.get(name) not in self._values]
         self._refresh_index += 1
         return [sorted(names)[self._refresh_index % len(names)]] if names else []
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.channel import OLD_NAMES, Channel, ChannelChoice, Parameters, VehicleKind, read_value, resolve_name
 
-# ARMING_SKIPCHK takes the place of ARMING_CHECK after ArduPilot 4.6: it names the checks to leave out.
-_ALTERNATIVES = {**OLD_NAMES, "ARMING_CHECK": "ARMING_SKIPCHK"}
+# Names of other releases. After ArduPilot 4.6 ARMING_SKIPCHK, the checks to leave out, replaces ARMING_CHECK.
+ALTERNATIVES = {**OLD_NAMES, "ARMING_CHECK": "ARMING_SKIPCHK"}
 MAX_OFFSET_M = 1.0  # of an antenna or a camera: a position that is moved by more is wrong by more than a good fix
 MAX_DELAY_MS = 50.0  # we send the position of the moment, so at 25 m/s this is wrong by 1.2 m
 
@@ -87,7 +87,7 @@ class ParameterTable:
     @cached_property
     def all_names(self) -> frozenset[str]:
         """The names of all parameters, and those that they have in other releases."""
-        return frozenset(self.names).union(filter(None, map(find_alternative, self.names)))
+        return frozenset(self.names).union(filter(None, map(ALTERNATIVES.get, self.names)))
 
     def list_needed(self, choice: ChannelChoice) -> tuple[str, ...]:
         """Return the names of the parameters that must be known before anything is sent by the channel of `choice`."""
@@ -120,11 +120,6 @@ class ParameterTable:
 def _decide_to_wait(missing: tuple[str, ...]) -> Decision:
     reason = Reason(ReasonCode.PARAMETERS_UNANSWERED, {"names": ", ".join(missing)})
     return Decision(ChannelChoice(Channel.NONE, reason), missing)
-
-
-def find_alternative(name: str) -> str | None:
-    """Return the name under which another release has this parameter, or one in its place; None if there is none."""
-    return _ALTERNATIVES.get(name)
 
 
 def require(channels: tuple[Channel, ...], right: str, check: Check, why: str, label: str = "") -> ParameterRule:

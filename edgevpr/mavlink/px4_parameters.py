@@ -34,8 +34,8 @@ _DELAY_CONSEQUENCE = "We send the position of the moment, and it would be taken 
 
 
 def choose_px4_channel(_kind: VehicleKind, parameters: Parameters) -> ChannelChoice:
-    """Choose the channel for a PX4: message 296 or ODOMETRY if CONTROL or VISION_CONTROL let it fuse positions, else
-    command 43003."""
+    """Choose the channel for a PX4: message 296 or ODOMETRY if AGP_CONTROL or VISION_CONTROL allow them, else command
+    43003."""
     fuses_ours = has_bit(parameters.get(AGP_CONTROL, 0), POSITION_BIT)
     if parameters.get(VISION_CONTROL) == POSITION_BIT and not fuses_ours:
         reason = Reason(ReasonCode.BY_ODOMETRY, {"parameter": VISION_CONTROL, "source_set": None})

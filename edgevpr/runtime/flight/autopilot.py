@@ -124,7 +124,8 @@ class AutopilotOutput:
             if sending:
                 if sending.sent is not False:  # a fix that was not sent gets no answer; the line of its query says why
                     self._unanswered.append((event.name, sending))
-                fix = _make_report(event.name, sending)
+                fields = _position_fields(sending.fix)
+                fix = FixReport(query=event.name, sent=sending.sent, why=sending.why, answer=sending.answer, **fields)
             self._send_figures(event, used_mah)
         return replace(event, fix=fix)
 
@@ -285,16 +286,6 @@ class SourceSets:
             return None
         self._requested, self._requested_s = number, now_s
         return number
-
-
-def _make_report(query: str, sending: FixTransmission) -> FixReport:
-    return FixReport(
-        query=query,
-        sent=sending.sent,
-        why=sending.why,
-        answer=sending.answer,
-        **_position_fields(sending.fix),
-    )
 
 
 def _position_fields(fix: Fix) -> dict[str, float]:

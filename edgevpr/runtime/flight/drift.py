@@ -122,19 +122,15 @@ class DriftFilter:
         else:
             move[_B, _B] = math.exp(-step_s / _ATTITUDE_ERROR_TIME_S) * _EYE
         drift = self._drift
-        rough = 1.0 + _MAX_NOISE_FACTOR * self._roughness  # gyros that tilt wrongly turn wrongly too
+        # Poorness of the gyros, by the tilts that pictures have shown: gyros that tilt wrongly turn wrongly too.
+        share = (self._attitude_error - _CALM_ERROR) / (_ROUGH_ERROR - _CALM_ERROR)
+        rough = 1.0 + _MAX_NOISE_FACTOR * min(1.0, max(0.0, share)) * drift.is_of_attitude
         wander = drift.acceleration_noise * (rough + _GPS_LOSS_NOISE_FACTOR * self._gps_loss)
         noise = np.repeat((drift.position_noise, drift.velocity_noise, wander, 0.0, 0.0, _ODOMETRY_NOISE * rough), 2)
         noise[_TURN] += _ODOMETRY_NOISE * _GPS_LOSS_TURN_FACTOR * self._gps_loss
         self._x = move @ self._x
         self._p = move @ self._p @ move.T + step_s * np.diag(np.square(noise))
         self._gps_loss *= math.exp(-step_s / _GPS_LOSS_TIME_S)
-
-    @property
-    def _roughness(self) -> float:
-        """Poorness of the gyros, 0 to 1, by the leans that pictures have shown."""
-        share = (self._attitude_error - _CALM_ERROR) / (_ROUGH_ERROR - _CALM_ERROR)
-        return min(1.0, max(0.0, share)) if self._drift.is_of_attitude else 0.0
 
     def lose_gps(self) -> None:
         """Note that GPS is lost: the error of velocity becomes more uncertain, since nothing corrects it any more, and

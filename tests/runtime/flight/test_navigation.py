@@ -110,10 +110,10 @@ def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopi
     assert (abs(errors_m) < 2 * said_m[:, None]).mean() > 0.9
 
 
-@pytest.mark.parametrize("upset", [drift._UPSET, 0.0])
+@pytest.mark.parametrize("upset", [drift._GPS_LOSS_NOISE_FACTOR, 0.0])
 def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_reckon_is_allowed_for(upset, monkeypatch):
     """4.5 degrees within ten seconds, 100 m high: fixes and strides lead 8 m away, and claim a metre."""
-    monkeypatch.setattr(drift, "_UPSET", upset)
+    monkeypatch.setattr(drift, "_GPS_LOSS_NOISE_FACTOR", upset)
     flown, frames = Flown(DEAD_RECKONING, wind=(5.0, 0.0), fix_sd_m=0.5), []
     flown.fly(30, has_gps=True, fixes=False)
     loss_s, lean_s2 = flown.t_s, 100 / GRAVITY_M_S2
