@@ -17,6 +17,7 @@ from edgevpr.cli.shared import (
     add_parameters,
     add_recording,
     check_output,
+    describe_lost_calibration,
     make_config,
     parse_count,
     parse_parameters,
@@ -309,10 +310,7 @@ def run_map_merge(args: Namespace) -> int:
     merged = {"map": args.out, "places": sum(copied for copied, _ in counts), "of": parts}
     text = [f"{part['map']}: {part['copied']} places copied, {part['already_here']} already there" for part in parts]
     text.append(f"{args.out}: {merged['places']} places")
-    if were_calibrated:
-        text.append(
-            f"  not calibrated: the confidence of its parts does not apply; run edgevpr map calibrate {args.out}"
-        )
+    text += describe_lost_calibration(args.out, were_calibrated)
     print_result({**merged, "lost_calibration": were_calibrated}, args.json, text)
     return 0
 

@@ -169,6 +169,12 @@ def print_result(value: Any, as_json: bool, text: str | Iterable[str] | None = N
         print(lines if isinstance(lines, str) else "\n".join(map(sanitize, lines)))
 
 
+def describe_lost_calibration(path: str, is_lost: bool) -> list[str]:
+    """Return what to do with a map made of several calibrated maps, in a line; none if nothing `is_lost`."""
+    why = "not calibrated: the confidence of its parts does not apply, and the shipped one is used"
+    return [f"  {why}; run edgevpr map calibrate {path}"] if is_lost else []
+
+
 def format_fields(fields: dict[str, Any], indent: str = "") -> Iterator[str]:
     """Yield a line of text for each field that is known: its name, and its value with the unit that ends the name. The
     lines of a field that has fields itself are indented; a list of rows or sentences has one line for each."""

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from edgevpr.cli.shared import add_json, parse_positive, print_result
+from edgevpr.cli.shared import add_json, describe_lost_calibration, format_fields, parse_positive, print_result
 from edgevpr.core.text import progress
 
 _MARGIN_M = 500.0
@@ -41,5 +41,7 @@ def run_map_subset(args: Namespace) -> int:
 
     area, out = read_area(args.mission), parse_map_path(args.out)
     result = subset(Path(args.map), area, args.margin_m, out, args.mb and 1e6 * args.mb, progress)
-    print_result({"map": str(out), **asdict(result)}, args.json)
+    fields = {"map": str(out), **asdict(result)}
+    text = [*format_fields(fields), *describe_lost_calibration(str(out), result.lost_calibration)]
+    print_result(fields, args.json, text)
     return 0

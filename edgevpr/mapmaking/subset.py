@@ -12,25 +12,19 @@ from edgevpr.mapmaking.missions import Area, shapely
 from edgevpr.places import mapfiles
 from edgevpr.places.examine import ShowProgress, copy_places, merge_maps, read_place_positions, shrink_map
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.calibration import (
-    MapCalibration,
-    calibration_text,
-    join_calibrations,
-    read_calibration_for,
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Subset:
     """A map that was made for one flight. `maps`: number of those that it was made of. `near`: places near the mission,
-    of which the best `places` are in it. `file_bytes`: its size. `is_calibrated`: it has the calibration of the map
-    that it is of, or that of several (see `join_calibrations`)."""
+    of which the best `places` are in it. `file_bytes`: its size. `lost_calibration`: it is of several
+    maps, one of which was calibrated, and is not."""
 
     maps: int
     near: int
     places: int
     file_bytes: int
-    is_calibrated: bool
+    lost_calibration: bool
 
 
 def subset(
@@ -46,28 +40,23 @@ def subset(
 
     ground = area.on_plane(project, margin_m, margin_m)
     ids_near: dict[Path, list[int]] = {}
-    calibrations: list[MapCalibration | None] = []
     for path in _list_maps(source):
         with PlaceMap.open(path) as place_map:
             place_ids, lat_deg, lon_deg = read_place_positions(place_map)
             if there := place_ids[shapely.contains_xy(ground, *project(lat_deg, lon_deg))].tolist():
                 ids_near[path] = there
-                calibrations.append(read_calibration_for(place_map))
-    paths = list(ids_near)
+    paths, lost_calibration = list(ids_near), False
     with mapfiles.write_atomically(out) as unfinished, tempfile.TemporaryDirectory(dir=out.parent) as scratch:
         whole, made = Path(scratch) / "near.gpkg", Path(scratch) / "small.gpkg"
         if len(paths) == 1:
             near = copy_places(paths[0], whole, ids_near[paths[0]])
-        else:
-            counts = merge_maps(paths, whole, show_progress, list(ids_near.values()))[0] if paths else []
+        elif paths:
+            counts, lost_calibration = merge_maps(paths, whole, show_progress, list(ids_near.values()))
             near = sum(copied for copied, _ in counts)
-        if not near:
+        if not paths or not near:
             raise UsageError(
                 f"No place of {source} is within {margin_m:g} m of the mission: check both, or the margin."
             )
-        if len(paths) > 1 and (calibration := join_calibrations(calibrations)):
-            with PlaceMap.open_for_adding(whole) as place_map:
-                place_map.record_calibration(calibration_text(calibration))
         count, file_bytes = near, whole.stat().st_size
         if most_bytes is not None and file_bytes > most_bytes:
             count = int(near * most_bytes / file_bytes)
@@ -75,10 +64,8 @@ def subset(
                 raise UsageError(f"A place takes {file_bytes / near / 1e6:.3f} MB, and {most_bytes / 1e6:g} hold none.")
             shrink_map(whole, made, count, show_progress)
         shutil.move(made if count < near else whole, unfinished)
-        with PlaceMap.open(unfinished) as place_map:
-            is_calibrated = place_map.calibration is not None
         size = unfinished.stat().st_size
-    return Subset(maps=len(paths), near=near, places=count, file_bytes=size, is_calibrated=is_calibrated)
+    return Subset(maps=len(paths), near=near, places=count, file_bytes=size, lost_calibration=lost_calibration)
 
 
 def _list_maps(source: Path) -> list[Path]:

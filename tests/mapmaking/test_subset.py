@@ -1,12 +1,12 @@
 """The part of a map that a mission needs."""
 
 import shutil
-from dataclasses import replace
 
 import pytest
 from pictures import textured
 from walks import map_of
 
+from edgevpr.cli.main import main
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Frame, Position
@@ -14,8 +14,6 @@ from edgevpr.mapmaking.missions import Area, Waypoint
 from edgevpr.mapmaking.subset import subset
 from edgevpr.places.examine import iterate_silently, merge_maps
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.calibration import MapCalibration, calibration_text, read_calibration_for
-from edgevpr.runtime.recognise.confidence import prior
 from edgevpr.techniques import create
 
 HOME = 47.0, 8.0
@@ -64,7 +62,7 @@ def test_places_along_a_path_are_taken_from_the_maps_that_they_are_in(tiles, who
         whole if of_one else tiles, path_over((0, 200), (400, 200)), 110.0, tmp_path / "f.gpkg", None, iterate_silently
     )
     assert names_in(tmp_path / "f.gpkg") == sorted(f"{column}{row}" for column in range(5) for row in (1, 2, 3))
-    assert (found.maps, found.near, found.places, found.is_calibrated) == (1 if of_one else 4, 15, 15, False)
+    assert (found.maps, found.near, found.places, found.lost_calibration) == (1 if of_one else 4, 15, 15, False)
     assert found.file_bytes == (tmp_path / "f.gpkg").stat().st_size
 
 
@@ -92,22 +90,19 @@ def test_a_budget_keeps_the_places_that_leave_the_smallest_gaps(tiles, tmp_path)
     assert not (tmp_path / "g.gpkg").exists()
 
 
-def test_the_most_cautious_calibration_of_the_tiles_counts(tiles, tmp_path):
+def test_map_subset_of_several_calibrated_maps_is_not_calibrated_and_says_so(tiles, tmp_path, capsys):
     shutil.copytree(tiles, tmp_path / "tiles")
-    paths, model = sorted((tmp_path / "tiles").iterdir()), prior("ahead")
-    model = replace(model, scale=model.adapted_scale, adapted_scale=None)
-    for number, path in enumerate(paths):
-        biased = replace(model, of_place=replace(model.of_place, bias=float(-number)))
-        calibration = MapCalibration(
-            models={"ahead": biased}, made="2026-05-01", asked=40, precision=0.999, accepted=0.5, accepted_wrong=0
-        )
+    for path in (tmp_path / "tiles").iterdir():
         with PlaceMap.open_for_adding(path) as place_map:
-            place_map.record_calibration(calibration_text(calibration))
-    area = path_over((0, 0), (400, 400))
-    assert subset(tmp_path / "tiles", area, 1000.0, tmp_path / "f.gpkg", None, iterate_silently).is_calibrated
-    with PlaceMap.open(tmp_path / "f.gpkg") as place_map:
-        (joined,) = read_calibration_for(place_map).models.values()
-    assert {each.bias for each in (joined.of_place, *joined.of_other_places)} == {-float(n) for n in range(len(paths))}
+            place_map.record_calibration("of this map")
+    out, (lat_deg, lon_deg) = tmp_path / "f.gpkg", at(200, 200)
+    one, several = tmp_path / "tiles" / "0.gpkg", tmp_path / "tiles"
+    for source, lost, kept in ((one, False, "of this map"), (several, True, None)):
+        assert main(["map", "subset", str(source), "--mission", f"{lat_deg},{lon_deg},1000", "--out", str(out)]) == 0
+        assert (f"edgevpr map calibrate {out}" in capsys.readouterr().out) == lost
+        with PlaceMap.open(out) as place_map:
+            assert place_map.calibration == kept
+        out.unlink()
 
 
 def test_what_cannot_be_taken_is_said_and_leaves_nothing(tiles, tmp_path):

@@ -4,13 +4,13 @@
 import json
 import logging
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from edgevpr.core.errors import MapError
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.confidence import Model, prior, select_model
+from edgevpr.runtime.recognise.confidence import Model, select_model
 from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE, LookAlike, LookAlikes
 
 MIN_PLACES = 30  # a map with fewer is not calibrated
@@ -60,11 +60,6 @@ class MapCalibration:
 
     def described(self) -> str:
         """Describe the calibration in one sentence: matches accepted, wrong matches, and hardly recognisable places."""
-        if not self.recognisable:  # see `join_calibrations`
-            return (
-                f"the most cautious of its parts counts: of {self.asked} altered copies of their own images at least "
-                f"{100 * self.accepted:.0f} % were accepted, at a precision of {100 * self.precision:.6g} %"
-            )
         wrong = f"{self.accepted_wrong or 'no'} wrong match{'es were' if self.accepted_wrong > 1 else ' was'} accepted"
         alike = "; most of this map looks alike: expect few fixes over it" if self.looks_alike else ""
         return (
@@ -78,7 +73,7 @@ def require_usable(kind: str, model: Model) -> None:
     """Check a model read from a map. Raises ValueError for an unknown kind or name of evidence, as another version of
     edgevpr may have, and ValueError or ArithmeticError for figures with which no confidence can be computed."""
     known = OF_MAP.get(kind, ()) + OF_PLACE.get(kind, ())
-    names = {name for each in (model.of_map, model.of_place, *model.of_other_places) for name in each.names}
+    names = {name for each in (model.of_map, model.of_place) for name in each.names}
     if unknown := names.difference(known):
         raise ValueError(f"there is no evidence {min(unknown)!r:.40} of kind {kind!r:.40}")
     for value in (-1.0, 0.0, 1.0):
@@ -103,42 +98,6 @@ def read_calibration_for(place_map: PlaceMap) -> MapCalibration | None:
         )
         return None
     return found
-
-
-def join_calibrations(maps: Sequence[MapCalibration | None]) -> MapCalibration | None:
-    """Join the calibrations of maps whose places are put together (None: a map has none): a match is only accepted if
-    each of them accepts it, and the shipped confidence, if one has none. Places of different maps that look alike were
-    never seen together. Returns None if no map has one, or if different versions have made them."""
-    known = [each for each in maps if each]
-    if not known:
-        return None
-    models = {}
-    for kind in known[0].models:
-        shipped, own = prior(kind), [each.models[kind] for each in known if kind in each.models]
-        scale = shipped.adapted_scale or shipped.scale
-        if len(own) < len(known) or any((each.of_map, each.scale) != (shipped.of_map, scale) for each in own):
-            return None
-        of_places = [place for each in own for place in (each.of_place, *each.of_other_places)]
-        if len(known) < len(maps):  # its scale is the stricter one, see `Model.threshold`
-            of_places, scale = [*of_places, shipped.of_place], shipped.scale
-        models[kind] = Model(
-            of_map=shipped.of_map,
-            of_place=of_places[0],
-            of_other_places=tuple(dict.fromkeys(of_places[1:])),
-            scale=scale,
-            adapted_scale=shipped.adapted_scale if len(known) < len(maps) else None,
-            made=min(each.made for each in known),
-            made_of=f"the calibrations of {len(known)} of {len(maps)} maps",
-            matches=shipped.matches,
-        )
-    return MapCalibration(
-        models=models,
-        made=min(each.made for each in known),
-        asked=sum(each.asked for each in known),
-        precision=max(each.precision for each in known),
-        accepted=min(each.accepted for each in known),
-        accepted_wrong=sum(each.accepted_wrong for each in known),
-    )
 
 
 def not_calibrated(places: int) -> str:

@@ -89,14 +89,12 @@ class Scale:
 class Model:
     """Computes the confidence of the matches of one technique and kind of evidence. `of_map` is the regression that
     tells whether the query shows ground of the map, `of_place` whether the best place is the right one, and `scale`
-    converts their logits. Of a map joined of several, `of_other_places` are those of the others: the least logit
-    counts. `adapted_scale` replaces `scale` once the model is adapted to a map (None: this model is
+    converts their logits. `adapted_scale` replaces `scale` once the model is adapted to a map (None: this model is
     adapted). `made` is its date, `made_of` describes in words the data it was fitted to, and `matches` is the number of
     matches of many sites that the scale was fitted to."""
 
     of_map: Logistic
     of_place: Logistic
-    of_other_places: tuple[Logistic, ...] = ()
     scale: Scale
     adapted_scale: Scale | None = None
     made: str
@@ -106,10 +104,10 @@ class Model:
     def chance(self, evidence: Figures) -> float:
         """Return the probability (0..1) that a wrong match offers as much evidence; 1 if any of it is not finite. If
         the heading is known, `tried` says that fewer rotations than a map was measured with had the chance to match."""
-        of_map, *of_places = (each.logit(evidence) for each in (self.of_map, self.of_place, *self.of_other_places))
-        if not all(map(math.isfinite, (of_map, *of_places))):
+        of_map, of_place = self.of_map.logit(evidence), self.of_place.logit(evidence)
+        if not (math.isfinite(of_map) and math.isfinite(of_place)):
             return 1.0
-        chance = self.scale.off_map.beyond(of_map) + self.scale.off_place.beyond(min(of_places))
+        chance = self.scale.off_map.beyond(of_map) + self.scale.off_place.beyond(of_place)
         return min(1.0, chance * math.pow(evidence.get("tried", 1.0), _OF_ROTATIONS))
 
     def confidence(self, evidence: Figures) -> float:
@@ -134,11 +132,14 @@ class Model:
 
 
 def select_model(stored: Mapping[str, Any]) -> Model:
-    """Make a model from decoded JSON. Raises KeyError or TypeError for other contents."""
+    """Make a model from decoded JSON. Raises KeyError or TypeError for other contents, and ValueError for a model that
+    was joined from those of several maps."""
+    if stored.get("of_other_places"):  # earlier builds joined the models of several maps
+        raise ValueError("it was joined from several maps")
+    stored = {name: value for name, value in stored.items() if name != "of_other_places"}
     scales = {name: stored[name] and _scale(**stored[name]) for name in ("scale", "adapted_scale")}
     regressions = {name: _logistic(**stored[name]) for name in ("of_map", "of_place")}
-    others = tuple(_logistic(**each) for each in stored.get("of_other_places", ()))
-    return Model(**{**stored, **regressions, **scales, "of_other_places": others})
+    return Model(**{**stored, **regressions, **scales})
 
 
 @lru_cache

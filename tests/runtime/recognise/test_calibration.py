@@ -10,7 +10,6 @@ import sqlite3
 import zlib
 from dataclasses import asdict, replace
 
-import numpy as np
 import pytest
 from pictures import textured
 from walks import map_of
@@ -22,14 +21,11 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.calibration import (
     MapCalibration,
     calibration_text,
-    join_calibrations,
-    read_calibration,
     read_calibration_for,
     require_usable,
 )
 from edgevpr.runtime.recognise.confidence import prior, select_model
-from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE, Evidence
-from edgevpr.runtime.recognise.judge import Sureness
+from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.techniques import create
 
@@ -86,9 +82,10 @@ def test_a_flight_decides_by_the_models_of_its_map(path, caplog):
     assert not caplog.records
 
 
-def changed(**figures):
-    """The text of the calibration with other figures of its model, and a right checksum."""
+def changed(of_other_places=(), **figures):
+    """The text of the calibration as an earlier build wrote it, with other figures of its model, and its checksum."""
     stored = json.loads(calibration_text(FOUND)[8:])
+    stored["models"]["ahead"]["of_other_places"] = of_other_places
     stored["models"]["ahead"]["of_map"].update(figures)
     body = json.dumps(stored)
     return f"{zlib.crc32(body.encode()):08x}{body}"
@@ -101,6 +98,7 @@ DAMAGED = {
     "evidence that there is not": changed(names=["colour", *OWN.of_map.names[1:]]),
     "a kind that there is not": calibration_text(replace(FOUND, models={"sideways": OWN})),
     "a weight too few": changed(weights=OWN.of_map.weights[1:]),
+    "joined from several maps": changed(of_other_places=[asdict(OWN.of_place)]),
     "a place that is no number": calibration_text(replace(FOUND, recognisable={"x": 0.5})),
     "no places": calibration_text(replace(FOUND, recognisable=None)),
     "a wrong surrogate": "\ud800" * 9,
@@ -138,46 +136,3 @@ def test_a_shipped_model_makes_a_probability_of_any_evidence(kind):
     needed = [model.threshold(precision) for precision in (0.5, 0.9, 0.99, 0.999, 0.999999)]
     assert needed == sorted(needed)
     assert needed[0] < needed[-1]
-
-
-def adapted_to(rng, kind):
-    """The calibration of a map whose places look alike in a way of its own."""
-    shipped = prior(kind)
-    weights = tuple((np.array(shipped.of_place.weights) * rng.uniform(0.3, 1.7, len(shipped.of_place.names))).tolist())
-    of_place = replace(shipped.of_place, weights=weights, bias=shipped.of_place.bias + rng.uniform(-2, 2))
-    model = replace(shipped, of_place=of_place, scale=shipped.adapted_scale, adapted_scale=None, made="2026-05-01")
-    return replace(FOUND, models={kind: model}, asked=int(rng.integers(30, 60)), accepted=float(rng.uniform(0.2, 0.9)))
-
-
-@pytest.mark.parametrize("kind", ["ahead", "ahead_proven", "down", "down_bare"])
-@pytest.mark.parametrize("bare", [0, 1])  # maps without a calibration
-def test_joined_maps_accept_nothing_that_one_of_them_refuses(kind, bare):
-    rng = np.random.default_rng(3)
-    maps = [*(adapted_to(rng, kind) for _ in range(3)), *[None] * bare]
-    joined = read_calibration(calibration_text(join_calibrations(maps)))
-    require_usable(kind, joined.models[kind])
-    every = [Sureness(each.models if each else {kind: prior(kind)}, 0.999) for each in maps]
-    of_joined, accepted, refused = Sureness(joined.models, 0.999), 0, 0
-    for _ in range(3000):
-        figures = {name: float(rng.normal(1.5, 3)) for name in sorted({*OF_MAP[kind], *OF_PLACE[kind]})}
-        seen = Evidence(agree=0.0, **figures)
-        each_accepts = [one.confidence(seen) >= one.threshold(seen) for one in every]
-        if of_joined.confidence(seen) >= of_joined.threshold(seen):
-            assert all(each_accepts)
-            accepted += 1
-        refused += any(each_accepts) and not all(each_accepts)
-    assert min(accepted, refused) > 20
-    assert (joined.asked, joined.accepted) == (
-        sum(each.asked for each in maps if each),
-        min(each.accepted for each in maps if each),
-    )
-    assert "the most cautious of its parts counts" in joined.described()
-
-
-def test_maps_that_cannot_be_joined_are_not_calibrated():
-    other = replace(prior("ahead"), of_map=replace(prior("ahead").of_map, bias=1.0))  # of another version
-    assert join_calibrations([None, None]) is None
-    assert (
-        join_calibrations([adapted_to(np.random.default_rng(1), "ahead"), replace(FOUND, models={"ahead": other})])
-        is None
-    )
