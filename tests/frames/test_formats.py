@@ -44,7 +44,7 @@ def write_video(path: Path, pictures, pixel_format: str, codec: str = "ffv1", **
     return path
 
 
-def frames_of(path: Path) -> list[np.ndarray]:
+def read_frames(path: Path) -> list[np.ndarray]:
     return [frame.image for frame in read_to_end(open_source(str(path), live=False), pytest.fail) if frame]
 
 
@@ -57,7 +57,7 @@ def thermal_flight() -> list[np.ndarray]:
     return [as_counts(np.roll(SCENE, 8 * step, 1)) for step in range(12)]
 
 
-def decoded(path: Path) -> tuple[VideoDecoder, list[av.VideoFrame]]:
+def decode_file(path: Path) -> tuple[VideoDecoder, list[av.VideoFrame]]:
     whole = open_decoder(str(path), {})
     return whole, [picture for fetched in iter(whole.fetch, None) for picture in whole.decode(fetched)]
 
@@ -67,7 +67,7 @@ def decoded(path: Path) -> tuple[VideoDecoder, list[av.VideoFrame]]:
 def test_two_threads_convert_the_pictures_of_one_stream(pixel_format, tmp_path):
     """Two threads in one converter of FFmpeg hang or crash, and take memory without end."""
     codec = "rawvideo" if pixel_format == "yuyv422" else "ffv1"
-    whole, pictures = decoded(write_video(tmp_path / "a.nut", [cv2.merge([RAMP] * 3)] * 8, pixel_format, codec))
+    whole, pictures = decode_file(write_video(tmp_path / "a.nut", [cv2.merge([RAMP] * 3)] * 8, pixel_format, codec))
     finished = []
 
     def convert() -> None:
@@ -110,7 +110,7 @@ def test_a_ramp_of_grey_keeps_its_levels_in_every_format(pixel_format, codec, co
     options = {"libx264": {"qp": "1"}, "libx265": {"crf": "4", "x265-params": "log-level=none"}}.get(codec, {})
     quality = {"qmin": 1, "qmax": 1} if codec == "mjpeg" else {}
     settings = {"options": options, "color_range": color_range, **quality}
-    (image,) = frames_of(write_video(tmp_path / "ramp.nut", [frame], pixel_format, codec, **settings))
+    (image,) = read_frames(write_video(tmp_path / "ramp.nut", [frame], pixel_format, codec, **settings))
     assert np.abs(image[SIZE_PX[1] // 2].astype(int) - RAMP[0][:, None]).max() <= levels
 
 
@@ -118,19 +118,19 @@ def test_counts_are_the_same_from_a_folder_and_from_a_video(tmp_path):
     flight = thermal_flight()
     for index, counts in enumerate(flight):
         cv2.imwrite(str(tmp_path / f"{index}{('.png', '.tif')[index % 2]}"), counts)
-    images = frames_of(tmp_path)
+    images = read_frames(tmp_path)
     assert all(image.std() > 50 for image in images)
     for form in ("gray16le", "gray16be"):
         video = [av.VideoFrame.from_ndarray(counts, "gray16le").reformat(format=form) for counts in flight]
         path = write_video(tmp_path / f"{form}.nut", video, form, "rawvideo")
-        assert all((image == frame).all() for image, frame in zip(images, frames_of(path), strict=True))
+        assert all((image == frame).all() for image, frame in zip(images, read_frames(path), strict=True))
 
 
 def test_video_of_12_bits_of_grey_shows_its_own_range_with_square_pixels(tmp_path):
     counts = as_counts(SCENE, 32, 16_000)  # 16 times the counts of 12 bits
     video = [av.VideoFrame.from_ndarray(counts, "gray16le").reformat(format="gray12le")]
     settings = {"options": {"x265-params": "log-level=none:lossless=1"}, "sample_aspect_ratio": Fraction(3, 2)}
-    (image,) = frames_of(write_video(tmp_path / "a.mkv", video, "gray12le", "libx265", **settings))
+    (image,) = read_frames(write_video(tmp_path / "a.mkv", video, "gray12le", "libx265", **settings))
     assert image.std() > 50
     assert image.shape == (240, 480)
 
@@ -173,7 +173,7 @@ def test_noise_without_a_scene_is_not_made_a_picture():
 def test_coarse_copies_of_a_frozen_picture_of_counts_are_equal(tmp_path):
     flight = [*thermal_flight(), *[thermal_flight()[3]] * 3]
     video = [av.VideoFrame.from_ndarray(counts, "gray16le") for counts in flight]
-    whole, pictures = decoded(write_video(tmp_path / "a.nut", video, "gray16le"))
+    whole, pictures = decode_file(write_video(tmp_path / "a.nut", video, "gray16le"))
     looks = [whole.make_thumbnail(picture) for picture in pictures]
     assert (looks[-1] == looks[-2]).all()
     assert np.abs(looks[0].astype(int) - looks[1]).mean() > 3
@@ -202,7 +202,7 @@ def test_v4l2_camera_of_16_bits_shows_what_a_folder_of_its_images_does(tmp_path)
     for index, counts in enumerate(thermal_flight()):
         cv2.imwrite(str(tmp_path / f"{index}.png"), counts)
     capture = DeviceCapture(ThermalCamera(thermal_flight()), clock=lambda: 1.0)
-    for image in frames_of(tmp_path):
+    for image in read_frames(tmp_path):
         shot = capture.read()
         assert (shot.convert() == image).all()
         assert shot.thumbnail.std() > 50
@@ -216,7 +216,7 @@ def test_pixels_that_are_not_square_are_resampled_unless_their_shape_cannot_be_r
     circle = np.zeros((240, 320, 3), np.uint8)
     cv2.ellipse(circle, (160, 120), (round(160 / (width_px / 320)) // 2, 80), 0, 0, 360, (255, 255, 255), -1)
     settings = {"codec": "libx264", "sample_aspect_ratio": Fraction(aspect)}
-    images = frames_of(write_video(tmp_path / f"a{extension}", [circle] * 3, "yuv420p", **settings))
+    images = read_frames(write_video(tmp_path / f"a{extension}", [circle] * 3, "yuv420p", **settings))
     assert {image.shape for image in images} == {(240, width_px, 3)}
     *_, width, height = cv2.boundingRect((images[0][..., 1] > 128).astype(np.uint8))
     assert width == pytest.approx(height, abs=3)

@@ -32,14 +32,14 @@ def feed_delayed(time, delays_s, **more):
     return feed(time, taken_s, taken_s + delays_s, **more)[0]
 
 
-def sizes_of(pictures, rng, key_every=10, key_factor=2.2):
+def draw_sizes(pictures, rng, key_every=10, key_factor=2.2):
     """Bytes of pictures of which each tenth is decoded without others."""
     sizes = 20_000 * (1 + 0.1 * rng.standard_normal(pictures))
     sizes[::key_every] *= key_factor
     return sizes
 
 
-def come_through_link(taken_s, sizes, bytes_per_s, rng, jitter_s=0.003):
+def simulate_link(taken_s, sizes, bytes_per_s, rng, jitter_s=0.003):
     """Times at which pictures come, one after the other, through a link with the capacity `bytes_per_s(t_s)`."""
     now_s, came_s = 0.0, []
     for taken, size in zip(taken_s, sizes, strict=True):
@@ -58,7 +58,7 @@ def test_stamps_of_another_rate_make_no_picture_old(rate, from_s, rate_hz):
     """Three minutes, with jitter; a camera that stamps 25 pictures a second and delivers 12 has the rate 0.48."""
     rng = np.random.default_rng(1)
     taken_s = np.arange(180 * rate_hz) / rate_hz
-    sizes = sizes_of(len(taken_s), rng)
+    sizes = draw_sizes(len(taken_s), rng)
     came_s = np.maximum.accumulate(taken_s + rng.exponential(0.005, len(taken_s)))
     time = StampedTime()
     ages_s, sds_s = feed(time, taken_s, came_s, rate=rate, sizes=sizes)
@@ -79,9 +79,9 @@ def test_congestion_makes_pictures_older_and_is_no_clock(slow, lasts_s, key_fact
     """A link that carries 0.84 of what is sent makes the delay grow as straightly as stamps that run slow."""
     rng = np.random.default_rng(2)
     taken_s = np.arange(90 * 25) / 25
-    sizes = sizes_of(len(taken_s), rng, key_factor=key_factor)
+    sizes = draw_sizes(len(taken_s), rng, key_factor=key_factor)
     sent_bytes_per_s = 25 * sizes.mean()
-    came_s = come_through_link(
+    came_s = simulate_link(
         taken_s, sizes, lambda t_s: (slow if 30 <= t_s < 30 + lasts_s else 3) * sent_bytes_per_s, rng
     )
     time = StampedTime()
@@ -98,9 +98,9 @@ def test_congestion_of_a_link_that_changes_is_no_clock(seed):
     """Capacities of 0.3 to 1.3 of what is sent, each for some seconds, and pictures that are nearly all of one size."""
     rng = np.random.default_rng(seed)
     taken_s = np.arange(90 * 25) / 25
-    sizes = sizes_of(len(taken_s), rng, key_every=25, key_factor=1.0 + seed)
+    sizes = draw_sizes(len(taken_s), rng, key_every=25, key_factor=1.0 + seed)
     capacities = 25 * sizes.mean() * np.where(np.arange(1000) < 2, 3, rng.uniform(0.3, 1.3, 1000))
-    came_s = come_through_link(taken_s, sizes, lambda t_s: capacities[int(t_s / 4)], rng)
+    came_s = simulate_link(taken_s, sizes, lambda t_s: capacities[int(t_s / 4)], rng)
     ages_s, _ = feed(StampedTime(), taken_s, came_s, sizes=sizes)
     assert np.nanmin(ages_s - (came_s - taken_s)) > -0.1, "none is said to be younger than it is"
 
@@ -116,7 +116,7 @@ def test_a_camera_that_runs_slow_and_then_right_is_followed():
     rng = np.random.default_rng(3)
     steps_s = np.r_[np.full(12 * 30, 1 / 12), np.full(25 * 60, 1 / 25)]
     taken_s = np.cumsum(steps_s)
-    sizes = sizes_of(len(taken_s), rng)
+    sizes = draw_sizes(len(taken_s), rng)
     time, ages_s = StampedTime(), []
     came_s = np.maximum.accumulate(taken_s + rng.exponential(0.005, len(taken_s)))
     for number, came in enumerate(came_s):
@@ -185,7 +185,7 @@ def test_age_is_less_certain_where_stamps_are_counted(rate, least_sd_s):
     taken_s = np.arange(20 * 25) / 25
     came_s = taken_s + rng.uniform(0, 0.002, len(taken_s))
     came_s[-1] += 1.0
-    ages_s, sds_s = feed(StampedTime(), taken_s, came_s, rate=rate, sizes=sizes_of(len(taken_s), rng))
+    ages_s, sds_s = feed(StampedTime(), taken_s, came_s, rate=rate, sizes=draw_sizes(len(taken_s), rng))
     assert ages_s[-1] == pytest.approx(1.0, abs=0.02)
     assert sds_s[-1] == pytest.approx(least_sd_s, rel=0.05)
     assert sds_s[-2] == pytest.approx(FRAME_TIME_SD_S, rel=0.05)

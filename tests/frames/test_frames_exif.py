@@ -17,22 +17,22 @@ TAKEN, ZONE = 0x9003, 0x9011
 T_UTC_S = 1466699519  # date -u -d '2016-06-23 16:31:59' +%s
 
 
-def tag_of(path, gps=None, **tags):
+def read_tag(path, gps=None, **tags):
     photographs.write_jpeg(path / "photo.jpg", gps, **tags)
     return read_exif(path / "photo.jpg")
 
 
 def test_read_exif_of_a_photograph_with_everything(tmp_path):
     gps = GPS | {ALT_REF: b"\x00", ALT: 198.5, TIME: (16.0, 31.0, 59.5), DATE: "2016:06:23"}
-    tag = tag_of(tmp_path, gps | {DIRECTION_REF: "T", DIRECTION: 123.25})
+    tag = read_tag(tmp_path, gps | {DIRECTION_REF: "T", DIRECTION: 123.25})
     assert tag.position.lat_deg == pytest.approx(46.8425, abs=1e-9)
     assert tag.position.lon_deg == pytest.approx(-91.995, abs=1e-9)
     assert (tag.position.alt_m, tag.heading_deg, tag.t_utc_s) == (198.5, 123.25, T_UTC_S + 0.5)
 
 
 def test_read_exif_ignores_a_height_above_the_ellipsoid_and_a_magnetic_heading(tmp_path):
-    assert tag_of(tmp_path, GPS | {ALT_REF: b"\x02", ALT: 198.5}).position == Position(46.8425, -91.995, None)
-    assert tag_of(tmp_path, {DIRECTION_REF: "M", DIRECTION: 10.0}).heading_deg is None
+    assert read_tag(tmp_path, GPS | {ALT_REF: b"\x02", ALT: 198.5}).position == Position(46.8425, -91.995, None)
+    assert read_tag(tmp_path, {DIRECTION_REF: "M", DIRECTION: 10.0}).heading_deg is None
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_read_exif_ignores_a_height_above_the_ellipsoid_and_a_magnetic_heading(t
     ],
 )
 def test_read_exif_takes_a_senseless_position_for_none(gps, tmp_path):
-    assert tag_of(tmp_path, GPS | gps).position is None
+    assert read_tag(tmp_path, GPS | gps).position is None
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_read_exif_takes_a_senseless_position_for_none(gps, tmp_path):
     ],
 )
 def test_read_exif_time(gps, camera, t_utc_s, tmp_path):
-    assert tag_of(tmp_path, gps, camera=camera).t_utc_s == t_utc_s
+    assert read_tag(tmp_path, gps, camera=camera).t_utc_s == t_utc_s
 
 
 def test_photograph_lying_on_its_side_is_set_upright(tmp_path):

@@ -16,7 +16,7 @@ def view(number):
     return GROUND[2 * number : 2 * number + HEIGHT, 5 * number : 5 * number + WIDTH].copy()
 
 
-def refusals(pictures):
+def find_repeats(pictures):
     newness = RepeatDetector()
     return [newness.find_repeat(make_thumbnail(picture)) for picture in pictures]
 
@@ -29,13 +29,13 @@ NOISY = [
 
 @pytest.mark.parametrize("pictures", [[view(number) for number in range(100)], NOISY], ids=["flight", "hover"])
 def test_pictures_of_a_flight_and_noise_of_a_camera_that_stands_still_are_new(pictures):
-    assert refusals(pictures) == [None] * len(pictures)
+    assert find_repeats(pictures) == [None] * len(pictures)
 
 
 def test_same_picture_is_frozen_for_as_long_as_it_lasts():
     again = view(1)
     again[::40, ::40] += 1  # a grey level here and there does not make a picture new
-    assert refusals([view(0), view(1), *[again] * 20, view(2)]) == [None, None, *[Refusal.FROZEN] * 20, None]
+    assert find_repeats([view(0), view(1), *[again] * 20, view(2)]) == [None, None, *[Refusal.FROZEN] * 20, None]
 
 
 @pytest.mark.parametrize("behind", [1, 2, 4])
@@ -44,7 +44,7 @@ def test_picture_of_which_the_lower_part_is_older_is_patched(behind):
     patched = [view(number) for number in range(40, 90)]
     for picture in patched:
         picture[100:] = flown[-behind][100:]
-    assert refusals([*flown, *patched, view(91)])[40:] == [Refusal.PATCHED] * 50 + [None]
+    assert find_repeats([*flown, *patched, view(91)])[40:] == [Refusal.PATCHED] * 50 + [None]
 
 
 def test_what_stands_in_every_picture_is_no_patch():
@@ -53,7 +53,7 @@ def test_what_stands_in_every_picture_is_no_patch():
     for picture in pictures:
         picture[:70], picture[220:] = 255, 0
         cv2.putText(picture, "ALT 120 BAT 14.8 AUTO", (5, 236), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 255, 2)
-    assert refusals(pictures) == [None] * 80
+    assert find_repeats(pictures) == [None] * 80
 
 
 def test_a_standing_scene_in_which_something_moves_is_no_patch():
@@ -61,8 +61,8 @@ def test_a_standing_scene_in_which_something_moves_is_no_patch():
     pictures = [view(0) for _ in range(60)]
     for number, picture in enumerate(pictures):
         picture[100:160, 4 * number : 4 * number + 40] = GROUND[500:560, 40:80]
-    assert Refusal.PATCHED not in refusals(pictures)
+    assert Refusal.PATCHED not in find_repeats(pictures)
 
 
 def test_a_picture_of_another_size_begins_anew():
-    assert refusals([view(0), view(0)[:96, :128], view(0)[:96, :128]]) == [None, None, Refusal.FROZEN]
+    assert find_repeats([view(0), view(0)[:96, :128], view(0)[:96, :128]]) == [None, None, Refusal.FROZEN]

@@ -47,7 +47,7 @@ def all_frames(source):
     return list(filter(None, read_to_end(source, pytest.fail)))
 
 
-def shades_of(frames):
+def find_shades(frames):
     """Which frames of the test video these are."""
     return [round(frame.image.mean() / 10) for frame in frames]
 
@@ -147,7 +147,7 @@ def test_video_gives_every_frame_to_its_end(video):
     source = open_source(str(video), live=False, clock=lambda: 12.5)
     assert source.total == len(SHADES)
     frames = all_frames(source)
-    assert shades_of(frames) == list(range(len(SHADES)))
+    assert find_shades(frames) == list(range(len(SHADES)))
     assert [frame.name for frame in frames[1:3]] == ["frame 000001 t=0.100 s", "frame 000002 t=0.200 s"]
     assert frames[0].t_mono_s == 12.5
     assert (source.state, source.read(1.0)) == ("ended", None)
@@ -157,7 +157,7 @@ def test_video_gives_every_frame_to_its_end(video):
 def test_frames_of_a_video_are_at_least_a_step_apart(step_s, stride, video):
     source = open_source(str(video), step_s=step_s, live=False)
     frames = all_frames(source)
-    assert shades_of(frames) == list(range(len(SHADES)))[::stride]
+    assert find_shades(frames) == list(range(len(SHADES)))[::stride]
     assert abs(source.total - len(frames)) <= 1
 
 
@@ -182,29 +182,29 @@ def film(path, codec, options, **container):
     return path
 
 
-def frames_and_complaints(path):
+def read_with_complaints(path):
     source, errors = open_source(str(path), live=False), []
     frames = list(filter(None, read_to_end(source, errors.append)))
     return frames, [str(error) for error in errors], source.refused["damaged"], sum(error.count for error in errors)
 
 
-def time_of(frame):
+def read_time(frame):
     return frame.name.split("t=")[1]
 
 
 def test_video_leaves_out_damaged_frames_and_those_built_on_them(tmp_path):
     path = film(tmp_path / "flight.mkv", "libx264", IN_ORDER)
-    whole, complaints, *_ = frames_and_complaints(path)
+    whole, complaints, *_ = read_with_complaints(path)
     assert (len(whole), complaints) == (75, [])
     damaged_file = bytearray(path.read_bytes())
     middle = len(damaged_file) // 2
     damaged_file[middle : middle + 300] = np.random.default_rng(1).bytes(300)
     path.write_bytes(damaged_file)
-    frames, complaints, damaged, missing = frames_and_complaints(path)
-    images = {time_of(frame): frame.image for frame in whole}
-    assert all((images[time_of(frame)] == frame.image).all() for frame in frames)
+    frames, complaints, damaged, missing = read_with_complaints(path)
+    images = {read_time(frame): frame.image for frame in whole}
+    assert all((images[read_time(frame)] == frame.image).all() for frame in frames)
     assert 50 <= len(frames) < 75
-    assert time_of(frames[-1]) == time_of(whole[-1]), "it goes on with the next key frame"
+    assert read_time(frames[-1]) == read_time(whole[-1]), "it goes on with the next key frame"
     assert damaged == missing == 75 - len(frames)
     (complaint,) = complaints
     assert f"{path}: frame 0000" in complaint
@@ -215,14 +215,14 @@ def test_video_leaves_out_frames_predicted_from_one_that_is_missing(tmp_path):
     """Of an MPEG transport stream, recorded from a radio link that lost the packets of a whole frame: no decoder finds
     anything wrong with the frames after it."""
     path = film(tmp_path / "flight.ts", "libx264", IN_ORDER)
-    images = {time_of(frame): frame.image for frame in frames_and_complaints(path)[0]}
+    images = {read_time(frame): frame.image for frame in read_with_complaints(path)[0]}
     packets = [path.read_bytes()[start : start + 188] for start in range(0, path.stat().st_size, 188)]
     video = [index for index, packet in enumerate(packets) if packet[1] & 0x1F == 1 and packet[2] == 0]
     begins = [index for index in video if packets[index][1] & 0x40]
     lost = [index for index in video if begins[35] <= index < begins[36]]
     path.write_bytes(b"".join(packet for index, packet in enumerate(packets) if index not in lost))
-    frames, complaints, damaged, _ = frames_and_complaints(path)
-    assert all((images[time_of(frame)] == frame.image).all() for frame in frames)
+    frames, complaints, damaged, _ = read_with_complaints(path)
+    assert all((images[read_time(frame)] == frame.image).all() for frame in frames)
     assert 55 <= len(frames) <= 65
     assert (len(complaints), len(frames) + damaged) == (1, 74)
 
@@ -232,7 +232,7 @@ def test_video_that_is_cut_short_is_reported(name, tmp_path):
     index_first = {"movflags": "faststart"} if name.endswith("mp4") else {}
     path = film(tmp_path / name, "mpeg4", {"qmin": "3", "qmax": "3"}, **index_first)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    frames, complaints, _, missing = frames_and_complaints(path)
+    frames, complaints, _, missing = read_with_complaints(path)
     assert 10 < len(frames) < 60
     assert len(frames) + missing == pytest.approx(75, abs=1)
     assert re.search(

@@ -131,7 +131,7 @@ def test_read_lens_refuses_what_is_no_calibration(tmp_path, text, given, says):
         read_lens(str(tmp_path / "absent.yaml"))
 
 
-def lens_of(camera):
+def make_lens(camera):
     (focal_x, _, column), (_, focal_y, row) = camera.matrix[:2]
     return CalibratedLens(
         path="lens.yaml",
@@ -143,16 +143,16 @@ def lens_of(camera):
     )
 
 
-def taken(camera, ground, **pose):
+def photograph(camera, ground, **pose):
     pose = {"height_m": 100.0, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0} | pose
     return Frame(image=camera.photograph(ground, 0.5, east_m=400, north_m=400, **pose), name="it", t_mono_s=0.0, **pose)
 
 
-def pinhole(focal_px, size_px):
+def make_pinhole(focal_px, size_px):
     return DistortedCamera(focal_px, (0,) * 4, centre_px=tuple((side - 1) / 2 for side in size_px), size_px=size_px)
 
 
-def off(one, other):
+def difference(one, other):
     return np.abs(one.astype(float) - other).mean()
 
 
@@ -161,17 +161,18 @@ CAMERAS = pytest.mark.parametrize("camera", [wide(), fisheye()], ids=["wide", "f
 
 @CAMERAS
 def test_a_straightened_picture_is_that_of_a_camera_without_distortion(camera, ground):
-    lens, frame = lens_of(camera), taken(camera, ground)
+    lens, frame = make_lens(camera), photograph(camera, ground)
     found = undistort_frame(frame.image, None, UNKNOWN_VIEW, lens)
     sight = compute_lens_view(lens, SIZE_PX)
     height, width = found.image.shape[:2]
     assert (width, height) == sight.straight_px
     assert max(width, height) == max(SIZE_PX)
-    other = pinhole(max(SIZE_PX) / 2 / math.tan(math.radians(sight.fov_deg / 2)), (width, height))
-    truth = taken(other, ground).image
+    other = make_pinhole(max(SIZE_PX) / 2 / math.tan(math.radians(sight.fov_deg / 2)), (width, height))
+    truth = photograph(other, ground).image
     shown = np.ones((height, width), bool) if found.mask is None else found.mask
     assert shown.mean() > 0.95
-    assert off(found.image[shown], truth[shown]) < 1.5 < off(cv2.resize(frame.image, (width, height)), truth) / 3
+    distorted = cv2.resize(frame.image, (width, height))
+    assert difference(found.image[shown], truth[shown]) < 1.5 < difference(distorted, truth) / 3
 
 
 @CAMERAS
@@ -184,10 +185,10 @@ def test_a_straightened_picture_is_that_of_a_camera_without_distortion(camera, g
     ],
 )
 def test_a_picture_is_levelled_and_straightened_in_one_warp(camera, ground, pose):
-    lens = lens_of(camera)
+    lens = make_lens(camera)
     footprint_m = 150.0
     found = level_image(
-        taken(camera, ground, **pose),
+        photograph(camera, ground, **pose),
         None,
         Lens(compute_lens_view(lens, SIZE_PX).fov_deg, 0.0, lens),
         footprint_m,
@@ -195,10 +196,10 @@ def test_a_picture_is_levelled_and_straightened_in_one_warp(camera, ground, pose
     )
     assert (found.view.aside, found.view.footprint_m) == ((0.0, 0.0), pytest.approx(footprint_m))
     side = found.image.shape[0]
-    straight = taken(pinhole(side * 100.0 / footprint_m, (side, side)), ground).image
+    straight = photograph(make_pinhole(side * 100.0 / footprint_m, (side, side)), ground).image
     shown = np.ones((side, side), bool) if found.mask is None else found.mask
     assert shown.mean() > 0.5
-    assert off(found.image[shown], straight[shown]) < 1.5
+    assert difference(found.image[shown], straight[shown]) < 1.5
 
 
 def test_a_mask_of_the_camera_follows_its_picture(ground):
@@ -206,7 +207,7 @@ def test_a_mask_of_the_camera_follows_its_picture(ground):
     overlay = np.ones(SIZE_PX[::-1], bool)
     overlay[:, :160] = False
     grey = np.where(overlay, 255, 0).astype(np.uint8)
-    found = undistort_frame(grey, overlay, UNKNOWN_VIEW, lens_of(camera))
+    found = undistort_frame(grey, overlay, UNKNOWN_VIEW, make_lens(camera))
     assert found.mask is not None
     assert 0.6 < found.mask.mean() < 0.95
     sure = (found.image < 5) | (found.image > 250)
@@ -216,9 +217,12 @@ def test_a_mask_of_the_camera_follows_its_picture(ground):
 def test_what_lies_beyond_the_lens_shows_no_ground(ground):
     """With strong barrel distortion alone, directions far outside of the picture have pixels inside of it too."""
     camera = DistortedCamera(512.0, (-0.3, 0, 0, 0))
-    lens = lens_of(camera)
+    lens = make_lens(camera)
     picture = level_image(
-        taken(camera, ground, pitch_deg=30.0), None, Lens(compute_lens_view(lens, SIZE_PX).fov_deg, 0.0, lens), 250.0
+        photograph(camera, ground, pitch_deg=30.0),
+        None,
+        Lens(compute_lens_view(lens, SIZE_PX).fov_deg, 0.0, lens),
+        250.0,
     )
     assert picture.mask is not None
     outline = cv2.findContours(picture.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
@@ -227,10 +231,10 @@ def test_what_lies_beyond_the_lens_shows_no_ground(ground):
 
 def test_frames_of_another_size_are_scaled_and_of_another_shape_refused(ground):
     camera = wide()
-    lens, frame = lens_of(camera), taken(camera, ground)
+    lens, frame = make_lens(camera), photograph(camera, ground)
     small = cv2.resize(frame.image, (320, 240), interpolation=cv2.INTER_AREA)
     half = undistort_frame(small, None, UNKNOWN_VIEW, lens).image
     full = undistort_frame(frame.image, None, UNKNOWN_VIEW, lens).image
-    assert off(half, cv2.resize(full, half.shape[1::-1], interpolation=cv2.INTER_AREA)) < 1
+    assert difference(half, cv2.resize(full, half.shape[1::-1], interpolation=cv2.INTER_AREA)) < 1
     with pytest.raises(ImageError, match=r"640x360 pixels, and lens\.yaml was calibrated with 640x480"):
         undistort_frame(frame.image[60:420], None, UNKNOWN_VIEW, lens)

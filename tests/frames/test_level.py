@@ -21,31 +21,31 @@ M_PER_PX = 0.5
 MIDDLE_M = 800 * M_PER_PX  # of the ground
 
 
-def seen(ground, camera=CAMERA, east_m=0.0, north_m=0.0, **pose):
+def photograph_ground(ground, camera=CAMERA, east_m=0.0, north_m=0.0, **pose):
     """The picture of a camera so far from the middle of the ground."""
     pose = {"height_m": HEIGHT_M, "heading_deg": 0.0} | pose
     where = CameraPose(east_m=MIDDLE_M + east_m, north_m=MIDDLE_M + north_m, **pose)
     return photograph(ground, M_PER_PX, where, camera, LIGHT, np.random.default_rng(0))
 
 
-def frame_of(image, **told):
+def make_frame(image, **told):
     return Frame(image=image, name="it", t_mono_s=0.0, **told)
 
 
 def taken(ground, **pose):
     """A frame that knows how it was taken."""
     pose = {"height_m": HEIGHT_M, "heading_deg": 0.0, "roll_deg": 0.0, "pitch_deg": 0.0} | pose
-    return frame_of(seen(ground, **pose), **pose)
+    return make_frame(photograph_ground(ground, **pose), **pose)
 
 
-def from_above(ground, view):
+def photograph_above(ground, view):
     """What a square camera sees from straight above the middle of a levelled picture."""
     right_m, up_m = (share * view.footprint_m for share in view.aside)
     camera = replace(CAMERA, width=640, height=640)
-    return seen(ground, camera, -right_m, -up_m, height_m=view.footprint_m * CAMERA.focal_px / 640)
+    return photograph_ground(ground, camera, -right_m, -up_m, height_m=view.footprint_m * CAMERA.focal_px / 640)
 
 
-def off(one, other, mask):
+def difference(one, other, mask):
     """Mean difference in grey levels where the mask lets look."""
     return np.abs(one.astype(float) - other)[mask].mean()
 
@@ -70,9 +70,9 @@ def test_levelled_gives_one_taken_from_straight_above(ground, pose, shown, below
     assert found.image.shape == (640, 640, 3)
     mask = np.ones((640, 640), bool) if found.mask is None else found.mask
     assert mask.mean() > shown
-    straight = from_above(ground, found.view)
-    assert off(found.image, straight, mask) < 0.5
-    assert off(np.roll(found.image, 8, axis=1), straight, mask) > 2, "one that is 8 pixels off would be noticed"
+    straight = photograph_above(ground, found.view)
+    assert difference(found.image, straight, mask) < 0.5
+    assert difference(np.roll(found.image, 8, axis=1), straight, mask) > 2, "one that is 8 pixels off would be noticed"
     is_steep = math.hypot(pose.get("roll_deg", 0.0), pose.get("pitch_deg", 0.0)) > MAX_TILT_UNLEVELLED_DEG
     assert not below or is_steep or found.view.aside == (0.0, 0.0)
 
@@ -91,12 +91,12 @@ def test_levelled_with_a_camera_that_is_mounted_turned(ground, up_deg):
     """A quarter turn of the camera to the right turns its picture by one to the left."""
     square = replace(CAMERA, width=640, height=640)
     pose = {"height_m": HEIGHT_M, "heading_deg": 20.0, "roll_deg": 10.0, "pitch_deg": -5.0}
-    image = np.ascontiguousarray(np.rot90(seen(ground, square, **pose), up_deg / 90))
-    one = level_image(frame_of(seen(ground, square, **pose), **pose), None, LENS, FOOTPRINT_M)
-    other = level_image(frame_of(image, **pose), None, Lens(LENS.fov_deg, up_deg), FOOTPRINT_M)
+    image = np.ascontiguousarray(np.rot90(photograph_ground(ground, square, **pose), up_deg / 90))
+    one = level_image(make_frame(photograph_ground(ground, square, **pose), **pose), None, LENS, FOOTPRINT_M)
+    other = level_image(make_frame(image, **pose), None, Lens(LENS.fov_deg, up_deg), FOOTPRINT_M)
     assert other.view.aside == pytest.approx(one.view.aside)
-    assert off(one.image, other.image, one.mask & other.mask) < 0.1
-    upright = level_image(frame_of(image, heading_deg=(360 - up_deg) % 360), None, Lens(LENS.fov_deg, up_deg))
+    assert difference(one.image, other.image, one.mask & other.mask) < 0.1
+    upright = level_image(make_frame(image, heading_deg=(360 - up_deg) % 360), None, Lens(LENS.fov_deg, up_deg))
     assert (upright.image is image, upright.view.up_deg) == (True, 0.0), "its top points north as it is"
 
 
@@ -106,7 +106,7 @@ def test_levelled_without_a_heading_turns_nothing(ground):
     for frame in (steep, tilted):
         found = level_image(frame, None, LENS)
         assert found.view.up_deg is None
-        assert off(found.image, from_above(ground, found.view), found.mask) < 0.5
+        assert difference(found.image, photograph_above(ground, found.view), found.mask) < 0.5
 
 
 def test_levelled_without_a_height_scales_nothing(ground):
@@ -123,7 +123,7 @@ def test_levelled_without_an_attitude_knows_no_point_below(ground):
     assert found.view == View(
         up_deg=0.0, footprint_m=pytest.approx(FOOTPRINT_M), aside=None, focal=pytest.approx(LENS_FOCAL)
     )
-    assert off(found.image, from_above(ground, replace(found.view, aside=(0, 0))), found.mask) < 0.5
+    assert difference(found.image, photograph_above(ground, replace(found.view, aside=(0, 0))), found.mask) < 0.5
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_levelled_without_an_attitude_knows_no_point_below(ground):
 )
 def test_levelled_returns_the_same_object_where_nothing_is_known_or_needed(told):
     image = np.zeros((48, 64), np.uint8)
-    found = level_image(frame_of(image, **told), None, LENS, FOOTPRINT_M)
+    found = level_image(make_frame(image, **told), None, LENS, FOOTPRINT_M)
     assert found.image is image
     assert found.mask is None
     assert (found.view.up_deg, found.view.reason) == (told.get("heading_deg"), None)
@@ -156,7 +156,7 @@ def test_levelled_scales_nothing_by_a_height_that_cannot_be(ground, height_m):
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
 def test_levelled_takes_what_is_no_number_as_unknown(wrong):
     odd = dict.fromkeys(("roll_deg", "pitch_deg", "heading_deg", "height_m"), wrong)
-    found = level_image(frame_of(np.zeros((48, 64), np.uint8), **odd), None, LENS, FOOTPRINT_M)
+    found = level_image(make_frame(np.zeros((48, 64), np.uint8), **odd), None, LENS, FOOTPRINT_M)
     assert found.view == View(focal=pytest.approx(LENS_FOCAL))
 
 
@@ -168,7 +168,7 @@ TILTED = {"heading_deg": 90.0, "roll_deg": 0.0, "pitch_deg": 40.0}
 )
 def test_levelled_leaves_a_picture_that_bears_no_warp_with_a_reason(pose):
     image = np.zeros((48, 64), np.uint8)
-    found = level_image(frame_of(image, **TILTED | pose), None, LENS)
+    found = level_image(make_frame(image, **TILTED | pose), None, LENS)
     assert found.image is image
     assert found.view.reason.code is ReasonCode.TILTED
     assert (found.view.footprint_m, found.view.aside) == (None, None)
@@ -176,7 +176,7 @@ def test_levelled_leaves_a_picture_that_bears_no_warp_with_a_reason(pose):
 
 @pytest.mark.parametrize("below", [False, True])
 def test_levelled_keeps_the_middle_of_a_steep_picture_in_place_of_what_is_below(below):
-    found = level_image(frame_of(np.zeros((48, 64), np.uint8), **TILTED), None, Lens(40.0), below=below)
+    found = level_image(make_frame(np.zeros((48, 64), np.uint8), **TILTED), None, Lens(40.0), below=below)
     assert found.view.reason is None
     assert found.view.aside != (0.0, 0.0)
 
@@ -187,7 +187,7 @@ def test_levelled_takes_from_the_vehicle_what_the_frame_does_not_know(ground):
     vehicle = Vehicle(lat_deg=50.0, lon_deg=8.0, alt_m=300.0, t_heard_s=0.0, has_gps=True, **pose)
     wrong = replace(vehicle, heading_deg=0.0, roll_deg=0.0, pitch_deg=0.0, height_m=50.0)
     by_frame = level_image(known, wrong, LENS, FOOTPRINT_M)
-    by_vehicle = level_image(frame_of(known.image), vehicle, LENS, FOOTPRINT_M)
+    by_vehicle = level_image(make_frame(known.image), vehicle, LENS, FOOTPRINT_M)
     assert by_frame.view == by_vehicle.view
     assert np.array_equal(by_frame.image, by_vehicle.image)
 
@@ -196,7 +196,7 @@ def test_levelled_makes_a_large_picture_smaller_without_leaving_pixels_out():
     """Rows of one pixel, black and white in turns, become grey; a warp alone would make stripes of them."""
     stripes = np.zeros((3000, 4000), np.uint8)
     stripes[::2] = 200
-    found = level_image(frame_of(stripes, heading_deg=180.0), None, LENS)
+    found = level_image(make_frame(stripes, heading_deg=180.0), None, LENS)
     assert found.image.shape == (1024, 1024)
     inner = found.image[found.mask][5000:-5000].astype(float)
     assert (inner.mean(), inner.std()) == (pytest.approx(100, abs=1), pytest.approx(0, abs=4))
@@ -207,7 +207,7 @@ def test_levelled_makes_a_large_picture_smaller_without_leaving_pixels_out():
 )
 def test_mount_counts_as_the_attitude_of_a_level_airframe(mount, attitude):
     pose = {"heading_deg": 70.0, "height_m": HEIGHT_M, "roll_deg": 0.0, "pitch_deg": 0.0}
-    level, tilted = (frame_of(np.zeros((48, 64), np.uint8), **pose | more) for more in ({}, attitude))
+    level, tilted = (make_frame(np.zeros((48, 64), np.uint8), **pose | more) for more in ({}, attitude))
     expected = level_image(tilted, None, LENS, FOOTPRINT_M).view
     assert level_image(level, None, replace(LENS, mount=mount), FOOTPRINT_M).view == expected
     assert estimate_tilted_view(level, None, mount) == estimate_tilted_view(tilted, None)

@@ -6,7 +6,7 @@ from edgevpr.frames.liveness import Liveness
 from edgevpr.frames.shot import Condition, Refusal
 
 
-def liveness(*new_s, opened_s=0.0):
+def make_liveness(*new_s, opened_s=0.0):
     """That of a source opened at `opened_s`, with new pictures at these times."""
     found = Liveness()
     found.record_opening(opened_s)
@@ -15,7 +15,7 @@ def liveness(*new_s, opened_s=0.0):
     return found
 
 
-def begins_s(watched, wanted, start_s=0.0, refusal=None, every_s=0.1):
+def measure_fault_s(watched, wanted, start_s=0.0, refusal=None, every_s=0.1):
     """Seconds from `start_s` until a fault is `wanted`, of a source of which every picture is refused so."""
     for step in range(1, 1000):
         if refusal:
@@ -37,9 +37,9 @@ def must_reopen(fault):
     ("interval_s", "lost_s"), [(0.04, 3.0), (1.0, 3.0), (2.0, 5.0), (5.0, 12.5), (10.0, 25.0), (20.0, 30.0)]
 )
 def test_source_is_lost_after_three_seconds_or_what_its_rate_allows(interval_s, lost_s):
-    watched = liveness(*(number * interval_s for number in range(8)))
-    assert begins_s(watched, is_(Condition.LOST), 7 * interval_s) == lost_s
-    assert begins_s(watched, must_reopen, 7 * interval_s) == lost_s
+    watched = make_liveness(*(number * interval_s for number in range(8)))
+    assert measure_fault_s(watched, is_(Condition.LOST), 7 * interval_s) == lost_s
+    assert measure_fault_s(watched, must_reopen, 7 * interval_s) == lost_s
 
 
 LOST, DAMAGED, LATE = is_(Condition.LOST), is_(Condition.DAMAGED), is_(Condition.LATE)
@@ -61,18 +61,18 @@ LOST, DAMAGED, LATE = is_(Condition.LOST), is_(Condition.DAMAGED), is_(Condition
     ],
 )
 def test_source_without_a_usable_picture_has_a_fault_in_time(new_s, opened_s, refusal, wanted, after_s):
-    watched = liveness(*new_s)
+    watched = make_liveness(*new_s)
     if opened_s is not None:
         watched.record_opening(opened_s)
-    assert begins_s(watched, wanted, opened_s or max(new_s, default=0.0), refusal) == after_s
+    assert measure_fault_s(watched, wanted, opened_s or max(new_s, default=0.0), refusal) == after_s
 
 
 def test_source_opened_anew_keeps_its_rate():
-    watched = liveness(0.0, 0.1, 0.2)
+    watched = make_liveness(0.0, 0.1, 0.2)
     watched.record_opening(20.0)
     watched.record_picture(25.0)
-    assert begins_s(watched, is_(Condition.LOST), 25.0) == 3.0
-    assert liveness(0.0, 5.0).find_fault(10.0) is None
+    assert measure_fault_s(watched, is_(Condition.LOST), 25.0) == 3.0
+    assert make_liveness(0.0, 5.0).find_fault(10.0) is None
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_source_opened_anew_keeps_its_rate():
     [(5, 0.1, False), (11, 0.1, True), (2, 0.9, False), (3, 0.9, True), (3, 0.2, False)],
 )
 def test_picture_that_repeats_for_a_second_and_three_times_is_frozen(repeats, step_s, is_frozen):
-    watched = liveness(0.0, 0.1)
+    watched = make_liveness(0.0, 0.1)
     for _ in range(repeats):
         watched.record_refusal(Refusal.FROZEN, 0.1)
     fault = watched.find_fault(0.1 + repeats * step_s)
@@ -88,21 +88,21 @@ def test_picture_that_repeats_for_a_second_and_three_times_is_frozen(repeats, st
 
 
 def test_frozen_source_is_opened_anew_after_growing_times_until_it_gives_new_pictures():
-    watched, waits_s = liveness(0.0, 0.1), []
+    watched, waits_s = make_liveness(0.0, 0.1), []
     for _ in range(5):
         watched.record_opening(0.0)
-        waits_s.append(begins_s(watched, must_reopen, 0.0, Refusal.FROZEN))
+        waits_s.append(measure_fault_s(watched, must_reopen, 0.0, Refusal.FROZEN))
         watched.record_reopening(watched.find_fault(100.0))
     assert waits_s == [5.0, 10.0, 20.0, 30.0, 30.0]
     watched.record_opening(0.0)
     assert watched.record_picture(0.1) is Refusal.FROZEN, "it may be the frozen picture, coded in another way"
     assert watched.record_picture(0.2) is None
-    assert begins_s(watched, must_reopen, 0.2, Refusal.FROZEN) == 5.0
+    assert measure_fault_s(watched, must_reopen, 0.2, Refusal.FROZEN) == 5.0
 
 
 def test_new_picture_ends_every_fault():
     for refusal in (Refusal.FROZEN, Refusal.DAMAGED, Refusal.PATCHED, Refusal.LATE):
-        watched = liveness(0.0, 0.1)
+        watched = make_liveness(0.0, 0.1)
         for _ in range(20):
             watched.record_refusal(refusal, 9.9)
         assert watched.find_fault(10.0)

@@ -60,7 +60,7 @@ def sending():
     is_on.clear()
 
 
-def cause_of(uri):
+def find_cause(uri):
     with pytest.raises(OpeningError) as refusal:
         open_address(uri, lambda: 0.0, 0.5)
     return str(refusal.value)
@@ -96,7 +96,7 @@ def hang(connection, asked):
 def test_open_address_names_the_cause(address, answer, cause, serve, monkeypatch):
     if "0.7 s" in cause:
         monkeypatch.setattr(streams, "OPEN_TIMEOUT_S", 0.7)
-    found = cause_of(f"{address}{serve(answer)}/stream")
+    found = find_cause(f"{address}{serve(answer)}/stream")
     assert found.startswith(cause)
     assert PASSWORD not in found
 
@@ -104,13 +104,13 @@ def test_open_address_names_the_cause(address, answer, cause, serve, monkeypatch
 def test_open_address_names_the_cause_without_a_camera(monkeypatch):
     closed = free_port()
     for uri in (f"rtsp://127.0.0.1:{closed}/a", f"http://127.0.0.1:{closed}/a", f"tcp://127.0.0.1:{closed}"):
-        assert cause_of(uri) == "connection refused"
-    assert cause_of("udp://:99999") == "no host and port in the address"
-    assert cause_of("rtsp://127.0.0.1:99999/a") == "an address that cannot be used: correct host and port"
-    assert cause_of("rtsp://camera.invalid/a") == "no such host camera.invalid"
-    assert cause_of("rtsp://pilot:a@b/secret@10.0.0.1/a").startswith("no such host: percent-encode the password's")
+        assert find_cause(uri) == "connection refused"
+    assert find_cause("udp://:99999") == "no host and port in the address"
+    assert find_cause("rtsp://127.0.0.1:99999/a") == "an address that cannot be used: correct host and port"
+    assert find_cause("rtsp://camera.invalid/a") == "no such host camera.invalid"
+    assert find_cause("rtsp://pilot:a@b/secret@10.0.0.1/a").startswith("no such host: percent-encode the password's")
     monkeypatch.setattr(streams, "OPEN_TIMEOUT_S", 0.3)
-    assert cause_of(f"udp://:{closed}") == f"no packet at UDP port {closed} within 0.3 s"
+    assert find_cause(f"udp://:{closed}") == f"no packet at UDP port {closed} within 0.3 s"
 
 
 @pytest.mark.parametrize("password", ["sec/ret", "sec#ret", "sec?ret", "sec ret"])
@@ -178,10 +178,10 @@ def test_ports_that_are_in_use_are_named(sending):
     port = sending(send_rtp)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("", port + 1))
-        assert cause_of(f"udp://:{port}") == f"UDP port {port + 1} is in use by another program"
+        assert find_cause(f"udp://:{port}") == f"UDP port {port + 1} is in use by another program"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("", port))
-        assert cause_of(f"udp://:{port}") == f"UDP port {port} is in use by another program"
+        assert find_cause(f"udp://:{port}") == f"UDP port {port} is in use by another program"
 
 
 def send_unknown(port, is_on):
@@ -192,7 +192,7 @@ def send_unknown(port, is_on):
 
 
 def test_rtp_of_an_unknown_codec_asks_for_a_description(sending):
-    cause = cause_of(f"udp://:{sending(send_unknown)}")
+    cause = find_cause(f"udp://:{sending(send_unknown)}")
     assert cause == "RTP of an unknown codec (payload type 98): describe it in an .sdp file"
 
 
@@ -280,15 +280,15 @@ def test_snapshots_take_a_password(serve):
     assert isinstance(capture.read(), Shot)
 
 
-def seen(uri):
+def check_source(uri):
     finding = check_frame("source", load_config(None, {"source.uri": uri}).source)
     return finding.reason.code, finding.reason.parameters
 
 
 def test_check_frame_has_the_facts_of_the_first_picture_and_refuses_an_old_one(serve, monkeypatch):
     uri = f"http://{serve(multipart('image/jpg', '.jpg'))}/video"
-    code, found = seen(uri)
+    code, found = check_source(uri)
     assert (code, found["width"], found["height"]) == (FindingCode.FRAME_RECEIVED, WIDTH, HEIGHT)
     assert found["facts"] == "mjpeg, 8 bits a channel, square pixels"
-    monkeypatch.setattr(camera, "FIX_MAX_AGE_S", -1.0)
-    assert seen(uri)[0] is FindingCode.FRAMES_LATE
+    monkeypatch.setattr(camera, "MAX_FIX_AGE_S", -1.0)
+    assert check_source(uri)[0] is FindingCode.FRAMES_LATE

@@ -1,6 +1,6 @@
-"""A map made on one processor flies on another: what is made of a picture is the same to the last bit.
+"""A map made on one processor flies on another: descriptors are the same to the last bit.
 
-The expected numbers are those of x86-64 and of aarch64 (a Cortex-A53), of which every one was seen to be the same.
+The expected checksums were the same on x86-64 and on aarch64 (a Cortex-A53).
 """
 
 import itertools
@@ -41,7 +41,7 @@ def dim_picture():
 
 
 PICTURES = {"ordinary": whole_numbers, "dim": dim_picture}
-TOLD = {
+CHECKSUMS = {
     "forward, ordinary": "3849885506 598602243 4103587366 2563522183",
     "nadir, ordinary": "959436069 1475824441 556021769 4160277071",
     "forward, dim": "3324972193 3205433921 289916544 2563522183",
@@ -51,9 +51,9 @@ TOLD = {
 }
 
 
-def told_by(**environment):
-    """What a process of its own makes of the pictures, by camera and picture."""
-    asked = "import test_any_processor; test_any_processor.tell()"
+def compute_checksums(**environment):
+    """Return the checksums of what a separate process makes of the pictures, by camera and picture."""
+    asked = "import test_any_processor; test_any_processor.print_checksums()"
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", asked],
         capture_output=True,
@@ -65,10 +65,10 @@ def told_by(**environment):
     return dict(line.split(": ") for line in done.stdout.splitlines())
 
 
-def tell():
+def print_checksums():
     for camera, kind in itertools.product(("forward", "nadir"), PICTURES):
-        found = create("cohog", {"camera": camera}).encode(PICTURES[kind]())
-        report(f"{camera}, {kind}", found.coarse, found.fine, found.regions, found.good)
+        descriptor = create("cohog", {"camera": camera}).encode(PICTURES[kind]())
+        report(f"{camera}, {kind}", descriptor.coarse, descriptor.fine, descriptor.regions, descriptor.good)
     picture, forward = whole_numbers(), create("cohog")
     report("packed", forward.pack(forward.encode(picture).coarse[None], np.full((12, 12, 8), 90.0, np.float32)))
     rule = {"layout": "NCHW", "height": 512, "width": 512, "colour": "grey", "equalise": False, "resize": "linear"}
@@ -82,7 +82,7 @@ def report(what, *parts):
 @pytest.mark.process
 @pytest.mark.parametrize("processor", [{}, *_PROCESSORS.values()], ids=["this one", *_PROCESSORS])
 def test_all_that_is_made_of_a_picture_is_the_same_whatever_the_processor_can_do(processor):
-    assert told_by(**processor) == TOLD
+    assert compute_checksums(**processor) == CHECKSUMS
 
 
 def test_a_query_is_turned_to_the_same_picture():

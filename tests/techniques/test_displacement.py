@@ -103,7 +103,7 @@ def test_the_support_of_a_step_is_that_of_all_regions(step, asked):
 SIDE = 31
 
 
-def pairs(shift, turn_deg, scale, side=SIDE, wrong=0.0, seed=0):
+def make_pairs(shift, turn_deg, scale, side=SIDE, wrong=0.0, seed=0):
     """Numbers of the regions of a query and of those of the place that they lie on, a part of them wrong."""
     numbers = np.arange(side * side)
     y, x = np.divmod(numbers, side)
@@ -128,16 +128,16 @@ def align(asking, best, shift_cells):
 )
 @pytest.mark.parametrize("wrong", [0.0, 0.7])
 def test_shift_rotation_and_scale_are_found_among_pairs_that_are_wrong(shift, turn_deg, scale, wrong):
-    found = align(*pairs(shift, turn_deg, scale, wrong=wrong), shift_cells=tuple(np.rint(shift)))
+    found = align(*make_pairs(shift, turn_deg, scale, wrong=wrong), shift_cells=tuple(np.rint(shift)))
     assert found.shift_cells == pytest.approx(shift, abs=0.15)
     assert found.rotation_deg == pytest.approx((350 + turn_deg) % 360, abs=0.7)
     assert found.height_ratio == pytest.approx(2 * scale, abs=0.03)
 
 
 def test_the_covariance_is_that_of_pairs_which_lie_off():
-    exact = align(*pairs((0.0, 0.0), 0.0, 1.0), shift_cells=(0.0, 0.0))
+    exact = align(*make_pairs((0.0, 0.0), 0.0, 1.0), shift_cells=(0.0, 0.0))
     assert exact.covariance_cells2 == pytest.approx((1 / 12, 0, 1 / 12))
-    mixed = align(*pairs((0.0, 0.0), 0.0, 1.0, wrong=0.8), shift_cells=(0.0, 0.0))
+    mixed = align(*make_pairs((0.0, 0.0), 0.0, 1.0, wrong=0.8), shift_cells=(0.0, 0.0))
     assert mixed.covariance_cells2[0] > 1 / 12
 
 
@@ -146,7 +146,7 @@ def is_as_it_was(match):
 
 
 def test_pairs_of_different_places_and_too_few_are_not_aligned():
-    asking, best = pairs((0.0, 0.0), 0.0, 1.0)
+    asking, best = make_pairs((0.0, 0.0), 0.0, 1.0)
     assert is_as_it_was(align((asking[0][:7], SIDE), (best[0][:7], SIDE), (0.0, 0.0)))
     assert is_as_it_was(align(asking, best, (40.0, 40.0)))
     same = np.zeros(20, int)

@@ -18,7 +18,7 @@ SEEN = np.ones((REGIONS, REGIONS), bool)
 structure = partial(overlay.compute_structure, around_cells=3.0)
 
 
-def ground_of(seed):
+def make_ground(seed):
     coarse = np.random.default_rng(seed).uniform(0, 255, (40, 40)).astype(np.float32)
     return cv2.resize(coarse, (2 * SIDE_PX, 2 * SIDE_PX), interpolation=cv2.INTER_CUBIC).clip(0, 255)
 
@@ -34,7 +34,7 @@ def patterns(seed):
 
 @pytest.mark.parametrize(("turned_deg", "right_px", "down_px", "height"), [(0, 24, -16, 1), (40, 8, 30, 1.2)])
 def test_a_query_is_laid_as_its_match_says(turned_deg, right_px, down_px, height):
-    ground = ground_of(1)
+    ground = make_ground(1)
     match = FineMatch(
         0.1,
         shift_cells=(right_px * CELLS / SIDE_PX, down_px * CELLS / SIDE_PX),
@@ -82,8 +82,8 @@ def test_structures_agree_only_at_the_shift_that_is_asked_for():
 
 def test_a_match_of_changed_ground_stands_out():
     technique = CoHog(camera="nadir")
-    places = [np.dstack([view(ground_of(seed))] * 3).astype(np.uint8) for seed in range(4)]
-    changed = view(ground_of(0), 33, 20, -12) * 0.6 + np.random.default_rng(0).normal(40, 12, (SIDE_PX, SIDE_PX))
+    places = [np.dstack([view(make_ground(seed))] * 3).astype(np.uint8) for seed in range(4)]
+    changed = view(make_ground(0), 33, 20, -12) * 0.6 + np.random.default_rng(0).normal(40, 12, (SIDE_PX, SIDE_PX))
     query = technique.encode(np.dstack([changed.clip(0, 255)] * 3).astype(np.uint8))
     matches = [technique.match(query, technique.encode(place).fine) for place in places]
     assert matches[0].structure > 4 > 2 > max(match.structure for match in matches[1:])
@@ -93,7 +93,7 @@ def test_a_match_of_changed_ground_stands_out():
 
 def test_ahead_the_structures_weigh_the_score():
     technique = CoHog()
-    seen = [np.dstack([view(ground_of(seed))] * 3).astype(np.uint8) for seed in (0, 1)]
+    seen = [np.dstack([view(make_ground(seed))] * 3).astype(np.uint8) for seed in (0, 1)]
     places, query = [technique.encode(picture) for picture in seen], technique.encode(seen[0])
     same, other = (technique.match(query, place.fine) for place in places)
     assert same.structure > 6 > 4 > other.structure

@@ -32,7 +32,7 @@ def literal_enhanced(differences, window=10):
     return np.array(result)
 
 
-def rows_of(technique, count, first=0):
+def encode_rows(technique, count, first=0):
     return np.stack([technique.encode(textured(first + seed)).coarse for seed in range(count)])
 
 
@@ -63,7 +63,7 @@ def test_light_and_contrast_change_nothing_and_a_flat_patch_says_so():
 
 def test_scores_are_the_enhanced_mean_absolute_differences_of_the_paper():
     technique = SeqSlam()
-    rows = rows_of(technique, 40)
+    rows = encode_rows(technique, 40)
     query = technique.encode(cv2.convertScaleAbs(textured(17), alpha=0.7))
     scores, hypotheses = technique.score_places(query, rows, None)
     differences = [sum(abs(int(a) - int(b)) for a, b in zip(row, query.coarse, strict=True)) / 2048 for row in rows]
