@@ -19,7 +19,7 @@ from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Fix, Severity
 
 MAX_QUEUED_FIXES = 8
-# The longest that a fix may wait, from `put` on and in all buffers together. types.FIX_MAX_AGE_S limits the age of its
+# The longest that a fix may wait, from `put` on and in all buffers together. types.MAX_FIX_AGE_S limits the age of its
 # frame, which the autopilot is told.
 MAX_FIX_WAIT_S = 1.0
 MAX_UNANSWERED = 5  # this number of unanswered fixes in a row stops the sending, until one is answered
