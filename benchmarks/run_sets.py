@@ -27,7 +27,7 @@ from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.evaluate import provenance
 from edgevpr.lab.evaluate.dataset import Dataset, load_dataset
-from edgevpr.lab.evaluate.evaluate import MatchOptions, evaluate, read_prior
+from edgevpr.lab.evaluate.evaluate import MatchOptions, answer_queries, read_prior, summarise
 from edgevpr.lab.evaluate.metrics import add_pcu
 from edgevpr.runtime.preflight.choose import ACCURACY_PATH as ACCURACY
 from edgevpr.techniques import create
@@ -177,7 +177,9 @@ def write_set(path: Path, folder: Path, wanted: list[Variant]) -> None:
         def shown(items, total, label, variant=variant):
             return progress(items, total, f"{folder.name}, {variant.label}, {label.partition(': ')[2]}")
 
-        result = evaluate(variant.technique, dataset, settings(variant, folder), variant.options, shown)
+        technique = create(variant.technique, settings(variant, folder))
+        answers, not_done = answer_queries(technique, dataset, variant.options, shown)
+        result = summarise(technique, dataset, answers, variant.options, not_done)
         rows[variant.label] = asdict(replace(result, technique=variant.label)) | {
             "precision_recall": thinned(result.precision_recall) if sets_page.is_drawn(variant.label) else [],
             "commit": base.commit(),

@@ -67,16 +67,16 @@ class Match:
 
     def geojson(self) -> dict[str, Any]:
         """Return the position as a GeoJSON feature; its geometry is None without a position."""
-        at = self.position
-        about = {
+        properties = {
             "accepted": self.accepted,
             "reason": self.reason.code.name,
             "confidence": self.confidence,
             "accuracy_m": self.accuracy_m,
             "place": self.place and self.place.place_id,
         }
-        geometry = None if at is None else {"type": "Point", "coordinates": [at.lon_deg, at.lat_deg]}
-        return {"type": "Feature", "geometry": geometry, "properties": about}
+        position = self.position
+        geometry = position and {"type": "Point", "coordinates": [position.lon_deg, position.lat_deg]}
+        return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
 class Map:
@@ -97,8 +97,8 @@ class Map:
         accept_precision: float | None = None,
         follow: bool = False,
     ) -> None:
-        wanted = {"map": _to_path(path), "source.fov_deg": fov_deg, "match.accept_precision": accept_precision}
-        settings = load_config(config, wanted)
+        overrides = {"map": _to_path(path), "source.fov_deg": fov_deg, "match.accept_precision": accept_precision}
+        settings = load_config(config, overrides)
         source = settings.source
         known = ("heading", "height", "reach") if source.fov_deg or source.lens else ("heading", "reach")
         board = resolve_board(load_board(settings.board), source, settings.memory)
@@ -110,7 +110,9 @@ class Map:
     def __enter__(self) -> "Map":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
     def __len__(self) -> int:
@@ -174,7 +176,7 @@ class Map:
 
 
 def _to_match(event: Recognition) -> Match:
-    best, where, cost = event.best, event.located, event.cost
+    best, located, cost = event.best, event.located, event.cost
     return Match(
         accepted=event.accepted,
         reason=event.reason,
@@ -183,9 +185,9 @@ def _to_match(event: Recognition) -> Match:
         confidence=event.confidence,
         position=event.position,
         accuracy_m=event.accuracy_m,
-        covariance_m2=where.covariance_m2 if where else None,
-        of_place=bool(where and not where.places),
-        heading_deg=where.heading_deg if where else None,
+        covariance_m2=located.covariance_m2 if located else None,
+        of_place=bool(located and not located.places),
+        heading_deg=located.heading_deg if located else None,
         turned_deg=best.match.rotation_deg if best else None,
         t_query_s=cost.t_encode_s + cost.t_match_s,
     )
@@ -214,21 +216,21 @@ def build(
         path=_to_path(path), pictures=pictures, technique=technique, parameters={}, refine=refine, calibrate=calibrate
     )
     settings = load_config(config, {"source.camera": camera})
-    shown = text.progress if progress is None else _wrap_progress(progress)
+    show = text.progress if progress is None else _wrap_progress(progress)
     with ThreadpoolController().limit(limits=1, user_api="blas"):
-        made = make_map(order, settings, lambda error: _log.warning("%s", error), shown)
+        made = make_map(order, settings, lambda error: _log.warning("%s", error), show)
     for sentence in made.not_done:
         _log.warning("%s", sentence)
     return made
 
 
 def _wrap_progress(progress: Progress) -> Any:
-    def shown(items: Iterable[T], total: int, label: str) -> Iterator[T]:
+    def report(items: Iterable[T], total: int, label: str) -> Iterator[T]:
         for done, item in enumerate(items, 1):
             yield item
             progress(done, total, label)
 
-    return shown
+    return report
 
 
 def _to_path(path: object) -> str:
@@ -239,12 +241,12 @@ def _to_path(path: object) -> str:
 
 def _check_image(image: object) -> None:
     """Raise ImageError for anything but a picture."""
-    wanted = "give a NumPy array of uint8, (H, W) grey or (H, W, 3) blue, green, red, as cv2.imread returns"
+    hint = "give a NumPy array of uint8, (H, W) grey or (H, W, 3) blue, green, red, as cv2.imread returns"
     if not isinstance(image, np.ndarray):
-        hint = " (None: the file could not be read)" if image is None else ""
-        raise ImageError(f"The picture is of type {type(image).__name__}: {wanted}{hint}.")
+        cause = " (None: the file could not be read)" if image is None else ""
+        raise ImageError(f"The picture is of type {type(image).__name__}: {hint}{cause}.")
     if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.ndim < 2 or 0 in image.shape:
-        raise ImageError(f"The picture is {image.dtype} of shape {image.shape}: {wanted}.")
+        raise ImageError(f"The picture is {image.dtype} of shape {image.shape}: {hint}.")
 
 
 __all__ = ("Cuttings", "FlownPictures", "Map", "Match", "build")

@@ -44,7 +44,7 @@ def publisher():
 def main(path: str, folder: str) -> None:
     publish = publisher()
     with edgevpr.Map(path) as ground:
-        home = next(place.position for place in ground.read_places() if place.position)
+        home = next(place.position for place in ground.places() if place.position)
         for picture in sorted(Path(folder).glob("*.jpg")):
             match = ground.match(cv2.imread(str(picture)))
             if match.position is None:

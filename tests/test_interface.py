@@ -57,7 +57,7 @@ def valley(flight):
 def test_map_match_returns_position_and_confidence(flight, valley):
     with edgevpr.Map(valley) as ground:
         assert len(ground) == PLACES
-        assert [place.source_image for place in ground.read_places()] == [f"{place}.jpg" for place in range(PLACES)]
+        assert [place.source_image for place in ground.places()] == [f"{place}.jpg" for place in range(PLACES)]
         match = ground.match(cv2.imread(str(flight / "later" / "3.jpg")))
         assert match.accepted
         assert match.place.source_image == "3.jpg"
@@ -159,5 +159,5 @@ def test_example_of_a_film_with_subtitles(flight, tmp_path, capsys, caplog):
     assert json.loads(capsys.readouterr().out)["placed"] == PLACES
     assert main(["map", "build", f"{film}.gpkg", *build, "--camera", "nadir"]) == 0
     with edgevpr.Map(f"{film}.gpkg") as ground:
-        places = list(ground.read_places())
+        places = list(ground.places())
     assert [place.position.lat_deg for place in places] == pytest.approx([50 + 0.002 * at for at in range(PLACES)])

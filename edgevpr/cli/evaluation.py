@@ -40,21 +40,15 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--within-m", type=parse_positive, default=25.0, metavar="M", help="metres that count as near (default: 25)"
     )
-    parser.add_argument(
-        "--out", metavar="FOLDER", help="folder for results.json and results.csv; an interrupted run resumes"
-    )
+    parser.add_argument("--out", metavar="FOLDER", help="folder for results.json and results.csv; resumes if run again")
     parser.add_argument("--similarity", nargs="+", metavar="FILE", help="evaluate stored similarity matrices (.npy)")
     parser.add_argument("--form", default="float", metavar="A,B", help=f"of vectors: {', '.join(FORMS)} (float)")
     parser.add_argument("--exact", action="store_true", help="compare all places in full; too slow for a flight")
     parser.add_argument("--follow", action="store_true", help="treat the queries as one flight, in order (cohog only)")
     add_known(parser)
-    parser.add_argument(
-        "--config", metavar="FILE", help="configuration file; its sections `salience` and `match` are used"
-    )
+    parser.add_argument("--config", metavar="FILE", help="configuration file: sections `salience` and `match`")
     add_keys(parser, "source.camera", "match.candidates", "match.sequence", "salience.use")
-    parser.add_argument(
-        "--techniques", default="hog,cohog", metavar="A,B", help="techniques to evaluate, separated by commas"
-    )
+    parser.add_argument("--techniques", default="hog,cohog", metavar="A,B", help="techniques (default: hog,cohog)")
     add_parameters(parser, "a parameter of a technique", "TECHNIQUE.KEY=VALUE")
     add_json(parser)
 

@@ -60,9 +60,7 @@ def add(commands: Any) -> None:
 
     services = add_group(commands, "service", "print the systemd unit")
     unit = add_command(services, "print", run_service_print, "print the systemd unit")
-    unit.add_argument(
-        "--board", default="this", metavar="NAME", help="board that the unit is for (default: this computer)"
-    )
+    unit.add_argument("--board", default="this", metavar="NAME", help="board of the unit (default: this computer)")
 
     text = "check the autopilot's parameters and this computer (read-only)"
     doctor = add_command(commands, "doctor", run_doctor, text)

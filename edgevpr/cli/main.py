@@ -72,9 +72,7 @@ def _run(argv: list[str]) -> int:
             args, error, f"{what}{error.strerror or error}: check the path, its permissions and the disk.", 1
         )
     except ImportError as error:
-        return _report_failure(
-            args, error, f"{error}: a package is missing or broken; install edgevpr again (64-bit OS).", 1
-        )
+        return _report_failure(args, error, f"{error}: package missing or broken; reinstall edgevpr (64-bit OS).", 1)
     except KeyboardInterrupt:
         print("edgevpr: stopped; everything confirmed so far is kept.", file=sys.stderr)
         return 130

@@ -24,9 +24,7 @@ def add(commands: Any) -> None:
         metavar="S",
         help="seconds to add to the camera's clock (default: the time zone that fits), or to the time of subtitles",
     )
-    parser.add_argument(
-        "--out", metavar="CSV", help="file to write (default: positions.csv in the folder, or VIDEO.csv)"
-    )
+    parser.add_argument("--out", metavar="CSV", help="file to write (default: positions.csv there, or VIDEO.csv)")
     add_json(parser)
 
 

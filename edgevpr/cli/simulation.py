@@ -22,9 +22,7 @@ def add(commands: Any) -> None:
     text = "generate the images and positions.csv of a flight"
     flight = add_command(simulations, "flight", run_simulate_flight, text)
     flight.add_argument("out", metavar="DIR")
-    flight.add_argument(
-        "--which", choices=("map", "query"), help="map: the mapping flight (default); query: a later flight"
-    )
+    flight.add_argument("--which", choices=("map", "query"), help="the mapping flight (map, default) or a later one")
     flight.add_argument(
         "--seed", type=_parse_seed, default=1, metavar="N", help="random seed of landscape and motion (default: 1)"
     )

@@ -117,7 +117,8 @@ def read_flight(path: str | Path) -> LoggedFlight:
                 flight.queries.append(query)
             case "answer":
                 if (answered := queries.get(get_text(line, "query") or "")) and answered.fix:
-                    _apply_answer(answered.fix, line)
+                    answered.fix.outcome = _read_outcome(line, line.get("result"))
+                    answered.fix.why = read_reason(line.get("why")) or answered.fix.why
             case "unusable":
                 flight.unusable += 1
             case "between":
@@ -128,12 +129,6 @@ def read_flight(path: str | Path) -> LoggedFlight:
         _log.warning("%s", lines.missing)
         flight.remarks.insert(0, (0.0, "missing", lines.missing))
     return flight
-
-
-def _apply_answer(fix: LoggedFix, line: dict[str, Any]) -> None:
-    """Set outcome and reason of a fix from a log line of kind "answer"."""
-    fix.outcome = _read_outcome(line, line.get("result"))
-    fix.why = read_reason(line.get("why")) or fix.why
 
 
 def _read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:

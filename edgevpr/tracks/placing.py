@@ -82,14 +82,11 @@ def _match_times(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s
         fine_s = estimate_clock_offset_s(track, [times[name] + offset_s for name in earliest], paths)
         offset_s += fine_s or 0.0
         how += ", the camera's clock set by " + ("its time zone" if fine_s is None else "how the pictures move")
-    found = {
-        name: replace(track.interpolate_tag(t_s + offset_s), t_utc_s=t_s + offset_s) for name, t_s in times.items()
-    }
+    times = {name: t_s + offset_s for name, t_s in times.items()}
+    found = {name: replace(track.interpolate_tag(t_s), t_utc_s=t_s) for name, t_s in times.items()}
     tags = {name: _fill_tag(tag, own[name]) for name, tag in found.items() if tag.position}
     if not tags:
-        raise UsageError(
-            f"No picture lies within the track with --offset-s {offset_s:g}: {_format_spans(track, times_s)}"
-        )
+        raise UsageError(f"No image lies in the track with --offset-s {offset_s:g}: {_format_spans(track, times_s)}")
     return Placement(how=how, tags=tags, pictures=len(own), offset_s=offset_s)
 
 

@@ -67,9 +67,7 @@ def read_table(path: Path) -> Record:
             continue
         needed = ", ".join(f"`{names[column]}`" for part, column in columns.items() if part in _REQUIRED_COLUMNS)
         return Record(kind=f"table of {needed}, {divider} between them", named=_read_rows(rows[first:], columns, path))
-    raise UsageError(
-        f"{path}: no columns of image, latitude and longitude were found: name them file, lat and lon in line 1."
-    )
+    raise UsageError(f"{path}: no columns of image, latitude and longitude: name them file, lat and lon in line 1.")
 
 
 def _find_columns(rows: Rows) -> Layout | None:

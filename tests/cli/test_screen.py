@@ -34,12 +34,12 @@ def said(capfd, *words):
         ("\ud800\0", r"\ud800\x00"),
     ],
 )
-def test_printable_escapes_what_a_terminal_acts_on(text, printed):
+def test_escape_unprintable_escapes_what_a_terminal_acts_on(text, printed):
     assert escape_unprintable(text) == printed
     printed.encode("utf-8")
 
 
-def test_decoded_name_is_utf_8():
+def test_decode_name_gives_utf_8():
     assert decode_name(os.fsdecode(b"caf\xe9.jpg")) == "caf\\xe9.jpg"
     assert decode_name("café.jpg") == "café.jpg"
 
@@ -57,7 +57,7 @@ def test_decoded_name_is_utf_8():
         ("serial:/dev/ttyAMA0:921600", "serial:/dev/ttyAMA0:921600"),
     ],
 )
-def test_without_passwords_replaces_them(address, without):
+def test_redact_passwords_replaces_them(address, without):
     assert redact_passwords(address) == without
     assert sanitize(f"{address} is lost, {address} is back") == f"{without} is lost, {without} is back"
 

@@ -9,7 +9,7 @@ from fakes import FakeClock
 from edgevpr.core.text import format_probability, progress
 
 
-def test_a_file_gets_a_line_for_every_tenth():
+def test_progress_writes_a_line_for_every_tenth_to_a_file():
     out = io.StringIO()
     assert list(progress(range(200), 200, "cohog: queries", out)) == list(range(200))
     lines = out.getvalue().splitlines()
@@ -18,7 +18,7 @@ def test_a_file_gets_a_line_for_every_tenth():
     assert lines[-1] == "cohog: queries  200/200  100 %"
 
 
-def test_a_terminal_sees_one_line_redrawn():
+def test_progress_redraws_one_line_on_a_terminal():
     reader, writer = os.openpty()
     with os.fdopen(writer, "w") as terminal:
         assert list(progress("abcd", 4, "map", terminal)) == list("abcd")
@@ -30,7 +30,7 @@ def test_a_terminal_sees_one_line_redrawn():
     assert drawn.count("\n") == 1
 
 
-def test_the_time_that_is_left_is_told_once_it_can_be_known():
+def test_progress_shows_the_remaining_time_once_it_can_be_estimated():
     out, clock = io.StringIO(), FakeClock()
 
     def slow():

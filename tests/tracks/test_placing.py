@@ -50,7 +50,7 @@ def points(count=15, lat_step=1e-4):
     return [(t, HOME[0] + lat_step * t, HOME[1], 120.0, 30.0, 0.0, 0.0, 0.0) for t in range(count)]
 
 
-def test_pictures_are_placed_by_their_names(capsys, folder, tmp_path):
+def test_positions_places_pictures_by_their_names(capsys, folder, tmp_path):
     rows = "".join(f"D:\\pics\\img_{number}.tif;50.{number + 1};8\n" for number in range(5))
     (tmp_path / "table.csv").write_text(f"imagename;latitude;longitude\n{rows}")
     said = run(capsys, "positions", tmp_path / "table.csv", "--images", folder).out
@@ -61,7 +61,7 @@ def test_pictures_are_placed_by_their_names(capsys, folder, tmp_path):
     assert "exists already" in refused(capsys, "positions", tmp_path / "table.csv", "--images", folder)
 
 
-def test_pictures_that_the_autopilot_triggered_are_placed_in_order(capsys, folder, tmp_path):
+def test_positions_places_triggered_pictures_in_order(capsys, folder, tmp_path):
     write_dataflash(tmp_path / "f.bin", points(), shots=points(6, lat_step=1e-3))
     found = json.loads(run(capsys, "positions", tmp_path / "f.bin", "--images", folder, "--json").out)
     assert (found["placed"], found["of"], found["offset_s"]) == (6, 6, None)
@@ -69,7 +69,7 @@ def test_pictures_that_the_autopilot_triggered_are_placed_in_order(capsys, folde
     assert [tag.position.lat_deg for tag in tags.values()] == pytest.approx([50 + 1e-3 * number for number in range(6)])
 
 
-def test_where_the_log_has_another_number_of_pictures_they_are_placed_by_time(capsys, folder, tmp_path):
+def test_positions_goes_by_time_where_the_numbers_of_pictures_differ(capsys, folder, tmp_path):
     write_dataflash(tmp_path / "f.bin", points(), shots=points(3))
     found = json.loads(run(capsys, "positions", tmp_path / "f.bin", "--images", folder, "--json").out)
     assert (found["placed"], found["offset_s"]) == (6, 0)
@@ -79,7 +79,7 @@ def test_where_the_log_has_another_number_of_pictures_they_are_placed_by_time(ca
 
 
 @pytest.mark.parametrize("hours", [2, -9.5])
-def test_a_clock_of_another_time_zone_is_found_out(capsys, tmp_path, hours):
+def test_positions_finds_the_time_zone_of_the_camera(capsys, tmp_path, hours):
     folder = tmp_path / "flight"
     folder.mkdir()
     for number in range(6):
@@ -89,14 +89,14 @@ def test_a_clock_of_another_time_zone_is_found_out(capsys, tmp_path, hours):
     assert (found["placed"], found["offset_s"]) == (6, 3600 * hours)
 
 
-def test_a_clock_that_could_be_of_several_time_zones_is_asked_for(capsys, folder, tmp_path):
+def test_positions_refuses_an_ambiguous_time_zone(capsys, folder, tmp_path):
     write_gpx(tmp_path / "t.gpx", [(t, HOME[0], HOME[1] + 1e-6 * t) for t in range(4000, 20_000, 4)])
     assert "--offset-s" in refused(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
     flags = ("--images", folder, "--offset-s", 7200, "--json")
     assert json.loads(run(capsys, "positions", tmp_path / "t.gpx", *flags).out)["placed"] == 6
 
 
-def test_pictures_of_another_day_are_refused_with_both_times(capsys, folder, tmp_path):
+def test_positions_refuses_pictures_of_another_day_with_both_times(capsys, folder, tmp_path):
     write_gpx(tmp_path / "t.gpx", [(t + 300_000, *HOME) for t in range(9)])
     said = refused(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
     day = (datetime.fromtimestamp(START_S, timezone.utc) + timedelta(seconds=300_000)).date().isoformat()
@@ -127,7 +127,7 @@ def flown(count=40):
 
 
 @pytest.mark.slow
-def test_a_clock_that_is_off_by_seconds_is_set_by_how_the_pictures_move(capsys, tmp_path):
+def test_estimate_clock_offset_s_sets_the_clock_by_the_motion_of_the_pictures(capsys, tmp_path):
     track, pictures = flown()
     folder = tmp_path / "flight"
     folder.mkdir()

@@ -160,7 +160,7 @@ def test_tables_of_other_programs_are_understood_and_said(tmp_path, text, expect
         ("t.gpx", b"<gpx", "GPX"),
     ],
 )
-def test_what_is_no_recording_gets_a_sentence(tmp_path, name, content, said):
+def test_read_record_refuses_what_is_none_in_a_sentence(tmp_path, name, content, said):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UsageError, match=said):
         read_record(tmp_path / name)

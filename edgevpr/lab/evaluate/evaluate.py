@@ -44,7 +44,7 @@ from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 from edgevpr.runtime.recognise.salience_gate import Gate
-from edgevpr.techniques import create, format_name
+from edgevpr.techniques import format_name
 from edgevpr.techniques.card import describe_weights
 
 # Yields the items, of that number, and shows it with a label.
@@ -98,32 +98,14 @@ def iterate_silently(items: Iterable[Any], total: int, label: str) -> Iterable[A
     return items
 
 
-def evaluate(
-    technique_name: str,
-    dataset: Dataset,
-    parameters: dict[str, Any] | None = None,
-    options: MatchOptions = MatchOptions(),
-    progress: Progress = iterate_silently,
-    gate: Gate | None = None,
-) -> metrics.TechniqueResult:
-    """Map the references of `dataset` in a temporary file, ask every query, and score the answers. `parameters` are
-    those of the technique (None: its defaults). `gate` discards queries that are not memorable (None: none are); the
-    map has all references, as in the thesis (3.3).
-
-    Raises UsageError for an unknown technique or parameter, ImageError for an image that cannot be used, MapError if
-    the temporary map cannot be written, and ModelError for a network that cannot be used or a query that fails.
-    """
-    technique = create(technique_name, parameters)
-    answers, not_done = answer_queries(technique, dataset, options, progress, gate)
-    return summarise(technique, dataset, answers, options, not_done)
-
-
 def answer_queries(
     technique: Technique, dataset: Dataset, options: MatchOptions, progress: Progress, gate: Gate | None = None
 ) -> tuple[list[QueryAnswer], tuple[str, ...]]:
     """Map the references of `dataset` in a temporary file, and ask every query. Return one judged answer for each that
-    is scored, and what could not be done to the map (see `open_temporary_map`). Raises UsageError where no query has
-    what `options.known` asks for, ModelError for a query that fails."""
+    is scored, and what could not be done to the map (see `open_temporary_map`). `gate` discards queries that are not
+    memorable (None: none are); the map has all references, as in the thesis (3.3). Raises UsageError where no query
+    has what `options.known` asks for, ImageError and ModelError for an image, a network or a query that fails, and
+    MapError if the map cannot be written."""
     spec = technique.spec
     prior, tags = read_prior(options.known, dataset, spec, options.sequence)
     sequence = options.sequence or spec.sequence

@@ -25,9 +25,7 @@ SPEED_M_S = 10.0
 _SWAY_DEG = 2.0  # largest roll, pitch and yaw error on a track without attitude
 _START_UTC_S = 1_771_029_000.0
 _LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)  # the shadows stay those of the orthophoto
-_MAX_CORNER_HEIGHTS = (
-    3.0  # heights from the point below the camera to a corner of its picture: more is nearly the horizon
-)
+_MAX_CORNER_HEIGHTS = 3.0  # heights from below the camera to a corner of its picture: beyond is nearly the horizon
 
 
 def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list[GeoTag]:

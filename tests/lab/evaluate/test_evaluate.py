@@ -10,7 +10,7 @@ from pictures import textured
 
 from edgevpr.core.errors import UsageError
 from edgevpr.lab.evaluate.dataset import load_dataset
-from edgevpr.lab.evaluate.evaluate import evaluate
+from edgevpr.lab.evaluate.evaluate import MatchOptions, answer_queries, iterate_silently, summarise
 from edgevpr.lab.evaluate.metrics import add_pcu, read_result
 from edgevpr.lab.evaluate.tables import format_results
 from edgevpr.mapmaking import finishing
@@ -30,13 +30,16 @@ def folder(tmp_path):
     return tmp_path
 
 
-def load(folder):
-    return load_dataset(folder / "query", folder / "ref", folder / "truth.csv")
+def evaluate(folder, name, parameters):
+    dataset = load_dataset(folder / "query", folder / "ref", folder / "truth.csv")
+    technique, options = create(name, parameters), MatchOptions()
+    answers, not_done = answer_queries(technique, dataset, options, iterate_silently)
+    return summarise(technique, dataset, answers, options, not_done)
 
 
 @pytest.mark.parametrize(("name", "parameters"), [("hog", HOG), ("cohog", COHOG)])
 def test_evaluate_measures_recall_costs_and_sizes(folder, name, parameters):
-    (result,) = add_pcu([evaluate(name, load(folder), parameters)])
+    (result,) = add_pcu([evaluate(folder, name, parameters)])
     assert (result.queries, result.queries_off_map, result.references) == (8, 1, 8)
     assert (result.recall_at_1, result.with_match.recall_at_1) == (6 / 8, 6 / 7)
     assert (result.recall_at_10, result.with_match.recall_at_10) == (7 / 8, 1)
@@ -56,7 +59,7 @@ def test_evaluate_counts_a_match_that_was_accepted_off_the_map(folder):
     cv2.imwrite(
         str(folder / "ref" / "r7.png"), textured(7)
     )  # its twin is in the map, and the truth has no place for it
-    result = evaluate("cohog", load(folder), COHOG)
+    result = evaluate(folder, "cohog", COHOG)
     assert (result.accepted_off_map, result.accepted_wrong, result.accepted_elsewhere) == (1, 2, 2)
 
 
@@ -65,7 +68,7 @@ def test_evaluate_ignores_a_loose_reference_and_counts_the_next(folder):
     others = " ".join(f"r{place}.png" for place in range(2, 8))
     (folder / "truth.csv").write_text(f"query_file,ref_files,ref_files_loose\nq0.png,{others},r0.png {others}\n")
     cv2.imwrite(str(folder / "ref" / "r2.png"), cv2.blur(textured(0), (3, 3)))
-    result = evaluate("hog", load(folder), HOG)
+    result = evaluate(folder, "hog", HOG)
     assert (result.recall_at_1, result.with_match, result.unscored) == (1, None, 7)
     assert (result.accepted, result.accepted_wrong) == (1, 0)
 
@@ -75,19 +78,19 @@ def test_evaluate_says_what_could_not_be_done_to_the_map(folder, monkeypatch):
         raise UsageError("SciPy is missing.")
 
     monkeypatch.setattr(finishing, "calibrate_map", lack_scipy)
-    result = evaluate("cohog", load(folder), COHOG)
+    result = evaluate(folder, "cohog", COHOG)
     assert result.not_done == ("the map is not calibrated: SciPy is missing.",)
     assert result.not_done[0] in format_results(add_pcu([result]))
-    assert evaluate("hog", load(folder), HOG).not_done == (), "it has no confidence to calibrate"
+    assert evaluate(folder, "hog", HOG).not_done == (), "it has no confidence to calibrate"
 
 
 def test_from_json_gives_the_same_tables(folder):
-    (result,) = add_pcu([evaluate("hog", load(folder), HOG)])
+    (result,) = add_pcu([evaluate(folder, "hog", HOG)])
     read_back = json.loads(json.dumps(asdict(result), allow_nan=False))
     assert format_results([read_result({**read_back, "other": 1})]) == format_results([result])
 
 
 @pytest.mark.parametrize(("name", "settings"), [("hog", {"form": "1bit"}), ("cohog", {"camera": "nadir", "w1": 208})])
 def test_evaluate_counts_as_many_bytes_a_place_as_probe(folder, name, settings):
-    result, costs = evaluate(name, load(folder), settings), measure_costs(create(name, settings))
+    result, costs = evaluate(folder, name, settings), measure_costs(create(name, settings))
     assert (result.descriptor_bytes, result.fine_bytes) == (costs.ram_bytes_per_place, costs.disk_bytes_per_place)
