@@ -28,7 +28,7 @@ from shipped_model import FittedSite, shipped_model
 
 from edgevpr.frames.images import list_images
 from edgevpr.lab.evaluate.metrics import roc_auc
-from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, MapAnswer, adapt_model
+from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, QueryResult, adapt_model
 from edgevpr.runtime.recognise.calibration import MIN_PLACES
 from edgevpr.runtime.recognise.confidence import Model
 from edgevpr.runtime.recognise.evidence import (
@@ -109,7 +109,7 @@ def site(rows: Sequence[Row], kind: str, without: str | None = None) -> FittedSi
         own=[(row.evidence, row.right or row.near) for row in rows if row.kind == "own"],
         foreign=[row.evidence for row in rows if row.kind == "foreign" and site_of(row.set) != without],
         answers=[
-            MapAnswer(place_id=0, way=row.kind, right=row.right, evidence=row.evidence)
+            QueryResult(place_id=0, way=row.kind, right=row.right, evidence=row.evidence)
             for row in rows
             if row.kind in (THERE, LEFT_OUT, MIRRORED)
         ],

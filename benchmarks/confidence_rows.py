@@ -16,7 +16,7 @@ from edgevpr.core.reasons import ReasonCode
 from edgevpr.frames.images import list_images
 from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage
 from edgevpr.lab.evaluate.dataset import ScoredQuery
-from edgevpr.mapmaking.calibrate import ask, query_altered_copies
+from edgevpr.mapmaking.calibrate import count_queries, query_map
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import outside_neighbourhood
 from edgevpr.runtime.recognise.evidence import Evidence
@@ -97,10 +97,10 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
             return  # such a map is not calibrated
         frames = list(walks.frames_of(folder / "ref"))
         order = np.random.default_rng(15).permutation(len(frames))
-        frames = [frames[at] for at in np.resize(order, min(query_altered_copies(technique), 6 * len(frames)))]
+        frames = [frames[at] for at in np.resize(order, min(count_queries(technique), 6 * len(frames)))]
         ids = {place.source_image: place.place_id for place in place_map.read_places()}
         pictures = ((ids[frame.name], LevelledImage(frame.image, None, UNKNOWN_VIEW)) for frame in frames)
-        for answer in ask(technique, place_map, index, rule, walks.meter(), pictures):
+        for answer in query_map(technique, place_map, index, rule, walks.meter(), pictures):
             if answer.evidence is not None:
                 told = {"kind": answer.way, "right": answer.right, "evidence": answer.evidence}
                 yield Row(map=name, set=name, query=str(answer.place_id), near=False, score=0.0, **told)

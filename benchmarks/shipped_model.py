@@ -7,7 +7,7 @@ from datetime import date
 
 import numpy as np
 
-from edgevpr.mapmaking.calibrate import MapAnswer, adapt_model, evidence_matrix, fit_logistic
+from edgevpr.mapmaking.calibrate import QueryResult, adapt_model, fit_logistic, make_evidence_matrix
 from edgevpr.runtime.recognise.confidence import Logistic, Model, Scale, Tail
 from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE, Evidence
 
@@ -29,7 +29,7 @@ class FittedSite:
     name: str
     own: Sequence[tuple[Evidence, bool]]
     foreign: Sequence[Evidence]
-    answers: Sequence[MapAnswer]
+    answers: Sequence[QueryResult]
 
 
 def shipped_model(kind: str, sites: Sequence[FittedSite], made_of: str) -> Model:
@@ -66,7 +66,7 @@ def _regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence],
     rows = [row.figures() for group, _ in groups for row in group]
     right = np.concatenate([np.full(len(group), each) for group, each in groups])
     weights = np.concatenate([np.full(len(group), _EACH / len(group)) for group, _ in groups])
-    scales = np.maximum(evidence_matrix(rows, names).std(0), 1e-3)
+    scales = np.maximum(make_evidence_matrix(rows, names).std(0), 1e-3)
     nothing_known = Logistic(tuple(names), (0.0,) * len(names), tuple(scales.tolist()), 0.0)
     return fit_logistic(nothing_known, rows, right, weights, _PULL * len(groups))
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from edgevpr.mapmaking.changes import another_season
+from edgevpr.mapmaking.changes import change_season
 
 ACROSS_DEG = 66.0  # of the camera that is supposed
 _FOG_GREY, _READ_NOISE = 200.0, 1.5
@@ -87,7 +87,7 @@ def spoilt(sweep: str, level: float, image: np.ndarray, rng: np.random.Generator
         return hidden
     if sweep == "season":
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
-        changed = 255 * another_season(grey.astype(np.float32) / 255, rng, level)
+        changed = 255 * change_season(grey.astype(np.float32) / 255, rng, level)
     else:
         changed = level * image if sweep == "dark" else (1 - level) * image + level * _FOG_GREY
         changed = changed + _READ_NOISE * rng.normal(size=image.shape)

@@ -29,7 +29,7 @@ from edgevpr.core.types import Place
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
 from edgevpr.lab.simulate.generated import write_generated_flight
-from edgevpr.mapmaking.graph import Solved, Ties, solve
+from edgevpr.mapmaking.graph import GraphSolution, Ties, solve_graph
 from edgevpr.places.mapfile import PlaceMap
 
 SETS = ("aerial_caliterra", "aerial_garfield28", "aerial_swindale", "aerial_brighton")
@@ -81,7 +81,7 @@ def load(folder: Path) -> Set:
     return Set(folder.name, folder, empty.origin, tags, truth, mosaic)
 
 
-def _registered(folder: Path, names: list[str], tags: dict[str, complex]) -> Solved:
+def _registered(folder: Path, names: list[str], tags: dict[str, complex]) -> GraphSolution:
     number = {name: at for at, name in enumerate(names)}
     rejected_path = folder / "rejected_pairs.csv"
     refused = base.read_csv(rejected_path) if rejected_path.is_file() else []
@@ -93,7 +93,7 @@ def _registered(folder: Path, names: list[str], tags: dict[str, complex]) -> Sol
     step_sd, turn_sd = (np.full(len(rows), each) for each in _PAIR_SD)
     query, place = (np.array([number[row[key]] for row in rows]) for key in ("file_a", "file_b"))
     ties = Ties(query=query, place=place, step=np.array(step), turn=np.array(turn), step_sd=step_sd, turn_sd=turn_sd)
-    return solve(np.array([tags[name] for name in names]), ties)
+    return solve_graph(np.array([tags[name] for name in names]), ties)
 
 
 def picture(folder: Path, name: str) -> np.ndarray:

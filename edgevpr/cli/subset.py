@@ -36,11 +36,11 @@ def add(add_to_map: Callable[..., Any]) -> None:
 def run_map_subset(args: Namespace) -> int:
     """Run `map subset`: make the map of a mission, and print what is left out."""
     from edgevpr.mapmaking.missions import read_area
-    from edgevpr.mapmaking.subset import subset
+    from edgevpr.mapmaking.subset import make_subset
     from edgevpr.places.mapfiles import parse_map_path
 
     area, out = read_area(args.mission), parse_map_path(args.out)
-    result = subset(Path(args.map), area, args.margin_m, out, args.mb and 1e6 * args.mb, progress)
+    result = make_subset(Path(args.map), area, args.margin_m, out, args.mb and 1e6 * args.mb, progress)
     fields = {"map": str(out), **asdict(result)}
     text = [*format_fields(fields), *describe_lost_calibration(str(out), result.lost_calibration)]
     print_result(fields, args.json, text)

@@ -9,7 +9,7 @@ from edgevpr.core.text import format_offset, sanitize
 if TYPE_CHECKING:
     from edgevpr.mapmaking.making import MadeMap
     from edgevpr.mapmaking.moving import MapMove
-    from edgevpr.mapmaking.refine import Refined
+    from edgevpr.mapmaking.refine import Refinement
     from edgevpr.places.examine import MapCheck
     from edgevpr.places.mapinfo import MapInfo
     from edgevpr.review.compare import LineComparison, PacketComparison
@@ -56,7 +56,7 @@ def format_build(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
         yield f"{path}: {NO_POSITIONS_NOTE}"
 
 
-def format_refinement(path: str, refined: "Refined") -> Iterator[str]:
+def format_refinement(path: str, refined: "Refinement") -> Iterator[str]:
     """Yield the result of refining a map: how many pictures were moved to where they really lie, by how much, and which
     were recorded far from there."""
     if refined.without_position == refined.places:

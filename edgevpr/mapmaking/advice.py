@@ -35,12 +35,12 @@ from edgevpr.runtime.recognise.calibration import MIN_PLACES
 from edgevpr.runtime.recognise.landmarks import describe
 
 _log = logging.getLogger(__name__)
-_RUNS = 6  # of neighbouring pictures that are compared, spread over the folder
+_RUN_COUNT = 6  # of neighbouring pictures that are compared, spread over the folder
 _RUN_LENGTH = 3
 _TILT_RUN_LENGTH = 12  # those of a video are so close together that only every third or fourth has moved
-_FILM_PICTURES = 10  # of a video, a second apart
-_TILT_FILM_PICTURES = 60
-_LANDMARKS = 500
+_VIDEO_PICTURES = 10  # of a video, a second apart
+_TILT_VIDEO_PICTURES = 60
+_MAX_LANDMARKS = 500
 # Limits chosen on corridor and grief_stromovka_seasons (ahead: turned by 12 degrees and moved up by 0.07 at most), and
 # on aerial_caliterra and aerial_garfield28. Turning on the spot moves pictures aside too: nearly all must be.
 _MIN_TURN_DEG = 15.0
@@ -53,7 +53,7 @@ _MIN_PAIRS = 6  # the same, together with those moved aside
 _MIN_SHARE = 0.75
 _MAX_DOWN_DEG = 25.0  # tilt of a gimbal from straight down
 _MIN_AHEAD_DEG = 45.0
-_MANY_HZ = 4.0  # more places a second of a video show nearly the same
+_MAX_USEFUL_HZ = 4.0  # more places a second of a video show nearly the same
 _DISPLAY_SHAPE = 240, 320  # rows and columns of the small pictures in which a display is looked for
 _DISPLAY_PICTURES = 24  # spread over all
 _MIN_DISPLAY_PICTURES = 12  # fewer say nothing
@@ -73,12 +73,12 @@ def warn_of_gaps(pictures: FlownPictures, total: int, places: int | None) -> Non
     if pictures.folder:
         table = pictures.positions or find_positions(uri)
         tags = read_positions(table) if table else {}
-        paths = [path for run in _runs(pictures.folder) for path in run]
+        paths = [path for run in _choose_runs(pictures.folder) for path in run]
         is_placed = any((tags.get(path.name) or read_exif(path)).position for path in paths)
     elif not pictures.rate_hz:
-        with closing(_open_film(uri)) as film:
+        with closing(_open_video(uri)) as film:
             lasts_s = film.total
-        if total > _MANY_HZ * lasts_s:
+        if total > _MAX_USEFUL_HZ * lasts_s:
             text = "every frame of %s becomes a place, %d in %d s: --rate-hz 1 makes %d"
             _log.warning(text, uri, total, lasts_s, lasts_s)
     if not is_placed:
@@ -106,10 +106,10 @@ def suggest_lens(pictures: FlownPictures, config: SourceConfig, technique: Techn
 
 
 @show_elapsed("looking where the camera looks")
-def require_ahead(pictures: FlownPictures, mask: OverlayMask | None) -> None:
+def require_forward_camera(pictures: FlownPictures, mask: OverlayMask | None) -> None:
     """Log that the camera is taken to look ahead, and why. Raises UsageError if the pictures clearly look straight
     down: the user must say then what is meant."""
-    tilt_deg = _gimbal_tilt_deg(pictures.folder) if pictures.folder else None
+    tilt_deg = _read_gimbal_tilt_deg(pictures.folder) if pictures.folder else None
     if tilt_deg is not None and not _MAX_DOWN_DEG < tilt_deg < _MIN_AHEAD_DEG:
         is_down, why = tilt_deg <= _MAX_DOWN_DEG, f"XMP data: {tilt_deg:.0f} degrees from straight down"
     else:
@@ -122,11 +122,11 @@ def require_ahead(pictures: FlownPictures, mask: OverlayMask | None) -> None:
 
 
 @show_elapsed("measuring the tilt of the camera")
-def require_level(pictures: FlownPictures, fov_deg: float | None) -> None:
+def require_level_camera(pictures: FlownPictures, fov_deg: float | None) -> None:
     """Raise UsageError if neighbouring pictures show that a camera that is to look straight down is tilted, and its
     angles are not recorded: then nothing could level them."""
     if pictures.folder:
-        paths = [path for run in _runs(pictures.folder, _TILT_RUN_LENGTH) for path in run]
+        paths = [path for run in _choose_runs(pictures.folder, _TILT_RUN_LENGTH) for path in run]
         table = pictures.positions or find_positions(pictures.source)
         tags = read_positions(table) if table else {}
         if any(tag.pitch_deg is not None for path in paths for tag in (tags.get(path.name), read_xmp(path)) if tag):
@@ -136,7 +136,7 @@ def require_level(pictures: FlownPictures, fov_deg: float | None) -> None:
         table = pictures.positions or find_track(pictures.source)
         if table and any(tag.pitch_deg is not None for tag in read_track(table).tags):
             return
-        tilt = measure_tilt(_read_film(pictures.source, _TILT_FILM_PICTURES), fov_deg)
+        tilt = measure_tilt(_read_video(pictures.source, _TILT_VIDEO_PICTURES), fov_deg)
     if tilt and tilt.deg > MAX_UNKNOWN_TILT_DEG:
         raise UsageError(
             f"The camera is tilted by {tilt.deg:.0f} degrees or more from straight down (by {tilt.pairs} pairs of "
@@ -148,10 +148,10 @@ def require_level(pictures: FlownPictures, fov_deg: float | None) -> None:
 def _compare_neighbours(pictures: FlownPictures, mask: OverlayMask | None) -> tuple[bool, str]:
     """Compare neighbouring pictures. Returns whether they clearly look down, and what was found, as text."""
     folder = pictures.folder
-    runs = map(_read_usable, _runs(folder)) if folder else [_read_film(pictures.source, _FILM_PICTURES)]
+    runs = map(_read_usable, _choose_runs(folder)) if folder else [_read_video(pictures.source, _VIDEO_PICTURES)]
     pairs, clear, aside = 0, 0, 0
     for run in runs:
-        marks = [describe(image, mask.fit_to(image) if mask else None, _LANDMARKS) for image in run]
+        marks = [describe(image, mask.fit_to(image) if mask else None, _MAX_LANDMARKS) for image in run]
         for seen in (measure_agreement(one, other) for one, other in pairwise(marks)):
             if seen.inliers < PROVEN or seen.shift_share is None or seen.rotation_deg is None or seen.scale is None:
                 continue
@@ -175,7 +175,7 @@ def warn_of_display(pictures: FlownPictures, mask: OverlayMask | None) -> None:
             paths[at] for at in np.unique(np.linspace(0, len(paths) - 1, _DISPLAY_PICTURES, dtype=int))
         )
     else:
-        images = _read_film(pictures.source, _DISPLAY_PICTURES)
+        images = _read_video(pictures.source, _DISPLAY_PICTURES)
     share = measure_still_share(images, mask)
     if share is not None and share >= _MIN_DISPLAY_SHARE:
         text = (
@@ -191,9 +191,9 @@ def measure_still_share(images: Iterable[Image], mask: OverlayMask | None) -> fl
     count, allowed = 0, np.ones(_DISPLAY_SHAPE, bool)
     x, y, strength = np.zeros((3, *_DISPLAY_SHAPE), np.float32)
     for image in images:
-        across, along = _edges(image)
+        across, along = _compute_gradients(image)
         x, y, strength, count = x + across, y + along, strength + cv2.magnitude(across, along), count + 1
-        allowed &= _shrunk(mask.fit_to(image)) if mask else True
+        allowed &= _shrink_mask(mask.fit_to(image)) if mask else True
     if count < _MIN_DISPLAY_PICTURES:
         return None
     edges = allowed & (strength >= _MIN_EDGE * count)
@@ -201,7 +201,7 @@ def measure_still_share(images: Iterable[Image], mask: OverlayMask | None) -> fl
     return None if still.sum() > _MAX_STILL_EDGES * edges.sum() else float(still.mean())
 
 
-def _edges(image: Image) -> tuple[Singles, Singles]:
+def _compute_gradients(image: Image) -> tuple[Singles, Singles]:
     """Return how much a small copy of a picture brightens a pixel, to the right and down: float32 (H, W) each."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     grey = cv2.resize(grey.astype(np.float32), _DISPLAY_SHAPE[::-1], interpolation=cv2.INTER_AREA)
@@ -209,17 +209,17 @@ def _edges(image: Image) -> tuple[Singles, Singles]:
     return np.asarray(across, np.float32), np.asarray(along, np.float32)
 
 
-def _shrunk(allowed: Bools) -> Bools:
+def _shrink_mask(allowed: Bools) -> Bools:
     return cv2.resize(allowed.view(np.uint8), _DISPLAY_SHAPE[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-def _open_film(uri: str) -> Source:
+def _open_video(uri: str) -> Source:
     return open_source(uri, step_s=1.0, live=False)
 
 
-def _read_film(uri: str, count: int) -> Iterator[Image]:
+def _read_video(uri: str, count: int) -> Iterator[Image]:
     """Yield the first `count` usable pictures of a video, a second apart."""
-    with closing(_open_film(uri)) as film:
+    with closing(_open_video(uri)) as film:
         yield from (frame.image for frame in islice(filter(None, read_to_end(film, lambda error: None)), count))
 
 
@@ -229,17 +229,17 @@ def _read_usable(paths: Iterable[Path]) -> Iterator[Image]:
             yield read_image(path)
 
 
-def _runs(folder: Path, length: int = _RUN_LENGTH) -> list[list[Path]]:
+def _choose_runs(folder: Path, length: int = _RUN_LENGTH) -> list[list[Path]]:
     """Choose runs of neighbouring pictures, spread over a folder; none comes twice."""
     paths = list_images(folder)
-    if len(paths) <= _RUNS * length:
+    if len(paths) <= _RUN_COUNT * length:
         return [paths]
-    starts = np.linspace(0, len(paths) - length, _RUNS).astype(int).tolist()
+    starts = np.linspace(0, len(paths) - length, _RUN_COUNT).astype(int).tolist()
     return [paths[start : start + length] for start in starts]
 
 
-def _gimbal_tilt_deg(folder: Path) -> float | None:
+def _read_gimbal_tilt_deg(folder: Path) -> float | None:
     """Return how far a camera on a gimbal is from straight down, by the XMP data of some pictures; None: unknown."""
-    tags = [read_xmp(path) for run in _runs(folder) for path in run]
+    tags = [read_xmp(path) for run in _choose_runs(folder) for path in run]
     tilts_deg = [max(abs(tag.roll_deg or 0.0), abs(tag.pitch_deg)) for tag in tags if tag.pitch_deg is not None]
     return float(np.median(tilts_deg)) if tilts_deg else None

@@ -27,7 +27,7 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.level import LevelledImage
 from edgevpr.mapmaking.changes import change_picture
 from edgevpr.mapmaking.look_alikes import MapSearch, measure_look_alikes
-from edgevpr.mapmaking.mapping import Watch
+from edgevpr.mapmaking.mapping import Progress
 from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import outside_neighbourhood
@@ -49,20 +49,23 @@ from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
 
 Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the frames of these names, as far as they are found
 
-THERE, LEFT_OUT, MIRRORED = "there", "left out", "mirrored"
-ASKED_AHEAD, ASKED_DOWN = 120, 60  # pictures, by the camera's direction; each takes longer when it looks down
+THERE = "there"
+LEFT_OUT = "left out"
+MIRRORED = "mirrored"
+FORWARD_QUERIES = 120
+NADIR_QUERIES = 60  # each takes longer
 _MAX_WITHOUT_POSITION = 0.2  # share of the places of a map that looks down, whose pictures overlap in any order
-_LEFT_OUT_COUNTS = 0.3  # weight of LEFT_OUT results: flights over ground outside the map are rarer
+_LEFT_OUT_WEIGHT = 0.3  # weight of LEFT_OUT results: flights over ground outside the map are rarer
 # Strength with which the fit holds on to the shipped weights, and to the bias (see `fit_logistic`). Chosen on corridor
 # and sat_marash, with the other sets in view. Looking down, with 5 and a free bias, the pictures drawn by chance
 # decided whether 14 or 39 of 80 queries of sat_marash were accepted; ahead, a bias that is held costs corridor half.
-_PULL = {AHEAD: (50.0, 0.0), AHEAD_PROVEN: (50.0, 0.0), DOWN: (200.0, 200.0), DOWN_BARE: (200.0, 200.0)}
+_PRIOR_PRECISIONS = {AHEAD: (50.0, 0.0), AHEAD_PROVEN: (50.0, 0.0), DOWN: (200.0, 200.0), DOWN_BARE: (200.0, 200.0)}
 _SEED = 15
-_EVEN = 0.5  # precision for which hardly any match is refused for low confidence
+_EVEN_PRECISION = 0.5  # precision for which hardly any match is refused for low confidence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MapAnswer:
+class QueryResult:
     """Result of one query made from a picture of the map. `place_id`: the place of this picture. `way`: how the query
     was made (THERE, LEFT_OUT, MIRRORED). `right`: the best match is the right place. `evidence`: that of the best match
     (None: the picture holds too little to be looked for). `refused`: the match was refused for another reason than low
@@ -75,7 +78,7 @@ class MapAnswer:
     refused: bool = False
 
 
-def ask(
+def query_map(
     technique: Technique,
     place_map: PlaceMap,
     index: PlaceIndex,
@@ -83,27 +86,27 @@ def ask(
     meter: QueryMeter,
     pictures: Iterable[tuple[int, LevelledImage]],
     seed: int = 0,
-) -> Iterator[MapAnswer]:
+) -> Iterator[QueryResult]:
     """Run queries with changed pictures of the map's own places, in all three ways, and yield the results. `index` has
     the places of `place_map`, and `rule` is the rule for accepting a match. `pictures` are pairs of a place's number
     and its picture as it was encoded for the map. A place that is not in the index is left out."""
     rng = np.random.default_rng((_SEED, seed))
     assert rule.sure is not None  # set for a technique that has a confidence model
-    sure = replace(rule.sure, precision=_EVEN)
+    sure = replace(rule.sure, precision=_EVEN_PRECISION)
     rule = replace(rule, sure=sure)
     search = MapSearch(technique, place_map, index, rule, meter=meter)
     for place_id, picture in pictures:
         if (slot := search.slots.get(place_id)) is None:
             continue
-        may_be_same = search.same_ground(slot)
+        may_be_same = search.find_same_ground(slot)
         ways = ((THERE, picture, index), (LEFT_OUT, picture, index.select(~may_be_same)))
-        for way, seen, among in (*ways, (MIRRORED, _mirror(picture), index)):
+        for way, seen, among in (*ways, (MIRRORED, _mirror_picture(picture), index)):
             if not len(among):
                 continue
             image, shown = change_picture(seen.image, rng, technique.spec.looks_down, seen.mask)
             event = search.find(place_id, image, shown, among)
             if event.evidence is None or event.best is None or event.confidence is None:
-                yield MapAnswer(place_id=place_id, way=way, right=False, evidence=None)
+                yield QueryResult(place_id=place_id, way=way, right=False, evidence=None)
                 continue
             best = search.slots[event.best.place.place_id]
             beside = count_neighbours(rule.look_alikes)
@@ -114,7 +117,7 @@ def ask(
             if way == THERE and not right and may_be_same[best] and not np.isnan(index.lat_deg[best]):
                 continue  # the two pictures may overlap: it is unknown whether the match is right
             refused = not event.accepted and event.confidence >= sure.threshold(event.evidence)
-            yield MapAnswer(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
+            yield QueryResult(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
 
 
 def calibrate(
@@ -123,10 +126,10 @@ def calibrate(
     config: MatchConfig,
     meter: QueryMeter,
     pictures: Pictures,
-    watch: Watch[Frame],
+    progress: Progress[Frame],
 ) -> MapCalibration:
     """Calibrate a map that is open for adding, and store the result in the map. `pictures` opens the pictures of given
-    names; `watch` wraps the iteration over these frames, to show progress. `encoder` is that with which the map was
+    names; `progress` wraps the iteration over these frames, to show progress. `encoder` is that with which the map was
     made.
     Raises UsageError if the technique has no confidence model, the map has too few places, or too few of their
     pictures are found. Raises MapError for a file that cannot be read or written.
@@ -150,32 +153,32 @@ def calibrate(
         near_m = MapSearch(technique, place_map, index, rule, meter=meter).near_m
         described = (
             (place_id, encoded.descriptor)
-            for place_id, encoded in _read_mapped(encoder, place_map, pictures, watch, len(place_map))
+            for place_id, encoded in _read_mapped(encoder, place_map, pictures, progress, len(place_map))
         )
         rule = replace(rule, look_alikes=measure_look_alikes(technique, place_map, index, near_m, described))
-    count = query_altered_copies(technique)
+    count = count_queries(technique)
     as_mapped = (
-        (place_id, encoded.picture) for place_id, encoded in _read_mapped(encoder, place_map, pictures, watch, count)
+        (place_id, encoded.picture) for place_id, encoded in _read_mapped(encoder, place_map, pictures, progress, count)
     )
-    answers = list(ask(technique, place_map, index, rule, meter, as_mapped))
+    answers = list(query_map(technique, place_map, index, rule, meter, as_mapped))
     at_hand = len({answer.place_id for answer in answers})
     require(
         at_hand >= MIN_PLACES,
         f"the pictures of {at_hand} places are at hand, and those of {MIN_PLACES} are needed; give the pictures "
         "that it was made of, with the same camera and mask",
     )
-    calibration = replace(_calibration(answers, kinds, config.accept_precision), look_alikes=rule.look_alikes)
+    calibration = replace(_fit_calibration(answers, kinds, config.accept_precision), look_alikes=rule.look_alikes)
     place_map.record_calibration(calibration_text(calibration))
     return calibration
 
 
-def query_altered_copies(technique: Technique) -> int:
+def count_queries(technique: Technique) -> int:
     """Return the number of pictures that are used to calibrate a map of this technique."""
-    return ASKED_DOWN if technique.spec.looks_down else ASKED_AHEAD
+    return NADIR_QUERIES if technique.spec.looks_down else FORWARD_QUERIES
 
 
 def _read_mapped(
-    encoder: FrameEncoder, place_map: PlaceMap, pictures: Pictures, watch: Watch[Frame], count: int
+    encoder: FrameEncoder, place_map: PlaceMap, pictures: Pictures, progress: Progress[Frame], count: int
 ) -> Iterator[tuple[int, EncodedFrame]]:
     """Yield (a place's number, its picture as it was encoded for the map) for `count` pictures in random order, again
     from the first one if there are fewer. A picture that has the name of a place's picture, but another content, is
@@ -184,7 +187,7 @@ def _read_mapped(
     names = sorted(ids_by_image)
     names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
     frames = (frame for done in range(0, count, len(names)) for frame in pictures(names[: count - done]))
-    for frame in watch(frames, count):
+    for frame in progress(frames, count):
         encoded = encoder.encode(frame)
         of_name = ids_by_image.get(escape_name(frame.name), ())
         if (
@@ -193,7 +196,7 @@ def _read_mapped(
             yield place_id, encoded
 
 
-def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: float) -> MapCalibration:
+def _fit_calibration(answers: Sequence[QueryResult], kinds: Sequence[str], precision: float) -> MapCalibration:
     """Fit the models of all `kinds` of evidence to the answers, and count those that are accepted at the `precision`
     asked for."""
     known = [answer for answer in answers if answer.evidence]
@@ -221,7 +224,7 @@ def _calibration(answers: Sequence[MapAnswer], kinds: Sequence[str], precision: 
     )
 
 
-def adapt_model(model: Model, kind: str, answers: Iterable[MapAnswer], made_of: str) -> Model:
+def adapt_model(model: Model, kind: str, answers: Iterable[QueryResult], made_of: str) -> Model:
     """Return a copy of the confidence model `model`, of this kind of evidence, with its `of_place` fitted to the
     answers of a map. Answers without evidence are ignored. `made_of`: a note, kept in the model, on the data that it
     was fitted to."""
@@ -231,8 +234,8 @@ def adapt_model(model: Model, kind: str, answers: Iterable[MapAnswer], made_of: 
     right = np.array([answer.right for answer, _ in known], bool)
     of_place = model.of_place
     if not right.all():  # wrong ones are needed to fit anything
-        weights = np.array([_LEFT_OUT_COUNTS if answer.way == LEFT_OUT else 1.0 for answer, _ in known])
-        of_place = fit_logistic(of_place, rows, right, weights, *_PULL[kind])
+        weights = np.array([_LEFT_OUT_WEIGHT if answer.way == LEFT_OUT else 1.0 for answer, _ in known])
+        of_place = fit_logistic(of_place, rows, right, weights, *_PRIOR_PRECISIONS[kind])
     return Model(
         of_map=model.of_map,
         of_place=of_place,
@@ -244,35 +247,40 @@ def adapt_model(model: Model, kind: str, answers: Iterable[MapAnswer], made_of: 
 
 
 def fit_logistic(
-    start: Logistic, rows: Sequence[Figures], right: Bools, weights: Doubles, pull: float, pull_of_bias: float = 0.0
+    start: Logistic,
+    rows: Sequence[Figures],
+    right: Bools,
+    weights: Doubles,
+    precision: float,
+    bias_precision: float = 0.0,
 ) -> Logistic:
     """Fit a logistic regression to N `rows` of evidence, of which `right`, bool (N,), is True for right matches;
     `weights`, float (N,), are their weights.
 
-    Gaussian priors hold the regression near `start`: its scaled coefficients with the variance 1 / `pull`, its bias
-    with 1 / `pull_of_bias` (0: the bias is free). With few rows the result stays close to `start`.
+    Gaussian priors hold the regression near `start`: its scaled coefficients with the variance 1 / `precision`, its
+    bias with 1 / `bias_precision` (0: the bias is free). With few rows the result stays close to `start`.
     """
-    scales, mine = np.array(start.scales), evidence_matrix(rows, start.names) / np.array(start.scales)
+    scales, mine = np.array(start.scales), make_evidence_matrix(rows, start.names) / np.array(start.scales)
     middle = np.append(np.array(start.weights) * scales, start.bias)
-    pulls = np.append(np.full(len(scales), pull), pull_of_bias)
+    precisions = np.append(np.full(len(scales), precision), bias_precision)
     sign = np.where(right, 1.0, -1.0)
 
     def cost(at: Doubles) -> tuple[float, Doubles]:
         logit = mine @ at[:-1] + at[-1]
         off = at - middle
-        loss = weights @ np.logaddexp(0, -sign * logit) + pulls / 2 @ (off * off)
+        loss = weights @ np.logaddexp(0, -sign * logit) + precisions / 2 @ (off * off)
         slope = -weights * sign * np.exp(-np.logaddexp(0, sign * logit))
-        return float(loss), np.append(mine.T @ slope, slope.sum()) + pulls * off
+        return float(loss), np.append(mine.T @ slope, slope.sum()) + precisions * off
 
     found = minimize(cost, middle, jac=True, method="L-BFGS-B").x
     return Logistic(start.names, tuple((found[:-1] / scales).tolist()), start.scales, float(found[-1]))
 
 
-def evidence_matrix(rows: Sequence[Figures], names: Sequence[str]) -> Doubles:
+def make_evidence_matrix(rows: Sequence[Figures], names: Sequence[str]) -> Doubles:
     """Return the evidence of N matches as a matrix, float64 (N, F), with a column for each of the F `names`."""
     return np.array([[row[name] for name in names] for row in rows], float).reshape(len(rows), len(names))
 
 
-def _mirror(picture: LevelledImage) -> LevelledImage:
+def _mirror_picture(picture: LevelledImage) -> LevelledImage:
     mask = None if picture.mask is None else np.ascontiguousarray(picture.mask[:, ::-1])
     return LevelledImage(np.ascontiguousarray(picture.image[:, ::-1]), mask, picture.view)

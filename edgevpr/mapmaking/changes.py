@@ -11,12 +11,12 @@ import numpy as np
 from edgevpr.core.arrays import Array, Doubles, Floats, Image, Mask, Singles
 from edgevpr.frames.images import resize
 
-_STRENGTH = (0.3, 1.3)  # least and greatest: from a change like a cloud to one like snow
+_STRENGTH_RANGE = (0.3, 1.3)  # least and greatest: from a change like a cloud to one like snow
 # Of the pictures of the sets that the strengths were chosen on. Larger ones take long to change, and their noise, which
 # is that of pixels, would be averaged away.
 _MAX_PX = 640
-_TONES = 6  # points of a tone curve
-_PATCHES = 2  # most plain patches that hide a part of the picture
+_TONE_POINTS = 6  # points of a tone curve
+_MAX_PATCHES = 2  # most plain patches that hide a part of the picture
 
 
 def change_picture(
@@ -26,7 +26,7 @@ def change_picture(
     by any angle. `shown`, bool (H, W), is False where it shows no ground (None: it shows ground everywhere). Returns
     * the changed picture, uint8 grey, at most 640 pixels long, and
     * `shown` for the changed picture."""
-    strength = rng.uniform(*_STRENGTH)
+    strength = rng.uniform(*_STRENGTH_RANGE)
     if (shrink := _MAX_PX / max(image.shape[:2])) < 1:
         size_px = round(shrink * image.shape[1]), round(shrink * image.shape[0])
         image = resize(image, size_px)
@@ -34,12 +34,12 @@ def change_picture(
             shown = cv2.resize(shown.view(np.uint8), size_px, interpolation=cv2.INTER_NEAREST).view(bool)
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
     warp = _change_viewpoint(grey.shape, rng, strength, looks_down)
-    seen = _warp(grey.astype(np.float32) / 255, warp, cv2.INTER_LINEAR)
-    seen = another_season(seen, rng, strength)
-    lit = _another_light(seen, rng, strength)
-    _hide(lit, rng, strength)
+    seen = _warp_image(grey.astype(np.float32) / 255, warp, cv2.INTER_LINEAR)
+    seen = change_season(seen, rng, strength)
+    lit = _change_light(seen, rng, strength)
+    _cover_patches(lit, rng, strength)
     if shown is not None:
-        shown = _warp(shown.view(np.uint8), warp, cv2.INTER_NEAREST).view(bool)
+        shown = _warp_image(shown.view(np.uint8), warp, cv2.INTER_NEAREST).view(bool)
     return (255 * np.clip(lit, 0, 1)).round().astype(np.uint8), shown
 
 
@@ -58,25 +58,25 @@ def _change_viewpoint(shape: tuple[int, int], rng: np.random.Generator, strength
     return warp
 
 
-def _warp(image: Array, warp: Doubles, flags: int) -> Array:
+def _warp_image(image: Array, warp: Doubles, flags: int) -> Array:
     return cv2.warpPerspective(image, warp, image.shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT)
 
 
-def another_season(grey: Singles, rng: np.random.Generator, strength: float) -> Singles:
+def change_season(grey: Singles, rng: np.random.Generator, strength: float) -> Singles:
     """Map grey levels through random tone curves that differ between parts of the picture, as leaves and snow do, and
     add a random texture. `grey` is float32 (H, W), 0..1, and so is the result, which may slightly exceed 0..1."""
     height, width = grey.shape
     tones = np.clip(255 * grey, 0, 255).astype(np.uint8)
-    one, other = (_curve(rng, strength)[tones] for _ in range(2))
-    part = np.clip(0.5 + _smooth(rng, (height, width), 6), 0, 1)
+    one, other = (_make_tone_curve(rng, strength)[tones] for _ in range(2))
+    part = np.clip(0.5 + _make_smooth_field(rng, (height, width), 6), 0, 1)
     texture = cv2.GaussianBlur(rng.normal(size=(height, width)).astype(np.float32), (0, 0), max(1.0, width / 200))
     changed: Singles = part * one + (1 - part) * other + 0.36 * strength * texture
     return changed
 
 
-def _another_light(grey: Singles, rng: np.random.Generator, strength: float) -> Floats:
+def _change_light(grey: Singles, rng: np.random.Generator, strength: float) -> Floats:
     """Add soft shadows, another exposure, blur (to half of the pictures) and sensor noise to `grey`, float (H, W)."""
-    lit: Floats = np.clip(grey * np.exp(0.5 * strength * _smooth(rng, grey.shape, 3)), 0, 1)
+    lit: Floats = np.clip(grey * np.exp(0.5 * strength * _make_smooth_field(rng, grey.shape, 3)), 0, 1)
     lit = lit ** np.exp(rng.uniform(-1, 1) * 0.7 * strength)
     if rng.random() < 0.5:
         lit = np.asarray(cv2.GaussianBlur(lit, (0, 0), 0.3 + strength * grey.shape[1] / 400), lit.dtype)
@@ -84,22 +84,22 @@ def _another_light(grey: Singles, rng: np.random.Generator, strength: float) -> 
     return lit
 
 
-def _hide(grey: Floats, rng: np.random.Generator, strength: float) -> None:
+def _cover_patches(grey: Floats, rng: np.random.Generator, strength: float) -> None:
     """Cover `grey`, float (H, W), in place with up to two plain patches."""
     height, width = grey.shape
-    for _ in range(rng.integers(0, _PATCHES + 1)):
+    for _ in range(rng.integers(0, _MAX_PATCHES + 1)):
         x, y, half = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0.05, 0.2) * width * strength
         rows, columns = (slice(max(0, int(at - half)), int(at + half)) for at in (y, x))
         grey[rows, columns] = rng.uniform(0, 1)
 
 
-def _curve(rng: np.random.Generator, strength: float) -> Singles:
-    points = np.linspace(0, 1, _TONES)
-    bent = np.clip(points + 0.45 * strength * rng.normal(size=_TONES), 0, 1)
+def _make_tone_curve(rng: np.random.Generator, strength: float) -> Singles:
+    points = np.linspace(0, 1, _TONE_POINTS)
+    bent = np.clip(points + 0.45 * strength * rng.normal(size=_TONE_POINTS), 0, 1)
     return np.interp(np.linspace(0, 1, 256), points, bent).astype(np.float32)
 
 
-def _smooth(rng: np.random.Generator, shape: tuple[int, int], cells: int) -> Singles:
+def _make_smooth_field(rng: np.random.Generator, shape: tuple[int, int], cells: int) -> Singles:
     """Return a random smooth field, float32 of this shape, with values about -1..1; more `cells` vary faster."""
     coarse = rng.normal(size=(cells, cells)).astype(np.float32)
     field = cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_CUBIC)

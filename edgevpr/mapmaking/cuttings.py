@@ -19,7 +19,7 @@ from edgevpr.core.text import decode_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
-from edgevpr.mapmaking.georaster import WGS84, local_crs, transform
+from edgevpr.mapmaking.georaster import WGS84, make_local_crs, transform
 from edgevpr.mapmaking.missions import Area, read_area, shapely
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.mapmaking.tiles import surround
@@ -31,17 +31,16 @@ _log = logging.getLogger(__name__)
 
 SIDE_PX = 512
 MAX_WITHOUT_DATA = 0.1  # share of a picture's pixels
-_GEO_REFERENCE_M = 1.0  # standard deviation of the orthophoto's own position on the Earth, in each axis
+_GEOREFERENCE_SD_M = 1.0  # standard deviation of the orthophoto's own position on the Earth, in each axis
 # Pixels of the raster along a picture, by benchmarks/results/from_space.md: with fewer, less is found, or nothing.
-_SHARP_PX = 150
-_MIN_PX = 32
-_WHITE = 200  # grey values: the least, and the largest difference of colours
-_COLOURLESS = 30
-_CLOUDY = 1 / 3  # share of a picture that is white: in seven sets without clouds it is at most a sixth
-_BESIDE_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
+_SHARP_WIDTH_PX = 150
+_MIN_WIDTH_PX = 32
+_MIN_WHITE = 200  # grey values: the least, and the largest difference of colours
+_MAX_COLOUR_DIFFERENCE = 30
+_MIN_CLOUDY_SHARE = 1 / 3  # share of a picture that is white: in seven sets without clouds it is at most a sixth
+_METADATA_BYTES = 10_000  # of a place in a map file, beside its descriptor: mainly landmarks
 _MAX_PLACES = 1_000_000
-_EDGE_MARGIN = 0.01  # of the sides of a box
-_MAX_POINTS = 20 * _MAX_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
+_MAX_GRID_POINTS = 20 * _MAX_PLACES  # of the grid in the bounding box of an area, before points outside are dropped
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +79,7 @@ class OrthophotoSource(RecordingSource):
         self.counts = {"without_data": 0, "white": 0}
         self._read = 0
         self._left = self._list_places()
-        variance_m2 = _GEO_REFERENCE_M**2 + (orthophoto.resolution_m / 2) ** 2
+        variance_m2 = _GEOREFERENCE_SD_M**2 + (orthophoto.resolution_m / 2) ** 2
         self._covariance_m2 = variance_m2, 0.0, variance_m2
 
     def read(self, timeout_s: float) -> Frame | None:
@@ -108,20 +107,24 @@ class OrthophotoSource(RecordingSource):
         if valid.mean() < 1 - MAX_WITHOUT_DATA:
             self.counts["without_data"] += 1
             return None
-        self.counts["white"] += _white(image) > _CLOUDY
+        self.counts["white"] += _compute_white_share(image) > _MIN_CLOUDY_SHARE
         pose = Pose(up_deg=0.0, footprint_m=lattice.footprint_m, covariance_m2=self._covariance_m2, is_surveyed=True)
         return Frame(image=image, name=name, t_mono_s=time.monotonic(), position=position, heading_deg=0.0, pose=pose)
 
-    def begin(
-        self, spacing_m: float, technique: Technique, shown: Callable[..., Iterable[tuple[Lattice, int]]]
+    def prepare(
+        self, spacing_m: float, technique: Technique, progress: Callable[..., Iterable[tuple[Lattice, int]]]
     ) -> None:
         """Log how much will be cut, and fetch the tiles for it: so an address that refuses them leaves no half map.
-        `shown` shows progress."""
+        `progress` shows progress."""
         lattice = min(self._lattices, key=lambda each: each.footprint_m)
         spec = technique.spec
-        place_bytes = spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + _BESIDE_BYTES
+        place_bytes = spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + _METADATA_BYTES
         across_px = lattice.footprint_m / self._orthophoto.resolution_m
-        few = "" if across_px >= _SHARP_PX else f", too few to find all (with {_SHARP_PX} nearly all are found)"
+        few = (
+            ""
+            if across_px >= _SHARP_WIDTH_PX
+            else f", too few to find all (with {_SHARP_WIDTH_PX} nearly all are found)"
+        )
         _log.info(
             "%d places will be cut: %.2f km2 of ground, %.1f MB, %.0f pixels along a picture%s",
             self.total,
@@ -131,7 +134,9 @@ class OrthophotoSource(RecordingSource):
             few,
         )
         if self._orthophoto.is_remote:
-            for lattice, at in shown(self._list_places(), self.total, f"fetching tiles from {self._orthophoto.name}"):
+            for lattice, at in progress(
+                self._list_places(), self.total, f"fetching tiles from {self._orthophoto.name}"
+            ):
                 self._orthophoto.cut(lattice.locate_place(at), lattice.footprint_m, SIDE_PX)
 
     def _list_places(self) -> Iterator[tuple[Lattice, int]]:
@@ -143,11 +148,11 @@ class OrthophotoSource(RecordingSource):
         self._orthophoto.close()
 
 
-def _white(image: Image) -> float:
+def _compute_white_share(image: Image) -> float:
     """Return the share of a picture's pixels that are white."""
     blue, green, red = cv2.split(image)
     low, high = cv2.min(cv2.min(blue, green), red), cv2.max(cv2.max(blue, green), red)
-    return float(((low > _WHITE) & (high - low < _COLOURLESS)).mean())
+    return float(((low > _MIN_WHITE) & (high - low < _MAX_COLOUR_DIFFERENCE)).mean())
 
 
 def open_cuttings(cuttings: "Cuttings", only: Collection[str] | None) -> OrthophotoSource:
@@ -156,10 +161,10 @@ def open_cuttings(cuttings: "Cuttings", only: Collection[str] | None) -> Orthoph
     area = read_area(cuttings.area) if cuttings.area else None
     orthophoto = Orthophoto(cuttings.orthophoto, surround(area.points, footprints_m[-1]) if area else None)
     lattices = [make_lattice(orthophoto, footprint_m, cuttings.spacing_m, area) for footprint_m in footprints_m]
-    if (across_px := footprints_m[0] / orthophoto.resolution_m) < _MIN_PX:
+    if (across_px := footprints_m[0] / orthophoto.resolution_m) < _MIN_WIDTH_PX:
         raise UsageError(
             f"{orthophoto.name} has {across_px:.0f} pixels along a picture of {footprints_m[0]:g} m, and nothing is "
-            f"found with fewer than {_MIN_PX}: give a sharper one."
+            f"found with fewer than {_MIN_WIDTH_PX}: give a sharper one."
         )
     return OrthophotoSource(orthophoto, lattices, only=only)
 
@@ -172,8 +177,8 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
     Raises UsageError if footprint or spacing do not fit the orthophoto, or there are more than a million places, or
     none.
     """
-    plane = local_crs(orthophoto.middle)
-    outline_m = np.array(orthophoto.outline(plane))
+    plane = make_local_crs(orthophoto.middle)
+    outline_m = np.array(orthophoto.compute_outline(plane))
     low, high = outline_m.min(axis=1), outline_m.max(axis=1)
     size_m = high - low
     for flag, given_m, most_m in (
@@ -190,16 +195,18 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
     first = (low + high - (count - 1) * spacing_m) / 2  # the south-west place
     begin, end = np.zeros(2, int), count
     if area:
-        ground = area.on_plane(lambda lat_deg, lon_deg: transform(WGS84, plane, lon_deg, lat_deg), 0.0, footprint_m)
+        ground = area.project_ground(
+            lambda lat_deg, lon_deg: transform(WGS84, plane, lon_deg, lat_deg), 0.0, footprint_m
+        )
         area_low, area_high = np.reshape(ground.bounds, (2, 2))
         if not ((area_low <= high) & (area_high >= low)).all():  # false for an empty one, whose bounds are NaN
             raise UsageError(
-                f"The area does not touch {orthophoto.name}: it is at {extent_words(area.extent_deg)}, the orthophoto "
-                f"at {extent_words(orthophoto.extent_deg)}."
+                f"The area does not touch {orthophoto.name}: it is at {format_extent(area.extent_deg)}, the orthophoto "
+                f"at {format_extent(orthophoto.extent_deg)}."
             )
         begin = np.clip(np.ceil((area_low - first) / spacing_m), 0, count).astype(int)
         end = np.clip(np.floor((area_high - first) / spacing_m) + 1, begin, count).astype(int)
-    _require_bounded((end - begin).prod(), _MAX_POINTS if area else _MAX_PLACES, spacing_m)
+    _require_at_most((end - begin).prod(), _MAX_GRID_POINTS if area else _MAX_PLACES, spacing_m)
     x_m, y_m = (first[axis] + spacing_m * np.arange(begin[axis], end[axis]) for axis in (0, 1))
     y_m = y_m[::-1]
     if area:
@@ -207,7 +214,7 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
     else:
         wanted = np.ones((len(y_m), len(x_m)), bool)
     rows, columns = np.nonzero(wanted)
-    _require_bounded(len(rows), _MAX_PLACES, spacing_m)
+    _require_at_most(len(rows), _MAX_PLACES, spacing_m)
     if not len(rows):
         raise UsageError(
             f"No place of a grid of {spacing_m:g} m lies in the area and in {orthophoto.name}: give a smaller spacing."
@@ -218,7 +225,7 @@ def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, a
     return Lattice(footprint_m=footprint_m, rows=rows, columns=columns, lat_deg=lat_deg, lon_deg=lon_deg, shape=shape)
 
 
-def _require_bounded(count: int, most: int, spacing_m: float) -> None:
+def _require_at_most(count: int, most: int, spacing_m: float) -> None:
     if count > most:
         needed_m = math.ceil(spacing_m * math.sqrt(count / _MAX_PLACES))
         raise UsageError(
@@ -227,7 +234,7 @@ def _require_bounded(count: int, most: int, spacing_m: float) -> None:
         )
 
 
-def extent_words(extent_deg: Extent) -> str:
+def format_extent(extent_deg: Extent) -> str:
     """Format a bounding box (south, west, north, east) for messages."""
     south, west, north, east = extent_deg
     return f"{south:.4f}..{north:.4f} north, {west:.4f}..{east:.4f} east"

@@ -25,12 +25,12 @@ from edgevpr.runtime.recognise.evidence import list_evidence_kinds
 from edgevpr.runtime.recognise.levelling import Levelling, make_levelling
 
 if TYPE_CHECKING:
-    from edgevpr.mapmaking.refine import Refined
+    from edgevpr.mapmaking.refine import Refinement
 
 _log = logging.getLogger(__name__)
 
 # Called with items, their number and a label; yields the items unchanged and shows the progress.
-Shown = Callable[[Iterable[Any], int, str], Iterable[Any]]
+Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class FinishedMap:
     """Result of `finish_map`. `refined`, `calibration`: results of refining and calibrating (None: not done).
     `not_done`: sentences on which of them was to be done and could not be, and why."""
 
-    refined: "Refined | None"
+    refined: "Refinement | None"
     calibration: MapCalibration | None
     not_done: tuple[str, ...]
 
@@ -48,7 +48,7 @@ def finish_map(
     encoder: FrameEncoder,
     match: MatchConfig,
     pictures: FlownPictures | Cuttings | None,
-    shown: Shown,
+    progress: Progress,
     refine: bool = True,
     calibrate: bool = True,
 ) -> FinishedMap:
@@ -57,18 +57,20 @@ def finish_map(
     technique, refined, calibration, not_done = encoder.technique, None, None, []
     if refine and technique.spec.looks_down and not isinstance(pictures, Cuttings):
         try:
-            refined = refine_map(place_map, technique, pictures.folder if pictures else None, shown)
+            refined = refine_map(place_map, technique, pictures.folder if pictures else None, progress)
         except EdgevprError as error:
             not_done.append(f"the map is not refined: {error}")
     if calibrate and pictures and list_evidence_kinds(technique.spec):
         try:
-            calibration = calibrate_map(place_map, encoder, match, pictures, shown)
+            calibration = calibrate_map(place_map, encoder, match, pictures, progress)
         except EdgevprError as error:
             not_done.append(f"the map is not calibrated: {error}")
     return FinishedMap(refined, calibration, tuple(not_done))
 
 
-def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | None, shown: Shown) -> "Refined":
+def refine_map(
+    place_map: PlaceMap, technique: Technique, images: str | Path | None, progress: Progress
+) -> "Refinement":
     """Refine the positions of an open map (see `refine`). `images` is the folder of its pictures (None: not at hand).
     Raises UsageError if the map's technique does not allow it, or SciPy is missing."""
     if not technique.spec.looks_down:
@@ -78,7 +80,7 @@ def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | N
         )
     with _require_scipy():
         from edgevpr.mapmaking.refine import refine
-    refined = refine(place_map, technique, lambda pairs, total: shown(pairs, total, "refining"), images)
+    refined = refine(place_map, technique, lambda pairs, total: progress(pairs, total, "refining"), images)
     if refined.is_mirrored:
         _log.warning(
             "lat and lon may be swapped, or the sign of one lost (south and west are negative): the pictures fit the "
@@ -89,7 +91,11 @@ def refine_map(place_map: PlaceMap, technique: Technique, images: str | Path | N
 
 
 def calibrate_map(
-    place_map: PlaceMap, encoder: FrameEncoder, match: MatchConfig, pictures: FlownPictures | Cuttings, shown: Shown
+    place_map: PlaceMap,
+    encoder: FrameEncoder,
+    match: MatchConfig,
+    pictures: FlownPictures | Cuttings,
+    progress: Progress,
 ) -> MapCalibration:
     """Calibrate the confidence of an open map with the pictures that it was made from, as far as they can be read (see
     `calibrate`). Raises UsageError if the map cannot be calibrated, or SciPy is missing."""
@@ -115,7 +121,7 @@ def calibrate_map(
         match,
         QueryMeter(load_board("this")),
         frames,
-        lambda asked, total: shown(asked, total, "calibrating"),
+        lambda asked, total: progress(asked, total, "calibrating"),
     )
 
 

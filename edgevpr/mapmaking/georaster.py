@@ -47,14 +47,14 @@ class GeoRaster:
     at the corners of pixels) to coordinates of `crs`. `width` and `height` are in pixels. `name` names it in messages,
     and `short_name` the pictures cut from it. `is_remote`: it is fetched from an address, which no message may hold."""
 
-    def __init__(self, opened: str | Path, name: str, short_name: str, is_remote: bool = False) -> None:
-        """Open what GDAL opens by the text `opened`. Raises SourceError for what is no picture or has no
+    def __init__(self, source: str | Path, name: str, short_name: str, is_remote: bool = False) -> None:
+        """Open what GDAL opens by the text `source`. Raises SourceError for what is no picture or has no
         georeference."""
         self.name, self.short_name, self.is_remote = name, short_name, is_remote
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)
-                self._data = rasterio.open(opened)
+                self._data = rasterio.open(source)
         except (RasterioError, OSError) as error:
             raise SourceError(
                 f"{name} cannot be opened as an orthophoto: give a GeoTIFF, VRT or MBTiles file, a folder of tiles "
@@ -62,9 +62,9 @@ class GeoRaster:
             ) from (None if is_remote else error)
         self.crs, self.transform = self._data.crs, self._data.transform
         self.width, self.height = self._data.width, self._data.height
-        self._bands = self._colour_bands()
+        self._bands = self._find_colour_bands()
 
-    def _colour_bands(self) -> list[int]:
+    def _find_colour_bands(self) -> list[int]:
         """Return the numbers (from 1) of the bands blue, green and red, or of the grey band. Raises SourceError."""
         kinds, dtypes = self._data.colorinterp, self._data.dtypes
         colours = [kinds.index(colour) + 1 for colour in _COLOURS if colour in kinds]
@@ -117,7 +117,7 @@ class GeoRaster:
         self._data.close()
 
 
-def local_crs(at: Position) -> CRS:
+def make_local_crs(at: Position) -> CRS:
     """Return the coordinate system of the plane that touches the Earth at `at`: metres east and true north of that
     point. Distances and directions from that point are exact."""
     return CRS.from_proj4(f"+proj=aeqd +lat_0={at.lat_deg:.10f} +lon_0={at.lon_deg:.10f} +datum=WGS84 +units=m")

@@ -27,23 +27,27 @@ from edgevpr.core.arrays import Array, Complexes, Floats
 from edgevpr.core.geodesy import fit_similarity
 from edgevpr.core.text import show_elapsed
 
-_ROUNDS, _SETTLED = 4, 0.05  # most rounds of estimating the scatters, and their relative change that ends the rounds
-_MOVES, _STAYS = 40, 1e-4  # most Gauss-Newton steps, and the largest move that ends them, as a share of a footprint
-_MAX_MOVE = 0.5  # largest change of a log in one Gauss-Newton step
+_MAX_ROUNDS = 4  # of estimating the standard deviations
+_MIN_SD_CHANGE = 0.05  # relative; a smaller one ends the rounds
+_MAX_STEPS = 40  # of Gauss-Newton
+_MIN_MOVE = 1e-4  # as a share of a footprint; a smaller one ends the steps
+_MAX_LOG_MOVE = 0.5  # largest change of a log in one Gauss-Newton step
 # Factor from the given to the real standard deviations of ties: the first estimate, and the least, since ties that
 # agree well by chance must not make the others look wrong.
-_FIRST, _LEAST = 3.0, 0.5
-_LEAST_M, _FIRST_M = 0.5, 10.0  # scatter of recorded positions: the least, and the first estimate
-_GONE = 0.1  # a tie or position with a smaller weight counts as contradicting the others
-_MEDIAN_OF_FOUR = 1.832  # median length of a vector of four standard normal numbers
-_NOTHING = 1e-6  # added to the diagonal, so that places without ties can be solved
+_INITIAL_TIE_FACTOR = 3.0
+_MIN_TIE_FACTOR = 0.5
+_MIN_RECORDED_SD_M = 0.5
+_INITIAL_RECORDED_SD_M = 10.0
+_MIN_AGREEMENT = 0.1  # a tie or position with a smaller weight counts as contradicting the others
+_MEDIAN_LENGTH = 1.832  # median length of a vector of four standard normal numbers
+_DIAGONAL_DAMPING = 1e-6  # added to the diagonal, so that places without ties can be solved
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ties:
     """T pairs of pictures of the same ground: `query` and `place`, int (T,), are the numbers of the two pictures.
     `step` and `turn`, complex (T,), are defined in the module's docstring. `step_sd` and `turn_sd`, float (T,), are the
-    standard deviations of step and turn along one axis, up to a factor that all share, which `solve` estimates."""
+    standard deviations of both along one axis, up to a factor that all share, which `solve_graph` estimates."""
 
     query: np.ndarray
     place: np.ndarray
@@ -57,13 +61,13 @@ class Ties:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Solved:
+class GraphSolution:
     """The solved graph of N places with T ties. `position`, complex (N,): east + i north in metres. `log`, complex
     (N,): footprint and direction, see the module.
     `position_var` (m^2) and `log_var`, float (N,): variances of `position` and `log`, summed over both axes.
     `component`, int (N,): number of the group of places, connected by ties, that each place belongs to.
     `recorded_sd_m`: estimated standard deviation of recorded positions along one axis.
-    `recorded_counts` (N,), `ties_count` (T,): bool, False for positions and ties that contradict the others."""
+    `recorded_agree` (N,), `ties_agree` (T,): bool, False for positions and ties that contradict the others."""
 
     position: np.ndarray
     log: np.ndarray
@@ -71,46 +75,48 @@ class Solved:
     log_var: np.ndarray
     component: np.ndarray
     recorded_sd_m: float
-    recorded_counts: np.ndarray
-    ties_count: np.ndarray
+    recorded_agree: np.ndarray
+    ties_agree: np.ndarray
 
 
 @show_elapsed("refining: solving where all pictures lie")
-def solve(recorded: np.ndarray, ties: Ties) -> Solved:
+def solve_graph(recorded: np.ndarray, ties: Ties) -> GraphSolution:
     """Solve the pose graph of N places by least squares. `recorded`, complex (N,): the recorded positions, east + i
     north in metres. One standard deviation is estimated for all of them."""
     count = len(recorded)
-    _, component = connected_components(_matrix(ties, count), directed=False)
+    _, component = connected_components(_make_tie_matrix(ties, count), directed=False)
     graph = _Graph(recorded, ties, component)
-    times, scatter_m = _FIRST, _FIRST_M
-    for _ in range(_ROUNDS):
-        before, sd_m = times, scatter_m
-        normal, agree = graph.settle(sd_m, times)
-        variance = 2 * _inverse_diagonal(normal)  # the weights are of one axis, the variance of both
+    factor, recorded_sd_m = _INITIAL_TIE_FACTOR, _INITIAL_RECORDED_SD_M
+    for _ in range(_MAX_ROUNDS):
+        before, sd_m = factor, recorded_sd_m
+        normal, agree = graph.optimise(sd_m, factor)
+        variance = 2 * _invert_diagonal(normal)  # the weights are of one axis, the variance of both
         if len(ties):
             # Unknowns absorb a part of the residuals: the estimate is corrected by the share of spare observations.
             spare = max(2 * len(ties) - 2 * (count - len(np.unique(component))), 1) / (2 * len(ties))
-            times = max(_LEAST, float(np.median(graph.tie_residuals())) / _MEDIAN_OF_FOUR / np.sqrt(spare))
+            median = float(np.median(graph.compute_tie_residuals()))
+            factor = max(_MIN_TIE_FACTOR, median / _MEDIAN_LENGTH / np.sqrt(spare))
         off_m = abs(graph.position - recorded)
         # Residual plus the variance of the solution: with few ties, the solution follows every recorded error.
-        scatter_m = max(_LEAST_M, float(np.sqrt(_scatter(off_m) ** 2 + np.median(variance[:count]) / 2)))
-        if abs(np.log(before / times)) < _SETTLED and abs(np.log(sd_m / scatter_m)) < _SETTLED:
+        total_var_m2 = _estimate_sd(off_m) ** 2 + np.median(variance[:count]) / 2
+        recorded_sd_m = max(_MIN_RECORDED_SD_M, float(np.sqrt(total_var_m2)))
+        if abs(np.log(before / factor)) < _MIN_SD_CHANGE and abs(np.log(sd_m / recorded_sd_m)) < _MIN_SD_CHANGE:
             break
-    return Solved(
+    return GraphSolution(
         position=graph.position,
         log=graph.log,
         position_var=variance[:count],
         log_var=variance[count:],
         component=component,
-        recorded_sd_m=scatter_m,
-        recorded_counts=_agree(off_m / sd_m) >= _GONE,
-        ties_count=agree >= _GONE,
+        recorded_sd_m=recorded_sd_m,
+        recorded_agree=_weigh_residuals(off_m / sd_m) >= _MIN_AGREEMENT,
+        ties_agree=agree >= _MIN_AGREEMENT,
     )
 
 
 class _Graph:
-    """The least-squares problem that `solve` solves: N places with T ties, their recorded positions, and the solution
-    found so far, `position` and `log`, complex (N,) each."""
+    """The least-squares problem of `solve_graph`: N places with T ties, their recorded positions, and the solution so
+    far, `position` and `log`, complex (N,) each."""
 
     def __init__(self, recorded: np.ndarray, ties: Ties, component: np.ndarray) -> None:
         """Make the first solution: place the pictures of each component one after the other along its most exact ties,
@@ -118,7 +124,7 @@ class _Graph:
         self._recorded, self._ties = recorded, ties
         count = len(recorded)
         position, log = np.zeros(count, complex), np.zeros(count, complex)
-        tree = minimum_spanning_tree(_matrix(ties, count))
+        tree = minimum_spanning_tree(_make_tie_matrix(ties, count))
         tie_of = {}
         for at in np.argsort(-ties.step_sd, kind="stable").tolist():  # the most exact tie of a pair comes last
             query, place, step, turn = int(ties.query[at]), int(ties.place[at]), ties.step[at], ties.turn[at]
@@ -130,50 +136,50 @@ class _Graph:
                 base = int(before[at])
                 step, turn = tie_of[at, base]
                 position[at], log[at] = position[base] + np.exp(log[base]) * step, log[base] + turn
-            scale, offset = _fit_similarity(position[members], recorded[members])
+            scale, offset = _fit_robust_similarity(position[members], recorded[members])
             position[members] = scale * position[members] + offset
             log[members] += np.log(scale)
         self.position, self.log = position, log
 
-    def settle(self, sd_m: float, times: float) -> tuple[csc_matrix, np.ndarray]:
+    def optimise(self, sd_m: float, factor: float) -> tuple[csc_matrix, np.ndarray]:
         """Solve for positions and logs by Gauss-Newton steps. The standard deviation of recorded positions is `sd_m`,
-        and those of the ties are multiplied by `times`. Returns the normal matrix (2 N, 2 N), and the robust weight of
+        and those of the ties are multiplied by `factor`. Returns the normal matrix (2 N, 2 N), and the robust weight of
         each tie, float (T,), 0..1."""
         count, ties = len(self.position), self._ties
-        for _ in range(_MOVES):
-            agree = _agree(self.tie_residuals() / times)
-            by_step, by_turn = (agree / (times * each) ** 2 for each in (ties.step_sd, ties.turn_sd))
-            by_recorded = _agree(abs(self.position - self._recorded) / sd_m) / sd_m**2
-            jacobian, rest = self._linear(*map(np.sqrt, (by_step, by_turn, by_recorded)))
+        for _ in range(_MAX_STEPS):
+            agree = _weigh_residuals(self.compute_tie_residuals() / factor)
+            by_step, by_turn = (agree / (factor * sd) ** 2 for sd in (ties.step_sd, ties.turn_sd))
+            by_recorded = _weigh_residuals(abs(self.position - self._recorded) / sd_m) / sd_m**2
+            jacobian, rest = self._linearise(*map(np.sqrt, (by_step, by_turn, by_recorded)))
             normal = (jacobian.conj().T @ jacobian).tocsc()
             move = _factorise(normal).solve(-(jacobian.conj().T @ rest))
             # A long move is shortened: far from the solution the logs are not linear.
-            share = min(1.0, _MAX_MOVE / max(abs(move[count:]).max(initial=0), 1e-9))
+            share = min(1.0, _MAX_LOG_MOVE / max(abs(move[count:]).max(initial=0), 1e-9))
             self.position, self.log = self.position + share * move[:count], self.log + share * move[count:]
-            if (abs(move[:count]) < _STAYS * np.exp(self.log.real)).all():
+            if (abs(move[:count]) < _MIN_MOVE * np.exp(self.log.real)).all():
                 break
         return normal, agree
 
-    def tie_residuals(self) -> Floats:
+    def compute_tie_residuals(self) -> Floats:
         """Return how far each tie differs from the solution, in standard deviations of the tie: float (T,)."""
-        steps, turns = self._residuals()
+        steps, turns = self._compute_residuals()
         off: Floats = np.hypot(abs(steps) / self._ties.step_sd, abs(turns) / self._ties.turn_sd)
         return off
 
-    def _residuals(self) -> tuple[Complexes, Complexes]:
+    def _compute_residuals(self) -> tuple[Complexes, Complexes]:
         """Return how much the solution so far differs from the ties: in steps and in turns, complex (T,) each."""
         position, log, ties = self.position, self.log, self._ties
         steps = (position[ties.query] - position[ties.place]) * np.exp(-log[ties.place]) - ties.step
         turns = log[ties.query] - log[ties.place] - ties.turn
         return steps, turns.real + 1j * ((turns.imag + np.pi) % (2 * np.pi) - np.pi)
 
-    def _linear(
+    def _linearise(
         self, by_step: np.ndarray, by_turn: np.ndarray, by_recorded: np.ndarray
     ) -> tuple[csc_matrix, np.ndarray]:
         """Return the weighted Jacobian (R, 2 N) and the weighted residuals, complex (R,). The R rows are those of the
         steps, the turns and the recorded positions, in this order; the arguments are the weights."""
         count, many, ties = len(self._recorded), len(self._ties), self._ties
-        steps, turns = self._residuals()
+        steps, turns = self._compute_residuals()
         unit = np.exp(-self.log[ties.place])
         row, places = np.arange(many), np.arange(count)
         entries = (  # rows, columns and values
@@ -190,11 +196,11 @@ class _Graph:
         return jacobian, np.concatenate([by_step * steps, by_turn * turns, from_recorded])
 
 
-def _matrix(ties: Ties, count: int) -> csc_matrix:
+def _make_tie_matrix(ties: Ties, count: int) -> csc_matrix:
     return coo_matrix((ties.step_sd, (ties.query, ties.place)), (count, count)).tocsc()
 
 
-def _fit_similarity(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, complex]:
+def _fit_robust_similarity(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, complex]:
     """Return two complex numbers, the factor `scale`, which also rotates, and `offset`, so that scale * `shape` +
     offset fits `recorded`; both are points, complex (N,). Outliers get little weight. For one point, the scale is 1."""
     weight = np.ones(len(shape))
@@ -205,16 +211,16 @@ def _fit_similarity(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, c
             break
         scale, offset = fitted, shift
         off = abs(scale * shape + offset - recorded)
-        weight = _agree(off / max(_LEAST_M, _scatter(off))) + 1e-6
+        weight = _weigh_residuals(off / max(_MIN_RECORDED_SD_M, _estimate_sd(off))) + 1e-6
     return scale, offset
 
 
-def _agree(off: np.ndarray) -> np.ndarray:
+def _weigh_residuals(off: np.ndarray) -> np.ndarray:
     """Return the robust weight, 0..1, of residuals `off` in standard deviations: 0.5 for a residual of three."""
     return 1 / (1 + (off / 4.66) ** 2) ** 2
 
 
-def _scatter(residuals: np.ndarray) -> float:
+def _estimate_sd(residuals: np.ndarray) -> float:
     """Estimate the standard deviation along one axis of complex residuals from their median, so ignoring outliers."""
     return float(np.median(abs(residuals))) / 1.1774 if len(residuals) else 0.0
 
@@ -222,11 +228,11 @@ def _scatter(residuals: np.ndarray) -> float:
 def _factorise(normal: csc_matrix) -> SuperLU:
     """Factor a Hermitian positive definite matrix (M, M) as L D L^H, its rows and columns in an order that keeps L
     sparse. The factor `U` is D L^H."""
-    filled = normal + _NOTHING * identity(normal.shape[0])
+    filled = normal + _DIAGONAL_DAMPING * identity(normal.shape[0])
     return splu(filled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-def _inverse_diagonal(normal: csc_matrix) -> Floats:
+def _invert_diagonal(normal: csc_matrix) -> Floats:
     """Return the diagonal of the inverse of a Hermitian positive definite matrix (M, M), float (M,).
 
     Only entries of the inverse where L has entries are computed, from the last column to the first (Takahashi, Fagan
@@ -236,7 +242,7 @@ def _inverse_diagonal(normal: csc_matrix) -> Floats:
     factored = _factorise(normal)
     lower, pivots = factored.L.tocsc(), factored.U.diagonal().real
     lower.sort_indices()
-    below = _rows_below(lower)
+    below = _find_rows_below(lower)
     waiting = np.bincount([rows[0] for rows in below if len(rows)], minlength=len(below))  # children of a column
     blocks: dict[int, Complexes] = {}
     found = np.empty(len(below))
@@ -263,7 +269,7 @@ def _inverse_diagonal(normal: csc_matrix) -> Floats:
     return in_order
 
 
-def _rows_below(lower: csc_matrix) -> list[Array]:
+def _find_rows_below(lower: csc_matrix) -> list[Array]:
     """Return the numbers of the rows below the diagonal where a column of the factor L (M, M) may have entries: M
     arrays, int (R,), ascending. An entry that is zero by chance, and so not stored, counts."""
     starts, ends = lower.indptr[:-1] + 1, lower.indptr[1:]

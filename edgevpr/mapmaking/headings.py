@@ -32,7 +32,7 @@ def find_headings(frames: Iterable[Frame], lens: Lens) -> Iterator[Frame]:
         features = detect_features(orb, frame.image) if lacks_heading(frame, lens) else None
         heading_deg = turn_deg = None
         if last and last[1] and features:
-            found = _compare(last[0], last[1], frame, features, lens)
+            found = _measure_heading(last[0], last[1], frame, features, lens)
             heading_deg, turn_deg = found or (None, None)
         if last:
             before_deg = None if heading_deg is None or turn_deg is None else heading_deg - turn_deg
@@ -48,7 +48,9 @@ def lacks_heading(frame: Frame, lens: Lens) -> bool:
     return frame.heading_deg is None and MAX_TILT_UNLEVELLED_DEG < tilt_deg <= MAX_TILT_DEG
 
 
-def _compare(before: Frame, start: Features, after: Frame, end: Features, lens: Lens) -> tuple[float, float] | None:
+def _measure_heading(
+    before: Frame, start: Features, after: Frame, end: Features, lens: Lens
+) -> tuple[float, float] | None:
     """Return the heading of the frame `after`, and the turn to it since `before`, degrees; None if the two are too near
     to each other or share too little."""
     if before.position is None or after.position is None:
@@ -58,7 +60,7 @@ def _compare(before: Frame, start: Features, after: Frame, end: Features, lens: 
     pairs = match_features(start, end) if math.hypot(east_m, north_m) >= _MIN_STEP_M else None
     if pairs is None:
         return None
-    was, now = (_lay(points, frame, lens) for points, frame in zip(pairs, (before, after), strict=True))
+    was, now = (_project_to_ground(points, frame, lens) for points, frame in zip(pairs, (before, after), strict=True))
     turn_scale, shift = fit_similarity(was, now)
     if not 1 / _MAX_SCALE < abs(turn_scale) < _MAX_SCALE:
         return None
@@ -68,7 +70,7 @@ def _compare(before: Frame, start: Features, after: Frame, end: Features, lens: 
     return course_deg - bearing_deg - lens.up_deg, -math.degrees(math.atan2(turn_scale.imag, turn_scale.real))
 
 
-def _lay(points: Doubles, frame: Frame, lens: Lens) -> Array:
+def _project_to_ground(points: Doubles, frame: Frame, lens: Lens) -> Array:
     """Return where points of an image (n, 2) lie on the ground, in heights right and down of the point under the
     camera, complex (n,)."""
     focal = 0.5 / math.tan(math.radians(lens.fov_deg) / 2)

@@ -41,9 +41,11 @@ from edgevpr.runtime.recognise.opening import create_technique
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
-_BESIDE_PLACES = 10  # so many places before and after one without position may show the same ground
-_OVERLAPS = 2.0  # footprints between two places from which on their pictures, from any heights, share no ground
-MIN_ALIKE = 0.1  # confidence from which a place elsewhere looks alike, on the page of a map
+_MAX_OVERLAP_SLOTS = 10  # so many places before and after one without position may show the same ground
+_MAX_OVERLAP_FOOTPRINTS = (
+    2.0  # footprints between two places from which on their pictures, from any heights, share no ground
+)
+MIN_LOOK_ALIKE_CONFIDENCE = 0.1  # confidence from which a place elsewhere looks alike, on the page of a map
 _DIGITS = 3  # of stored agreements
 
 
@@ -60,13 +62,13 @@ class MapSearch:
         self.near_m = max(rule.neighbour_m, self._layers.median_m or index.spacing_m() or 0.0)
         self.slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
 
-    def same_ground(self, slot: int) -> Bools:
+    def find_same_ground(self, slot: int) -> Bools:
         """Return bool (N,), True for each of the index's N places that may show some ground of the place `slot`."""
         index = self._index
         away_m = distance_m(index.lat_deg[slot], index.lon_deg[slot], index.lat_deg, index.lon_deg)
         apart, is_way = abs(np.arange(len(index)) - slot), count_neighbours(self._rule.look_alikes) > 0
-        beside = apart <= (_BESIDE_PLACES if is_way else 0)
-        return np.where(np.isnan(away_m), beside, away_m <= _OVERLAPS * self.near_m)
+        beside = apart <= (_MAX_OVERLAP_SLOTS if is_way else 0)
+        return np.where(np.isnan(away_m), beside, away_m <= _MAX_OVERLAP_FOOTPRINTS * self.near_m)
 
     def find(self, place_id: int, image: Image, shown: Shown | None, among: PlaceIndex) -> Recognition:
         """Look for a picture of the place `place_id` among some places. `shown`, bool (H, W), is False where it shows
@@ -174,11 +176,11 @@ def find_look_alikes(
         slot = search.slots.get(place_id)
         if slot is None or np.isnan(index.lat_deg[slot]):
             continue
-        away = index.select(~search.same_ground(slot))
+        away = index.select(~search.find_same_ground(slot))
         if not len(away) or not place_map.has_descriptor(place_id, technique.encode(image, mask).coarse):
             continue
         event = search.find(place_id, image, mask, away)
-        if event.best is None or event.confidence is None or event.confidence < MIN_ALIKE:
+        if event.best is None or event.confidence is None or event.confidence < MIN_LOOK_ALIKE_CONFIDENCE:
             yield None
         else:
             yield FoundLookAlike(place_id, event.best.place.place_id, event.confidence)

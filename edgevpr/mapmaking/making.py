@@ -15,9 +15,9 @@ from edgevpr.frames.level import STRAIGHT_DOWN
 from edgevpr.frames.mask import OverlayMask, load_mask
 from edgevpr.frames.source import Source, read_to_end
 from edgevpr.mapmaking import advice
-from edgevpr.mapmaking.finishing import Shown, finish_map, make_encoder
+from edgevpr.mapmaking.finishing import Progress, finish_map, make_encoder
 from edgevpr.mapmaking.headings import find_headings
-from edgevpr.mapmaking.mapping import Covered, Gaps, MappingResult, build_map, measure_ground
+from edgevpr.mapmaking.mapping import CoveredGround, MappingResult, PlaceSelector, build_map, measure_ground
 from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import parse_map_path, remove_map
@@ -36,10 +36,10 @@ from edgevpr.runtime.recognise.opening import (
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.cuttings import OrthophotoSource
-    from edgevpr.mapmaking.refine import Refined
+    from edgevpr.mapmaking.refine import Refinement
 
 _log = logging.getLogger(__name__)
-_OF_ORTHOPHOTOS = "cohog"
+_ORTHOPHOTO_TECHNIQUE = "cohog"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,15 +70,15 @@ class MadeMap:
     places: int
     with_position: int
     result: MappingResult
-    covered: Covered | None
-    refined: "Refined | None"
+    covered: CoveredGround | None
+    refined: "Refinement | None"
     calibration: MapCalibration | None
     not_done: tuple[str, ...] = ()
 
 
-def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], None], shown: Shown) -> MadeMap:
+def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], None], progress: Progress) -> MadeMap:
     """Make the map that `order` describes, or continue it. `unusable` is called with an error for each picture that
-    cannot be used. `shown` shows progress. Raises EdgevprError."""
+    cannot be used. `progress` shows progress. Raises EdgevprError."""
     path, here, pictures = parse_map_path(order.path), load_board("this"), order.pictures
     flown, salience = config.source, config.salience
     is_new = not (order.append and path.exists())
@@ -91,7 +91,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     else:
         mask, lens = None, None
         source, technique = cuttings, _ = _open_cuttings(order, pictures, flown.camera, place_map)
-        cuttings.begin(pictures.spacing_m, technique, shown)
+        cuttings.prepare(pictures.spacing_m, technique, progress)
         counts = cuttings.counts
     if place_map is None:
         place_map = PlaceMap.create(path, technique.spec)
@@ -108,7 +108,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 advice.warn_of_display(pictures, mask)
             else:
                 place_map.add_attribution(pictures.attribution)
-            frames: Iterator[Frame] = filter(None, shown(read_to_end(source, unusable), source.total, "mapping"))
+            frames: Iterator[Frame] = filter(None, progress(read_to_end(source, unusable), source.total, "mapping"))
             if (
                 technique.spec.looks_down
                 and isinstance(pictures, FlownPictures)
@@ -120,7 +120,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 frames,
                 replace(encoder, gate=open_salience_gate(salience, here.threads)),
                 place_map,
-                Gaps(salience.gap_frames, salience.gap_m),
+                PlaceSelector(salience.gap_frames, salience.gap_m),
                 unusable,
             )
         except EdgevprError:
@@ -128,9 +128,9 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 remove_map(path)
             raise
         if covered := measure_ground(place_map):
-            _log.info("%s", covered.described(is_flown=isinstance(pictures, FlownPictures)))
+            _log.info("%s", covered.describe(is_flown=isinstance(pictures, FlownPictures)))
         finished = finish_map(
-            place_map, encoder, config.match, pictures, shown, refine=order.refine, calibrate=order.calibrate
+            place_map, encoder, config.match, pictures, progress, refine=order.refine, calibrate=order.calibrate
         )
         info = describe_map(place_map)
         if info.one_way_deg is not None:
@@ -157,7 +157,7 @@ def _open_flown(
     name = order.technique or (place_map.spec.name if place_map is not None else None)
     asks_camera = camera is None and place_map is None and "camera" not in settings
     if asks_camera and (not name or make_camera_setting(name, "nadir")):
-        advice.require_ahead(pictures, mask)
+        advice.require_forward_camera(pictures, mask)
     if name is None:
         with show_elapsed("choosing a technique"):
             name = pick_technique(order.board, source.total or 1, camera)
@@ -166,7 +166,7 @@ def _open_flown(
         settings = settings | {"camera": camera}
     technique = _make_technique(order, place_map, name, settings)
     if technique.spec.looks_down and not flown.gimbal and read_mount(flown) == STRAIGHT_DOWN:
-        advice.require_level(pictures, flown.fov_deg)
+        advice.require_level_camera(pictures, flown.fov_deg)
     return source, technique
 
 
@@ -179,7 +179,7 @@ def _open_cuttings(
         raise UsageError("Tiles of an address have an owner: give --attribution TEXT, as its terms ask for.")
     if camera not in (None, "nadir"):
         raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
-    name = order.technique or (place_map.spec.name if place_map is not None else _OF_ORTHOPHOTOS)
+    name = order.technique or (place_map.spec.name if place_map is not None else _ORTHOPHOTO_TECHNIQUE)
     settings = order.parameters | make_camera_setting(name, "nadir")
     return pictures.open(), _make_technique(order, place_map, name, settings)
 

@@ -1,7 +1,7 @@
 """Making places of a map from frames: every frame is encoded, and is on the disk before the next one is read.
 
 With salience criteria (`FrameEncoder.gate`), only frames that reach all thresholds become places. So that no long gaps
-arise (thesis 3.4.8), the other frames are held back ("wait"). After `most_frames` frames or `most_m` metres without a
+arise (thesis 3.4.8), the other frames are held back ("wait"). After `max_frames` frames or `max_gap_m` metres without a
 place, all thresholds are lowered in steps of 0.03 until some waiting frames pass; these become places of low quality.
 """
 
@@ -24,62 +24,62 @@ from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, select_best
 
 _NO_PIXELS = np.empty((0, 0), np.uint8)
 T = TypeVar("T")
-Watch = Callable[[Iterable[T], int], Iterable[T]]  # gets items and their number, yields them and shows the progress
-Kept = tuple[EncodedFrame, Salience | None]  # a frame that becomes a place, and its salience (None: no gate)
+Progress = Callable[[Iterable[T], int], Iterable[T]]  # gets items and their number, yields them and shows the progress
+SelectedFrame = tuple[EncodedFrame, Salience | None]  # a frame that becomes a place, and its salience (None: no gate)
 
 
-class Gaps:
-    """Chooses the frames that become places, so that no long gaps arise, see the module. `most_m` None: distances are
-    ignored."""
+class PlaceSelector:
+    """Selects the frames that become places, so that no long gaps arise, see the module. `max_gap_m` None: distances
+    are ignored."""
 
-    def __init__(self, most_frames: int = GAP_FRAMES, most_m: float | None = None) -> None:
-        self._most_frames, self._most_m = most_frames, most_m
+    def __init__(self, max_frames: int = GAP_FRAMES, max_gap_m: float | None = None) -> None:
+        self._max_frames, self._max_gap_m = max_frames, max_gap_m
         self._waiting: list[EncodedFrame] = []
         self._last: Position | None = None  # of the last place; before there is one, of the first frame
         self._has_begun = False
 
-    def take(self, encoded: EncodedFrame) -> Iterator[Kept]:
+    def add_frame(self, encoded: EncodedFrame) -> Iterator[SelectedFrame]:
         """Process the next frame. Yield those that now become places: some of those waiting, then this one if it
         reaches all thresholds; else it waits. Each comes with its salience (None: there are no criteria)."""
         if encoded.worth is None:
             yield encoded, None
             return
         frame = encoded.frame
-        while self._waiting and (len(self._waiting) >= self._most_frames or self._is_too_far(frame.position)):
-            yield from self._best_waiting()
+        while self._waiting and (len(self._waiting) >= self._max_frames or self._is_too_far(frame.position)):
+            yield from self._take_best_waiting()
         if encoded.worth.reason is None:
             self._waiting.clear()
-            yield self._kept(encoded), encoded.worth.salience
+            yield self._keep(encoded), encoded.worth.salience
         else:
             self._last = self._last or frame.position
             self._waiting.append(replace(encoded, frame=replace(frame, image=_NO_PIXELS)))
 
-    def end(self) -> Iterator[Kept]:
+    def end(self) -> Iterator[SelectedFrame]:
         """Yield the frames that become places at the end of a recording: the best ones, if there is no place yet."""
         if not self._has_begun and self._waiting:
-            yield from self._best_waiting()
+            yield from self._take_best_waiting()
 
-    def _best_waiting(self) -> Iterator[Kept]:
+    def _take_best_waiting(self) -> Iterator[SelectedFrame]:
         """Yield the best of the waiting frames, as places of low quality. Of the others, those before the last one
         yielded are dropped, and those after it continue to wait."""
         waiting = [(encoded, encoded.worth) for encoded in self._waiting if encoded.worth]
         best = np.flatnonzero(select_best([worth.short_by for _, worth in waiting])).tolist()
         self._waiting = self._waiting[best[-1] + 1 :]
         for encoded, worth in (waiting[at] for at in best):
-            yield self._kept(encoded), replace(worth.salience, is_low=True)
+            yield self._keep(encoded), replace(worth.salience, is_low=True)
 
-    def _kept(self, encoded: EncodedFrame) -> EncodedFrame:
+    def _keep(self, encoded: EncodedFrame) -> EncodedFrame:
         self._has_begun, self._last = True, encoded.frame.position or self._last
         return encoded
 
     def _is_too_far(self, position: Position | None) -> bool:
-        if self._most_m is None or position is None or self._last is None:
+        if self._max_gap_m is None or position is None or self._last is None:
             return False
-        return distance_m(self._last.lat_deg, self._last.lon_deg, position.lat_deg, position.lon_deg) > self._most_m
+        return distance_m(self._last.lat_deg, self._last.lon_deg, position.lat_deg, position.lon_deg) > self._max_gap_m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Covered:
+class CoveredGround:
     """Ground covered by the places with a position, in the order mapped. `north_south_m`, `east_west_m`: its extent.
     `lat_deg`, `lon_deg`: its middle. `track_m`: length of the way from place to place; `step_m`: median step of it."""
 
@@ -90,7 +90,7 @@ class Covered:
     track_m: float
     step_m: float
 
-    def described(self, is_flown: bool) -> str:
+    def describe(self, is_flown: bool) -> str:
         """Describe the ground in one sentence, and the track if the pictures were taken in a flight."""
         lengths_m = self.north_south_m, self.east_west_m, self.track_m, self.step_m
         high, wide, track, step = (f"{each / 1000:.1f} km" if each >= 1000 else f"{each:.0f} m" for each in lengths_m)
@@ -98,7 +98,7 @@ class Covered:
         return f"{where}; the track is {track} long, {step} from picture to picture (median)" if is_flown else where
 
 
-def measure_ground(place_map: PlaceMap) -> Covered | None:
+def measure_ground(place_map: PlaceMap) -> CoveredGround | None:
     """Measure the ground that a map covers; None with fewer than two positions."""
     points = np.array([(lat_deg, lon_deg) for _, lat_deg, lon_deg, _ in place_map.read_outlines()]).reshape(-1, 2)
     lat_deg, lon_deg = points[~np.isnan(points).any(axis=1)].T
@@ -108,7 +108,7 @@ def measure_ground(place_map: PlaceMap) -> Covered | None:
     steps_m = distance_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])
     middle_m = [float(each.max() + each.min()) / 2 for each in (east_m, north_m)]
     middle = offset_position(float(lat_deg[0]), float(lon_deg[0]), *middle_m)
-    return Covered(
+    return CoveredGround(
         north_south_m=float(np.ptp(north_m)),
         east_west_m=float(np.ptp(east_m)),
         lat_deg=middle[0],
@@ -141,7 +141,7 @@ def build_map(
     frames: Iterable[Frame],
     encoder: FrameEncoder,
     place_map: PlaceMap,
-    gaps: Gaps | None = None,
+    selector: PlaceSelector | None = None,
     unusable: Callable[[ImageError], None] | None = None,
 ) -> MappingResult:
     """Add a place for every selected frame that is not in the map yet, so that an interrupted map can be continued.
@@ -152,11 +152,11 @@ def build_map(
     from an orthophoto (surveyed ones), those that hold too little to be recognised are left out.
     """
     place_map.require_technique(encoder.technique.spec)
-    gaps = gaps or Gaps()
+    selector = selector or PlaceSelector()
     ids_by_image = place_map.select_ids("source_image")
     result, layers = MappingResult(), read_layers(place_map)
 
-    def keep(kept: Iterable[Kept]) -> None:
+    def keep(kept: Iterable[SelectedFrame]) -> None:
         for encoded, salience in kept:
             place, landmarks = place_at_middle(encoded.frame, encoded.view), encoder.pack_landmarks(encoded.picture)
             place_map.add(place, encoded.descriptor, salience, landmarks)
@@ -185,6 +185,6 @@ def build_map(
             result.already_here += 1
         else:
             result.not_memorable += bool(encoded.worth and encoded.worth.lacks)
-            keep(gaps.take(encoded))
-    keep(gaps.end())
+            keep(selector.add_frame(encoded))
+    keep(selector.end())
     return result

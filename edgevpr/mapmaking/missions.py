@@ -25,9 +25,9 @@ _MAX_FILE_BYTES = 50_000_000
 _WAYPOINT_COLUMNS = 12
 # The MAV_CMDs whose position an aircraft flies to: waypoint, loiter (unlimited, turns, time, to altitude), land, take
 # off, spline, and take off and land of a VTOL. Others, such as a region of interest, have a position to look at.
-_FLOWN_TO = {16, 17, 18, 19, 21, 22, 31, 82, 84, 85}
-_OVER_GROUND = {3, 6, 10, 11}  # MAV_FRAMEs whose altitude is relative to home or the terrain
-_CIRCLE = re.compile(r"\s*-?[\d.]+\s*,\s*-?[\d.]+\s*,\s*-?[\d.]+\s*")  # LAT,LON,RADIUS_M
+_FLOWN_COMMANDS = {16, 17, 18, 19, 21, 22, 31, 82, 84, 85}
+_RELATIVE_FRAMES = {3, 6, 10, 11}  # MAV_FRAMEs whose altitude is relative to home or the terrain
+_CIRCLE_PATTERN = re.compile(r"\s*-?[\d.]+\s*,\s*-?[\d.]+\s*,\s*-?[\d.]+\s*")  # LAT,LON,RADIUS_M
 _CIRCLE_CORNERS = 72
 _MAX_RADIUS_M = 200_000.0
 _QUARTER_SEGMENTS = 64  # of a buffer's round corners: exact to 0.01 % of its width
@@ -66,7 +66,7 @@ class Area:
         """The bounding box of polygons and path: (south, west, north, east) in degrees, see `compute_extent`."""
         return compute_extent(self.points)
 
-    def on_plane(self, project: Projection, polygon_margin_m: float, path_margin_m: float) -> "shapely.Geometry":
+    def project_ground(self, project: Projection, polygon_margin_m: float, path_margin_m: float) -> "shapely.Geometry":
         """Return the ground within these margins of the polygons and of the path, on a plane."""
 
         def corners_m(points: Sequence[LatLon]) -> Doubles:
@@ -93,8 +93,8 @@ def read_area(path: str | Path) -> Area:
     describes. Raises UsageError for a file that is none of them, holds no position, or has one
     beyond -90..90 or -180..180 degrees."""
     try:
-        if _CIRCLE.fullmatch(str(path)):
-            return _circle(*map(float, str(path).split(",")))
+        if _CIRCLE_PATTERN.fullmatch(str(path)):
+            return _make_circle(*map(float, str(path).split(",")))
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
         if text.startswith("QGC WPL"):
             area = _read_waypoints(text.splitlines())
@@ -116,7 +116,7 @@ def read_area(path: str | Path) -> Area:
     return area
 
 
-def _circle(lat_deg: float, lon_deg: float, radius_m: float) -> Area:
+def _make_circle(lat_deg: float, lon_deg: float, radius_m: float) -> Area:
     if not (abs(lat_deg) < 90 and abs(lon_deg) <= 180 and 0 < radius_m <= _MAX_RADIUS_M):
         raise UsageError(
             f"--area {lat_deg:g},{lon_deg:g},{radius_m:g}: write LAT,LON,RADIUS_M, in degrees of WGS-84 and metres (at "
@@ -134,18 +134,18 @@ def _read_waypoints(lines: list[str]) -> Area:
     for values in filter(None, map(str.split, lines[1:])):
         if len(values) != _WAYPOINT_COLUMNS:
             raise ValueError
-        path += _waypoint(int(values[3]), int(values[2]), values[8:11])
+        path += _parse_waypoint(int(values[3]), int(values[2]), values[8:11])
     return Area(path=tuple(path))
 
 
-def _waypoint(command: int, frame: int, where: Sequence[float | str | None]) -> list[Waypoint]:
+def _parse_waypoint(command: int, frame: int, where: Sequence[float | str | None]) -> list[Waypoint]:
     """Return the waypoint of a mission item in a list, empty for an item that is not flown to. `command` is a MAV_CMD,
     `frame` a MAV_FRAME, `where` latitude, longitude and altitude; (0, 0) means the aircraft's present position."""
-    lat_deg, lon_deg, alt_m = map(_finite, where)
-    if command not in _FLOWN_TO or lat_deg == lon_deg == 0:
+    lat_deg, lon_deg, alt_m = map(_parse_finite, where)
+    if command not in _FLOWN_COMMANDS or lat_deg == lon_deg == 0:
         return []
     # Height 0, as of home and a landing, is not that from which pictures are taken: it counts as not given.
-    return [Waypoint(lat_deg, lon_deg, alt_m if frame in _OVER_GROUND and alt_m > 0 else None)]
+    return [Waypoint(lat_deg, lon_deg, alt_m if frame in _RELATIVE_FRAMES and alt_m > 0 else None)]
 
 
 def _read_plan(items: list[dict[str, Any]]) -> Area:
@@ -155,18 +155,18 @@ def _read_plan(items: list[dict[str, Any]]) -> Area:
     polygons: list[Ring] = []
     for item in items:
         if item["type"] == "SimpleItem":
-            path += _waypoint(int(item["command"]), int(item["frame"]), item["params"][4:7])
+            path += _parse_waypoint(int(item["command"]), int(item["frame"]), item["params"][4:7])
             continue
         style = item.get("TransectStyleComplexItem", {})
         height_m = style.get("CameraCalc", {}).get("DistanceToSurface")
         points = style.get("VisualTransectPoints", ())
-        path += [Waypoint(_finite(lat_deg), _finite(lon_deg), height_m) for lat_deg, lon_deg, *_ in points]
-        corners = [(_finite(lat_deg), _finite(lon_deg)) for lat_deg, lon_deg, *_ in item.get("polygon", ())]
+        path += [Waypoint(_parse_finite(lat_deg), _parse_finite(lon_deg), height_m) for lat_deg, lon_deg, *_ in points]
+        corners = [(_parse_finite(lat_deg), _parse_finite(lon_deg)) for lat_deg, lon_deg, *_ in item.get("polygon", ())]
         polygons += [[*corners, corners[0]]] if corners else []
     return Area(tuple(polygons), tuple(path))
 
 
-def _finite(value: float | str | None) -> float:
+def _parse_finite(value: float | str | None) -> float:
     if not math.isfinite(number := float(value or 0)):
         raise ValueError
     return number

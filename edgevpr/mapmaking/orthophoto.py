@@ -21,7 +21,7 @@ from edgevpr.mapmaking.georaster import (
     CPLE_BaseError,
     GeoRaster,
     RasterioError,
-    local_crs,
+    make_local_crs,
     rasterio,
     transform,
 )
@@ -58,12 +58,12 @@ class Orthophoto:
         self._raster = _open_raster(source, ground, self._links.name)
         self.name, self.short_name, self.is_remote = self._raster.name, self._raster.short_name, self._raster.is_remote
         is_mercator = self._raster.crs == CRS.from_epsg(3857)
-        self._turn = 360 if self._raster.crs.is_geographic else 2 * HALF_WORLD_M if is_mercator else 0
+        self._wrap = 360 if self._raster.crs.is_geographic else 2 * HALF_WORLD_M if is_mercator else 0
         try:
             columns, rows = np.array([[self._raster.width / 2], [self._raster.height / 2]])
             (lon_deg,), (lat_deg,) = self._to_crs(columns, rows, WGS84)
             self.middle = Position(lat_deg, wrap_deg(lon_deg))
-            lons_deg, lats_deg = self.outline(WGS84)
+            lons_deg, lats_deg = self.compute_outline(WGS84)
         except (CPLE_BaseError, RasterioError):
             lats_deg = lons_deg = np.array([np.nan])
         if not np.isfinite((lats_deg, lons_deg)).all():
@@ -74,10 +74,10 @@ class Orthophoto:
             )
         lons_deg = self.middle.lon_deg + wrap_deg(lons_deg - self.middle.lon_deg)
         self.extent_deg = (lats_deg.min(), lons_deg.min(), lats_deg.max(), lons_deg.max())
-        metre_px = self._pixels(self.middle, np.array([[0, 0], [1, 0], [0, 1]]))
+        metre_px = self._to_pixels(self.middle, np.array([[0, 0], [1, 0], [0, 1]]))
         self.resolution_m = float(1 / np.sqrt(abs(np.linalg.det(metre_px[1:] - metre_px[0]))))
 
-    def outline(self, crs: CRS) -> tuple[Doubles, Doubles]:
+    def compute_outline(self, crs: CRS) -> tuple[Doubles, Doubles]:
         """Return points along the edges of the file, x and y in the coordinate system `crs`, float64 (N,) each."""
         along, zero = np.linspace(0, 1, _EDGE_POINTS), np.zeros(_EDGE_POINTS)
         columns = np.concatenate((along, along, zero, zero + 1)) * self._raster.width
@@ -87,21 +87,21 @@ class Orthophoto:
     def _to_crs(self, columns: Doubles, rows: Doubles, crs: CRS) -> tuple[Doubles, Doubles]:
         """Convert the pixels at `columns` and `rows`, float (N,) each, to x and y in the coordinate system `crs`,
         float64 (N,) each."""
-        x, y = transform(self._raster.crs, crs, *_transform(self._raster.transform, columns, rows))
+        x, y = transform(self._raster.crs, crs, *_apply_affine(self._raster.transform, columns, rows))
         return np.array(x), np.array(y)
 
-    def _pixels(self, at: Position, points_m: Doubles) -> Doubles:
+    def _to_pixels(self, at: Position, points_m: Doubles) -> Doubles:
         """Convert points (N, 2), in metres (east, north) of `at`, to pixels (column, row), float64 (N, 2). Whole
         numbers are the corners of pixels."""
-        return np.column_stack(self._in_file(*transform(local_crs(at), self._raster.crs, *points_m.T)))
+        return np.column_stack(self._crs_to_pixels(*transform(make_local_crs(at), self._raster.crs, *points_m.T)))
 
-    def _in_file(self, x: Sequence[float], y: Sequence[float]) -> tuple[Doubles, Doubles]:
+    def _crs_to_pixels(self, x: Sequence[float], y: Sequence[float]) -> tuple[Doubles, Doubles]:
         """Convert points from the coordinate system of the file to pixels: columns and rows, float64 (N,) each."""
         raster, across = self._raster, np.array(x)
-        if self._turn:  # a file may have longitudes from 0 to 360 degrees, or cross the date line
-            middle, _ = _transform(raster.transform, raster.width / 2, raster.height / 2)
-            across += self._turn * np.round((middle - across) / self._turn)
-        return _transform(~raster.transform, across, np.array(y))
+        if self._wrap:  # a file may have longitudes from 0 to 360 degrees, or cross the date line
+            middle, _ = _apply_affine(raster.transform, raster.width / 2, raster.height / 2)
+            across += self._wrap * np.round((middle - across) / self._wrap)
+        return _apply_affine(~raster.transform, across, np.array(y))
 
     def cut(self, at: Position, footprint_m: float, side_px: int) -> tuple[Image, Bools]:
         """Cut out the square of ground with its middle at `at`, true north up, and sides of `footprint_m`.
@@ -110,16 +110,16 @@ class Orthophoto:
         Pixels without data have the mean colour of the others. Raises ImageError for a damaged part of the file.
         """
         half_m = footprint_m / 2
-        corners = self._pixels(at, half_m * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]))
+        corners = self._to_pixels(at, half_m * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]))
         if not np.isfinite(corners).all():
-            return _nothing(side_px)
+            return _make_blank(side_px)
         across_px = np.hypot(*(corners[1] - corners[0]))
-        shrink = _shrink(across_px, side_px)
+        shrink = _compute_shrink_factor(across_px, side_px)
         size = np.array([self._raster.width, self._raster.height])
         low = np.clip(corners.min(axis=0) - 2 * shrink, 0, size).astype(int) // shrink * shrink
         high = np.clip(corners.max(axis=0) + 3 * shrink, 0, size).astype(int) // shrink * shrink
         if (high <= low).any():
-            return _nothing(side_px)
+            return _make_blank(side_px)
         ground, valid = self._raster.read(tuple(low.tolist()), tuple(high.tolist()), shrink)
         # Warped to twice the size and averaged, so that no pixel of the file is skipped.
         large_px = 2 * side_px
@@ -143,15 +143,15 @@ class Orthophoto:
         self._links.cleanup()
 
 
-def _transform(way: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
+def _apply_affine(way: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
     """Apply the affine map `way` to x and y (scalars or arrays). Its own operator differs between releases."""
     return way.a * x + way.b * y + way.c, way.d * x + way.e * y + way.f
 
 
-def _shrink(across_px: float, side_px: int) -> int:
+def _compute_shrink_factor(across_px: float, side_px: int) -> int:
     """Return by which power of two the pixels of a file are averaged when so many become `side_px`."""
     return 1 << min(int(np.log2(max(across_px / side_px, 1))), _MAX_HALVINGS)
 
 
-def _nothing(side_px: int) -> tuple[Image, Bools]:
+def _make_blank(side_px: int) -> tuple[Image, Bools]:
     return np.zeros((side_px, side_px, 3), np.uint8), np.zeros((side_px, side_px), bool)

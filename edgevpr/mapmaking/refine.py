@@ -29,24 +29,24 @@ from edgevpr.core.geodesy import offset_position, project_to_metres
 from edgevpr.core.text import decode_name
 from edgevpr.core.types import Place, Pose, Position
 from edgevpr.frames.images import list_images, read_image
-from edgevpr.mapmaking.graph import Solved, Ties, solve
-from edgevpr.mapmaking.mapping import Watch
+from edgevpr.mapmaking.graph import GraphSolution, Ties, solve_graph
+from edgevpr.mapmaking.mapping import Progress
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, measure_agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks, unpack_bytes
 
 _MIN_GROUP = 4  # places connected by ties: with three, an error of the scale does not show
-_MAX_TURN = 0.15  # largest standard deviation of a log (see `graph`): 9 degrees, 15 % of the footprint
+_MAX_LOG_SD = 0.15  # largest standard deviation of a log (see `graph`): 9 degrees, 15 % of the footprint
 # Positions that miss the shape of the ties by more than this share of their spread are held against mirror images, and
 # one that misses by so much less is the right one. As recorded, sets miss by .01 to .36, and their mirror images by 1.3
 # times as much or more, also with 20 m of noise; with lat and lon exchanged, by .18 to 1.0, and mirrored by .7 or less.
-_MISSES = 0.15
-_MIRRORED = 0.75
-_MIRROR_ASKS = 300  # places that the mirror image is fitted to
+_MIN_MISFIT = 0.15
+_MAX_MIRRORED_RATIO = 0.75
+_MAX_MIRROR_PLACES = 300  # places that the mirror image is fitted to
 _INCONSISTENT_SDS = 4.0  # standard deviations of a recorded position from which on the pictures contradict it
-_NEAREST = 8  # each place is compared with so many places recorded nearest
-_BEFORE = 2  # and with so many places mapped just before
-_OVERLAPS = 0.6  # of the longest side: pictures with nearer middles share a third of their ground or more
+_NEAREST_PLACES = 8  # each place is compared with so many places recorded nearest
+_PREVIOUS_PLACES = 2  # and with so many places mapped just before
+_MAX_OVERLAP_DISTANCE = 0.6  # of the longest side: pictures with nearer middles share a third of their ground or more
 _MAX_OVERLAPPING = 12  # pairs of one place, after the graph is solved
 # Chosen on aerial_caliterra and aerial_garfield28: of their pairs without enough landmarks, and of those of three other
 # sets, no vote with .02 or more was wrong, and of those with landmarks near the vote none at all.
@@ -56,9 +56,11 @@ _MIN_SCORE = 0.01  # from which landmarks near the vote are compared
 # and of a vote, which has whole cells, turns of 15 degrees, and an uncertain scale if few regions agree.
 _LANDMARK_SDS = (0.01, 0.05)
 _VOTE_SDS = (0.016, 0.09)
-_TRIED = 8  # hypotheses of rotation and height for a pair
-_KEPT = 512  # places whose landmarks are cached: a place is compared with its neighbours soon after each other
-_KEPT_PICTURES = 4  # descriptors that are cached
+_MAX_HYPOTHESES = 8  # hypotheses of rotation and height for a pair
+_CACHED_LANDMARKS = (
+    512  # places whose landmarks are cached: a place is compared with its neighbours soon after each other
+)
+_CACHED_DESCRIPTORS = 4  # descriptors that are cached
 
 
 class Tie(NamedTuple):
@@ -74,11 +76,11 @@ class Tie(NamedTuple):
 
 
 Pair = tuple[int, int]  # the numbers of query and place, the later one first
-Look = Callable[[int, int], Tie | None]  # compares a pair (query, place); None: no tie found
+ComparePair = Callable[[int, int], Tie | None]  # compares a pair (query, place); None: no tie found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Refined:
+class Refinement:
     """Result of refining a map of so many `places`. Of these, `without_position` have no position, `surveyed` were cut
     from an orthophoto and stay as they are, and `refined` have a pose now; for the others there were too few ties.
     `ties`: number of ties that agree with the solution. `recorded_sd_m`: standard deviation of recorded positions along
@@ -101,16 +103,19 @@ class Refined:
 
 
 def refine(
-    place_map: PlaceMap, technique: Technique, watch: Watch[tuple[int, int]], images: str | Path | None = None
-) -> Refined:
-    """Refine a map that is open for adding, in one transaction. `watch` wraps the iteration over the pairs of places,
-    to show progress. `images` is the folder of the map's pictures (None: not at hand, so only the landmarks in the map
+    place_map: PlaceMap,
+    technique: Technique,
+    progress: Progress[tuple[int, int]],
+    images: str | Path | None = None,
+) -> Refinement:
+    """Refine a map that is open for adding, in one transaction. `progress` wraps the iteration over the pairs of
+    places. `images` is the folder of the map's pictures (None: not at hand, so only the landmarks in the map
     are compared). Raises MapError if the file cannot be read or written.
     """
-    places = list(_readable(place_map))
+    places = list(_read_places(place_map))
     with_position = [place for place in places if place.position]
     placed = [place for place in with_position if not (place.pose and place.pose.is_surveyed)]
-    result = Refined(
+    result = Refinement(
         places=len(places),
         without_position=len(places) - len(with_position),
         surveyed=len(with_position) - len(placed),
@@ -120,27 +125,27 @@ def refine(
     recorded_at = [_recorded_position(place) for place in placed]
     east_m, north_m = project_to_metres(*np.array([(position.lat_deg, position.lon_deg) for position in recorded_at]).T)
     recorded = east_m + 1j * north_m
-    look = _looker(place_map, technique, placed, images)
+    compare_pair = _make_comparer(place_map, technique, placed, images)
     pairs = _find_likely_pairs(recorded)
-    ties = {pair: tie for pair in watch(pairs, len(pairs)) if (tie := look(*pair))}
-    solved = solve(recorded, _to_ties(ties))
-    more = sorted(set(_overlapping_pairs(solved.position, solved.log, _is_sure(solved))) - set(pairs))
+    ties = {pair: tie for pair in progress(pairs, len(pairs)) if (tie := compare_pair(*pair))}
+    solved = solve_graph(recorded, _to_ties(ties))
+    more = sorted(set(_find_overlapping_pairs(solved.position, solved.log, _is_determined(solved))) - set(pairs))
     if more:
-        ties |= {pair: tie for pair in watch(more, len(more)) if (tie := look(*pair))}
-        solved = solve(recorded, _to_ties(ties))
+        ties |= {pair: tie for pair in progress(more, len(more)) if (tie := compare_pair(*pair))}
+        solved = solve_graph(recorded, _to_ties(ties))
     is_mirrored = _is_mirrored(recorded_at, recorded, _to_ties(ties), solved)
-    sure = _is_sure(solved) & (not is_mirrored)
-    _write(place_map, placed, recorded_at, solved, sure)
+    sure = _is_determined(solved) & (not is_mirrored)
+    _write_poses(place_map, placed, recorded_at, solved, sure)
     off_m = abs(solved.position - recorded)
-    inconsistent = sure & ~solved.recorded_counts & (off_m > _INCONSISTENT_SDS * solved.recorded_sd_m)
+    inconsistent = sure & ~solved.recorded_agree & (off_m > _INCONSISTENT_SDS * solved.recorded_sd_m)
     return replace(
         result,
         refined=int(sure.sum()),
-        ties=int(solved.ties_count.sum()),
+        ties=int(solved.ties_agree.sum()),
         recorded_sd_m=solved.recorded_sd_m,
-        moved_m=_median(off_m[sure]),
-        position_sd_m=_median(np.sqrt(solved.position_var[sure] / 2)),
-        footprint_m=_median(np.exp(solved.log.real[sure])),
+        moved_m=_find_median(off_m[sure]),
+        position_sd_m=_find_median(np.sqrt(solved.position_var[sure] / 2)),
+        footprint_m=_find_median(np.exp(solved.log.real[sure])),
         contradictory=tuple(
             (place.place_id, place.source_image, float(off_m[at]))
             for at, place in enumerate(placed)
@@ -157,31 +162,33 @@ def _recorded_position(place: Place) -> Position:
     return position
 
 
-def _is_sure(solved: Solved) -> Bools:
+def _is_determined(solved: GraphSolution) -> Bools:
     """Return bool (N,), True for places with enough ties and a sufficiently exact solution to get a pose."""
     members = np.bincount(solved.component)[solved.component]
-    is_sure: Bools = (members >= _MIN_GROUP) & (solved.log_var / 2 <= _MAX_TURN**2)
+    is_sure: Bools = (members >= _MIN_GROUP) & (solved.log_var / 2 <= _MAX_LOG_SD**2)
     return is_sure
 
 
-def _is_mirrored(recorded_at: list[Position], recorded: Complexes, ties: Ties, solved: Solved) -> bool:
+def _is_mirrored(recorded_at: list[Position], recorded: Complexes, ties: Ties, solved: GraphSolution) -> bool:
     """Tell whether the ties fit a mirror image of the recorded positions much better than these, as when lat and lon
     are exchanged or a sign is lost. Places on one straight line cannot tell, and neither can groups of few places."""
-    some = slice(_MIRROR_ASKS)
-    misses = _misses(recorded, solved, some)
-    if misses < _MISSES:
+    some = slice(_MAX_MIRROR_PLACES)
+    misses = _compute_misfit(recorded, solved, some)
+    if misses < _MIN_MISFIT:
         return False
-    within = (ties.query < _MIRROR_ASKS) & (ties.place < _MIRROR_ASKS)
+    within = (ties.query < _MAX_MIRROR_PLACES) & (ties.place < _MAX_MIRROR_PLACES)
     fewer = Ties(**{each.name: getattr(ties, each.name)[within] for each in fields(Ties)})
     lat_deg, lon_deg = np.array([(position.lat_deg, position.lon_deg) for position in recorded_at[some]]).T
     mirrored = [recorded[some].conj()]
     if abs(lon_deg).max() < 90:  # exchanging lat and lon also changes the proportions of the track
         east_m, north_m = project_to_metres(lon_deg, lat_deg)
         mirrored.append(east_m + 1j * north_m)
-    return any(_misses(each, solve(each, fewer), some) < _MIRRORED * misses for each in mirrored)
+    return any(
+        _compute_misfit(each, solve_graph(each, fewer), some) < _MAX_MIRRORED_RATIO * misses for each in mirrored
+    )
 
 
-def _misses(recorded: Complexes, solved: Solved, some: slice) -> float:
+def _compute_misfit(recorded: Complexes, solved: GraphSolution, some: slice) -> float:
     """Return by how much the recorded positions of `some` places miss the solved ones (median), as a share of the
     spread of the recorded ones. Only groups of enough places, connected by ties, count; 0 if there is none."""
     component, here = solved.component[some], recorded[some]
@@ -194,13 +201,15 @@ def _misses(recorded: Complexes, solved: Solved, some: slice) -> float:
     return float(np.median(off_m) / max(np.median(spread_m), 1e-9))
 
 
-def _readable(place_map: PlaceMap) -> Iterator[Place]:
+def _read_places(place_map: PlaceMap) -> Iterator[Place]:
     for place_id, *_ in place_map.read_outlines():
         with suppress(PlaceError):
             yield from place_map.read_places([place_id])
 
 
-def _write(place_map: PlaceMap, placed: list[Place], recorded_at: list[Position], solved: Solved, sure: Bools) -> None:
+def _write_poses(
+    place_map: PlaceMap, placed: list[Place], recorded_at: list[Position], solved: GraphSolution, sure: Bools
+) -> None:
     """Write the solved positions and poses to the map for the places where `sure`, bool (N,), is True. The others get
     their recorded positions again, and no pose."""
     origin = recorded_at[0]
@@ -220,18 +229,18 @@ def _write(place_map: PlaceMap, placed: list[Place], recorded_at: list[Position]
                 place_map.move_place(place.place_id, position, pose)
 
 
-def _median(values: Floats) -> float | None:
+def _find_median(values: Floats) -> float | None:
     return float(np.median(values)) if len(values) else None
 
 
 def _find_likely_pairs(recorded: Complexes) -> list[Pair]:
     """Return the pairs of places that may overlap. `recorded`: positions, complex (N,) metres, in the order mapped."""
     count = len(recorded)
-    pairs = {(at, at - before) for before in range(1, _BEFORE + 1) for at in range(before, count)}
-    return sorted(pairs | {(at, other) for at, other, _ in _pair_nearest(recorded, _NEAREST)})
+    pairs = {(at, at - before) for before in range(1, _PREVIOUS_PLACES + 1) for at in range(before, count)}
+    return sorted(pairs | {(at, other) for at, other, _ in _pair_nearest(recorded, _NEAREST_PLACES)})
 
 
-def _overlapping_pairs(position: Complexes, log: Complexes, of: Bools) -> list[Pair]:
+def _find_overlapping_pairs(position: Complexes, log: Complexes, of: Bools) -> list[Pair]:
     """Return the pairs of places that overlap according to a solved graph. `position` and `log` are those of
     `graph.Solved`; only places where `of`, bool (N,), is True are considered."""
     members, footprint_m = np.flatnonzero(of), np.exp(log.real[of])
@@ -240,7 +249,7 @@ def _overlapping_pairs(position: Complexes, log: Complexes, of: Bools) -> list[P
         {
             (int(members[at]), int(members[other]))
             for at, other, away_m in near
-            if away_m <= _OVERLAPS * min(footprint_m[at], footprint_m[other])
+            if away_m <= _MAX_OVERLAP_DISTANCE * min(footprint_m[at], footprint_m[other])
         }
     )
 
@@ -263,14 +272,16 @@ def _to_ties(tie_of: dict[Pair, Tie]) -> Ties:
     return Ties(query=query, place=place, step=step, turn=turn, step_sd=step_sd.real, turn_sd=turn_sd.real)
 
 
-def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], images: str | Path | None) -> Look:
+def _make_comparer(
+    place_map: PlaceMap, technique: Technique, places: list[Place], images: str | Path | None
+) -> ComparePair:
     """Return the function that compares two of `places`, given by their indices in this list, and returns their tie
     (None: none is found). `images` is the folder of their pictures (None: they are not at hand, so only landmarks are
     compared)."""
     paths = {decode_name(path.name): path for path in list_images(images)} if images else {}
     coarse = {place_id: part for place_id, *_, part in place_map.read_coarse_parts()}
 
-    @lru_cache(_KEPT)
+    @lru_cache(_CACHED_LANDMARKS)
     def landmarks(at: int) -> Landmarks | None:
         try:
             blob = place_map.read_landmarks(places[at].place_id)
@@ -278,7 +289,7 @@ def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], imag
         except (EdgevprError, ValueError):
             return None
 
-    @lru_cache(_KEPT_PICTURES)
+    @lru_cache(_CACHED_DESCRIPTORS)
     def descriptor(at: int) -> Descriptor | None:
         if (path := paths.get(places[at].source_image)) is None:
             return None
@@ -288,7 +299,7 @@ def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], imag
             return None
         return found if place_map.has_descriptor(places[at].place_id, found.coarse) else None
 
-    def by_landmarks(query: int, place: int, expected: Overlay | None, least: int) -> Tie | None:
+    def compare_landmarks(query: int, place: int, expected: Overlay | None, least: int) -> Tie | None:
         one, other = landmarks(query), landmarks(place)
         found = None if one is None or other is None else measure_agreement(one, other, expected)
         if found is None or found.inliers < least or found.shift_share is None or found.rotation_deg is None:
@@ -296,8 +307,8 @@ def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], imag
         overlay = Overlay(found.shift_share, found.rotation_deg, found.scale)
         return Tie(*overlay.step_and_turn, *_LANDMARK_SDS)
 
-    def look(query: int, place: int) -> Tie | None:
-        if tie := by_landmarks(query, place, None, PROVEN):
+    def compare_pair(query: int, place: int) -> Tie | None:
+        if tie := compare_landmarks(query, place, None, PROVEN):
             return tie
         asking, part = descriptor(query), coarse.get(places[place].place_id)
         if asking is None or part is None:
@@ -311,10 +322,10 @@ def _looker(place_map: PlaceMap, technique: Technique, places: list[Place], imag
             return None
         (dx, dy), cells = match.shift_cells or (0.0, 0.0), technique.spec.cells or 1
         vote = Overlay((dx / cells, dy / cells), match.rotation_deg or 0.0, match.height_ratio)
-        tie = by_landmarks(query, place, vote, CONFIRMED)
+        tie = compare_landmarks(query, place, vote, CONFIRMED)
         return tie or (Tie(*vote.step_and_turn, *_VOTE_SDS) if match.score >= _MIN_VOTE_SCORE else None)
 
-    return look
+    return compare_pair
 
 
 def _rank_hypotheses(technique: Technique, query: Descriptor, coarse: Array) -> list[int]:
@@ -322,6 +333,6 @@ def _rank_hypotheses(technique: Technique, query: Descriptor, coarse: Array) -> 
     by its coarse part: the eight with the best scores, as numbers, the best first."""
     _, by_hypothesis = technique.score_places(query, coarse[None], None)
     assert by_hypothesis is not None  # set by techniques for a camera that looks down
-    best = np.argsort(-by_hypothesis[0], kind="stable")[:_TRIED]
+    best = np.argsort(-by_hypothesis[0], kind="stable")[:_MAX_HYPOTHESES]
     ranked: list[int] = best[np.isfinite(by_hypothesis[0][best])].tolist()
     return ranked

@@ -10,7 +10,7 @@ from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import offset_m
 from edgevpr.mapmaking.missions import Area, shapely
 from edgevpr.places import mapfiles
-from edgevpr.places.examine import ShowProgress, copy_places, merge_maps, read_place_positions, shrink_map
+from edgevpr.places.examine import Progress, copy_places, merge_maps, read_place_positions, shrink_map
 from edgevpr.places.mapfile import PlaceMap
 
 
@@ -27,18 +27,18 @@ class Subset:
     lost_calibration: bool
 
 
-def subset(
-    source: Path, area: Area, margin_m: float, out: Path, most_bytes: float | None, show_progress: ShowProgress
+def make_subset(
+    source: Path, area: Area, margin_m: float, out: Path, max_bytes: float | None, progress: Progress
 ) -> Subset:
     """Make the map `out` of the places of `source`, a map or a folder of maps, that are within `margin_m` metres of an
-    area: as many as fit into `most_bytes` (None: all), the best, spread over the ground. Raises UsageError if there are
+    area: as many as fit into `max_bytes` (None: all), the best, spread over the ground. Raises UsageError if there are
     none or none fits, and MapError for a map that cannot be read."""
     south, west, north, east = area.extent_deg
 
     def project(lat_deg: Doubles, lon_deg: Doubles) -> tuple[Doubles, Doubles]:
         return offset_m((south + north) / 2, (west + east) / 2, lat_deg, lon_deg)
 
-    ground = area.on_plane(project, margin_m, margin_m)
+    ground = area.project_ground(project, margin_m, margin_m)
     ids_near: dict[Path, list[int]] = {}
     for path in _list_maps(source):
         with PlaceMap.open(path) as place_map:
@@ -51,18 +51,18 @@ def subset(
         if len(paths) == 1:
             near = copy_places(paths[0], whole, ids_near[paths[0]])
         elif paths:
-            counts, lost_calibration = merge_maps(paths, whole, show_progress, list(ids_near.values()))
+            counts, lost_calibration = merge_maps(paths, whole, progress, list(ids_near.values()))
             near = sum(copied for copied, _ in counts)
         if not paths or not near:
             raise UsageError(
                 f"No place of {source} is within {margin_m:g} m of the mission: check both, or the margin."
             )
         count, file_bytes = near, whole.stat().st_size
-        if most_bytes is not None and file_bytes > most_bytes:
-            count = int(near * most_bytes / file_bytes)
+        if max_bytes is not None and file_bytes > max_bytes:
+            count = int(near * max_bytes / file_bytes)
             if not count:
-                raise UsageError(f"A place takes {file_bytes / near / 1e6:.3f} MB, and {most_bytes / 1e6:g} hold none.")
-            shrink_map(whole, made, count, show_progress)
+                raise UsageError(f"A place takes {file_bytes / near / 1e6:.3f} MB, and {max_bytes / 1e6:g} hold none.")
+            shrink_map(whole, made, count, progress)
         shutil.move(made if count < near else whole, unfinished)
         size = unfinished.stat().st_size
     return Subset(maps=len(paths), near=near, places=count, file_bytes=size, lost_calibration=lost_calibration)

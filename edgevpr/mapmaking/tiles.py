@@ -26,19 +26,19 @@ from edgevpr.core.geodesy import EARTH_RADIUS_M, Extent, compute_extent
 from edgevpr.mapmaking.georaster import HALF_WORLD_M
 
 TILE_PX = 256  # the usual side
-_ACROSS_PX = 640  # of a footprint, in tiles as fine as a technique can use
-_FINEST_ZOOM = 24
+_FOOTPRINT_PX = 640  # of a footprint, in tiles as fine as a technique can use
+_MAX_ZOOM = 24
 _MAX_LAT_DEG = 85.0
-_ENDINGS = (".png", ".jpg", ".jpeg", ".webp")
+_TILE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 _TMS_RESOURCE = "tilemapresource.xml"  # by OSGeo's Tile Map Service, whose y counts from the south
-_JOINS_COMPARED = 50
-_CLEARLY_BETTER = 0.5  # ratio of the differences along two edges; of tiles that do not join it is near 1
+_MAX_JOINS = 50
+_MAX_DIFFERENCE_RATIO = 0.5  # ratio of the differences along two edges; of tiles that do not join it is near 1
 _PLACEHOLDERS = ("{z}", "{x}", "{y}")
-_CONNECTIONS = 2
+_MAX_CONNECTIONS = 2
 _TIMEOUT_S = 30
 _MAX_TILE_BYTES = 10_000_000
-_NO_TILE = (204, 404, 410)  # HTTP status
-_ZOOMS_TRIED = 3  # from the one that is wanted: servers have different highest ones
+_ABSENT_STATUSES = (204, 404, 410)  # HTTP status
+_MAX_ZOOM_TRIES = 3  # from the one that is wanted: servers have different highest ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +53,8 @@ class Ground:
     def zoom(self) -> int:
         """The zoom at which tiles of 256 pixels are as fine as a technique can use."""
         south, _, north, _ = self.extent_deg
-        world_px = 2 * HALF_WORLD_M * math.cos(math.radians((south + north) / 2)) / self.footprint_m * _ACROSS_PX
-        return min(max(math.ceil(math.log2(world_px / TILE_PX)), 0), _FINEST_ZOOM)
+        world_px = 2 * HALF_WORLD_M * math.cos(math.radians((south + north) / 2)) / self.footprint_m * _FOOTPRINT_PX
+        return min(max(math.ceil(math.log2(world_px / TILE_PX)), 0), _MAX_ZOOM)
 
 
 class _Window(NamedTuple):
@@ -99,7 +99,7 @@ def describe_folder(folder: Path, links: Path) -> str:
     tiles = {
         tuple(map(int, (*path.parts[-3:-1], path.stem))): path
         for path in folder.glob("*/*/*")
-        if path.suffix.lower() in _ENDINGS and all(map(str.isdecimal, (*path.parts[-3:-1], path.stem)))
+        if path.suffix.lower() in _TILE_SUFFIXES and all(map(str.isdecimal, (*path.parts[-3:-1], path.stem)))
     }
     zoom = max((zoom for zoom, _, _ in tiles), default=0)
     tiles = {tile: path for tile, path in tiles.items() if tile[0] == zoom}
@@ -111,24 +111,24 @@ def describe_folder(folder: Path, links: Path) -> str:
         )
     if (folder / _TMS_RESOURCE).exists():
         tiles = {(zoom, x, 2**zoom - 1 - y): path for (_, x, y), path in tiles.items()}
-    _require_joined(folder, tiles)
+    _require_joining_rows(folder, tiles)
     for (_, x, y), path in tiles.items():
         (links / str(x)).mkdir(exist_ok=True)
         (links / str(x) / str(y)).symlink_to(path.absolute())
     (_, left, top), (_, right, bottom) = (edge(list(tiles), axis=0).tolist() for edge in (np.min, np.max))
-    return _describe(f"file://{links}/{{x}}/{{y}}", _Window(zoom, left, top, right + 1, bottom + 1), len(first))
+    return _format_gdal_xml(f"file://{links}/{{x}}/{{y}}", _Window(zoom, left, top, right + 1, bottom + 1), len(first))
 
 
-def _require_joined(folder: Path, tiles: dict[tuple[int, ...], Path]) -> None:
+def _require_joining_rows(folder: Path, tiles: dict[tuple[int, ...], Path]) -> None:
     """Raise SourceError if the rows of tiles, named from the north, join clearly better the other way round."""
     pairs = [(path, tiles[zoom, x, y + 1]) for (zoom, x, y), path in tiles.items() if (zoom, x, y + 1) in tiles]
     named, other = [0.0], [0.0]
-    for paths in pairs[:: max(1, len(pairs) // _JOINS_COMPARED)]:
+    for paths in pairs[:: max(1, len(pairs) // _MAX_JOINS)]:
         upper, lower = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths)
         if _is_square(upper) and _is_square(lower) and upper.shape == lower.shape:
             named.append(float(cv2.absdiff(upper[-1], lower[0]).mean()))
             other.append(float(cv2.absdiff(lower[-1], upper[0]).mean()))
-    if sum(other) >= _CLEARLY_BETTER * sum(named):
+    if sum(other) >= _MAX_DIFFERENCE_RATIO * sum(named):
         return
     if (folder / _TMS_RESOURCE).exists():
         advice = f"from the north, and {_TMS_RESOURCE} says from the south: remove it if the tiles were written so"
@@ -150,16 +150,16 @@ def describe_address(address: str, ground: Ground) -> str:
             f"The address at {host} must have {{z}}, {{x}} and {{y}} where zoom, column and row of a tile stand, and "
             "no other braces: https://HOST/.../{z}/{x}/{y}.png."
         )
-    for zoom in range(ground.zoom, max(ground.zoom - _ZOOMS_TRIED, -1), -1):
+    for zoom in range(ground.zoom, max(ground.zoom - _MAX_ZOOM_TRIES, -1), -1):
         window = _find_window(ground, zoom)
         tile = _fetch_tile(address, zoom, (window.left + window.right) // 2, (window.top + window.bottom) // 2)
         if tile is not None:
             # A larger tile has finer pixels.
             window = _find_window(ground, max(zoom - round(math.log2(len(tile) / TILE_PX)), 0))
             caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-            return _describe(address, window, len(tile), Path(caches) / "edgevpr" / "tiles" / host)
+            return _format_gdal_xml(address, window, len(tile), Path(caches) / "edgevpr" / "tiles" / host)
     raise SourceError(
-        f"{host} has no tile of zoom {max(ground.zoom - _ZOOMS_TRIED + 1, 0)} to {ground.zoom} in the middle of the "
+        f"{host} has no tile of zoom {max(ground.zoom - _MAX_ZOOM_TRIES + 1, 0)} to {ground.zoom} in the middle of the "
         "area (HTTP 404): check address and area; a larger --footprint-m takes coarser tiles."
     )
 
@@ -188,7 +188,7 @@ def _fetch_tile(address: str, zoom: int, x: int, y: int) -> Image | None:
             data = answer.read(_MAX_TILE_BYTES)
     except HTTPError as error:
         error.close()
-        if error.code in _NO_TILE:
+        if error.code in _ABSENT_STATUSES:
             return None
         raise SourceError(
             f"{host} gives no tile (HTTP {error.code}): check the key in the address (401, 403) and your right to "
@@ -206,7 +206,7 @@ def _is_square(tile: object) -> TypeGuard[Image]:
     return isinstance(tile, np.ndarray) and tile.shape[0] == tile.shape[1] and not tile.shape[0] & tile.shape[0] - 1
 
 
-def _describe(address: str, window: _Window, side_px: int, cache: Path | None = None) -> str:
+def _format_gdal_xml(address: str, window: _Window, side_px: int, cache: Path | None = None) -> str:
     """Return the XML by which GDAL opens the tiles of a window; `cache` is the folder where it keeps them (None: they
     are files). A tile that is not there is transparent, and coarser zooms are not asked for."""
     tile_m = 2 * HALF_WORLD_M / 2**window.zoom
@@ -223,7 +223,7 @@ def _describe(address: str, window: _Window, side_px: int, cache: Path | None = 
 </DataWindow>
 <Projection>EPSG:3857</Projection><BandsCount>4</BandsCount><OverviewCount>0</OverviewCount>
 <BlockSizeX>{side_px}</BlockSizeX><BlockSizeY>{side_px}</BlockSizeY>
-<ZeroBlockHttpCodes>{",".join(map(str, _NO_TILE))}</ZeroBlockHttpCodes>
-<MaxConnections>{_CONNECTIONS}</MaxConnections><Timeout>{_TIMEOUT_S}</Timeout>
+<ZeroBlockHttpCodes>{",".join(map(str, _ABSENT_STATUSES))}</ZeroBlockHttpCodes>
+<MaxConnections>{_MAX_CONNECTIONS}</MaxConnections><Timeout>{_TIMEOUT_S}</Timeout>
 <UserAgent>edgevpr/{__version__}</UserAgent>{f"<Cache>{kept}</Cache>" if cache else ""}
 </GDAL_WMS>"""

@@ -41,7 +41,7 @@ def read_place_positions(place_map: PlaceMap) -> tuple[Ints, Doubles, Doubles]:
 
 
 # Takes places, their number and a label; yields the places unchanged and shows the progress.
-ShowProgress = Callable[[Iterable[PlaceCheck], int, str], Iterable[PlaceCheck]]
+Progress = Callable[[Iterable[PlaceCheck], int, str], Iterable[PlaceCheck]]
 
 
 def iterate_silently(places: Iterable[PlaceCheck], total: int, label: str) -> Iterable[PlaceCheck]:
@@ -108,7 +108,7 @@ def _read_rows(place_map: PlaceMap, place_ids: Collection[int]) -> Iterator[tupl
 def merge_maps(
     paths: Sequence[str | Path],
     out: Path,
-    show_progress: ShowProgress = iterate_silently,
+    progress: Progress = iterate_silently,
     only: Sequence[Collection[int] | None] | None = None,
 ) -> tuple[list[tuple[int, int]], bool]:
     """Merge the places of several maps, or those with the ids `only`, a collection for each map, into the new map
@@ -132,14 +132,14 @@ def merge_maps(
             for source in maps:
                 merged.add_attribution(source.attribution)
             counts = [
-                _add_places(merged, source, show_progress, place_ids)
+                _add_places(merged, source, progress, place_ids)
                 for source, place_ids in zip(maps, only or [None] * len(maps), strict=True)
             ]
             return counts, any(source.calibration is not None for source in maps)
 
 
 def _add_places(
-    place_map: PlaceMap, source: PlaceMap, show_progress: ShowProgress, only: Collection[int] | None
+    place_map: PlaceMap, source: PlaceMap, progress: Progress, only: Collection[int] | None
 ) -> tuple[int, int]:
     """Copy the places of `source`, or those with the ids `only`, that are new into `place_map`; return the numbers
     (copied, duplicates)."""
@@ -147,7 +147,7 @@ def _add_places(
     with place_map.transaction():
         ids_by_picture = place_map.select_ids("source_image, time")
         total = len(source) if only is None else len(only)
-        for place in show_progress(check_places(source, only), total, f"copying {source.path.name}"):
+        for place in progress(check_places(source, only), total, f"copying {source.path.name}"):
             if place.problem:
                 raise PlaceError(source.path, place.place_id, place.problem)
             part = rows.decode_part(place.content, "coarse", source.spec.coarse)
@@ -160,10 +160,10 @@ def _add_places(
     return copied, duplicates
 
 
-def check_map(path: str | Path, show_progress: ShowProgress = iterate_silently) -> MapCheck:
+def check_map(path: str | Path, progress: Progress = iterate_silently) -> MapCheck:
     """Read and check everything in the map file `path`. Raises MapError for a file that cannot be opened as a map."""
     with PlaceMap.open(path) as place_map:
-        checks = show_progress(check_places(place_map), len(place_map), "checking")
+        checks = progress(check_places(place_map), len(place_map), "checking")
         places = [place._replace(content={}) for place in checks]
         try:
             faults = [str(text) for (text,) in place_map.db.execute(f"PRAGMA integrity_check({_MAX_FAULTS})")]
@@ -174,7 +174,7 @@ def check_map(path: str | Path, show_progress: ShowProgress = iterate_silently) 
     return MapCheck(str(path), usable, len(places), damaged, () if faults == ["ok"] else tuple(faults))
 
 
-def repair_map(path: str | Path, show_progress: ShowProgress = iterate_silently) -> Path:
+def repair_map(path: str | Path, progress: Progress = iterate_silently) -> Path:
     """Replace the map by a copy of its usable places, which keep their ids and get checksums; keep the original as
     `*.damaged` and return its path. Mask hash and calibration are copied if they can be read. Raises MapError, and
     leaves the map as it is, if no place can be read, if the original of an earlier repair exists, or if the copy cannot
@@ -187,7 +187,7 @@ def repair_map(path: str | Path, show_progress: ShowProgress = iterate_silently)
     lock = mapfiles.lock_map(path)  # meanwhile no program can add places, which the copy would lack
     try:
         with PlaceMap.open(path) as damaged:
-            if not _copy_usable(damaged, copy, show_progress(check_places(damaged), len(damaged), "copying")):
+            if not _copy_usable(damaged, copy, progress(check_places(damaged), len(damaged), "copying")):
                 raise MapError(f"{path}: none of its places can be read: restore a copy, or build it again.")
         for left, kept in zip(mapfiles.list_sqlite_files(path), mapfiles.list_sqlite_files(original), strict=True):
             if left.exists():  # else SQLite would apply the log of the damaged map to the copy
@@ -210,21 +210,19 @@ def copy_places(path: str | Path, out: Path, place_ids: Collection[int]) -> int:
         return _copy_usable(place_map, unfinished, check_places(place_map, place_ids))
 
 
-def shrink_map(
-    path: str | Path, out: Path, count: int, show_progress: ShowProgress = iterate_silently
-) -> tuple[int, int]:
+def shrink_map(path: str | Path, out: Path, count: int, progress: Progress = iterate_silently) -> tuple[int, int]:
     """Copy the `count` best readable places of a map to the new file `out`: those of high quality that leave small gaps
     (see `choose_places`). They keep their ids, to which the calibration, copied like the mask hash, refers. Returns
     (number of places copied, number of readable places). Raises MapError if the map cannot be read, or if `out` exists
     or cannot be written; no part of a file is then left."""
     with mapfiles.write_atomically(out) as unfinished, PlaceMap.open(path) as place_map:
-        checks = show_progress(check_places(place_map), len(place_map), "reading")
+        checks = progress(check_places(place_map), len(place_map), "reading")
         places = [rows.parse_place(check.place_id, check.content) for check in checks if check.is_usable]
         points = [place.position or Position(np.nan, np.nan) for place in places]
         lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points], float).reshape(-1, 2).T
         best = choose_places(lat_deg, lon_deg, np.array([_rate_place(place) for place in places]), count)
         kept = [places[number].place_id for number in best.tolist()]
-        checks = show_progress(check_places(place_map, kept), len(kept), "copying")
+        checks = progress(check_places(place_map, kept), len(kept), "copying")
         return _copy_usable(place_map, unfinished, checks), len(places)
 
 

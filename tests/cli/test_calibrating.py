@@ -18,7 +18,7 @@ PLACES = 8
 @pytest.fixture(autouse=True)
 def few(monkeypatch):
     monkeypatch.setattr(calibrate, "MIN_PLACES", PLACES)
-    monkeypatch.setattr(calibrate, "query_altered_copies", lambda technique: PLACES)
+    monkeypatch.setattr(calibrate, "count_queries", lambda technique: PLACES)
 
 
 @pytest.fixture(scope="module")

@@ -115,7 +115,7 @@ def test_simulate_flight_refuses_a_wrong_request(tmp_path, ground, track, capsys
 @pytest.mark.slow
 def test_map_calibrate_cuts_the_orthophoto_again(tmp_path, ground, track, capsys, monkeypatch):
     monkeypatch.setattr(calibrate, "MIN_PLACES", 6)
-    monkeypatch.setattr(calibrate, "query_altered_copies", lambda technique: 6)
+    monkeypatch.setattr(calibrate, "count_queries", lambda technique: 6)
     path = tmp_path / "m.gpkg"
     cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 80, "--area", track)
     assert run("map", "build", path, *cut, "--no-refine", "--no-calibrate", "--json") == 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_matrix, identity
 
-from edgevpr.mapmaking.graph import Ties, _inverse_diagonal, solve
+from edgevpr.mapmaking.graph import Ties, _invert_diagonal, solve_graph
 
 FOOTPRINT_M, SPACING_M = 60.0, 15.0
 STEP_SD, TURN_SD, RECORDED_SD_M = 0.01, 0.03, 8.0
@@ -57,13 +57,13 @@ def off(solved, position, log):
 def test_noisy_positions_become_exact_by_ties_and_wrong_ties_are_named(wrong):
     position, log = flight()
     ties, lies = ties_of(position, log, wrong=wrong)
-    solved = solve(recorded_of(position), ties)
+    solved = solve_graph(recorded_of(position), ties)
     off_m, turned = off(solved, position, log)
     assert rms(off_m) < RECORDED_SD_M / 3
     assert rms(off_m - off_m.mean()) < RECORDED_SD_M / 4
     assert rms(turned) < 0.06
-    assert not solved.ties_count[lies].any()
-    assert solved.ties_count[~lies].mean() > 0.97
+    assert not solved.ties_agree[lies].any()
+    assert solved.ties_agree[~lies].mean() > 0.97
     assert solved.recorded_sd_m == pytest.approx(RECORDED_SD_M, rel=0.25)
 
 
@@ -73,7 +73,7 @@ def test_covariances_are_those_of_the_errors():
     far, turned = [], []
     for seed in range(30):
         ties, _ = ties_of(position, log, seed)
-        solved = solve(recorded_of(position, seed), ties)
+        solved = solve_graph(recorded_of(position, seed), ties)
         off_m, off_log = off(solved, position, log)
         far.append(off_m / np.sqrt(solved.position_var / 2))
         turned.append(off_log / np.sqrt(solved.log_var / 2))
@@ -92,4 +92,4 @@ def test_variances_are_those_of_the_whole_inverse_also_where_entries_cancel():
         jacobian = coo_matrix((values.ravel().astype(complex), (rows.ravel(), columns.ravel())), (ties, places)).tocsc()
         normal = (jacobian.conj().T @ jacobian + identity(places)).tocsc()
         expected = np.linalg.inv(normal.toarray()).diagonal().real
-        np.testing.assert_allclose(_inverse_diagonal(normal), expected, rtol=1e-4)
+        np.testing.assert_allclose(_invert_diagonal(normal), expected, rtol=1e-4)

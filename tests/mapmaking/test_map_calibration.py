@@ -13,7 +13,7 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, Lens, LevelledImage
 from edgevpr.mapmaking import calibrate as calibrating
-from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, ask, calibrate, fit_logistic
+from edgevpr.mapmaking.calibrate import LEFT_OUT, MIRRORED, THERE, calibrate, fit_logistic, query_map
 from edgevpr.mapmaking.changes import change_picture
 from edgevpr.mapmaking.mapping import build_map
 from edgevpr.places.index import load_index
@@ -52,7 +52,7 @@ def at_hand(*frames):
 def few(monkeypatch):
     """A map of few places is enough, and few questions."""
     monkeypatch.setattr(calibrating, "MIN_PLACES", PLACES)
-    monkeypatch.setattr(calibrating, "query_altered_copies", lambda technique: 2 * PLACES)
+    monkeypatch.setattr(calibrating, "count_queries", lambda technique: 2 * PLACES)
 
 
 @pytest.fixture
@@ -69,14 +69,14 @@ def calibrated(place_map, pictures, technique=AHEAD, **more):
 def test_a_map_is_asked_for_each_picture_in_three_ways(place_map):
     index, rule = load_index(place_map, AHEAD, 10**6), accept_rule(AHEAD, CONFIG)
     pictures = [(number + 1, LevelledImage(frame(number).image, None, UNKNOWN_VIEW)) for number in range(3)]
-    answers = list(ask(AHEAD, place_map, index, rule, query_meter(), [*pictures, (99, pictures[0][1])]))
+    answers = list(query_map(AHEAD, place_map, index, rule, query_meter(), [*pictures, (99, pictures[0][1])]))
     assert Counter(each.way for each in answers) == {THERE: 3, LEFT_OUT: 3, MIRRORED: 3}
     assert [each.place_id for each in answers] == [1, 1, 1, 2, 2, 2, 3, 3, 3]
     assert all(each.right for each in answers if each.way == THERE)
     assert not any(each.right for each in answers if each.way != THERE)
-    again = list(ask(AHEAD, place_map, index, rule, query_meter(), pictures))
+    again = list(query_map(AHEAD, place_map, index, rule, query_meter(), pictures))
     assert again == answers
-    assert list(ask(AHEAD, place_map, index, rule, query_meter(), pictures, seed=1)) != answers
+    assert list(query_map(AHEAD, place_map, index, rule, query_meter(), pictures, seed=1)) != answers
 
 
 def test_a_calibration_is_kept_in_the_map(place_map):
@@ -100,7 +100,7 @@ def test_a_place_that_cannot_be_read_is_not_asked_for(place_map):
 
 
 def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
-    monkeypatch.setattr(calibrating, "query_altered_copies", lambda technique: PLACES)
+    monkeypatch.setattr(calibrating, "count_queries", lambda technique: PLACES)
     down = create("cohog", {"camera": "nadir", "w1": 208})
     tilted = [frame(number, roll_deg=8.0, pitch_deg=-6.0, heading_deg=40.0, height_m=90.0) for number in range(PLACES)]
 
@@ -156,7 +156,7 @@ def test_a_strong_pull_keeps_the_weights_and_only_the_bias_follows():
     found = fit_logistic(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6)
     assert found.weights == pytest.approx(start.weights, abs=0.01)
     assert found.bias < start.bias - 1
-    held = fit_logistic(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6, pull_of_bias=1e6)
+    held = fit_logistic(start, rows, np.zeros(len(right), bool), np.ones(len(rows)), 1e6, bias_precision=1e6)
     assert held.bias == pytest.approx(start.bias, abs=0.01)
 
 

@@ -11,7 +11,7 @@ from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import offset_position
 from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.missions import Area, Waypoint
-from edgevpr.mapmaking.subset import subset
+from edgevpr.mapmaking.subset import make_subset
 from edgevpr.places.examine import iterate_silently, merge_maps
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.techniques import create
@@ -58,7 +58,7 @@ def path_over(*points):
 
 @pytest.mark.parametrize("of_one", [True, False])
 def test_places_along_a_path_are_taken_from_the_maps_that_they_are_in(tiles, whole, tmp_path, of_one):
-    found = subset(
+    found = make_subset(
         whole if of_one else tiles, path_over((0, 200), (400, 200)), 110.0, tmp_path / "f.gpkg", None, iterate_silently
     )
     assert names_in(tmp_path / "f.gpkg") == sorted(f"{column}{row}" for column in range(5) for row in (1, 2, 3))
@@ -67,26 +67,26 @@ def test_places_along_a_path_are_taken_from_the_maps_that_they_are_in(tiles, who
 
 
 def test_subset_reads_only_the_maps_near_the_mission(tiles, tmp_path):
-    found = subset(tiles, path_over((0, 0), (0, 400)), 20.0, tmp_path / "f.gpkg", None, iterate_silently)
+    found = make_subset(tiles, path_over((0, 0), (0, 400)), 20.0, tmp_path / "f.gpkg", None, iterate_silently)
     assert (found.maps, names_in(tmp_path / "f.gpkg")) == (1, [f"0{row}" for row in range(SIDE)])
 
 
 def test_places_in_a_polygon_are_taken(tiles, tmp_path):
     square = [at(-50, -50), at(250, -50), at(250, 450), at(-50, 450), at(-50, -50)]
-    subset(tiles, Area(polygons=(square,)), 20.0, tmp_path / "f.gpkg", None, iterate_silently)
+    make_subset(tiles, Area(polygons=(square,)), 20.0, tmp_path / "f.gpkg", None, iterate_silently)
     assert set(names_in(tmp_path / "f.gpkg")) == {f"{c}{r}" for c in range(3) for r in range(5)}
-    subset(tiles, Area(polygons=(square,)), 60.0, tmp_path / "g.gpkg", None, iterate_silently)
+    make_subset(tiles, Area(polygons=(square,)), 60.0, tmp_path / "g.gpkg", None, iterate_silently)
     assert "32" in names_in(tmp_path / "g.gpkg")
 
 
 def test_a_budget_keeps_the_places_that_leave_the_smallest_gaps(tiles, tmp_path):
     area = path_over((0, 0), (400, 400))
-    whole = subset(tiles, area, 1000.0, tmp_path / "whole.gpkg", None, iterate_silently)
-    found = subset(tiles, area, 1000.0, tmp_path / "f.gpkg", whole.file_bytes / 2, iterate_silently)
+    whole = make_subset(tiles, area, 1000.0, tmp_path / "whole.gpkg", None, iterate_silently)
+    found = make_subset(tiles, area, 1000.0, tmp_path / "f.gpkg", whole.file_bytes / 2, iterate_silently)
     assert (found.near, found.places) == (25, 12)
     assert found.file_bytes < whole.file_bytes
     with pytest.raises(UsageError, match="hold none"):
-        subset(tiles, area, 1000.0, tmp_path / "g.gpkg", 100, iterate_silently)
+        make_subset(tiles, area, 1000.0, tmp_path / "g.gpkg", 100, iterate_silently)
     assert not (tmp_path / "g.gpkg").exists()
 
 
@@ -107,7 +107,7 @@ def test_map_subset_of_several_calibrated_maps_is_not_calibrated_and_says_so(til
 
 def test_what_cannot_be_taken_is_said_and_leaves_nothing(tiles, tmp_path):
     with pytest.raises(UsageError, match=r"No place of .* is within 50 m of the mission"):
-        subset(tiles, path_over((5000, 0)), 50.0, tmp_path / "f.gpkg", None, iterate_silently)
+        make_subset(tiles, path_over((5000, 0)), 50.0, tmp_path / "f.gpkg", None, iterate_silently)
     with pytest.raises(MapError, match="holds no map"):
-        subset(tmp_path, path_over((0, 0)), 50.0, tmp_path / "f.gpkg", None, iterate_silently)
+        make_subset(tmp_path, path_over((0, 0)), 50.0, tmp_path / "f.gpkg", None, iterate_silently)
     assert not list(tmp_path.iterdir())

@@ -6,7 +6,7 @@ import pytest
 
 from edgevpr.core.errors import UsageError
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph
-from edgevpr.mapmaking.advice import require_level
+from edgevpr.mapmaking.advice import require_level_camera
 from edgevpr.mapmaking.pictures import FlownPictures
 from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, MIN_PAIRS, measure_tilt
 
@@ -53,9 +53,9 @@ def test_require_level_refuses_a_tilted_camera_whose_angles_are_not_recorded(gro
         cv2.imwrite(str(tmp_path / f"{number:02}.png"), image)
     pictures = FlownPictures(source=str(tmp_path))
     with pytest.raises(UsageError, match="degrees or more from straight down"):
-        require_level(pictures, None)
+        require_level_camera(pictures, None)
     (tmp_path / "positions.csv").write_text("file,lat,lon,roll_deg,pitch_deg\n00.png,50,8,0,45\n")
-    require_level(pictures, None)
+    require_level_camera(pictures, None)
 
 
 def test_measure_tilt_says_nothing_of_images_that_do_not_overlap():

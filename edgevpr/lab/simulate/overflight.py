@@ -16,7 +16,7 @@ from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph, view_on_ground
 from edgevpr.lab.simulate.generated import make_oscillation, write_shots
-from edgevpr.mapmaking.cuttings import MAX_WITHOUT_DATA, extent_words
+from edgevpr.mapmaking.cuttings import MAX_WITHOUT_DATA, format_extent
 from edgevpr.mapmaking.missions import read_area
 from edgevpr.mapmaking.orthophoto import Orthophoto
 from edgevpr.mapmaking.tiles import Ground, surround
@@ -135,7 +135,7 @@ def write_overflight(
     first = next(names, None)
     if first is None:
         raise UsageError(
-            f"No picture of the track shows {orthophoto.name}, which is at {extent_words(orthophoto.extent_deg)}: "
+            f"No picture of the track shows {orthophoto.name}, which is at {format_extent(orthophoto.extent_deg)}: "
             "pictures that leave it are not taken."
         )
     yield first

@@ -10,7 +10,7 @@ from edgevpr.core.contract import Descriptor
 from edgevpr.core.types import Frame, Position, Salience
 from edgevpr.frames.images import cv2
 from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage
-from edgevpr.mapmaking.mapping import Gaps
+from edgevpr.mapmaking.mapping import PlaceSelector
 from edgevpr.runtime.recognise.encoder import EncodedFrame
 from edgevpr.runtime.recognise.gate_networks import interpolate_map
 from edgevpr.runtime.recognise.salience_gate import (
@@ -136,7 +136,7 @@ def event(number, short_by=0.0, north_m=None):
 
 
 def kept(gaps, events):
-    found = [pair for each in events for pair in gaps.take(each)]
+    found = [pair for each in events for pair in gaps.add_frame(each)]
     return [(int(each.frame.name), salience.is_low) for each, salience in [*found, *gaps.end()]]
 
 
@@ -144,7 +144,7 @@ def kept(gaps, events):
 def test_no_gap_is_longer_than_the_bound_in_frames(seed):
     rng = np.random.default_rng(seed)
     events = [event(number, 0.0 if rng.random() < 0.02 else rng.uniform(0.001, 0.4)) for number in range(500)]
-    numbers = [number for number, _ in kept(Gaps(20), events)]
+    numbers = [number for number, _ in kept(PlaceSelector(20), events)]
     assert numbers == sorted(set(numbers))
     assert max(np.diff([-1, *numbers, 500])) <= 21  # twenty frames without a place between two with one
     assert len(numbers) < 150
@@ -155,11 +155,11 @@ def test_no_gap_is_longer_than_the_bound_in_metres(seed):
     rng = np.random.default_rng(seed)
     where_m = np.cumsum(rng.uniform(1, 9, 300))
     events = [event(number, rng.uniform(0.001, 0.4), where) for number, where in enumerate(where_m)]
-    places_m = [where_m[number] for number, _ in kept(Gaps(10_000, 40.0), events)]
+    places_m = [where_m[number] for number, _ in kept(PlaceSelector(10_000, 40.0), events)]
     assert max(np.diff([where_m[0], *places_m])) <= 40.01
 
 
 def test_the_best_of_a_gap_are_those_that_pass_after_the_fewest_steps_and_are_marked():
     events = [event(0), *(event(number, 0.2) for number in range(1, 21))]
     events[7], events[12] = event(7, 0.07), event(12, 0.08)
-    assert kept(Gaps(20), [*events, event(21, 0.2)]) == [(0, False), (7, True), (12, True)]
+    assert kept(PlaceSelector(20), [*events, event(21, 0.2)]) == [(0, False), (7, True), (12, True)]
