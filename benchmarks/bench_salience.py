@@ -30,7 +30,7 @@ from edgevpr.frames.images import list_images, read_image
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
-from edgevpr.runtime.recognise.salience_gate import compute_memorability, compute_scores
+from edgevpr.runtime.recognise.salience_gate import compute_scores, judge_scores
 from edgevpr.techniques.card import load_card
 
 TECHNIQUES = ("hog", "cohog", "calc", "netvlad")
@@ -141,7 +141,7 @@ def gated(
     `false_discarded` wrongly. `places` is the share of the references that pass the gate."""
     score, found = answers(asked, np.ones(len(asked[0][2]), bool))
     for gate, thresholds in GATES.items():
-        passes = np.array([compute_memorability(each[gate], thresholds).reason is None for each in seen])
+        passes = np.array([judge_scores(each[gate], thresholds).reason is None for each in seen])
         precision, recall = metrics.precision_recall(score[passes], found[passes])
         yield {
             "set": name,
@@ -170,7 +170,7 @@ def scores_by_gate(path: Path, memorability: Memorability, detector: Detector | 
 def _kept(places: list[Path], seen: dict[Path, dict[str, Salience]]) -> dict[str, np.ndarray]:
     """Return which references pass each gate."""
     return {
-        gate: np.array([compute_memorability(seen[path][gate], thresholds).reason is None for path in places])
+        gate: np.array([judge_scores(seen[path][gate], thresholds).reason is None for path in places])
         for gate, thresholds in GATES.items()
     }
 

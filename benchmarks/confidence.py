@@ -38,7 +38,7 @@ from edgevpr.runtime.recognise.evidence import (
     DOWN_BARE,
     Evidence,
 )
-from edgevpr.runtime.recognise.judge import Sureness, accept_rule
+from edgevpr.runtime.recognise.judge import ConfidenceRule, accept_rule
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 
 PRECISIONS = (0.9, 0.99, 0.999)
@@ -148,11 +148,11 @@ def judged(rows: Sequence[Row], models: Models) -> base.Row:
 
 
 def _sure(models: Models, row: Row) -> float:
-    return max(Sureness(models, PRECISIONS[-1]).confidence(each) for each in _looks(row))
+    return max(ConfidenceRule(models, PRECISIONS[-1]).confidence(each) for each in _looks(row))
 
 
 def _accepted(models: Models, row: Row, precision: float) -> bool:
-    sure = Sureness(models, precision)
+    sure = ConfidenceRule(models, precision)
     return row.veto is None and any(
         sure.confidence(each) >= models[each.kind].threshold(precision) for each in _looks(row)
     )
@@ -183,7 +183,7 @@ def followed(name: str, models: dict[str, Models]) -> base.Row:
     made: base.Row = {"set": name, "ways": {}}
     with walks.map_of(DATA / name) as (place_map, index, technique):
         rule = accept_rule(technique, walks.config().match)
-        rule = replace(rule, sure=Sureness(models[name], walks.config().match.accept_precision))
+        rule = replace(rule, sure=ConfidenceRule(models[name], walks.config().match.accept_precision))
         for way, paths in ways.items():
             counts = {}
             for mode in ("alone", "followed"):

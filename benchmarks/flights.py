@@ -77,7 +77,7 @@ FLOWN = {
 
 
 def _recogniser(
-    technique: Technique, place_map: PlaceMap, index: PlaceIndex, *, length: int = 1, follows: bool = False
+    technique: Technique, place_map: PlaceMap, index: PlaceIndex, *, length: int = 1, tracks_flight: bool = False
 ) -> Recogniser:
     config = walks.config()
     reach_m_s, rule = (
@@ -92,13 +92,13 @@ def _recogniser(
         search=make_sequence_search(length),
         prior=Prior(reach_m_s, technique.spec.heading_within_deg, True) if length == 1 else None,
         min_accuracy_m=config.mavlink.min_accuracy_m,
-        place_filter=PlaceFilter(place_map, max_speed_m_s=reach_m_s, is_live=True) if follows else None,
+        place_filter=PlaceFilter(place_map, max_speed_m_s=reach_m_s, is_live=True) if tracks_flight else None,
     )
 
 
 # The ways of recognising, as a flight has them.
 MODES: dict[str, Callable[[Technique, PlaceMap, PlaceIndex], Recogniser]] = {
-    "filter": partial(_recogniser, follows=True),
+    "filter": partial(_recogniser, tracks_flight=True),
     "alone": partial(_recogniser),
     "sequence 10": partial(_recogniser, length=10),
 }

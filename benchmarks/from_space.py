@@ -151,7 +151,7 @@ def matched(path: Path, frames: Iterable[Frame], known: str, fov_deg: float = FO
         map=str(path), **{"source.camera": "nadir"}, **({"source.fov_deg": fov_deg} if is_told else {})
     )
     told = ("heading", "height") if is_told else ()
-    recogniser = open_recogniser(config, load_board("this"), known=told, narrowed=is_flown, follows=is_flown)
+    recogniser = open_recogniser(config, load_board("this"), known=told, uses_hints=is_flown, tracks_flight=is_flown)
     right, errors_m, claims_m = 0, [], []
     for frame in frames:
         told = frame if is_told else replace(frame, heading_deg=None, height_m=None, roll_deg=None, pitch_deg=None)

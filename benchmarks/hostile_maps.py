@@ -152,14 +152,14 @@ def _asked(recogniser: Recogniser) -> int:
 
 
 def _at_take_off(config: Config) -> int:
-    recogniser = open_recogniser(config, _BOARD, narrowed=True)
+    recogniser = open_recogniser(config, _BOARD, uses_hints=True)
     with recogniser.place_map:
         return _asked(recogniser)
 
 
 def _in_flight(config: Config, path: Path, whole: Path, damaged: bytes) -> int:
     shutil.copyfile(whole, path)
-    recogniser = open_recogniser(config, _BOARD, narrowed=True)
+    recogniser = open_recogniser(config, _BOARD, uses_hints=True)
     with recogniser.place_map:
         if not recogniser.step(_frame(3)).accepted:
             raise AssertionError("a whole map must be recognised in")

@@ -9,7 +9,7 @@ import numpy as np
 
 from edgevpr.mapmaking.calibrate import QueryResult, adapt_model, fit_logistic, make_evidence_matrix
 from edgevpr.runtime.recognise.confidence import Logistic, Model, Scale, Tail
-from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE, Evidence
+from edgevpr.runtime.recognise.evidence import MAP_FIGURES, PLACE_FIGURES, Evidence
 
 _PULL = 0.3
 # Parts of the wrong matches that are the tail. With .3 of those of a site itself, the draw of the pictures that a map
@@ -35,12 +35,12 @@ class FittedSite:
 def shipped_model(kind: str, sites: Sequence[FittedSite], made_of: str) -> Model:
     """Fit the model of one kind of evidence to these sites, each as important as any other."""
     of_map = _regression(
-        OF_MAP[kind],
+        MAP_FIGURES[kind],
         [([evidence for evidence, right in site.own if right], True) for site in sites]
         + [(site.foreign, False) for site in sites],
     )
     of_place = _regression(
-        OF_PLACE[kind],
+        PLACE_FIGURES[kind],
         [
             ([evidence for evidence, each in site.own if each == right], right)
             for site in sites

@@ -102,7 +102,7 @@ class Map:
         source = settings.source
         known = ("heading", "height", "reach") if source.fov_deg or source.lens else ("heading", "reach")
         board = resolve_board(load_board(settings.board), source, settings.memory)
-        self._recogniser = open_recogniser(settings, board, known=known, follows=follow)
+        self._recogniser = open_recogniser(settings, board, known=known, tracks_flight=follow)
         is_nadir = self._recogniser.technique.spec.looks_down
         self._needs_height = source.fov_deg is not None or (source.lens is not None and is_nadir)
         self._is_open, self._threads = True, ThreadpoolController()

@@ -8,8 +8,8 @@ from edgevpr.core.contract import PartSpec, TechniqueSpec
 from edgevpr.places.index import PlaceIndex, allocate_index
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.confidence import Figures
-from edgevpr.runtime.recognise.evidence import OF_MAP
-from edgevpr.runtime.recognise.judge import AcceptRule, Sureness
+from edgevpr.runtime.recognise.evidence import MAP_FIGURES
+from edgevpr.runtime.recognise.judge import AcceptRule, ConfidenceRule
 
 NEEDED = 0.9
 
@@ -21,9 +21,9 @@ class Told:
     confidence: Callable[[Figures], float]
     of_map: Callable[[Figures], float] | None = None
     needed: float = NEEDED
-    most_shown: float = 1.0
+    max_reported: float = 1.0
 
-    def confidence_of_map(self, evidence: Figures) -> float:
+    def map_confidence(self, evidence: Figures) -> float:
         return (self.of_map or self.confidence)(evidence)
 
     def threshold(self, precision: float) -> float:
@@ -34,9 +34,9 @@ def told(
     confidence: Callable[[Figures], float],
     of_map: Callable[[Figures], float] | None = None,
     needed: float = NEEDED,
-) -> Sureness:
+) -> ConfidenceRule:
     """The decision by a confidence that is told what to say."""
-    return Sureness(dict.fromkeys(OF_MAP, Told(confidence, of_map, needed)), 0.999)
+    return ConfidenceRule(dict.fromkeys(MAP_FIGURES, Told(confidence, of_map, needed)), 0.999)
 
 
 def sure_rule(confidence: Callable[[Figures], float], needed: float = NEEDED, **limits: float) -> AcceptRule:

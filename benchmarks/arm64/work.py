@@ -19,8 +19,8 @@ from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import NO_EXPECTATION, Expectation, Query, compare_places, scan_index
 from edgevpr.power.speed import make_pass_round, make_product_round
-from edgevpr.runtime.recognise.landmarks import OF_QUERY, describe
-from edgevpr.runtime.recognise.stride import Strides
+from edgevpr.runtime.recognise.landmarks import QUERY_LANDMARKS, detect_landmarks
+from edgevpr.runtime.recognise.odometry import VisualOdometry
 from edgevpr.techniques import create
 
 PER_PLACE = ("place_ids", "lat_deg", "lon_deg", "heading_deg", "rows")
@@ -79,16 +79,16 @@ def of_landmarks(picture: Image) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield what a flight does beside its queries: the landmarks of a frame, and its stride."""
     moved = cv2.warpAffine(picture, np.float32([[1, 0, 40], [0, 1, 15]]), picture.shape[::-1])
     view = View(up_deg=0.0, footprint_m=130.0, aside=(0.0, 0.0), focal=0.77)
-    before, now = describe(picture, None, OF_QUERY), describe(moved, None, OF_QUERY)
+    before, now = detect_landmarks(picture, None, QUERY_LANDMARKS), detect_landmarks(moved, None, QUERY_LANDMARKS)
 
     def stride() -> object:
-        strides = Strides()
-        strides.to(0.0, view, before)
-        if (found := strides.to(1.0, view, now)) is None:
+        strides = VisualOdometry()
+        strides.measure(0.0, view, before)
+        if (found := strides.measure(1.0, view, now)) is None:
             raise RuntimeError("no stride was found")
         return found
 
-    yield "flight: landmarks of a frame", lambda: describe(moved, None, OF_QUERY)
+    yield "flight: landmarks of a frame", lambda: detect_landmarks(moved, None, QUERY_LANDMARKS)
     yield "flight: the stride since the frame before", stride
 
 

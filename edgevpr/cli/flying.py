@@ -74,7 +74,7 @@ def run_match(args: Namespace) -> int:
     from edgevpr.cli.matched import format_match, format_matches
     from edgevpr.frames.source import open_source, read_to_end
     from edgevpr.power.boards import load_board, resolve_board
-    from edgevpr.runtime.recognise.calibration import not_calibrated
+    from edgevpr.runtime.recognise.calibration import explain_not_calibrated
     from edgevpr.runtime.recognise.evidence import list_evidence_kinds
     from edgevpr.runtime.recognise.hints import parse_known_fields
     from edgevpr.runtime.recognise.opening import open_recogniser
@@ -82,7 +82,7 @@ def run_match(args: Namespace) -> int:
 
     config, known = make_config(args, args.config, map=args.map), parse_known_fields(args.known)
     board = resolve_board(load_board(config.board), config.source, config.memory)
-    recogniser = open_recogniser(config, board, known=known, follows=args.follow)
+    recogniser = open_recogniser(config, board, known=known, tracks_flight=args.follow)
     matches = []
     unusable: list[ImageError] = []
     source = open_source(args.source, positions=to_path(args.positions), live=False)
@@ -101,7 +101,7 @@ def run_match(args: Namespace) -> int:
             matches[-1]["hints"] = event.hints and event.hints.fields()
     lines = list(format_matches(matches))
     if not is_calibrated and list_evidence_kinds(place_map.spec):
-        lines.append(f"The map is {not_calibrated(len(place_map))}.")
+        lines.append(f"The map is {explain_not_calibrated(len(place_map))}.")
     if known:
         lines.append(f"Known of each query: {','.join(known)}.")
     if weights := describe_weights(recogniser.technique.spec):

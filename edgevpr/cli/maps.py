@@ -227,7 +227,7 @@ def run_map_info(args: Namespace) -> int:
     from edgevpr.places.index import compute_place_bytes
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import describe_map
-    from edgevpr.runtime.recognise.calibration import not_calibrated, read_calibration_for
+    from edgevpr.runtime.recognise.calibration import explain_not_calibrated, read_calibration_for
     from edgevpr.techniques import CONFIDENCE_TECHNIQUE
 
     if args.page:
@@ -238,7 +238,7 @@ def run_map_info(args: Namespace) -> int:
     if calibration:
         confidence: str | None = f"calibrated {calibration.made}: {calibration.described()}"
     else:
-        confidence = not_calibrated(info.places) if info.spec.name == CONFIDENCE_TECHNIQUE else None
+        confidence = explain_not_calibrated(info.places) if info.spec.name == CONFIDENCE_TECHNIQUE else None
     ram_mb = info.places * place_bytes / 1e6
     known = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": place_bytes}
     lines = list(format_info(info, confidence, ram_mb))
@@ -329,11 +329,11 @@ def run_salience(args: Namespace) -> int:
     """Run `salience`: print the salience scores of a picture (see the glossary)."""
     from edgevpr.frames.images import read_image
     from edgevpr.runtime.recognise.opening import open_salience_gate
-    from edgevpr.runtime.recognise.salience_gate import compute_memorability
+    from edgevpr.runtime.recognise.salience_gate import judge_scores
 
     gate = open_salience_gate(make_config(args, args.config, **{"salience.use": True}).salience)
     assert gate is not None  # salience.use is set
-    memorability = compute_memorability(gate.scores(read_image(Path(args.image))), gate.config)
+    memorability = judge_scores(gate.scores(read_image(Path(args.image))), gate.config)
     outcome = {"kept": memorability.reason is None, "reason": memorability.reason and memorability.reason.fields()}
-    print_result({"image": args.image, **asdict(memorability.salience), **outcome}, args.json)
+    print_result({"image": args.image, **asdict(memorability.scores), **outcome}, args.json)
     return 0

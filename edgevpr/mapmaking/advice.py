@@ -30,9 +30,9 @@ from edgevpr.frames.positions import find_positions, find_track, read_positions,
 from edgevpr.frames.source import Source, open_source, read_to_end
 from edgevpr.mapmaking.pictures import FlownPictures
 from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, measure_tilt
-from edgevpr.runtime.recognise.agreement import PROVEN, measure_agreement
+from edgevpr.runtime.recognise.agreement import MIN_PROVEN_INLIERS, measure_agreement
 from edgevpr.runtime.recognise.calibration import MIN_PLACES
-from edgevpr.runtime.recognise.landmarks import describe
+from edgevpr.runtime.recognise.landmarks import detect_landmarks
 
 _log = logging.getLogger(__name__)
 _RUN_COUNT = 6  # of neighbouring pictures that are compared, spread over the folder
@@ -151,9 +151,14 @@ def _compare_neighbours(pictures: FlownPictures, mask: OverlayMask | None) -> tu
     runs = map(_read_usable, _choose_runs(folder)) if folder else [_read_video(pictures.source, _VIDEO_PICTURES)]
     pairs, clear, aside = 0, 0, 0
     for run in runs:
-        marks = [describe(image, mask.fit_to(image) if mask else None, _MAX_LANDMARKS) for image in run]
+        marks = [detect_landmarks(image, mask.fit_to(image) if mask else None, _MAX_LANDMARKS) for image in run]
         for seen in (measure_agreement(one, other) for one, other in pairwise(marks)):
-            if seen.inliers < PROVEN or seen.shift_share is None or seen.rotation_deg is None or seen.scale is None:
+            if (
+                seen.inliers < MIN_PROVEN_INLIERS
+                or seen.shift_share is None
+                or seen.rotation_deg is None
+                or seen.scale is None
+            ):
                 continue
             pairs += 1
             if abs(wrap_deg(seen.rotation_deg)) >= _MIN_TURN_DEG or abs(seen.shift_share[1]) >= _MIN_UP_SHARE:

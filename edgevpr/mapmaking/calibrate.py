@@ -33,7 +33,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import outside_neighbourhood
 from edgevpr.places.rows import escape_name
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.calibration import MIN_PLACES, MapCalibration, calibration_text
+from edgevpr.runtime.recognise.calibration import MIN_PLACES, MapCalibration, format_calibration
 from edgevpr.runtime.recognise.confidence import Figures, Logistic, Model, prior
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder
 from edgevpr.runtime.recognise.evidence import (
@@ -45,7 +45,7 @@ from edgevpr.runtime.recognise.evidence import (
     count_neighbours,
     list_evidence_kinds,
 )
-from edgevpr.runtime.recognise.judge import AcceptRule, Sureness, accept_rule
+from edgevpr.runtime.recognise.judge import AcceptRule, ConfidenceRule, accept_rule
 
 Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the frames of these names, as far as they are found
 
@@ -168,7 +168,7 @@ def calibrate(
         "that it was made of, with the same camera and mask",
     )
     calibration = replace(_fit_calibration(answers, kinds, config.accept_precision), look_alikes=rule.look_alikes)
-    place_map.record_calibration(calibration_text(calibration))
+    place_map.record_calibration(format_calibration(calibration))
     return calibration
 
 
@@ -202,7 +202,7 @@ def _fit_calibration(answers: Sequence[QueryResult], kinds: Sequence[str], preci
     known = [answer for answer in answers if answer.evidence]
     made_of = f"{len(known)} answers of the map itself"
     models = {kind: adapt_model(prior(kind), kind, known, made_of) for kind in kinds}
-    sure = Sureness(models, precision)
+    sure = ConfidenceRule(models, precision)
     accepted = [
         answer
         for answer in answers

@@ -31,7 +31,7 @@ from edgevpr.runtime.recognise.opening import (
     create_technique,
     make_technique,
     open_salience_gate,
-    warn_of_other_pictures,
+    warn_of_mismatch,
 )
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
         place_map.record_mask(mask.sha256 if mask else None)
         place_map.record_lens(lens)
     else:
-        warn_of_other_pictures(place_map, mask, lens)
+        warn_of_mismatch(place_map, mask, lens)
     with place_map:
         try:
             if isinstance(pictures, FlownPictures):

@@ -18,8 +18,8 @@ from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.rows import escape_name
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, explain_failure
-from edgevpr.runtime.recognise.judge import says_nothing
-from edgevpr.runtime.recognise.levelling import place_at_middle
+from edgevpr.runtime.recognise.judge import check_texture
+from edgevpr.runtime.recognise.levelling import centre_place
 from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, select_best
 
 _NO_PIXELS = np.empty((0, 0), np.uint8)
@@ -41,15 +41,15 @@ class PlaceSelector:
     def add_frame(self, encoded: EncodedFrame) -> Iterator[SelectedFrame]:
         """Process the next frame. Yield those that now become places: some of those waiting, then this one if it
         reaches all thresholds; else it waits. Each comes with its salience (None: there are no criteria)."""
-        if encoded.worth is None:
+        if encoded.salience is None:
             yield encoded, None
             return
         frame = encoded.frame
         while self._waiting and (len(self._waiting) >= self._max_frames or self._is_too_far(frame.position)):
             yield from self._take_best_waiting()
-        if encoded.worth.reason is None:
+        if encoded.salience.reason is None:
             self._waiting.clear()
-            yield self._keep(encoded), encoded.worth.salience
+            yield self._keep(encoded), encoded.salience.scores
         else:
             self._last = self._last or frame.position
             self._waiting.append(replace(encoded, frame=replace(frame, image=_NO_PIXELS)))
@@ -62,11 +62,11 @@ class PlaceSelector:
     def _take_best_waiting(self) -> Iterator[SelectedFrame]:
         """Yield the best of the waiting frames, as places of low quality. Of the others, those before the last one
         yielded are dropped, and those after it continue to wait."""
-        waiting = [(encoded, encoded.worth) for encoded in self._waiting if encoded.worth]
-        best = np.flatnonzero(select_best([worth.short_by for _, worth in waiting])).tolist()
+        waiting = [(encoded, encoded.salience) for encoded in self._waiting if encoded.salience]
+        best = np.flatnonzero(select_best([worth.shortfall for _, worth in waiting])).tolist()
         self._waiting = self._waiting[best[-1] + 1 :]
         for encoded, worth in (waiting[at] for at in best):
-            yield self._keep(encoded), replace(worth.salience, is_low=True)
+            yield self._keep(encoded), replace(worth.scores, is_low=True)
 
     def _keep(self, encoded: EncodedFrame) -> EncodedFrame:
         self._has_begun, self._last = True, encoded.frame.position or self._last
@@ -158,7 +158,7 @@ def build_map(
 
     def keep(kept: Iterable[SelectedFrame]) -> None:
         for encoded, salience in kept:
-            place, landmarks = place_at_middle(encoded.frame, encoded.view), encoder.pack_landmarks(encoded.picture)
+            place, landmarks = centre_place(encoded.frame, encoded.view), encoder.pack_landmarks(encoded.picture)
             place_map.add(place, encoded.descriptor, salience, landmarks)
             result.added += 1
             result.without_position += encoded.frame.position is None
@@ -179,12 +179,12 @@ def build_map(
             result.tilted += 1
             continue
         of_name = ids_by_image.get((escape_name(frame.name),), ())
-        if says_nothing(encoded.descriptor, min_quality):
+        if check_texture(encoded.descriptor, min_quality):
             result.says_nothing += 1
         elif any(place_map.has_descriptor(place_id, encoded.descriptor.coarse) for place_id in of_name):
             result.already_here += 1
         else:
-            result.not_memorable += bool(encoded.worth and encoded.worth.lacks)
+            result.not_memorable += bool(encoded.salience and encoded.salience.criterion)
             keep(selector.add_frame(encoded))
     keep(selector.end())
     return result

@@ -32,7 +32,7 @@ from edgevpr.frames.images import list_images, read_image
 from edgevpr.mapmaking.graph import GraphSolution, Ties, solve_graph
 from edgevpr.mapmaking.mapping import Progress
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, measure_agreement
+from edgevpr.runtime.recognise.agreement import MIN_CONFIRMED_INLIERS, MIN_PROVEN_INLIERS, Overlay, measure_agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks, unpack_bytes
 
 _MIN_GROUP = 4  # places connected by ties: with three, an error of the scale does not show
@@ -305,10 +305,10 @@ def _make_comparer(
         if found is None or found.inliers < least or found.shift_share is None or found.rotation_deg is None:
             return None
         overlay = Overlay(found.shift_share, found.rotation_deg, found.scale)
-        return Tie(*overlay.step_and_turn, *_LANDMARK_SDS)
+        return Tie(*overlay.relative_pose, *_LANDMARK_SDS)
 
     def compare_pair(query: int, place: int) -> Tie | None:
-        if tie := compare_landmarks(query, place, None, PROVEN):
+        if tie := compare_landmarks(query, place, None, MIN_PROVEN_INLIERS):
             return tie
         asking, part = descriptor(query), coarse.get(places[place].place_id)
         if asking is None or part is None:
@@ -322,8 +322,8 @@ def _make_comparer(
             return None
         (dx, dy), cells = match.shift_cells or (0.0, 0.0), technique.spec.cells or 1
         vote = Overlay((dx / cells, dy / cells), match.rotation_deg or 0.0, match.height_ratio)
-        tie = compare_landmarks(query, place, vote, CONFIRMED)
-        return tie or (Tie(*vote.step_and_turn, *_VOTE_SDS) if match.score >= _MIN_VOTE_SCORE else None)
+        tie = compare_landmarks(query, place, vote, MIN_CONFIRMED_INLIERS)
+        return tie or (Tie(*vote.relative_pose, *_VOTE_SDS) if match.score >= _MIN_VOTE_SCORE else None)
 
     return compare_pair
 

@@ -17,8 +17,8 @@ from edgevpr.core.errors import ImageError
 from edgevpr.core.geodesy import project_to_metres
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import MAX_GAP_S, Track
-from edgevpr.runtime.recognise.agreement import PROVEN, Overlay, measure_agreement
-from edgevpr.runtime.recognise.landmarks import Landmarks, describe
+from edgevpr.runtime.recognise.agreement import MIN_PROVEN_INLIERS, Overlay, measure_agreement
+from edgevpr.runtime.recognise.landmarks import Landmarks, detect_landmarks
 
 _MAX_LANDMARKS = 500
 _MAX_OFFSET_S = 180.0  # clocks further off are set wrong, and do not only drift
@@ -88,7 +88,7 @@ def _find_changes(paths: Iterable[Path]) -> tuple[Ints, Complexes]:
 def _describe_landmarks(paths: Iterable[Path]) -> Iterator[Landmarks | None]:
     for path in paths:
         try:
-            yield describe(read_image(path), None, _MAX_LANDMARKS)
+            yield detect_landmarks(read_image(path), None, _MAX_LANDMARKS)
         except ImageError:
             yield None
 
@@ -96,6 +96,6 @@ def _describe_landmarks(paths: Iterable[Path]) -> Iterator[Landmarks | None]:
 def _measure_move(one: Landmarks | None, other: Landmarks | None) -> Move | None:
     """Return how the middle moves from picture `one` to the `other`, in the frame of `one`, and how it turns."""
     match = measure_agreement(other, one) if one is not None and other is not None else None
-    if match is None or match.inliers < PROVEN or match.shift_share is None or match.rotation_deg is None:
+    if match is None or match.inliers < MIN_PROVEN_INLIERS or match.shift_share is None or match.rotation_deg is None:
         return None
-    return Overlay(match.shift_share, match.rotation_deg, match.scale).step_and_turn
+    return Overlay(match.shift_share, match.rotation_deg, match.scale).relative_pose

@@ -52,7 +52,7 @@ def test_matchability_keeps_a_picture_and_leaves_it_out_in_the_dark_in_fog_and_w
 
     def worth(picture):
         seen = picture + np.random.default_rng(2).normal(0, 6, picture.shape)  # by a sensor
-        return network.matrix(np.clip(seen, 0, 255).astype(np.uint8)).mean()
+        return network.compute_matrix(np.clip(seen, 0, 255).astype(np.uint8)).mean()
 
     least = load_config(None).salience.memorability
     assert worth(ground) > least

@@ -18,8 +18,8 @@ from edgevpr.mavlink.receivers import RECEIVER_LAG_S
 from edgevpr.mavlink.vehicle import Attitude
 from edgevpr.runtime.flight.navigator import Advice, Navigator
 from edgevpr.runtime.recognise.locate import Located
+from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.stride import Stride
 
 HOME = 47.0, 8.0
 GPS_SD_M = 1.0
@@ -161,10 +161,10 @@ class Air:
 
     def _see(self, step, vehicle, is_query=True) -> None:
         frame = Frame(image=_PICTURE, name="", t_mono_s=step * _STEP_S)
-        event = Recognition(frame=frame, vehicle=vehicle, stride=self._stride(step))
+        event = Recognition(frame=frame, vehicle=vehicle, odometry=self._stride(step))
         self.navigator.handle_frame(event, is_query)
 
-    def _stride(self, step) -> Stride | None:
+    def _stride(self, step) -> OdometryStep | None:
         before, self.strode = self.strode, step
         if self.stride_sd_m is None or before is None or step - before > _FARTHEST_STEPS:
             return None
@@ -172,7 +172,7 @@ class Air:
         turned = complex(east_m, north_m) * np.exp(-1j * self.turn)
         moved_m = np.array([turned.real, turned.imag]) + self.rng.normal(0, self.stride_sd_m, 2)
         from_s, to_s = before * _STEP_S, step * _STEP_S
-        return Stride(from_s=from_s, to_s=to_s, moved_m=tuple(moved_m), sd_m=self.stride_sd_m, inliers=100)
+        return OdometryStep(from_s=from_s, to_s=to_s, moved_m=tuple(moved_m), sd_m=self.stride_sd_m, inliers=100)
 
     def tell(self, event: Recognition) -> Advice:
         return self.navigator.advise(event, self.t_s)
@@ -182,7 +182,7 @@ class Air:
         where = Position(*offset_position(*HOME, *seen_m))
         event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, self.places(step), view)
         frame = replace(event.frame, t_sd_s=self.t_sd_s)
-        event = replace(event, frame=frame, stride=self._stride(step))
+        event = replace(event, frame=frame, odometry=self._stride(step))
         if self.shows_turn:
             picture = LevelledImage(_PICTURE, None, replace(event.view, up_deg=0.0))
             located = replace(event.located, heading_deg=-math.degrees(self.turn))

@@ -19,9 +19,9 @@ from edgevpr.mavlink.conversation import Conversation, LinkSettings
 from edgevpr.mavlink.messages import Health
 from edgevpr.mavlink.wire import PacketReader, mavlink
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.perspective import AttitudeError
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.stride import Stride
 
 HEIGHT_M = 60.0
 _FRAME_S = 1.0  # from frame to frame
@@ -155,7 +155,7 @@ class ClosedLoop:
         else:
             frame = Frame(image=_PICTURE, name="", t_mono_s=t_s)
             event = Recognition(frame=frame, vehicle=vehicle, picture=LevelledImage(_PICTURE, None, _VIEW))
-        self._waiting.append(replace(event, stride=self._stride(truth, t_s)))
+        self._waiting.append(replace(event, odometry=self._stride(truth, t_s)))
 
     def _stride(self, truth, t_s):
         before, self._last_frame = self._last_frame, (truth, t_s, self.brain.tilt)
@@ -164,7 +164,9 @@ class ClosedLoop:
         was, from_s, tilt = before
         moved_m = self.stride_scale * displacement_m(was.point, truth.point)
         moved_m += HEIGHT_M * (self.brain.tilt - tilt) + self._noise(_STRIDE_SD_M)
-        return Stride(from_s=from_s, to_s=t_s, moved_m=(moved_m.real, moved_m.imag), sd_m=_STRIDE_SD_M, inliers=100)
+        return OdometryStep(
+            from_s=from_s, to_s=t_s, moved_m=(moved_m.real, moved_m.imag), sd_m=_STRIDE_SD_M, inliers=100
+        )
 
     def _noise(self, sd):
         return complex(*self._rng.normal(0, sd, 2))

@@ -37,7 +37,7 @@ class Flight:
         self.config = load_config(None, {"map": str(place_map), "source.uri": "/dev/video0"} | settings)
         self.board = resolve_board(load_board(self.config.board), self.config.source, self.config.memory)
         self.log, self.clock, self.link = log, clock, link
-        self.recogniser = open_recogniser(self.config, self.board, narrowed=True)
+        self.recogniser = open_recogniser(self.config, self.board, uses_hints=True)
         self.recogniser.meter = metered(self.config, self.recogniser, clock)
         self.stop = Stop()
         self.end: dict = {}

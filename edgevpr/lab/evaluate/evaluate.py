@@ -43,7 +43,7 @@ from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.salience_gate import Gate
+from edgevpr.runtime.recognise.salience_gate import SalienceGate
 from edgevpr.techniques import format_name
 from edgevpr.techniques.card import describe_weights
 
@@ -99,7 +99,7 @@ def iterate_silently(items: Iterable[Any], total: int, label: str) -> Iterable[A
 
 
 def answer_queries(
-    technique: Technique, dataset: Dataset, options: MatchOptions, progress: Progress, gate: Gate | None = None
+    technique: Technique, dataset: Dataset, options: MatchOptions, progress: Progress, gate: SalienceGate | None = None
 ) -> tuple[list[QueryAnswer], tuple[str, ...]]:
     """Map the references of `dataset` in a temporary file, and ask every query. Return one judged answer for each that
     is scored, and what could not be done to the map (see `open_temporary_map`). `gate` discards queries that are not
@@ -131,7 +131,7 @@ def answer_queries(
         # One query is not counted: the first pays for lazy imports and a cold disk.
         _recognise(open_recogniser(1, False), paths[0], _NO_TAG)
         if gate:
-            gate.forget()
+            gate.reset()
         if sequence > 1 or follows:  # queries that are not scored are part of a sequence too
             paths = list_images(paths[0].parent)
         recogniser, answers = open_recogniser(sequence, follows), []
@@ -258,7 +258,7 @@ def _recognise(recogniser: Recogniser, path: Path, tag: GeoTag) -> Recognition:
 def _judge(event: Recognition, query: ScoredQuery, references: Sequence[str], index: PlaceIndex) -> QueryAnswer:
     """Judge the recognition of `query`. `references` are the names of all places, in the order of mapping, which is
     that of the slots of the index."""
-    discarded = event.worth is not None and event.worth.reason is not None
+    discarded = event.salience is not None and event.salience.reason is not None
     ranking = None if discarded else event.ranking
     slots = ranking.slots if ranking else np.empty(0, np.intp)
     right, ignored = (np.array([name in names for name in references]) for names in (query.right, query.ignored))

@@ -74,7 +74,7 @@ INERTIAL_PX4 = replace(INERTIAL, attitude_follows_positions=True)
 
 @dataclass(frozen=True, slots=True)
 class OdometryMeasurement:
-    """A stride (see `recognise.stride`): by `moved_m` (2,), which exceeds the motion of the path by `off_m` (2,).
+    """A stride (see `recognise.odometry`): by `moved_m` (2,), which exceeds the motion of the path by `off_m` (2,).
     `sd_m` is the standard deviation of each axis."""
 
     moved_m: Doubles

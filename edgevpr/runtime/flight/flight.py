@@ -218,7 +218,7 @@ class Flight:
         """Return True if a frame for visual odometry is due: between rare queries, without GPS. The pictures of a
         recording are all queries."""
         parts = self._parts
-        if parts.autopilot is None or not parts.source.is_live or not parts.recogniser.measures_strides:
+        if parts.autopilot is None or not parts.source.is_live or not parts.recogniser.measures_motion:
             return False
         return not self._commands.is_paused and self._pace.is_odometry_due() and parts.autopilot.needs_motion_frames()
 

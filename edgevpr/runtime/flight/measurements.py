@@ -11,9 +11,9 @@ from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.types import FRAME_TIME_SD_S, Position, Vehicle
 from edgevpr.runtime.flight.drift import GRAVITY_M_S2
 from edgevpr.runtime.recognise.locate import covariance_matrix
+from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.perspective import AttitudeError
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.stride import Stride
 
 # Standard deviation of a reported attitude, as a tangent: half a degree. The watch over GPS allows for twice as much:
 # its false alarm costs an aircraft its GPS, and matches in a row share the error of one turn. A filter averages over
@@ -31,14 +31,14 @@ _MAX_TURN_DEG = 45.0  # so far a compass does not turn from one fix to the next
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameMeasurement:
     """A frame taken at `t_s`. `sd_m` is the standard deviation, of each axis, by which its picture puts the aircraft
-    wrongly, beside what `lean_s2` says that an error of the attitude does (see `DriftFilter`). `stride` is the motion
+    wrongly, beside what `lean_s2` says that an error of the attitude does (see `DriftFilter`). `odometry` is the motion
     since the frame before (None: unknown), whose scale is wrong by `scale_sd` where heights contradict each other.
     `alike_m` is how far apart pictures are whose fixes do not err alike."""
 
     t_s: float
     sd_m: float
     lean_s2: float = 0.0
-    stride: Stride | None = None
+    odometry: OdometryStep | None = None
     scale_sd: float = 0.0
     alike_m: float = 0.0
 
@@ -102,7 +102,7 @@ def measure_frame(
         t_s=event.frame.t_mono_s,
         sd_m=sd_m,
         lean_s2=0.0 if is_unmoved else height_m / GRAVITY_M_S2,
-        stride=event.stride.scale(height_ratio) if event.stride and is_correctable else None,
+        odometry=event.odometry.scale(height_ratio) if event.odometry and is_correctable else None,
         scale_sd=max(abs(height_ratio - 1.0), height_ratio_sd),
         alike_m=_CORRELATED_SHARE * (event.view.footprint_m or 0.0),
     )

@@ -216,7 +216,7 @@ class Navigation:
             return
         if turn_deg is not None:
             self._filter.correct_by_turn(math.radians(turn_deg))
-        stride, strode = frame.stride, None
+        stride, strode = frame.odometry, None
         if stride and before and before.t_s == stride.from_s:
             moved_m = np.array(stride.moved_m)
             strode = OdometryMeasurement(moved_m, moved_m - (there.position_m - before.position_m), stride.sd_m)
@@ -257,7 +257,7 @@ class Navigation:
         at_m, before_m = fix.path_m + fix.off_m, self._fixed_m
         self._fixed_m = at_m
         alike_m = fix.seen.frame.alike_m
-        if fix.seen.frame.stride is None or before_m is None or alike_m == 0:
+        if fix.seen.frame.odometry is None or before_m is None or alike_m == 0:
             return 1.0
         away_m = float(np.hypot(*(at_m - before_m)))
         return max(1.0, alike_m / max(away_m, alike_m / _MAX_ALIKE))

@@ -42,7 +42,7 @@ def open_map(config: Config, io: FlightIO) -> Recogniser:
         memory_mb=io.machine.rss_mb,
     )
     config = replace(config, map=io.place_map)
-    return open_recogniser(config, io.board, narrowed=True, follows=config.match.follow, meter=meter)
+    return open_recogniser(config, io.board, uses_hints=True, tracks_flight=config.match.follow, meter=meter)
 
 
 def apply_recorded_rate(source: SourceConfig, steps_s: Sequence[float]) -> SourceConfig:

@@ -116,7 +116,7 @@ class MapCoverageWatch:
             if self._accepted >= _MIN_TO_RETURN:
                 self._map.update(False)
             return
-        if event.failed or event.says_nothing or event.view.reason or (event.worth and event.worth.reason):
+        if event.failed or event.says_nothing or event.view.reason or (event.salience and event.salience.reason):
             return
         self._misses += 1
         is_lost = event.followed is not None and event.followed.lost >= _LOST_PROBABILITY

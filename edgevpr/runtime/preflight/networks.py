@@ -45,7 +45,7 @@ def try_network(card: Card) -> None:
     if card.outputs.boxes:
         Detector(card).is_static(frame)
     if card.outputs.memorability:
-        Memorability(card).matrix(frame)
+        Memorability(card).compute_matrix(frame)
 
 
 def _check_model(name: str) -> ModelEntry:

@@ -22,29 +22,31 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles, Ints
 
-_MAX_HYPOTHESES = 64  # hypotheses kept
+_MAX_HYPOTHESES = 64
 # Chances between two queries to leave the map, to be anywhere on it, and to enter it. The odds for a history are at
 # most 1 to the sum of the first two.
-_LEAVES, _JUMPS, _ENTERS = 0.01, 0.01, 0.02
-_MISSED = 0.2  # how likely a query misses the place below it, relative to one over ground that is not in the map
-_ALIKE = 0.1  # how likely ground outside the map, once taken for a place, resembles the next places as well
+_LEAVE_CHANCE = 0.01
+_JUMP_CHANCE = 0.01
+_ENTER_CHANCE = 0.02
+_MISS_LIKELIHOOD = 0.2  # of a query that misses the place below it, over that of one off the map
+_RESEMBLANCE = 0.1  # how likely ground outside the map, once taken for a place, resembles the next places as well
 _MIN_REST = 1e-4  # least probability that no candidate is right
 _STEADY = 0.75  # probability of going on as before
 _STEADY_SD = 0.5  # in spacings of the map
-# Of moving by odometry, which comes first, as an autopilot reports it or as the camera sees it: the probability, and
-# the standard deviation in spacings and as a share of the length.
-_REPORTED = (0.6, 0.25, 0.15)
-_SEEN = (0.98, 0.05, 0.05)
+# Of odometry, as an autopilot reports it and as the camera measures it: the probability that it holds, and its
+# standard deviation in spacings and as a share of the length.
+_REPORTED_ODOMETRY = (0.6, 0.25, 0.15)
+_VISUAL_ODOMETRY = (0.98, 0.05, 0.05)
 _REACH_SD = 1.5  # the reach in standard deviations
 _NEWEST_WEIGHT = 0.2  # weight of the newest displacement in the mean velocity
 _SAME_POSITION_SD = 2.0  # standard deviations of a position: a shorter displacement may be none
 _MIN_WEIGHT = 1e-9  # a hypothesis of less weight is dropped
-_LEAST = 1e-300  # instead of zero, where a number divides
+_MIN_DIVISOR = 1e-300  # instead of zero, where a number divides
 _ROUNDING = 1e-12  # relative error of the difference of two squares
 _MIN_VARIANCE_RATIO = 1e-6  # least ratio of the variances along both axes of a covariance that can be inverted
 _MAX_DISTANCE = 1e8  # metres or places: farther than any two points on the Earth
 _MIN_SD = 0.25  # least standard deviation of a position, in spacings of the map
-_FLAT = 1 / (2 * np.pi)  # variance of a Gaussian with the density 1 in its middle, for the second axis of ordinal maps
+_UNIT_VARIANCE = 1 / (2 * np.pi)  # of a Gaussian with the density 1 in its middle: second axis of ordinal maps
 DEFAULT_MAX_SPEED_M_S = 30.0  # unless the configuration says another speed
 
 
@@ -83,8 +85,8 @@ class _Hypotheses:
 
 
 @dataclass(frozen=True, slots=True)
-class _Way:
-    """One way in which each of M hypotheses can have moved: its probability `share` (M,), and the new position `at`
+class _Move:
+    """One motion that each of M hypotheses can have made: its probability `share` (M,), and the new position `at`
     (M, 2) with its `covariance` (M, 2, 2). The density is nowhere below `least`."""
 
     share: Doubles
@@ -148,20 +150,20 @@ class Belief:
         """Update the belief with the candidates that a query proposes (None: its picture shows too little; those that
         are not finite do not count), the motion since the previous query, and the number of places in the map now."""
         odds = (1 - self._lost) / max(self._lost, _MIN_WEIGHT)
-        now, lost, appears = self._leave()
-        ways = self._ways(now, motion, places)
+        now, lost, appears = self._apply_transitions()
+        moves = self._predict_motions(now, motion, places)
         p = np.zeros(0 if proposed is None else len(proposed.p))
         numbers: Ints = np.zeros(0, int)
         if proposed is None:
             lost += appears  # whoever enters the map now is at an unknown place
-            after = _keep_unseen(now, ways, 1.0)
+            after = _keep_unseen(now, moves, 1.0)
         else:
-            self._enters = _ENTERS
-            numbers, proposed = _usable(proposed, self._scale)
-            there, alike, staleness, left = self._credit(proposed, now, ways, motion.elapsed_s, appears, places)
+            self._enters = _ENTER_CHANCE
+            numbers, proposed = _select_usable(proposed, self._scale)
+            there, alike, staleness, left = self._weigh(proposed, now, moves, motion.elapsed_s, appears, places)
             lost *= alike
             # Of a miss, too, pictures of the same ground are no new evidence.
-            unseen = _keep_unseen(now, ways, _MISSED ** motion.share_of_new_ground(self._scale.spacing))
+            unseen = _keep_unseen(now, moves, _MISS_LIKELIHOOD ** motion.share_of_new_ground(self._scale.spacing))
             # A lost aircraft that sees the same ground again has not moved either, so staying is no evidence for it.
             kept = (left * odds * lost - float(unseen.w.sum())) / max(float(there.w.sum()), _MIN_WEIGHT)
             there = replace(there, w=there.w * max(1.0, kept) ** staleness)
@@ -172,46 +174,52 @@ class Belief:
         strongest = np.argsort(-share, kind="stable")[:_MAX_HYPOTHESES]
         self._now = replace(after, w=share)[strongest[share[strongest] > _MIN_WEIGHT]]
         self._lost = max(0.0, 1 - float(self._now.w.sum()))
-        return self._posterior(p)
+        return self._make_posterior(p)
 
-    def _leave(self) -> tuple[_Hypotheses, float, float]:
+    def _apply_transitions(self) -> tuple[_Hypotheses, float, float]:
         """Return the hypotheses after the chances of leaving, entering and jumping between two queries, the probability
         of being lost, and that of having entered or jumped to any place."""
         held = float(self._now.w.sum())
-        lost = (1 - self._enters) * self._lost + _LEAVES * held
-        stays = 1 - _LEAVES - _JUMPS
-        leaked = max(0.0, math.log(max(lost, _LEAST) / max(stays * self._lost, _LEAST)))
+        lost = (1 - self._enters) * self._lost + _LEAVE_CHANCE * held
+        stays = 1 - _LEAVE_CHANCE - _JUMP_CHANCE
+        leaked = max(0.0, math.log(max(lost, _MIN_DIVISOR) / max(stays * self._lost, _MIN_DIVISOR)))
         self._strongest = max(0.0, self._strongest - leaked)
         credited = np.maximum(self._now.credited - leaked, 0)
         now = replace(self._now, w=stays * self._now.w, credited=credited)
-        return now, lost, self._enters * self._lost + _JUMPS * held
+        return now, lost, self._enters * self._lost + _JUMP_CHANCE * held
 
-    def _ways(self, now: _Hypotheses, motion: Motion, places: int) -> list[_Way]:
-        """Return the ways in which each hypothesis can have moved: by odometry, on as before, or anywhere in reach."""
-        scale, ways = self._scale, []
+    def _predict_motions(self, now: _Hypotheses, motion: Motion, places: int) -> list[_Move]:
+        """Return the motions that each hypothesis can have made: by odometry, on as before, or anywhere in reach."""
+        scale, moves = self._scale, []
         area = places * scale.cell
         widest = area / 2 if scale.is_ordinal else math.sqrt(area / math.pi)
         is_everywhere = not motion.reach < widest
         reach = widest if is_everywhere else motion.reach
         is_going = ~np.isnan(now.velocity[:, 0])
         ahead = np.where(is_going[:, None], now.velocity, 0) * motion.elapsed_s
-        ahead *= (motion.reach / np.maximum(np.hypot(*ahead.T), max(motion.reach, _LEAST)))[:, None]
+        ahead *= (motion.reach / np.maximum(np.hypot(*ahead.T), max(motion.reach, _MIN_DIVISOR)))[:, None]
         left, middle, sd = np.ones(len(now.w)), np.zeros(2), max(reach / _REACH_SD, _STEADY_SD * scale.spacing)
         if motion.by is not None:
-            share, least_sd, of_length = _SEEN if motion.is_seen else _REPORTED
+            share, least_sd, of_length = _VISUAL_ODOMETRY if motion.is_seen else _REPORTED_ODOMETRY
             spread = (of_length**2 * motion.by @ motion.by + (least_sd * scale.spacing) ** 2) * np.eye(2)
-            ways.append(_Way(share * left, now.at + motion.by, now.covariance + spread))
+            moves.append(_Move(share * left, now.at + motion.by, now.covariance + spread))
             # Odometry that is wrong by a factor of two is wrong by as much as its length.
             left, middle, sd = (1 - share) * left, motion.by, min(sd, scale.spacing + math.hypot(*motion.by))
         variance = (_STEADY_SD * scale.spacing) ** 2 + (_STEADY_SD * np.hypot(*ahead.T)) ** 2 / 2
         going = now.covariance + variance[:, None, None] * np.eye(2)
-        ways.append(_Way(_STEADY * is_going * left, now.at + ahead, going))
+        moves.append(_Move(_STEADY * is_going * left, now.at + ahead, going))
         anywhere = now.covariance + sd**2 * np.eye(2)
-        ways.append(_Way((1 - _STEADY * is_going) * left, now.at + middle, anywhere, is_everywhere / area))
-        return ways
+        moves.append(_Move((1 - _STEADY * is_going) * left, now.at + middle, anywhere, is_everywhere / area))
+        return moves
 
-    def _credit(
-        self, proposed: Proposals, now: _Hypotheses, ways: list[_Way], elapsed_s: float, appears: float, places: int
+    def _weigh(
+        self,
+        proposed: Proposals,
+        now: _Hypotheses,
+        moves: list[_Move],
+        elapsed_s: float,
+        appears: float,
+        places: int,
     ) -> tuple[_Hypotheses, float, float, float]:
         """Weigh the candidates by the hypotheses that can have moved to them. Returns
 
@@ -222,29 +230,29 @@ class Belief:
         """
         scale, at, of_step = self._scale, proposed.at, proposed.covariance
         rest = max(_MIN_REST, 1 - float(proposed.p.sum()))
-        ratio = np.log(np.maximum(proposed.p, _LEAST) * places / rest)
+        ratio = np.log(np.maximum(proposed.p, _MIN_DIVISOR) * places / rest)
         born = appears / places * np.exp(ratio)
 
         # A picture of the same ground repeats the evidence of the one before. This holds for a lost aircraft as well.
         strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
         same, self._strongest = min(before, strongest), strongest
         scatter = np.sqrt(of_step[:, 0, 0] if scale.is_ordinal else np.trace(of_step, axis1=1, axis2=2) / 2)
-        fresh = np.clip((_distances_m(now.anchor, at) - _SAME_POSITION_SD * scatter) / scale.spacing, 0, 1)
+        fresh = np.clip((_compute_distances(now.anchor, at) - _SAME_POSITION_SD * scatter) / scale.spacing, 0, 1)
         evidence = np.exp(ratio + (1 - fresh) * (same - now.credited[:, None])) * (scale.cell * now.w[:, None])
-        led = [way.share[:, None] * evidence * _density(way, at, of_step, scale.is_ordinal) for way in ways]
+        led = [move.share[:, None] * evidence * _compute_density(move, at, of_step, scale.is_ordinal) for move in moves]
         weight = sum(each.sum(0) for each in led)  # of the hypotheses that lead to each candidate
-        by = sum(led) / np.maximum(weight, _LEAST)
+        by = sum(led) / np.maximum(weight, _MIN_DIVISOR)
         stale = by * (1 - fresh)
-        staleness = float(weight @ stale.sum(0)) / max(_LEAST, float((weight + born).sum()))
+        staleness = float(weight @ stale.sum(0)) / max(_MIN_DIVISOR, float((weight + born).sum()))
         newest = float(ratio[stale.sum(0) > 0.5].max(initial=-math.inf))
         left = math.exp(min(0.0, newest - before))
-        agreement = float(weight.sum()) * rest / max(_LEAST, float(now.w.sum() * proposed.p.sum()))
-        alike = (1 - _ALIKE + _ALIKE * agreement) ** (1 - staleness) if len(now.w) else 1.0
+        agreement = float(weight.sum()) * rest / max(_MIN_DIVISOR, float(now.w.sum() * proposed.p.sum()))
+        alike = (1 - _RESEMBLANCE + _RESEMBLANCE * agreement) ** (1 - staleness) if len(now.w) else 1.0
 
         at_before, of_before = _mix_gaussians(
-            np.concatenate(led).T / np.maximum(weight, _LEAST)[:, None],
-            np.concatenate([way.at for way in ways]),
-            np.concatenate([way.covariance for way in ways]),
+            np.concatenate(led).T / np.maximum(weight, _MIN_DIVISOR)[:, None],
+            np.concatenate([move.at for move in moves]),
+            np.concatenate([move.covariance for move in moves]),
         )
         at_both, of_both = _fuse(at, of_step, at_before, of_before)
         learns = np.where(np.isnan(now.velocity[:, :1]), 1.0, _NEWEST_WEIGHT)
@@ -263,12 +271,12 @@ class Belief:
         )
         return there, alike, staleness, left
 
-    def _posterior(self, p: Doubles) -> Posterior:
+    def _make_posterior(self, p: Doubles) -> Posterior:
         """Return the belief with an estimate: the mean of the hypotheses around the one with most weight near it."""
         now = self._now
         if not len(now.w):
             return Posterior(lost=self._lost, p=p)
-        is_near = _distances_m(now.at, now.at) <= self._scale.near
+        is_near = _compute_distances(now.at, now.at) <= self._scale.near
         there = is_near[(is_near @ now.w).argmax()]
         mass = float(now.w[there].sum())
         share = now.w[there] / mass
@@ -278,35 +286,35 @@ class Belief:
         return Posterior(lost=self._lost, p=p, mass=mass, at=at, covariance=covariance, heading_deg=heading_deg)
 
 
-def _keep_unseen(now: _Hypotheses, ways: list[_Way], chance: float) -> _Hypotheses:
+def _keep_unseen(now: _Hypotheses, moves: list[_Move], chance: float) -> _Hypotheses:
     """Return the hypotheses after their motion, if the query proposes none of them: `w` times this `chance`."""
-    share = np.stack([way.share for way in ways], 1)[..., None]
-    at = np.stack([way.at for way in ways], 1)
-    covariance = np.stack([way.covariance for way in ways], 1)
+    share = np.stack([move.share for move in moves], 1)[..., None]
+    at = np.stack([move.at for move in moves], 1)
+    covariance = np.stack([move.covariance for move in moves], 1)
     mean = (share * at).sum(1)
     off = at - mean[:, None]
     spread = (share[..., None] * (covariance + off[..., :, None] * off[..., None, :])).sum(1)
     return replace(now, w=chance * now.w, at=mean, covariance=spread)
 
 
-def _distances_m(one: Doubles, other: Doubles) -> Doubles:
+def _compute_distances(one: Doubles, other: Doubles) -> Doubles:
     """Return the distance between each of `one` (M, 2) and each of `other` (K, 2): (M, K)."""
     return np.asarray(np.sqrt(((one[:, None] - other) ** 2).sum(2)))
 
 
-def _density(way: _Way, at: Doubles, covariance: Doubles, is_ordinal: bool) -> Doubles:
-    """Return the density (M, K) at positions `at` (K, 2) with `covariance` (K, 2, 2), if M hypotheses move by `way`."""
-    xx, xy, yy = (way.covariance[:, None, i, j] + covariance[None, :, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    dx, dy = (at[None, :, i] - way.at[:, None, i] for i in (0, 1))
+def _compute_density(move: _Move, at: Doubles, covariance: Doubles, is_ordinal: bool) -> Doubles:
+    """Return the density (M, K) at positions `at` (K, 2) with `covariance` (K, 2, 2), after M hypotheses have moved."""
+    xx, xy, yy = (move.covariance[:, None, i, j] + covariance[None, :, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    dx, dy = (at[None, :, i] - move.at[:, None, i] for i in (0, 1))
     if is_ordinal:
-        xy, yy, dy = np.zeros(()), np.full((), _FLAT), np.zeros(())
+        xy, yy, dy = np.zeros(()), np.full((), _UNIT_VARIANCE), np.zeros(())
     determinant = np.maximum(xx * yy - xy * xy, _MIN_VARIANCE_RATIO * xx * yy)
     squared = (yy * (dx * dx) - 2 * xy * (dx * dy) + xx * (dy * dy)) / determinant
     gaussian: Doubles = np.exp(-np.maximum(squared, 0) / 2) / (2 * np.pi * np.sqrt(determinant))
-    return np.maximum(gaussian, way.least)
+    return np.maximum(gaussian, move.least)
 
 
-def _firm(covariance: Doubles, least: float) -> Doubles:
+def _regularize(covariance: Doubles, least: float) -> Doubles:
     """Make covariances (K, 2, 2) invertible: add the variance `least`, and a small share of their own, to each axis."""
     more: Doubles = least + _MIN_VARIANCE_RATIO * np.abs(np.trace(covariance, axis1=1, axis2=2))
     return covariance + more[:, None, None] * np.eye(2)
@@ -330,10 +338,10 @@ def _mix_gaussians(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Do
     second = covariance + off[:, :, None] * off[:, None]
     mean = share @ off
     spread = (share @ second.reshape(-1, 4)).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None]
-    return middle + mean, _firm(spread, _ROUNDING * float(np.abs(second).max(initial=1)))
+    return middle + mean, _regularize(spread, _ROUNDING * float(np.abs(second).max(initial=1)))
 
 
-def _usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposals]:
+def _select_usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposals]:
     """Return the indices of the likeliest finite proposals, and these, made invertible and with a sum of 1 at most."""
     is_near = (np.abs(proposed.at) < _MAX_DISTANCE).all(1) & (np.abs(proposed.covariance) < _MAX_DISTANCE**2).all(
         (1, 2)
@@ -344,6 +352,6 @@ def _usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposals]:
     return numbers, Proposals(
         p=p / max(1.0, float(p.sum())),
         at=proposed.at[numbers],
-        covariance=_firm(proposed.covariance[numbers], (_MIN_SD * scale.spacing) ** 2),
+        covariance=_regularize(proposed.covariance[numbers], (_MIN_SD * scale.spacing) ** 2),
         heading_deg=proposed.heading_deg[numbers],
     )

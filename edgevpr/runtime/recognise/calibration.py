@@ -10,11 +10,11 @@ from typing import Any
 
 from edgevpr.core.errors import MapError
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.confidence import Model, select_model
-from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE, LookAlike, LookAlikes
+from edgevpr.runtime.recognise.confidence import Model, parse_model
+from edgevpr.runtime.recognise.evidence import MAP_FIGURES, PLACE_FIGURES, LookAlike, LookAlikes
 
 MIN_PLACES = 30  # a map with fewer is not calibrated
-_MIN_RECOGNISABLE = 0.5  # mean confidence below which a place is hardly recognisable
+_MIN_CONFIDENCE = 0.5  # mean confidence below which a place is hardly recognisable
 _CHECKSUM_DIGITS = 8
 
 _log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ class MapCalibration:
     @property
     def hardly_recognisable(self) -> float:
         """Share of the tested places that are hardly recognisable."""
-        return sum(each < _MIN_RECOGNISABLE for each in self.recognisable.values()) / max(len(self.recognisable), 1)
+        return sum(each < _MIN_CONFIDENCE for each in self.recognisable.values()) / max(len(self.recognisable), 1)
 
     @property
     def looks_alike(self) -> bool:
@@ -72,7 +72,7 @@ class MapCalibration:
 def require_usable(kind: str, model: Model) -> None:
     """Check a model read from a map. Raises ValueError for an unknown kind or name of evidence, as another version of
     edgevpr may have, and ValueError or ArithmeticError for figures with which no confidence can be computed."""
-    known = OF_MAP.get(kind, ()) + OF_PLACE.get(kind, ())
+    known = MAP_FIGURES.get(kind, ()) + PLACE_FIGURES.get(kind, ())
     names = {name for each in (model.of_map, model.of_place) for name in each.names}
     if unknown := names.difference(known):
         raise ValueError(f"there is no evidence {min(unknown)!r:.40} of kind {kind!r:.40}")
@@ -100,14 +100,14 @@ def read_calibration_for(place_map: PlaceMap) -> MapCalibration | None:
     return found
 
 
-def not_calibrated(places: int) -> str:
+def explain_not_calibrated(places: int) -> str:
     """Return a sentence for a map with so many places: it is not calibrated, and why."""
     if places < MIN_PLACES:
         return f"not calibrated ({places} places: fewer than {MIN_PLACES}): the shipped confidence is used"
     return "not calibrated: the shipped confidence is used; `edgevpr map calibrate` makes its own of its pictures"
 
 
-def calibration_text(calibration: MapCalibration) -> str:
+def format_calibration(calibration: MapCalibration) -> str:
     """Write a calibration as text for `read_calibration`: the CRC-32 of the JSON that follows, then the JSON."""
     body = json.dumps(asdict(calibration))
     return _checksum(body) + body
@@ -120,7 +120,7 @@ def read_calibration(text: str) -> MapCalibration:
     if text != _checksum(body) + body:
         raise ValueError("its checksum is wrong")
     found = json.loads(body)
-    found["models"] = {kind: select_model(model) for kind, model in found["models"].items()}
+    found["models"] = {kind: parse_model(model) for kind, model in found["models"].items()}
     found["recognisable"] = {int(place_id): each for place_id, each in found["recognisable"].items()}
     if (alike := found.get("look_alikes")) is not None:
         places = {int(place_id): LookAlike(**each) for place_id, each in alike["places"].items()}

@@ -24,18 +24,19 @@ from edgevpr.core.files import find_shipped, read_file
 Figures = Mapping[str, float]  # the figures of the evidence of a match, by their names
 
 _MAX_FILE_BYTES = 100_000
-_MOST = 40.0  # limit of a logit: beyond it, a probability is 0 or 1 in float64
+_MAX_LOGIT = 40.0  # limit of a logit: beyond it, a probability is 0 or 1 in float64
 # Factors to the share of matches that may be wrong: a chance is an estimate. Without them one tunnel of nordland_tiny
 # was taken for another, and a foreign picture for a place of aerial_swindale; and where a model is not adapted to its
 # map, foreign pictures for places of grief_michigan_monthly, of which there are five.
-_ADAPTED, _NOT_ADAPTED = 0.5, 0.1
+_ADAPTED_FACTOR = 0.5
+_SHIPPED_FACTOR = 0.1
 # Matches that a model was fitted to, where a map was calibrated before they were stored.
 _UNKNOWN_MATCHES = 1000
-_LEAST = 1e-15  # least chance, so that its logarithm exists
+_MIN_CHANCE = 1e-15  # least chance, so that its logarithm exists
 # Power of the share of rotations tried, as a factor of a chance: 1 if rotations were independent, but streets and
 # furrows have directions. Of 2,015 foreign and mirrored pictures, asked with random headings in the maps of sat_marash
 # and aerial_garfield28, 3 had a chance below 1 % without this factor, and 12 one below 30 %.
-_OF_ROTATIONS = 2 / 3
+_ROTATIONS_EXPONENT = 2 / 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ class Tail:
     share: float
     scale: float
 
-    def beyond(self, logit: float) -> float:
+    def compute_exceedance(self, logit: float) -> float:
         """Return the share of all matches that are wrong and have a logit above this one; 1 at most."""
         return math.exp(min(0.0, math.log(self.share) + (self.start - logit) / self.scale))
 
@@ -81,8 +82,8 @@ class Scale:
 
     def confidence(self, chance: float) -> float:
         """Return the probability that a match is right, given its chance (see the module)."""
-        logit = self.offset - self.slope * math.log(max(chance, _LEAST))
-        return 1 / (1 + math.exp(-max(-_MOST, min(_MOST, logit))))
+        logit = self.offset - self.slope * math.log(max(chance, _MIN_CHANCE))
+        return 1 / (1 + math.exp(-max(-_MAX_LOGIT, min(_MAX_LOGIT, logit))))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,38 +108,38 @@ class Model:
         of_map, of_place = self.of_map.logit(evidence), self.of_place.logit(evidence)
         if not (math.isfinite(of_map) and math.isfinite(of_place)):
             return 1.0
-        chance = self.scale.off_map.beyond(of_map) + self.scale.off_place.beyond(of_place)
-        return min(1.0, chance * math.pow(evidence.get("tried", 1.0), _OF_ROTATIONS))
+        chance = self.scale.off_map.compute_exceedance(of_map) + self.scale.off_place.compute_exceedance(of_place)
+        return min(1.0, chance * math.pow(evidence.get("tried", 1.0), _ROTATIONS_EXPONENT))
 
     def confidence(self, evidence: Figures) -> float:
         """Return the probability that the match is right, 0..1."""
         return self.scale.confidence(self.chance(evidence))
 
     @property
-    def most_shown(self) -> float:
+    def max_reported(self) -> float:
         """Return the highest confidence that the data support: how seldom a match is wrong that none of so many was."""
         return 1 - 1 / max(self.matches, 1)
 
-    def confidence_of_map(self, evidence: Figures) -> float:
+    def map_confidence(self, evidence: Figures) -> float:
         """Return the probability, 0..1, that the query shows ground of the map, no matter which place."""
         logit = self.of_map.logit(evidence)
-        return self.scale.confidence(self.scale.off_map.beyond(logit) if math.isfinite(logit) else 1.0)
+        return self.scale.confidence(self.scale.off_map.compute_exceedance(logit) if math.isfinite(logit) else 1.0)
 
     def threshold(self, precision: float) -> float:
         """Return the confidence at and above which the share `precision` (below 1) of the matches is right. A model
         that is not adapted to its map does not know how alike places look there, so its threshold is higher."""
         wrong = 1 - precision
-        return self.scale.confidence(wrong * (_ADAPTED if self.adapted_scale is None else _NOT_ADAPTED))
+        return self.scale.confidence(wrong * (_ADAPTED_FACTOR if self.adapted_scale is None else _SHIPPED_FACTOR))
 
 
-def select_model(stored: Mapping[str, Any]) -> Model:
+def parse_model(stored: Mapping[str, Any]) -> Model:
     """Make a model from decoded JSON. Raises KeyError or TypeError for other contents, and ValueError for a model that
     was joined from those of several maps."""
     if stored.get("of_other_places"):  # earlier builds joined the models of several maps
         raise ValueError("it was joined from several maps")
     stored = {name: value for name, value in stored.items() if name != "of_other_places"}
-    scales = {name: stored[name] and _scale(**stored[name]) for name in ("scale", "adapted_scale")}
-    regressions = {name: _logistic(**stored[name]) for name in ("of_map", "of_place")}
+    scales = {name: stored[name] and _make_scale(**stored[name]) for name in ("scale", "adapted_scale")}
+    regressions = {name: _make_logistic(**stored[name]) for name in ("of_map", "of_place")}
     return Model(**{**stored, **regressions, **scales})
 
 
@@ -147,14 +148,14 @@ def prior(kind: str) -> Model:
     """Return the shipped model for a kind of evidence (see `evidence`). Raises ModelError if its file is unusable."""
     path = find_shipped("models") / f"confidence_{kind}.json"
     try:
-        return select_model(json.loads(read_file(path, _MAX_FILE_BYTES)))
+        return parse_model(json.loads(read_file(path, _MAX_FILE_BYTES)))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ModelError(f"{path} cannot be used ({error}): install edgevpr again.") from error
 
 
-def _logistic(names: list[str], weights: list[float], scales: list[float], bias: float) -> Logistic:
+def _make_logistic(names: list[str], weights: list[float], scales: list[float], bias: float) -> Logistic:
     return Logistic(tuple(names), tuple(weights), tuple(scales), bias)
 
 
-def _scale(off_map: dict[str, float], off_place: dict[str, float], slope: float, offset: float) -> Scale:
+def _make_scale(off_map: dict[str, float], off_place: dict[str, float], slope: float, offset: float) -> Scale:
     return Scale(Tail(**off_map), Tail(**off_place), slope, offset)

@@ -28,7 +28,7 @@ from edgevpr.places.retrieve import (
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.agreement import (
-    CONFIRMED,
+    MIN_CONFIRMED_INLIERS,
     Agreement,
     Overlay,
     compare_near,
@@ -42,8 +42,8 @@ from edgevpr.runtime.recognise.evidence import (
     count_neighbours,
     gather_evidence,
     log_count,
+    log_inlier_ratio,
     log_share,
-    log_times_more,
 )
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.runtime.recognise.judge import (
@@ -53,16 +53,16 @@ from edgevpr.runtime.recognise.judge import (
     is_at_rest,
     judge,
 )
-from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, Landmarks, unpack_bytes
-from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, allow_for_tilt, locate, locate_at_place
+from edgevpr.runtime.recognise.landmarks import PLACE_LANDMARKS, QUERY_LANDMARKS, Landmarks, unpack_bytes
+from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, add_tilt_covariance, locate, locate_at_place
 from edgevpr.runtime.recognise.perspective import ShownTilt, convert_to_tilt
-from edgevpr.runtime.recognise.place_filter import Followed, PlaceFilter
+from edgevpr.runtime.recognise.place_filter import PlaceFilter, TrackEstimate
 from edgevpr.runtime.recognise.tilted import measure_again
 
 _MAX_SAME_GROUND = 12  # places that may show the same ground: so many overlap on kite_ochota, which has no positions
 # Of the votes of the best place, those that a place elsewhere has at rest: behind a display or figures nearly all have
 # 0.15 to 0.9 of them, on smooth ground some are at rest by chance with up to 0.065.
-_LIKE_AT_REST = 0.15
+_MIN_REST_VOTES_SHARE = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +100,8 @@ class Verifier:
     @cached_property
     def landmarks(self) -> Landmarks:
         """Landmarks of the query."""
-        return self._encoder.detect_landmarks(self._picture, OF_QUERY if self._spec.looks_down else OF_QUERY // 2)
+        count = QUERY_LANDMARKS if self._spec.looks_down else QUERY_LANDMARKS // 2
+        return self._encoder.detect_landmarks(self._picture, count)
 
     def compare_best(self, ranking: Ranking) -> Agreement | None:
         """Compare the landmarks of the query with those of the best place, expected to agree on the overlay that its
@@ -131,7 +132,7 @@ class Verifier:
         if not len(away):
             return 0
         expected, known = self._place(ranking, int(away[0]))
-        return OF_PLACE if known is None else measure_agreement(self.landmarks, known, expected).inliers
+        return PLACE_LANDMARKS if known is None else measure_agreement(self.landmarks, known, expected).inliers
 
     def find_same_ground(self, ranking: Ranking) -> tuple[int, ...]:
         """Of the best few places compared, return the numbers of those that show the same ground as the best one: the
@@ -149,7 +150,7 @@ class Verifier:
             for place_id, (other, landmarks) in others.items()
             if other
             and landmarks
-            and measure_agreement(known, landmarks, compose_overlays(expected, other)).inliers >= CONFIRMED
+            and measure_agreement(known, landmarks, compose_overlays(expected, other)).inliers >= MIN_CONFIRMED_INLIERS
         )
 
     def _place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
@@ -191,7 +192,7 @@ class Decision:
     best: Candidate | None = None
     findings: Findings | None = None
     confidence: float | None = None
-    followed: Followed | None = None
+    followed: TrackEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -225,10 +226,10 @@ class Decider:
         if place_filter and rule.sure and found.evidence:
             with self.meter.step("locate"):
                 followed = place_filter.update(ranking, index, found.evidence, rule.sure, found.where)
-            if followed.slot is not None and followed.leads_from(int(ranking.slots[0])):
+            if followed.slot is not None and followed.prefers_other(int(ranking.slots[0])):
                 ranking = ranking.promote(followed.slot)
                 best, found = self._examine(ranking, query, verifier)
-        found = replace(found, by_flight=followed.confidence if followed else None)
+        found = replace(found, track_confidence=followed.confidence if followed else None)
         verdict = judge(found, index, rule, search)
         if verdict.accepted and self.technique.spec.looks_down and search is None:
             heading_deg = best.place.heading_deg
@@ -238,12 +239,12 @@ class Decider:
                 found,
                 # A recorded tilt is not refused for what a few regions show; the claim counts a contradiction.
                 tilt=None if query.view.is_tilt_known else tilt,
-                where=allow_for_tilt(found.where, tilt, query.view) if found.where else None,
+                where=add_tilt_covariance(found.where, tilt, query.view) if found.where else None,
                 at_rest_elsewhere=self._share_at_rest_elsewhere(best, ranking, query),
-                ahead_of_turned=None if is_heading_known else self._lead_over_turned(best, found.evidence, query),
+                lead_over_turned=None if is_heading_known else self._lead_over_turned(best, found.evidence, query),
             )
             verdict = judge(found, index, rule, search)
-        confidence = rule.sure.shown(found.evidence) if rule.sure and found.evidence else None
+        confidence = rule.sure.limit_confidence(found.evidence) if rule.sure and found.evidence else None
         return Decision(
             verdict=verdict, hints=hints, best=best, findings=found, confidence=confidence, followed=followed
         )
@@ -279,7 +280,7 @@ class Decider:
             with step("verify"):
                 inliers = verifier.count_inliers(ranking)
                 rival = verifier.count_rival(ranking, rule.neighbour_m, max_slots=count_neighbours(rule.look_alikes))
-            evidence = replace(evidence, proof=log_times_more(inliers, rival), landmarks=log_count(inliers))
+            evidence = replace(evidence, proof=log_inlier_ratio(inliers, rival), landmarks=log_count(inliers))
         if evidence and proof and evidence.is_hardly_ahead:
             with step("verify"):
                 rival = verifier.count_rival(ranking, rule.neighbour_m, same)
@@ -314,5 +315,5 @@ class Decider:
         with self.meter.step("compare"):
             query = self.make_query(encoded.descriptor, NO_EXPECTATION)
             matches = match_unmoved_places(query, int(ranking.slots[0]), self.accuracy_m)
-        least = _LIKE_AT_REST * compute_share(best)
+        least = _MIN_REST_VOTES_SHARE * compute_share(best)
         return sum(is_at_rest(match) and compute_share(match) >= least for match in matches) / max(len(matches), 1)

@@ -11,20 +11,27 @@ from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage, Mount, View, enlarge_image
 from edgevpr.frames.mask import OverlayMask
 from edgevpr.places.layers import Layers
-from edgevpr.runtime.recognise.landmarks import AHEAD_PX, DOWN_PX, OF_PLACE, Landmarks, describe, pack_bytes
-from edgevpr.runtime.recognise.levelling import Levelling, Straightening
-from edgevpr.runtime.recognise.salience_gate import Gate, Worth
+from edgevpr.runtime.recognise.landmarks import (
+    AHEAD_PX,
+    DOWN_PX,
+    PLACE_LANDMARKS,
+    Landmarks,
+    detect_landmarks,
+    pack_bytes,
+)
+from edgevpr.runtime.recognise.levelling import Levelling, Undistortion
+from edgevpr.runtime.recognise.salience_gate import SalienceGate, SalienceVerdict
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EncodedFrame:
     """A frame that was prepared and described. `vehicle`: the autopilot's report when it was taken (None: unknown).
-    `worth`: judgement of the salience gate (None: there is no gate)."""
+    `salience`: judgement of the salience gate (None: there is no gate)."""
 
     frame: Frame
     vehicle: Vehicle | None = None
     picture: LevelledImage
-    worth: Worth | None = None
+    salience: SalienceVerdict | None = None
     descriptor: Descriptor
 
     @property
@@ -39,9 +46,9 @@ class FrameEncoder:
     memorable (`gate`; None: each is not done), and describes it by the `technique`."""
 
     technique: Technique
-    levelling: Levelling | Straightening | None = None
+    levelling: Levelling | Undistortion | None = None
     mask: OverlayMask | None = None
-    gate: Gate | None = None
+    gate: SalienceGate | None = None
 
     def prepare(
         self, frame: Frame, vehicle: Vehicle | None = None, *, layers: Layers | None = None, scale: float = 1.0
@@ -66,25 +73,25 @@ class FrameEncoder:
         with metered("prepare"):
             picture = self.prepare(frame, vehicle, layers=layers, scale=scale)
         with metered("gate"):
-            worth = self.gate.judge(frame.image) if self.gate else None
+            salience = self.gate.judge(frame.image) if self.gate else None
         with metered("encode"):
             descriptor = self.technique.encode(picture.image, picture.mask)
-        return EncodedFrame(frame=frame, vehicle=vehicle, picture=picture, worth=worth, descriptor=descriptor)
+        return EncodedFrame(frame=frame, vehicle=vehicle, picture=picture, salience=salience, descriptor=descriptor)
 
-    def detect_landmarks(self, picture: LevelledImage, count: int = OF_PLACE) -> Landmarks:
+    def detect_landmarks(self, picture: LevelledImage, count: int = PLACE_LANDMARKS) -> Landmarks:
         """Find the `count` best landmarks of a picture, of the size at which those of places are found."""
         longest_px = DOWN_PX if self.technique.spec.looks_down else AHEAD_PX
-        return describe(picture.image, picture.mask, count, longest_px)
+        return detect_landmarks(picture.image, picture.mask, count, longest_px)
 
     def pack_landmarks(self, picture: LevelledImage) -> bytes | None:
         """Return the landmarks to store for a place; None if the technique has no use for them."""
         return pack_bytes(self.detect_landmarks(picture)) if self.technique.spec.cells else None
 
-    def with_mount(self, mount: Mount) -> "FrameEncoder":
+    def replace_mount(self, mount: Mount) -> "FrameEncoder":
         """Return the same for a camera that looks straight down but for `mount`."""
         if not isinstance(self.levelling, Levelling):
             return self
-        return replace(self, levelling=self.levelling.with_mount(mount))
+        return replace(self, levelling=self.levelling.replace_mount(mount))
 
 
 def explain_failure(error: Exception | None) -> Reason:

@@ -12,7 +12,7 @@ match, but for `rank_gap`.
 * likeness: `Support.likeness` (ahead)
 * rank_gap: mean logarithm of the rank of the regions (see `Support`), minus the least of all places compared (ahead)
 * landmarks: logarithm of one more than the number of landmarks that agree as expected (ahead, no model weighs it)
-* proof: what `log_times_more` returns, of the landmarks (ahead)
+* proof: what `log_inlier_ratio` returns, of the landmarks (ahead)
 * twin: agreement of the place, in the map, with the one that looks most like it (see `LookAlike`), minus that of
   pictures of its own ground; from 0 on the two are *twins* (ahead). No model weighs it, nor the next one
 * apart: `agree` minus the agreement of these two places (ahead, in a map of single views)
@@ -30,25 +30,28 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.retrieve import MAX_NEIGHBOUR_SLOTS, Ranking, outside_neighbourhood
 from edgevpr.runtime.recognise.agreement import Agreement
 
-AHEAD, AHEAD_PROVEN, DOWN, DOWN_BARE = "ahead", "ahead_proven", "down", "down_bare"
+AHEAD = "ahead"
+AHEAD_PROVEN = "ahead_proven"
+DOWN = "down"
+DOWN_BARE = "down_bare"
 _BARE = ("lead", "coverage", "structure")
 _LOOKING_DOWN = {DOWN: (*_BARE, "landmarks"), DOWN_BARE: _BARE}
 _MAP_AHEAD = ("coverage", "likeness", "structure")
 _PLACE_AHEAD = ("lead", "coverage", "rank_gap", "structure")
 # Names of the evidence that tells whether a query shows ground of the map, and which of its places.
-OF_MAP = {AHEAD: _MAP_AHEAD, AHEAD_PROVEN: _MAP_AHEAD, **_LOOKING_DOWN}
-OF_PLACE = {AHEAD: _PLACE_AHEAD, AHEAD_PROVEN: (*_PLACE_AHEAD, "proof"), **_LOOKING_DOWN}
+MAP_FIGURES = {AHEAD: _MAP_AHEAD, AHEAD_PROVEN: _MAP_AHEAD, **_LOOKING_DOWN}
+PLACE_FIGURES = {AHEAD: _PLACE_AHEAD, AHEAD_PROVEN: (*_PLACE_AHEAD, "proof"), **_LOOKING_DOWN}
 _MIN_SHARE = 1e-3  # so that its logarithm exists
 # So many landmarks agree with a place that only looks alike. Were fewer told apart, wrong matches would scatter more.
 INLIERS_BY_CHANCE = 8
 SHARE_BY_CHANCE = 0.07  # that pictures of foreign ground reach; stands for a place elsewhere if there is none
 # A place that leads by a smaller factor must be told by its landmarks from the best one elsewhere.
 SMALL_LEAD = math.log(1.5)
-_NO_LEAD = math.log(1.05)
+_MIN_LEAD = math.log(1.05)
 # Ahead, the most by which the regions of another place may rank better. Chosen on corridor, where one match was
 # accepted beside the right places.
 _MAX_RANK_GAP = 0.1
-_TWICE = math.log(2)
+_MIN_PROOF = math.log(2)
 # A place that has a twin must lead by this factor. Of thumbs_essex, the lift door of another floor, seen from where
 # this one was mapped, led by 2.
 _CLEAR_LEAD = math.log(4)
@@ -93,7 +96,7 @@ class Evidence:
     @property
     def leads(self) -> bool:
         """True if no place elsewhere agrees about as well, by the regions, the landmarks, and what the map knows."""
-        return self.lead >= _NO_LEAD and not self.has_twin
+        return self.lead >= _MIN_LEAD and not self.has_twin
 
     @property
     def needs_landmarks(self) -> bool:
@@ -106,7 +109,7 @@ class Evidence:
         if self.likeness is None:
             return False
         if self.is_hardly_ahead and (self.rank_gap or 0.0) > _MAX_RANK_GAP:
-            return (self.proof or 0.0) < _TWICE
+            return (self.proof or 0.0) < _MIN_PROOF
         if self.apart is not None:
             return self.apart < SMALL_LEAD and not self.proof
         return self.is_hardly_ahead and _to_count(self.landmarks or 0.0) <= INLIERS_BY_CHANCE
@@ -182,12 +185,12 @@ def gather_evidence(
         return None
     slots = np.array(list(matches))
     best = int(slots[0])
-    beside = count_neighbours(look_alikes)
-    away = frozenset(
-        slots[outside_neighbourhood(index, best, slots, neighbour_m, same if down else (), beside)].tolist()
+    neighbours = count_neighbours(look_alikes)
+    distant = frozenset(
+        slots[outside_neighbourhood(index, best, slots, neighbour_m, same if down else (), neighbours)].tolist()
     )
     agree = {slot: compute_share(match) for slot, match in matches.items()}
-    rivals = (agree[slot] for slot in away)
+    rivals = (agree[slot] for slot in distant)
     evidence = Evidence(
         agree=log_share(agree[best]),
         lead=log_share(agree[best]) - log_share(max(rivals, default=SHARE_BY_CHANCE)),
@@ -197,13 +200,14 @@ def gather_evidence(
     )
     if not down:
         least_rank = min(each.log_rank for each in support.values())
-        ahead = support[best]
-        evidence = replace(evidence, rank_gap=ahead.log_rank - least_rank, likeness=ahead.likeness, proof=0.0)
-        alike = look_alikes.places.get(int(index.place_ids[best])) if look_alikes else None
-        if look_alikes is None or alike is None:
+        best_support = support[best]
+        rank_gap, likeness = best_support.log_rank - least_rank, best_support.likeness
+        evidence = replace(evidence, rank_gap=rank_gap, likeness=likeness, proof=0.0)
+        look_alike = look_alikes.places.get(int(index.place_ids[best])) if look_alikes else None
+        if look_alikes is None or look_alike is None:
             return evidence
-        apart = None if look_alikes.overlap else evidence.agree - alike.agree
-        return replace(evidence, twin=alike.agree - alike.own, apart=apart)
+        apart = None if look_alikes.overlap else evidence.agree - look_alike.agree
+        return replace(evidence, twin=look_alike.agree - look_alike.own, apart=apart)
     if proof is None:
         return evidence
     return replace(evidence, landmarks=log_count(proof.inliers if proof.is_expected and not proof.is_at_rest else 0))
@@ -214,7 +218,7 @@ def count_neighbours(look_alikes: LookAlikes | None) -> int:
     return MAX_NEIGHBOUR_SLOTS if look_alikes is None or look_alikes.overlap else 0
 
 
-def log_times_more(inliers: int, rival: int) -> float:
+def log_inlier_ratio(inliers: int, rival: int) -> float:
     """Return the evidence of the landmarks, ahead, where `inliers` agree with those of the best place and `rival` with
     those of the best place elsewhere: the logarithm of how many times more agree than with the rival and by chance. It
     is 0 at least, so it never speaks against a match."""

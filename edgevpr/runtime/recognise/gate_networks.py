@@ -25,11 +25,11 @@ from edgevpr.techniques.session import compute_fill_shares, open_session, prepar
 
 _CAR_M = 4.5
 _CAR_PX = 24  # least length of a car on the input: small detectors find little that is smaller
-_LARGEST_M = 25.0  # no vehicle or boat that moves about is longer
+_MAX_MOVING_M = 25.0  # no vehicle or boat that moves about is longer
 _MAX_TILES = 4  # along each side; each tile is a run of the network
 _OVERLAP = 0.1  # of a tile's side, so that what lies across a border is whole in one of them
 CROPS = 5  # along each side; the thesis's C is 5x5
-_SEED = 7
+_TEST_SEED = 7
 _STRIDES_PX = (8, 16, 32)  # of the grids of yolox
 _MAX_LOG = 20.0  # of the side of a box in cells; the exponential of more would overflow
 
@@ -45,20 +45,20 @@ class Memorability:
             raise ModelError(f"{card.path} has no `outputs.memorability`: name the card of a network that has.")
         self.card, self._output = card, card.outputs.memorability
         self._session = open_session(card, threads)
-        self._takes_many = type(self._session.get_inputs()[0].shape[0]) is not int
-        self.matrix(np.random.default_rng(_SEED).integers(0, 256, (480, 640, 3), np.uint8))
+        self._has_batches = type(self._session.get_inputs()[0].shape[0]) is not int
+        self.compute_matrix(np.random.default_rng(_TEST_SEED).integers(0, 256, (480, 640, 3), np.uint8))
 
-    def matrix(self, image: Image) -> Singles:
+    def compute_matrix(self, image: Image) -> Singles:
         """Compute the memorability of each crop of uint8 (H, W[, 3]): float32 (5, 5) in 0..1, the M of thesis 3.2.1.
 
         Raises ModelError for numbers that are not finite, or are outside 0..1.
         """
         name, crops = self._output, prepare_crops(image, self.card.input)
-        batches = [crops] if self._takes_many else np.split(crops, len(crops))
-        said = [run_outputs(self.card, self._session, [name], batch)[0] for batch in batches]
-        if any(part.size != len(batch) for part, batch in zip(said, batches, strict=True)):
+        batches = [crops] if self._has_batches else np.split(crops, len(crops))
+        results = [run_outputs(self.card, self._session, [name], batch)[0] for batch in batches]
+        if any(part.size != len(batch) for part, batch in zip(results, batches, strict=True)):
             raise ModelError(f"{self.card.path}: `{name}` must be one number a picture: correct `outputs`.")
-        values = np.concatenate([part.ravel() for part in said]).astype(np.float32)
+        values = np.concatenate([part.ravel() for part in results]).astype(np.float32)
         if values.min() < 0 or values.max() > 1:
             raise ModelError(f"{self.card.path}: `{name}` is {values.max():g} for a picture: it must be from 0 to 1.")
         return values.reshape(CROPS, CROPS)
@@ -88,7 +88,7 @@ class Detector:
         self.card, self._rule, self._outputs = card, card.detector, card.outputs.boxes
         self._session = open_session(card, threads)
         size = card.input.height, card.input.width
-        self.is_static(np.random.default_rng(_SEED).integers(0, 256, (*size, 3), np.uint8))
+        self.is_static(np.random.default_rng(_TEST_SEED).integers(0, 256, (*size, 3), np.uint8))
 
     def is_static(self, image: Image, footprint_m: float | None = None) -> Mask:
         """Return bool (H, W): True for the pixels of uint8 (H, W[, 3]) that lie in no box of a dynamic class.
@@ -99,22 +99,22 @@ class Detector:
         """
         height, width = image.shape[:2]
         static = np.ones((height, width), bool)
-        largest_px = math.inf if footprint_m is None else _LARGEST_M / footprint_m * width
-        count = self.tiles(footprint_m)
-        for rows, columns in product(_cuts(height, count), _cuts(width, count)):
-            for left, top, right, bottom in self._boxes_px(image[rows, columns]):
+        largest_px = math.inf if footprint_m is None else _MAX_MOVING_M / footprint_m * width
+        count = self.count_tiles(footprint_m)
+        for rows, columns in product(_cut_tiles(height, count), _cut_tiles(width, count)):
+            for left, top, right, bottom in self._detect_boxes_px(image[rows, columns]):
                 if max(right - left, bottom - top) <= largest_px:
                     static[rows, columns][top:bottom, left:right] = False
         return static
 
-    def tiles(self, footprint_m: float | None) -> int:
+    def count_tiles(self, footprint_m: float | None) -> int:
         """Return the number of tiles along each side of a picture whose ground is `footprint_m` metres wide."""
         if footprint_m is None:
             return 1
         car_px = _CAR_M / footprint_m * self.card.input.width
         return min(_MAX_TILES, max(1, math.ceil(_CAR_PX / car_px)))
 
-    def _boxes_px(self, image: Image) -> Ints:
+    def _detect_boxes_px(self, image: Image) -> Ints:
         """Return the boxes of dynamic classes, int (N, 4): left, top, right, bottom, clipped to the picture."""
         rule = self.card.input
         outputs = run_outputs(self.card, self._session, self._outputs, prepare_input(image, rule))
@@ -134,14 +134,14 @@ class Detector:
         return np.hstack([least, most]).clip(0, [width, height] * 2).astype(int)
 
 
-def _cuts(side: int, count: int) -> list[slice]:
+def _cut_tiles(side: int, count: int) -> list[slice]:
     """Cut a side of `side` pixels into `count` parts of equal length that overlap; return them as slices of pixels."""
     part = side / (count - (count - 1) * _OVERLAP)
     starts = [part * (1 - _OVERLAP) * number for number in range(count)]
     return [slice(round(start), min(side, round(start + part))) for start in starts]
 
 
-def yolox(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
+def decode_yolox(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
     """Decode (1, N, 5 + C), the cells of three grids in turn (Ge et al. 2021, arXiv 2107.08430). Each has the offset of
     the centre in cells, the logarithms of the sides in cells, the score of an object, and the scores of the classes."""
     values = outputs[0][0]
@@ -157,7 +157,7 @@ def yolox(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
     return boxes.astype(np.float32), values[:, 4:5] * values[:, 5:]
 
 
-def fastestdet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
+def decode_fastestdet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
     """Decode (1, 5 + C, h, w): score of an object, tanh of the centre's offset in cells, logit of the sides as shares
     of the input, scores of the classes (FastestDet's own code; a score is objectness^0.6 times class^0.4)."""
     values = outputs[0][0]
@@ -171,6 +171,6 @@ def fastestdet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
 
 
 _DECODERS: dict[str, Callable[[Sequence[Floats], tuple[int, int]], Decoded]] = {
-    "yolox": yolox,
-    "fastestdet": fastestdet,
+    "yolox": decode_yolox,
+    "fastestdet": decode_fastestdet,
 }

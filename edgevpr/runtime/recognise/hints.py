@@ -26,18 +26,18 @@ from edgevpr.runtime.recognise.locate import Located
 KNOWN_FIELDS = ("heading", "height", "reach")  # what can be known of a recorded query
 RECORDED_REACH_M = 300.0  # a flight at 20 m/s reaches as much 15 s after its last position
 _MAX_FIX_AGE_S = 60.0
-_ALL_TRUSTED = (True, True)
-_SAME_SCALE = 1.08  # the ratio of two heights from which on it is no error of a match
+_TRUST_ALL = (True, True)
+_SCALE_ERROR = 1.08  # the ratio of two heights from which on it is no error of a match
 _MIN_SCALE = 0.5
-_HEIGHTS_SURE = 3  # matches that agree on a small error of the recorded heights
-_HEIGHTS_KEPT = 5  # matches whose heights are compared with the recorded ones
+_MIN_HEIGHTS = 3  # matches that agree on a small error of the recorded heights
+_MAX_HEIGHTS = 5  # matches whose heights are compared with the recorded ones
 # The flight so far narrows the search where it is so sure of its position. The area then has places enough to compare
 # the best one with: it is as large as that of recorded queries, and reaches over so many places.
 _MIN_MASS = 0.99
 _AREA_SD = 4.0
 _AREA_PLACES = 5.0
 # Field of a tag and column of positions.csv that a part needs. Without any height, it is the map's.
-_NEEDED = {"heading": ("heading_deg", "yaw_deg"), "reach": ("position", "lat and lon")}
+_REQUIRED_FIELDS = {"heading": ("heading_deg", "yaw_deg"), "reach": ("position", "lat and lon")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,30 +96,30 @@ class RecordedPrior:
     ) -> None:
         self._known, self._heading_within_deg, self._map_height_m = known, heading_within_deg, map_height_m
         self._expects_height = False
-        self._height_errors: deque[float] = deque(maxlen=_HEIGHTS_KEPT)
+        self._height_errors: deque[float] = deque(maxlen=_MAX_HEIGHTS)
         self.footprint_m: float | None = None
         self.height_ratio = 1.0
-        self.looks_again = True
+        self.searches_heights = True
 
-    def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
+    def make_hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
         """Return the hints for a frame; `vehicle` and `margin_m`, of a flight, do not count."""
         ratio: float | None = self._height_error
         if self._map_height_m is not None:
             recorded_m = frame.height_m if frame.height_m and frame.height_m > 0 else None
             ratio = recorded_m and self._height_error * recorded_m / self._map_height_m
         self._expects_height = "height" in self._known and ratio is not None
-        self.looks_again = not (self._expects_height and len(self._height_errors) >= _HEIGHTS_SURE)
+        self.searches_heights = not (self._expects_height and len(self._height_errors) >= _MIN_HEIGHTS)
         self.height_ratio = ratio if self._expects_height and ratio else self.scale(())
         uses_heading = "heading" in self._known and self._heading_within_deg is not None
         reach = Reach(frame.position, RECORDED_REACH_M) if "reach" in self._known and frame.position else None
-        return _narrowing(reach, frame.heading_deg if uses_heading else None, index)
+        return _drop_useless(reach, frame.heading_deg if uses_heading else None, index)
 
     @property
     def _height_error(self) -> float:
         """The heights by the last matches over those recorded, median; 1.0 if they are about the same."""
         error = statistics.median(self._height_errors) if self._height_errors else 1.0
         # The height of one match may be wrong by 8 %: few of them correct what is clearly wrong only.
-        same = _SAME_SCALE if len(self._height_errors) >= _HEIGHTS_SURE else _SAME_SCALE**2
+        same = _SCALE_ERROR if len(self._height_errors) >= _MIN_HEIGHTS else _SCALE_ERROR**2
         return error if abs(math.log(error)) > math.log(same) else 1.0
 
     def scale(self, height_ratios: Sequence[float]) -> float:
@@ -153,8 +153,8 @@ class Prior(RecordedPrior):
 
     `height_ratio` is the height of the camera over that of the map's pictures, by the last accepted match; where
     pictures are scaled by known heights, it is how far these are wrong. `footprint_m` is that of the layer in which the
-    last match was (None: unknown, or its height tells it); the height ratio is relative to it. `looks_again`: a query
-    that is not accepted there is searched at all other heights. `reach_m_s` is the highest speed, m/s (None: positions
+    last match was (None: unknown, or its height tells it); the height ratio is relative to it. `searches_heights`: a
+    query that is not accepted there is searched at other heights too. `reach_m_s` is the highest speed (None: positions
     give no hint), `heading_within_deg` the largest error of a known heading (None: headings give no hint). `is_live` is
     False for recorded frames, for which the autopilot's reports do not hold.
     """
@@ -163,12 +163,12 @@ class Prior(RecordedPrior):
         super().__init__((), heading_within_deg)
         self._reach_m_s, self._is_live = reach_m_s, is_live
         self._uses_hints = True
-        self._trusted = _ALL_TRUSTED  # area and heading, by the last accepted match
+        self._trusted = _TRUST_ALL  # area and heading, by the last accepted match
         self._last_fix: tuple[Position, float] | None = None  # and when the aircraft was there
         self._estimate: tuple[Reach, float] | None = None  # where the flight so far puts it, and when
-        self._known_hints: Hints | None = None
+        self._all_hints: Hints | None = None
 
-    def hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
+    def make_hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
         """Return the hints for a frame; None if there are none, or if hints are not trusted now.
 
         `vehicle` is the autopilot's last report. `margin_m` metres are added to the distance that it can have flown. It
@@ -191,14 +191,14 @@ class Prior(RecordedPrior):
                 least_m = max(RECORDED_REACH_M, _AREA_PLACES * margin_m)
                 reach = Reach(area.position, least_m + area.radius_m + DEFAULT_MAX_SPEED_M_S * since_s)
         heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
-        self._known_hints = _narrowing(reach, None if self._heading_within_deg is None else heading_deg, index)
-        return self._known_hints.select(*self._trusted) if self._known_hints and self._uses_hints else None
+        self._all_hints = _drop_useless(reach, None if self._heading_within_deg is None else heading_deg, index)
+        return self._all_hints.select(*self._trusted) if self._all_hints and self._uses_hints else None
 
     def scale(self, height_ratios: Sequence[float]) -> float:
         """Return the factor to enlarge the next picture by, so that it is as if taken from one of the `height_ratios`:
         between two of them less is found. Of a picture from above the edges are needed too: it is enlarged no more."""
         ratio = self.height_ratio
-        if not height_ratios or abs(math.log(ratio)) <= math.log(_SAME_SCALE):
+        if not height_ratios or abs(math.log(ratio)) <= math.log(_SCALE_ERROR):
             return 1.0
         return max(ratio, _MIN_SCALE) if ratio < 1 else ratio / find_nearest_height(height_ratios, ratio)
 
@@ -217,15 +217,15 @@ class Prior(RecordedPrior):
         has one).
         """
         # Over ground outside the map only every second query is searched at all heights, which takes twice as long.
-        self.looks_again = accepted or not self.looks_again
-        if self._known_hints is None:
-            self._uses_hints, self._trusted = True, _ALL_TRUSTED
+        self.searches_heights = accepted or not self.searches_heights
+        if self._all_hints is None:
+            self._uses_hints, self._trusted = True, _TRUST_ALL
         elif accepted:
-            self._trusted = self._known_hints.agree_with(match, self._heading_within_deg)
+            self._trusted = self._all_hints.agree_with(match, self._heading_within_deg)
             self._uses_hints = any(self._trusted)
         else:
             self._uses_hints = not self._uses_hints
-            self._trusted = self._trusted if any(self._trusted) else _ALL_TRUSTED
+            self._trusted = self._trusted if any(self._trusted) else _TRUST_ALL
         if not accepted:
             return
         if match.match.height_ratio:
@@ -234,7 +234,7 @@ class Prior(RecordedPrior):
                 seen_m = height_ratio * match.place.pose.footprint_m
                 layer_m = footprint_m or layers.choose_footprint(seen_m)
                 height_ratio = seen_m / (layer_m or seen_m)
-            if layer_m != self.footprint_m or abs(math.log(height_ratio / self.height_ratio)) > math.log(_SAME_SCALE):
+            if layer_m != self.footprint_m or abs(math.log(height_ratio / self.height_ratio)) > math.log(_SCALE_ERROR):
                 self.footprint_m, self.height_ratio = layer_m, height_ratio
         if match.place.position:
             self._last_fix = match.place.position, t_mono_s
@@ -266,20 +266,20 @@ def explain_useless(
     `sequence` is the number of queries that are matched together."""
     if known and sequence > 1:
         return f"{sequence} queries are matched together, and what is known narrows only single ones: leave one out."
-    for part, (field, columns) in _NEEDED.items():
+    for part, (field, columns) in _REQUIRED_FIELDS.items():
         for name, tags in (("query", queries), ("place", places)):
             if part in known and all(getattr(tag, field) is None for tag in tags):
                 return f"No {name} has what `{part}` needs: write {columns} into positions.csv, or leave `{part}` out."
     return None
 
 
-def _narrowing(reach: Reach | None, heading_deg: float | None, index: PlaceIndex) -> Hints | None:
+def _drop_useless(reach: Reach | None, heading_deg: float | None, index: PlaceIndex) -> Hints | None:
     """Return what narrows a search of the index; None if nothing does. An area of all places or of none does not."""
     if reach and not 0 < index.find_within(reach.position, reach.radius_m).sum() < len(index):
         reach = None
     if not index.knows_headings:
         heading_deg = None
-    return Hints(reach, heading_deg).select(*_ALL_TRUSTED)
+    return Hints(reach, heading_deg).select(*_TRUST_ALL)
 
 
 def to_expectation(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> Expectation:

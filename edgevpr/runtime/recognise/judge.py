@@ -32,16 +32,16 @@ _MAX_INDEPENDENT = 10
 
 # Looking down, if more than this share of a few places elsewhere agree without any shift or rotation, as the best one
 # does, all share what is drawn over every frame.
-_DISPLAY_SHARE = 0.4
-_AT_REST_CELLS = 0.75
-_AT_REST_DEG = 7.5
-_AT_REST_HEIGHT = 0.2
+_MAX_AT_REST_SHARE = 0.4
+_MAX_REST_CELLS = 0.75
+_MAX_REST_DEG = 7.5
+_MAX_REST_HEIGHT = 0.2
 
 # A right match with such a score has landmarks that agree: all 413 of them, in all sets from the air, had six or more.
 # Weaker ones, of grass under other light, may have none. Applied if both pictures have enough landmarks.
-_CLEAR_SCORE = 0.2
+_MIN_CLEAR_SCORE = 0.2
 _MIN_INLIERS = 5
-_ENOUGH_LANDMARKS = 100
+_MIN_LANDMARKS = 100
 # Agreeing landmarks make up for a score below the technique's limit, down to this share of it.
 _MIN_SCORE_SHARE_WITH_LANDMARKS = 0.5
 # The least lead over the same place with the picture turned otherwise. Over sat_marash's ground, heading unknown, 273
@@ -50,21 +50,21 @@ _MIN_LEAD_OVER_TURNED = math.log(1.75)
 # Probabilities: the highest where a place elsewhere agrees as well, and ahead, without the landmarks that are needed
 # (of 111 queries of corridor, asked in a map without their part of it, regions alone had 12 accepted); the least for
 # accepting, at any precision, by the match alone, and by the flight so far.
-_MAX_WITH_TWIN = 0.5
-_MAX_UNPROVEN = 0.9
+_MAX_TWIN_CONFIDENCE = 0.5
+_MAX_UNPROVEN_CONFIDENCE = 0.9
 _MIN_CONFIDENCE = 0.9
-_MIN_BY_FLIGHT = 0.99
+_MIN_TRACK_CONFIDENCE = 0.99
 # How many times the flight must raise the odds of a match for the precision to be enough. By itself a match often needs
 # more, since of many matches the luckiest wrong one must be refused; the queries before do not share its luck. In seven
 # manners of flying along corridor, the seasons and nordland_tiny, and over some 200 foreign pictures each, nothing
 # more was wrong; of nordland_tiny's queries 0.59 instead of 0.47 are accepted.
 _MIN_ODDS_RAISED = 10.0
 _MAX_TILT_SHOWN_DEG = 60.0  # of a tilt that is not recorded; below, the claim counts it (kite_ochota sways by 20)
-_MIN_FOLLOWED = 0.5  # least probability by the flight so far, for a match that is sure by itself
+_MIN_TRACK_SUPPORT = 0.5  # least probability by the flight so far, for a match that is sure by itself
 
 
 @dataclass(frozen=True, slots=True)
-class Sureness:
+class ConfidenceRule:
     """Acceptance by confidence. `models` gives a model for each kind of evidence. A match is accepted if its confidence
     is at least the model's threshold for `precision`, the share of accepted matches that must be right."""
 
@@ -76,21 +76,21 @@ class Sureness:
         if landmarks are needed and do not agree."""
         confidence = self.models[evidence.kind].confidence(evidence.figures())
         if not evidence.leads:
-            return min(confidence, _MAX_WITH_TWIN)
-        return min(confidence, _MAX_UNPROVEN) if evidence.needs_landmarks else confidence
+            return min(confidence, _MAX_TWIN_CONFIDENCE)
+        return min(confidence, _MAX_UNPROVEN_CONFIDENCE) if evidence.needs_landmarks else confidence
 
-    def shown(self, evidence: Evidence) -> float:
+    def limit_confidence(self, evidence: Evidence) -> float:
         """Return the confidence as it is reported: no higher than the data support that its model was fitted to."""
-        return min(self.confidence(evidence), self.models[evidence.kind].most_shown)
+        return min(self.confidence(evidence), self.models[evidence.kind].max_reported)
 
-    def of_map(self, evidence: Evidence) -> float:
+    def compute_map_confidence(self, evidence: Evidence) -> float:
         """Return the probability that the query of this evidence shows ground of the map."""
-        return self.models[evidence.kind].confidence_of_map(evidence.figures())
+        return self.models[evidence.kind].map_confidence(evidence.figures())
 
     def is_open(self, evidence: Evidence) -> bool:
         """Return True if more evidence of the place can still decide: the match leads, its query is likely to show
         ground of the map, and it is not sure yet."""
-        is_likely = evidence.leads and self.of_map(evidence) >= _MAX_WITH_TWIN
+        is_likely = evidence.leads and self.compute_map_confidence(evidence) >= _MAX_TWIN_CONFIDENCE
         return is_likely and self.confidence(evidence) < self.threshold(evidence)
 
     def threshold(self, evidence: Evidence) -> float:
@@ -118,7 +118,7 @@ class AcceptRule:
     min_margin: float
     neighbour_m: float
     min_quality: float = 0.0
-    sure: Sureness | None = None
+    sure: ConfidenceRule | None = None
     worth_a_look: float = 0.0
     look_alikes: LookAlikes | None = None
 
@@ -130,8 +130,8 @@ class Findings:
     `proof` is the agreement of the landmarks
     of query and place (None: not compared). `where` is the position computed from the best places (None: only that of
     the best place is known); the places it was computed from are not elsewhere. `evidence` is that of the match (None:
-    the rule needs none), and `by_flight` the probability of the place by the flight so far (None: the query is judged
-    alone). `ahead_of_turned` is the lead, as in the evidence, over the same place with the picture turned otherwise
+    the rule needs none), and `track_confidence` that of the place by the flight so far (None: the query is judged
+    alone). `lead_over_turned` is the lead, as in the evidence, over the same place with the picture turned otherwise
     (None: not compared). `at_rest_elsewhere` is the share of a few places elsewhere that agree at rest, where the best
     one does too (else 0). `tilt` is that of the query against the place (None: not measured).
     """
@@ -140,8 +140,8 @@ class Findings:
     proof: Agreement | None = None
     where: Located | None = None
     evidence: Evidence | None = None
-    by_flight: float | None = None
-    ahead_of_turned: float | None = None
+    track_confidence: float | None = None
+    lead_over_turned: float | None = None
     at_rest_elsewhere: float = 0.0
     tilt: ShownTilt | None = None
 
@@ -173,13 +173,13 @@ def accept_rule(
         min_margin=own_margin if config.min_margin is None else config.min_margin,
         neighbour_m=config.neighbour_m,
         min_quality=technique.min_quality,
-        sure=Sureness(models, config.accept_precision) if kinds else None,
+        sure=ConfidenceRule(models, config.accept_precision) if kinds else None,
         worth_a_look=_MIN_SCORE_SHARE_WITH_LANDMARKS * technique.min_score,
         look_alikes=calibration.look_alikes if calibration and kinds else None,
     )
 
 
-def says_nothing(query: Descriptor, min_quality: float) -> Reason | None:
+def check_texture(query: Descriptor, min_quality: float) -> Reason | None:
     """Return the reason if a picture shows too little to be recognised, as a covered lens or bare sky does, None if its
     quality is at least `min_quality`. The few regions that hold information can agree on a place by chance."""
     if query.quality >= min_quality:  # False for NaN
@@ -195,23 +195,23 @@ def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: Seque
     ranking, proof, where = findings.ranking, findings.proof, findings.where
     score = float(ranking.scores[0])
     ahead = margin(ranking, index, rule.neighbour_m, where.places if where else ())
-    if objection := _below_limits(score, ahead, rule):
+    if objection := _check_limits(score, ahead, rule):
         return Verdict(False, objection)
-    if search and (objection := _lost_track(ranking, index, rule, search)):
+    if search and (objection := _check_sequence(ranking, index, rule, search)):
         return Verdict(False, objection)
     if len(ranking.unread):
         return _refuse(ReasonCode.PLACE_UNREAD)
     if rule.sure:
-        verdict = _by_confidence(rule.sure, findings)
+        verdict = _judge_confidence(rule.sure, findings)
     elif ahead is None:
         verdict = Verdict(True, Reason(ReasonCode.ACCEPTED_WITHOUT_RIVAL, {"score": score}))
     else:
         verdict = Verdict(True, Reason(ReasonCode.ACCEPTED_BY_SCORE, {"score": score, "lead": ahead}))
     if not verdict.accepted:
         return verdict
-    if findings.at_rest_elsewhere > _DISPLAY_SHARE:
+    if findings.at_rest_elsewhere > _MAX_AT_REST_SHARE:
         return _refuse(ReasonCode.ELSEWHERE_AT_REST)
-    if proof is not None and (objection := _disproves(proof, score)):
+    if proof is not None and (objection := _check_landmarks(proof, score)):
         return Verdict(False, objection)
     if where and where.objection:
         return Verdict(False, where.objection)
@@ -224,7 +224,7 @@ def _refuse(code: ReasonCode, **parameters: float) -> Verdict:
     return Verdict(False, Reason(code, parameters))
 
 
-def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> Reason | None:
+def _check_limits(score: float, ahead: float | None, rule: AcceptRule) -> Reason | None:
     """Return the reason if a match fails the least score or the least lead of `rule`, else None. `ahead` is its lead
     (None: there is no place elsewhere)."""
     least = max(rule.min_score, rule.worth_a_look if rule.sure else 0.0)
@@ -237,38 +237,39 @@ def _below_limits(score: float, ahead: float | None, rule: AcceptRule) -> Reason
     return None
 
 
-def _by_confidence(sure: Sureness, findings: Findings) -> Verdict:
+def _judge_confidence(sure: ConfidenceRule, findings: Findings) -> Verdict:
     """Decide by the confidence of the match or, if it is known, by the place's probability by the flight so far."""
-    evidence, followed = findings.evidence, findings.by_flight
+    evidence, followed = findings.evidence, findings.track_confidence
     if evidence is None:
         return _refuse(ReasonCode.NOT_CALIBRATED)
     confidence, needed = sure.confidence(evidence), sure.threshold(evidence)
-    figures = {"track": followed, "confidence": sure.shown(evidence), "needed": needed, **evidence.describe()}
+    shown = sure.limit_confidence(evidence)
+    figures = {"track": followed, "confidence": shown, "needed": needed, **evidence.describe()}
     by_itself = confidence >= needed
     code = ReasonCode.ACCEPTED_BY_CONFIDENCE
-    if not (by_itself or (followed is not None and _is_sure_by_flight(followed, confidence, needed, sure.precision))):
+    if not (by_itself or (followed is not None and _is_track_confident(followed, confidence, needed, sure.precision))):
         code = ReasonCode.LOW_CONFIDENCE
     elif evidence.lead < 0 and not by_itself:
         code = ReasonCode.ELSEWHERE_AGREES_BETTER
-    elif followed is not None and followed < _MIN_FOLLOWED:
+    elif followed is not None and followed < _MIN_TRACK_SUPPORT:
         code = ReasonCode.TRACK_CONTRADICTS
-    elif findings.ahead_of_turned is not None and findings.ahead_of_turned < _MIN_LEAD_OVER_TURNED:
+    elif findings.lead_over_turned is not None and findings.lead_over_turned < _MIN_LEAD_OVER_TURNED:
         code = ReasonCode.TURNED_AGREES
     return Verdict(code is ReasonCode.ACCEPTED_BY_CONFIDENCE, Reason(code, figures))
 
 
-def _is_sure_by_flight(followed: float, confidence: float, needed: float, precision: float) -> bool:
+def _is_track_confident(followed: float, confidence: float, needed: float, precision: float) -> bool:
     """Return True if a place's probability by the flight so far, `followed`, is enough. By itself its match has this
     `confidence` of the one `needed`."""
     is_raised = followed * (1 - confidence) >= _MIN_ODDS_RAISED * confidence * (1 - followed)
-    return followed >= max(_MIN_BY_FLIGHT, min(needed, precision) if is_raised else needed)
+    return followed >= max(_MIN_TRACK_CONFIDENCE, min(needed, precision) if is_raised else needed)
 
 
-def _disproves(proof: Agreement, score: float) -> Reason | None:
+def _check_landmarks(proof: Agreement, score: float) -> Reason | None:
     """Return the reason if the landmarks show that the query is not at the best place, None if they do not."""
     if not proof.is_expected:
         return Reason(ReasonCode.LANDMARKS_DISAGREE, {"landmarks": proof.inliers})
-    if score >= _CLEAR_SCORE and proof.inliers < _MIN_INLIERS and proof.possible >= _ENOUGH_LANDMARKS:
+    if score >= _MIN_CLEAR_SCORE and proof.inliers < _MIN_INLIERS and proof.possible >= _MIN_LANDMARKS:
         return Reason(ReasonCode.FEW_LANDMARKS, {"landmarks": proof.inliers, "needed": _MIN_INLIERS})
     return None
 
@@ -278,12 +279,12 @@ def is_at_rest(match: FineMatch) -> bool:
     if match.rotation_deg is None or match.shift_cells is None:
         return False
     off_deg = abs(wrap_deg(match.rotation_deg))
-    if off_deg > _AT_REST_DEG or abs((match.height_ratio or 1.0) - 1) > _AT_REST_HEIGHT:
+    if off_deg > _MAX_REST_DEG or abs((match.height_ratio or 1.0) - 1) > _MAX_REST_HEIGHT:
         return False
-    return max(map(abs, match.shift_cells)) <= _AT_REST_CELLS
+    return max(map(abs, match.shift_cells)) <= _MAX_REST_CELLS
 
 
-def _lost_track(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch) -> Reason | None:
+def _check_sequence(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch) -> Reason | None:
     """Return the reason if the mean score of a sequence is not to be trusted, else None: the newest query shows other
     places, the newest queries no longer fit, or a place elsewhere fits about as well if it is passed at another speed.
     """

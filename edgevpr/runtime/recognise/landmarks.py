@@ -13,20 +13,23 @@ import numpy as np
 
 from edgevpr.core.arrays import Bytes, Image, Ints, Mask, Singles
 
-OF_PLACE, OF_QUERY = 250, 1000  # points
+PLACE_LANDMARKS = 250
+QUERY_LANDMARKS = 1000
 # Ahead, smaller pictures are as good: of right matches across seasons more agree than at 640 pixels.
-DOWN_PX, AHEAD_PX = 640, 320  # longest side
-_FOUND = 4 * OF_PLACE  # least number of corners to choose from
-_LEVELS, _FACTOR = 8, 1.2  # of the pyramid
-_CORNER = 5  # grey levels between a corner and its surroundings; low, so that dark pictures have corners
+DOWN_PX = 640  # longest side
+AHEAD_PX = 320
+_MIN_CORNERS = 4 * PLACE_LANDMARKS  # least number of corners to choose from
+_LEVELS = 8  # of the pyramid
+_LEVEL_FACTOR = 1.2
+_MIN_CONTRAST = 5  # grey levels between a corner and its surroundings; low, so that dark pictures have corners
 _PATCH_PX = 31  # width of the patch that a point is described by, on its level of the pyramid
 _CELLS = 8  # along the longest side; each has about the same number of points
-_APART_PX = 3.0  # a corner found on several levels of the pyramid is one landmark
+_MIN_DISTANCE_PX = 3.0  # a corner found on several levels of the pyramid is one landmark
 
 _VERSION = 1
 _HEADER = struct.Struct("<BH")
-_STORED = np.dtype([("x", "<u2"), ("y", "<u2"), ("angle", "u1"), ("size", "u1"), ("bits", "u1", 32)])
-_SIZES = 0.001  # resolution of stored sizes, as a share of the longest side
+_STORED_DTYPE = np.dtype([("x", "<u2"), ("y", "<u2"), ("angle", "u1"), ("size", "u1"), ("bits", "u1", 32)])
+_SIZE_RESOLUTION = 0.001  # resolution of stored sizes, as a share of the longest side
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +54,9 @@ class Landmarks:
         return Landmarks(self.points[:most], self.angle_deg[:most], self.size[:most], self.bits[:most])
 
 
-def describe(image: Image, mask: Mask | None = None, most: int = OF_PLACE, longest_px: int = DOWN_PX) -> Landmarks:
+def detect_landmarks(
+    image: Image, mask: Mask | None = None, most: int = PLACE_LANDMARKS, longest_px: int = DOWN_PX
+) -> Landmarks:
     """Find the `most` best landmarks of a uint8 image, (H, W) grey or (H, W, 3) BGR, scaled to `longest_px` along its
     longest side, best first: none without corners, or in a picture smaller than a patch. No patch covers a pixel where
     `mask`, bool (H, W), is False."""
@@ -64,31 +69,33 @@ def describe(image: Image, mask: Mask | None = None, most: int = OF_PLACE, longe
     if mask is not None:
         allowed = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         allowed = cv2.erode(allowed, np.ones((_PATCH_PX, _PATCH_PX), np.uint8), borderValue=1)
-    orb = cv2.ORB.create(max(most, _FOUND), _FACTOR, _LEVELS, fastThreshold=_CORNER, patchSize=_PATCH_PX)
-    found, bits = orb.detectAndCompute(grey, allowed) if min(size) > 2 * _PATCH_PX else ((), None)
+    orb = cv2.ORB.create(
+        max(most, _MIN_CORNERS), _LEVEL_FACTOR, _LEVELS, fastThreshold=_MIN_CONTRAST, patchSize=_PATCH_PX
+    )
+    keypoints, bits = orb.detectAndCompute(grey, allowed) if min(size) > 2 * _PATCH_PX else ((), None)
     if bits is None:
         none = np.empty(0, np.float32)
         return Landmarks(np.empty((0, 2), np.float32), none, none, np.empty((0, 32), np.uint8))
-    at_px: Singles = np.array([point.pt for point in found], np.float32)
-    order = np.argsort([-point.response for point in found], kind="stable")
-    chosen = order[_spread(at_px[order], most, longest_px / _CELLS)]
+    points_px: Singles = np.array([point.pt for point in keypoints], np.float32)
+    order = np.argsort([-point.response for point in keypoints], kind="stable")
+    chosen = order[_select_spread(points_px[order], most, longest_px / _CELLS)]
     middle = (np.array(size, np.float32) - 1) / 2
-    width_px = np.array([point.size for point in found], np.float32)
+    width_px = np.array([point.size for point in keypoints], np.float32)
     return Landmarks(
-        np.asarray(((at_px - middle) / longest_px)[chosen], np.float32),
-        np.array([point.angle for point in found], np.float32)[chosen],
+        np.asarray(((points_px - middle) / longest_px)[chosen], np.float32),
+        np.array([point.angle for point in keypoints], np.float32)[chosen],
         np.asarray(width_px[chosen] / longest_px, np.float32),
         np.asarray(bits[chosen], np.uint8),
     )
 
 
-def _spread(at_px: Singles, most: int, cell_px: float) -> Ints:
-    """Return the indices of at most `most` of the points `at_px` (K, 2), given best first, so that they spread over the
-    picture: the best of every cell of a grid, then the second best, and so on."""
+def _select_spread(points_px: Singles, most: int, cell_px: float) -> Ints:
+    """Return the indices of at most `most` of the points (K, 2), given best first, spread over the picture: the best of
+    every cell of a grid, then the second best, and so on."""
     # Keep only the best of the points of one corner.
-    _, first = np.unique(np.rint(at_px / _APART_PX).astype(int), axis=0, return_index=True)
+    _, first = np.unique(np.rint(points_px / _MIN_DISTANCE_PX).astype(int), axis=0, return_index=True)
     kept = np.sort(first)
-    _, cell = np.unique((at_px[kept] // cell_px).astype(int), axis=0, return_inverse=True)
+    _, cell = np.unique((points_px[kept] // cell_px).astype(int), axis=0, return_inverse=True)
     by_cell = np.argsort(cell.ravel(), kind="stable")
     ordered = cell.ravel()[by_cell]
     starts = np.searchsorted(ordered, ordered)
@@ -99,11 +106,11 @@ def _spread(at_px: Singles, most: int, cell_px: float) -> Ints:
 
 def pack_bytes(landmarks: Landmarks) -> bytes:
     """Convert landmarks to the form of map files: a header of 3 bytes, then 38 bytes for each."""
-    stored = np.empty(len(landmarks), _STORED)
+    stored = np.empty(len(landmarks), _STORED_DTYPE)
     at = np.rint((landmarks.points.astype(np.float64) + 0.5) * 65535).clip(0, 65535)
     stored["x"], stored["y"] = at[:, 0], at[:, 1]
     stored["angle"] = np.rint(landmarks.angle_deg * (256 / 360)).astype(int) % 256
-    stored["size"] = np.rint(landmarks.size / _SIZES).clip(0, 255)
+    stored["size"] = np.rint(landmarks.size / _SIZE_RESOLUTION).clip(0, 255)
     stored["bits"] = landmarks.bits
     return _HEADER.pack(_VERSION, len(stored)) + stored.tobytes()
 
@@ -111,13 +118,13 @@ def pack_bytes(landmarks: Landmarks) -> bytes:
 def unpack_bytes(blob: bytes) -> Landmarks:
     """Convert bytes made by `pack_bytes` back to landmarks. Raises ValueError for anything else."""
     version, count = _HEADER.unpack(blob[: _HEADER.size].ljust(_HEADER.size, b"\0"))
-    if version != _VERSION or len(blob) != _HEADER.size + count * _STORED.itemsize:
+    if version != _VERSION or len(blob) != _HEADER.size + count * _STORED_DTYPE.itemsize:
         raise ValueError("its landmarks have a form that this edgevpr does not know")
-    stored = np.frombuffer(blob, _STORED, offset=_HEADER.size)
+    stored = np.frombuffer(blob, _STORED_DTYPE, offset=_HEADER.size)
     at = np.stack([stored["x"], stored["y"]], axis=1).astype(np.float64) / 65535 - 0.5
     return Landmarks(
         at.astype(np.float32),
         stored["angle"].astype(np.float32) * np.float32(360 / 256),
-        stored["size"].astype(np.float32) * np.float32(_SIZES),
+        stored["size"].astype(np.float32) * np.float32(_SIZE_RESOLUTION),
         stored["bits"],
     )

@@ -34,7 +34,7 @@ GPS_SD_M = 5.0  # standard deviation along one axis of a recorded position, unle
 # Chosen on generated flights and aerial_swindale.
 TILT_SD_WITHOUT_ATTITUDE = 0.04
 _MAX_ASIDE_WITHOUT_HEADING = 0.25  # of the longest side: farther from the aircraft, the picture shows other ground
-_FIELDS_AGREE_DEG = 5.0  # that of a data sheet is rounded
+_MAX_FIELD_DIFFERENCE_DEG = 5.0  # that of a data sheet is rounded
 
 _log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ class Levelling:
     mount: Mount = STRAIGHT_DOWN
     _has_warned: bool = field(default=False, init=False)
 
-    def with_mount(self, mount: Mount) -> "Levelling":
+    def replace_mount(self, mount: Mount) -> "Levelling":
         """Return the same for a camera that is mounted otherwise."""
         return replace(self, lens=self.lens and replace(self.lens, mount=mount), mount=mount)
 
@@ -91,7 +91,7 @@ class Levelling:
 
 
 @dataclass(frozen=True, slots=True)
-class Straightening:
+class Undistortion:
     """Takes the distortion of a lens from the pictures of a camera that looks ahead, which are not levelled."""
 
     lens: CalibratedLens
@@ -103,13 +103,13 @@ class Straightening:
 
 def make_levelling(
     config: SourceConfig, technique: Technique, *, below: bool = False
-) -> Levelling | Straightening | None:
+) -> Levelling | Undistortion | None:
     """Make what comes before encoding for a configuration. None: nothing, for a camera that looks ahead, or on a gimbal
     with unknown lens. Raises ConfigError for a calibration of the lens that cannot be used, and UsageError for a field
     of view that contradicts it."""
     if technique.spec.parameters.get("camera") != "nadir":
         calibrated = load_calibrated_lens(config)
-        return Straightening(calibrated) if calibrated else None
+        return Undistortion(calibrated) if calibrated else None
     lens, mount = read_camera_lens(config), read_mount(config)
     if lens is None:
         _log.info("no correction for tilt, height or heading: set source.fov_deg (--fov-deg)")
@@ -136,7 +136,7 @@ def load_calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
         return None
     lens = read_lens(config.lens)
     field_deg = compute_lens_view(lens, lens.size_px).field_deg
-    if config.fov_deg is not None and abs(config.fov_deg - field_deg) > _FIELDS_AGREE_DEG:
+    if config.fov_deg is not None and abs(config.fov_deg - field_deg) > _MAX_FIELD_DIFFERENCE_DEG:
         raise UsageError(
             f"`source.fov_deg` is {config.fov_deg:g}, and {config.lens} says {field_deg:.0f} degrees: leave `fov_deg` "
             "out, or name the calibration of this camera."
@@ -144,16 +144,16 @@ def load_calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
     return lens
 
 
-def with_picture_heading(frame: Frame, view: View) -> Frame:
+def set_picture_heading(frame: Frame, view: View) -> Frame:
     """Return the frame with the heading of the top of its levelled picture, for the hints, if that is known."""
     return frame if view.up_deg is None else replace(frame, heading_deg=view.up_deg)
 
 
-def place_at_middle(frame: Frame, view: View) -> Frame:
+def centre_place(frame: Frame, view: View) -> Frame:
     """Change a frame to what a place stores. Its heading becomes that of the levelled picture. If it has a position,
     this becomes the position of the picture's middle instead of the aircraft's, as far as that can be computed, and
     with a known height and heading it gets a pose."""
-    frame = with_picture_heading(frame, view)
+    frame = set_picture_heading(frame, view)
     if view.aside and view.up_deg is None and math.hypot(*view.aside) > _MAX_ASIDE_WITHOUT_HEADING:
         return replace(frame, position=None)
     if frame.position and view.lean_m:

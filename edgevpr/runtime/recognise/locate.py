@@ -16,7 +16,7 @@ from edgevpr.core.geodesy import offset_m, offset_position, picture_axes
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Candidate, Place, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
-from edgevpr.runtime.recognise.agreement import CONFIRMED, Agreement
+from edgevpr.runtime.recognise.agreement import MIN_CONFIRMED_INLIERS, Agreement
 from edgevpr.runtime.recognise.levelling import TILT_SD_WITHOUT_ATTITUDE
 from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, AttitudeError, ShownTilt, fit_attitude_error
 
@@ -29,7 +29,7 @@ _MEAN_VARIANCE_SHARE = 0.25  # of the covariance of single votes, which their me
 _MIN_SCORE_SHARE = 0.5  # of the best score: matches with at least that score are used too
 _MAX_DIFFERENCE_SD = 4.0  # places that differ by more are not used
 _CONTRADICTION_SHARE = 0.2  # of the footprint: if two positions are farther apart, one of the places is wrong
-_OUTWEIGHS = 0.4  # share of the scores of agreeing places; contradicting ones with more make the position doubtful
+_MAX_CONTRADICTION = 0.4  # scores of contradicting places, over those of agreeing ones
 MAX_PLACES_CHECKED = 12  # in a dense map so many show the same ground
 _MAX_PLACES_AVERAGED = 5  # of these determine the position
 
@@ -70,23 +70,23 @@ class Located:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PlaceEstimate:
-    """Position of the aircraft as computed from one place. `at_m` (2,) is metres east and north of the best place. It
-    has two covariances (2, 2): `of_step` by the errors of the match, `of_pose` by those of the place's pose.
-    `rotation_deg` and `height_ratio`, of the query on the place, are as in `FineMatch`."""
+    """Position of the aircraft computed from one place. `position_m` (2,) is metres east and north of the best place.
+    Its covariances (2, 2) are `match_covariance`, of the match, and `pose_covariance`, of the pose. `rotation_deg`
+    and `height_ratio`, of the query on the place, are as in `FineMatch`."""
 
     place_id: int
     score: float
-    at_m: Doubles
-    of_step: Doubles
-    of_pose: Doubles
+    position_m: Doubles
+    match_covariance: Doubles
+    pose_covariance: Doubles
     rotation_deg: float
     height_ratio: float | None
 
     def agrees_with(self, other: "_PlaceEstimate") -> bool:
         """Return True if both positions are about the same. Relative to each other, poses are known far better than on
         the Earth, so only half of the variance of each counts."""
-        covariance = self.of_step + other.of_step + (self.of_pose + other.of_pose) / 2
-        return mahalanobis(self.at_m - other.at_m, covariance) <= _MAX_DIFFERENCE_SD
+        covariance = self.match_covariance + other.match_covariance + (self.pose_covariance + other.pose_covariance) / 2
+        return mahalanobis(self.position_m - other.position_m, covariance) <= _MAX_DIFFERENCE_SD
 
 
 def locate_at_place(position: Position, accuracy_m: float) -> Located:
@@ -111,26 +111,29 @@ def locate(
     if first is None or best.position is None or pose is None:
         return None
     estimates = [first, *filter(None, (_estimate(place, best, cells, aside) for place in places[1:]))]
-    if proof and proof.is_expected and proof.inliers >= CONFIRMED:
+    if proof and proof.is_expected and proof.inliers >= MIN_CONFIRMED_INLIERS:
         first = _estimate(places[0], best, cells, aside, proof) or first
         estimates.insert(0, first)
-        if proof.coinciding:
-            lean = fit_attitude_error(*proof.coinciding, view, pose.up_deg + first.rotation_deg)
+        if proof.inlier_points:
+            lean = fit_attitude_error(*proof.inlier_points, view, pose.up_deg + first.rotation_deg)
     least = _MIN_SCORE_SHARE * first.score
     agreeing = [estimate for estimate in estimates if first.agrees_with(estimate)]
-    at_m, covariance = _average([each for each in agreeing if each.score >= least][:_MAX_PLACES_AVERAGED])
+    position_m, covariance = _average([each for each in agreeing if each.score >= least][:_MAX_PLACES_AVERAGED])
     if view.lean_m is not None:
-        at_m = at_m + view.lean_m
+        position_m = position_m + view.lean_m
     else:
         tilt_sd = TILT_SD_WITHOUT_ATTITUDE if view.aside is None else view.aside_sd
         covariance += (tilt_sd * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
     objection, far_m = None, _CONTRADICTION_SHARE * pose.footprint_m
-    apart = [(each.score, float(np.hypot(*(each.at_m - first.at_m)))) for each in estimates if each.score >= least]
-    against = [(score, off_m) for score, off_m in apart if off_m > far_m]
-    if sum(score for score, _ in against) > _OUTWEIGHS * sum(each.score for each in agreeing):
+    against = []
+    for estimate in estimates:
+        apart_m = float(np.hypot(*(estimate.position_m - first.position_m)))
+        if estimate.score >= least and apart_m > far_m:
+            against.append((estimate.score, apart_m))
+    if sum(score for score, _ in against) > _MAX_CONTRADICTION * sum(each.score for each in agreeing):
         objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"apart_m": max(against)[1]})
     footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
-    here = offset_position(best.position.lat_deg, best.position.lon_deg, *at_m.tolist())
+    here = offset_position(best.position.lat_deg, best.position.lon_deg, *position_m.tolist())
     return Located(
         position=Position(*here, best.position.alt_m),
         covariance_m2=to_triple(covariance),
@@ -144,7 +147,7 @@ def locate(
     )
 
 
-def allow_for_tilt(where: Located, tilt: ShownTilt, view: View) -> Located:
+def add_tilt_covariance(where: Located, tilt: ShownTilt, view: View) -> Located:
     """Return a position with the covariance that it has if the query is tilted as `tilt` shows beyond what its `view`
     has been levelled by."""
     tangent_sd = tilt.get_sd(view.is_tilt_known)
@@ -165,14 +168,15 @@ def mahalanobis(step: Doubles, covariance: Doubles) -> float:
 
 def _average(estimates: list[_PlaceEstimate]) -> tuple[Doubles, Doubles]:
     """Return the mean (2,) of the positions computed from several places, and its covariance (2, 2)."""
-    of_step = np.linalg.inv(sum(np.linalg.inv(each.of_step) for each in estimates))
-    at_m = of_step @ sum(np.linalg.inv(each.of_step) @ each.at_m for each in estimates)
+    match_covariance = np.linalg.inv(sum(np.linalg.inv(each.match_covariance) for each in estimates))
+    position_m = match_covariance @ sum(np.linalg.inv(each.match_covariance) @ each.position_m for each in estimates)
     if len(estimates) > 1:
         # If places differ by more than their covariances allow, these are scaled up (Birge 1932).
-        off = sum((each.at_m - at_m) @ np.linalg.solve(each.of_step, each.at_m - at_m) for each in estimates)
-        of_step = of_step * max(1.0, float(off) / (2 * (len(estimates) - 1)))
+        errors_m = [(each.position_m - position_m, each.match_covariance) for each in estimates]
+        off = sum(error_m @ np.linalg.solve(covariance, error_m) for error_m, covariance in errors_m)
+        match_covariance = match_covariance * max(1.0, float(off) / (2 * (len(estimates) - 1)))
     # Errors of the poses are common to neighbours: using several makes them no smaller.
-    return at_m, of_step + np.mean([each.of_pose for each in estimates], axis=0)
+    return position_m, match_covariance + np.mean([each.pose_covariance for each in estimates], axis=0)
 
 
 def _estimate(
@@ -209,9 +213,9 @@ def _estimate(
     return _PlaceEstimate(
         place_id=place.place_id,
         score=match.score,
-        at_m=off_m + step_m,
-        of_step=pose.footprint_m**2 * (axes @ upwards @ axes.T) + by_length,
-        of_pose=covariance_matrix(pose.covariance_m2),
+        position_m=off_m + step_m,
+        match_covariance=pose.footprint_m**2 * (axes @ upwards @ axes.T) + by_length,
+        pose_covariance=covariance_matrix(pose.covariance_m2),
         rotation_deg=rotation_deg,
         height_ratio=height_ratio,
     )

@@ -23,10 +23,10 @@ from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
 from edgevpr.runtime.recognise.hints import Prior, RecordedPrior
 from edgevpr.runtime.recognise.judge import accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling, make_levelling
+from edgevpr.runtime.recognise.odometry import VisualOdometry
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
-from edgevpr.runtime.recognise.salience_gate import MAX_ENTROPY, Gate
-from edgevpr.runtime.recognise.stride import Strides
+from edgevpr.runtime.recognise.salience_gate import MAX_ENTROPY, SalienceGate
 from edgevpr.techniques.card import load_card
 
 _MAX_WAIT_S = 0.05  # longest wait in flight for another program that writes to the map: a query must not be late
@@ -38,17 +38,17 @@ def open_recogniser(
     config: Config,
     board: Board,
     *,
-    narrowed: bool = False,
+    uses_hints: bool = False,
     known: Collection[str] = (),
-    follows: bool = False,
+    tracks_flight: bool = False,
     meter: QueryMeter | None = None,
 ) -> Recogniser:
     """Open the map, make its technique for the board (see `resolve_board`), and load the index.
 
-    With `narrowed`, for a flight, hints narrow each query (see `hints`); otherwise every query searches the whole map,
-    but for what is `known` of recorded ones (see `RecordedPrior`). With `follows`, the queries are those of one flight,
-    in order (see `place_filter`). `meter` measures the queries (None: by the clocks of this computer). Raises an
-    EdgevprError that names what does not fit together, such as a setting that the map was not built with.
+    With `uses_hints`, for a flight, hints narrow each query (see `hints`); otherwise only what is `known` of recorded
+    queries does (see `RecordedPrior`). With `tracks_flight`, the queries are those of one flight, in order (see
+    `place_filter`). `meter` measures the queries (None: by the clocks of this computer). Raises an EdgevprError that
+    names what does not fit together, such as a setting that the map was not built with.
     """
     if config.map is None:
         raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
@@ -56,21 +56,21 @@ def open_recogniser(
     place_map = PlaceMap.open(config.map)
     with ExitStack() as on_error:
         on_error.callback(place_map.close)
-        wanted = {"camera": source.camera, "matching": match.matching, "form": match.form}
-        given = {name: value for name, value in wanted.items() if value}
-        technique = create_technique(place_map, config.technique, given, board)
+        settings_by_name = {"camera": source.camera, "matching": match.matching, "form": match.form}
+        technique_settings = {name: value for name, value in settings_by_name.items() if value}
+        technique = create_technique(place_map, config.technique, technique_settings, board)
         length = match.sequence or technique.spec.sequence
         index = load_index(place_map, technique, int(board.budget_mb * 1e6), compute_sequence_bytes(length))
         mask = load_mask(source.mask)
-        warn_of_other_pictures(place_map, mask, source.lens)
+        warn_of_mismatch(place_map, mask, source.lens)
         levelling, gate = make_levelling(source, technique), open_salience_gate(config.salience, board.threads)
         knows_scale = isinstance(levelling, Levelling) and levelling.lens is not None
         prior = RecordedPrior(known, technique.spec.heading_within_deg)
-        if narrowed:
+        if uses_hints:
             prior = Prior(match.reach_m_s, technique.spec.heading_within_deg, is_live(source.uri))
         place_filter = None
         # Only matches that have a confidence can be followed, and only where no sequence is asked for.
-        if follows and match.sequence is None and list_evidence_kinds(technique.spec):
+        if tracks_flight and match.sequence is None and list_evidence_kinds(technique.spec):
             place_filter = PlaceFilter(place_map, max_speed_m_s=match.reach_m_s, is_live=is_live(source.uri))
         rule = accept_rule(technique, match, length, read_calibration_for(place_map))
         candidates, min_accuracy_m = match.candidates or technique.candidates, config.mavlink.min_accuracy_m
@@ -81,18 +81,18 @@ def open_recogniser(
             Matcher(index, rule, make_sequence_search(length)),
             meter or QueryMeter(board, config.battery),
             settings=settings,
-            strides=Strides() if narrowed and knows_scale else None,
+            odometry=VisualOdometry() if uses_hints and knows_scale else None,
             # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
             prior=prior if length == 1 else None,
             place_filter=place_filter,
         )
-        if narrowed:
+        if uses_hints:
             place_map.set_max_wait(_MAX_WAIT_S)
         on_error.pop_all()
     return recogniser
 
 
-def open_salience_gate(config: SalienceConfig, threads: int = 1) -> Gate | None:
+def open_salience_gate(config: SalienceConfig, threads: int = 1) -> SalienceGate | None:
     """Make the salience gate, None if the configuration asks for none. A criterion whose network is not named is off,
     with a warning. Raises ConfigError if nothing can pass or all criteria are off, ModelError for an unusable
     network."""
@@ -115,7 +115,7 @@ def open_salience_gate(config: SalienceConfig, threads: int = 1) -> Gate | None:
             _log.warning("no `salience.detector` is named: what moves in a picture does not count")
     if not (memorability or detector or config.entropy > 0):
         raise ConfigError("`salience.use` is true, and every criterion is off: raise a threshold, or use no salience.")
-    return Gate(config, memorability, detector)
+    return SalienceGate(config, memorability, detector)
 
 
 def make_technique(threads: int | None, name: str, settings: Settings | None = None) -> Technique:
@@ -154,7 +154,7 @@ def create_technique(
     return technique
 
 
-def warn_of_other_pictures(place_map: PlaceMap, mask: OverlayMask | None, lens: str | None) -> None:
+def warn_of_mismatch(place_map: PlaceMap, mask: OverlayMask | None, lens: str | None) -> None:
     """Warn if the places of a map, which remain usable, were made with another `mask`, or if their pictures were
     straightened by a calibration and those to come are not (`lens` None)."""
     if not len(place_map):

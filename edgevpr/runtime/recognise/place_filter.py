@@ -25,9 +25,9 @@ from edgevpr.runtime.recognise.belief import (
     Proposals,
 )
 from edgevpr.runtime.recognise.evidence import Evidence, compute_share
-from edgevpr.runtime.recognise.judge import Sureness
+from edgevpr.runtime.recognise.judge import ConfidenceRule
 from edgevpr.runtime.recognise.locate import Located, covariance_matrix, to_triple
-from edgevpr.runtime.recognise.stride import Stride
+from edgevpr.runtime.recognise.odometry import OdometryStep
 
 _TWIN_SHARE = 0.5  # share of the best place's votes from which on its twins are as likely, as in `Evidence.has_twin`
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
@@ -37,14 +37,14 @@ _MAX_PROPOSED = 20  # most places that one query proposes
 # Distances that count as one position, in places and in footprints; and the probability that is more likely than not.
 _NEAR_PLACES = 3.0
 _NEAR_FOOTPRINT = 0.25
-_HALF = 0.5
+_MIN_MAJORITY = 0.5
 _PLACES_A_QUERY = 3.0  # highest speed where the time or the positions are unknown
 _MAX_ELAPSED_S = 3600.0
 _MIN_SPACING_M = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Followed:
+class TrackEstimate:
     """Result of a query together with the flight so far. `slot` is the place most likely now, by its row in the index
     (None: no place), and `confidence` the probability that the aircraft is there. `lost` is the probability that it is
     at no position of the belief. `estimate` is its most likely position (None: unknown, or the map has no positions),
@@ -56,12 +56,12 @@ class Followed:
     mass: float
     estimate: Located | None
 
-    def leads_from(self, slot: int) -> bool:
+    def prefers_other(self, slot: int) -> bool:
         """Return True if a place other than `slot` is more likely than not."""
-        return self.slot is not None and self.slot != slot and self.confidence > _HALF
+        return self.slot is not None and self.slot != slot and self.confidence > _MIN_MAJORITY
 
 
-class _Survey:
+class _MapGeometry:
     """Measures of a map: the `origin` of the belief's plane (None: the map has no positions), the
     `scale`, and `spread`, the standard deviation of the position of a place without a pose."""
 
@@ -69,7 +69,7 @@ class _Survey:
         known = ~np.isnan(index.lat_deg)
         self.origin = None
         self.scale, self.spread = MapScale(spacing=1.0, near=_NEAR_PLACES, is_ordinal=True), 1.0
-        if known.mean() > _HALF:
+        if known.mean() > _MIN_MAJORITY:
             first = int(np.flatnonzero(known)[0])
             self.origin = Position(float(index.lat_deg[first]), float(index.lon_deg[first]))
             spacing_m, footprint_m = index.spacing_m() or 0.0, read_layers(place_map).median_m
@@ -98,89 +98,92 @@ class PlaceFilter:
 
     def __init__(self, place_map: PlaceMap, *, max_speed_m_s: float | None, is_live: bool) -> None:
         self._map, self._max_speed_m_s, self._is_live = place_map, max_speed_m_s or DEFAULT_MAX_SPEED_M_S, is_live
-        self._survey: _Survey | None = None
+        self._geometry: _MapGeometry | None = None
         self._belief: Belief | None = None
         self._next: Belief | None = None  # the belief after the last pass, until `commit`
-        self._arrived: tuple[Doubles, float] | None = None  # position of the newest ground, first confidence
-        self._arriving: tuple[Doubles, float] | None = None
+        self._first_sight: tuple[Doubles, float] | None = None  # position of the newest ground, first confidence
+        self._next_first_sight: tuple[Doubles, float] | None = None
         self._t_now_s: float | None = None
         self._t_committed_s: float | None = None
         self._elapsed_s: float | None = None
         self._velocity_m_s: tuple[float, float] | None = None
-        self._stride: Stride | None = None
+        self._odometry: OdometryStep | None = None
 
-    def predict(self, frame: Frame, vehicle: Vehicle | None, stride: Stride | None = None) -> None:
-        """Take the time since the last committed pass, and the motion since then, if they are known: the `stride` from
-        the frame before or, without one, by the velocity that the autopilot reports."""
+    def predict(self, frame: Frame, vehicle: Vehicle | None, odometry: OdometryStep | None = None) -> None:
+        """Set the time and the motion since the last committed pass, if known: the motion by `odometry` from the frame
+        before or, without it, by the velocity that the autopilot reports."""
         now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
         before_s, self._t_now_s = self._t_committed_s, now_s
         self._elapsed_s = None if before_s is None or now_s is None else now_s - before_s
         is_fresh = self._is_live and vehicle is not None and vehicle.is_fresh(frame.t_mono_s)
         self._velocity_m_s = vehicle.velocity_m_s if vehicle and is_fresh else None
-        self._stride = stride if stride and stride.from_s == before_s else None
+        self._odometry = odometry if odometry and odometry.from_s == before_s else None
 
     def update(
-        self, ranking: Ranking, index: PlaceIndex, evidence: Evidence, sure: Sureness, where: Located | None
-    ) -> Followed:
+        self, ranking: Ranking, index: PlaceIndex, evidence: Evidence, sure: ConfidenceRule, where: Located | None
+    ) -> TrackEstimate:
         """Return the result of one pass together with the flight so far; nothing is kept before `commit`. `evidence` is
         that of the best place of the `ranking`, and `sure` turns it into probabilities. `where` is the position of the
         aircraft computed from the best place (None: the position of the place itself is taken)."""
-        if self._survey is None or self._belief is None:
-            self._survey = _Survey(self._map, index)
-            self._belief = Belief(self._survey.scale)
-        survey, near = self._survey, self._survey.scale.near
-        slots, proposed = _propose(ranking, index, survey, sure, evidence, where)
+        if self._geometry is None or self._belief is None:
+            self._geometry = _MapGeometry(self._map, index)
+            self._belief = Belief(self._geometry.scale)
+        geometry, near = self._geometry, self._geometry.scale.near
+        slots, proposed = _make_proposals(ranking, index, geometry, sure, evidence, where)
         self._next = copy.copy(self._belief)
-        posterior = self._next.update(proposed, self._motion(survey), len(index))
+        posterior = self._next.update(proposed, self._motion(geometry), len(index))
         slot, confidence = None, 0.0
         if len(slots) and posterior.p.max() > 0:
             best = int(posterior.p.argmax())
             slot, at = int(slots[best]), proposed.at[best]
             is_near = np.hypot(*(proposed.at - at).T) <= near
             confidence = float(posterior.p[is_near].sum())
-            if confidence > _HALF and np.hypot(*(posterior.at - at)) <= near:
+            if confidence > _MIN_MAJORITY and np.hypot(*(posterior.at - at)) <= near:
                 confidence = max(confidence, posterior.mass)  # with hypotheses not proposed by this pass
             confidence = self._limit_repetition(at, confidence, float(proposed.p[is_near].sum()))
         estimate = None
-        if survey.origin and posterior.mass:
-            position = Position(*offset_position(survey.origin.lat_deg, survey.origin.lon_deg, *posterior.at.tolist()))
+        if geometry.origin and posterior.mass:
+            lat_deg, lon_deg = geometry.origin.lat_deg, geometry.origin.lon_deg
+            position = Position(*offset_position(lat_deg, lon_deg, *posterior.at.tolist()))
             covariance_m2, heading_deg = to_triple(posterior.covariance), posterior.heading_deg
             estimate = Located(position=position, covariance_m2=covariance_m2, heading_deg=heading_deg)
-        return Followed(slot=slot, confidence=confidence, lost=posterior.lost, mass=posterior.mass, estimate=estimate)
+        return TrackEstimate(
+            slot=slot, confidence=confidence, lost=posterior.lost, mass=posterior.mass, estimate=estimate
+        )
 
     def update_without_match(self, index: PlaceIndex) -> None:
         """Take a picture that shows too little: it does not tell whether the aircraft is over the map."""
-        if self._survey and self._belief:
+        if self._geometry and self._belief:
             self._next = copy.copy(self._belief)
-            self._next.update(None, self._motion(self._survey), len(index))
+            self._next.update(None, self._motion(self._geometry), len(index))
             self.commit()
 
     def commit(self) -> None:
         """Keep the belief of the last pass; without a pass since the last call the belief stays as it is."""
         self._belief, self._next = self._next or self._belief, None
-        self._arrived, self._t_committed_s = self._arriving, self._t_now_s
+        self._first_sight, self._t_committed_s = self._next_first_sight, self._t_now_s
 
-    def _motion(self, survey: _Survey) -> Motion:
-        if survey.scale.is_ordinal or self._elapsed_s is None:
-            return limit_motion(None, _PLACES_A_QUERY * survey.scale.spacing)
-        if self._stride and self._elapsed_s > 0:
-            east_m, north_m = self._stride.moved_m
+    def _motion(self, geometry: _MapGeometry) -> Motion:
+        if geometry.scale.is_ordinal or self._elapsed_s is None:
+            return make_motion(None, _PLACES_A_QUERY * geometry.scale.spacing)
+        if self._odometry and self._elapsed_s > 0:
+            east_m, north_m = self._odometry.moved_m
             velocity_m_s = east_m / self._elapsed_s, north_m / self._elapsed_s
-            return limit_motion(self._elapsed_s, self._max_speed_m_s, velocity_m_s, is_seen=True)
-        return limit_motion(self._elapsed_s, self._max_speed_m_s, self._velocity_m_s)
+            return make_motion(self._elapsed_s, self._max_speed_m_s, velocity_m_s, is_seen=True)
+        return make_motion(self._elapsed_s, self._max_speed_m_s, self._velocity_m_s)
 
     def _limit_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:
         """Return `confidence`: over the same ground as the query before, of which repeated pictures prove nothing new,
         at most that after the first picture there, or that of this pass `by_itself`."""
-        arrived = self._arrived
-        if arrived is None or self._survey is None or np.hypot(*(at - arrived[0])) >= self._survey.scale.spacing:
-            self._arriving = at, confidence
+        arrived = self._first_sight
+        if arrived is None or self._geometry is None or np.hypot(*(at - arrived[0])) >= self._geometry.scale.spacing:
+            self._next_first_sight = at, confidence
             return confidence
-        self._arriving = arrived
+        self._next_first_sight = arrived
         return min(confidence, max(arrived[1], by_itself))
 
 
-def limit_motion(
+def make_motion(
     elapsed_s: float | None, speed_max: float, velocity: tuple[float, float] | None = None, is_seen: bool = False
 ) -> Motion:
     """Return the motion in `elapsed_s` seconds, one second if they are unknown (None) or the clock was set back.
@@ -194,36 +197,41 @@ def limit_motion(
     return Motion(reach=speed_max * elapsed_s, elapsed_s=elapsed_s, by=by, is_seen=is_seen)
 
 
-def _propose(
-    ranking: Ranking, index: PlaceIndex, survey: _Survey, sure: Sureness, evidence: Evidence, where: Located | None
+def _make_proposals(
+    ranking: Ranking,
+    index: PlaceIndex,
+    geometry: _MapGeometry,
+    sure: ConfidenceRule,
+    evidence: Evidence,
+    where: Located | None,
 ) -> tuple[Ints, Proposals]:
     """Return what the query proposes to the belief, as in `PlaceFilter.update`: the slots, int (K,), and these."""
     slots: Ints = np.array(ranking.compared_slots[:_MAX_PROPOSED])
-    at = survey.positions(slots, index)
+    at = geometry.positions(slots, index)
     # Of a match that is not worth locating the place is known, and not where in its picture the aircraft is.
-    spread = survey.spread if where else max(survey.spread, survey.scale.near)
-    covariance = np.tile((1.0 if survey.origin is None else spread**2) * np.eye(2), (len(slots), 1, 1))
+    spread = geometry.spread if where else max(geometry.spread, geometry.scale.near)
+    covariance = np.tile((1.0 if geometry.origin is None else spread**2) * np.eye(2), (len(slots), 1, 1))
     heading_deg = np.full(len(slots), np.nan)
     same = np.zeros(len(slots), bool)
-    if where and survey.origin:
-        here, there = survey.origin, where.position
+    if where and geometry.origin:
+        here, there = geometry.origin, where.position
         at[0] = offset_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
         if not evidence.has_twin:  # of places that are equally likely none may be known better than the others
             covariance[0] = covariance_matrix(where.covariance_m2)
         heading_deg[0] = np.nan if where.heading_deg is None else where.heading_deg
         same = np.isin(index.place_ids[slots], where.places) & (slots != slots[0])
     votes = np.array([compute_share(ranking.compared[slot]) for slot in slots.tolist()])
-    near = np.hypot(*(at - at[0]).T) <= survey.scale.near
+    near = np.hypot(*(at - at[0]).T) <= geometry.scale.near
     near[0] = True  # even if its position is unknown
     confidence = sure.confidence(evidence)
-    left = max(0.0, sure.of_map(evidence) - confidence)
+    left = max(0.0, sure.compute_map_confidence(evidence) - confidence)
     p = np.zeros(len(slots))
     if evidence.has_twin:  # more votes only mean that it was pictured from nearer by
         votes = np.minimum(votes, _TWIN_SHARE * votes.max(initial=0))
-        p[~same] = (confidence + _RIGHT_AMONG_OTHERS * left) * _shares(votes[~same])
+        p[~same] = (confidence + _RIGHT_AMONG_OTHERS * left) * _compute_shares(votes[~same])
     else:
-        p[near & ~same] = confidence * _shares(votes[near & ~same])
-        p[~near & ~same] = _RIGHT_AMONG_OTHERS * left * _shares(votes[~near & ~same])
+        p[near & ~same] = confidence * _compute_shares(votes[near & ~same])
+        p[~near & ~same] = _RIGHT_AMONG_OTHERS * left * _compute_shares(votes[~near & ~same])
     # The probability of a place without a position is given to no other place.
     is_placed = ~np.isnan(at[:, 0]) & ~same
     return slots[is_placed], Proposals(
@@ -231,7 +239,7 @@ def _propose(
     )
 
 
-def _shares(votes: Doubles) -> Doubles:
+def _compute_shares(votes: Doubles) -> Doubles:
     """Return the share (K,) of each of K places in a probability. `votes` (K,) is what `compute_share` says of each."""
     if not len(votes):
         return votes

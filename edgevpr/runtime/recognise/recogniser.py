@@ -20,11 +20,11 @@ from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Decider, Decision, Matcher, Verifier, WalkSettings
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, explain_failure
 from edgevpr.runtime.recognise.hints import RecordedPrior, to_expectation
-from edgevpr.runtime.recognise.judge import Verdict, says_nothing
-from edgevpr.runtime.recognise.levelling import with_picture_heading
+from edgevpr.runtime.recognise.judge import Verdict, check_texture
+from edgevpr.runtime.recognise.levelling import set_picture_heading
+from edgevpr.runtime.recognise.odometry import OdometryStep, VisualOdometry
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recognition import Recognition
-from edgevpr.runtime.recognise.stride import Stride, Strides
 
 _log = logging.getLogger(__name__)
 _LATER_PASS_SHARE = 0.4  # of the candidates, compared at each height but the first
@@ -33,7 +33,7 @@ _LATER_PASS_SHARE = 0.4  # of the candidates, compared at each height but the fi
 class Recogniser:
     """Recognises places of an open map, frame after frame.
 
-    `strides` measures the motion between frames (None: it is not measured). `prior` makes hints that narrow each query
+    `odometry` measures the motion between frames (None: it is not measured). `prior` makes hints that narrow each query
     (None: the whole map is searched). `place_filter` follows the flight from query to query (None: each is judged
     alone). Between two frames, `change` sets what the next is recognised with.
     """
@@ -46,13 +46,13 @@ class Recogniser:
         meter: QueryMeter,
         *,
         settings: WalkSettings,
-        strides: Strides | None = None,
+        odometry: VisualOdometry | None = None,
         prior: RecordedPrior | None = None,
         place_filter: PlaceFilter | None = None,
     ) -> None:
         self.encoder, self.place_map, self.meter = encoder, place_map, meter
         self.technique, self.candidates = encoder.technique, settings.candidates
-        self._settings, self._strides, self._place_filter = settings, strides, place_filter
+        self._settings, self._odometry, self._place_filter = settings, odometry, place_filter
         self._prior = prior or RecordedPrior()
         self._left_out_reported = 0  # places
         self._layers = matcher.layers or read_layers(place_map)
@@ -76,8 +76,8 @@ class Recogniser:
         if candidates is not None:
             self.candidates = candidates
         if mount is not None:
-            self.encoder = self.encoder.with_mount(mount)
-            self._strides = Strides() if self._strides else None  # no stride leads to the first frame
+            self.encoder = self.encoder.replace_mount(mount)
+            self._odometry = VisualOdometry() if self._odometry else None  # no stride leads to the first frame
 
     @property
     def sequence(self) -> int:
@@ -85,9 +85,9 @@ class Recogniser:
         return self.matcher.search.length if self.matcher.search else 1
 
     @property
-    def measures_strides(self) -> bool:
+    def measures_motion(self) -> bool:
         """True if the motion between two frames is measured."""
-        return self._strides is not None
+        return self._odometry is not None
 
     def step(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
         """Recognise one frame; `vehicle` is the autopilot's report at that moment (None: no report).
@@ -95,73 +95,73 @@ class Recogniser:
         Never raises an Exception: an error in a frame, a place or the technique becomes a rejection with its reason.
         """
         self.meter.begin()
-        query = stride = decision = failure = None
+        query = odometry_step = decision = failure = None
         try:
             query = self.encoder.encode(frame, vehicle, layers=self._layers, scale=self._scale, metered=self.meter.step)
             verifier = Verifier(self.encoder, query.picture, self.index, self.place_map)
-            stride = self._measure_stride(frame, query.view, verifier)
-            decision = self._decide(query, verifier, stride)
+            odometry_step = self._measure_odometry(frame, query.view, verifier)
+            decision = self._decide(query, verifier, odometry_step)
         except Exception as error:
             _log.debug("%s failed", frame.name, exc_info=True)
             failure = error
-        return self._event(frame, vehicle, query, stride, decision, failure)
+        return self._make_event(frame, vehicle, query, odometry_step, decision, failure)
 
     def measure_motion(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
         """Measure the motion from the frame before to this one, and nothing else. Never raises an Exception."""
         self.meter.begin()
-        picture = stride = failure = None
+        picture = odometry_step = failure = None
         try:
             with self.meter.step("prepare"):
                 picture = self.encoder.prepare(frame, vehicle, layers=self._layers, scale=self._scale)
             verifier = Verifier(self.encoder, picture, self.index, self.place_map)
-            stride = self._measure_stride(frame, picture.view, verifier)
+            odometry_step = self._measure_odometry(frame, picture.view, verifier)
         except Exception as error:
             _log.debug("%s failed", frame.name, exc_info=True)
             failure = error
-        return replace(self._event(frame, vehicle, stride=stride, failure=failure), picture=picture)
+        return replace(self._make_event(frame, vehicle, odometry_step=odometry_step, failure=failure), picture=picture)
 
     def report_unread(self, error: Exception) -> Recognition:
         """Return the event of a frame that could not even be read."""
         self.meter.begin()
-        return self._event(None, None, failure=error)
+        return self._make_event(None, None, failure=error)
 
-    def _event(
+    def _make_event(
         self,
         frame: Frame | None,
         vehicle: Vehicle | None,
         query: EncodedFrame | None = None,
-        stride: Stride | None = None,
+        odometry_step: OdometryStep | None = None,
         decision: Decision | None = None,
         failure: Exception | None = None,
     ) -> Recognition:
         """Return the event of a frame; `failure` is the error that ended it (None: none did)."""
         decision = decision or Decision(verdict=Verdict(False, explain_failure(failure)))
-        found, accepted = decision.findings, decision.verdict.accepted
-        where = found.where if found and accepted else None
+        findings, accepted = decision.findings, decision.verdict.accepted
+        located = findings.where if findings and accepted else None
         left_out = tuple(islice(self.place_map.left_out.items(), self._left_out_reported, None))
         self._left_out_reported += len(left_out)
         return Recognition(
             frame=frame,
             vehicle=vehicle,
             picture=query.picture if query else None,
-            worth=query.worth if query else None,
+            salience=query.salience if query else None,
             descriptor=query.descriptor if query else None,
-            stride=stride,
+            odometry=odometry_step,
             hints=decision.hints,
-            ranking=found.ranking if found else None,
+            ranking=findings.ranking if findings else None,
             best=decision.best,
-            proof=found.proof if found else None,
-            evidence=found.evidence if found else None,
+            proof=findings.proof if findings else None,
+            evidence=findings.evidence if findings else None,
             confidence=decision.confidence,
             followed=decision.followed,
             accepted=accepted,
             reason=decision.verdict.reason,
-            says_nothing=query is not None and says_nothing(query.descriptor, self.rule.min_quality) is not None,
+            says_nothing=query is not None and check_texture(query.descriptor, self.rule.min_quality) is not None,
             failed=failure is not None,
             map_lost=isinstance(failure, MapError) and not isinstance(failure, PlaceError),
             left_out=left_out,
-            located=where,
-            accuracy_m=max(self._settings.min_accuracy_m, where.accuracy_m) if where else None,
+            located=located,
+            accuracy_m=max(self._settings.min_accuracy_m, located.accuracy_m) if located else None,
             steps=self.meter.steps(),
             cost=self.meter.cost(),
         )
@@ -171,25 +171,25 @@ class Recogniser:
         """The factor to enlarge the next picture by."""
         return self._prior.scale(self.technique.spec.height_ratios)
 
-    def _measure_stride(self, frame: Frame, view: View, verifier: Verifier) -> Stride | None:
+    def _measure_odometry(self, frame: Frame, view: View, verifier: Verifier) -> OdometryStep | None:
         """Measure the stride of a frame from the one before, if its picture lies on the ground."""
-        if self._strides is None or not view.is_georeferenced:
+        if self._odometry is None or not view.is_georeferenced:
             return None
         with self.meter.step("stride"):
-            return self._strides.to(frame.t_mono_s, view, verifier.landmarks)
+            return self._odometry.measure(frame.t_mono_s, view, verifier.landmarks)
 
-    def _decide(self, query: EncodedFrame, verifier: Verifier, stride: Stride | None) -> Decision:
+    def _decide(self, query: EncodedFrame, verifier: Verifier, odometry_step: OdometryStep | None) -> Decision:
         """Search the map for an encoded frame, and learn from the decision what the next query needs."""
         place_filter = self._place_filter
-        objection = says_nothing(query.descriptor, self.rule.min_quality)
-        objection = objection or query.view.reason or (query.worth.reason if query.worth else None)
+        objection = check_texture(query.descriptor, self.rule.min_quality)
+        objection = objection or query.view.reason or (query.salience.reason if query.salience else None)
         if place_filter:
-            place_filter.predict(query.frame, query.vehicle, stride)
+            place_filter.predict(query.frame, query.vehicle, odometry_step)
         if objection and self.matcher.search is None:  # a sequence needs every query
             if place_filter:
                 place_filter.update_without_match(self.index)
             return Decision(verdict=Verdict(False, objection))
-        decision = self._find(query, verifier, place_filter)
+        decision = self._search_heights(query, verifier, place_filter)
         if place_filter:
             place_filter.commit()
         if objection:
@@ -201,11 +201,11 @@ class Recogniser:
             self._prior.update_area(followed.estimate, followed.mass, t_mono_s)
         return decision
 
-    def _find(self, query: EncodedFrame, verifier: Verifier, place_filter: PlaceFilter | None) -> Decision:
+    def _search_heights(self, query: EncodedFrame, verifier: Verifier, place_filter: PlaceFilter | None) -> Decision:
         """Search for a query as expected and, if nothing is accepted, at all other heights."""
         prior, search, height_ratios = self._prior, self.matcher.search, self.technique.spec.height_ratios
         margin_m = max(self.accuracy_m, self.rule.neighbour_m)
-        hints = prior.hints(with_picture_heading(query.frame, query.view), query.vehicle, self.index, margin_m)
+        hints = prior.make_hints(set_picture_heading(query.frame, query.view), query.vehicle, self.index, margin_m)
         height_ratio = prior.height_ratio / self._scale
         expected = to_expectation(hints, height_ratio, self.index)
         footprint_m = query.view.footprint_m or prior.footprint_m
@@ -213,7 +213,7 @@ class Recogniser:
         if search:
             ranking = search.add_query(ranking, self.index, query.frame.t_mono_s)
         decision = self._decider.decide(ranking, query, hints, verifier, place_filter)
-        if decision.verdict.accepted or search or not height_ratios or not prior.looks_again:
+        if decision.verdict.accepted or search or not height_ratios or not prior.searches_heights:
             return decision
         first = find_nearest_height(height_ratios, height_ratio)
         for ratio in height_ratios:

@@ -12,9 +12,9 @@ from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.evidence import Evidence
 from edgevpr.runtime.recognise.hints import Hints
 from edgevpr.runtime.recognise.locate import Located
-from edgevpr.runtime.recognise.place_filter import Followed
-from edgevpr.runtime.recognise.salience_gate import Worth
-from edgevpr.runtime.recognise.stride import Stride
+from edgevpr.runtime.recognise.odometry import OdometryStep
+from edgevpr.runtime.recognise.place_filter import TrackEstimate
+from edgevpr.runtime.recognise.salience_gate import SalienceVerdict
 
 _OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", "covariance_cells2", "rotation_deg")
 
@@ -29,16 +29,16 @@ class Recognition:
     frame: Frame | None
     vehicle: Vehicle | None = None  # the autopilot's report when the frame was taken
     picture: LevelledImage | None = None  # that was encoded, and how it lies on the ground
-    worth: Worth | None = None  # judgement of the salience gate
+    salience: SalienceVerdict | None = None  # judgement of the salience gate
     descriptor: Descriptor | None = None
-    stride: Stride | None = None  # since the frame before
+    odometry: OdometryStep | None = None  # since the frame before
     hints: Hints | None = None  # that narrowed the search
     ranking: Ranking | None = None
     best: Candidate | None = None  # the first of the ranking
     proof: Agreement | None = None  # of the landmarks
     evidence: Evidence | None = None
     confidence: float | None = None  # probability, by the evidence, that the match is right (None: judged by limits)
-    followed: Followed | None = None  # the result together with the flight so far
+    followed: TrackEstimate | None = None  # the result together with the flight so far
     accepted: bool = False  # `best` is taken for the place
     reason: Reason = NOT_SEARCHED  # why or why not
     says_nothing: bool = False  # too little to be recognised; a search was only made to continue a sequence
@@ -84,8 +84,8 @@ def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
     evidence = event.evidence and {key: round(value, 3) for key, value in event.evidence.figures().items()}
     known: dict[str, Any] = {
         "view": event.view.fields() if event.view != UNKNOWN_VIEW else None,
-        "salience": event.worth and event.worth.salience.rounded(),
-        "stride": event.stride and event.stride.fields(),
+        "salience": event.salience and event.salience.scores.rounded(),
+        "stride": event.odometry and event.odometry.fields(),
         "landmarks": event.proof and _landmarks(event.proof),
         "confidence": event.confidence if exact else _round(event.confidence, 6),
         "evidence": evidence,
@@ -121,7 +121,7 @@ def _landmarks(proof: Agreement) -> dict[str, Any]:
     return fields
 
 
-def _followed_fields(followed: Followed) -> dict[str, Any]:
+def _followed_fields(followed: TrackEstimate) -> dict[str, Any]:
     fields = {"confidence": round(followed.confidence, 6), "lost": round(followed.lost, 6)}
     return fields | (_where(followed.estimate) if followed.estimate else {})
 

@@ -23,25 +23,27 @@ from edgevpr.techniques.entropy import compute_filled_bins
 
 MAX_ENTROPY = float(np.log2(81) / 8)  # entropy / 8 bits of a disc of 81 pixels, all different
 GAP_FRAMES = 20  # if none of so many frames passes, the thresholds are lowered
-STEP = 0.03  # by which they are lowered at a time
-_TO_KNOW, _REMEMBERED = 8, 100  # frames that tell what entropy is usual: at least, at most
+THRESHOLD_STEP = 0.03  # by which they are lowered at a time
+_MIN_FRAMES = 8  # for the usual entropy
+_MAX_FRAMES = 100
 # A tenth of a normal distribution lies more than so many differences of its 90th and 75th percentiles below the 75th.
-_STEPS_BELOW, _LEAST_STEP = 3.2, 0.005
+_USUAL_LIMIT_STEPS = 3.2
+_MIN_STEP = 0.005
 _MAX_PX = 320  # of the copy on which entropy is computed: a larger one costs more and gives the same
 
 
 @dataclass(frozen=True, slots=True)
-class Worth:
-    """Judgement of a frame by its scores, `salience`. `short_by` is how far the worst one is below its threshold,
-    `lacks` its name, and `reason` says so (0 and None: the frame passes)."""
+class SalienceVerdict:
+    """Judgement of a frame by its `scores`. `shortfall` is how far the worst one is below its threshold,
+    `criterion` its name, and `reason` says so (0 and None: the frame passes)."""
 
-    salience: Salience
-    short_by: float = 0.0
-    lacks: str | None = None
+    scores: Salience
+    shortfall: float = 0.0
+    criterion: str | None = None
     reason: Reason | None = None
 
 
-class Gate:
+class SalienceGate:
     """Judges the frames of a flight, one after the other.
 
     `memorability` and `detector` are None if their criterion is off. The detector runs on every k-th frame only (k =
@@ -52,24 +54,24 @@ class Gate:
         self, config: SalienceConfig, memorability: Memorability | None = None, detector: Detector | None = None
     ) -> None:
         self.config, self._memorability, self._detector = config, memorability, detector
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Prepare for another flight: forget the usual entropy and the last result of the detector."""
-        self._entropies: deque[float] = deque(maxlen=_REMEMBERED)
+        self._entropies: deque[float] = deque(maxlen=_MAX_FRAMES)
         self._until_detection = 0
         self._static: Mask | None = None
 
-    def judge(self, image: Image) -> Worth:
+    def judge(self, image: Image) -> SalienceVerdict:
         """Judge a frame, uint8 (H, W[, 3]). Raises ModelError for an unusable network."""
         scores = self.scores(image)
         self._entropies.append(scores.entropy or 0.0)
         # In the first frames of a flight the light is not known; half of the threshold still rejects an empty picture.
         usual = self.config.entropy / 2
-        if len(self._entropies) >= _TO_KNOW:
+        if len(self._entropies) >= _MIN_FRAMES:
             middle, high = np.percentile(self._entropies, (75, 90))
-            usual = float(middle - _STEPS_BELOW * max(high - middle, _LEAST_STEP))
-        return compute_memorability(scores, self.config, usual)
+            usual = float(middle - _USUAL_LIMIT_STEPS * max(high - middle, _MIN_STEP))
+        return judge_scores(scores, self.config, usual)
 
     def scores(self, image: Image) -> Salience:
         """Return the scores of a frame. Raises ModelError as `judge` does."""
@@ -81,22 +83,22 @@ class Gate:
         return compute_scores(image, self._memorability, self._static)
 
 
-def compute_memorability(salience: Salience, config: SalienceConfig, usual: float = 1.0) -> Worth:
+def judge_scores(salience: Salience, config: SalienceConfig, usual: float = 1.0) -> SalienceVerdict:
     """Compare the scores of a frame (None: not) with their thresholds, entropy with `usual` if that is lower."""
     known = salience.scores
     least = {name: getattr(config, name) for name in known} | {"entropy": min(config.entropy, usual)}
     short = {name: least[name] - score for name, score in known.items() if least[name] > 0 and score is not None}
     worst = max(short, key=lambda name: short[name], default=None)
     if worst is None or short[worst] <= 0:
-        return Worth(salience)
+        return SalienceVerdict(salience)
     figures = {"measure": worst, "score": known[worst], "needed": least[worst]}
-    return Worth(salience, short[worst], worst, Reason(ReasonCode.NOT_MEMORABLE, figures))
+    return SalienceVerdict(salience, short[worst], worst, Reason(ReasonCode.NOT_MEMORABLE, figures))
 
 
 def select_best(shortfalls: list[float]) -> list[bool]:
     """Find the best of some frames: lower all thresholds in steps of 0.03 until at least one frame passes. Returns for
-    each frame whether it passes then; `shortfalls` are the frames' `Worth.short_by`."""
-    steps = np.ceil(np.round(np.array(shortfalls) / STEP, 6))
+    each frame whether it passes then; `shortfalls` are the frames' `SalienceVerdict.shortfall`."""
+    steps = np.ceil(np.round(np.array(shortfalls) / THRESHOLD_STEP, 6))
     return [bool(step == steps.min()) for step in steps]
 
 
@@ -116,7 +118,7 @@ def compute_scores(image: Image, memorability: Memorability | None = None, is_st
         covered = cv2.resize((~is_static).astype(np.float32), grey.shape[::-1], interpolation=cv2.INTER_AREA)
         is_static = covered < 0.5
     static = 1.0 if is_static is None else is_static
-    memorable = None if memorability is None else interpolate_map(memorability.matrix(image), grey.shape)
+    memorable = None if memorability is None else interpolate_map(memorability.compute_matrix(image), grey.shape)
     return Salience(
         memorability=None if memorable is None else float((memorable * static).mean()),
         staticity=None if is_static is None else float(is_static.mean()),

@@ -19,7 +19,7 @@ from edgevpr.mavlink.signing import open_signing
 from edgevpr.power.boards import Board, load_board, resolve_board
 from edgevpr.runtime.flight.startup import apply_recorded_rate
 from edgevpr.runtime.preflight.pick import explain_technique, measure_flight
-from edgevpr.runtime.recognise.calibration import not_calibrated, read_calibration_for
+from edgevpr.runtime.recognise.calibration import explain_not_calibrated, read_calibration_for
 from edgevpr.runtime.recognise.levelling import load_calibrated_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.service.camera import FRAME_WAIT_S, check_frame
@@ -52,13 +52,13 @@ def check_configuration(config_path: str | Path, *, offline: bool = False) -> li
 
 
 def _check_map(what: str, config: Config, board: Board) -> Finding:
-    recogniser = open_recogniser(config, board, narrowed=True)
+    recogniser = open_recogniser(config, board, uses_hints=True)
     with closing(recogniser.place_map) as place_map:
         t_query_s, cost = measure_flight(recogniser)
         technique, confidence = explain_technique(recogniser, is_named=config.technique is not None), None
         if recogniser.rule.sure:
             calibration = read_calibration_for(place_map)
-            confidence = calibration.described() if calibration else not_calibrated(len(place_map))
+            confidence = calibration.described() if calibration else explain_not_calibrated(len(place_map))
     settings = config.mavlink
     if settings.link and settings.send_fixes and t_query_s > MAX_FIX_AGE_S:
         return report_fault(what, FindingCode.QUERY_TOO_SLOW, t_query_s=t_query_s, limit_s=MAX_FIX_AGE_S)

@@ -66,7 +66,7 @@ def test_ratio_sd_is_what_the_newest_match_contradicts_the_ratio_by(watch):
 
 def test_measure_frame_claims_what_the_height_may_be_wrong_by():
     frame = SimpleNamespace(t_mono_s=1.0, t_sd_s=0.03)
-    event = SimpleNamespace(frame=frame, view=View(), stride=None)
+    event = SimpleNamespace(frame=frame, view=View(), odometry=None)
     ratios = {(1.0, 0.0): 0.0, (1.0, 0.41): 0.41, (1.4, 0.1): 0.4}
     for (ratio, ratio_sd), claimed in ratios.items():
         found = measure_frame(event, None, is_level=False, height_ratio=ratio, height_ratio_sd=ratio_sd)

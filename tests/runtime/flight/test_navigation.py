@@ -13,8 +13,8 @@ from edgevpr.runtime.flight import drift
 from edgevpr.runtime.flight.drift import DEAD_RECKONING, GRAVITY_M_S2, INERTIAL
 from edgevpr.runtime.flight.measurements import FrameMeasurement, PositionedMatch
 from edgevpr.runtime.flight.navigation import Navigation
+from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.perspective import AttitudeError
-from edgevpr.runtime.recognise.stride import Stride
 
 HOME = 47.0, 8.0
 STEP_S = 0.02
@@ -124,8 +124,8 @@ def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_rec
         stride = None
         if len(frames) > 1:
             (from_s, before), (to_s, now) = frames[-2:]
-            stride = Stride(from_s=from_s, to_s=to_s, moved_m=tuple(now - before), sd_m=0.7, inliers=100)
-        flown.take(seen_m, 1.0, lean_s2=lean_s2, sd_m=1.5, stride=stride)
+            stride = OdometryStep(from_s=from_s, to_s=to_s, moved_m=tuple(now - before), sd_m=0.7, inliers=100)
+        flown.take(seen_m, 1.0, lean_s2=lean_s2, sd_m=1.5, odometry=stride)
 
     flown.fix = fix
     errors_m, said_m = flown.fly(15)
@@ -217,9 +217,11 @@ def test_strides_claim_what_unknown_ground_can_do(zoom, gap_s, least_m, most_m):
     flown.fly(gap_s, has_gps=False)
     for number in range(10):
         flown.fly(1, has_gps=False)
-        stride = Stride(from_s=flown.t_s - 1, to_s=flown.t_s, moved_m=(10.0, 0.0), sd_m=0.2, inliers=100, zoom=zoom)
+        stride = OdometryStep(
+            from_s=flown.t_s - 1, to_s=flown.t_s, moved_m=(10.0, 0.0), sd_m=0.2, inliers=100, zoom=zoom
+        )
         flown.navigation._strides_since_fix.add(
-            np.array([10.0, 0.0]), zoom, FrameMeasurement(t_s=flown.t_s, sd_m=0.2, stride=stride)
+            np.array([10.0, 0.0]), zoom, FrameMeasurement(t_s=flown.t_s, sd_m=0.2, odometry=stride)
         )
         assert number or flown.navigation.estimate_state(flown.t_s)
     assert least_m <= flown.navigation._strides_since_fix.error_m <= most_m

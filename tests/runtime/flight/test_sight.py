@@ -32,7 +32,7 @@ class Seen:
                     accepted=outcome == "+",
                     failed=outcome == "x",
                     says_nothing=outcome == "0",
-                    worth=SimpleNamespace(reason="grass" if outcome == "n" else None),
+                    salience=SimpleNamespace(reason="grass" if outcome == "n" else None),
                     view=View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 50.0}) if outcome == "t" else None),
                     followed=SimpleNamespace(lost=0.95 if outcome == "L" else 0.2),
                     frame=SimpleNamespace(t_mono_s=self.clock.now_s),

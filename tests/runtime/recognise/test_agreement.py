@@ -5,8 +5,14 @@ import numpy as np
 import pytest
 from pictures import textured
 
-from edgevpr.runtime.recognise.agreement import CONFIRMED, PROVEN, Overlay, compare_near, measure_agreement
-from edgevpr.runtime.recognise.landmarks import OF_QUERY, Landmarks, describe, pack_bytes, unpack_bytes
+from edgevpr.runtime.recognise.agreement import (
+    MIN_CONFIRMED_INLIERS,
+    MIN_PROVEN_INLIERS,
+    Overlay,
+    compare_near,
+    measure_agreement,
+)
+from edgevpr.runtime.recognise.landmarks import QUERY_LANDMARKS, Landmarks, detect_landmarks, pack_bytes, unpack_bytes
 from edgevpr.techniques import create
 
 WIDE, HIGH = 640, 480
@@ -37,11 +43,11 @@ def cut(landscape, x, y, up_deg=0.0, scale=1.0):
 
 
 def asked(image):
-    return describe(image, most=OF_QUERY)
+    return detect_landmarks(image, most=QUERY_LANDMARKS)
 
 
 def kept(image):
-    return unpack_bytes(pack_bytes(describe(image)))
+    return unpack_bytes(pack_bytes(detect_landmarks(image)))
 
 
 @pytest.mark.slow
@@ -54,7 +60,7 @@ def test_the_signs_are_those_of_a_match_of_cohog(landscape, right_px, down_px, t
     place = cut(landscape, 800, 600)
     query = cut(landscape, 800 + right_px, 600 + down_px, turned_deg, scale)
     found = measure_agreement(asked(query), kept(place))
-    assert found.inliers >= PROVEN
+    assert found.inliers >= MIN_PROVEN_INLIERS
     assert np.array(found.shift_share) * WIDE == pytest.approx((right_px, down_px), abs=2)
     assert abs((found.rotation_deg - turned_deg + 180) % 360 - 180) < 1
     assert found.scale == pytest.approx(scale, rel=0.02)
@@ -67,7 +73,7 @@ def test_the_signs_are_those_of_a_match_of_cohog(landscape, right_px, down_px, t
     expected = Overlay((match.shift_cells[0] / 32, match.shift_cells[1] / 32), match.rotation_deg)
     guided = compare_near(asked(query), kept(place), expected)
     assert guided.is_expected
-    assert guided.inliers >= PROVEN
+    assert guided.inliers >= MIN_PROVEN_INLIERS
     assert guided.shift_share == pytest.approx(found.shift_share, abs=0.005)
 
 
@@ -76,7 +82,7 @@ def test_pictures_of_other_ground_do_not_agree(landscape, seed):
     other = textured(100 + seed, HIGH, WIDE)
     expected = Overlay((0.05 * (seed % 3), -0.05), 15.0 * seed)
     found = compare_near(asked(other), kept(cut(landscape, 800, 600)), expected)
-    assert found.inliers < CONFIRMED
+    assert found.inliers < MIN_CONFIRMED_INLIERS
     assert found.is_expected
 
 
@@ -85,5 +91,5 @@ def test_landmarks_all_on_one_spot_do_not_agree(landscape):
     place = kept(cut(landscape, 800, 600))
     heap = Landmarks(np.zeros_like(place.points), place.angle_deg, np.zeros_like(place.size), place.bits)
     for expected in (None, Overlay((0.0, 0.0), 0.0)):
-        assert measure_agreement(asked(cut(landscape, 800, 600)), heap, expected).inliers < CONFIRMED
-        assert measure_agreement(heap, place, expected).inliers < CONFIRMED
+        assert measure_agreement(asked(cut(landscape, 800, 600)), heap, expected).inliers < MIN_CONFIRMED_INLIERS
+        assert measure_agreement(heap, place, expected).inliers < MIN_CONFIRMED_INLIERS

@@ -123,7 +123,7 @@ def test_landmark_is_an_inlier_within_the_tolerance(off, inliers):
     place.points[40, 0] = off
     found = measure_agreement(query, place)
     assert (found.inliers, found.matched, found.possible) == (inliers, 41, 41)
-    assert len(found.coinciding[0]) == inliers
+    assert len(found.inlier_points[0]) == inliers
 
 
 def test_agreement_that_all_inliers_put_beyond_the_expected_overlays_is_none():
@@ -220,7 +220,7 @@ def test_compose_overlays_leads_from_one_place_to_the_other():
 
 
 def test_step_and_turn_are_a_complex_step_and_logarithm():
-    assert Overlay((0.1, 0.2), 330.0, 1.5).step_and_turn == pytest.approx(
+    assert Overlay((0.1, 0.2), 330.0, 1.5).relative_pose == pytest.approx(
         (0.1 - 0.2j, math.log(1.5) + 1j * math.pi / 6)
     )
-    assert Overlay((0.1, 0.2), 0.0).step_and_turn[1] == 0
+    assert Overlay((0.1, 0.2), 0.0).relative_pose[1] == 0

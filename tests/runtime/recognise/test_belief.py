@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from edgevpr.runtime.recognise.belief import Belief, MapScale, Proposals
-from edgevpr.runtime.recognise.place_filter import limit_motion
+from edgevpr.runtime.recognise.place_filter import make_motion
 
 PLACES, SPACING_M = 100, 20.0
 IN_ORDER = MapScale(spacing=1.0, near=2.0, is_ordinal=True)
 IN_METRES = MapScale(spacing=SPACING_M, near=30.0)
-STEP = limit_motion(1.0, 3.0)  # within three places of the query before
+STEP = make_motion(1.0, 3.0)  # within three places of the query before
 SURE = 0.999
 
 
@@ -97,7 +97,7 @@ def over(track_m, belief, odometry, p=0.8):
         said = odometry(at - track_m[n - 1]) if n else None
         beside = at + np.array([300.0 * np.cos(7 * n), 300.0 * np.sin(7 * n)])
         query = seen([at, beside], [p, (1 - p) / 2], sd=4.0, heading_deg=350.0 if n % 2 else 10.0)
-        posteriors.append(belief.update(query, limit_motion(1.0, 40.0, said), PLACES))
+        posteriors.append(belief.update(query, make_motion(1.0, 40.0, said), PLACES))
     return posteriors
 
 
@@ -151,7 +151,7 @@ def test_any_numbers_at_all_pass(ground, places):
         query = some(rng, int(rng.integers(0, 60)), rng.choice([0, 1, 100, 1e7]))
         velocity = rng.choice([0, 1, -3, np.nan, 1e9, np.inf], 2).tolist()
         elapsed_s = float(rng.choice([1, 1e-9, -1, np.nan, 1e6, 1e12]))
-        posterior = belief.update(query, limit_motion(elapsed_s, float(rng.choice([3, 1e5])), tuple(velocity)), places)
+        posterior = belief.update(query, make_motion(elapsed_s, float(rng.choice([3, 1e5])), tuple(velocity)), places)
         assert np.isfinite([*posterior.p, posterior.lost, posterior.mass]).all()
         assert not posterior.mass or np.linalg.eigvalsh(posterior.covariance)[0] > 0
 
@@ -166,5 +166,5 @@ def test_any_numbers_at_all_pass(ground, places):
     ],
 )
 def test_limit_motion_uses_no_time_and_no_velocity_that_cannot_be(elapsed_s, velocity, by, reach):
-    motion = limit_motion(elapsed_s, 30.0, velocity)
+    motion = make_motion(elapsed_s, 30.0, velocity)
     assert (motion.by if motion.by is None else tuple(motion.by), motion.reach) == (by, reach)

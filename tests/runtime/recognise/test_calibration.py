@@ -20,12 +20,12 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.calibration import (
     MapCalibration,
-    calibration_text,
+    format_calibration,
     read_calibration_for,
     require_usable,
 )
-from edgevpr.runtime.recognise.confidence import prior, select_model
-from edgevpr.runtime.recognise.evidence import OF_MAP, OF_PLACE
+from edgevpr.runtime.recognise.confidence import parse_model, prior
+from edgevpr.runtime.recognise.evidence import MAP_FIGURES, PLACE_FIGURES
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.techniques import create
 
@@ -64,7 +64,7 @@ def keep(path, text):
 
 def flown(path):
     """The models by which the flight over a map decides, and whether it recognises its own picture."""
-    recogniser = open_recogniser(load_config(None, {"map": str(path)}), load_board("this"), narrowed=True)
+    recogniser = open_recogniser(load_config(None, {"map": str(path)}), load_board("this"), uses_hints=True)
     with recogniser.place_map:
         event = recogniser.step(frame(1))
         assert not event.failed, event.reason
@@ -75,7 +75,7 @@ def flown(path):
 
 def test_a_flight_decides_by_the_models_of_its_map(path, caplog):
     assert flown(path) == SHIPPED
-    keep(path, calibration_text(FOUND))
+    keep(path, format_calibration(FOUND))
     assert flown(path) == {**SHIPPED, "ahead": OWN}, "an older edgevpr calibrated one of them"
     with PlaceMap.open(path) as place_map:
         assert read_calibration_for(place_map) == FOUND
@@ -84,7 +84,7 @@ def test_a_flight_decides_by_the_models_of_its_map(path, caplog):
 
 def changed(of_other_places=(), **figures):
     """The text of the calibration as an earlier build wrote it, with other figures of its model, and its checksum."""
-    stored = json.loads(calibration_text(FOUND)[8:])
+    stored = json.loads(format_calibration(FOUND)[8:])
     stored["models"]["ahead"]["of_other_places"] = of_other_places
     stored["models"]["ahead"]["of_map"].update(figures)
     body = json.dumps(stored)
@@ -94,13 +94,13 @@ def changed(of_other_places=(), **figures):
 DAMAGED = {
     "empty": "",
     "no json": "deadbeef{",
-    "changed": calibration_text(FOUND).replace("2026", "2025"),
+    "changed": format_calibration(FOUND).replace("2026", "2025"),
     "evidence that there is not": changed(names=["colour", *OWN.of_map.names[1:]]),
-    "a kind that there is not": calibration_text(replace(FOUND, models={"sideways": OWN})),
+    "a kind that there is not": format_calibration(replace(FOUND, models={"sideways": OWN})),
     "a weight too few": changed(weights=OWN.of_map.weights[1:]),
     "joined from several maps": changed(of_other_places=[asdict(OWN.of_place)]),
-    "a place that is no number": calibration_text(replace(FOUND, recognisable={"x": 0.5})),
-    "no places": calibration_text(replace(FOUND, recognisable=None)),
+    "a place that is no number": format_calibration(replace(FOUND, recognisable={"x": 0.5})),
+    "no places": format_calibration(replace(FOUND, recognisable=None)),
     "a wrong surrogate": "\ud800" * 9,
 }
 
@@ -123,12 +123,12 @@ def test_a_row_of_another_form_ends_no_flight(path, value):
     assert flown(path) == SHIPPED
 
 
-@pytest.mark.parametrize("kind", OF_MAP)
+@pytest.mark.parametrize("kind", MAP_FIGURES)
 def test_a_shipped_model_makes_a_probability_of_any_evidence(kind):
     model = prior(kind)
     require_usable(kind, model)
-    assert select_model(json.loads(json.dumps(asdict(model)))) == model
-    evidence = dict.fromkeys(OF_MAP[kind] + OF_PLACE[kind], 0.0)
+    assert parse_model(json.loads(json.dumps(asdict(model)))) == model
+    evidence = dict.fromkeys(MAP_FIGURES[kind] + PLACE_FIGURES[kind], 0.0)
     for value in (-3.0, -1.0, 0.0, 1.0, 3.0):
         assert 0 <= model.confidence(dict.fromkeys(evidence, value)) <= 1
     for value in (math.nan, math.inf, -math.inf):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from edgevpr.runtime.recognise.gate_networks import Detector, fastestdet
+from edgevpr.runtime.recognise.gate_networks import Detector, decode_fastestdet
 from edgevpr.techniques.card import load_card
 
 pytest.importorskip("onnx", reason="the test networks are written with onnx (pip install onnx)")
@@ -44,7 +44,7 @@ def test_a_padded_picture_has_its_boxes_where_they_are(opened):
 
 def test_a_wide_view_is_looked_at_in_tiles_and_what_is_too_long_to_move_counts_as_ground(opened):
     detector = opened([(16, 16, 32, 32, 2)])
-    assert [detector.tiles(width_m) for width_m in (None, 5, 12, 20, 30, 4000)] == [1, 1, 1, 2, 3, 4]
+    assert [detector.count_tiles(width_m) for width_m in (None, 5, 12, 20, 30, 4000)] == [1, 1, 1, 2, 3, 4]
     static = detector.is_static(PICTURE, 20.0)
     assert not static[:64, :128].all()  # found in every tile
     assert not static[64:, 128:].all()
@@ -76,7 +76,7 @@ def test_fastestdet_cell_by_cell():
     rows, columns, classes = 3, 5, 4
     raw = RNG.normal(0, 1, (1, 5 + classes, rows, columns)).astype(np.float32)
     raw[0, 0], raw[0, 5:] = RNG.random((rows, columns)), RNG.random((classes, rows, columns))
-    boxes, scores = fastestdet([raw], (96, 160))
+    boxes, scores = decode_fastestdet([raw], (96, 160))
     for row in range(rows):
         for column in range(columns):
             thing, x, y, w, h, *named = raw[0, :, row, column].tolist()

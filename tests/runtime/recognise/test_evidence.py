@@ -17,14 +17,14 @@ from edgevpr.runtime.recognise.evidence import (
     AHEAD_PROVEN,
     DOWN,
     DOWN_BARE,
-    OF_MAP,
-    OF_PLACE,
+    MAP_FIGURES,
+    PLACE_FIGURES,
     LookAlike,
     LookAlikes,
     gather_evidence,
     list_evidence_kinds,
     log_count,
-    log_times_more,
+    log_inlier_ratio,
 )
 from edgevpr.techniques import create
 
@@ -65,7 +65,7 @@ def test_evidence_has_the_names_that_models_ask_for():
         (DOWN_BARE, looked_down(down)),
     ):
         assert evidence.kind == kind
-        assert set(evidence.figures()) >= {*OF_MAP[kind], *OF_PLACE[kind]}
+        assert set(evidence.figures()) >= {*MAP_FIGURES[kind], *PLACE_FIGURES[kind]}
         assert evidence.describe().keys() <= ReasonCode.LOW_CONFIDENCE.parameters
 
 
@@ -99,12 +99,12 @@ HARDLY_AHEAD = replace(AHEAD_OF_ALL, lead=math.log(1.49))
         (HARDLY_AHEAD, True),
         (replace(HARDLY_AHEAD, landmarks=log_count(8)), True),
         (replace(HARDLY_AHEAD, landmarks=log_count(9)), False),
-        (replace(HARDLY_AHEAD, landmarks=log_count(15), rank_gap=0.11, proof=log_times_more(15, 3)), True),
-        (replace(HARDLY_AHEAD, landmarks=log_count(16), rank_gap=0.11, proof=log_times_more(16, 3)), False),
+        (replace(HARDLY_AHEAD, landmarks=log_count(15), rank_gap=0.11, proof=log_inlier_ratio(15, 3)), True),
+        (replace(HARDLY_AHEAD, landmarks=log_count(16), rank_gap=0.11, proof=log_inlier_ratio(16, 3)), False),
         (replace(AHEAD_OF_ALL, rank_gap=0.11), False),
         (replace(HARDLY_AHEAD, apart=math.log(1.51)), False),
         (replace(AHEAD_OF_ALL, apart=math.log(1.49)), True),
-        (replace(AHEAD_OF_ALL, apart=math.log(1.49), proof=log_times_more(9, 3)), False),
+        (replace(AHEAD_OF_ALL, apart=math.log(1.49), proof=log_inlier_ratio(9, 3)), False),
         (replace(HARDLY_AHEAD, likeness=None), False),
     ],
 )
@@ -132,7 +132,7 @@ def test_the_lead_is_over_places_elsewhere_and_not_over_neighbours():
 
 @pytest.mark.parametrize(("inliers", "rival", "times"), [(32, 0, 4), (32, 16, 2), (32, 40, 1), (7, 3, 1), (0, 250, 1)])
 def test_ahead_landmarks_speak_for_a_match_as_far_as_more_agree_than_elsewhere_and_by_chance(inliers, rival, times):
-    proof = log_times_more(inliers, rival)
+    proof = log_inlier_ratio(inliers, rival)
     assert proof == pytest.approx(math.log(times))
     known = replace(looked_ahead({5: ahead(0.2)}), proof=proof)
     described = known.describe()

@@ -14,7 +14,7 @@ from edgevpr.core.contract import Descriptor
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import NO_COST, Frame
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.judge import says_nothing
+from edgevpr.runtime.recognise.judge import check_texture
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.techniques import create
 
@@ -43,7 +43,7 @@ def walk(request, tmp_path_factory):
     ("quality", "refused"), [(0.0, True), (0.399, True), (math.nan, True), (0.4, False), (1, False)]
 )
 def test_a_picture_says_enough_from_two_fifths_on(quality, refused):
-    reason = says_nothing(Descriptor(coarse=np.zeros(1), quality=quality), create("cohog").min_quality)
+    reason = check_texture(Descriptor(coarse=np.zeros(1), quality=quality), create("cohog").min_quality)
     assert (reason is not None) == refused
 
 

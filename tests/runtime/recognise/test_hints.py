@@ -62,7 +62,7 @@ def hints_at(now_s, index, autopilot=None, fix=None, reach_m_s=10.0, heading_deg
     if fix:
         prior.update(found(fix[0]), True, fix[1])
     frame = Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=now_s, heading_deg=heading_deg)
-    return prior.hints(frame, autopilot, index, 50.0)
+    return prior.make_hints(frame, autopilot, index, 50.0)
 
 
 def test_reach_grows_with_the_time_since_the_position_was_known(index):
@@ -123,7 +123,7 @@ def test_queries_look_with_and_without_hints_until_a_match_says_whether_they_can
     for number, (metres, accepted) in enumerate(answers):
         # The autopilot knows where it is to within 100 m, so that hints are there for every query.
         frame = Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=float(number))
-        seen.append(prior.hints(frame, vehicle(near, float(number)), index, 100.0) is not None)
+        seen.append(prior.make_hints(frame, vehicle(near, float(number)), index, 100.0) is not None)
         prior.update(found(metres), accepted, float(number))
     assert seen == [True, False, True, False, True, True, False]
 
@@ -134,7 +134,7 @@ def test_a_compass_that_is_wrong_leaves_the_area_believed_and_a_false_position_l
     answers = [(50, 90.0), None, None, (50, 90.0), (500, 0.0), (500, 90.0), None, None, (50, 0.0), None]
     for number, answer in enumerate(answers):
         frame = Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=float(number), heading_deg=0.0)
-        hints = prior.hints(frame, vehicle(near, float(number)), index, 100.0)
+        hints = prior.make_hints(frame, vehicle(near, float(number)), index, 100.0)
         seen.append(hints and (hints.reach is not None, hints.heading_deg is not None))
         metres, turned_deg = answer or (50, 0.0)
         prior.update(found(metres, 0.0, turned_deg), answer is not None, float(number))
@@ -148,13 +148,15 @@ def test_a_flight_that_is_sure_where_it_is_narrows_the_search_for_a_minute():
     there = Located(position=north(2000), covariance_m2=(9.0, 0.0, 16.0))
     prior.update_area(there, 0.98, 10.0)
     prior.update_area(None, 1.0, 10.0)
-    assert prior.hints(frame, None, long_index, 50.0) is None
+    assert prior.make_hints(frame, None, long_index, 50.0) is None
     prior.update_area(there, 0.99, 10.0)
-    assert prior.hints(frame, None, long_index, 50.0) == Hints(Reach(north(2000), 320.0))
-    assert prior.hints(frame, None, long_index, 100.0) == Hints(Reach(north(2000), 520.0)), "five places on every side"
+    assert prior.make_hints(frame, None, long_index, 50.0) == Hints(Reach(north(2000), 320.0))
+    assert prior.make_hints(frame, None, long_index, 100.0) == Hints(Reach(north(2000), 520.0)), (
+        "five places on every side"
+    )
     prior.update_area(there, 0.5, 12.0)
-    assert prior.hints(replace(frame, t_mono_s=14.0), None, long_index, 50.0) == Hints(Reach(north(2000), 440.0))
-    assert prior.hints(replace(frame, t_mono_s=70.1), None, long_index, 50.0) is None
+    assert prior.make_hints(replace(frame, t_mono_s=14.0), None, long_index, 50.0) == Hints(Reach(north(2000), 440.0))
+    assert prior.make_hints(replace(frame, t_mono_s=70.1), None, long_index, 50.0) is None
 
 
 def test_the_next_picture_is_scaled_to_a_height_that_is_tried():
@@ -180,7 +182,7 @@ def test_over_unmapped_ground_every_second_query_is_looked_for_from_all_heights(
     prior = Prior(None, WITHIN_DEG, is_live=True)
     again = []
     for accepted in (False, False, False, True, True, False, False):
-        again.append(prior.looks_again)
+        again.append(prior.searches_heights)
         prior.update(found(), accepted, 0.0)
     assert again == [True, False, True, False, True, True, False]
 
@@ -192,7 +194,7 @@ def test_recorded_prior_corrects_a_small_error_of_the_height_by_three_matches_on
     best = Candidate(Place(place_id=1, source_image="a"), FineMatch(0.5, height_ratio=ratio))
     found = []
     for _ in range(4):
-        prior.hints(frame, None, index, 0.0)
+        prior.make_hints(frame, None, index, 0.0)
         found.append(prior.height_ratio)
         prior.update(best, True, 0.0, 1.0, 60.0)
     uncorrected = matches or 4

@@ -15,8 +15,16 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Position
 from edgevpr.places.retrieve import Ranking
 from edgevpr.places.sequence import SequenceSearch
-from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, OF_MAP, OF_PLACE, Evidence, log_count
-from edgevpr.runtime.recognise.judge import AcceptRule, Findings, Sureness, accept_rule, is_at_rest, judge, says_nothing
+from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, MAP_FIGURES, PLACE_FIGURES, Evidence, log_count
+from edgevpr.runtime.recognise.judge import (
+    AcceptRule,
+    ConfidenceRule,
+    Findings,
+    accept_rule,
+    check_texture,
+    is_at_rest,
+    judge,
+)
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.perspective import ShownTilt
 from edgevpr.techniques import create
@@ -59,10 +67,10 @@ def test_more_evidence_is_asked_for_only_where_it_can_decide(confidence, of_map,
 
 
 def test_sureness_shows_no_more_than_the_data_support():
-    sure = Sureness(dict.fromkeys(OF_MAP, Told(lambda evidence: 1.0, most_shown=0.9998)), 0.999)
-    assert (sure.confidence(CLEAR), sure.shown(CLEAR)) == (1.0, 0.9998)
+    sure = ConfidenceRule(dict.fromkeys(MAP_FIGURES, Told(lambda evidence: 1.0, max_reported=0.9998)), 0.999)
+    assert (sure.confidence(CLEAR), sure.limit_confidence(CLEAR)) == (1.0, 0.9998)
     down = accept_rule(create("cohog", {"camera": "nadir"}), load_config(None).match).sure
-    assert down.shown(replace(CLEAR, lead=30.0)) <= 1 - 1 / 10_000
+    assert down.limit_confidence(replace(CLEAR, lead=30.0)) <= 1 - 1 / 10_000
 
 
 def test_regions_ahead_that_prove_nothing_are_accepted_only_with_landmarks_or_by_the_flight():
@@ -71,7 +79,7 @@ def test_regions_ahead_that_prove_nothing_are_accepted_only_with_landmarks_or_by
     assert rule.sure.confidence(hardly) == 0.9
     assert not judged(rule=rule, evidence=hardly).accepted
     assert judged(rule=rule, evidence=replace(hardly, landmarks=log_count(9))).accepted
-    assert judged(rule=rule, evidence=hardly, by_flight=0.9999).accepted
+    assert judged(rule=rule, evidence=hardly, track_confidence=0.9999).accepted
     twin = replace(hardly, landmarks=log_count(30), twin=0.1)
     assert rule.sure.confidence(twin) == 0.5
 
@@ -90,7 +98,7 @@ def test_regions_ahead_that_prove_nothing_are_accepted_only_with_landmarks_or_by
 )
 def test_a_flight_that_makes_a_place_much_likelier_needs_the_precision_only(confidence, followed, accepted):
     rule = sure_rule(lambda evidence: confidence, needed=0.9999)
-    assert judged(rule=rule, evidence=CLEAR, by_flight=followed).accepted == accepted
+    assert judged(rule=rule, evidence=CLEAR, track_confidence=followed).accepted == accepted
     assert judged(rule=rule, evidence=CLEAR).accepted is (confidence == 1.0)
 
 
@@ -98,12 +106,12 @@ def test_a_flight_that_makes_a_place_much_likelier_needs_the_precision_only(conf
 def test_a_flight_that_decides_is_sure_itself_however_little_is_asked(followed, accepted):
     rule = sure_rule(lambda evidence: 0.5)
     rule = replace(rule, sure=replace(rule.sure, precision=0.5))
-    assert judged(rule=rule, evidence=CLEAR, by_flight=followed).accepted is accepted
+    assert judged(rule=rule, evidence=CLEAR, track_confidence=followed).accepted is accepted
 
 
 @pytest.mark.parametrize(("lead", "code"), [(math.log(1.75), None), (math.log(1.74), ReasonCode.TURNED_AGREES)])
 def test_a_match_must_lead_over_the_picture_turned_otherwise(lead, code):
-    verdict = judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR, ahead_of_turned=lead)
+    verdict = judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR, lead_over_turned=lead)
     assert verdict.reason.code is (code or ReasonCode.ACCEPTED_BY_CONFIDENCE)
 
 
@@ -141,21 +149,21 @@ def test_limits_are_met_by_what_equals_them(scores, limits, code):
 
 @pytest.mark.parametrize(("quality", "needed"), [(0.3, None), (0.29, 0.3), (math.nan, 0.3)])
 def test_says_nothing_of_a_picture_of_enough_quality(quality, needed):
-    reason = says_nothing(SimpleNamespace(quality=quality), 0.3)
+    reason = check_texture(SimpleNamespace(quality=quality), 0.3)
     assert (reason and reason.parameters["needed"]) == needed
 
 
 def test_a_flight_may_know_better_than_the_scores_which_place_it_is():
     rule = replace(accept_rule(create("cohog"), load_config(None, {}).match), sure=told(lambda evidence: 0.5))
-    assert judged((0.19, 0.2), rule, evidence=CLEAR, by_flight=0.9999).accepted
+    assert judged((0.19, 0.2), rule, evidence=CLEAR, track_confidence=0.9999).accepted
     assert not judged((0.19, 0.2), rule, evidence=CLEAR).accepted
-    assert not judged((0.19, 0.2), replace(rule, min_margin=0.0), evidence=CLEAR, by_flight=0.9999).accepted
+    assert not judged((0.19, 0.2), replace(rule, min_margin=0.0), evidence=CLEAR, track_confidence=0.9999).accepted
 
 
 @pytest.mark.parametrize(("lead", "accepted"), [(0.0, True), (-0.01, False)])
 def test_no_flight_makes_sure_what_a_place_elsewhere_beats_in_the_same_picture(lead, accepted):
     rule = sure_rule(lambda evidence: 0.5)
-    verdict = judged(rule=rule, evidence=replace(CLEAR, lead=lead), by_flight=0.9999)
+    verdict = judged(rule=rule, evidence=replace(CLEAR, lead=lead), track_confidence=0.9999)
     assert verdict.accepted is accepted
     assert (verdict.reason.code is ReasonCode.ELSEWHERE_AGREES_BETTER) is not accepted
 
@@ -181,7 +189,7 @@ def test_a_place_that_is_not_ahead_of_one_elsewhere_is_never_sure(kind, precisio
     """Whatever the shipped models say."""
     config = load_config(None, {"match.accept_precision": precision}).match
     sure = accept_rule(create("cohog", {"camera": "nadir"}), config).sure
-    evidence = Evidence(agree=0.0, **dict.fromkeys(OF_MAP[kind] + OF_PLACE[kind], 5.0) | {"lead": 0.04})
+    evidence = Evidence(agree=0.0, **dict.fromkeys(MAP_FIGURES[kind] + PLACE_FIGURES[kind], 5.0) | {"lead": 0.04})
     assert sure.confidence(evidence) <= 0.5 < sure.threshold(evidence)
 
 
@@ -250,7 +258,7 @@ def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, i
     assert (parameters["landmarks"], parameters["rival_landmarks"]) == (inliers, rival)
     if not accepted:
         assert parameters["confidence"] == 0.5
-        by_flight = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), evidence=evidence, by_flight=0.999)
+        by_flight = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), evidence=evidence, track_confidence=0.999)
         assert by_flight.accepted, "the flight knows which of the two it is"
 
 

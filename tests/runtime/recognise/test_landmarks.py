@@ -5,7 +5,13 @@ import pytest
 from pictures import textured
 
 from edgevpr.places.rows import MAX_LANDMARK_BYTES
-from edgevpr.runtime.recognise.landmarks import OF_PLACE, OF_QUERY, describe, pack_bytes, unpack_bytes
+from edgevpr.runtime.recognise.landmarks import (
+    PLACE_LANDMARKS,
+    QUERY_LANDMARKS,
+    detect_landmarks,
+    pack_bytes,
+    unpack_bytes,
+)
 
 
 @pytest.fixture(scope="module")
@@ -14,8 +20,8 @@ def ground():
 
 
 def test_they_are_spread_over_the_picture_and_lie_about_its_middle(ground):
-    found = describe(ground)
-    assert 100 < len(found) <= OF_PLACE < len(describe(ground, most=OF_QUERY))
+    found = detect_landmarks(ground)
+    assert 100 < len(found) <= PLACE_LANDMARKS < len(detect_landmarks(ground, most=QUERY_LANDMARKS))
     assert (np.abs(found.points) <= (0.5, 0.375)).all()
     for side in (found.points[:, 0] < 0, found.points[:, 0] > 0, found.points[:, 1] < 0, found.points[:, 1] > 0):
         assert np.mean(side) > 0.2
@@ -24,8 +30,8 @@ def test_they_are_spread_over_the_picture_and_lie_about_its_middle(ground):
 
 
 def test_the_number_of_pixels_of_a_camera_does_not_matter(ground):
-    small = describe(np.ascontiguousarray(ground.repeat(2, axis=0).repeat(2, axis=1)))
-    one = {tuple(point) for point in np.rint(describe(ground).points * 100).tolist()}
+    small = detect_landmarks(np.ascontiguousarray(ground.repeat(2, axis=0).repeat(2, axis=1)))
+    one = {tuple(point) for point in np.rint(detect_landmarks(ground).points * 100).tolist()}
     other = {tuple(point) for point in np.rint(small.points * 100).tolist()}
     assert len(one & other) > 0.6 * len(one)
 
@@ -33,13 +39,13 @@ def test_the_number_of_pixels_of_a_camera_does_not_matter(ground):
 def test_none_touches_what_the_mask_leaves_out(ground):
     mask = np.ones(ground.shape, bool)
     mask[:, 300:] = False
-    found = describe(ground, mask)
+    found = detect_landmarks(ground, mask)
     assert len(found) > 30
     assert found.points[:, 0].max() * 640 + 319.5 < 300 - 15
 
 
 def test_they_come_back_as_they_were_packed_and_fit_into_a_place(ground):
-    found = describe(ground)
+    found = detect_landmarks(ground)
     blob = pack_bytes(found)
     assert len(blob) <= MAX_LANDMARK_BYTES
     again = unpack_bytes(blob)
@@ -62,7 +68,7 @@ def test_they_come_back_as_they_were_packed_and_fit_into_a_place(ground):
 )
 def test_what_is_damaged_is_said_to_be(ground, spoil):
     with pytest.raises(ValueError, match="its landmarks"):
-        unpack_bytes(spoil(pack_bytes(describe(ground))))
+        unpack_bytes(spoil(pack_bytes(detect_landmarks(ground))))
 
 
 @pytest.mark.parametrize(
@@ -77,5 +83,5 @@ def test_what_is_damaged_is_said_to_be(ground, spoil):
     ids=["one pixel", "a line", "tiny", "flat", "black"],
 )
 def test_a_picture_without_corners_has_none(image):
-    found = describe(image)
+    found = detect_landmarks(image)
     assert (len(found), found.points.shape, found.bits.shape) == (0, (0, 2), (0, 32))

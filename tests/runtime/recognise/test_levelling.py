@@ -22,7 +22,7 @@ from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.decide import WalkSettings
 from edgevpr.runtime.recognise.hints import Prior, RecordedPrior
-from edgevpr.runtime.recognise.levelling import Levelling, make_levelling, place_at_middle
+from edgevpr.runtime.recognise.levelling import Levelling, centre_place, make_levelling
 from edgevpr.techniques import create
 
 CAMERA = Camera(noise_sigma=0)
@@ -160,21 +160,21 @@ def test_a_tilt_that_a_picture_does_not_bear_is_refused_and_said_once(walk, grou
 
 def test_a_place_has_the_position_of_the_middle_of_its_picture():
     at = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=Position(50.0, 8.0, 300.0))
-    east = place_at_middle(
+    east = centre_place(
         at, View(up_deg=90.0, footprint_m=100.0, aside=(0.0, -0.3))
     )  # the aircraft is west of the middle
     assert east.position.lon_deg == pytest.approx(8.0 + 30 / (M_PER_DEG * math.cos(math.radians(50))), abs=1e-7)
     assert east.position.lat_deg == pytest.approx(50.0, abs=1e-9)
     assert (east.position.alt_m, east.heading_deg) == (300.0, 90.0)
     assert (east.pose.up_deg, east.pose.footprint_m, east.pose.covariance_m2) == (90.0, 100.0, (25.0, 0.0, 25.0))
-    untold = place_at_middle(at, View(up_deg=0.0, footprint_m=100.0))
+    untold = centre_place(at, View(up_deg=0.0, footprint_m=100.0))
     assert (untold.position, untold.pose.covariance_m2) == (at.position, (41.0, 0.0, 41.0)), "its tilt is unknown"
 
 
 @pytest.mark.parametrize("view", [View(), View(up_deg=0.0), View(footprint_m=50.0, aside=(0.1, 0.1))])
 def test_without_height_or_heading_a_place_has_no_pose(view):
     at = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=Position(50.0, 8.0), heading_deg=70.0)
-    found = place_at_middle(at, view)
+    found = centre_place(at, view)
     assert (found.pose, found.position) == (None, at.position)
     assert found.heading_deg == (70.0 if view.up_deg is None else view.up_deg)
 
@@ -292,7 +292,7 @@ def test_a_recorded_height_that_is_wrong_is_corrected_by_the_first_match(walk, g
     assert recognised(first, 3)
     assert recognised(second, 2)
     assert second.view.footprint_m == pytest.approx(FOOTPRINT_M, rel=0.05)
-    assert prior.looks_again, "until three matches agree"
+    assert prior.searches_heights, "until three matches agree"
 
 
 @pytest.mark.parametrize("lens", [LENS, None])

@@ -12,7 +12,7 @@ from edgevpr.core.contract import Perspective
 from edgevpr.frames.level import View
 from edgevpr.lab.simulate.camera import CameraPose
 from edgevpr.runtime.recognise.agreement import measure_agreement
-from edgevpr.runtime.recognise.landmarks import OF_QUERY, describe
+from edgevpr.runtime.recognise.landmarks import QUERY_LANDMARKS, detect_landmarks
 from edgevpr.runtime.recognise.perspective import convert_to_tilt, fit_attitude_error
 
 FOCAL = 0.77  # shares of the longest side: 66 degrees across
@@ -100,8 +100,10 @@ def test_pictures_show_by_how_much_the_reported_attitude_is_wrong(ground, roll_d
         east_m=168.0, north_m=134.0, height_m=102.0, heading_deg=40.0, roll_deg=roll_deg, pitch_deg=pitch_deg
     )
     query = view_from(ground, pose, replace(pose, roll_deg=told_roll_deg, pitch_deg=0.0))
-    found = measure_agreement(describe(query.image, query.mask, OF_QUERY), describe(place.image, place.mask))
-    lean = fit_attitude_error(*found.coinciding, query.view, found.rotation_deg)
+    found = measure_agreement(
+        detect_landmarks(query.image, query.mask, QUERY_LANDMARKS), detect_landmarks(place.image, place.mask)
+    )
+    lean = fit_attitude_error(*found.inlier_points, query.view, found.rotation_deg)
     # The left wing is up: the camera looks to the left, and the aircraft is right of where it is taken to be.
     right, ahead = (math.tan(math.radians(each)) for each in (roll_deg - told_roll_deg, -pitch_deg))
     turned = math.radians(40.0)

@@ -16,8 +16,8 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Ranking
 from edgevpr.runtime.recognise.evidence import Evidence
 from edgevpr.runtime.recognise.locate import Located
+from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
-from edgevpr.runtime.recognise.stride import Stride
 
 PLACES, SPACING_M, FOOTPRINT_M = 150, 20.0, 80.0
 STRIDE = 3  # places from look to look, at one a second: each look is of new ground
@@ -56,7 +56,7 @@ class Flight:
         """Go on, `moved_m` (east, north) by the camera's own motion."""
         before_s, self.t_s = self.t_s, self.t_s + elapsed_s
         vehicle = vehicle_at(50.0, 8.0, self.t_s, velocity_m_s=velocity_m_s)
-        stride = moved_m and Stride(from_s=before_s, to_s=self.t_s, moved_m=moved_m, sd_m=0.2, inliers=100)
+        stride = moved_m and OdometryStep(from_s=before_s, to_s=self.t_s, moved_m=moved_m, sd_m=0.2, inliers=100)
         self.follower.predict(Frame(image=NOTHING, name="", t_mono_s=self.t_s), vehicle, stride)
 
     def handle(self, place, p, of_map=None, others=(), lead=1.0, rival=0):
@@ -141,7 +141,7 @@ def test_the_first_look_is_believed_as_it_stands(flight, p):
     assert followed.slot == 20
     assert followed.confidence == pytest.approx(p)
     assert followed.lost == pytest.approx(1 - p)
-    assert not followed.leads_from(20)
+    assert not followed.prefers_other(20)
 
 
 def test_what_the_best_place_leaves_is_shared_by_the_others(flight):
@@ -149,8 +149,8 @@ def test_what_the_best_place_leaves_is_shared_by_the_others(flight):
     assert followed.slot == 40
     assert 0.1 < followed.confidence < 0.8, "it may be none of those that were compared"
     assert followed.confidence + followed.lost == pytest.approx(0.9)
-    assert followed.leads_from(20)
-    assert not followed.leads_from(40)
+    assert followed.prefers_other(20)
+    assert not followed.prefers_other(40)
 
 
 def test_positions_are_those_of_the_places(posed_map, bare_map):
@@ -210,7 +210,7 @@ def test_a_place_without_position_lends_its_confidence_to_no_other(posed_map, ba
         flight.has_poses = False
         followed = flight.look(30, 0.95, others=(41, 50))
         assert followed.confidence < 0.1
-        assert not followed.leads_from(30)
+        assert not followed.prefers_other(30)
         assert followed.lost > 0.9
 
 

@@ -14,10 +14,10 @@ from edgevpr.mapmaking.mapping import PlaceSelector
 from edgevpr.runtime.recognise.encoder import EncodedFrame
 from edgevpr.runtime.recognise.gate_networks import interpolate_map
 from edgevpr.runtime.recognise.salience_gate import (
-    Gate,
-    Worth,
-    compute_memorability,
+    SalienceGate,
+    SalienceVerdict,
     compute_scores,
+    judge_scores,
 )
 from edgevpr.techniques.entropy import compute_filled_bins
 
@@ -32,7 +32,7 @@ def asked(memorability=0.0, staticity=0.0, entropy=0.0, **keys):
 class Half:
     """A network that finds the left of a picture memorable."""
 
-    def matrix(self, image):
+    def compute_matrix(self, image):
         return np.repeat(np.array([[1.0, 1.0, 0.5, 0.0, 0.0]], np.float32), 5, axis=0)
 
 
@@ -67,40 +67,40 @@ def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_noth
     ],
 )
 def test_all_criteria_that_are_on_must_hold(thresholds, lacks):
-    worth = compute_memorability(Salience(0.5, 0.9, 0.5), thresholds)
-    assert worth.lacks == lacks
-    assert (worth.reason is None) == (lacks is None) == (worth.short_by == 0)
+    worth = judge_scores(Salience(0.5, 0.9, 0.5), thresholds)
+    assert worth.criterion == lacks
+    assert (worth.reason is None) == (lacks is None) == (worth.shortfall == 0)
 
 
 def test_a_score_that_was_not_looked_at_is_not_asked_for():
-    assert compute_memorability(Salience(None, None, 0.5), asked(0.9, 0.9, 0.4)).reason is None
+    assert judge_scores(Salience(None, None, 0.5), asked(0.9, 0.9, 0.4)).reason is None
 
 
 def test_in_bad_light_less_entropy_is_asked_for():
     day = [texture() for _ in range(40)]
     night = [(picture * 0.04).astype(np.uint8) for picture in day]
-    by_day, at_night = Gate(asked(entropy=0.4)), Gate(asked(entropy=0.4))
+    by_day, at_night = SalienceGate(asked(entropy=0.4)), SalienceGate(asked(entropy=0.4))
     assert all(by_day.judge(picture).reason is None for picture in day)
     passed = [at_night.judge(picture).reason is None for picture in night]
     assert sum(passed) >= 36
-    assert at_night.judge(np.full((120, 160), 3, np.uint8)).lacks == "entropy"
+    assert at_night.judge(np.full((120, 160), 3, np.uint8)).criterion == "entropy"
 
 
 def test_while_nothing_is_known_of_the_light_half_of_the_threshold_is_enough():
-    gate = Gate(asked(entropy=0.4))
+    gate = SalienceGate(asked(entropy=0.4))
     little = texture()
     while not 0.2 < compute_scores(little).entropy < 0.4:
         little = (little * 0.8).astype(np.uint8)
     assert [gate.judge(little).reason for _ in range(4)] == [None] * 4
-    assert all(gate.judge(np.full((120, 160), 3, np.uint8)).lacks == "entropy" for _ in range(3))
+    assert all(gate.judge(np.full((120, 160), 3, np.uint8)).criterion == "entropy" for _ in range(3))
 
 
 def test_a_long_stretch_without_information_does_not_become_usual():
-    gate = Gate(asked(entropy=0.4))
+    gate = SalienceGate(asked(entropy=0.4))
     for _ in range(30):
         assert gate.judge(texture()).reason is None
     empty = np.full((120, 160), 77, np.uint8)
-    assert all(gate.judge(empty).lacks == "entropy" for _ in range(70))
+    assert all(gate.judge(empty).criterion == "entropy" for _ in range(70))
 
 
 def test_the_detector_looks_at_every_kth_frame_only():
@@ -112,7 +112,7 @@ def test_the_detector_looks_at_every_kth_frame_only():
             return np.ones(image.shape[:2], bool)
 
     detector = Counting()
-    gate = Gate(asked(staticity=0.6, detect_every=4), detector=detector)
+    gate = SalienceGate(asked(staticity=0.6, detect_every=4), detector=detector)
     for _ in range(9):
         gate.judge(texture())
     assert detector.looks == 3
@@ -123,15 +123,15 @@ def test_the_detector_looks_at_every_kth_frame_only():
 NORTH_M = 1 / 111_195  # degrees
 
 
-def event(number, short_by=0.0, north_m=None):
+def event(number, shortfall=0.0, north_m=None):
     position = None if north_m is None else Position(50 + north_m * NORTH_M, 8.0)
-    lacks = "entropy" if short_by else None
+    lacks = "entropy" if shortfall else None
     image = np.zeros((8, 8), np.uint8)
     return EncodedFrame(
         frame=Frame(image=image, name=str(number), t_mono_s=float(number), position=position),
         picture=LevelledImage(image, None, UNKNOWN_VIEW),
         descriptor=Descriptor(coarse=np.zeros(1)),
-        worth=Worth(Salience(None, None, 0.4 - short_by), short_by, lacks, lacks and "not memorable"),
+        salience=SalienceVerdict(Salience(None, None, 0.4 - shortfall), shortfall, lacks, lacks and "not memorable"),
     )
 
 

@@ -22,7 +22,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.decide import Verifier, WalkSettings
 from edgevpr.runtime.recognise.judge import AcceptRule
-from edgevpr.runtime.recognise.landmarks import describe, pack_bytes, unpack_bytes
+from edgevpr.runtime.recognise.landmarks import detect_landmarks, pack_bytes, unpack_bytes
 from edgevpr.runtime.recognise.recognition import to_fields
 from edgevpr.techniques import create
 
@@ -114,7 +114,7 @@ def test_looking_ahead_landmarks_count_where_a_match_is_not_sure_without_them(ma
 
 
 def test_a_clear_match_with_the_landmarks_of_another_picture_is_refused(mapped, technique):
-    others = pack_bytes(describe(frame(77).image))
+    others = pack_bytes(detect_landmarks(frame(77).image))
     keep(mapped, others, zlib.crc32(others))
     event = asked(mapped, technique, frame(1, 20, -10))
     assert event.best.match.score > 0.2
@@ -124,7 +124,7 @@ def test_a_clear_match_with_the_landmarks_of_another_picture_is_refused(mapped, 
 
 
 def test_a_place_whose_landmarks_lie_otherwise_than_its_regions_is_refused(mapped, technique):
-    turned = pack_bytes(describe(np.ascontiguousarray(np.rot90(frame(1).image, 2))))
+    turned = pack_bytes(detect_landmarks(np.ascontiguousarray(np.rot90(frame(1).image, 2))))
     keep(mapped, turned, zlib.crc32(turned))
     event = asked(mapped, technique, frame(1, 20, -10))
     assert not event.accepted
@@ -203,7 +203,9 @@ def test_places_without_positions_that_overlap_are_the_same_ground(overlapping, 
         assert event.evidence.lead > math.log(1.5), "places of the same ground are no rivals"
 
 
-@pytest.mark.parametrize("blob", [None, b"", b"\x09of a newer form", pack_bytes(describe(np.zeros((9, 9), np.uint8)))])
+@pytest.mark.parametrize(
+    "blob", [None, b"", b"\x09of a newer form", pack_bytes(detect_landmarks(np.zeros((9, 9), np.uint8)))]
+)
 def test_a_place_without_landmarks_is_judged_as_ever(mapped, technique, blob):
     without = asked(mapped, technique, frame(1, 20, -10), verify=False)
     keep(mapped, blob, None if blob is None else zlib.crc32(blob))

@@ -11,7 +11,7 @@ from typing import Any
 from edgevpr.core.geodesy import picture_axes, wrap_deg
 from edgevpr.frames.level import View
 from edgevpr.runtime.recognise.agreement import measure_agreement
-from edgevpr.runtime.recognise.landmarks import OF_PLACE, Landmarks
+from edgevpr.runtime.recognise.landmarks import PLACE_LANDMARKS, Landmarks
 
 # Over ground that repeats, as furrows do, landmarks match at many shifts: few of the matches agree on one.
 _MIN_INLIERS = 30
@@ -22,7 +22,7 @@ _MAX_ELAPSED_S = 30.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stride:
+class OdometryStep:
     """Motion from the frame of `from_s` to that of `to_s`: by `moved_m` (east, north), as far as height and heading are
     right that the pictures were levelled by. `sd_m` is the standard deviation of each axis, by the landmarks alone, of
     which `inliers` agree. `zoom` is the natural logarithm of how much more of the ground a picture shows than the one
@@ -35,7 +35,7 @@ class Stride:
     inliers: int
     zoom: float = 0.0
 
-    def scale(self, factor: float) -> "Stride":
+    def scale(self, factor: float) -> "OdometryStep":
         """Return the motion that the same pictures show from a height that is `factor` times as large."""
         east_m, north_m = self.moved_m
         return replace(self, moved_m=(factor * east_m, factor * north_m), sd_m=factor * self.sd_m)
@@ -47,41 +47,41 @@ class Stride:
         return {"from_s": self.from_s, "moved_m": moved_m, **rest}
 
 
-class Strides:
+class VisualOdometry:
     """Measures the stride to each frame from the one before it."""
 
     def __init__(self) -> None:
-        self._before: tuple[float, View, Landmarks] | None = None
+        self._previous: tuple[float, View, Landmarks] | None = None
 
-    def to(self, t_s: float, view: View, landmarks: Landmarks) -> Stride | None:
+    def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
         """Return the stride to a frame taken at `t_s`; None if it is not known. The next one begins there."""
-        before, self._before = self._before, (t_s, view, landmarks.best(OF_PLACE))
-        if before is None or not 0 < t_s - before[0] <= _MAX_ELAPSED_S:
+        stored, self._previous = self._previous, (t_s, view, landmarks.best(PLACE_LANDMARKS))
+        if stored is None or not 0 < t_s - stored[0] <= _MAX_ELAPSED_S:
             return None
-        from_s, start, known = before
+        from_s, start, previous = stored
         if start.aside is None or view.aside is None or start.up_deg is None or view.up_deg is None:
             return None
         if start.footprint_m is None or view.footprint_m is None:
             return None
-        found = measure_agreement(landmarks, known)
-        if found.inliers < max(_MIN_INLIERS, _MIN_INLIER_SHARE * found.matched):
+        agreement = measure_agreement(landmarks, previous)
+        if agreement.inliers < max(_MIN_INLIERS, _MIN_INLIER_SHARE * agreement.matched):
             return None
-        if found.shift_share is None or found.rotation_deg is None or found.scale is None:
+        if agreement.shift_share is None or agreement.rotation_deg is None or agreement.scale is None:
             return None
-        turned_deg = wrap_deg(found.rotation_deg - (view.up_deg - start.up_deg))
-        stretched = found.scale * start.footprint_m / view.footprint_m
+        turned_deg = wrap_deg(agreement.rotation_deg - (view.up_deg - start.up_deg))
+        stretched = agreement.scale * start.footprint_m / view.footprint_m
         if abs(turned_deg) > _MAX_TURN_DEG or not 1 / _MAX_SCALE < stretched < _MAX_SCALE:
             return None
         # The point under the camera, in the picture before: that of this picture, turned, scaled and shifted.
-        factor = found.scale * complex(math.cos(turn := math.radians(found.rotation_deg)), math.sin(turn))
-        step = factor * complex(view.aside[0], -view.aside[1]) + complex(*found.shift_share)
+        factor = agreement.scale * complex(math.cos(turn := math.radians(agreement.rotation_deg)), math.sin(turn))
+        step = factor * complex(view.aside[0], -view.aside[1]) + complex(*agreement.shift_share)
         step -= complex(start.aside[0], -start.aside[1])
         east_m, north_m = start.footprint_m * picture_axes(start.up_deg) @ (step.real, -step.imag)
-        return Stride(
+        return OdometryStep(
             from_s=from_s,
             to_s=t_s,
             moved_m=(float(east_m), float(north_m)),
-            sd_m=start.footprint_m * math.sqrt((found.covariance_share2 or (0.0,))[0]),
-            inliers=found.inliers,
+            sd_m=start.footprint_m * math.sqrt((agreement.covariance_share2 or (0.0,))[0]),
+            inliers=agreement.inliers,
             zoom=math.log(stretched),
         )

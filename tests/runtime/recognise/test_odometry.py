@@ -10,8 +10,8 @@ from levelled_views import lit_ground, view_from
 
 from edgevpr.frames.level import UNKNOWN_VIEW
 from edgevpr.lab.simulate.camera import CameraPose
-from edgevpr.runtime.recognise.landmarks import OF_QUERY, describe
-from edgevpr.runtime.recognise.stride import Strides
+from edgevpr.runtime.recognise.landmarks import QUERY_LANDMARKS, detect_landmarks
+from edgevpr.runtime.recognise.odometry import VisualOdometry
 
 START = CameraPose(east_m=200.0, north_m=200.0, height_m=100.0, heading_deg=30.0, roll_deg=4.0, pitch_deg=-3.0)
 
@@ -24,13 +24,13 @@ def ground():
 def seen(ground, pose, told=None):
     """The view from a pose, and its landmarks; `told` is the pose that the autopilot reports."""
     picture = view_from(ground, pose, told)
-    return picture.view, describe(picture.image, picture.mask, OF_QUERY)
+    return picture.view, detect_landmarks(picture.image, picture.mask, QUERY_LANDMARKS)
 
 
 def stride(first, second, after_s=1.0):
-    strides = Strides()
-    assert strides.to(5.0, *first) is None
-    return strides.to(5.0 + after_s, *second)
+    strides = VisualOdometry()
+    assert strides.measure(5.0, *first) is None
+    return strides.measure(5.0 + after_s, *second)
 
 
 @pytest.mark.parametrize(
