@@ -47,7 +47,7 @@ def test_scores_are_means_over_the_whole_picture_and_masked_pixels_count_as_noth
     static[:, 120:] = False
     scores = compute_scores(picture, Half(), static)
     assert scores.staticity == pytest.approx(0.75)
-    memorable = interpolate_map(Half().matrix(picture), picture.shape)
+    memorable = interpolate_map(Half().compute_matrix(picture), picture.shape)
     assert scores.memorability == pytest.approx(memorable[:, :120].sum() / picture.size, abs=1e-6)
     assert scores.entropy == pytest.approx(compute_filled_bins(picture)[:, :120].sum() / picture.size, abs=1e-6)
     alone = compute_scores(picture)
