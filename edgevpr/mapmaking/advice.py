@@ -176,9 +176,8 @@ def warn_of_display(pictures: FlownPictures, mask: OverlayMask | None) -> None:
     """Warn if something stands still in the pictures where `mask` shows ground (None: everywhere)."""
     if pictures.folder:
         paths = list_images(pictures.folder)
-        images = _read_usable(
-            paths[at] for at in np.unique(np.linspace(0, len(paths) - 1, _DISPLAY_PICTURES, dtype=int))
-        )
+        spread = np.unique(np.linspace(0, len(paths) - 1, _DISPLAY_PICTURES, dtype=int))
+        images = _read_usable(paths[at] for at in spread)
     else:
         images = _read_video(pictures.source, _DISPLAY_PICTURES)
     share = measure_still_share(images, mask)

@@ -137,9 +137,7 @@ def calibrate(
 
     def require(is_so: object, lacking: str) -> None:
         if not is_so:
-            raise UsageError(
-                f"{place_map.path} cannot be calibrated, and flies with the shipped confidence: {lacking}."
-            )
+            raise UsageError(f"{place_map.path} cannot be calibrated and flies with the shipped confidence: {lacking}.")
 
     technique = encoder.technique
     kinds = list_evidence_kinds(technique.spec)

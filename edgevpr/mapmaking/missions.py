@@ -81,9 +81,8 @@ class Area:
             way = (*self.path, self.path[-1])  # a line has two points or more
             points = [(waypoint.lat_deg, waypoint.lon_deg) for waypoint in way]
             shapes.append((shapely.LineString(corners_m(points)), path_margin_m))
-        ground = shapely.union_all(
-            [shapely.buffer(shape, margin_m, quad_segs=_QUARTER_SEGMENTS) for shape, margin_m in shapes]
-        )
+        wide = [shapely.buffer(shape, margin_m, quad_segs=_QUARTER_SEGMENTS) for shape, margin_m in shapes]
+        ground = shapely.union_all(wide)
         shapely.prepare(ground)
         return ground
 

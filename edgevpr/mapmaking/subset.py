@@ -54,9 +54,7 @@ def make_subset(
             counts, lost_calibration = merge_maps(paths, whole, progress, list(ids_near.values()))
             near = sum(copied for copied, _ in counts)
         if not paths or not near:
-            raise UsageError(
-                f"No place of {source} is within {margin_m:g} m of the mission: check both, or the margin."
-            )
+            raise UsageError(f"No place of {source} is within {margin_m:g} m of the mission: check both or the margin.")
         count, file_bytes = near, whole.stat().st_size
         if max_bytes is not None and file_bytes > max_bytes:
             count = int(near * max_bytes / file_bytes)

@@ -87,9 +87,8 @@ def choose_ardupilot_channel(kind: VehicleKind, parameters: Parameters) -> Chann
     if kind is VehicleKind.PLANE:
         return ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_TO_PLANE))
     change = f"{resolve_name(parameters, RECEIVERS[ADVISED_RECEIVER])}={MAVLINK_GPS}"
-    return ChannelChoice(
-        Channel.COMMAND, Reason(ReasonCode.COMMAND_NEEDS_FLOW, {"vehicle": kind.value, "change": change})
-    )
+    why = Reason(ReasonCode.COMMAND_NEEDS_FLOW, {"vehicle": kind.value, "change": change})
+    return ChannelChoice(Channel.COMMAND, why)
 
 
 def _has_other_receiver(parameters: Parameters, choice: ChannelChoice) -> bool:

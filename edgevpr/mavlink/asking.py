@@ -60,9 +60,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
             self._port = open_port(address)
         except OSError as error:
             why = error.strerror or error
-            raise LinkError(
-                f"{address} cannot be opened ({why}): connect it, start it, or correct the link."
-            ) from error
+            raise LinkError(f"{address} cannot be opened ({why}): connect or start it, or correct the link.") from error
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self._port.close()
@@ -83,9 +81,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         for _ in range(MAX_TRIES):
             sent_s = time.monotonic()
             self._send(messages.make_message_request(self.system_id or 0, message_id))
-            answer = self._wait_for(
-                ANSWER_TIMEOUT_S, lambda message: message.get_type() == name or _is_refusal(message)
-            )
+            answer = self._wait_for(ANSWER_TIMEOUT_S, lambda reply: reply.get_type() == name or _is_refusal(reply))
             if answer is None:
                 continue
             self.round_trips_s.append(time.monotonic() - sent_s)

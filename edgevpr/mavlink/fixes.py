@@ -71,9 +71,7 @@ class Fixes:
     (too old or too many), `withheld` (by `find_objection` or a pause), and `unanswered`. `refusal` is the reason of the
     last refusal by the autopilot (None: there was none)."""
 
-    def __init__(
-        self, max_wait_s: float = MAX_FIX_WAIT_S, announce: Announce = lambda severity, text, topic: None
-    ) -> None:
+    def __init__(self, max_wait_s: float = MAX_FIX_WAIT_S, announce: Announce = lambda *_: None) -> None:
         self._announce = announce
         self.dropped = self.withheld = self.unanswered = 0
         self.refusal: Reason | None = None

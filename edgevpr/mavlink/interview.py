@@ -130,9 +130,8 @@ class Interview:
         self._answers += name in self._waiting
         self._waiting.discard(name)
         if self._is_asking:
-            self._due_s = min(
-                self._due_s, self._asked_s + (ROUND_INTERVAL_S if self._waiting else MIN_ROUND_INTERVAL_S)
-            )
+            interval_s = ROUND_INTERVAL_S if self._waiting else MIN_ROUND_INTERVAL_S
+            self._due_s = min(self._due_s, self._asked_s + interval_s)
 
     def _mark_absent(self) -> None:
         """Take those for absent that were asked for in vain so often that a loss of all answers is next to impossible,

@@ -23,9 +23,7 @@ TCP_TIMEOUT_MS = 1000  # if the other end has not confirmed bytes by then, the c
 TCP_BUFFER_BYTES = 8192  # doubled by the system: some 30 messages; left to itself it takes megabytes
 READ_BYTES = 65_536
 LOST = Reason(ReasonCode.LINK_LOST)
-WRITE_TIMEOUT_S = (
-    0.5  # a port that has accepted no byte for this time is reopened: bytes that wait in it would leave late
-)
+WRITE_TIMEOUT_S = 0.5  # a port that has accepted no byte for this time is reopened: waiting bytes would leave late
 
 
 class Port:

@@ -179,9 +179,8 @@ def open_signing(settings: MavlinkConfig, is_read_only: bool = False) -> Signing
     if settings.signing_key is None:
         return NOT_SIGNING
     key, state = read_key(settings.signing_key), Path(settings.signing_state or f"{settings.signing_key}.time")
-    return Signing(
-        key, TimeStamps(state, is_saved=not is_read_only), CHECK_LINK_ID if is_read_only else AUTOPILOT_LINK_ID
-    )
+    link_id = CHECK_LINK_ID if is_read_only else AUTOPILOT_LINK_ID
+    return Signing(key, TimeStamps(state, is_saved=not is_read_only), link_id)
 
 
 def read_key(path: str) -> bytes:

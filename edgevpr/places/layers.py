@@ -59,9 +59,8 @@ def read_layers(place_map: PlaceMap) -> Layers:
     if len(footprints_m) < 2:
         return Layers(median_m, (median_m,) if median_m else (), np.zeros(0, int), np.zeros(0, int))
     order = np.argsort(place_ids[is_cut])
-    return Layers(
-        median_m, tuple(footprints_m), place_ids[is_cut][order], _find_nearest(footprints_m, length_m[is_cut][order])
-    )
+    layer = _find_nearest(footprints_m, length_m[is_cut][order])
+    return Layers(median_m, tuple(footprints_m), place_ids[is_cut][order], layer)
 
 
 def _find_nearest(footprints_m: Sequence[float], to_m: float | Doubles) -> Ints:

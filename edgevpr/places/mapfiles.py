@@ -164,9 +164,7 @@ def translate_errors(path: Path) -> Iterator[None]:
     except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter if SQLite's message quotes a damaged schema
         message = str(error)
         if "locked" in message:
-            raise MapBusyError(
-                f"{path}: another program is writing to it: close that program and try again."
-            ) from error
+            raise MapBusyError(f"{path}: another program writes to it: close that program and try again.") from error
         advice = next(advice for words, advice in _ADVICE.items() if words in message)
         raise MapError(f"{path}: {advice.format(message=message)}.") from error
 

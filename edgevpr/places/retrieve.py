@@ -127,9 +127,7 @@ def compare_places(query: Query, scanned: Scan, candidates: int | None, apart_m:
     chosen = comparison.choose_candidates(likely, count, spec.in_full)
     chosen += comparison.choose_candidates(readable & ~likely, _ELSEWHERE_PLACES, spec.in_full and _ELSEWHERE_PLACES)
     if not chosen:
-        raise MapError(
-            f"{query.place_map.path}: none of its places can be read any more: restore a copy or build it again."
-        )
+        raise MapError(f"{query.place_map.path}: none of its places can be read: restore a copy or build it again.")
     comparison.compare_places(chosen)
     if len(comparison.scores) < np.count_nonzero(readable):
         compared = list(comparison.scores)
@@ -305,9 +303,8 @@ def outside_neighbourhood(
 def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Collection[int] = ()) -> float | None:
     """Return the best score minus the best score of a place elsewhere (see `outside_neighbourhood`); None if none is
     ranked."""
-    runners_up = ranking.scores[1:][
-        outside_neighbourhood(index, int(ranking.slots[0]), ranking.slots[1:], neighbour_m, same)
-    ]
+    is_rival = outside_neighbourhood(index, int(ranking.slots[0]), ranking.slots[1:], neighbour_m, same)
+    runners_up = ranking.scores[1:][is_rival]
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None
 
 

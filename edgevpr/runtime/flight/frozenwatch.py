@@ -27,9 +27,7 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 
 # Motions are shares of the picture's longest side. A picture that has moved by 0.012 is not taken for unmoved.
 MIN_MOTION_SHARE = 0.03  # least motion by the aircraft that contradicts an unmoved picture
-MIN_PROOF_SHARE = (
-    0.09  # sum of such motions by which pictures are frozen: one reset of an autopilot's heading is no proof
-)
+MIN_PROOF_SHARE = 0.09  # sum of such motions by which pictures are frozen: one reset of the heading is no proof
 _MAX_SINGLE_SHARE = 0.04  # that one rotation, or one repeated picture, counts for
 _PROOF_WINDOW_S = 20.0
 _MIN_FROZEN_S = 2.5  # that pictures stay the same, or that lie between a picture and its repetition

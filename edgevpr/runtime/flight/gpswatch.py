@@ -24,9 +24,7 @@ _MAX_MOVE_SIGMA = 3.5
 _MIN_MOVE_M = 7.0
 _MIN_USUAL_MATCHES = 10
 _MAX_USUAL_MATCHES = 60
-_MIN_MATCHES_IN_A_ROW = (
-    3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; at 1 a second it costs 3 s
-)
+_MIN_MATCHES_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; takes 3 s at 1 Hz
 _MAX_MATCH_AGE_S = 30.0  # the matches in a row must be no older
 _MIN_DOUBTS = 5  # with others between them that agree
 _DOUBT_WINDOW_S = 20.0

@@ -190,9 +190,8 @@ class Navigation:
         velocity_m_s, velocity_sd_m_s = np.zeros(2), _ANY_M_S
         if receiver.velocity_m_s is not None:
             velocity_m_s, velocity_sd_m_s = np.array(receiver.velocity_m_s), _GPS_VELOCITY_SD
-        self._start(
-            Position(*extrapolate(receiver, now_s)), _GPS_ALIKE * receiver.sd_m, velocity_m_s, now_s, velocity_sd_m_s
-        )
+        position = Position(*extrapolate(receiver, now_s))
+        self._start(position, _GPS_ALIKE * receiver.sd_m, velocity_m_s, now_s, velocity_sd_m_s)
         self._record_gps(now_s)
         self.is_in_doubt, self._contradicted_since_s = False, None
         return True
