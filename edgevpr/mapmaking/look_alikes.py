@@ -89,7 +89,7 @@ def measure_look_alikes(
 ) -> LookAlikes:
     """Compare the `pictures` of a map whose camera looks ahead, pairs of a place's number and the descriptor of its
     picture, with the map's places: with its neighbours in the order of mapping, and with those elsewhere that a search
-    finds. `near_m`: as in `places.retrieve.elsewhere`. Raises MapError for a map that cannot be read."""
+    finds. `near_m`: as in `outside_neighbourhood`. Raises MapError for a map that cannot be read."""
     slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
     all_slots = np.arange(len(index))
 

@@ -252,7 +252,7 @@ def _read_fine_parts(query: Query, chosen: list[Choice]) -> Iterator[tuple[int, 
 
 def match_unmoved_places(query: Query, best: int, apart_m: float) -> list[FineMatch]:
     """Compare a query, looking down, with a few places elsewhere than the slot `best`, all over the map, as if it had
-    been taken from their height and not turned (see `Technique.unmoved`). Raises as `compare_places` does."""
+    been taken from their height and not turned (see `Technique.match_at_rest`). Raises as `compare_places` does."""
     index, left_out = query.index, list(query.place_map.left_out)
     slots = np.flatnonzero(
         outside_neighbourhood(index, best, np.arange(len(index)), apart_m) & ~np.isin(index.place_ids, left_out)

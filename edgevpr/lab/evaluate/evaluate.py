@@ -75,7 +75,7 @@ class QueryAnswer:
 
     `accepted`: a flight would have accepted the match; `accepted_wrong`: and it is wrong; `accepted_off_map`: and the
     query has no place in the map; `accepted_elsewhere`: it is wrong, and no neighbour of a right or ignored reference
-    (`places.retrieve.elsewhere`). `discarded`: the salience gate dropped the query as not memorable. `encoding` and
+    (`outside_neighbourhood`). `discarded`: the salience gate dropped the query as not memorable. `encoding` and
     `matching` are the costs of the two stages.
     """
 

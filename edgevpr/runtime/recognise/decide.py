@@ -123,7 +123,7 @@ class Verifier:
         same: Collection[int] = (),
         max_slots: int = MAX_NEIGHBOUR_SLOTS,
     ) -> int:
-        """Return the number of landmarks of the query and of the best place elsewhere (see `places.retrieve.elsewhere`)
+        """Return the number of landmarks of the query and of the best place elsewhere (see `outside_neighbourhood`)
         that agree on the overlay of its match: 0 if there is no place elsewhere, the largest possible number if its
         landmarks are unknown. Places with the numbers `same` are not elsewhere."""
         away = ranking.slots[

@@ -1,6 +1,6 @@
 """Decides when a match is accepted as the place. No other code does, and a match that is not accepted has no position.
 
-A place *elsewhere* is outside the neighbourhood of the best place (see `places.retrieve.elsewhere`). The *lead* of
+A place *elsewhere* is outside the neighbourhood of the best place (see `outside_neighbourhood`). The *lead* of
 the best place is how far its score is above that of the best place elsewhere.
 """
 
