@@ -26,6 +26,7 @@ from edgevpr.core.contract import (
 )
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import wrap_deg
+from edgevpr.techniques import cohog_tuning as tuning
 from edgevpr.techniques import layout, overlay, placecode
 from edgevpr.techniques.contrast import stretch_contrast
 from edgevpr.techniques.displacement import (
@@ -50,44 +51,6 @@ from edgevpr.techniques.layout import ROTATIONS
 from edgevpr.techniques.perspective import fit_perspective
 from edgevpr.techniques.views import HEIGHT_RATIOS, QueryViews, ViewRegions, compute_scale, decode_hypothesis
 
-# The goodness threshold GT of the thesis (6.3.2) and of the authors' public code, each for its own entropy.
-_DEFAULT_GT = {"filled_bins": 0.5, "shannon": 0.4}
-# Weight of a vote that is 0, 1, 2 ... cells off the peak. With a forward camera near and far ground shift differently;
-# with a nadir camera (one that looks straight down) the shift is known more exactly.
-_VOTE_WEIGHTS = {"forward": (1.0, 1.0, 0.75, 0.5), "nadir": (1.0, 1.0)}
-# (min_score, min_margin), by which sequences are judged: of corridor, the seasons and nordland_tiny no sequence of ten
-# was accepted elsewhere. The thesis's score has no safe threshold: its margin rejects queries of two other sites in the
-# map of aerial_caliterra, and most right matches too.
-_ACCEPT_LIMITS = {"forward": (0.02, 0.01), "nadir": (0.02, 0.01), "thesis": (0.0, 0.02)}
-# On the tuning sets, accepted pictures without texture had 0.39 or less, and washed-out or covered ones that matched a
-# wrong place 0.43 or less; right matches had 0.91 or more (on the other sites 0.72 or more, and 0.47 with pictures of
-# 64 x 32 pixels). With `filled_bins` it was 0.14, 0.18 and 0.30.
-_MIN_QUALITY = {"shannon": 0.4, "filled_bins": 0.2}
-# (min_levels, target_levels, sigma_pixels), see `stretch_contrast`. No place of any set lies below `min_levels`
-# (aerial_copr has one of 45, nordland_tiny one of 81), so none changed. Chosen on corridor, aerial_caliterra and
-# aerial_garfield28, with aerial_swindale: looking ahead, noise harms more.
-_CONTRAST = {"forward": (75, 200, 0.4), "nadir": (40, 40, 0.25)}
-_MATCHINGS = ("displacement", "thesis")
-# Places or, with a nadir camera, pairs of a place and a rotation.
-_CANDIDATES = {"forward": 42, "nadir": 30}
-# Places compared in full, those with the best `score_quickly`. With a forward camera it uses every fourth good region:
-# on corridor, the seasons and nordland_tiny 12 of 42 find as many places as all compared in full (of the 994 of
-# nordland_tiny four fewer). Looking down 6 of 30 find as many as 10 on sat_marash, aerial_swindale and kite_ochota.
-_MAX_FULL_MATCHES = {"forward": 12, "nadir": 6}
-_QUICK_STEP = 4
-_NADIR_BINS = 8  # orientations of the regions whose patterns make a layout
-# Agreement of the layouts of query and place at which the share of votes alone is the score. Right matches on
-# sat_marash have 0.18 to 0.38, those of one season up to 0.5. At 0.35 one foreign picture was accepted in the map of
-# aerial_caliterra, from 0.4 on none in the maps of sat_marash, kite_ochota, aerial_swindale and aerial_caliterra.
-_FULL_LAYOUT_AGREEMENT = 0.45
-# Surroundings of a region in the structure of a picture (see `overlay`). Looking ahead, things are larger.
-_SURROUND_SD_CELLS = {"forward": 5.0, "nadir": 3.0}
-_MIN_ROTATED_DEG = 45.0  # from which a rotation counts as another one
-# A match whose structures agree by the second figure keeps its score; an agreement below the first one counts as it.
-# Foreign pictures have at most 4.9 ahead and 2.7 looking down; wrong places in the uniform corridor have 9.9.
-_STRUCTURE_LIMITS = {"forward": (1.0, 6.0), "nadir": (1.0, 3.0)}
-_MAX_HEADING_OFF_DEG = 1.5 * 360 / ROTATIONS  # the expected rotation, and one on either side
-
 
 @dataclass(eq=False, kw_only=True)
 class CoHog:
@@ -111,13 +74,13 @@ class CoHog:
     def __post_init__(self) -> None:
         self._require_parameters()
         if self.gt < 0:
-            self.gt = _DEFAULT_GT[self.entropy]
+            self.gt = tuning.DEFAULT_GT[self.entropy]
         self._side = self.w1 // self.w2 - 1  # blocks along one side
         self._is_nadir, self._votes = self.camera == "nadir", self.matching == "displacement"
         finds_height = self._is_nadir and self._votes  # the thesis's score does not tell two heights apart
-        self.min_score, self.min_margin = _ACCEPT_LIMITS[self.camera if self._votes else "thesis"]
-        self.min_quality = _MIN_QUALITY[self.entropy]
-        self.candidates = _CANDIDATES[self.camera]
+        self.min_score, self.min_margin = tuning.ACCEPT_LIMITS[self.camera if self._votes else "thesis"]
+        self.min_quality = tuning.MIN_QUALITY[self.entropy]
+        self.candidates = tuning.CANDIDATES[self.camera]
         unchanged = HEIGHT_RATIOS.index(1.0) * ROTATIONS
         self._hypotheses = range(unchanged, unchanged + (ROTATIONS if self._is_nadir else 1))
         if finds_height:
@@ -134,15 +97,19 @@ class CoHog:
             fine=PartSpec((self._side**2, 4 * self.bins), "|u1"),
             packed=None if self._is_nadir else PartSpec((placecode.SIDE**2 * self.bins // 8,), "|u1"),
             scan_counts=self._votes and not self._is_nadir,
-            heading_within_deg=_MAX_HEADING_OFF_DEG if self._is_nadir else None,
+            heading_within_deg=tuning.MAX_HEADING_OFF_DEG if self._is_nadir else None,
             cells=self.w1 // self.w2 if self._votes else None,
             looks_down=finds_height,
             height_ratios=HEIGHT_RATIOS if finds_height else (),
-            in_full=_MAX_FULL_MATCHES[self.camera] if self._votes else None,
+            in_full=tuning.MAX_FULL_MATCHES[self.camera] if self._votes else None,
         )
 
     def _require_parameters(self) -> None:
-        allowed: dict[str, Collection[str]] = {"entropy": _DEFAULT_GT, "camera": _VOTE_WEIGHTS, "matching": _MATCHINGS}
+        allowed: dict[str, Collection[str]] = {
+            "entropy": tuning.DEFAULT_GT,
+            "camera": tuning.VOTE_WEIGHTS,
+            "matching": tuning.MATCHINGS,
+        }
         for what, values in allowed.items():
             if (value := getattr(self, what)) not in values:
                 raise UsageError(f"cohog has no {what} `{value}`: use {' or '.join(sorted(values))}.")
@@ -152,8 +119,8 @@ class CoHog:
                 f"cohog cannot use w1={w1}, w2={w2}, bins={bins}: w1 must be a multiple of w2 (more than "
                 f"{placecode.SIDE} regions of at least 2 pixels, at most 4096 pixels), bins 2 to 64."
             )
-        if self.camera == "nadir" and bins != _NADIR_BINS:
-            raise UsageError(f"cohog with `camera` nadir uses {_NADIR_BINS} bins, not {bins}: leave `bins` out.")
+        if self.camera == "nadir" and bins != tuning.NADIR_BINS:
+            raise UsageError(f"cohog with `camera` nadir uses {tuning.NADIR_BINS} bins, not {bins}: leave `bins` out.")
         if self.gt > 1:
             raise UsageError(f"cohog: gt is {self.gt:g}; it is a share of the largest entropy, 0 to 1.")
 
@@ -167,7 +134,7 @@ class CoHog:
             image, mask = pad_to_square(image, mask)
         grey, allowed = make_grey_square(image, self.w1), make_mask_square(mask, self.w1)
         pixel_px = self.w1 / image.shape[1], self.w1 / image.shape[0]
-        grey = stretch_contrast(grey, allowed, pixel_px, *_CONTRAST[self.camera])
+        grey = stretch_contrast(grey, allowed, pixel_px, *tuning.CONTRAST[self.camera])
         blocks, seen, good = self._make_good_blocks(grey, allowed, self.w2)
         regions = blocks.reshape(-1, 4 * self.bins)
         # The square root of each value in 8 bits: most values are small, and the root keeps more of their digits.
@@ -256,7 +223,7 @@ class CoHog:
         if match.shift_cells is None:
             return match
         structure = self._measure_agreement(query, reference, match)
-        least, most = _STRUCTURE_LIMITS[self.camera]
+        least, most = tuning.STRUCTURE_LIMITS[self.camera]
         counts = min(max(structure, least), most) / most
         return replace(match, score=match.score * counts, votes=match.score, structure=structure)
 
@@ -265,7 +232,7 @@ class CoHog:
         ratio = find_nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0)
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
         off_deg = np.abs(wrap_deg(360 * np.arange(ROTATIONS) / ROTATIONS - (match.rotation_deg or 0.0)))
-        return self.match(query, fine, (first + np.flatnonzero(off_deg >= _MIN_ROTATED_DEG)).tolist())
+        return self.match(query, fine, (first + np.flatnonzero(off_deg >= tuning.MIN_ROTATED_DEG)).tolist())
 
     def measure_perspective(self, query: Descriptor, fine: Bytes, match: FineMatch) -> Perspective | None:
         """See `Technique.measure_perspective`."""
@@ -309,7 +276,7 @@ class CoHog:
             if place is not None and match.shift_cells is not None:
                 shift = match.shift_cells[0] / self._side, match.shift_cells[1] / self._side
                 agreement = layout.compute_agreement(self._make_field(query, number, layout.FINE), place, shift)
-                match = replace(match, score=min(1.0, match.score * agreement / _FULL_LAYOUT_AGREEMENT))
+                match = replace(match, score=min(1.0, match.score * agreement / tuning.FULL_LAYOUT_AGREEMENT))
             matches[number] = match
         best = max(matches, key=lambda number: matches[number].score)
         ratio, turn = decode_hypothesis(best)
@@ -321,7 +288,7 @@ class CoHog:
         how well their structures agree, or with a nadir camera, how far this stands out."""
         views, cells = self._make_views(query), self._side + 1
         is_known = reference.any(axis=1).reshape(self._side, self._side)
-        place = overlay.compute_structure(reference, is_known, _SURROUND_SD_CELLS[self.camera])
+        place = overlay.compute_structure(reference, is_known, tuning.SURROUND_SD_CELLS[self.camera])
         if self._is_nadir:
             laid = overlay.overlay_query(*views.halved, match, cells)
             return overlay.measure_prominence(
@@ -334,7 +301,7 @@ class CoHog:
     def _make_structure(self, blocks: Singles, seen: Bools) -> Singles:
         """Return the structure of a picture (see `overlay`) that has these blocks, float32 (n, n, 4 bins)."""
         return overlay.compute_structure(
-            self._make_patterns(blocks.reshape(-1, 4 * self.bins)), seen, _SURROUND_SD_CELLS[self.camera]
+            self._make_patterns(blocks.reshape(-1, 4 * self.bins)), seen, tuning.SURROUND_SD_CELLS[self.camera]
         )
 
     def score_quickly(
@@ -347,9 +314,9 @@ class CoHog:
             best, match, _ = self._find_best_hypothesis(query, reference, hypotheses)
             return match.score, [best]
         view = self._make_view(query, self._hypotheses[0])
-        nearest = find_most_similar(view.regions[::_QUICK_STEP], reference)
+        nearest = find_most_similar(view.regions[:: tuning.QUICK_STEP], reference)
         return compute_vote_share(
-            view.numbers[::_QUICK_STEP], nearest, (view.side, self._side), _VOTE_WEIGHTS[self.camera]
+            view.numbers[:: tuning.QUICK_STEP], nearest, (view.side, self._side), tuning.VOTE_WEIGHTS[self.camera]
         ), None
 
     def _restore_regions(self, fine: Bytes) -> Singles:
@@ -375,7 +342,7 @@ class CoHog:
 
     def _match_view(self, view: ViewRegions, reference: Singles) -> tuple[FineMatch, Ints]:
         if self._votes:  # with a nadir camera, landmarks tell more than the support of all regions
-            return match_view(view, reference, _VOTE_WEIGHTS[self.camera], with_support=not self._is_nadir)
+            return match_view(view, reference, tuning.VOTE_WEIGHTS[self.camera], with_support=not self._is_nadir)
         likeness = view.regions @ reference.T
         nearest = likeness.argmax(axis=1)
         score = np.clip(likeness[np.arange(len(nearest)), nearest].mean(), 0, 1) if len(nearest) else 0
