@@ -42,9 +42,7 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _MAX_OVERLAP_SLOTS = 10  # so many places before and after one without position may show the same ground
-_MAX_OVERLAP_FOOTPRINTS = (
-    2.0  # footprints between two places from which on their pictures, from any heights, share no ground
-)
+_MAX_OVERLAP_FOOTPRINTS = 2.0  # between two places; farther apart, pictures from any heights share no ground
 MIN_LOOK_ALIKE_CONFIDENCE = 0.1  # confidence from which a place elsewhere looks alike, on the page of a map
 _DIGITS = 3  # of stored agreements
 

@@ -57,9 +57,7 @@ _MIN_SCORE = 0.01  # from which landmarks near the vote are compared
 _LANDMARK_SDS = (0.01, 0.05)
 _VOTE_SDS = (0.016, 0.09)
 _MAX_HYPOTHESES = 8  # hypotheses of rotation and height for a pair
-_CACHED_LANDMARKS = (
-    512  # places whose landmarks are cached: a place is compared with its neighbours soon after each other
-)
+_CACHED_LANDMARKS = 512  # places whose landmarks are cached: neighbours are compared soon after each other
 _CACHED_DESCRIPTORS = 4  # descriptors that are cached
 
 
@@ -183,9 +181,8 @@ def _is_mirrored(recorded_at: list[Position], recorded: Complexes, ties: Ties, s
     if abs(lon_deg).max() < 90:  # exchanging lat and lon also changes the proportions of the track
         east_m, north_m = project_to_metres(lon_deg, lat_deg)
         mirrored.append(east_m + 1j * north_m)
-    return any(
-        _compute_misfit(each, solve_graph(each, fewer), some) < _MAX_MIRRORED_RATIO * misses for each in mirrored
-    )
+    limit = _MAX_MIRRORED_RATIO * misses
+    return any(_compute_misfit(each, solve_graph(each, fewer), some) < limit for each in mirrored)
 
 
 def _compute_misfit(recorded: Complexes, solved: GraphSolution, some: slice) -> float:

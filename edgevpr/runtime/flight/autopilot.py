@@ -174,10 +174,8 @@ class AutopilotOutput:
         now_s = self._clock.mono_s()
         if event.accepted and (best := event.best):
             place, score = best.place.place_id, best.match.score
-            found = messages.make_named_values(
-                now_s, vpr_place=place, vpr_score=score, vpr_conf=combine_confidence(event)
-            )
-            self._link.send(*found)
+            confidence = combine_confidence(event)
+            self._link.send(*messages.make_named_values(now_s, vpr_place=place, vpr_score=score, vpr_conf=confidence))
         if event.is_query:
             cpu_share = event.cost.whole.utilisation(self._cores)
             self._link.send(*messages.make_named_values(now_s, vpr_cpu=float(cpu_share), vpr_mah=float(used_mah)))

@@ -95,10 +95,8 @@ class Commands:
     def _carry_out(self, request: CommandRequest) -> None:
         is_new = self.is_paused != (request.command is UserCommand.PAUSE)
         self.is_paused = request.command is UserCommand.PAUSE
-        code = _COMMAND_CODES[request.command]
-        self._notifier.log(
-            "command", wish=request.command.name, sender=request.sender, note=Reason(code), is_new=is_new
-        )
+        code, name = _COMMAND_CODES[request.command], request.command.name
+        self._notifier.log("command", wish=name, sender=request.sender, note=Reason(code), is_new=is_new)
         if is_new:  # a command repeated because its answer was lost changes nothing
             text = code.summary
             self._notifier.announce(Severity.INFO, f"{text} by {request.sender}", ground=text, topic="pause")
