@@ -18,7 +18,7 @@ from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage
 from edgevpr.lab.evaluate.dataset import ScoredQuery
 from edgevpr.mapmaking.calibrate import count_queries, query_map
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.retrieve import outside_neighbourhood
+from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.runtime.recognise.evidence import Evidence
 from edgevpr.runtime.recognise.judge import accept_rule
 

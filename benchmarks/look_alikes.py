@@ -13,7 +13,7 @@ import numpy as np
 import walks
 from base import DATA
 
-from edgevpr.places.retrieve import outside_neighbourhood
+from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.evidence import INLIERS_BY_CHANCE, count_neighbours
 

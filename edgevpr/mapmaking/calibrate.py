@@ -30,7 +30,7 @@ from edgevpr.mapmaking.look_alikes import MapSearch, measure_look_alikes
 from edgevpr.mapmaking.mapping import Progress
 from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import outside_neighbourhood
+from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.places.rows import escape_name
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import MIN_PLACES, MapCalibration, format_calibration

@@ -20,7 +20,8 @@ from edgevpr.frames.mask import OverlayMask
 from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import MAX_NEIGHBOUR_SLOTS, Query, compare_places, outside_neighbourhood, scan_index
+from edgevpr.places.ranking import MAX_NEIGHBOUR_SLOTS, outside_neighbourhood
+from edgevpr.places.retrieve import Query, compare_places, scan_index
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import read_calibration_for

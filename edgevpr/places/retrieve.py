@@ -10,8 +10,8 @@ A place that cannot be read is left out from then on. Its loss must never make a
 """
 
 import math
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,17 +19,16 @@ import numpy as np
 from edgevpr.core.arrays import Array, Bools, Doubles, Ints, LatLon, Singles
 from edgevpr.core.contract import Descriptor, FineMatch, Technique
 from edgevpr.core.errors import MapError, PlaceError
-from edgevpr.core.geodesy import distance_m
 from edgevpr.core.types import Candidate
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.ranking import Ranking, outside_neighbourhood
 
 Choice = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all)
 QuickScore = tuple[float, Choice]  # approximate score, and the slot with its best hypothesis
 # Scan scores of each place, float32 (N,), and each hypothesis, float32 (N, H), -inf if ruled out (None: there is none).
 Scan = tuple[Singles, Singles | None]
 
-MAX_NEIGHBOUR_SLOTS = 2  # places before and after one without a position that are its neighbours
 _ELSEWHERE_PLACES = 5
 _MAX_HYPOTHESES = 3  # per place
 _MAX_UNMOVED_PLACES = 9
@@ -66,32 +65,6 @@ class Query:
     place_map: PlaceMap
     index: PlaceIndex
     expected: Expectation = NO_EXPECTATION
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ranking:
-    """The places that a query may show, best first: their `slots` in the index, int (K,), and their `scores`, float32
-    (K,). `compared` maps the slot of each place that was compared in full to the match found, which has this score;
-    those only scored quickly (see `Technique.score_quickly`) come last. `unread` int (U,): slots of places that cannot
-    be read from the file, but that the query may show as well, because the scan scored their row (see `Scan`) at least
-    as high as the best place's, or among the three best. `tried`: share (0..1) of the rotations under which the query
-    could match that were not ruled out."""
-
-    slots: Ints
-    scores: Singles
-    compared: dict[int, FineMatch]
-    unread: Ints = field(default_factory=lambda: np.empty(0, np.intp))
-    tried: float = 1.0
-
-    @property
-    def compared_slots(self) -> list[int]:
-        """The slots of the places that were compared in full, best first."""
-        return [slot for slot in self.slots.tolist() if slot in self.compared]
-
-    def promote(self, slot: int) -> "Ranking":
-        """Return the ranking with the place `slot` moved to the front; it keeps its own score."""
-        order = np.argsort(self.slots != slot, kind="stable")
-        return replace(self, slots=self.slots[order], scores=self.scores[order])
 
 
 def scan_index(query: Query) -> Scan:
@@ -259,53 +232,6 @@ def match_unmoved_places(query: Query, best: int, apart_m: float) -> list[FineMa
     )
     choices: list[Choice] = [(slot, None) for slot in slots[:: -(-len(slots) // _MAX_UNMOVED_PLACES) or 1].tolist()]
     return [query.technique.match_at_rest(query.descriptor, fine) for _, fine, _ in _read_fine_parts(query, choices)]
-
-
-def merge_rankings(one: Ranking, other: Ranking) -> Ranking:
-    """Merge two rankings of the same query, made with different expectations. If both compared a place in full, the
-    better match counts."""
-    compared = dict(one.compared)
-    for slot, match in other.compared.items():
-        if slot not in compared or match.score > compared[slot].score:
-            compared[slot] = match
-    rest = dict[int, float]()
-    for ranking in (one, other):
-        for slot, score in zip(ranking.slots.tolist(), ranking.scores.tolist(), strict=True):
-            if slot not in compared:
-                rest[slot] = max(score, rest.get(slot, score))
-    scores = {slot: compared[slot].score for slot in sorted(compared, key=lambda slot: -compared[slot].score)}
-    lowest = min(scores.values())
-    scores |= {slot: min(rest[slot], lowest) for slot in sorted(rest, key=lambda slot: -rest[slot])}
-    return Ranking(
-        slots=np.array(list(scores), np.intp),
-        scores=np.array(list(scores.values()), np.float32),
-        compared=compared,
-        unread=np.union1d(one.unread, other.unread).astype(np.intp),
-        tried=min(1.0, one.tried + other.tried),
-    )
-
-
-def outside_neighbourhood(
-    index: PlaceIndex,
-    best: int,
-    slots: Ints,
-    neighbour_m: float,
-    same: Collection[int] = (),
-    max_slots: int = MAX_NEIGHBOUR_SLOTS,
-) -> Bools:
-    """Return bool (K,), True for each of `slots` (K,) that is no neighbour of the slot `best`: it is more than
-    `neighbour_m` metres or, without a position, `max_slots` slots away, and its id is not in `same`."""
-    away_m = distance_m(index.lat_deg[best], index.lon_deg[best], index.lat_deg[slots], index.lon_deg[slots])
-    away = np.where(np.isnan(away_m), abs(slots - best) > max_slots, away_m > neighbour_m)
-    return away & ~np.isin(index.place_ids[slots], tuple(same)) if same else away
-
-
-def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Collection[int] = ()) -> float | None:
-    """Return the best score minus the best score of a place elsewhere (see `outside_neighbourhood`); None if none is
-    ranked."""
-    is_rival = outside_neighbourhood(index, int(ranking.slots[0]), ranking.slots[1:], neighbour_m, same)
-    runners_up = ranking.scores[1:][is_rival]
-    return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None
 
 
 def load_candidates(

@@ -14,7 +14,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Bools, Floats, Singles
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.retrieve import Ranking
+from edgevpr.places.ranking import Ranking
 
 FOLLOWED_SPEEDS = np.linspace(0.8, 1.2, 5)  # places per query, as in the paper
 _SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places per query; ten queries can tell steps of 0.25 apart

@@ -4,7 +4,8 @@ import numpy as np
 
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
 from edgevpr.places.index import PlaceIndex, allocate_index
-from edgevpr.places.retrieve import Expectation, Query, Ranking, compare_places, scan_index
+from edgevpr.places.ranking import Ranking
+from edgevpr.places.retrieve import Expectation, Query, compare_places, scan_index
 
 
 class Ruler:

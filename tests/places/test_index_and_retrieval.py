@@ -13,14 +13,8 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.places import retrieve
 from edgevpr.places.index import compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import (
-    Query,
-    compute_candidate_factor,
-    load_candidates,
-    margin,
-    match_unmoved_places,
-    outside_neighbourhood,
-)
+from edgevpr.places.ranking import margin, outside_neighbourhood
+from edgevpr.places.retrieve import Query, compute_candidate_factor, load_candidates, match_unmoved_places
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.places.geopackage import encode_point
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import load_candidates, margin
+from edgevpr.places.ranking import margin
+from edgevpr.places.retrieve import load_candidates
 from edgevpr.runtime.recognise.judge import AcceptRule, Findings, judge
 
 RULE = AcceptRule(min_score=0.1, min_margin=0.1, neighbour_m=20.0)

@@ -7,7 +7,8 @@ import pytest
 from ranking import index_of
 
 from edgevpr.core.contract import FineMatch
-from edgevpr.places.retrieve import Ranking, choose_best, merge_rankings, outside_neighbourhood
+from edgevpr.places.ranking import Ranking, merge_rankings, outside_neighbourhood
+from edgevpr.places.retrieve import choose_best
 
 
 def tried(by_hypothesis, count, among=None):

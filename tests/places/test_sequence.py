@@ -8,7 +8,7 @@ import pytest
 from ranking import index_of
 
 from edgevpr.core.contract import FineMatch
-from edgevpr.places.retrieve import Ranking
+from edgevpr.places.ranking import Ranking
 from edgevpr.places.sequence import SequenceSearch, compute_sequence_bytes
 
 FOLLOWED = (0.8, 0.9, 1.0, 1.1, 1.2)

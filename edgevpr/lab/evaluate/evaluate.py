@@ -29,7 +29,7 @@ from edgevpr.mapmaking.mapping import build_map
 from edgevpr.mapmaking.pictures import FlownPictures
 from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import outside_neighbourhood
+from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.places.sequence import make_sequence_search
 from edgevpr.power.boards import load_board
 from edgevpr.power.equations import parse_pack, queries_ah

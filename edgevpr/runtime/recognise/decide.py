@@ -15,16 +15,8 @@ from edgevpr.frames.level import LevelledImage
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import (
-    MAX_NEIGHBOUR_SLOTS,
-    NO_EXPECTATION,
-    Expectation,
-    Query,
-    Ranking,
-    load_candidates,
-    match_unmoved_places,
-    outside_neighbourhood,
-)
+from edgevpr.places.ranking import MAX_NEIGHBOUR_SLOTS, Ranking, outside_neighbourhood
+from edgevpr.places.retrieve import NO_EXPECTATION, Expectation, Query, load_candidates, match_unmoved_places
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.agreement import (

@@ -27,7 +27,7 @@ import numpy as np
 
 from edgevpr.core.contract import FineMatch, TechniqueSpec
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.retrieve import MAX_NEIGHBOUR_SLOTS, Ranking, outside_neighbourhood
+from edgevpr.places.ranking import MAX_NEIGHBOUR_SLOTS, Ranking, outside_neighbourhood
 from edgevpr.runtime.recognise.agreement import Agreement
 
 AHEAD = "ahead"

@@ -15,7 +15,7 @@ from edgevpr.core.contract import Descriptor, FineMatch, Technique
 from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.places.index import PlaceIndex
-from edgevpr.places.retrieve import Ranking, margin, outside_neighbourhood
+from edgevpr.places.ranking import Ranking, margin, outside_neighbourhood
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.calibration import MapCalibration

@@ -16,7 +16,7 @@ from edgevpr.core.types import Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Ranking
+from edgevpr.places.ranking import Ranking
 from edgevpr.runtime.recognise.belief import (
     DEFAULT_MAX_SPEED_M_S,
     Belief,

@@ -15,7 +15,8 @@ from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.level import Mount, View
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Expectation, Ranking, compare_places, merge_rankings, scan_index
+from edgevpr.places.ranking import Ranking, merge_rankings
+from edgevpr.places.retrieve import Expectation, compare_places, scan_index
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.decide import Decider, Decision, Matcher, Verifier, WalkSettings
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, explain_failure

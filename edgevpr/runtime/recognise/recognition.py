@@ -7,7 +7,7 @@ from edgevpr.core.contract import Descriptor
 from edgevpr.core.reasons import NOT_SEARCHED, Reason
 from edgevpr.core.types import Candidate, FixReport, Frame, Position, QueryCost, StepCosts, Vehicle
 from edgevpr.frames.level import UNKNOWN_VIEW, LevelledImage, View
-from edgevpr.places.retrieve import Ranking
+from edgevpr.places.ranking import Ranking
 from edgevpr.runtime.recognise.agreement import Agreement
 from edgevpr.runtime.recognise.evidence import Evidence
 from edgevpr.runtime.recognise.hints import Hints

@@ -9,7 +9,7 @@ from sureness import agreed, bare_index
 
 from edgevpr.core.contract import FineMatch, Support
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.places.retrieve import Ranking
+from edgevpr.places.ranking import Ranking
 from edgevpr.runtime.recognise.calibration import require_usable
 from edgevpr.runtime.recognise.confidence import prior
 from edgevpr.runtime.recognise.evidence import (

@@ -13,7 +13,7 @@ from edgevpr.core.config import load_config
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Position
-from edgevpr.places.retrieve import Ranking
+from edgevpr.places.ranking import Ranking
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.runtime.recognise.evidence import DOWN, DOWN_BARE, MAP_FIGURES, PLACE_FIGURES, Evidence, log_count
 from edgevpr.runtime.recognise.judge import (

@@ -13,7 +13,7 @@ from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.places.index import PlaceIndex, allocate_index
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.places.retrieve import Ranking
+from edgevpr.places.ranking import Ranking
 from edgevpr.runtime.recognise.evidence import Evidence
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.odometry import OdometryStep
