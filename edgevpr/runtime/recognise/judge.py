@@ -95,11 +95,7 @@ class ConfidenceRule:
 
     def threshold(self, evidence: Evidence) -> float:
         """Return the confidence needed to accept a match with this kind of evidence."""
-        return self.needed(evidence.kind)
-
-    def needed(self, kind: str) -> float:
-        """Return the confidence needed to accept a match with evidence of this kind."""
-        return max(_MIN_CONFIDENCE, self.models[kind].threshold(self.precision))
+        return max(_MIN_CONFIDENCE, self.models[evidence.kind].threshold(self.precision))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
