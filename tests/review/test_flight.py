@@ -35,7 +35,7 @@ def test_a_file_that_is_missing_is_a_remark(tmp_path):
     list_numbered(path)[0].unlink()
     flight = read_flight(path)
     assert (flight.start["map"], flight.start["repeated"]) == ("m.gpkg", True)
-    assert flight.problems[0][:2] == (0.0, "missing")
+    assert flight.remarks[0][:2] == (0.0, "missing")
     assert 0 < len(flight.queries) < 4
 
 

@@ -44,7 +44,7 @@ def test_the_fingerprint_changes_with_all_that_a_descriptor_depends_on(models):
         ({"file": "../tiny.onnx"}, "write the name of a file that lies beside the card"),
         ({"file": "tiny.yaml"}, "`file` is `tiny.yaml`, which is the name of a card: write that of the ONNX file"),
         ({"file": "a\0.onnx"}, r"tiny.yaml: `file` holds a character that no file name can have"),
-        ({"outputs": {}}, "`outputs` names none"),
+        ({"outputs": {}}, "`outputs` is empty"),
         ({"input": {**CARD["input"], "colour": "gray"}}, "`input.colour` is `gray`: write grey, bgr or rgb"),
         (
             {"input": {**CARD["input"], "layout": "CHW"}},

@@ -23,7 +23,7 @@ def place_map(altitudes_m, footprint_m=100.0, lens=None, is_surveyed=False):
             position = Position(50.0 + number, 8.0, alt_m)
             yield Place(place_id=number, source_image=f"{number}.jpg", position=position, pose=pose)
 
-    return SimpleNamespace(lens=lens, places=places)
+    return SimpleNamespace(lens=lens, read_places=places)
 
 
 @pytest.mark.parametrize(

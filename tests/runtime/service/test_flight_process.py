@@ -60,7 +60,7 @@ def test_run_sends_what_the_log_says(fly, tmp_path):
     assert [line["result"] for line in answered] == ["ACCEPTED"] * seen.fixes_accepted
     assert told <= {line["query"] for line in answered}
     assert len(answered) == len({line["query"] for line in answered})
-    assert f"{seen.fixes_accepted} taken" in said
+    assert f"{seen.fixes_accepted} accepted" in said
     # The board draws between the queries too, and the process does more than its queries' stages.
     totals, slack = queries[-1]["totals"], 1 + 1e-4
     assert totals["used_mah"] * slack > sum(line["costs"]["used_mah"] for line in queries)

@@ -75,7 +75,7 @@ def test_run_feeds_no_watchdog_from_a_hanging_thread_and_ends(hanging, tmp_path)
                 assert time.monotonic() < give_up_s, "it is still fed"
     flight.terminate()
     assert flight.wait(END_S) == 1
-    assert "its process is ended" in flight.stderr.read()
+    assert "ending its process" in flight.stderr.read()
     assert of_kind(read_log(tmp_path / "f.jsonl"), "start")
 
 
