@@ -235,7 +235,7 @@ def _wrap_progress(progress: Progress) -> Any:
 
 def _to_path(path: object) -> str:
     if not isinstance(path, str | os.PathLike):
-        raise UsageError(f"A path is {path!r}: give text or a pathlib.Path.")
+        raise UsageError(f"{path!r} is not a path: give a string or a pathlib.Path.")
     return os.fspath(path)
 
 

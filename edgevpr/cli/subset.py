@@ -29,7 +29,7 @@ def add(add_to_map: Callable[..., Any]) -> None:
         default=_MARGIN_M,
         help="margin around the mission in metres (default: %(default)g)",
     )
-    parser.add_argument("--mb", type=parse_positive, metavar="MB", help="maximum file size in MB (default: all places)")
+    parser.add_argument("--mb", type=parse_positive, metavar="MB", help="maximum file size in MB (default: no limit)")
     add_json(parser)
 
 

@@ -115,7 +115,7 @@ def create_numbered(path: str | Path) -> Path:
         with suppress(FileExistsError):  # another process was faster
             os.close(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, LOG_FILE_MODE))
             return target
-    raise OSError(errno.EEXIST, f"there is a file of number {_MAX_NUMBER}", str(path))
+    raise OSError(errno.EEXIST, f"file number {_MAX_NUMBER} exists, and no higher one is allowed", str(path))
 
 
 def rotate_file(path: str | Path) -> Path:

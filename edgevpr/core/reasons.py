@@ -87,7 +87,7 @@ class ReasonCode(Code):
     NEWEST_DISAGREES = "the newest query resembles other places more"
     NEWEST_LEFT = "the newest queries show other ground than those before"
     LOW_LEAD_SPEED = (
-        "too little ahead of a place passed at another speed",
+        "its lead over the best match at another assumed speed is too small",
         "{summary}: {lead:.3f}, {needed:.3f} needed",
     )
 
@@ -143,7 +143,10 @@ class ReasonCode(Code):
     NOT_SAID = "see its log", "it gives no reason: GPS just in use, no origin, or no source of position"
     OTHER_ANSWER = "see its log", "it answers {result}"
     WRONG_FORM = "wrong format", "it rejects their format"
-    NO_COMMAND = "43003 not known", "its firmware has no command 43003, or was built without, as for boards of 1 MB"
+    NO_COMMAND = (
+        "43003 not known",
+        "its firmware has no command 43003, or was built without it, as on boards with 1 MB of flash",
+    )
     NO_COMMAND_ANSWERED = (
         "signing? system id?",
         "it answers no command of ours: does its port take signed messages only, does another vehicle have its ",
@@ -184,7 +187,7 @@ class ReasonCode(Code):
     PAUSED_BY_COMMAND = "paused by command"
     RESUMED_BY_COMMAND = "resumed by command"
     UNDER_VOLTAGE = "companion under-voltage: check 5 V supply"
-    SUPPLY_FINE = "companion supply is fine again"
+    SUPPLY_FINE = "companion supply is back to normal"
     THROTTLED = "companion throttled", "{summary}", " at {temperature_c:.0f} C", ": runs slower"
     FULL_SPEED = "companion runs at full speed again"
     HOT = "companion hot", "{summary}", " at {temperature_c:.0f} C", ": improve its cooling"

@@ -63,7 +63,7 @@ class Fix:
         if not 0 < self.accuracy_m < math.inf:
             raise ValueError(f"an accuracy of {self.accuracy_m} m says nothing: it must be finite and above zero")
         if not math.isfinite(self.t_frame_s):
-            raise ValueError(f"a frame taken at {self.t_frame_s} s has no age")
+            raise ValueError(f"the age of a frame taken at {self.t_frame_s} s cannot be computed")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -82,15 +82,15 @@ class Px4Fusion:
         elif silent_s > (_VISION_TIMEOUT_S if self._is_vision else _SENSOR_TIMEOUT_S) or (
             self._is_vision and is_fusing
         ):
-            self._judge(is_fusing, now_s)
+            self._infer_gps_use(is_fusing, now_s)
         elif not self.uses_gps or silent_s < _SENDING_TIMEOUT_S:
             is_due = now_s >= self._next_try_s and receiver.steady_for_s >= _MIN_STEADY_S
             self._unused_since_s, self.uses_gps = None, takes_velocity and is_due and is_believed
         elif not takes_velocity:
-            self._judge(False, now_s)  # it does not take what we have stopped for
+            self._infer_gps_use(False, now_s)  # it does not take what we have stopped for
 
-    def _judge(self, is_fusing: bool, now_s: float) -> None:
-        """Set whether GPS is used while nothing of ours is, by whether its position is fused."""
+    def _infer_gps_use(self, is_fusing: bool, now_s: float) -> None:
+        """Infer whether PX4 uses GPS while it uses none of our positions: whether it fuses a position."""
         if is_fusing:
             self._unused_since_s, self.uses_gps, self._pause_s = None, True, _FIRST_PAUSE_S
         elif self._unused_since_s is None:

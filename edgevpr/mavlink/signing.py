@@ -191,7 +191,7 @@ def read_key(path: str) -> bytes:
     except OSError as error:
         raise ConfigError(f"{path}: the signing key cannot be read ({error.strerror}): {_KEY_ADVICE}.") from error
     if mode & 0o077 and not _is_credential(path, mode):
-        raise ConfigError(f"{path}: others may open the signing key (mode {mode:04o}): `chmod 600 {path}`.")
+        raise ConfigError(f"{path}: other users can read the signing key (mode {mode:04o}): run `chmod 600 {path}`.")
     if len(key) != KEY_BYTES:
         raise ConfigError(f"{path}: a signing key has {KEY_BYTES} bytes, this file has not: {_KEY_ADVICE}.")
     return key

@@ -36,7 +36,7 @@ def load_words(model: str, kind: str, count: int) -> tuple[Singles, str]:
     learned_on, fingerprint = str(arrays.get("model_sha256")), load_card(model).fingerprint
     if learned_on != fingerprint:
         networks = f"({learned_on[:12]}...) than `{model}` is now ({fingerprint[:12]}...)"
-        raise ModelError(f"{name} was learned on another network {networks}: {command}.")
+        raise ModelError(f"{name} was trained with a different network ({networks}): {command}.")
     if words.ndim != 2 or len(words) != count or not np.isfinite(words).all():
         raise ModelError(f"{name} must hold {count} words, and holds an array {words.shape}: {command}.")
     sha256 = hashlib.sha256((fingerprint + hashlib.sha256(content).hexdigest()).encode()).hexdigest()

@@ -104,7 +104,7 @@ def place_video(record: Record, video: Path, offset_s: float | None) -> Placemen
     began_s, lasts_s = read_start_s(video)
     if record.is_utc:
         if began_s is None:
-            raise UsageError(f"{video} has no start time: give a recording with times of the video.")
+            raise UsageError(f"{video} has no start time: give a flight log that covers the time of the video.")
         if offset_s is None:
             offset_s = _estimate_zone_offset_s(record.track, np.linspace(began_s, began_s + lasts_s, 60), str(video))
         shift_s, how = -began_s - offset_s, "by time"

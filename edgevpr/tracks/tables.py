@@ -99,7 +99,7 @@ def _read_rows(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, 
         except (KeyError, ValueError) as error:
             raise UsageError(f"{path}: `{' '.join(row):.80}` cannot be read ({error}): correct the line.") from error
     if named and not any(tag.position for tag in named.values()):
-        raise UsageError(f"{path} has no possible position: are latitude and longitude exchanged, or not in degrees?")
+        raise UsageError(f"{path} has no valid position: are latitude and longitude swapped, or not in degrees?")
     return named
 
 

@@ -36,7 +36,7 @@ def test_words_are_read_and_belong_to_their_file(folder):
 def test_words_of_another_network_are_refused(folder):
     write(folder)
     write_card(folder / "tiny.yaml", {"sha256": "1" * 64})
-    with pytest.raises(ModelError, match="another network"):
+    with pytest.raises(ModelError, match="different network"):
         words.load_words("tiny", "vlad", 3)
 
 

@@ -219,7 +219,9 @@ class AutopilotOutput:
         has_own, stats = self._navigator.knows_position(now_s), self._link.stats()
         answered_s = stats.answered_s.get(messages.SET_SOURCE_SET, -math.inf)
         if number := self._source_sets.choose_set(now_s, self._navigator.has_gps, has_own, answered_s):
-            self._notifier.announce(messages.Severity.WARNING, f"source set {number} asked for", topic="sources")
+            self._notifier.announce(
+                messages.Severity.WARNING, f"requested source set {number} from the autopilot", topic="sources"
+            )
             self._link.send(messages.make_source_set(number, stats.autopilot_system_id or 0))
 
     def _report_output(self) -> None:

@@ -113,7 +113,7 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
         def open_own(step_s: float) -> Source:
             source = open_source(uri, step_s=step_s, positions=positions, live=True, steps_s=steps_s)
             if steps_s:
-                _log.info("%d pictures come by their own times, in %.0f s", source.total, sum(steps_s))
+                _log.info("%d pictures are played at their recorded times, over %.0f s", source.total, sum(steps_s))
             elif Path(uri).is_dir():
                 _log.info("pictures come at %.3g a second: not all have a time, in their order", 1 / step_s)
             return source

@@ -45,10 +45,10 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
             continue
         options.append(make_option(board, _make_label(technique.spec), name, _measure_costs(technique, board), demand))
     if not options:
-        raise ModelError("No technique can be used here (see above): correct what it names, or name another one.")
+        raise ModelError("No technique can be used here: mend the problems listed above, or name another one.")
     chosen = choose_best(options, board)
     if chosen is None:
-        _log.warning("technique %s is used nevertheless: %s", options[0].name, explain_no_choice(options, board))
+        _log.warning("using technique %s anyway: %s", options[0].name, explain_no_choice(options, board))
         return options[0].name
     others = [f"{other.label} {other.objection}" for other in options if other.name != chosen.name and other.objection]
     _log.info("technique %s: %s", chosen.label, "; ".join([describe_option(board, chosen, demand), *others]))

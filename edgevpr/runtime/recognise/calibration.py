@@ -75,7 +75,7 @@ def require_usable(kind: str, model: Model) -> None:
     known = MAP_FIGURES.get(kind, ()) + PLACE_FIGURES.get(kind, ())
     names = {name for each in (model.of_map, model.of_place) for name in each.names}
     if unknown := names.difference(known):
-        raise ValueError(f"there is no evidence {min(unknown)!r:.40} of kind {kind!r:.40}")
+        raise ValueError(f"unknown evidence {min(unknown)!r:.40} for kind {kind!r:.40}")
     for value in (-1.0, 0.0, 1.0):
         model.confidence(dict.fromkeys(known, value))
     model.threshold(0.999999)

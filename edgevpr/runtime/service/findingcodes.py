@@ -54,14 +54,14 @@ class FindingCode(Code):
         ", {facts}",
         ", {age_s:.1f} s old: a flight accepts it",
     )
-    FRAMES_LATE = "{uri}: frames are {age_s:.1f} s old, {limit_s:g} s are allowed: shorten the buffers of the camera"
+    FRAMES_LATE = "{uri}: frames are {age_s:.1f} s old (limit {limit_s:g} s): reduce the camera's buffering"
     NO_FRAME = "{uri}: no frame in {waited_s:.0f} s ({state}): start it, or correct `source: {{uri: ...}}`"
 
     # The link
     LINK_OPENED = _LINK
     LINK_OPENED_DRY = *_LINK, ", dry run: no fix is sent"
     MESSAGES_REFUSED = "{address}: messages arrive but are refused ({cause}): {meaning}"
-    OTHER_SYSTEM = "{address}: heartbeats of system {systems}, none of the configured system"
+    OTHER_SYSTEM = "{address}: heartbeats from system {systems}, but none from the configured system"
     NO_HEARTBEAT = _NO_HEARTBEAT, "start the other end, or correct host and port"
     SERIAL_SILENT = _NO_HEARTBEAT, "nothing is received (are TX and RX swapped?): ", _SET_PORT
     SERIAL_NOT_MAVLINK = _NO_HEARTBEAT, "what arrives is not MAVLink (another baud rate?): ", _SET_PORT

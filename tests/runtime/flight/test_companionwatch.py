@@ -37,7 +37,7 @@ def watch(notifier, link):
 def test_take_reports_a_problem_when_it_begins_and_when_it_is_over(watch):
     assert watch([FINE] * 5 + [LOW] * 100 + [FINE] * 100) == [
         (5, Severity.WARNING, "edgevpr: companion under-voltage: check 5 V supply"),
-        (134, Severity.INFO, "edgevpr: companion supply is fine again"),
+        (134, Severity.INFO, "edgevpr: companion supply is back to normal"),
     ]
 
 
@@ -74,7 +74,7 @@ def test_an_under_voltage_in_flight_reaches_log_journal_ground_and_status(make_f
     assert {code for code, _ in notes[2:]} == {"SUPPLY_FINE", "FULL_SPEED"}
     texts = link.texts()
     assert (4, f"edgevpr: {begun}") in texts
-    assert (6, "edgevpr: companion supply is fine again") in texts
+    assert (6, "edgevpr: companion supply is back to normal") in texts
     assert [record.levelname for record in caplog.records if record.message == begun] == ["WARNING"]
     assert statuses[2]["under_voltage"] is False
     assert (statuses[3]["under_voltage"], statuses[3]["throttled"]) == (True, True)
