@@ -54,7 +54,8 @@ RATE_HZ = 40.0
 OLD_S = 1.0
 _WHOLE_AT_FIRST = 80  # pictures that every camera sends, so that the viewer gets to know the stream
 _TOO_SLOW = ("MJPEG over HTTP, whole", "H.264 in MPEG-TS, 0% lost", "H.264 in RTSP, 0% lost")
-_SLOWER, _LONGER = 2.0, 3  # than the stream: the work for a picture; and than the others: how long it is borne
+_SLOWER = 2.0  # than the stream: the work for a picture; and than the others: how long it is borne
+_LONGER = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,8 +7,10 @@ import numpy as np
 
 WIDTH = 320
 HEIGHT = 240
-_BAND_PX, _BAR_PX = 16, 16
-_NUMBER_BITS, _CHECK_BITS = 12, 8
+_BAND_PX = 16
+_BAR_PX = 16
+_NUMBER_BITS = 12
+_CHECK_BITS = 8
 
 
 def _texture() -> np.ndarray:

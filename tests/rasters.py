@@ -10,7 +10,8 @@ from edgevpr.core.types import Position
 
 HOME = Position(50.0, 11.9)  # at the edge of UTM zone 32: grid north is 2.2 degrees off true north
 MARKS_M = ((0.0, 0.0), (25.0, 0.0), (0.0, 30.0), (-28.0, -22.0))  # east and north of HOME
-_SEMI_MAJOR_M, _ECCENTRICITY2 = 6_378_137.0, 0.00669437999014
+_SEMI_MAJOR_M = 6_378_137.0
+_ECCENTRICITY2 = 0.00669437999014
 
 
 def ground_m(lat_deg, lon_deg) -> tuple[np.ndarray, np.ndarray]:

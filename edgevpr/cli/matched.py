@@ -12,7 +12,8 @@ from edgevpr.core.text import align_table, format_probability, sanitize
 if TYPE_CHECKING:
     from edgevpr.runtime.recognise.recognition import Recognition
 
-_NAME_COLUMNS, _REASON_COLUMNS = 17, 48  # with them a row has about 120 columns
+_NAME_COLUMNS = 17  # with them a row has about 120 columns
+_REASON_COLUMNS = 48
 _FIX_HEADINGS = ("lat", "lon", "± m", "m from its GPS tag")
 
 

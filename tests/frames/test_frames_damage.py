@@ -10,7 +10,8 @@ from edgevpr.frames import streams
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-PICTURES, RATE_HZ = 200, 80.0
+PICTURES = 200
+RATE_HZ = 80.0
 WHOLE = ("MJPEG over HTTP, whole", "H.264 in MPEG-TS, 0% lost", "H.264 in RTSP, 0% lost")
 CUT = ("MJPEG over HTTP, cut to 15 %", "MJPEG over HTTP, truncated")
 CORRUPTED = "MJPEG over HTTP, bytes corrupted"

@@ -10,10 +10,20 @@ from edgevpr.frames.positions import GeoTag
 
 pytest.importorskip("PIL", reason="the photographs with EXIF are made with Pillow")
 
-LAT_REF, LAT, LON_REF, LON, ALT_REF, ALT, TIME, STATUS = 1, 2, 3, 4, 5, 6, 7, 9
-DIRECTION_REF, DIRECTION, DATE = 16, 17, 29
+LAT_REF = 1
+LAT = 2
+LON_REF = 3
+LON = 4
+ALT_REF = 5
+ALT = 6
+TIME = 7
+STATUS = 9
+DIRECTION_REF = 16
+DIRECTION = 17
+DATE = 29
 GPS = {LAT_REF: "N", LAT: (46.0, 50.0, 33.0), LON_REF: "W", LON: (91.0, 59.0, 42.0)}
-TAKEN, ZONE = 0x9003, 0x9011
+TAKEN = 0x9003
+ZONE = 0x9011
 T_UTC_S = 1466699519  # date -u -d '2016-06-23 16:31:59' +%s
 
 

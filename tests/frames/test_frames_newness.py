@@ -6,7 +6,8 @@ import pytest
 
 from edgevpr.frames.shot import Refusal, RepeatDetector, make_thumbnail
 
-HEIGHT, WIDTH = 240, 320
+HEIGHT = 240
+WIDTH = 320
 _NOISE = np.random.default_rng(3).normal(128, 400, (900, 1200))
 GROUND = np.clip(128 + cv2.GaussianBlur(_NOISE - 128, (0, 0), 3), 0, 255).astype(np.uint8)
 

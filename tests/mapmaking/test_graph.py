@@ -6,8 +6,11 @@ from scipy.sparse import coo_matrix, identity
 
 from edgevpr.mapmaking.graph import Ties, _invert_diagonal, solve_graph
 
-FOOTPRINT_M, SPACING_M = 60.0, 15.0
-STEP_SD, TURN_SD, RECORDED_SD_M = 0.01, 0.03, 8.0
+FOOTPRINT_M = 60.0
+SPACING_M = 15.0
+STEP_SD = 0.01
+TURN_SD = 0.03
+RECORDED_SD_M = 8.0
 
 
 def flight(legs=5, a_leg=12, seed=0):

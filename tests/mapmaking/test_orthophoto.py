@@ -18,7 +18,8 @@ from edgevpr.mapmaking.orthophoto import Orthophoto
 
 pytestmark = pytest.mark.slow
 
-FOOTPRINT_M, SIDE_PX = 80.0, 400
+FOOTPRINT_M = 80.0
+SIDE_PX = 400
 
 
 def cut(path, footprint_m=FOOTPRINT_M, at=HOME):

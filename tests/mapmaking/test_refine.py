@@ -27,9 +27,11 @@ from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
 
-NOISE_M, GLITCH_M = 5.0, 250.0
+NOISE_M = 5.0
+GLITCH_M = 250.0
 FOOTPRINT_M = 80.0 * 640 / 493  # of the generated camera
-EVERY, LEGS = 1, 2  # pictures of the two first legs
+EVERY = 1  # pictures of the two first legs
+LEGS = 2
 _DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).parents[3] / "shared" / "data")
 
 

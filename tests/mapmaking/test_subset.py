@@ -17,7 +17,8 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.techniques import create
 
 HOME = 47.0, 8.0
-SIDE, STEP_M = 5, 100.0
+SIDE = 5
+STEP_M = 100.0
 
 
 def at(east_m, north_m):

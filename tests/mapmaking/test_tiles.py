@@ -23,7 +23,8 @@ from edgevpr.mapmaking.tiles import surround
 from edgevpr.places.mapfile import PlaceMap
 
 HALF_WORLD_M = 20037508.342789244
-ZOOM, REACH = 18, 2
+ZOOM = 18
+REACH = 2
 SECRET = "mykey123"
 HERE = surround([(HOME.lat_deg, HOME.lon_deg)], 100.0)
 

@@ -17,7 +17,8 @@ from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.px4_parameters import choose_px4_channel
 from edgevpr.mavlink.wire import mavlink
 
-ARDUPILOT, PX4 = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4
+ARDUPILOT = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+PX4 = mavlink.MAV_AUTOPILOT_PX4
 
 
 def test_the_receiver_is_the_one_that_is_ours_and_as_late_as_it_is_taken_to_be():
@@ -165,7 +166,9 @@ def test_a_px4_that_takes_odometry_is_asked_for_its_origin_and_told_its_position
     assert autopilot.conversation.autopilot.px4.used_share == 0.5
 
 
-ATTITUDE, GLOBAL, FUSES = mavlink.ESTIMATOR_ATTITUDE, mavlink.EKF_POS_HORIZ_ABS, mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+ATTITUDE = mavlink.ESTIMATOR_ATTITUDE
+GLOBAL = mavlink.EKF_POS_HORIZ_ABS
+FUSES = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
 
 
 def test_a_receiver_that_a_px4_does_not_use_is_no_gps():

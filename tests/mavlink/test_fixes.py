@@ -12,7 +12,9 @@ from edgevpr.mavlink.messages import MAX_TEXT_BYTES, Fix
 from edgevpr.mavlink.vehicle import Readiness
 from edgevpr.mavlink.wire import mavlink
 
-ACCEPTED, FAILED, DENIED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED, mavlink.MAV_RESULT_DENIED
+ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
+FAILED = mavlink.MAV_RESULT_FAILED
+DENIED = mavlink.MAV_RESULT_DENIED
 LATE = FixAnswer(None, Reason(ReasonCode.NO_ANSWER, {"limit_s": 1.0}), None)
 UNANSWERED = Reason(ReasonCode.FIXES_UNANSWERED)
 GPS_IN_USE = Reason(ReasonCode.GPS_IN_USE)

@@ -6,8 +6,10 @@ from edgevpr.mavlink.messages import Fix
 from edgevpr.mavlink.peer import Endpoint, Identity
 from edgevpr.mavlink.wire import mavlink
 
-OURS, FOREIGN = Endpoint(1, None), Endpoint(2, None)
-HERE, THERE = ("127.0.0.1", 1000), ("127.0.0.1", 2000)
+OURS = Endpoint(1, None)
+FOREIGN = Endpoint(2, None)
+HERE = ("127.0.0.1", 1000)
+THERE = ("127.0.0.1", 2000)
 
 
 def beat(identity: Identity, speaker: Endpoint, *times_s: float) -> list[bool]:

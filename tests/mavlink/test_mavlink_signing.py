@@ -29,7 +29,8 @@ from edgevpr.mavlink.signing import (
 )
 from edgevpr.mavlink.wire import PacketReader, mavlink
 
-KEY, OTHER_KEY = bytes(range(32)), bytes(32)
+KEY = bytes(range(32))
+OTHER_KEY = bytes(32)
 NOW = 1_000_000 * TICKS_S  # the time stamp that the clocks of these tests begin with
 UTC_S = 1_420_070_400 + NOW / TICKS_S
 

@@ -10,7 +10,8 @@ from edgevpr.mavlink.ground import MAX_ANSWERS_PER_S, Requests, Texts, UserComma
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.wire import mavlink
 
-US, STATION = (7, 197), (255, 190)
+US = (7, 197)
+STATION = (255, 190)
 ODD = (math.nan, math.inf, -math.inf, -0.0, -1.0, 1e-45, 0.5, 1.0, 3.0, 4.5, 148.0, 251.0, 390.0, 1e6, 2.0**64, 3e38)
 
 

@@ -9,7 +9,8 @@ from edgevpr.mavlink.channel import Channel
 from edgevpr.mavlink.wire import mavlink
 
 IMU = mavlink.MAVLINK_MSG_ID_SCALED_IMU
-RECEIVER, VISION = {"GPS1_TYPE": 1, "GPS2_TYPE": 14}, {"GPS2_TYPE": 0, "VISO_TYPE": 1}
+RECEIVER = {"GPS1_TYPE": 1, "GPS2_TYPE": 14}
+VISION = {"GPS2_TYPE": 0, "VISO_TYPE": 1}
 
 
 class Aircraft(Autopilot):

@@ -10,9 +10,13 @@ from edgevpr.mavlink.receivers import DEFAULT_GPS_SD_M
 from edgevpr.mavlink.vehicle import DRIFT_M_S
 from edgevpr.mavlink.wire import mavlink
 
-ABS, REL, CONST_POS = mavlink.EKF_POS_HORIZ_ABS, mavlink.EKF_POS_HORIZ_REL, mavlink.EKF_CONST_POS_MODE
-ACCEPTED, FAILED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED
-FIX_2D, FIX_3D = mavlink.GPS_FIX_TYPE_2D_FIX, mavlink.GPS_FIX_TYPE_3D_FIX
+ABS = mavlink.EKF_POS_HORIZ_ABS
+REL = mavlink.EKF_POS_HORIZ_REL
+CONST_POS = mavlink.EKF_CONST_POS_MODE
+ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
+FAILED = mavlink.MAV_RESULT_FAILED
+FIX_2D = mavlink.GPS_FIX_TYPE_2D_FIX
+FIX_3D = mavlink.GPS_FIX_TYPE_3D_FIX
 
 
 def test_its_position_is_known_while_it_is_fresh(autopilot):

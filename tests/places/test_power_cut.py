@@ -17,8 +17,10 @@ from edgevpr.places.mapfile import PlaceMap
 
 pytestmark = pytest.mark.slow
 
-FIRST, PLACES = 2, 8  # of an earlier flight, and added to them
-HEADER, FRAME = 32, 24 + 4096  # of SQLite's write-ahead log: its header, and each page with its own
+FIRST = 2  # of an earlier flight, and added to them
+PLACES = 8
+HEADER = 32  # of SQLite's write-ahead log: its header, and each page with its own
+FRAME = 24 + 4096
 
 
 @pytest.fixture(scope="module")

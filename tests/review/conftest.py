@@ -14,7 +14,8 @@ from edgevpr.cli.main import main
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.runtime.flight.startup import start_fields
 
-PLACES, SEEN = 8, 10  # the last pictures are of nothing in the map
+PLACES = 8  # the last pictures are of nothing in the map
+SEEN = 10
 STEP_DEG = 0.001  # of latitude: 111 m
 
 

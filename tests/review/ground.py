@@ -11,8 +11,11 @@ from edgevpr.core.geodesy import offset_position, picture_axes
 from edgevpr.core.types import Place, Pose, Position
 
 ORIGIN = 50.0, 8.0
-SIDE_M, METRE_PX = 40.0, 4  # of a picture's longest side; pixels of the large picture
-ROWS, COLUMNS, STEP_M = 3, 4, 20.0
+SIDE_M = 40.0  # of a picture's longest side; pixels of the large picture
+METRE_PX = 4
+ROWS = 3
+COLUMNS = 4
+STEP_M = 20.0
 
 LOW_REASON = {"code": "LOW_SCORE", "parameters": {"score": 0.004, "needed": 0.01}}
 UNSURE = {"code": "LOW_CONFIDENCE", "parameters": {"confidence": 0.99, "needed": 0.999, "landmarks": 30}}

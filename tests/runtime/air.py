@@ -24,7 +24,8 @@ from edgevpr.runtime.recognise.recognition import Recognition
 HOME = 47.0, 8.0
 GPS_SD_M = 1.0
 _STEP_S = 0.02
-_REPORT_STEPS, _STATE_STEPS = 10, 5  # five reports and ten states a second
+_REPORT_STEPS = 10  # five reports and ten states a second
+_STATE_STEPS = 5
 _FARTHEST_STEPS = 250  # between two frames that share ground
 _GRAVITY_M_S2 = 9.80665
 _DRIFT_M_S = 5.0  # as edgevpr takes an autopilot's own position to go wrong

@@ -35,7 +35,8 @@ _MAX_NOISE_M = 100.0
 # The share of a wind that comes up without GPS which neither accelerometers nor airspeed reveal to the filter. A plane
 # in ArduPilot's simulator was 767 m off after 150 s in 6 m/s.
 _UNNOTICED_SHARE = 0.85
-_GPS, _EXTERNAL = 3, 6  # EK3_SRCn_POSXY
+_GPS = 3  # EK3_SRCn_POSXY
+_EXTERNAL = 6
 
 
 class ArduPilot(Firmware):

@@ -9,11 +9,15 @@ from edgevpr.core.arrays import LatLon
 from edgevpr.mavlink.wire import Message, mavlink
 from simulated.motion import TrueState, displace, displacement_m
 
-NO_FIX, FIX_3D = mavlink.GPS_FIX_TYPE_NO_FIX, mavlink.GPS_FIX_TYPE_3D_FIX
+NO_FIX = mavlink.GPS_FIX_TYPE_NO_FIX
+FIX_3D = mavlink.GPS_FIX_TYPE_3D_FIX
 _BEST_FIX = mavlink.GPS_FIX_TYPE_RTK_FIXED  # as ArduPilot's simulator has it
 _NMEA = 5  # value of SIM_GPS1_TYPE
-_NONE, _BY_MAVLINK = 0, 14  # values of GPS1_TYPE and GPS2_TYPE
-_FIRST_FOR_EVER, _BLEND, _PRIMARY_IF_3D = 0, 2, 4  # values of GPS_AUTO_SWITCH; 1: the better one
+_NONE = 0  # values of GPS1_TYPE and GPS2_TYPE
+_BY_MAVLINK = 14
+_FIRST_FOR_EVER = 0  # values of GPS_AUTO_SWITCH; 1: the better one
+_BLEND = 2
+_PRIMARY_IF_3D = 4
 _SWITCH_TO_MORE_S = ((2, 5.0), (1, 20.0))  # satellites more, and the least time since the last switch
 _BLENDED_WITHIN_S = 0.4  # two intervals of the slower receiver
 _MAVLINK_AGE_S = 0.2  # AP_GPS assumes so (GPS_Backend::get_lag) where GPSn_DELAY_MS is 0

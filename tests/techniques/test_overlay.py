@@ -11,7 +11,9 @@ from edgevpr.core.contract import FineMatch
 from edgevpr.techniques import overlay
 from edgevpr.techniques.cohog import CoHog
 
-SIDE_PX, CELLS, REGIONS = 256, 32, 31
+SIDE_PX = 256
+CELLS = 32
+REGIONS = 31
 ALLOWED = np.ones((SIDE_PX, SIDE_PX), bool)
 SEEN = np.ones((REGIONS, REGIONS), bool)
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper, save
 
-HEIGHT, WIDTH = 24, 32
+HEIGHT = 24
+WIDTH = 32
 FEATURES = (4, 10, 14)
 CARD = {
     "title": "A tiny network",

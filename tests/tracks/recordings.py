@@ -4,7 +4,9 @@ import struct
 from datetime import datetime, timezone
 
 START_S = 1_700_000_000.0
-_GPS_EPOCH_S, _LEAP_S, _WEEK_S = 315_964_800, 18, 604_800
+_GPS_EPOCH_S = 315_964_800
+_LEAP_S = 18
+_WEEK_S = 604_800
 _HEAD = b"\xa3\x95"
 _FORMATS = {  # of DataFlash: number, format and columns
     "GPS": (130, "QBIHBcLLefffB", "TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,U"),

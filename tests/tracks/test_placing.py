@@ -16,7 +16,8 @@ from edgevpr.frames.positions import read_positions
 from edgevpr.tracks.clock import estimate_clock_offset_s
 from edgevpr.tracks.record import read_record
 
-SIDE_PX, GROUND_PX = 240, 2400
+SIDE_PX = 240
+GROUND_PX = 2400
 HOME = (50.0, 8.0)
 
 

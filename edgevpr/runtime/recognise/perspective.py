@@ -16,8 +16,9 @@ from edgevpr.core.contract import Perspective
 from edgevpr.core.geodesy import fit_similarity, picture_axes
 from edgevpr.frames.level import View
 
-_FEWEST = 12  # landmarks
-_POINT_SD, _SHEAR_SD = 2.5 / 640, 0.01  # of a landmark, as a share of the longest side; of a shear
+_MIN_LANDMARKS = 12  # landmarks
+_POINT_SD = 2.5 / 640  # of a landmark, as a share of the longest side
+_SHEAR_SD = 0.01
 TYPICAL_FOCAL = 0.77  # 66 degrees across
 _UNKNOWN_TILT_SD = math.tan(math.radians(30.0))  # where too little agrees to show a tilt
 _CLEAR_SD = 3.0  # of a tilt beyond the reported one
@@ -29,7 +30,8 @@ _PLACE_SLOPE_SD = 0.1
 _CLEAR_STRETCH = 0.075
 _STRETCH_SD_SHARE = 0.3  # of the tilt by it: clear enough for what a match may claim, too little to refuse 30 degrees
 # Relief moves neighbouring landmarks alike: so many of them count as one. The place's own picture is tilted too.
-_ALIKE, _PLACE_SD = 5.0, math.tan(math.radians(0.5))
+_CORRELATED_LANDMARKS = 5.0
+_PLACE_TILT_SD = math.tan(math.radians(0.5))
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +96,7 @@ def fit_attitude_error(asked: Array, known: Array, view: View, up_deg: float) ->
     the compass direction of the top of the query's levelled picture.
     """
     count = len(asked)
-    if count < _FEWEST or view.aside is None or view.focal is None:
+    if count < _MIN_LANDMARKS or view.aside is None or view.focal is None:
         return None
     # A ray at x + iy (focal lengths right and down of straight down) moves by t + (x Re t + y Im t)(x + iy) when the
     # camera turns by the small angle t = right + i down. Of the picture's own scale and turn, t is in the same units.
@@ -115,7 +117,9 @@ def fit_attitude_error(asked: Array, known: Array, view: View, up_deg: float) ->
         return None  # all landmarks on a line
     way = inverse @ looks.T @ seen
     left = seen - looks @ way
-    variance = float(left @ left) / (2 * count - len(way)) * _ALIKE * float(inverse[6, 6] + inverse[7, 7]) / 2
+    variance = (
+        float(left @ left) / (2 * count - len(way)) * _CORRELATED_LANDMARKS * float(inverse[6, 6] + inverse[7, 7]) / 2
+    )
     right, down = way[6:]
     east, north = picture_axes(up_deg) @ (-right, down)
-    return AttitudeError((float(east), float(north)), math.hypot(math.sqrt(variance), _PLACE_SD))
+    return AttitudeError((float(east), float(north)), math.hypot(math.sqrt(variance), _PLACE_TILT_SD))

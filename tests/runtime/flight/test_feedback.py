@@ -12,7 +12,8 @@ from edgevpr.runtime.flight import drift, navigator
 
 pytestmark = pytest.mark.slow
 
-GOOD, AS_SIMULATED = 0.0, math.radians(0.57)  # of gyros: a root second; PX4's simulator has the latter
+GOOD = 0.0  # of gyros: a root second; PX4's simulator has the latter
+AS_SIMULATED = math.radians(0.57)
 
 
 def fly_blind(min_accuracy_m, gyro_sd, show_tilt):

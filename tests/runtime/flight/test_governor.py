@@ -10,7 +10,8 @@ from edgevpr.power.boards import load_board
 from edgevpr.runtime.flight.governor import Change, Governor, Setting, list_settings
 from edgevpr.runtime.flight.metering import LoadReading
 
-BOARD, LIMIT_C = replace(load_board("rpi-4b"), cpu_share=0.5, memory_max_mb=512), 80
+BOARD = replace(load_board("rpi-4b"), cpu_share=0.5, memory_max_mb=512)
+LIMIT_C = 80
 ASKED = Setting(2.0, 40)
 
 

@@ -20,8 +20,15 @@ from edgevpr.runtime.flight.survey import MapSurvey
 from edgevpr.runtime.flight.watching import SurveyReporter
 from edgevpr.runtime.recognise.levelling import read_mount
 
-OFF_M, SCALE, AHEAD_DEG, RIGHT_DEG = np.array([5.0, -3.0]), 0.01, 9.0, -3.0
-HEIGHT_M, SPEED_M_S, FIX_SD_M, GPS_SD_M, GPS_LASTS_S = 100.0, 15.0, 2.0, 1.0, 60.0
+OFF_M = np.array([5.0, -3.0])
+SCALE = 0.01
+AHEAD_DEG = 9.0
+RIGHT_DEG = -3.0
+HEIGHT_M = 100.0
+SPEED_M_S = 15.0
+FIX_SD_M = 2.0
+GPS_SD_M = 1.0
+GPS_LASTS_S = 60.0
 SEEN = View(up_deg=0.0, footprint_m=130.0, aside=(0.0, 0.0))
 
 

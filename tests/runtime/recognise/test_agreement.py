@@ -15,7 +15,8 @@ from edgevpr.runtime.recognise.agreement import (
 from edgevpr.runtime.recognise.landmarks import QUERY_LANDMARKS, Landmarks, detect_landmarks, pack_bytes, unpack_bytes
 from edgevpr.techniques import create
 
-WIDE, HIGH = 640, 480
+WIDE = 640
+HIGH = 480
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,8 @@ import pytest
 from edgevpr.runtime.recognise.belief import Belief, MapScale, Proposals
 from edgevpr.runtime.recognise.place_filter import make_motion
 
-PLACES, SPACING_M = 100, 20.0
+PLACES = 100
+SPACING_M = 20.0
 IN_ORDER = MapScale(spacing=1.0, near=2.0, is_ordinal=True)
 IN_METRES = MapScale(spacing=SPACING_M, near=30.0)
 STEP = make_motion(1.0, 3.0)  # within three places of the query before

@@ -21,7 +21,8 @@ from edgevpr.techniques import create
 
 pytestmark = pytest.mark.slow
 
-PLACES, STRIDE = 40, 3
+PLACES = 40
+STRIDE = 3
 TWICE = 20, 36  # both places show the same picture
 TECHNIQUE = create("cohog", {"w1": 208})
 

@@ -14,7 +14,8 @@ from edgevpr.frames.level import View
 from edgevpr.runtime.recognise.locate import locate, locate_at_place
 
 ORIGIN = Position(50.0, 8.0, 120.0)
-CELLS, FOOTPRINT_M = 32, 64.0
+CELLS = 32
+FOOTPRINT_M = 64.0
 
 
 def candidate(number=1, shift=(0.0, 0.0), east_m=0.0, north_m=0.0, up_deg=0.0, turned_deg=0.0, score=0.3, **pose):

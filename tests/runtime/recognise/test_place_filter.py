@@ -19,7 +19,9 @@ from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 
-PLACES, SPACING_M, FOOTPRINT_M = 150, 20.0, 80.0
+PLACES = 150
+SPACING_M = 20.0
+FOOTPRINT_M = 80.0
 STRIDE = 3  # places from look to look, at one a second: each look is of new ground
 SPEC = TechniqueSpec(name="test", parameters={}, coarse=PartSpec((1,), "<f4"))
 NOTHING = np.zeros((4, 4), np.uint8)
@@ -41,7 +43,8 @@ def index_of(positions):
     return index
 
 
-IN_ORDER, IN_METRES = index_of([None] * PLACES), index_of([at(place) for place in range(PLACES)])
+IN_ORDER = index_of([None] * PLACES)
+IN_METRES = index_of([at(place) for place in range(PLACES)])
 
 
 class Flight:

@@ -22,8 +22,10 @@ from edgevpr.runtime.service.doctor import check_autopilot, explain_silence
 from edgevpr.runtime.service.findingcodes import FindingCode
 from edgevpr.runtime.service.rules import RULES
 
-UDP, SERIAL = parse_link("udpin:127.0.0.1:14550"), parse_link("serial:/dev/ttyAMA0:57600")
-FIXES, DRY = True, False
+UDP = parse_link("udpin:127.0.0.1:14550")
+SERIAL = parse_link("serial:/dev/ttyAMA0:57600")
+FIXES = True
+DRY = False
 PLAIN = {"GPS1_TYPE": 1, "GPS2_TYPE": 0, "GPS_AUTO_SWITCH": 1, "VISO_TYPE": 0, "FLOW_TYPE": 0, "EK3_SRC1_POSXY": 3}
 READY = 0x33F
 COPTER = AutopilotReading(
@@ -65,7 +67,8 @@ def wrong(reading: AutopilotReading, link=UDP, plan=FIXES) -> dict:
     return {each.what: each.changes for each in check_autopilot(reading, link, plan) if not each.ok}
 
 
-BARE, VISUAL = replace(COPTER, parameters=PLAIN), replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1})
+BARE = replace(COPTER, parameters=PLAIN)
+VISUAL = replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1})
 HOVERING = replace(COPTER, vehicle="plane", parameters=PLAIN | {"Q_ENABLE": 1})
 MUTE = replace(COPTER, answers=False, version=None, parameters={}, heard=(), filter_flags=None, origin=None)
 SIGNED = replace(MUTE, signs=True, is_signed_to=True)
