@@ -34,7 +34,7 @@ def loaded(name: str):
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        if error.name == "torch":
+        if error.name in ("torch", "cosmic_ray"):
             pytest.skip(f"{error.name} is not installed")
         raise
 
