@@ -18,6 +18,8 @@ from threading import Event, Thread
 from typing import Any, TextIO, TypeVar
 
 T = TypeVar("T")
+# Called with items, their number (0: unknown) and a label; yields the items unchanged and shows the progress.
+Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]
 # user:password@ of an address. A password may hold `@` and, wrongly, `/`: all up to the last @ of the word is replaced.
 # An address that was handled as a path has only one `/` after the colon.
 _PASSWORD = re.compile(r"(\w:/{1,2}[^\s/:@]*):\S*@")
@@ -157,6 +159,11 @@ def progress(
             stream.flush()
     if terminal and last_step is not None:
         stream.write("\n")
+
+
+def iterate_silently(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
+    """Return `items`: the `Progress` that shows nothing."""
+    return items
 
 
 @contextmanager

@@ -23,11 +23,11 @@ from edgevpr.core.arrays import Bools, Doubles
 from edgevpr.core.config import MatchConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
+from edgevpr.core.text import Progress
 from edgevpr.core.types import Frame
 from edgevpr.frames.level import LevelledImage
 from edgevpr.mapmaking.changes import change_picture
 from edgevpr.mapmaking.look_alikes import MapSearch, measure_look_alikes
-from edgevpr.mapmaking.mapping import Progress
 from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.ranking import outside_neighbourhood
@@ -126,7 +126,7 @@ def calibrate(
     config: MatchConfig,
     meter: QueryMeter,
     pictures: Pictures,
-    progress: Progress[Frame],
+    progress: Progress,
 ) -> MapCalibration:
     """Calibrate a map that is open for adding, and store the result in the map. `pictures` opens the pictures of given
     names; `progress` wraps the iteration over these frames, to show progress. `encoder` is that with which the map was
@@ -176,7 +176,7 @@ def count_queries(technique: Technique) -> int:
 
 
 def _read_mapped(
-    encoder: FrameEncoder, place_map: PlaceMap, pictures: Pictures, progress: Progress[Frame], count: int
+    encoder: FrameEncoder, place_map: PlaceMap, pictures: Pictures, progress: Progress, count: int
 ) -> Iterator[tuple[int, EncodedFrame]]:
     """Yield (a place's number, its picture as it was encoded for the map) for `count` pictures in random order, again
     from the first one if there are fewer. A picture that has the name of a place's picture, but another content, is
@@ -185,7 +185,7 @@ def _read_mapped(
     names = sorted(ids_by_image)
     names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
     frames = (frame for done in range(0, count, len(names)) for frame in pictures(names[: count - done]))
-    for frame in progress(frames, count):
+    for frame in progress(frames, count, "calibrating"):
         encoded = encoder.encode(frame)
         of_name = ids_by_image.get(escape_name(frame.name), ())
         if (

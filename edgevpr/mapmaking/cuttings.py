@@ -4,7 +4,7 @@ picture that a camera looking straight down would take there, with north at the 
 import logging
 import math
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ from edgevpr.core.arrays import Doubles, Image, Ints
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.geodesy import Extent
-from edgevpr.core.text import decode_name
+from edgevpr.core.text import Progress, decode_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
@@ -111,9 +111,7 @@ class OrthophotoSource(RecordingSource):
         pose = Pose(up_deg=0.0, footprint_m=lattice.footprint_m, covariance_m2=self._covariance_m2, is_surveyed=True)
         return Frame(image=image, name=name, t_mono_s=time.monotonic(), position=position, heading_deg=0.0, pose=pose)
 
-    def prepare(
-        self, spacing_m: float, technique: Technique, progress: Callable[..., Iterable[tuple[Lattice, int]]]
-    ) -> None:
+    def prepare(self, spacing_m: float, technique: Technique, progress: Progress) -> None:
         """Log how much will be cut, and fetch the tiles for it: so an address that refuses them leaves no half map.
         `progress` shows progress."""
         lattice = min(self._lattices, key=lambda each: each.footprint_m)

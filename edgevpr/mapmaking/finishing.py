@@ -2,15 +2,16 @@
 commands `edgevpr map refine` and `map calibrate` do one of these to an existing map."""
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from edgevpr.core.config import MatchConfig, SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, UsageError
+from edgevpr.core.text import Progress
 from edgevpr.core.types import Frame
 from edgevpr.frames.mask import load_mask
 from edgevpr.frames.source import read_to_end
@@ -28,9 +29,6 @@ if TYPE_CHECKING:
     from edgevpr.mapmaking.refine import Refinement
 
 _log = logging.getLogger(__name__)
-
-# Called with items, their number and a label; yields the items unchanged and shows the progress.
-Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +78,7 @@ def refine_map(
         )
     with _require_scipy():
         from edgevpr.mapmaking.refine import refine
-    refined = refine(place_map, technique, lambda pairs, total: progress(pairs, total, "refining"), images)
+    refined = refine(place_map, technique, progress, images)
     if refined.is_mirrored:
         _log.warning(
             "lat and lon may be swapped, or the sign of one lost (south and west are negative): the pictures fit the "
@@ -121,7 +119,7 @@ def calibrate_map(
         match,
         QueryMeter(load_board("this")),
         frames,
-        lambda asked, total: progress(asked, total, "calibrating"),
+        progress,
     )
 
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 from edgevpr.core.config import Config, SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
-from edgevpr.core.text import show_elapsed
+from edgevpr.core.text import Progress, show_elapsed
 from edgevpr.core.types import Frame
 from edgevpr.frames.level import STRAIGHT_DOWN
 from edgevpr.frames.mask import OverlayMask, load_mask
 from edgevpr.frames.source import Source, read_to_end
 from edgevpr.mapmaking import advice
-from edgevpr.mapmaking.finishing import Progress, finish_map, make_encoder
+from edgevpr.mapmaking.finishing import finish_map, make_encoder
 from edgevpr.mapmaking.headings import find_headings
 from edgevpr.mapmaking.mapping import CoveredGround, MappingResult, PlaceSelector, build_map, measure_ground
 from edgevpr.mapmaking.pictures import Cuttings, FlownPictures

@@ -7,7 +7,6 @@ place, all thresholds are lowered in steps of 0.03 until some waiting frames pas
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -23,8 +22,6 @@ from edgevpr.runtime.recognise.levelling import centre_place
 from edgevpr.runtime.recognise.salience_gate import GAP_FRAMES, select_best
 
 _NO_PIXELS = np.empty((0, 0), np.uint8)
-T = TypeVar("T")
-Progress = Callable[[Iterable[T], int], Iterable[T]]  # gets items and their number, yields them and shows the progress
 SelectedFrame = tuple[EncodedFrame, Salience | None]  # a frame that becomes a place, and its salience (None: no gate)
 
 

@@ -26,11 +26,10 @@ from edgevpr.core.arrays import Array, Bools, Complexes, Floats
 from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError, PlaceError
 from edgevpr.core.geodesy import offset_position, project_to_metres
-from edgevpr.core.text import decode_name
+from edgevpr.core.text import Progress, decode_name
 from edgevpr.core.types import Place, Pose, Position
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.mapmaking.graph import GraphSolution, Ties, solve_graph
-from edgevpr.mapmaking.mapping import Progress
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.agreement import MIN_CONFIRMED_INLIERS, MIN_PROVEN_INLIERS, Overlay, measure_agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks, unpack_bytes
@@ -103,7 +102,7 @@ class Refinement:
 def refine(
     place_map: PlaceMap,
     technique: Technique,
-    progress: Progress[tuple[int, int]],
+    progress: Progress,
     images: str | Path | None = None,
 ) -> Refinement:
     """Refine a map that is open for adding, in one transaction. `progress` wraps the iteration over the pairs of
@@ -125,11 +124,11 @@ def refine(
     recorded = east_m + 1j * north_m
     compare_pair = _make_comparer(place_map, technique, placed, images)
     pairs = _find_likely_pairs(recorded)
-    ties = {pair: tie for pair in progress(pairs, len(pairs)) if (tie := compare_pair(*pair))}
+    ties = {pair: tie for pair in progress(pairs, len(pairs), "refining") if (tie := compare_pair(*pair))}
     solved = solve_graph(recorded, _to_ties(ties))
     more = sorted(set(_find_overlapping_pairs(solved.position, solved.log, _is_determined(solved))) - set(pairs))
     if more:
-        ties |= {pair: tie for pair in progress(more, len(more)) if (tie := compare_pair(*pair))}
+        ties |= {pair: tie for pair in progress(more, len(more), "refining") if (tie := compare_pair(*pair))}
         solved = solve_graph(recorded, _to_ties(ties))
     is_mirrored = _is_mirrored(recorded_at, recorded, _to_ties(ties), solved)
     sure = _is_determined(solved) & (not is_mirrored)
@@ -239,7 +238,7 @@ def _find_likely_pairs(recorded: Complexes) -> list[Pair]:
 
 def _find_overlapping_pairs(position: Complexes, log: Complexes, of: Bools) -> list[Pair]:
     """Return the pairs of places that overlap according to a solved graph. `position` and `log` are those of
-    `graph.Solved`; only places where `of`, bool (N,), is True are considered."""
+    `graph.GraphSolution`; only places where `of`, bool (N,), is True are considered."""
     members, footprint_m = np.flatnonzero(of), np.exp(log.real[of])
     near = _pair_nearest(position[members], _MAX_OVERLAPPING)
     return sorted(

@@ -8,9 +8,10 @@ from pathlib import Path
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import offset_m
+from edgevpr.core.text import Progress
 from edgevpr.mapmaking.missions import Area, shapely
 from edgevpr.places import mapfiles
-from edgevpr.places.examine import Progress, copy_places, merge_maps, read_place_positions, shrink_map
+from edgevpr.places.examine import copy_places, merge_maps, read_place_positions, shrink_map
 from edgevpr.places.mapfile import PlaceMap
 
 

@@ -2,7 +2,7 @@
 
 import os
 import sqlite3
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles, Ints
 from edgevpr.core.errors import MapError, PlaceError
+from edgevpr.core.text import Progress, iterate_silently
 from edgevpr.core.types import Place, Position
 from edgevpr.places import mapfiles, rows
 from edgevpr.places.index import choose_places
@@ -38,14 +39,6 @@ def read_place_positions(place_map: PlaceMap) -> tuple[Ints, Doubles, Doubles]:
     """Return the ids, int (N,), and the positions, float64 (N,) each, of the readable places; NaN: unknown."""
     place_ids, lat_deg, lon_deg, _ = np.array(list(place_map.read_outlines())).reshape(-1, 4).T
     return place_ids.astype(int), lat_deg, lon_deg
-
-
-# Takes places, their number and a label; yields the places unchanged and shows the progress.
-Progress = Callable[[Iterable[PlaceCheck], int, str], Iterable[PlaceCheck]]
-
-
-def iterate_silently(places: Iterable[PlaceCheck], total: int, label: str) -> Iterable[PlaceCheck]:
-    return places
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from walks import map_of, query_meter
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import UsageError
+from edgevpr.core.text import iterate_silently
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, Lens, LevelledImage
 from edgevpr.mapmaking import calibrate as calibrating
@@ -63,7 +64,7 @@ def place_map(tmp_path):
 
 def calibrated(place_map, pictures, technique=AHEAD, **more):
     encoder = FrameEncoder(technique=technique, **more)
-    return calibrate(encoder, place_map, CONFIG, query_meter(), pictures, lambda frames, total: frames)
+    return calibrate(encoder, place_map, CONFIG, query_meter(), pictures, iterate_silently)
 
 
 def test_a_map_is_asked_for_each_picture_in_three_ways(place_map):

@@ -14,6 +14,7 @@ import pytest
 
 from edgevpr.cli.main import main
 from edgevpr.core.geodesy import distance_m, offset_position
+from edgevpr.core.text import iterate_silently
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.images import read_image
 from edgevpr.lab.simulate.camera import Camera, light_scene, photograph
@@ -162,7 +163,7 @@ def some_of(built, path, numbers, position=lambda number, place: place.position)
 def refined_of(path, images=None):
     with PlaceMap.open_for_adding(path) as place_map:
         technique = create_technique(place_map)
-        return refine(place_map, technique, lambda pairs, total: pairs, images), list(place_map.read_places())
+        return refine(place_map, technique, iterate_silently, images), list(place_map.read_places())
 
 
 @pytest.mark.parametrize(
@@ -240,6 +241,6 @@ def test_a_place_that_cannot_be_read_is_left_alone(map_path):
         db.execute("UPDATE places SET up_deg = 5, pose_crc32 = 1 WHERE place_id = 5")
     db.close()
     with PlaceMap.open_for_adding(map_path) as place_map:
-        found = refine(place_map, create_technique(place_map), lambda pairs, total: pairs)
+        found = refine(place_map, create_technique(place_map), iterate_silently)
     assert found.places == 27
     assert found.refined >= 25

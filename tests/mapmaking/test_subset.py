@@ -9,10 +9,11 @@ from walks import map_of
 from edgevpr.cli.main import main
 from edgevpr.core.errors import MapError, UsageError
 from edgevpr.core.geodesy import offset_position
+from edgevpr.core.text import iterate_silently
 from edgevpr.core.types import Frame, Position
 from edgevpr.mapmaking.missions import Area, Waypoint
 from edgevpr.mapmaking.subset import make_subset
-from edgevpr.places.examine import iterate_silently, merge_maps
+from edgevpr.places.examine import merge_maps
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.techniques import create
 

@@ -7,7 +7,7 @@ Zaffar, *Visual Place Recognition for Autonomous Robots*).
 
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,7 @@ import numpy as np
 from edgevpr.core.config import BatteryConfig, MatchConfig, SourceConfig, bounded_key
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
+from edgevpr.core.text import Progress, iterate_silently
 from edgevpr.core.types import NO_COST, Frame, StageCost
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.positions import GeoTag
@@ -47,8 +48,6 @@ from edgevpr.runtime.recognise.salience_gate import SalienceGate
 from edgevpr.techniques import format_name
 from edgevpr.techniques.card import describe_weights
 
-# Yields the items, of that number, and shows it with a label.
-Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]
 _NO_TAG = GeoTag()
 
 
@@ -91,11 +90,6 @@ class QueryAnswer:
     discarded: bool
     encoding: StageCost
     matching: StageCost
-
-
-def iterate_silently(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
-    """Return `items`: the `Progress` that shows nothing."""
-    return items
 
 
 def answer_queries(

@@ -15,11 +15,12 @@ from edgevpr.core.config import SalienceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, ImageError, ModelError
 from edgevpr.core.files import write_atomically
+from edgevpr.core.text import Progress
 from edgevpr.frames.images import list_images
 from edgevpr.frames.positions import find_positions
 from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset
-from edgevpr.lab.evaluate.evaluate import MatchOptions, Progress, answer_queries, summarise
+from edgevpr.lab.evaluate.evaluate import MatchOptions, answer_queries, summarise
 from edgevpr.lab.evaluate.provenance import describe_origin, hash_parts, read_versions, stamp_file
 from edgevpr.runtime.recognise.opening import open_salience_gate
 from edgevpr.techniques import create

@@ -9,8 +9,9 @@ from generated_sets import make_set
 from pictures import textured
 
 from edgevpr.core.errors import UsageError
+from edgevpr.core.text import iterate_silently
 from edgevpr.lab.evaluate.dataset import load_dataset
-from edgevpr.lab.evaluate.evaluate import MatchOptions, answer_queries, iterate_silently, summarise
+from edgevpr.lab.evaluate.evaluate import MatchOptions, answer_queries, summarise
 from edgevpr.lab.evaluate.metrics import add_pcu, read_result
 from edgevpr.lab.evaluate.tables import format_results
 from edgevpr.mapmaking import finishing
