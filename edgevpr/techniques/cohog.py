@@ -158,7 +158,7 @@ class CoHog:
         return blocks, seen, find_good_blocks(round_levels(grey), self.entropy, cell_px, self.gt, among=seen)
 
     def _make_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools]:
-        """Return the first two results of `_make_blocks_and_goodness`."""
+        """Return the first two results of `_make_good_blocks`."""
         blocks = normalise_blocks(orient_cells(grey, cell_px, self.bins, signed=True, allowed=allowed))
         if allowed is None:
             return blocks, np.ones(blocks.shape[:2], bool)

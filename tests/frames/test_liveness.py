@@ -42,7 +42,9 @@ def test_source_is_lost_after_three_seconds_or_what_its_rate_allows(interval_s, 
     assert measure_fault_s(watched, must_reopen, 7 * interval_s) == lost_s
 
 
-LOST, DAMAGED, LATE = is_(Condition.LOST), is_(Condition.DAMAGED), is_(Condition.LATE)
+LOST = is_(Condition.LOST)
+DAMAGED = is_(Condition.DAMAGED)
+LATE = is_(Condition.LATE)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ _FILE_MODE = 0o660  # positions are private, but the flight's group may read the
 
 
 class StatusFile:
-    """Writes the status of a flight (see `Vitals._status`) to a file, which is removed when it is closed."""
+    """Writes the status of a flight (see `Vitals._make_status`) to a file, which is removed when it is closed."""
 
     def __init__(self, path: str | Path) -> None:
         """Check that the file `path` can be written; `write` writes it. Raises EdgevprError if it cannot be created."""
