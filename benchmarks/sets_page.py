@@ -148,14 +148,14 @@ Of the queries whose place is in the map:
 
 {format_markdown_table(("set", *tables.list_headings(_REACHED)), reached)}
 
-Rows are of all queries; where some have no place in the map, those called *in map* are of the others alone. Measured
-before these were counted, so that they were not asked: {", ".join(old) or "none"}.
+Rows are of all queries; where some have no place in the map, those called *in map* are of the others alone. Sets that
+were measured before such queries were counted: {", ".join(old) or "none"}.
 
 {chr(10).join(f"* {each}" for each in tables.ABOUT_FIGURES)}
 * P@100%R: precision with the threshold at the lowest-scoring right match. R@100%P: recall with the threshold above the
   highest-scoring wrong one. EP: equation 2.4 of the thesis, as in VPR-Bench.
 * ROC: the chance that a right match scores higher than a wrong one; 0.5 means that the score by itself tells nothing.
-* PCU: P@100%R x log10(t_e,max / t_e + 9), where t_e,max is the slowest encoder on the same set.
+* PCU: P@100%R x log10(t_e,max / t_e + 9), t_e,max of the slowest encoder on the same set; by machine, too (see costs).
 * accepted: queries that would have moved the aircraft by the technique's own rule; in brackets, how many of them would
   have moved it to a wrong place. off the map: how many of the queries without a place in the map were accepted.
 
