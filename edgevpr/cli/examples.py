@@ -60,7 +60,6 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
         ("a mission over this year's ground", "later --orthophoto now.tif --track mission.plan --height-m 120"),
     ),
     "demo": (("the whole job in a minute", "--out demo_out"),),
-    "models list": (("the networks, and whether they work", ""),),
 }
 
 

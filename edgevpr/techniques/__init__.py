@@ -34,7 +34,7 @@ _TYPE_NAMES = {int: "a whole number", float: "a number", str: "a word"}
 
 def list_techniques() -> tuple[str, ...]:
     """Return the names of all techniques: those of edgevpr, then the networks whose cards give a descriptor. Cards that
-    cannot be read are left out."""
+    cannot be read are left out; one with the name of a technique of edgevpr only supplies its weights."""
     from edgevpr.techniques.card import list_cards, load_card
 
     def is_technique(card: str) -> bool:
@@ -43,12 +43,7 @@ def list_techniques() -> tuple[str, ...]:
         except EdgevprError:
             return False
 
-    return (*_FACTORIES, *(name for name in list_cards() if not is_builtin(name) and is_technique(name)))
-
-
-def is_builtin(name: str) -> bool:
-    """Tell whether `name` is one of edgevpr's own techniques. A card of that name then only supplies its weights."""
-    return name in _FACTORIES
+    return (*_FACTORIES, *(name for name in list_cards() if name not in _FACTORIES and is_technique(name)))
 
 
 def is_known(name: str) -> bool:
@@ -68,14 +63,6 @@ def format_name(name: str, form: str | None) -> str:
     """Return the technique and its `form` (see the glossary) as one name, such as "hog 8bit". The default form `float`,
     and None (the technique has no forms), are left out."""
     return name if form in (None, "float") else f"{name} {form}"
-
-
-def find_network_output(name: str) -> str | None:
-    """Return the output, "features" or "descriptor", that a technique uses of the network of its parameter `model`;
-    None if it has no such parameter."""
-    if "model" not in read_parameters(name):
-        return None
-    return "descriptor" if name == "calc" else "features"
 
 
 def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
@@ -100,7 +87,7 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
 def _find_factory(name: str) -> Callable[..., Any]:
     """Return the class or function that makes the technique `name`; its arguments are the technique's parameters.
     Raises as `read_parameters` does."""
-    if is_builtin(name):
+    if name in _FACTORIES:
         factory: Callable[..., Any] = resolve_name(f"edgevpr.techniques.{_FACTORIES[name]}")
         return factory
     if not is_known(name):

@@ -1,5 +1,5 @@
 """The card of a network: a YAML file that names the weights, the preparation of a picture, and the outputs. Techniques,
-training and the commands for models use it. Every error in a card is reported when the card is read, not in flight."""
+training and the salience gate use it. Every error in a card is reported when the card is read, not in flight."""
 
 import hashlib
 import json
@@ -121,7 +121,7 @@ def load_card(name: str) -> Card:
         except ConfigError as error:  # one network cannot be used; the user's request is not wrong
             raise ModelError(str(error)) from error
     names = ", ".join(list_cards()) or "there are none yet"
-    hint = suggest(name, list_cards(), f"use one of `edgevpr models list` ({names}).")
+    hint = suggest(name, list_cards(), f"those of your models folder and the shipped ones are: {names}.")
     raise ModelError(f"There is no model `{name}`: {hint}")
 
 

@@ -73,5 +73,5 @@ def test_match_says_how_to_get_the_network_of_a_map(models, flight, capsys):
     (models / "tiny.yaml").unlink()
     assert main(["match", str(path), "--images", str(flight / "query")]) == 1
     said = capsys.readouterr().err
-    assert "models list" in said
+    assert "EDGEVPR_MODELS" in said
     assert "`tiny`" in said

@@ -136,8 +136,8 @@ def create_technique(
     if not techniques.is_known(built_with.name):
         raise MapError(
             f"{place_map.path} was built with `{built_with.name}`, which this edgevpr does not have: update edgevpr, "
-            "copy its network and card to your models folder (`edgevpr models list` says where), or build the map with "
-            f"one of {', '.join(techniques.list_techniques())}."
+            "copy its network and card to your models folder ($EDGEVPR_MODELS, else ~/.local/share/edgevpr/models), or "
+            f"build the map with one of {', '.join(techniques.list_techniques())}."
         )
     if name in (None, built_with.name):
         try:
