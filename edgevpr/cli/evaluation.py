@@ -20,7 +20,6 @@ from edgevpr.cli.shared import (
     parse_value,
     print_notes,
     print_result,
-    to_path,
 )
 from edgevpr.core.config import FORMS
 from edgevpr.core.errors import UsageError
@@ -40,7 +39,6 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--within-m", type=parse_positive, default=25.0, metavar="M", help="metres that count as near (default: 25)"
     )
-    parser.add_argument("--out", metavar="FOLDER", help="folder for results.json and results.csv; resumes if run again")
     parser.add_argument("--similarity", nargs="+", metavar="FILE", help="evaluate stored similarity matrices (.npy)")
     parser.add_argument("--form", default="float", metavar="A,B", help=f"of vectors: {', '.join(FORMS)} (float)")
     parser.add_argument("--exact", action="store_true", help="compare all places in full; too slow for a flight")
@@ -54,12 +52,11 @@ def add(commands: Any) -> None:
 
 
 def run_eval(args: Namespace) -> int:
-    """Run `eval`: measure stored similarities, or rows on data sets, and print the results. With --out they are written
-    there, and rows that an earlier run measured are reused."""
+    """Run `eval`: measure stored similarities, or rows on data sets, and print the results."""
     if args.similarity:
         return _measure_similarities(args)
     from edgevpr.lab.evaluate.evaluate import MatchOptions
-    from edgevpr.lab.evaluate.runs import Plan, measure, write_results
+    from edgevpr.lab.evaluate.runs import Plan, measure
     from edgevpr.lab.evaluate.tables import format_results
 
     config, rows, sets = make_config(args, args.config), _list_rows(args), _open_sets(args)
@@ -71,18 +68,14 @@ def run_eval(args: Namespace) -> int:
         known=args.known,
     )
     plan = Plan(sets=sets, rows=rows, options=options, salience=config.salience)
-    outcome = measure(plan, to_path(args.out), progress)
+    outcome = measure(plan, progress)
     content = outcome.as_json()
     if not content["results"]:
         raise next(iter(outcome.failed.values()))
-    if args.out:
-        write_results(Path(args.out), outcome)
-    elif len(sets) == 1:
+    if len(sets) == 1:
         content["techniques"] = {row["row"]: row for row in content.pop("results")}
     tables = [
-        f"{sanitize(name)}\n\n{format_results([row.result for row in measured])}\n"
-        for name, measured in outcome.measured.items()
-        if measured
+        f"{sanitize(name)}\n\n{format_results(results)}\n" for name, results in outcome.measured.items() if results
     ]
     print_result(content, args.json, "\n".join(tables))
     print_notes(*(f"{name}, {row} was not measured: {error}" for (name, row), error in outcome.failed.items()))

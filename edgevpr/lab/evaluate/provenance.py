@@ -1,7 +1,5 @@
-"""Provenance of a measurement, stored with every result: date, machine and versions. And keys of finished work."""
+"""Provenance of a measurement, stored with every result: date, machine and versions."""
 
-import hashlib
-import json
 import os
 import platform
 from datetime import datetime, timezone
@@ -50,14 +48,3 @@ def read_cpu_model() -> str:
 def describe_origin() -> dict[str, Any]:
     """Return the date, the machine and the versions, which are stored with a result."""
     return {"date": format_date(), "machine": describe_machine(), "versions": read_versions()}
-
-
-def hash_parts(*parts: Any) -> str:
-    """Return the SHA-256 in hex of `parts`, any values that JSON or `str` can write."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
-
-
-def stamp_file(path: Path) -> tuple[str, int, int]:
-    """Return (name, size in bytes, time of writing in ns) of a file. If one of them differs, the file has changed."""
-    status = path.stat()
-    return path.name, status.st_size, status.st_mtime_ns

@@ -24,9 +24,3 @@ def make_set(folder, places=6):
         rows.append(f"q{place}.png,{right},{loose},{status}")
     (folder / "ground_truth.csv").write_text("\n".join(rows) + "\n")
     return folder
-
-
-def without_costs(content):
-    """Results as JSON, without what differs from run to run."""
-    times = ("t_", "u_", "ah_", "pcu", "made")
-    return [{key: value for key, value in row.items() if not key.startswith(times)} for row in content["results"]]
