@@ -37,6 +37,8 @@ def format_build(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
         yield f"  {result.already_here} images were in the map already"
     if result.tilted:
         yield f"  left out: {result.tilted} tilted by more than 63 degrees (without --fov-deg or --lens: 20)"
+    if result.without_heading:
+        yield f"  left out: {result.without_heading} tilted by more than 20 degrees, heading unknown (add yaw_deg)"
     if result.not_memorable:
         yield f"  left out: {result.not_memorable} that are not memorable"
     if result.without_data or result.says_nothing:

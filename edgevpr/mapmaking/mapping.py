@@ -12,6 +12,7 @@ import numpy as np
 
 from edgevpr.core.errors import ImageError, ModelError
 from edgevpr.core.geodesy import distance_m, offset_position, project_to_metres
+from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position, Salience
 from edgevpr.places.layers import read_layers
 from edgevpr.places.mapfile import PlaceMap
@@ -119,9 +120,9 @@ def measure_ground(place_map: PlaceMap) -> CoveredGround | None:
 class MappingResult:
     """Counts of frames. `added`: new places; of these, `without_position` have no position, and `of_low_quality` only
     closed a gap. `already_here`: frames in the map before. `says_nothing`: frames with too little information.
-    `tilted`: frames that are tilted too far to be levelled. `not_memorable`: frames left out because they failed a
-    salience criterion. `without_data`: places left out because the orthophoto has no data there. `white`: places cut
-    from it that are white over a third or more."""
+    `tilted`: frames that are tilted too far to be levelled, `without_heading`: those that a heading is missing for.
+    `not_memorable`: frames left out because they failed a salience criterion. `without_data`: places left out because
+    the orthophoto has no data there. `white`: places cut from it that are white over a third or more."""
 
     added: int = 0
     without_position: int = 0
@@ -129,6 +130,7 @@ class MappingResult:
     of_low_quality: int = 0
     says_nothing: int = 0
     tilted: int = 0
+    without_heading: int = 0
     not_memorable: int = 0
     without_data: int = 0
     white: int = 0
@@ -173,7 +175,10 @@ def build_map(
             unusable(ImageError(f"{frame.name}: {explain_failure(error)}"))
             continue
         if encoded.view.reason:
-            result.tilted += 1
+            if encoded.view.reason.code is ReasonCode.TILTED_WITHOUT_HEADING:
+                result.without_heading += 1
+            else:
+                result.tilted += 1
             continue
         of_name = ids_by_image.get((escape_name(frame.name),), ())
         if check_texture(encoded.descriptor, min_quality):

@@ -116,6 +116,20 @@ def test_pictures_are_levelled_as_those_of_the_map(tmp_path, monkeypatch):
     assert (found.asked, len(found.recognisable)) == (PLACES, PLACES)
 
 
+@pytest.mark.parametrize(
+    ("pitch_deg", "heading_deg", "left_out"), [(45.0, None, (0, 1)), (70.0, 40.0, (1, 0)), (45.0, 40.0, (0, 0))]
+)
+def test_build_map_counts_tilted_images_by_what_is_missing(tmp_path, pitch_deg, heading_deg, left_out):
+    down = create("cohog", {"camera": "nadir", "w1": 208})
+    path = map_of(tmp_path / "down.gpkg", down, [])
+    pose = {"roll_deg": 0.0, "pitch_deg": pitch_deg, "heading_deg": heading_deg, "height_m": 90.0}
+    encoder = FrameEncoder(technique=down, levelling=Levelling(Lens(60.0), below=True, is_live=False))
+    with PlaceMap.open_for_adding(path) as place_map:
+        result = build_map([frame(0, **pose)], encoder, place_map)
+    assert (result.tilted, result.without_heading) == left_out
+    assert result.added == 1 - sum(left_out)
+
+
 def test_a_map_that_looks_alike_everywhere_says_so(tmp_path):
     """Water: the same few faint waves on every picture."""
     waves = cv2.GaussianBlur(np.random.default_rng(1).normal(size=(240, 320)), (0, 0), 2)

@@ -86,7 +86,7 @@ class Levelling:
         picture = level_image(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self.below, scale=scale)
         if picture.view.reason and not self._has_warned:
             self._has_warned = True
-            _log.warning("%s is taken as it is, as others like it will be: %s", frame.name, picture.view.reason)
+            _log.warning("%s: %s; no more of these are reported", frame.name, picture.view.reason)
         return picture
 
 
