@@ -31,7 +31,6 @@ pytestmark = pytest.mark.slow
 NOISE_M = 5.0
 GLITCH_M = 250.0
 FOOTPRINT_M = 80.0 * 640 / 493  # of the generated camera
-EVERY = 1  # pictures of the two first legs
 LEGS = 2
 _DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).parents[3] / "shared" / "data")
 
@@ -50,7 +49,7 @@ def flown(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flown")
     (folder / "images").mkdir()
     shot_of, rng = photographer(7)
-    poses = plan_mapping_flight(7).poses[: 14 * LEGS : EVERY]
+    poses = plan_mapping_flight(7).poses[: 14 * LEGS]
     with open(folder / "positions.csv", "w", newline="") as handle:
         table = csv.writer(handle)
         table.writerow(("file", "lat", "lon"))

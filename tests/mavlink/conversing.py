@@ -59,7 +59,7 @@ class Autopilot:
         self.clock, self.firmware = FakeClock(), firmware
         self.conversation = Conversation(LinkSettings(**settings), self.clock)
         self._packers, self.packets = {}, []
-        self.booted_s, self.timesync_s, self.timesyncs = booted_s, timesync_s, 0
+        self.booted_s, self.timesync_s = booted_s, timesync_s
         self.beat()
         self._listen()
 
@@ -81,7 +81,6 @@ class Autopilot:
         for packet, fix in iter(self.conversation.next_packet, None):
             (message,) = PacketReader().feed(packet)
             if message.get_type() == "TIMESYNC" and message.tc1 == 0:
-                self.timesyncs += 1
                 if self.timesync_s is not None:
                     self.wait(self.timesync_s)
                     self.say(

@@ -5,7 +5,6 @@ import contextlib
 import dataclasses
 import os
 import shutil
-import sqlite3
 import subprocess
 import sys
 
@@ -177,23 +176,6 @@ def test_two_programs_never_add_to_one_map_at_once(map_path):
             assert len(reader) == len(place_map) == PLACES
     with PlaceMap.open_for_adding(map_path) as again:
         again.add(frame(41), descriptor(41))
-
-
-@pytest.mark.parametrize("part", ["geom", "coarse", "fine"])
-def test_one_bit_flipped_in_the_file_is_damage(map_path, part):
-    with sqlite3.connect(map_path) as db:
-        (blob,) = db.execute(f"SELECT {part} FROM places WHERE place_id = 7").fetchone()
-    db.close()
-    data = bytearray(map_path.read_bytes())
-    # Of a BLOB that stands on several pages, a stretch that is on one of them.
-    stretches = (blob[start : start + 24] for start in range(0, len(blob), 24))
-    at = next(data.find(stretch) for stretch in stretches if stretch in data)
-    data[at + 15] ^= 1
-    map_path.write_bytes(data)
-    with PlaceMap.open(map_path) as place_map:
-        (broken,) = [each for each in check_places(place_map) if each.problem]
-    assert broken.place_id == 7
-    assert "checksum" in broken.problem
 
 
 def test_open_for_adding_serves_the_triggers_of_a_spatial_index(map_path):

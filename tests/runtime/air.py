@@ -96,7 +96,7 @@ class Air:
         self.known = GPS_SD_M, 0.0  # how well it knew its position, and when
         self.way, self.waiting, self.vehicle = [self.at_m], deque(), None
         self.is_silent = self.knows_nothing = False
-        self.sees, self.takes_fixes, self.matches, self.events = True, True, True, []
+        self.takes_fixes, self.matches, self.events = True, True, []
         self.stride_sd_m, self.stretch, self.turn, self.strode = stride_sd_m, 1.0, 0.0, None
         self.shows_turn = False
         self.advices: list[tuple[float, Advice]] = []
@@ -141,7 +141,7 @@ class Air:
                     self._report(velocity)
             if self.step % _STATE_STEPS == 0:
                 self.states.append((self.t_s, self.navigator.estimate_state(self.t_s)))
-            if self.step % self.every_steps == 0 and self.sees:
+            if self.step % self.every_steps == 0:
                 self.waiting.append((self.step, self.vehicle))
             if self.stride_steps and not self.has_gps and self.step % self.stride_steps == 0 and not self.waiting:
                 self._see(self.step, self.vehicle, is_query=False)
@@ -178,10 +178,10 @@ class Air:
     def tell(self, event: Recognition) -> Advice:
         return self.navigator.advise(event, self.t_s)
 
-    def match(self, step, vehicle, off_m=(0.0, 0.0), view=None) -> Advice:
-        seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2) + off_m
+    def match(self, step, vehicle) -> Advice:
+        seen_m = self.way[step] + self.map_off + self.rng.normal(0, self.noise_sd_m, 2)
         where = Position(*offset_position(*HOME, *seen_m))
-        event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, self.places(step), view)
+        event = match_at(where, step * _STEP_S, vehicle, self.said_sd_m, self.places(step))
         frame = replace(event.frame, t_sd_s=self.t_sd_s)
         event = replace(event, frame=frame, odometry=self._stride(step))
         if self.shows_turn:
@@ -205,9 +205,6 @@ class Air:
     def places(self, step: int) -> tuple[int, ...]:
         """The places that a match of that step is of."""
         return (round(step * _STEP_S),)
-
-    def match_now(self, **changes) -> Advice:
-        return self.match(self.step, self.vehicle, **changes)
 
     def _feel(self, acceleration_m_s2: np.ndarray) -> None:
         east, north = acceleration_m_s2 + self.bias + self.rng.normal(0, 0.2, 2)

@@ -126,9 +126,11 @@ def test_a_sync_that_fails_between_lines_is_trouble_and_no_exception(path, monke
     assert kinds(path) == ["first", "second", "gap", "third"]
 
 
-def test_reading_leaves_out_a_cut_last_line_and_what_is_no_record(path):
-    path.write_bytes(b'{"kind": "a"}\n\n[1]\n\0\0\0\0\n\xff\xfe\n{"kind": "b"}\n{"kind": "c", "x": 1')
-    assert list(read_log(path)) == [{"kind": "a"}, {"kind": "b"}]
+def test_reading_leaves_out_a_last_line_cut_at_any_byte_and_what_is_no_record(path):
+    whole, last = b'{"kind": "a"}\n\n[1]\n\0\0\0\0\n\xff\xfe\n{"kind": "b"}\n', b'{"kind": "c", "x": 1}'
+    for cut in range(len(last)):
+        path.write_bytes(whole + last[:cut])
+        assert list(read_log(path)) == [{"kind": "a"}, {"kind": "b"}]
 
 
 def test_a_disk_that_has_room_again_is_written_again_without_half_a_line(path, caplog):

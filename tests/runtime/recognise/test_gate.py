@@ -1,7 +1,5 @@
 """A picture that says nothing is refused before anything is searched for, and nothing made of nothing is accepted."""
 
-import math
-
 import cv2
 import numpy as np
 import pictures_of_nothing
@@ -10,11 +8,9 @@ from pictures import textured
 from walks import map_of
 
 from edgevpr.core.config import load_config
-from edgevpr.core.contract import Descriptor
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import NO_COST, Frame
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.recognise.judge import check_texture
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.techniques import create
 
@@ -37,14 +33,6 @@ def walk(request, tmp_path_factory):
     recogniser = open_recogniser(config, board)
     with recogniser.place_map:
         yield recogniser
-
-
-@pytest.mark.parametrize(
-    ("quality", "refused"), [(0.0, True), (0.399, True), (math.nan, True), (0.4, False), (1, False)]
-)
-def test_a_picture_says_enough_from_two_fifths_on(quality, refused):
-    reason = check_texture(Descriptor(coarse=np.zeros(1), quality=quality), create("cohog").min_quality)
-    assert (reason is not None) == refused
 
 
 def test_what_says_nothing_is_not_searched_for(walk):

@@ -1,8 +1,6 @@
 """`edgevpr check` on a real map, folder, socket and pty; and on each thing that can be wrong."""
 
-import os
 import shutil
-import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -145,22 +143,6 @@ def test_check_reports_places_beyond_the_budget(settings, config_file):
     config_file.write_text(yaml.safe_dump(settings | {"map": str(big), "memory": {"budget_mb": 1}}))
     (finding,) = (each for each in check_configuration(config_file, offline=True) if each.what == "map")
     assert "are not loaded" in finding.reason.parameters["technique"]
-
-
-def test_check_finds_a_port_that_another_program_has(settings, config_file):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.bind(("127.0.0.1", 0))
-        settings["mavlink"]["link"] = f"udpin:127.0.0.1:{other.getsockname()[1]}"
-        (finding,) = wrong(config_file, settings)
-    assert finding.what == "link"
-
-
-def test_check_opens_a_serial_port(settings, config_file):
-    controller, port = os.openpty()
-    settings["mavlink"]["link"] = f"serial:{os.ttyname(port)}:921600"
-    assert wrong(config_file, settings) == []
-    os.close(controller)
-    os.close(port)
 
 
 def wrong_online(config_file: Path, settings: dict) -> list[Finding]:
