@@ -105,8 +105,7 @@ def _add_pictures(parser: ArgumentParser) -> None:
     flags.add_argument(
         "--orthophoto",
         metavar="FILE",
-        help="GeoTIFF, VRT, MBTiles, a folder of tiles (z/x/y.png), or the address of tiles "
-        "(https://.../{z}/{x}/{y}.png) that you may use",
+        help="GeoTIFF, VRT, MBTiles, or a folder of tiles (z/x/y.png)",
     )
     flags.add_argument(
         "--footprint-m",

@@ -55,7 +55,7 @@ def run_simulate_flight(args: Namespace) -> int:
     if args.track is None or args.which is not None:
         raise UsageError("A flight over an orthophoto needs its --track, and has no --which.")
     from edgevpr.core.text import progress
-    from edgevpr.lab.simulate.overflight import compute_ground, read_shots, write_overflight
+    from edgevpr.lab.simulate.overflight import read_shots, write_overflight
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or says that it is missing
 
     numbers: dict[str, Any] = {}
@@ -64,8 +64,7 @@ def run_simulate_flight(args: Namespace) -> int:
         if value is not None and not low <= value <= high:  # false for NaN
             raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {low:g} to {high:g}.")
     shots = read_shots(args.track, numbers["height_m"], numbers["every_m"])
-    orthophoto = Orthophoto(args.orthophoto, compute_ground(shots, numbers["fov_deg"]))
-    taken = write_overflight(Path(args.out), orthophoto, shots, numbers["fov_deg"], args.seed)
+    taken = write_overflight(Path(args.out), Orthophoto(args.orthophoto), shots, numbers["fov_deg"], args.seed)
     written = sum(1 for _ in progress(taken, len(shots), "flying"))
     print(f"{args.out}: {written} images in images/, where they were taken in positions.csv")
     if beyond := len(shots) - written:

@@ -4,7 +4,7 @@ picture that a camera looking straight down would take there, with north at the 
 import logging
 import math
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,14 +15,13 @@ from edgevpr.core.arrays import Doubles, Image, Ints
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.geodesy import Extent
-from edgevpr.core.text import Progress, decode_name
+from edgevpr.core.text import decode_name
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.frames.shot import Refusal
 from edgevpr.frames.source import RecordingSource
 from edgevpr.mapmaking.georaster import WGS84, make_local_crs, transform
 from edgevpr.mapmaking.missions import Area, read_area, shapely
 from edgevpr.mapmaking.orthophoto import Orthophoto
-from edgevpr.mapmaking.tiles import surround
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.pictures import Cuttings
@@ -78,7 +77,7 @@ class OrthophotoSource(RecordingSource):
         self.short_name = decode_name(orthophoto.short_name)
         self.counts = {"without_data": 0, "white": 0}
         self._read = 0
-        self._left = self._list_places()
+        self._left = ((lattice, at) for lattice in lattices for at in range(len(lattice)))
         variance_m2 = _GEOREFERENCE_SD_M**2 + (orthophoto.resolution_m / 2) ** 2
         self._covariance_m2 = variance_m2, 0.0, variance_m2
 
@@ -111,9 +110,8 @@ class OrthophotoSource(RecordingSource):
         pose = Pose(up_deg=0.0, footprint_m=lattice.footprint_m, covariance_m2=self._covariance_m2, is_surveyed=True)
         return Frame(image=image, name=name, t_mono_s=time.monotonic(), position=position, heading_deg=0.0, pose=pose)
 
-    def prepare(self, spacing_m: float, technique: Technique, progress: Progress) -> None:
-        """Log how much will be cut, and fetch the tiles for it: so an address that refuses them leaves no half map.
-        `progress` shows progress."""
+    def announce_size(self, spacing_m: float, technique: Technique) -> None:
+        """Log how much will be cut."""
         lattice = min(self._lattices, key=lambda each: each.footprint_m)
         spec = technique.spec
         place_bytes = spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + _METADATA_BYTES
@@ -131,15 +129,6 @@ class OrthophotoSource(RecordingSource):
             across_px,
             few,
         )
-        if self._orthophoto.is_remote:
-            for lattice, at in progress(
-                self._list_places(), self.total, f"fetching tiles from {self._orthophoto.name}"
-            ):
-                self._orthophoto.cut(lattice.locate_place(at), lattice.footprint_m, SIDE_PX)
-
-    def _list_places(self) -> Iterator[tuple[Lattice, int]]:
-        """Yield each place as its lattice and its number there."""
-        return ((lattice, at) for lattice in self._lattices for at in range(len(lattice)))
 
     def close(self) -> None:
         """Close the orthophoto."""
@@ -157,7 +146,7 @@ def open_cuttings(cuttings: "Cuttings", only: Collection[str] | None) -> Orthoph
     """Open an orthophoto and choose the places, see `Cuttings.open`."""
     footprints_m = [float(footprint_m) for footprint_m in np.unique(cuttings.footprint_m)]
     area = read_area(cuttings.area) if cuttings.area else None
-    orthophoto = Orthophoto(cuttings.orthophoto, surround(area.points, footprints_m[-1]) if area else None)
+    orthophoto = Orthophoto(cuttings.orthophoto)
     lattices = [make_lattice(orthophoto, footprint_m, cuttings.spacing_m, area) for footprint_m in footprints_m]
     if (across_px := footprints_m[0] / orthophoto.resolution_m) < _MIN_WIDTH_PX:
         raise UsageError(

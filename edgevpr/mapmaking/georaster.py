@@ -45,21 +45,21 @@ Pixel = tuple[int, int]  # column and row
 class GeoRaster:
     """An open georeferenced picture. `crs` is its coordinate system. `transform` converts column and row (whole numbers
     at the corners of pixels) to coordinates of `crs`. `width` and `height` are in pixels. `name` names it in messages,
-    and `short_name` the pictures cut from it. `is_remote`: it is fetched from an address, which no message may hold."""
+    and `short_name` the pictures cut from it."""
 
-    def __init__(self, source: str | Path, name: str, short_name: str, is_remote: bool = False) -> None:
+    def __init__(self, source: str | Path, name: str, short_name: str) -> None:
         """Open what GDAL opens by the text `source`. Raises SourceError for what is no picture or has no
         georeference."""
-        self.name, self.short_name, self.is_remote = name, short_name, is_remote
+        self.name, self.short_name = name, short_name
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)
                 self._data = rasterio.open(source)
         except (RasterioError, OSError) as error:
             raise SourceError(
-                f"{name} cannot be opened as an orthophoto: give a GeoTIFF, VRT or MBTiles file, a folder of tiles "
-                "(z/x/y.png), or an address."
-            ) from (None if is_remote else error)
+                f"{name} cannot be opened as an orthophoto: give a GeoTIFF, VRT or MBTiles file, or a folder of tiles "
+                "(z/x/y.png)."
+            ) from error
         self.crs, self.transform = self._data.crs, self._data.transform
         self.width, self.height = self._data.width, self._data.height
         self._bands = self._find_colour_bands()
@@ -101,11 +101,6 @@ class GeoRaster:
             )
             valid = self._data.dataset_mask(window=window, out_shape=shape) > 127
         except RasterioError as error:
-            if self.is_remote:
-                raise SourceError(
-                    f"{self.name} does not give all tiles of this ground: check the network and your right to fetch "
-                    "them, and run this again. Tiles fetched so far are kept."
-                ) from None
             raise ImageError(
                 f"{self.name}: the part from column {low[0]} and row {low[1]} on cannot be read ({error}): copy the "
                 "file again."

@@ -90,7 +90,7 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
     else:
         mask, lens = None, None
         source, technique = cuttings, _ = _open_cuttings(order, pictures, flown.camera, place_map)
-        cuttings.prepare(pictures.spacing_m, technique, progress)
+        cuttings.announce_size(pictures.spacing_m, technique)
         counts = cuttings.counts
     if place_map is None:
         place_map = PlaceMap.create(path, technique.spec)
@@ -168,9 +168,7 @@ def _open_cuttings(
     order: MapOrder, pictures: Cuttings, camera: str | None, place_map: PlaceMap | None
 ) -> tuple["OrthophotoSource", Technique]:
     """Open the orthophoto, and make the technique (`place_map` None: there is no map yet). Raises UsageError for
-    another camera, and for tiles whose owner is not named."""
-    if "://" in str(pictures.orthophoto) and not pictures.attribution:
-        raise UsageError("Tiles of an address have an owner: give --attribution TEXT, as its terms ask for.")
+    another camera."""
     if camera not in (None, "nadir"):
         raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
     name = _name_technique(order, place_map)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from edgevpr.core.arrays import Bools, Doubles, Image
-from edgevpr.core.errors import SourceError, UsageError
+from edgevpr.core.errors import SourceError
 from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.types import Position
 from edgevpr.frames.images import resize
@@ -25,7 +25,7 @@ from edgevpr.mapmaking.georaster import (
     rasterio,
     transform,
 )
-from edgevpr.mapmaking.tiles import Ground, describe_address, describe_folder, is_address, parse_host
+from edgevpr.mapmaking.tiles import describe_folder
 
 _EDGE_POINTS = 25  # per edge: a straight edge of the file is a curve in another coordinate system
 _MAX_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
@@ -33,30 +33,19 @@ _MAX_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
 Coordinate = TypeVar("Coordinate", float, Doubles)
 
 
-def _open_raster(source: str | Path, ground: Ground | None, links: str) -> GeoRaster:
-    """Open a file, a folder of tiles, or an address, see `Orthophoto`; `links` is an empty folder."""
-    if is_address(source):
-        host = parse_host(str(source))
-        if ground is None:
-            raise UsageError(f"{host} has tiles of the whole Earth: give --area.")
-        return GeoRaster(describe_address(str(source), ground), host, host, is_remote=True)
-    path = Path(source)
-    if not path.exists():
-        raise SourceError(f"There is no orthophoto {source}: check the name.")
-    return GeoRaster(describe_folder(path, Path(links)) if path.is_dir() else path, str(path), path.name)
-
-
 class Orthophoto:
     """An open orthophoto. `name` names it in messages, and `short_name` the pictures cut from it. `extent_deg` is its
     bounding box (south, west, north, east), `middle` its middle, and `resolution_m` the length in metres of a pixel on
-    the ground in the middle. `is_remote`: it is fetched from an address."""
+    the ground in the middle."""
 
-    def __init__(self, source: str | Path, ground: Ground | None = None) -> None:
-        """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads, a folder of map tiles, or an address of tiles, of
-        which `ground` is wanted. Raises SourceError, and UsageError for an address without ground or placeholders."""
-        self._links = TemporaryDirectory(prefix="edgevpr-tiles-")
-        self._raster = _open_raster(source, ground, self._links.name)
-        self.name, self.short_name, self.is_remote = self._raster.name, self._raster.short_name, self._raster.is_remote
+    def __init__(self, source: str | Path) -> None:
+        """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads, or a folder of map tiles. Raises SourceError."""
+        path, self._links = Path(source), TemporaryDirectory(prefix="edgevpr-tiles-")
+        if not path.exists():
+            raise SourceError(f"There is no orthophoto {source}: check the name.")
+        raster = describe_folder(path, Path(self._links.name)) if path.is_dir() else path
+        self._raster = GeoRaster(raster, str(path), path.name)
+        self.name, self.short_name = self._raster.name, self._raster.short_name
         is_mercator = self._raster.crs == CRS.from_epsg(3857)
         self._wrap = 360 if self._raster.crs.is_geographic else 2 * HALF_WORLD_M if is_mercator else 0
         try:

@@ -166,11 +166,9 @@ def _open_orthophoto(source: str | Path, places: Sequence[Place]) -> Finder:
     """Return a finder of the pictures of places that were cut from an orthophoto: they are cut again. Raises
     EdgevprError if it cannot be opened."""
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
-    from edgevpr.mapmaking.tiles import surround
 
     cut = {place.source_image: (place.position, place.pose) for place in places if place.position and place.pose}
-    points = [(position.lat_deg, position.lon_deg) for position, _ in cut.values()]
-    orthophoto = Orthophoto(source, surround(points, max(pose.footprint_m for _, pose in cut.values())))
+    orthophoto = Orthophoto(source)
 
     def find(name: str) -> AlbumPicture | None:
         position, pose = cut.get(name, (None, None))

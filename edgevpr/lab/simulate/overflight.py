@@ -1,8 +1,7 @@
 """A flight over an orthophoto: pictures, and where they were taken. The track is read from a positions.csv, or follows
 the waypoints of a mission. `edgevpr simulate flight` writes it."""
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from edgevpr.lab.simulate.generated import make_oscillation, write_shots
 from edgevpr.mapmaking.cuttings import MAX_WITHOUT_DATA, format_extent
 from edgevpr.mapmaking.missions import read_area
 from edgevpr.mapmaking.orthophoto import Orthophoto
-from edgevpr.mapmaking.tiles import Ground, surround
 
 SPEED_M_S = 10.0
 _SWAY_DEG = 2.0  # largest roll, pitch and yaw error on a track without attitude
@@ -68,13 +66,6 @@ def _plan_mission_shots(path: str | Path, every_m: float) -> list[GeoTag]:
     over_m = np.interp(at_m, way_m[is_known], heights_m[is_known]).tolist() if is_known.any() else [None] * len(at_m)
     places = zip(np.interp(at_m, way_m, lat_deg).tolist(), np.interp(at_m, way_m, lon_deg).tolist(), strict=True)
     return [GeoTag(position=Position(*place), height_m=height) for place, height in zip(places, over_m, strict=True)]
-
-
-def compute_ground(shots: Sequence[GeoTag], fov_deg: float) -> Ground:
-    """Return the ground that the pictures show, for tiles of it."""
-    points = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
-    highest_m = max(shot.height_m or 0.0 for shot in shots)
-    return surround(points, 2 * highest_m * math.tan(math.radians(fov_deg / 2)))
 
 
 def make_poses(shots: list[GeoTag], seed: int) -> list[CameraPose]:
