@@ -86,8 +86,9 @@ def add(commands: Any) -> None:
 
 def _add_build(build: ArgumentParser) -> None:
     _add_pictures(build)
-    build.add_argument("--technique", metavar="NAME", help="technique (default: cohog)")
+    build.add_argument("--technique", metavar="NAME", help="technique (default: chosen for the board)")
     add_parameters(build, "set a parameter of the technique")
+    build.add_argument("--board", default="this", metavar="NAME", help="board to plan for (default: this computer)")
     build.add_argument("--config", metavar="FILE", help="configuration of the flight (camera, mask, salience)")
     add_keys(build, "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg", "salience.use")
     build.add_argument("--rate-hz", type=parse_positive, metavar="HZ", help="places per second of a video")
@@ -163,6 +164,7 @@ def run_map_build(args: Namespace) -> int:
         pictures=_parse_pictures(args),
         technique=args.technique,
         parameters=parse_parameters(args.param),
+        board=args.board,
         append=args.append,
         refine=args.refine,
         calibrate=args.calibrate,
@@ -225,7 +227,7 @@ def run_map_info(args: Namespace) -> int:
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import describe_map
     from edgevpr.runtime.recognise.calibration import explain_not_calibrated, read_calibration_for
-    from edgevpr.techniques import DEFAULT_TECHNIQUE
+    from edgevpr.techniques import CONFIDENCE_TECHNIQUE
 
     if args.page:
         check_output(args.page, args.map)
@@ -235,7 +237,7 @@ def run_map_info(args: Namespace) -> int:
     if calibration:
         confidence: str | None = f"calibrated {calibration.made}: {calibration.described()}"
     else:
-        confidence = explain_not_calibrated(info.places) if info.spec.name == DEFAULT_TECHNIQUE else None
+        confidence = explain_not_calibrated(info.places) if info.spec.name == CONFIDENCE_TECHNIQUE else None
     ram_mb = info.places * place_bytes / 1e6
     known = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": place_bytes}
     lines = list(format_info(info, confidence, ram_mb))

@@ -31,6 +31,7 @@ def add(commands: Any) -> None:
 def run_profile(args: Namespace) -> int:
     """Run `profile`: estimate what techniques cost in a flight, or list the boards that have a profile."""
     from edgevpr.power.boards import list_boards, load_board, resolve_board
+    from edgevpr.runtime.preflight.choose import list_preferred
     from edgevpr.runtime.preflight.estimate import estimate_flight
     from edgevpr.runtime.preflight.presentation import format_table
     from edgevpr.runtime.preflight.scale import compare_speed
@@ -42,6 +43,7 @@ def run_profile(args: Namespace) -> int:
         return 0
     config = make_config(args)
     board = resolve_board(load_board(args.board), config.source, config.memory)
+    list_preferred(board)  # raises if the profile names a technique that is not there
     plan, trials = _make_plan(args, config, board)
     results = progress(run_trials(trials, board.threads), len(trials), "trying techniques")
     estimate = estimate_flight(board, compare_speed(board), results, plan)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from edgevpr.core.config import Config, SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
-from edgevpr.core.text import Progress
+from edgevpr.core.text import Progress, show_elapsed
 from edgevpr.core.types import Frame
 from edgevpr.frames.level import STRAIGHT_DOWN
 from edgevpr.frames.mask import OverlayMask, load_mask
@@ -23,7 +23,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import parse_map_path, remove_map
 from edgevpr.places.mapinfo import describe_map
 from edgevpr.power.boards import load_board
-from edgevpr.runtime.preflight.pick import make_camera_setting
+from edgevpr.runtime.preflight.pick import make_camera_setting, pick_technique
 from edgevpr.runtime.recognise.calibration import MapCalibration
 from edgevpr.runtime.recognise.evidence import list_evidence_kinds
 from edgevpr.runtime.recognise.levelling import read_camera_lens, read_mount
@@ -33,20 +33,20 @@ from edgevpr.runtime.recognise.opening import (
     open_salience_gate,
     warn_of_mismatch,
 )
-from edgevpr.techniques import DEFAULT_TECHNIQUE
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.cuttings import OrthophotoSource
     from edgevpr.mapmaking.refine import Refinement
 
 _log = logging.getLogger(__name__)
+_ORTHOPHOTO_TECHNIQUE = "cohog"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapOrder:
     """The map to be made at `path` from `pictures`.
 
-    `technique`: its name (None: that of the map if it exists, else `cohog`). `parameters`: of the technique, by name.
+    `technique`: its name (None: chosen for `board`, the board that will fly). `parameters`: of the technique, by name.
     `append`: add places to the map if it exists. `refine`, `calibrate`: also refine the map, and calibrate it, after
     the places are made."""
 
@@ -54,6 +54,7 @@ class MapOrder:
     pictures: FlownPictures | Cuttings
     technique: str | None = None
     parameters: dict[str, str]
+    board: str = "this"
     append: bool = False
     refine: bool = True
     calibrate: bool = True
@@ -149,14 +150,19 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
 def _open_flown(
     order: MapOrder, pictures: FlownPictures, flown: SourceConfig, place_map: PlaceMap | None, mask: OverlayMask | None
 ) -> tuple[Source, Technique]:
-    """Open the pictures, and make the technique (`place_map` None: there is no map yet). Raises UsageError if the
-    camera looks down, and nobody has said so, and for one that is tilted by angles that are not recorded."""
+    """Open the pictures, and make the technique: the one asked for, else that of the map (`place_map` None: there is no
+    map yet), else the best for the board. Raises UsageError if the camera looks down, and nobody has said so, and for
+    one that is tilted by angles that are not recorded."""
     source, settings, camera = pictures.open(), order.parameters, flown.camera
-    name = _name_technique(order, place_map)
+    name = order.technique or (place_map.spec.name if place_map is not None else None)
     asks_camera = camera is None and place_map is None and "camera" not in settings
-    if asks_camera and make_camera_setting(name, "nadir"):
+    if asks_camera and (not name or make_camera_setting(name, "nadir")):
         advice.require_forward_camera(pictures, mask)
-    if camera:  # a technique that knows no camera refuses one that was asked for
+    if name is None:
+        with show_elapsed("choosing a technique"):
+            name = pick_technique(order.board, source.total or 1, camera)
+        settings = settings | make_camera_setting(name, camera)
+    elif camera:  # a technique that knows no camera refuses one that was asked for
         settings = settings | {"camera": camera}
     technique = _make_technique(order, place_map, name, settings)
     if technique.spec.looks_down and not flown.gimbal and read_mount(flown) == STRAIGHT_DOWN:
@@ -167,18 +173,13 @@ def _open_flown(
 def _open_cuttings(
     order: MapOrder, pictures: Cuttings, camera: str | None, place_map: PlaceMap | None
 ) -> tuple["OrthophotoSource", Technique]:
-    """Open the orthophoto, and make the technique (`place_map` None: there is no map yet). Raises UsageError for
-    another camera."""
+    """Open the orthophoto, and make the technique: the one asked for, else that of the map (`place_map` None: there is
+    no map yet), else `cohog`. Raises UsageError for another camera."""
     if camera not in (None, "nadir"):
         raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
-    name = _name_technique(order, place_map)
+    name = order.technique or (place_map.spec.name if place_map is not None else _ORTHOPHOTO_TECHNIQUE)
     settings = order.parameters | make_camera_setting(name, "nadir")
     return pictures.open(), _make_technique(order, place_map, name, settings)
-
-
-def _name_technique(order: MapOrder, place_map: PlaceMap | None) -> str:
-    """Return the name of the technique that is asked for, else of that of the map, else of the default."""
-    return order.technique or (DEFAULT_TECHNIQUE if place_map is None else place_map.spec.name)
 
 
 def _make_technique(order: MapOrder, place_map: PlaceMap | None, name: str, settings: dict[str, str]) -> Technique:

@@ -50,6 +50,7 @@ class Board:
     `rate_hz`: queries per second, unless the user sets another rate.
     `cpu_share` (of all cores), `budget_mb` (index of the map), `memory_max_mb` (whole process): what edgevpr may use.
     `thermal_limit_c`: degrees Celsius at which the board begins to slow down (None: read from its kernel).
+    `technique`: used if the user names none, provided that it fits (None: the best that fits).
     `threads`: number of threads that a network may use.
     `recognised_by`: a machine is this board if its model, by device tree or firmware, contains this text (None: no
     machine is).
@@ -70,6 +71,7 @@ class Board:
     memory_max_mb: float = bounded_key(1, 4_000_000)
     thermal_limit_c: float | None = bounded_key(30, 125)
     benchmark_score: MachineSpeed
+    technique: str | None = None
     threads: int = bounded_key(1, 64, default=1)
 
     def is_this_machine(self, root: Path = Path("/")) -> bool:

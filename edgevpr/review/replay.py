@@ -70,7 +70,6 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
     if place_map and not Path(place_map).exists():
         raise UsageError(f"{place_map}, the map of the flight, is not there: give it with --map.")
     playback = Playback(notes)
-    header["board"].pop("technique", None)  # of earlier builds, whose boards named one
     recorded = build(Board, header["board"], "the board of the flight")
     board = resolve_board(recorded, config.source, config.memory)
     why_ended = None

@@ -28,7 +28,10 @@ _FACTORIES = {
     "region_vlad": "network:region_vlad",
     "cross_region_bow": "regions:cross_region_bow",
 }
-DEFAULT_TECHNIQUE = "cohog"  # the most accurate one, and the one whose matches have a confidence
+# The default is the first of these that fits the board. Networks are never the default: they need onnxruntime in RAM,
+# and weights that a person has chosen. Nor is `seqslam`: a sequence needs a flight along the mapped route.
+DEFAULT_TECHNIQUES = ("cohog", "hog")
+CONFIDENCE_TECHNIQUE = "cohog"  # the one whose matches have a confidence
 _TYPE_NAMES = {int: "a whole number", float: "a number", str: "a word"}
 
 

@@ -37,6 +37,7 @@ def test_load_board_gives_a_whole_profile_with_its_sources(name):
     assert board.source
     assert board.benchmark_score.source
     assert board.benchmark_score.arm64_mips or not board.benchmark_score.verified
+    assert board.technique == "cohog"
     assert 1 <= board.threads <= max(1, round(board.cores * board.cpu_share)), "as many as cores are spared"
 
 

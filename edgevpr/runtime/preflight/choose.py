@@ -4,7 +4,7 @@ The accuracy of each technique, for a camera that looks down or forward, is that
 sets. Its figures (accuracy.json) are installed with the program, so that no cost is ever shown without accuracy.
 
 An option is a technique in one form. Of those that fit the board, the most accurate is chosen. A technique that
-accepted a wrong place on the image sets is never recommended: its fixes would be sent.
+accepted a wrong place on the image sets is never chosen automatically: its fixes would be sent.
 """
 
 import json
@@ -16,6 +16,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from edgevpr import techniques
+from edgevpr.core.errors import ConfigError
 from edgevpr.core.types import MAX_FIX_AGE_S
 from edgevpr.power.boards import Board
 from edgevpr.runtime.preflight.probe import TechniqueCosts
@@ -98,7 +100,7 @@ class Option:
 
     @property
     def objection(self) -> str | None:
-        """Reason not to recommend the option, as words that follow its label; None if there is none."""
+        """Reason not to choose the option automatically, as words that follow its label; None if there is none."""
         if self.fit.misfit:
             return self.fit.misfit
         if self.accuracy is None:
@@ -138,11 +140,16 @@ def list_fewer_candidates(label: str, camera: str | None) -> tuple[int, ...]:
     return tuple(sorted((int(match[1]) for match in matches if match), reverse=True))
 
 
-def choose_best(options: Sequence[Option]) -> Option | None:
-    """Choose the most accurate option without an objection, the cheaper one (in CPU time) of two alike. Returns None if
-    no option is suitable."""
-    sound = (option for option in options if option.objection is None)
-    return max(sound, key=_rate_option, default=None)
+def choose_best(options: Sequence[Option], board: Board) -> Option | None:
+    """Choose the most accurate option without an objection, the cheaper one (in CPU time) of two alike. Options of the
+    board's own technique (`board.technique`) go before all others, even if none was measured, since the profile names
+    it. Returns None if no option is suitable."""
+    sound = [option for option in options if option.objection is None]
+    preferred = [option for option in sound if option.name == board.technique]
+    unmeasured = (option for option in options if not (option.accuracy or option.fit.misfit))
+    if not preferred and (named := next((option for option in unmeasured if option.name == board.technique), None)):
+        return named
+    return max(preferred or sound, key=lambda option: (_get_recall(option), -option.fit.cpu_s), default=None)
 
 
 def explain_no_choice(options: Sequence[Option], board: Board) -> str:
@@ -183,6 +190,23 @@ def check_fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
     )
 
 
+def list_preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
+    """Return the techniques to try if the user names none, best first: the board's own, then those offered to any
+    board.
+
+    For a `camera` that looks down ("nadir"), only techniques with a parameter `camera` are listed. Raises ConfigError
+    if the board's profile names a technique that does not exist.
+    """
+    preferred = board.technique
+    if preferred is not None and not techniques.is_known(preferred):
+        raise ConfigError(
+            f"The profile of {board.title} names the unknown technique `{preferred}`: use one of "
+            f"{', '.join(techniques.list_techniques())}."
+        )
+    names = dict.fromkeys((preferred, *techniques.DEFAULT_TECHNIQUES) if preferred else techniques.DEFAULT_TECHNIQUES)
+    return tuple(name for name in names if camera != "nadir" or "camera" in techniques.read_parameters(name))
+
+
 def describe_option(board: Board, option: Option, demand: Demand) -> str:
     """Return the accuracy of an option, the figures of its fit and, if it does not fit, why not and what would help."""
     fit = option.fit
@@ -194,8 +218,8 @@ def describe_option(board: Board, option: Option, demand: Demand) -> str:
     return f"{figures}; it {fit.misfit}" if fit.misfit else figures
 
 
-def _rate_option(option: Option) -> tuple[float, float]:
-    return option.accuracy.recall_at_1 if option.accuracy else 0.0, -option.fit.cpu_s
+def _get_recall(option: Option) -> float:
+    return option.accuracy.recall_at_1 if option.accuracy else 0.0
 
 
 def _format_label(label: str, candidates: int | None) -> str:

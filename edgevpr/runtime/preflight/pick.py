@@ -1,21 +1,58 @@
-"""What the technique that flies costs the board."""
+"""Automatic choice of a technique if none is named, and what the one that flies costs the board."""
 
+import logging
 from dataclasses import replace
 
 from edgevpr import techniques
 from edgevpr.core.contract import Technique, TechniqueSpec
-from edgevpr.power.boards import Board
+from edgevpr.core.errors import ModelError
+from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.preflight.choose import (
     Demand,
+    Option,
+    choose_best,
     describe_option,
+    explain_no_choice,
     find_accuracy,
     list_fewer_candidates,
+    list_preferred,
     make_option,
 )
 from edgevpr.runtime.preflight.probe import TechniqueCosts, compute_ram_bytes, measure_costs
 from edgevpr.runtime.preflight.scale import compare_speed, count_work, scale_to_board
+from edgevpr.runtime.recognise.opening import make_technique
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import describe_weights
+
+_log = logging.getLogger(__name__)
+
+
+def pick_technique(board_name: str, places: int, camera: str | None = None) -> str:
+    """Choose a technique for a new map of `places` places by its accuracy and its cost on the board, and log the reason
+    (see `choose`). `camera`: "nadir" or "forward" (None: forward).
+
+    If the board can afford none, the first usable one of `list_preferred` is taken, and the log says what is lacking: a
+    map is built once, and may be flown on a larger board. Raises ModelError if no technique can be used at all.
+    """
+    board = load_board(board_name)
+    demand = Demand(places=places, rate_hz=board.rate_hz, budget_mb=board.budget_mb, camera=camera)
+    options: list[Option] = []
+    for name in list_preferred(board, camera):
+        try:
+            technique = make_technique(board.threads, name, make_camera_setting(name, camera))
+        except ModelError as error:
+            _log.warning("technique %s cannot be used: %s", name, error)
+            continue
+        options.append(make_option(board, _make_label(technique.spec), name, _measure_costs(technique, board), demand))
+    if not options:
+        raise ModelError("No technique can be used here: mend the problems listed above, or name another one.")
+    chosen = choose_best(options, board)
+    if chosen is None:
+        _log.warning("using technique %s anyway: %s", options[0].name, explain_no_choice(options, board))
+        return options[0].name
+    others = [f"{other.label} {other.objection}" for other in options if other.name != chosen.name and other.objection]
+    _log.info("technique %s: %s", chosen.label, "; ".join([describe_option(board, chosen, demand), *others]))
+    return chosen.name
 
 
 def explain_technique(recogniser: Recogniser, is_named: bool) -> str:

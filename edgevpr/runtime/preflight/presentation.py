@@ -6,7 +6,7 @@ from edgevpr.runtime.preflight.estimate import FlightEstimate, TechniqueEstimate
 # The columns of the two tables: what each technique needs and draws, and what it finds.
 _NEEDS_COLUMNS = ("technique", "fits", "map MB", "RAM MB", "t_e s", "t_m s", "U_e", "U_m", "Hz")
 _DRAWS_COLUMNS = ("mAh/query", "mAh/flight", "marginal", "of pack")
-_FINDS_COLUMNS = ("technique", "recall@1", "accepted", "wrong", "sets", "queries", "recommended")
+_FINDS_COLUMNS = ("technique", "recall@1", "accepted", "wrong", "sets", "queries", "automatic choice")
 
 
 def format_table(estimate: FlightEstimate) -> str:

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 from example_costs import REGIONS, VECTOR, found
 
+from edgevpr import techniques
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
+from edgevpr.core.errors import ModelError
 from edgevpr.core.types import StageCost
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.preflight import choose as choosing
+from edgevpr.runtime.preflight import pick
 from edgevpr.runtime.preflight.choose import (
     Demand,
     check_fit,
@@ -21,6 +24,7 @@ from edgevpr.runtime.preflight.choose import (
     explain_no_choice,
     find_accuracy,
     list_fewer_candidates,
+    list_preferred,
     make_option,
 )
 from edgevpr.runtime.preflight.probe import measure_costs
@@ -46,7 +50,7 @@ def fit(board, costs, places, rate_hz=1.0):
 
 
 def chosen(board, costs, places):
-    option = choose_best(options_of(board, costs, places))
+    option = choose_best(options_of(board, costs, places), board)
     return option and option.label
 
 
@@ -110,15 +114,18 @@ def test_choose_best_takes_the_most_accurate_that_fits(accuracies):
     assert chosen(board(), COSTS, places=100) == "regions"
     assert chosen(board(), dict(reversed(COSTS.items())), places=100) == "regions", "whatever the order"
     assert chosen(board(), COSTS, places=300) == "vector", "regions are too slow"
+    assert chosen(board(technique="vector"), COSTS, 100) == "vector", "the board's own goes before a better one"
     of_ten = {**COSTS, "regions": dataclasses.replace(REGIONS, sequence=10)}
     assert chosen(board(), of_ten, 100) == "vector", "a sequence is not chosen by itself"
     del accuracies["regions"]
     assert chosen(board(), COSTS, 100) == "vector", "what was never measured"
+    assert chosen(board(technique="regions"), COSTS, 100) == "regions", "but the board names it"
 
 
 def test_choose_best_never_takes_what_has_accepted_wrong_places(accuracies):
     accuracies["regions"] = found(0.9, wrong=1)
     assert chosen(board(), COSTS, 100) == "vector"
+    assert chosen(board(technique="regions"), COSTS, 100) == "vector"
     accuracies["vector"] = found(0.5, wrong=2)
     assert chosen(board(), COSTS, 100) is None
     why = explain_no_choice(options_of(board(), COSTS, 100), board())
@@ -158,6 +165,44 @@ def test_check_fit_refuses_any_rate_where_no_fix_could_be_sent_in_time():
     assert slow.t_query_s == pytest.approx(5.3)
     assert "takes 5.3 s" in slow.misfit
     assert not fit(board(), REGIONS, places=1225, rate_hz=0.1).misfit
+
+
+@pytest.mark.slow
+def test_picked_technique_passes_over_a_network_that_is_not_there(monkeypatch, caplog, accuracies):
+    accuracies["cohog"] = found(0.9)
+    really = pick.make_technique
+
+    def made_for(threads, name, settings=None):
+        if name == "netvlad":
+            raise ModelError("There is no model.")
+        return really(threads, name, settings)
+
+    monkeypatch.setattr(pick, "make_technique", made_for)
+    own = board(technique="netvlad", budget_mb=20.0, memory_max_mb=4000.0)
+    monkeypatch.setattr(pick, "load_board", lambda name: own)
+    assert pick.pick_technique("this", 10) == "cohog"
+    assert any("netvlad" in message for message in caplog.messages)
+
+
+def test_list_preferred_begins_with_the_boards_own_technique():
+    assert list_preferred(board(technique=None)) == techniques.DEFAULT_TECHNIQUES
+    assert list_preferred(board(technique="seqslam")) == ("seqslam", *techniques.DEFAULT_TECHNIQUES)
+    assert list_preferred(board(technique="hog"), "forward") == ("hog", "cohog")
+    assert (
+        list_preferred(board(technique="hog"), "nadir") == list_preferred(board(technique=None), "nadir") == ("cohog",)
+    )
+
+
+def test_picked_technique_is_the_best_where_nothing_fits_and_the_log_says_why(monkeypatch, caplog):
+    slow = dataclasses.replace(REGIONS, encode=StageCost(30.0, 30.0))
+    monkeypatch.setattr(pick, "measure_costs", lambda technique: slow)
+    for camera, knows in (("nadir", {"camera": "nadir"}), ("forward", {"camera": "forward"}), (None, {})):
+        assert pick.pick_technique("this", 10, camera) == "cohog"
+        assert pick.make_camera_setting("cohog", camera) == knows
+        assert pick.make_camera_setting("hog", camera) == {}
+    said = [record.message for record in caplog.records if record.message.startswith("using technique")]
+    assert len(said) == 3
+    assert "takes 30.0 s" in said[0]
 
 
 def test_find_accuracy_gives_the_figures_of_the_results():

@@ -85,7 +85,7 @@ def test_estimate_notes_how_far_figures_can_be_trusted(board, ratio, times, note
 
 def test_estimate_recommends_the_most_accurate_that_fits_and_says_why():
     forms = {"cohog": COSTS["regions"], "hog": COSTS["vector"], "hog 1bit": COSTS["vector"]}
-    estimated = estimate(forms)
+    estimated = estimate(forms, board=replace(PI, technique=None))
     assert estimated.recommended == "cohog"
     assert estimated.reason.startswith("cohog: the most accurate that fits: recall@1 0.90 on 2 image sets")
     assert estimate({"netvlad": VECTOR}).recommended is None
