@@ -6,9 +6,8 @@ swaying by 2 degrees, nose anywhere. Each is asked alone, as `edgevpr match` doe
 autopilot tells them, and without. As a flight they are asked in the order of the grid, its rows to and fro, and nothing
 is told: all that is known of place and scale is by the matches before. Maps are cut at five scales, the footprint told
 being too small or too large, and of rasters of four resolutions; and at three footprints each, .62, .88 and 1.25 times
-the one told. The patchwork is the raster with every other square of 200 m twice as bright. Foreign: pictures of other
-ground (all other sites of the set, both days, and all other sets from the air, each turned by eight angles), told
-heading and height.
+the one told. Foreign: pictures of other ground (all other sites of the set, both days, and all other sets from the air,
+each turned by eight angles), told heading and height.
 
 Wrong: accepted, and the fix is off by more than a quarter of the footprint, or the ground is foreign. The constants of
 edgevpr were chosen on pictures of this set, too; on these pictures only the shares of three footprints, and which of
@@ -45,7 +44,7 @@ SPACING_M = 40.0
 _GRID, _SEED, _TURNS = (12, 8), 7, 8
 _SITE = "Hatay_Mimar_Sinan"  # that the rasters show
 TOLD, RESOLUTIONS_M, _SHARP = (1.0, 0.65, 0.8, 1.25, 1.5), (0.5, 1.0, 2.0, 4.0), "0.5 m"
-_ONE, _THREE, _PATCH_M = (1.0,), (0.62, 0.88, 1.25), 200.0
+_ONE, _THREE = (1.0,), (0.62, 0.88, 1.25)
 _NOTHING, _KNOWN, _FLOWN = "nothing", "heading, height", "the flight so far"
 _STEP_S = 7.0  # from picture to picture, at 15 m/s
 _LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)
@@ -80,16 +79,6 @@ def coarser(source: Path, path: Path, pixel_m: float) -> Path:
         layout = {"driver": "GTiff", "count": shape[0], "height": shape[1], "width": shape[2], "dtype": "uint8"}
         with rasterio.open(path, "w", crs=raster.crs, transform=affine, photometric="RGB", **layout) as out:
             out.write(bands)
-    return path
-
-
-def patchwork(source: Path, path: Path) -> Path:
-    """Write a raster of which every other square is twice as bright, as if of another day."""
-    with rasterio.open(source) as raster:
-        column, row = (np.arange(count) * raster.res[0] // _PATCH_M for count in (raster.width, raster.height))
-        factor = 1 + np.add.outer(row, column) % 2
-        with rasterio.open(path, "w", **raster.profile) as out:
-            out.write(np.minimum(factor * raster.read(), 255).astype(np.uint8))
     return path
 
 
@@ -171,18 +160,25 @@ def matched(path: Path, frames: Iterable[Frame], known: str, fov_deg: float = FO
     accepted = ~np.isnan(errors_m)
     found: Row = {"known": known, "places": len(recogniser.index), "queries": len(errors_m), "right": right}
     found |= {"accepted": int(accepted.sum()), "wrong": int(np.sum(np.array(errors_m) > FOOTPRINT_M / 4))}
-    if accepted.any() and np.isfinite(np.array(errors_m)[accepted]).all():
-        found["error"] = {"median_m": round(float(np.nanmedian(errors_m)), 1)}
-        found["error"]["p90_m"] = round(float(np.nanquantile(errors_m, 0.9)), 1)
-    if claims_m:
-        off_m, claimed_m = np.array(claims_m).T
-        found["claim_m"] = round(float(np.median(claimed_m)), 1)
-        found["within"] = round(float(np.mean(off_m <= 2 * claimed_m)), 2)
-        found["too_sure"] = int(np.sum((off_m > 2 * claimed_m) & (claimed_m < 40)))
+    found |= judge_claims(claims_m)
     if len(errors_m) == _GRID[0] * _GRID[1]:
         by_row = accepted.reshape(_GRID[::-1]).sum(axis=1)
         found["by_row"] = {"least": int(by_row.min()), "most": int(by_row.max())}
     return found
+
+
+def judge_claims(claims_m: list[tuple[float, float]]) -> Row:
+    """Return errors and claims of accepted matches, each (error, claim), in metres; {} where there are none."""
+    if not claims_m:
+        return {}
+    off_m, claimed_m = np.array(claims_m).T
+    within = off_m <= 2 * claimed_m
+    return {
+        "error": {"median_m": round(float(np.median(off_m)), 1), "p90_m": round(float(np.quantile(off_m, 0.9)), 1)},
+        "claim_m": round(float(np.median(claimed_m)), 1),
+        "within": round(float(np.mean(within)), 2),
+        "too_sure": int(np.sum(~within & (claimed_m < 40))),
+    }
 
 
 def measured(cutting: Cutting, folder: Path, work: Path, frames: list[Frame]) -> list[Row]:
@@ -206,7 +202,6 @@ def measured(cutting: Cutting, folder: Path, work: Path, frames: list[Frame]) ->
 def measure(folder: Path, work: Path) -> list[Row]:
     frames, before = list(flown(folder / "raster" / "after.vrt")), folder / "raster" / "before.vrt"
     rasters = [coarser(before, work / f"{pixel_m:g} m.tif", pixel_m) for pixel_m in RESOLUTIONS_M]
-    rasters.append(patchwork(rasters[0], work / "patchwork.tif"))
     cuttings = [Cutting(rasters[0], told, at) for at in (_ONE, _THREE) for told in TOLD]
     cuttings += [Cutting(raster, 1.0, _ONE) for raster in rasters[1:]]
     with ProcessPoolExecutor() as pool:

@@ -32,17 +32,11 @@ class Laid:
         return np.column_stack([turned, self.middle[name] - turned @ middle])
 
 
-def read_mosaic(folder: Path) -> list[dict[str, str]]:
-    """Return the rows of the largest component of a set's mosaic."""
+def laid(folder: Path) -> Laid:
+    """Read the largest component of a set's mosaic, scaled so that a picture keeps about its resolution."""
     rows = base.read_csv(folder / "mosaic_positions.csv")
     components = [row["component"] for row in rows]
-    largest = max(set(components), key=components.count)
-    return [row for row in rows if row["component"] == largest]
-
-
-def laid(folder: Path) -> Laid:
-    """Read a set's mosaic, scaled so that a picture keeps about its resolution."""
-    rows = read_mosaic(folder)
+    rows = [row for row in rows if row["component"] == max(set(components), key=components.count)]
     per_px = 1 / np.median([float(row["scale"]) for row in rows])
     scale = {row["file"]: float(row["scale"]) * per_px for row in rows}
     at = {row["file"]: np.array([float(row["x_px"]), float(row["y_px"])]) * per_px for row in rows}
