@@ -159,7 +159,7 @@ def open_cuttings(cuttings: "Cuttings", only: Collection[str] | None) -> Orthoph
 def make_lattice(orthophoto: Orthophoto, footprint_m: float, spacing_m: float, area: Area | None = None) -> Lattice:
     """Make a grid of places `spacing_m` apart over the orthophoto. A square with sides of `footprint_m` around each
     place is inside its bounding box. With an `area` (None: no limit), keep only the places of this grid that are in
-    its polygons or within `footprint_m` of its path.
+    its circle or within `footprint_m` of its path.
 
     Raises UsageError if footprint or spacing do not fit the orthophoto, or there are more than a million places, or
     none.

@@ -1,5 +1,5 @@
-"""Reading of areas and paths to be flown over: waypoint files and plans of QGroundControl. They limit the part of an
-orthophoto from which a map is made, and of a map the part that a flight takes."""
+"""Reading of paths to be flown over, waypoint files and plans of QGroundControl, and of circles. They limit the part of
+an orthophoto from which a map is made, and of a map the part that a flight takes."""
 
 import json
 import math
@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.core.arrays import Doubles, LatLon
+from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import UsageError
 from edgevpr.core.files import read_file
-from edgevpr.core.geodesy import compute_extent, offset_position
+from edgevpr.core.geodesy import Extent, compute_extent, offset_position
 
 try:
     import shapely as shapely
@@ -28,13 +28,11 @@ _WAYPOINT_COLUMNS = 12
 _FLOWN_COMMANDS = {16, 17, 18, 19, 21, 22, 31, 82, 84, 85}
 _RELATIVE_FRAMES = {3, 6, 10, 11}  # MAV_FRAMEs whose altitude is relative to home or the terrain
 _CIRCLE_PATTERN = re.compile(r"\s*-?[\d.]+\s*,\s*-?[\d.]+\s*,\s*-?[\d.]+\s*")  # LAT,LON,RADIUS_M
-_CIRCLE_CORNERS = 72
 _MAX_RADIUS_M = 200_000.0
 _QUARTER_SEGMENTS = 64  # of a buffer's round corners: exact to 0.01 % of its width
 _FAR_M = 1e8
 _MALFORMED = (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError)
 
-Ring = list[LatLon]
 Projection = Callable[[Doubles, Doubles], tuple[Any, Any]]  # latitudes and longitudes, to x and y in metres
 
 
@@ -49,40 +47,26 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """The areas and the path in a file. Each of `polygons` is a closed outline of points (lat, lon) in degrees. The
-    waypoints of `path` are in the order of flight."""
+    """The ground around the waypoints of a mission, `path`, in the order of flight. A circle has one waypoint, in its
+    middle, and a `radius_m` (0: a mission)."""
 
-    polygons: tuple[Ring, ...] = ()
-    path: tuple[Waypoint, ...] = ()
-
-    @property
-    def points(self) -> list[LatLon]:
-        """All corners of polygons and points of the path."""
-        points = [(waypoint.lat_deg, waypoint.lon_deg) for waypoint in self.path]
-        return points + [point for ring in self.polygons for point in ring]
+    path: tuple[Waypoint, ...]
+    radius_m: float = 0.0
 
     @property
-    def extent_deg(self) -> tuple[float, float, float, float]:
-        """The bounding box of polygons and path: (south, west, north, east) in degrees, see `compute_extent`."""
-        return compute_extent(self.points)
+    def extent_deg(self) -> Extent:
+        """The bounding box of path or circle, see `compute_extent`."""
+        sides_m = (-self.radius_m, self.radius_m)
+        return compute_extent([offset_position(at.lat_deg, at.lon_deg, m, m) for at in self.path for m in sides_m])
 
-    def project_ground(self, project: Projection, polygon_margin_m: float, path_margin_m: float) -> "shapely.Geometry":
-        """Return the ground within these margins of the polygons and of the path, on a plane."""
-
-        def corners_m(points: Sequence[LatLon]) -> Doubles:
-            # What cannot be projected is far away.
-            corners: Doubles = np.column_stack(project(*np.array(points, float).T))
-            return np.nan_to_num(corners, nan=_FAR_M, posinf=_FAR_M)
-
-        shapes = []
-        for ring in self.polygons:
-            shapes.append((shapely.make_valid(shapely.Polygon(corners_m(ring))), polygon_margin_m))
-        if self.path:
-            way = (*self.path, self.path[-1])  # a line has two points or more
-            points = [(waypoint.lat_deg, waypoint.lon_deg) for waypoint in way]
-            shapes.append((shapely.LineString(corners_m(points)), path_margin_m))
-        wide = [shapely.buffer(shape, margin_m, quad_segs=_QUARTER_SEGMENTS) for shape, margin_m in shapes]
-        ground = shapely.union_all(wide)
+    def project_ground(self, project: Projection, circle_margin_m: float, path_margin_m: float) -> "shapely.Geometry":
+        """Return the ground within these margins of the circle or of the path, on a plane."""
+        way = (*self.path, self.path[-1])  # a line has two points or more
+        points: Doubles = np.column_stack(project(*np.array([(at.lat_deg, at.lon_deg) for at in way]).T))
+        # What cannot be projected is far away.
+        line = shapely.LineString(np.nan_to_num(points, nan=_FAR_M, posinf=_FAR_M))
+        margin_m = self.radius_m + circle_margin_m if self.radius_m else path_margin_m
+        ground = shapely.buffer(line, margin_m, quad_segs=_QUARTER_SEGMENTS)
         shapely.prepare(ground)
         return ground
 
@@ -95,10 +79,8 @@ def read_area(path: str | Path) -> Area:
         if _CIRCLE_PATTERN.fullmatch(str(path)):
             return _make_circle(*map(float, str(path).split(",")))
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
-        if text.startswith("QGC WPL"):
-            area = _read_waypoints(text.splitlines())
-        else:
-            area = _read_plan(json.loads(text)["mission"]["items"])
+        is_list = text.startswith("QGC WPL")
+        way = _read_waypoints(text.splitlines()) if is_list else _read_plan(json.loads(text)["mission"]["items"])
     except OSError as error:
         raise UsageError(
             f"{path} cannot be read ({error.strerror}): give a mission file, or LAT,LON,RADIUS_M."
@@ -108,11 +90,11 @@ def read_area(path: str | Path) -> Area:
             f"{path} is no waypoint file (QGC WPL 110) and no .plan of QGroundControl that can be understood: save it "
             "again."
         ) from None
-    if not area.polygons and not area.path:
-        raise UsageError(f"{path} holds no polygon and no position to fly to: save the mission or the area again.")
-    if any(abs(lat_deg) > 90 or abs(lon_deg) > 180 for lat_deg, lon_deg in area.points):
+    if not way:
+        raise UsageError(f"{path} holds no position to fly to: save the mission again.")
+    if any(abs(at.lat_deg) > 90 or abs(at.lon_deg) > 180 for at in way):
         raise UsageError(f"{path} has positions beyond the globe: they must be degrees of WGS-84.")
-    return area
+    return Area(tuple(way))
 
 
 def _make_circle(lat_deg: float, lon_deg: float, radius_m: float) -> Area:
@@ -121,12 +103,10 @@ def _make_circle(lat_deg: float, lon_deg: float, radius_m: float) -> Area:
             f"--area {lat_deg:g},{lon_deg:g},{radius_m:g}: write LAT,LON,RADIUS_M, in degrees of WGS-84 and metres (at "
             f"most {_MAX_RADIUS_M:,.0f})."
         )
-    turns = (2 * math.pi * corner / _CIRCLE_CORNERS for corner in range(_CIRCLE_CORNERS + 1))
-    ring = [offset_position(lat_deg, lon_deg, radius_m * math.sin(turn), radius_m * math.cos(turn)) for turn in turns]
-    return Area(polygons=(ring,))
+    return Area((Waypoint(lat_deg, lon_deg),), radius_m)
 
 
-def _read_waypoints(lines: list[str]) -> Area:
+def _read_waypoints(lines: list[str]) -> list[Waypoint]:
     """Read a waypoint file. The first line is a heading; the columns of the others are index, current, frame, command,
     four parameters, lat, lon, alt, autocontinue."""
     path: list[Waypoint] = []
@@ -134,7 +114,7 @@ def _read_waypoints(lines: list[str]) -> Area:
         if len(values) != _WAYPOINT_COLUMNS:
             raise ValueError
         path += _parse_waypoint(int(values[3]), int(values[2]), values[8:11])
-    return Area(path=tuple(path))
+    return path
 
 
 def _parse_waypoint(command: int, frame: int, where: Sequence[float | str | None]) -> list[Waypoint]:
@@ -147,11 +127,10 @@ def _parse_waypoint(command: int, frame: int, where: Sequence[float | str | None
     return [Waypoint(lat_deg, lon_deg, alt_m if frame in _RELATIVE_FRAMES and alt_m > 0 else None)]
 
 
-def _read_plan(items: list[dict[str, Any]]) -> Area:
-    """Read the items of a plan: simple items, and surveys and corridors, which have both a polygon and the waypoints
-    computed from it. A plan has null for numbers that it leaves to the autopilot."""
+def _read_plan(items: list[dict[str, Any]]) -> list[Waypoint]:
+    """Read the items of a plan: simple items, and surveys and corridors, which have the waypoints computed from their
+    polygon. A plan has null for numbers that it leaves to the autopilot."""
     path: list[Waypoint] = []
-    polygons: list[Ring] = []
     for item in items:
         if item["type"] == "SimpleItem":
             path += _parse_waypoint(int(item["command"]), int(item["frame"]), item["params"][4:7])
@@ -160,9 +139,7 @@ def _read_plan(items: list[dict[str, Any]]) -> Area:
         height_m = style.get("CameraCalc", {}).get("DistanceToSurface")
         points = style.get("VisualTransectPoints", ())
         path += [Waypoint(_parse_finite(lat_deg), _parse_finite(lon_deg), height_m) for lat_deg, lon_deg, *_ in points]
-        corners = [(_parse_finite(lat_deg), _parse_finite(lon_deg)) for lat_deg, lon_deg, *_ in item.get("polygon", ())]
-        polygons += [[*corners, corners[0]]] if corners else []
-    return Area(tuple(polygons), tuple(path))
+    return path
 
 
 def _parse_finite(value: float | str | None) -> float:

@@ -1,11 +1,12 @@
 """Areas and paths of mission files."""
 
 import json
+import math
 
 import pytest
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import distance_m
+from edgevpr.core.geodesy import offset_m
 from edgevpr.mapmaking.missions import Waypoint, read_area
 
 WAYPOINTS = """QGC WPL 110
@@ -39,15 +40,19 @@ def written(tmp_path, said):
 
 def test_a_waypoint_file_gives_what_is_flown_to_and_nothing_else(tmp_path):
     area = read_area(written(tmp_path, WAYPOINTS))
-    assert area.polygons == ()
     assert area.path == (Waypoint(50.001, 11.9), Waypoint(50.002, 11.901, 60.0), Waypoint(50.003, 11.903, 70.0))
-    assert area.extent_deg == (50.001, 11.9, 50.003, 11.903)
+    assert area.extent_deg == pytest.approx((50.001, 11.9, 50.003, 11.903))
 
 
 def test_a_plan_gives_its_waypoints_and_its_survey(tmp_path):
     area = read_area(written(tmp_path, {"fileType": "Plan", "mission": {"items": ITEMS}}))
     assert area.path == (Waypoint(50.0, 11.9, 50.0), Waypoint(50.001, 11.9, 80), Waypoint(50.009, 11.9, 80))
-    assert area.polygons == ([(50.0, 11.9), (50.01, 11.9), (50.01, 11.91), (50.0, 11.9)],)
+
+
+def _plan_of(point):
+    """A plan with a survey of one point."""
+    survey = '{"type": "ComplexItem", "TransectStyleComplexItem": {"VisualTransectPoints": [POINT]}}'
+    return '{"mission": {"items": [ITEM]}}'.replace("ITEM", survey.replace("POINT", point))
 
 
 @pytest.mark.parametrize(
@@ -63,8 +68,8 @@ def test_a_plan_gives_its_waypoints_and_its_survey(tmp_path):
         '{"type": "Polygon", "coordinates": []}',
         '{"fileType": "Plan"}',
         '{"fileType": "Plan", "mission": {"items": [{}]}}',
-        '{"mission": {"items": [{"type": "ComplexItem", "polygon": [[NaN, 50]]}]}}',
-        '{"mission": {"items": [{"type": "ComplexItem", "polygon": [[1' + 400 * "0" + ", 50]]}]}}",
+        _plan_of("[NaN, 50]"),
+        _plan_of("[1" + 400 * "0" + ", 50]"),
     ],
 )
 def test_what_cannot_be_understood_is_said_in_a_sentence(tmp_path, said):
@@ -74,7 +79,7 @@ def test_what_cannot_be_understood_is_said_in_a_sentence(tmp_path, said):
 
 def test_an_empty_area_one_beyond_the_globe_and_a_foreign_file_are_refused(tmp_path):
     for empty in ("QGC WPL 110\n", {"fileType": "Plan", "mission": {"items": []}}):
-        with pytest.raises(UsageError, match="no polygon"):
+        with pytest.raises(UsageError, match="no position"):
             read_area(written(tmp_path, empty))
     with pytest.raises(UsageError, match="globe"):
         read_area(written(tmp_path, "QGC WPL 110\n0 1 3 16 0 0 0 0 5542661 707819 0 1"))
@@ -88,9 +93,9 @@ def test_an_empty_area_one_beyond_the_globe_and_a_foreign_file_are_refused(tmp_p
 @pytest.mark.parametrize(("lat_deg", "lon_deg"), [(50.0, 11.9), (-35.36, 149.16), (-17.0, -179.9999)])
 def test_an_area_may_be_a_circle(lat_deg, lon_deg):
     area = read_area(f"{lat_deg}, {lon_deg},500")
-    ((*corners, last),) = area.polygons
-    assert last == pytest.approx(corners[0])
-    assert all(distance_m(lat_deg, lon_deg, *corner) == pytest.approx(500, rel=0.01) for corner in corners)
+    ground = area.project_ground(lambda lats_deg, lons_deg: offset_m(lat_deg, lon_deg, lats_deg, lons_deg), 20.0, 7.0)
+    assert ground.bounds == pytest.approx((-520, -520, 520, 520))
+    assert ground.area == pytest.approx(math.pi * 520**2, rel=0.001)
     south, west, north, east = area.extent_deg
     assert (south + north) / 2 == pytest.approx(lat_deg)
     assert 0 < east - west < 0.02

@@ -73,11 +73,11 @@ def test_subset_reads_only_the_maps_near_the_mission(tiles, tmp_path):
     assert (found.maps, names_in(tmp_path / "f.gpkg")) == (1, [f"0{row}" for row in range(SIDE)])
 
 
-def test_places_in_a_polygon_are_taken(tiles, tmp_path):
-    square = [at(-50, -50), at(250, -50), at(250, 450), at(-50, 450), at(-50, -50)]
-    make_subset(tiles, Area(polygons=(square,)), 20.0, tmp_path / "f.gpkg", None, iterate_silently)
-    assert set(names_in(tmp_path / "f.gpkg")) == {f"{c}{r}" for c in range(3) for r in range(5)}
-    make_subset(tiles, Area(polygons=(square,)), 60.0, tmp_path / "g.gpkg", None, iterate_silently)
+def test_places_in_a_circle_are_taken(tiles, tmp_path):
+    circle = Area((Waypoint(*at(100, 200)),), radius_m=130.0)
+    make_subset(tiles, circle, 20.0, tmp_path / "f.gpkg", None, iterate_silently)
+    assert set(names_in(tmp_path / "f.gpkg")) == {f"{c}{r}" for c in range(3) for r in range(1, 4)}
+    make_subset(tiles, circle, 80.0, tmp_path / "g.gpkg", None, iterate_silently)
     assert "32" in names_in(tmp_path / "g.gpkg")
 
 
