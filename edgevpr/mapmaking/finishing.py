@@ -113,14 +113,7 @@ def calibrate_map(
         else:  # the images between show the motion
             yield from (frame for frame in find_headings(read(None), lens) if frame.name in names)
 
-    return calibrate(
-        encoder,
-        place_map,
-        match,
-        QueryMeter(load_board("this")),
-        frames,
-        progress,
-    )
+    return calibrate(encoder, place_map, match, QueryMeter(load_board("this")), frames, progress)
 
 
 def make_encoder(source: SourceConfig, pictures: FlownPictures | Cuttings | None, technique: Technique) -> FrameEncoder:

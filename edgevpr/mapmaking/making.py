@@ -27,12 +27,7 @@ from edgevpr.runtime.preflight.pick import make_camera_setting, pick_technique
 from edgevpr.runtime.recognise.calibration import MapCalibration
 from edgevpr.runtime.recognise.evidence import list_evidence_kinds
 from edgevpr.runtime.recognise.levelling import read_camera_lens, read_mount
-from edgevpr.runtime.recognise.opening import (
-    create_technique,
-    make_technique,
-    open_salience_gate,
-    warn_of_mismatch,
-)
+from edgevpr.runtime.recognise.opening import create_technique, make_technique, open_salience_gate, warn_of_mismatch
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.cuttings import OrthophotoSource

@@ -18,14 +18,7 @@ from edgevpr.frames.images import read_image
 from edgevpr.mavlink.signing import NOT_SIGNING
 from edgevpr.power.boards import Board, resolve_board
 from edgevpr.review.compare import Line, PacketComparison
-from edgevpr.review.tape import (
-    Playback,
-    ReplayedDriver,
-    ReplayedSigning,
-    ReplayedSource,
-    TapeEnded,
-    read_tape,
-)
+from edgevpr.review.tape import Playback, ReplayedDriver, ReplayedSigning, ReplayedSource, TapeEnded, read_tape
 from edgevpr.runtime.flight.boundary import TapedStop, TapedTurns, tape_clock, tape_machine
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.flight import Flight
