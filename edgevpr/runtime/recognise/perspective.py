@@ -70,8 +70,11 @@ class ShownTilt:
 
     def get_sd(self, is_reported: bool) -> float:
         """Return what it says of the error of a tilt, as a tangent. One that `is_reported` is taken to be right unless
-        the pictures clearly contradict it."""
-        return math.hypot(self.tangent, self.sd) if self.is_clear or not is_reported else 0.0
+        the pictures clearly contradict it. Of one that is not reported all may be missing, and its error comes on top:
+        where few regions agree, those that do lie near each other, and show too small a tilt (tilt_ariel)."""
+        if is_reported:
+            return math.hypot(self.tangent, self.sd) if self.is_clear else 0.0
+        return self.tangent + self.sd
 
 
 def convert_to_tilt(found: Perspective | None, focal: float | None) -> ShownTilt:
