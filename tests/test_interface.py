@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from commands import refused, run_json
 from pictures import seen_from_above, textured
 
 import edgevpr
@@ -153,10 +154,8 @@ def test_example_of_a_film_with_subtitles(flight, tmp_path, capsys, caplog):
     build = ["--images", f"{film}.MP4", "--no-calibrate"]
     assert main(["map", "build", f"{film}_bare.gpkg", *build, "--technique", "hog"]) == 0
     assert "DJI_0001.SRT --images" in caplog.text, "the subtitles are there, and nobody has read them"
-    assert main(["positions", f"{film}.SRT", "--images", str(flight / "later")]) == 2
-    assert "video" in capsys.readouterr().err
-    assert main(["positions", f"{film}.SRT", "--images", f"{film}.MP4", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["placed"] == PLACES
+    assert "video" in refused(capsys, "positions", f"{film}.SRT", "--images", flight / "later")
+    assert run_json(capsys, "positions", f"{film}.SRT", "--images", f"{film}.MP4")["placed"] == PLACES
     assert main(["map", "build", f"{film}.gpkg", *build, "--camera", "nadir"]) == 0
     with edgevpr.Map(f"{film}.gpkg") as ground:
         places = list(ground.places())

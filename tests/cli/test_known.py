@@ -1,12 +1,10 @@
 """What is known of a query beside its picture: `eval` and `match` with --known."""
 
-import json
-
 import cv2
 import pytest
+from commands import refused, run, run_json
 from pictures import from_height
 
-from edgevpr.cli.main import main
 from edgevpr.runtime.recognise.hints import RECORDED_REACH_M
 
 pytestmark = pytest.mark.slow
@@ -34,20 +32,9 @@ def make(folder, turned_deg=(None,) * PLACES, places_known=True):
     return folder
 
 
-def run_json(capsys, *argv):
-    assert main([*map(str, argv), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
 def evaluated(capsys, folder, *argv):
     flags = ("--data", folder, "--techniques", "cohog", "--camera", "nadir", "--param", "cohog.w1=256")
     return run_json(capsys, "eval", *flags, *argv)["techniques"]["cohog"]
-
-
-def refused(capsys, *argv):
-    """The one sentence with which a command fails as wrong usage does."""
-    assert main([str(word) for word in argv]) == 2
-    return capsys.readouterr().err.splitlines()[-1]
 
 
 def test_eval_with_known_headings_rules_out_other_rotations(capsys, tmp_path):
@@ -62,8 +49,7 @@ def test_match_reports_what_has_narrowed_each_query(capsys, tmp_path):
     folder = make(tmp_path / "set", turned_deg=(0, 0, 0, 90, 90, None))
     path = tmp_path / "m.gpkg"
     build = ("map", "build", path, "--images", folder / "ref", "--technique", "cohog", "--camera", "nadir")
-    assert main([str(word) for word in build]) == 0
-    capsys.readouterr()
+    assert run(*build) == 0
     match = ("match", path, "--images", folder / "query")
     without = run_json(capsys, *match)
     assert all(each["accepted"] and "hints" not in each for each in without)

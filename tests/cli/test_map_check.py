@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 
 import pytest
+from commands import refused, run_json
 from full_disk import no_file_larger_than
 from pictures import textured, write_flight
 
@@ -58,8 +59,7 @@ def test_map_repair_leaves_a_whole_map_alone(valley, capsys):
     assert "checking  6/6  100 %" in said.err
     assert main(["map", "repair", str(valley)]) == 0
     assert "no damage" in capsys.readouterr().out
-    assert main(["map", "repair", str(valley), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"path": str(valley), "kept": 6, "dropped": 0, "original": None}
+    assert run_json(capsys, "map", "repair", valley) == {"path": str(valley), "kept": 6, "dropped": 0, "original": None}
     assert valley.read_bytes() == before
     assert [entry.name for entry in valley.parent.iterdir()] == [valley.name]
 
@@ -90,16 +90,14 @@ def test_map_repair_drops_what_is_damaged_and_keeps_the_original(valley, capsys)
     assert main(["map", "check", str(valley)]) == 0
     assert sorted(entry.name for entry in valley.parent.iterdir()) == [valley.name, original.name]
     damage(valley, "UPDATE places SET fine = x'00' WHERE place_id = 1")
-    assert main(["map", "repair", str(valley)]) == 1
-    assert "exists already" in capsys.readouterr().err
+    assert "exists already" in refused(capsys, "map", "repair", valley, code=1)
     assert original.read_bytes() == before
 
 
 def test_map_repair_leaves_a_map_of_which_nothing_can_be_read(valley, capsys):
     damage(valley, "UPDATE places SET coarse = x'00'")
     before = valley.read_bytes()
-    assert main(["map", "repair", str(valley)]) == 1
-    assert "restore" in capsys.readouterr().err
+    assert "restore" in refused(capsys, "map", "repair", valley, code=1)
     assert valley.read_bytes() == before
     assert [entry.name for entry in valley.parent.iterdir()] == [valley.name]
 

@@ -1,9 +1,8 @@
 """Networks and forms through the commands: one map for all forms, and what cannot be used stops nothing else."""
 
-import json
-
 import cv2
 import pytest
+from commands import refused, run_json
 from pictures import textured, write_flight
 from tiny_networks import write_network
 
@@ -40,8 +39,7 @@ def test_match_uses_one_map_in_all_forms(capsys, flight):
     content = path.read_bytes()
     for form in FORMS:
         capsys.readouterr()
-        assert main(["match", str(path), "--images", str(flight / "query"), "--form", form, "--json"]) == 0
-        found = json.loads(capsys.readouterr().out)
+        found = run_json(capsys, "match", path, "--images", flight / "query", "--form", form)
         assert [each["place"]["image"] for each in found] == [each["query"] for each in found]
     assert path.read_bytes() == content
     assert main(["match", str(path), "--images", str(flight / "query")]) == 0
@@ -64,8 +62,7 @@ def test_match_refuses_a_map_of_other_weights(models, flight, capsys):
     path = built(flight, "--technique", "calc", "--param", "model=tiny")
     write_network(models, "tiny", fault="dynamic batch")
     capsys.readouterr()
-    assert main(["match", str(path), "--images", str(flight / "query")]) == 1
-    assert "sha256" in capsys.readouterr().err
+    assert "sha256" in refused(capsys, "match", path, "--images", flight / "query", code=1)
 
 
 def test_match_says_how_to_get_the_network_of_a_map(models, flight, capsys):

@@ -1,15 +1,13 @@
 """`edgevpr map build --orthophoto` and `edgevpr simulate flight --orthophoto`: a map and a flight without flying."""
 
-import json
-
 import numpy as np
 import pytest
+from commands import refused, run, run_json
 
 pytest.importorskip("rasterio", reason="rasterio is not installed (pip install 'edgevpr[maps]')")
 
 from rasters import HOME, textured_raster, write_mission
 
-from edgevpr.cli.main import main
 from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.frames.positions import read_positions
 from edgevpr.mapmaking import calibrate
@@ -28,16 +26,11 @@ def track(tmp_path):
     return str(write_mission(tmp_path / "track.waypoints", ends))
 
 
-def run(*command: str) -> int:
-    return main(list(map(str, command)))
-
-
 @pytest.mark.slow
 def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, track, capsys):
     place_map, flight = tmp_path / "m.gpkg", tmp_path / "flight"
     cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 25)
-    assert run("map", "build", place_map, *cut, "--area", track, "--no-calibrate", "--json") == 0
-    built = json.loads(capsys.readouterr().out)
+    built = run_json(capsys, "map", "build", place_map, *cut, "--area", track, "--no-calibrate")
     assert built["technique"] == "cohog"
     assert 15 <= built["places"] == built["added"]
     assert (built["without_position"], built["without_data"], built["says_nothing"]) == (0, 0, 0)
@@ -49,8 +42,7 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
     over = ("--orthophoto", ground, "--track", track, "--height-m", 77, "--every-m", 20)
     assert run("simulate", "flight", flight, *over) == 0
     assert "8 images" in capsys.readouterr().out
-    assert run("match", place_map, "--images", flight / "images", "--json") == 0
-    found = json.loads(capsys.readouterr().out)
+    found = run_json(capsys, "match", place_map, "--images", flight / "images")
     taken = read_positions(flight / "positions.csv")
     off_m = []
     for query in found:
@@ -88,10 +80,7 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
 )
 def test_map_build_refuses_a_wrong_request(tmp_path, ground, capsys, flags, code, said):
     flags = [ground if flag == "GROUND" else flag for flag in flags]
-    assert run("map", "build", tmp_path / "m.gpkg", *flags) == code
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
+    assert said in refused(capsys, "map", "build", tmp_path / "m.gpkg", *flags, code=code)
     assert not (tmp_path / "m.gpkg").exists()
 
 
@@ -105,10 +94,7 @@ def test_map_build_refuses_a_wrong_request(tmp_path, ground, capsys, flags, code
 )
 def test_simulate_flight_refuses_a_wrong_request(tmp_path, ground, track, capsys, flags, said):
     flags = [{"GROUND": ground, "TRACK": track}.get(flag, flag) for flag in flags]
-    assert run("simulate", "flight", tmp_path / "flight", *flags) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
+    assert said in refused(capsys, "simulate", "flight", tmp_path / "flight", *flags)
 
 
 @pytest.mark.slow
@@ -117,10 +103,8 @@ def test_map_calibrate_cuts_the_orthophoto_again(tmp_path, ground, track, capsys
     monkeypatch.setattr(calibrate, "count_queries", lambda technique: 6)
     path = tmp_path / "m.gpkg"
     cut = ("--orthophoto", ground, "--footprint-m", 100, "--spacing-m", 80, "--area", track)
-    assert run("map", "build", path, *cut, "--no-refine", "--no-calibrate", "--json") == 0
-    built = json.loads(capsys.readouterr().out)
+    built = run_json(capsys, "map", "build", path, *cut, "--no-refine", "--no-calibrate")
     assert built["places"] == 9
     assert "calibration" not in built
-    assert run("map", "calibrate", path, *cut, "--json") == 0
-    found = json.loads(capsys.readouterr().out)["calibration"]
+    found = run_json(capsys, "map", "calibrate", path, *cut)["calibration"]
     assert 0 < found["places_asked"] <= found["asked"] <= 6  # where pictures may overlap, nobody knows

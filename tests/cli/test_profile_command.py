@@ -1,15 +1,13 @@
 """`edgevpr profile` as a user meets it: before the flight, and on which board."""
 
-import json
 from dataclasses import replace
 
-import cv2
-import numpy as np
 import pytest
+from commands import refused, run, run_json
 from example_costs import REGIONS, VECTOR
+from pictures import textured, write_flight
 
 from edgevpr import techniques
-from edgevpr.cli.main import main
 from edgevpr.core.types import StageCost
 from edgevpr.power import speed
 from edgevpr.power.boards import list_boards
@@ -48,34 +46,11 @@ def tried(monkeypatch):
     return asked
 
 
-def run(capsys, *argv):
-    assert main(["profile", *map(str, argv)]) == 0
-    return capsys.readouterr()
-
-
-def refused(capsys, *argv):
-    code = main(["profile", *map(str, argv)])
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("edgevpr: ")]
-    assert "Traceback" not in "".join(said)
-    return code, said[-1].removeprefix("edgevpr: ")
-
-
-def a_map(tmp_path, technique="hog"):
-    folder = tmp_path / "flight"
-    folder.mkdir()
-    for number in range(3):
-        image = np.random.default_rng(number).integers(0, 256, (96, 128), np.uint8)
-        cv2.imwrite(str(folder / f"{number}.png"), image)
-    path = tmp_path / "valley.gpkg"
-    assert main(["map", "build", str(path), "--images", str(folder), "--technique", technique]) == 0
-    return path
-
-
 @pytest.mark.process
 @pytest.mark.slow
 def test_profile_tries_the_real_techniques(capsys, monkeypatch):
     monkeypatch.setattr(techniques, "list_techniques", lambda: ("cohog", "hog"))
-    found = json.loads(run(capsys, "--board", "rpi-zero-2w", "--places", 10_000, "--json").out)
+    found = run_json(capsys, "profile", "--board", "rpi-zero-2w", "--places", 10_000)
     rows = {row["option"]["label"]: row for row in found["techniques"]}
     assert list(rows) == ["cohog", "hog", "hog 8bit", "hog 1bit"]
     assert "RAM" in rows["hog"]["option"]["fit"]["misfit"], "286 KB a place is 2.9 GB"
@@ -86,7 +61,8 @@ def test_profile_tries_the_real_techniques(capsys, monkeypatch):
 
 
 def test_profile_recommends_first_and_lists_every_technique(capsys, tried):
-    said = run(capsys, "--board", "rpi-4b", "--places", 20).out.splitlines()
+    assert run("profile", "--board", "rpi-4b", "--places", 20) == 0
+    said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("Recommended: cohog: ")
     assert tried == ["cohog", "hog", "hog 8bit", "hog 1bit", "seqslam", "calc", "calc 8bit", "calc 1bit"]
     assert {"cohog", "hog 1bit", "seqslam", "calc"} <= {line.split("  ")[0] for line in said}
@@ -94,31 +70,30 @@ def test_profile_recommends_first_and_lists_every_technique(capsys, tried):
 
 
 def test_profile_list_names_every_board_and_this_machine(capsys):
-    said = [line.split()[0] for line in run(capsys, "--list").out.splitlines()]
-    assert said == ["this", *list_boards()]
+    assert run("profile", "--list") == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["this", *list_boards()]
 
 
 def test_profile_of_a_map_tries_only_its_forms(capsys, tmp_path, tried):
-    path = a_map(tmp_path)
-    capsys.readouterr()
-    found = json.loads(run(capsys, "--map", path, "--board", "rpi-4b", "--json").out)
+    path = tmp_path / "valley.gpkg"
+    write_flight(tmp_path / "flight", [textured(number) for number in range(3)])
+    assert run("map", "build", path, "--images", tmp_path / "flight", "--technique", "hog") == 0
+    found = run_json(capsys, "profile", "--map", path, "--board", "rpi-4b")
     assert found["plan"]["places"] == 3
     assert found["recommended"] == "hog"
     assert tried == ["hog", "hog 8bit", "hog 1bit"]
 
 
 @pytest.mark.parametrize(
-    ("argv", "sentence"),
+    ("argv", "code", "sentence"),
     [
-        (["--places", "50", "--battery", "4X"], "The battery pack `4X` cannot be read: write its cells in series"),
-        (["--map", "nowhere.gpkg"], "There is no map"),
-        (["--places", "50", "--rate-hz", "0"], "the command line: `source.rate_hz` is 0"),
-        (["--places", "50", "--board", "rpi4"], "There is no board `rpi4`"),
+        (["--places", "50", "--battery", "4X"], 2, "The battery pack `4X` cannot be read: write its cells in series"),
+        (["--map", "nowhere.gpkg"], 1, "There is no map"),
+        (["--places", "50", "--rate-hz", "0"], 2, "the command line: `source.rate_hz` is 0"),
+        (["--places", "50", "--board", "rpi4"], 2, "There is no board `rpi4`"),
     ],
 )
-def test_profile_refuses_a_wrong_request_before_any_work(capsys, monkeypatch, tmp_path, tried, argv, sentence):
+def test_profile_refuses_a_wrong_request_before_any_work(capsys, monkeypatch, tmp_path, tried, argv, code, sentence):
     monkeypatch.chdir(tmp_path)
-    code, said = refused(capsys, *argv)
-    assert code in (1, 2)
-    assert said.startswith(sentence)
+    assert sentence in refused(capsys, "profile", *argv, code=code)
     assert not tried, "said before the measuring"

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from commands import refused, run_json
 
 pytest.importorskip("onnx", reason="the test networks are written with onnx (pip install onnx)")
 
@@ -55,20 +56,18 @@ def test_salience_scores_a_picture(networks, tmp_path, capsys):
     command = ["salience", str(picture), "--config", settings]
     assert main(command) == 0
     assert "staticity          0." in capsys.readouterr().out
-    assert main([*command, "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = run_json(capsys, *command)
     assert (said["kept"], said["staticity"]) == (False, pytest.approx(0.5, abs=0.01))
     write_memorability(networks, gain=3.0)
-    assert main(["salience", str(picture), "--config", config(tmp_path, memorability=0.3, network="bright")]) != 0
-    assert "0 to 1" in capsys.readouterr().err
+    settings = config(tmp_path, memorability=0.3, network="bright")
+    assert "0 to 1" in refused(capsys, "salience", picture, "--config", settings, code=1)
 
 
 @pytest.mark.slow
 def test_map_build_leaves_out_frames_and_bounds_gaps(recording, tmp_path, capsys):
     place_map = tmp_path / "m.gpkg"
     command = ["map", "build", str(place_map), "--images", str(recording), "--technique", "hog", "--salience"]
-    assert main([*command, "--config", config(tmp_path), "--json"]) == 0
-    built = json.loads(capsys.readouterr().out)
+    built = run_json(capsys, *command, "--config", config(tmp_path))
     with PlaceMap.open(place_map) as opened:
         places = list(opened.read_places())
     low = [int(place.source_image[:2]) for place in places if place.salience.is_low]
@@ -91,31 +90,26 @@ def test_map_build_leaves_out_frames_and_bounds_gaps(recording, tmp_path, capsys
 def test_match_skips_a_query_that_is_not_memorable(recording, tmp_path, capsys):
     place_map = str(tmp_path / "m.gpkg")
     assert main(["map", "build", place_map, "--images", str(recording), "--technique", "hog"]) == 0
-    capsys.readouterr()
-    said = ["match", place_map, "--images", str(recording), "--salience", "--json"]
-    assert main([*said, "--config", config(tmp_path, entropy=0.5)]) == 0
-    answers = json.loads(capsys.readouterr().out)
-    refused = [each for each in answers if each["reason"]["code"] == "NOT_MEMORABLE"]
-    assert [int(each["query"][:2]) for each in refused] == [*range(15, 45)]
-    assert all(each["place"] is None and not each["accepted"] for each in refused)
+    flags = ["--images", recording, "--salience", "--config", config(tmp_path, entropy=0.5)]
+    answers = run_json(capsys, "match", place_map, *flags)
+    skipped = [each for each in answers if each["reason"]["code"] == "NOT_MEMORABLE"]
+    assert [int(each["query"][:2]) for each in skipped] == [*range(15, 45)]
+    assert all(each["place"] is None and not each["accepted"] for each in skipped)
 
 
 @pytest.mark.parametrize(
-    ("keys", "complaint"),
+    ("keys", "code", "complaint"),
     [
-        ({"entropy": 0.8}, "no picture has more than 0.792: lower it"),
-        ({"entropy": 0}, "every criterion is off"),
-        ({"memorability": 0.5, "network": "tiny"}, "has no `outputs.memorability`"),
-        ({"staticity": 0.5, "detector": "bright"}, "is of no detector"),
+        ({"entropy": 0.8}, 2, "no picture has more than 0.792: lower it"),
+        ({"entropy": 0}, 2, "every criterion is off"),
+        ({"memorability": 0.5, "network": "tiny"}, 1, "has no `outputs.memorability`"),
+        ({"staticity": 0.5, "detector": "bright"}, 1, "is of no detector"),
     ],
 )
-def test_salience_refuses_wrong_settings(networks, keys, complaint, tmp_path, capsys):
+def test_salience_refuses_wrong_settings(networks, keys, code, complaint, tmp_path, capsys):
     picture = tmp_path / "p.png"
     cv2.imwrite(str(picture), texture(1))
-    assert main(["salience", str(picture), "--config", config(tmp_path, **keys)]) != 0
-    said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 1
-    assert complaint in said[0]
+    assert complaint in refused(capsys, "salience", picture, "--config", config(tmp_path, **keys), code=code)
 
 
 def test_salience_without_a_network_turns_its_criterion_off(tmp_path, capsys, caplog):

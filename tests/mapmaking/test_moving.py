@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from commands import run_json
 
 from edgevpr.cli.main import main
 from edgevpr.core.contract import Descriptor
@@ -71,8 +72,7 @@ def test_every_position_is_moved_by_what_the_flight_found_last(path, capsys):
 
 def test_a_scale_is_taken_back_around_the_middle_of_the_flight(path, capsys):
     log = log_of(path, FOUND | {"scale": 0.01})
-    assert main(["map", "move", str(path), "--by", str(log), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["scale"] == 0.01
+    assert run_json(capsys, "map", "move", path, "--by", log)["scale"] == 0.01
     first, second, _ = places_of(path)
     at_m = offset_m(*HOME, second.position.lat_deg, second.position.lon_deg)
     assert at_m == pytest.approx((500 / 1.01 - 3.0, 4.0), abs=1e-2)

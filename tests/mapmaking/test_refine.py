@@ -3,7 +3,6 @@ recorded."""
 
 import csv
 import dataclasses
-import json
 import os
 import shutil
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from commands import refused, run_json
 
 from edgevpr.cli.main import main
 from edgevpr.core.geodesy import distance_m, offset_position
@@ -92,8 +92,7 @@ def test_pictures_say_where_they_lie(flown, map_path, capsys):
     _, poses = flown
     with PlaceMap.open(map_path) as place_map:
         before_m, _ = errors_m(place_map, poses)
-    assert main(["map", "refine", str(map_path), "--json"]) == 0
-    refined = json.loads(capsys.readouterr().out)
+    refined = run_json(capsys, "map", "refine", map_path)
     assert (refined["refined"], refined["is_mirrored"]) == (len(poses), False)
     ((place_id, image, off_m),) = refined["contradictory"]
     assert (place_id, image) == (10, "009.jpg")
@@ -121,8 +120,7 @@ def test_exchanged_lat_and_lon_and_a_lost_sign_are_noticed(map_path, capsys, wro
         for place in list(place_map.read_places()):
             lat_deg, lon_deg = wrong(place.position.lat_deg, place.position.lon_deg - east_deg)
             place_map.move_place(place.place_id, Position(lat_deg, lon_deg), None)
-    assert main(["map", "refine", str(map_path), "--json"]) == 0
-    refined = json.loads(capsys.readouterr().out)
+    refined = run_json(capsys, "map", "refine", map_path)
     assert (refined["refined"], refined["is_mirrored"]) == (0, True)
 
 
@@ -228,8 +226,7 @@ def test_what_cannot_be_refined_says_why(tmp_path, flown, map_path, capsys):
     path = tmp_path / "hog.gpkg"
     assert main(["map", "build", str(path), "--images", str(flown[0] / "images"), "--technique", "hog"]) == 0
     assert "refined:" not in capsys.readouterr().out, "a map of another kind is built as it was"
-    assert main(["map", "refine", str(path)]) == 2
-    assert "--camera nadir" in capsys.readouterr().err
+    assert "--camera nadir" in refused(capsys, "map", "refine", path)
 
 
 def test_a_place_that_cannot_be_read_is_left_alone(map_path):

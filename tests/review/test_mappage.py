@@ -7,6 +7,7 @@ from shutil import copyfile
 
 import pytest
 from browser import opened
+from commands import refused
 from ground import STEP_M, places_in, position, write_positions
 
 from edgevpr.cli.main import main
@@ -63,8 +64,7 @@ def test_map_page_shows_places_and_their_problems(browser, mapped):
 @pytest.mark.slow
 def test_a_page_is_never_written_over_the_map(mapped, capsys):
     before = (mapped / "valley.gpkg").read_bytes()
-    assert main(["map", "info", str(mapped / "valley.gpkg"), "--page", str(mapped / "valley.gpkg")]) == 2
-    assert "another name" in capsys.readouterr().err
+    assert "another name" in refused(capsys, "map", "info", mapped / "valley.gpkg", "--page", mapped / "valley.gpkg")
     assert (mapped / "valley.gpkg").read_bytes() == before
 
 

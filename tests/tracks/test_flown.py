@@ -1,13 +1,11 @@
 """Where the pictures of a recorded flight of ours were taken, by its log."""
 
-import json
-
 import cv2
 import pytest
+from commands import run_json
 from fakes import vehicle_at
 from pictures import textured
 
-from edgevpr.cli.main import main
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import read_positions
 from edgevpr.runtime.flight.flightlog import FlightLog
@@ -44,8 +42,7 @@ def fly(tmp_path, is_live=True):
 
 def test_positions_places_the_pictures_of_a_flight_while_the_autopilot_had_gps(tmp_path, capsys):
     log, frames = fly(tmp_path)
-    assert main(["positions", str(log), "--images", str(frames), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = run_json(capsys, "positions", log, "--images", frames)
     assert (said["placed"], said["of"]) == (2, 6)
     tags = {name: tag for name, tag in read_positions(frames / "positions.csv").items() if tag.position}
     assert {name: tag.position.lat_deg for name, tag in tags.items()} == {"000001.jpg": 50.1, "000006.jpg": 50.5}

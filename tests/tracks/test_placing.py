@@ -1,16 +1,15 @@
 """Which picture was taken where: by name, in order, by time and by how pictures move, and the command for people."""
 
-import json
 from datetime import datetime, timedelta, timezone
 
 import cv2
 import numpy as np
 import pytest
+from commands import refused, run, run_json
 from pictures import textured
 from PIL import Image
 from recordings import START_S, write_dataflash, write_gpx
 
-from edgevpr.cli.main import main
 from edgevpr.core.geodesy import offset_position
 from edgevpr.frames.positions import read_positions
 from edgevpr.tracks.clock import estimate_clock_offset_s
@@ -29,16 +28,6 @@ def taken(path, t_s, picture=None, clock_off_s=0.0):
     Image.fromarray(textured(1, 48, 64) if picture is None else picture).save(path, "JPEG", exif=exif, quality=92)
 
 
-def run(capsys, *argv):
-    assert main([str(word) for word in argv]) == 0
-    return capsys.readouterr()
-
-
-def refused(capsys, *argv):
-    assert main([str(word) for word in argv]) == 2
-    return capsys.readouterr().err.splitlines()[-1]
-
-
 @pytest.fixture
 def folder(tmp_path):
     (tmp_path / "flight").mkdir()
@@ -54,8 +43,8 @@ def points(count=15, lat_step=1e-4):
 def test_positions_places_pictures_by_their_names(capsys, folder, tmp_path):
     rows = "".join(f"D:\\pics\\img_{number}.tif;50.{number + 1};8\n" for number in range(5))
     (tmp_path / "table.csv").write_text(f"imagename;latitude;longitude\n{rows}")
-    said = run(capsys, "positions", tmp_path / "table.csv", "--images", folder).out
-    assert [line.split() for line in said.splitlines()][2:4] == [["placed", "5"], ["of", "6"]]
+    assert run("positions", tmp_path / "table.csv", "--images", folder) == 0
+    assert [line.split() for line in capsys.readouterr().out.splitlines()][2:4] == [["placed", "5"], ["of", "6"]]
     tags = read_positions(folder / "positions.csv")
     assert tags["IMG_3.JPG"].position.lat_deg == pytest.approx(50.4)
     assert tags["IMG_3.JPG"].t_utc_s == START_S + 7, "what the table does not say is taken from the picture"
@@ -64,7 +53,7 @@ def test_positions_places_pictures_by_their_names(capsys, folder, tmp_path):
 
 def test_positions_places_triggered_pictures_in_order(capsys, folder, tmp_path):
     write_dataflash(tmp_path / "f.bin", points(), shots=points(6, lat_step=1e-3))
-    found = json.loads(run(capsys, "positions", tmp_path / "f.bin", "--images", folder, "--json").out)
+    found = run_json(capsys, "positions", tmp_path / "f.bin", "--images", folder)
     assert (found["placed"], found["of"], found["offset_s"]) == (6, 6, None)
     tags = read_positions(folder / "positions.csv")
     assert [tag.position.lat_deg for tag in tags.values()] == pytest.approx([50 + 1e-3 * number for number in range(6)])
@@ -72,7 +61,7 @@ def test_positions_places_triggered_pictures_in_order(capsys, folder, tmp_path):
 
 def test_positions_goes_by_time_where_the_numbers_of_pictures_differ(capsys, folder, tmp_path):
     write_dataflash(tmp_path / "f.bin", points(), shots=points(3))
-    found = json.loads(run(capsys, "positions", tmp_path / "f.bin", "--images", folder, "--json").out)
+    found = run_json(capsys, "positions", tmp_path / "f.bin", "--images", folder)
     assert (found["placed"], found["offset_s"]) == (6, 0)
     tag = read_positions(folder / "positions.csv")["IMG_3.JPG"]
     assert tag.position.lat_deg == pytest.approx(50 + 7e-4, abs=2e-6)
@@ -86,15 +75,15 @@ def test_positions_finds_the_time_zone_of_the_camera(capsys, tmp_path, hours):
     for number in range(6):
         taken(folder / f"{number}.jpg", 60 * number + 1, clock_off_s=3600 * hours)
     write_gpx(tmp_path / "t.gpx", [(t, HOME[0] + 1e-5 * t, HOME[1]) for t in range(0, 400, 2)])
-    found = json.loads(run(capsys, "positions", tmp_path / "t.gpx", "--images", folder, "--json").out)
+    found = run_json(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
     assert (found["placed"], found["offset_s"]) == (6, 3600 * hours)
 
 
 def test_positions_refuses_an_ambiguous_time_zone(capsys, folder, tmp_path):
     write_gpx(tmp_path / "t.gpx", [(t, HOME[0], HOME[1] + 1e-6 * t) for t in range(4000, 20_000, 4)])
     assert "--offset-s" in refused(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
-    flags = ("--images", folder, "--offset-s", 7200, "--json")
-    assert json.loads(run(capsys, "positions", tmp_path / "t.gpx", *flags).out)["placed"] == 6
+    flags = ("--images", folder, "--offset-s", 7200)
+    assert run_json(capsys, "positions", tmp_path / "t.gpx", *flags)["placed"] == 6
 
 
 def test_positions_refuses_pictures_of_another_day_with_both_times(capsys, folder, tmp_path):
@@ -135,7 +124,7 @@ def test_estimate_clock_offset_s_sets_the_clock_by_the_motion_of_the_pictures(ca
     for number, picture in enumerate(pictures):
         taken(folder / f"{number}.jpg", 2 * number, picture, clock_off_s=3600 - 17)
     write_gpx(tmp_path / "t.gpx", track)
-    found = json.loads(run(capsys, "positions", tmp_path / "t.gpx", "--images", folder, "--json").out)
+    found = run_json(capsys, "positions", tmp_path / "t.gpx", "--images", folder)
     assert found["offset_s"] == pytest.approx(3583, abs=0.8)
     straight = tmp_path / "straight.gpx"
     write_gpx(straight, [(t, HOME[0] + 1e-5 * t, HOME[1]) for t in range(90)])

@@ -3,23 +3,17 @@
 import json
 
 import pytest
+from commands import refused, run, run_json
 from generated_sets import make_set
 
-from edgevpr.cli.main import main
-
 HOG = ["--techniques", "hog", "--param", "hog.w1=64"]
-
-
-def run(*argv):
-    return main(["eval", *map(str, argv)])
 
 
 @pytest.mark.slow
 def test_eval_prints_every_row_of_every_set_with_its_answers(tmp_path, capsys):
     sets = [make_set(tmp_path / name) for name in ("meadow", "town")]
     flags = ["--techniques", "hog,cohog", "--form", "float,1bit", "--param", "hog.w1=64", "--param", "cohog.w1=208"]
-    assert run("--data", *sets, *flags, "--json") == 0
-    content = json.loads(capsys.readouterr().out)
+    content = run_json(capsys, "eval", "--data", *sets, *flags)
     assert content["machine"]["cpu"]
     assert content["versions"]["numpy"]
     rows = ["hog", "hog 1bit", "cohog"]
@@ -37,14 +31,13 @@ def test_eval_prints_every_row_of_every_set_with_its_answers(tmp_path, capsys):
 def test_eval_fails_only_the_rows_of_a_set_with_a_broken_picture(tmp_path, capsys):
     broken = make_set(tmp_path / "broken")
     (broken / "ref" / "r1.png").write_bytes(b"")
-    assert run("--data", broken, make_set(tmp_path / "meadow"), *HOG, "--json") == 1
+    assert run("eval", "--data", broken, make_set(tmp_path / "meadow"), *HOG, "--json") == 1
     said = capsys.readouterr()
     assert "broken, hog" in said.err
     content = json.loads(said.out)
     assert [row["set"] for row in content["results"]] == ["meadow"]
     assert [row["set"] for row in content["failed"]] == ["broken"]
-    assert run("--data", broken, *HOG) == 1, "nothing was measured"
-    assert "r1.png" in capsys.readouterr().err
+    assert "r1.png" in refused(capsys, "eval", "--data", broken, *HOG, code=1), "nothing was measured"
 
 
 @pytest.mark.parametrize(
@@ -60,6 +53,5 @@ def test_eval_fails_only_the_rows_of_a_set_with_a_broken_picture(tmp_path, capsy
 )
 def test_eval_refuses_a_wrong_request_in_one_sentence(tmp_path, monkeypatch, capsys, argv, said):
     monkeypatch.chdir(tmp_path)
-    meadow = str(make_set(tmp_path / "meadow"))
-    assert run(*[meadow if word == "SET" else word for word in argv]) == 2
-    assert said in capsys.readouterr().err.splitlines()[-1]
+    meadow = make_set(tmp_path / "meadow")
+    assert said in refused(capsys, "eval", *[meadow if word == "SET" else word for word in argv])

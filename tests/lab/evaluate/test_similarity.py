@@ -1,14 +1,12 @@
 """Stored similarities are measured without any image, and come out as published."""
 
 import csv
-import json
 import os
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-from edgevpr.cli.main import main
+from commands import refused, run_json
 
 _DATA = Path(os.environ.get("EDGEVPR_DATA") or Path(__file__).parents[4] / "shared" / "data")
 _PUBLISHED = _DATA / "vprbench_precomputed"
@@ -30,8 +28,7 @@ def test_measure_gives_the_published_figures_of_eight_matrices(capsys):
         published = {row.pop("technique"): row for row in csv.DictReader(handle)}
     files = [str(_PUBLISHED / f"corridor_{name}.npy") for name in published]
     truth = str(_DATA / "corridor" / "ground_truth.csv")
-    assert main(["eval", "--similarity", *files, "--ground-truth", truth, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["similarities"]
+    found = run_json(capsys, "eval", "--similarity", *files, "--ground-truth", truth)["similarities"]
     ours = {"auc_eq_2_3": "auc_2_3", "auc_scikit_learn": "auc_from_zero"}
     assert len(found) == 8
     for name, row in published.items():
@@ -59,17 +56,13 @@ def test_measure_refuses_what_does_not_fit_in_one_sentence(tmp_path, truth, caps
         path.write_bytes(content)
     else:
         np.save(path, content, allow_pickle=True)
-    assert main(["eval", "--similarity", str(path), "--ground-truth", str(truth)]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
+    assert said in refused(capsys, "eval", "--similarity", path, "--ground-truth", truth)
 
 
 def test_measure_counts_queries_off_the_map_and_takes_the_first_of_equal_scores(tmp_path, truth, capsys):
     truth.write_text("query_file,ref_files,ref_files_loose\nq1,r1,\nq2,r2,\nq3,,\nq4,,r1 r2\n")
     np.save(tmp_path / "a.npy", [[0.9, 0.1], [0.5, 0.5], [0.7, 0.2], [0.1, 0.8]])
-    assert main(["eval", "--similarity", str(tmp_path / "a.npy"), "--ground-truth", str(truth), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["similarities"]["a"]
+    found = run_json(capsys, "eval", "--similarity", tmp_path / "a.npy", "--ground-truth", truth)["similarities"]["a"]
     assert (found["queries"], found["queries_off_map"], found["recall_at_1"]) == (4, 2, 0.25)
     assert (found["auc_from_zero"], found["roc_auc"]) == (1, 1), "q1 is right and scores best, q4 finds nothing"
     assert (found["with_match"]["queries"], found["with_match"]["recall_at_1"]) == (2, 0.5)
@@ -84,9 +77,7 @@ def test_measure_takes_all_images_of_the_folders(tmp_path, truth, capsys):
     truth.write_text(rows)
     np.save(tmp_path / "a.npy", np.eye(4))
     flags = ["--query", str(tmp_path / "query"), "--ref", str(tmp_path / "ref"), "--ground-truth", str(truth)]
-    assert main(["eval", "--similarity", str(tmp_path / "a.npy"), *flags, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["similarities"]["a"]
+    found = run_json(capsys, "eval", "--similarity", tmp_path / "a.npy", *flags)["similarities"]["a"]
     assert (found["queries"], found["references"], found["recall_at_1"], found["unscored"]) == (2, 4, 1.0, 2)
     truth.write_text(rows + "q9.png,r1.png\n")
-    assert main(["eval", "--similarity", str(tmp_path / "a.npy"), *flags]) == 2
-    assert "`q9.png`, which is not in --query" in capsys.readouterr().err
+    assert "`q9.png`, which is not in --query" in refused(capsys, "eval", "--similarity", tmp_path / "a.npy", *flags)

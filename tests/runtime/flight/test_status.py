@@ -1,9 +1,9 @@
 """The status file: whole at every moment, for its user and group, and nobody else."""
 
-import json
 import os
 
 import pytest
+from commands import refused, run_json
 from fakes import FakeSource
 from flights import pictures
 
@@ -59,12 +59,10 @@ def test_what_is_no_status_is_refused_by_name(path, text):
 
 
 def test_top_shows_the_status_of_a_flight_and_none_of_one_that_is_gone(make_flight, clock, path, capsys):
-    assert main(["top", "--file", str(path), "--once"]) == 1
-    assert "--file" in capsys.readouterr().err
+    assert "--file" in refused(capsys, "top", "--file", path, "--once", code=1)
     with StatusFile(path) as told:
         make_flight().fly(FakeSource([*pictures(2), *pictures(1, first=100)], clock), status=told)
-        assert main(["top", "--file", str(path), "--json"]) == 0
-        assert json.loads(capsys.readouterr().out) == read_status(path)[0]
+        assert run_json(capsys, "top", "--file", path) == read_status(path)[0]
         assert main(["top", "--file", str(path), "--once"]) == 0
         os.utime(path, (0, 0))
         assert main(["top", "--file", str(path), "--once"]) == 1

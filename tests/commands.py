@@ -1,0 +1,29 @@
+"""The commands, run in this process."""
+
+import json
+
+from edgevpr.cli.main import main
+
+
+def run(*argv) -> int:
+    """Run a command, whose words need not be text."""
+    return main([str(word) for word in argv])
+
+
+def run_json(capsys, *argv):
+    """Return what a command prints for programs."""
+    capsys.readouterr()
+    assert run(*argv, "--json") == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def refused(capsys, *argv, code=2) -> str:
+    """Return the one sentence with which a command fails."""
+    capsys.readouterr()
+    assert run(*argv) == code
+    said = capsys.readouterr().err
+    sentence = said.splitlines()[-1]
+    assert sentence.startswith("edgevpr: ")
+    assert said.count(sentence) == 1
+    assert "Traceback" not in said
+    return sentence
