@@ -24,17 +24,14 @@ def find_shipped(kind: str) -> Path:
     return in_wheel if in_wheel.is_dir() else package.parent / kind
 
 
-def find_own_models() -> Path:
-    """Return the folder of the user's own models, which may not exist: the environment variable EDGEVPR_MODELS, else
-    edgevpr/models in XDG_DATA_HOME or ~/.local/share."""
+def list_model_folders() -> tuple[Path, ...]:
+    """Return the folders that are searched for a model, in this order: the user's own, which may not exist (the
+    environment variable EDGEVPR_MODELS, else edgevpr/models in XDG_DATA_HOME or ~/.local/share), and the shipped one.
+    """
     # Without a home folder (a service may have none) "~" is not expanded, and no such folder is found.
     data = os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")
-    return Path(os.environ.get("EDGEVPR_MODELS") or os.path.join(data, "edgevpr", "models"))
-
-
-def list_model_folders() -> tuple[Path, ...]:
-    """Return the folders that are searched for a model, in this order: the user's own, the shipped one."""
-    return find_own_models(), find_shipped("models")
+    own = os.environ.get("EDGEVPR_MODELS") or os.path.join(data, "edgevpr", "models")
+    return Path(own), find_shipped("models")
 
 
 def find_model(file: str) -> Path | None:

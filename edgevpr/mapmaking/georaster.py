@@ -44,13 +44,13 @@ Pixel = tuple[int, int]  # column and row
 
 class GeoRaster:
     """An open georeferenced picture. `crs` is its coordinate system. `transform` converts column and row (whole numbers
-    at the corners of pixels) to coordinates of `crs`. `width` and `height` are in pixels. `name` names it in messages,
-    and `short_name` the pictures cut from it."""
+    at the corners of pixels) to coordinates of `crs`. `width` and `height` are in pixels. `name` names it in messages.
+    """
 
-    def __init__(self, source: str | Path, name: str, short_name: str) -> None:
+    def __init__(self, source: str | Path, name: str) -> None:
         """Open what GDAL opens by the text `source`. Raises SourceError for what is no picture or has no
         georeference."""
-        self.name, self.short_name = name, short_name
+        self.name = name
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)

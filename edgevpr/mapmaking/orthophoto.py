@@ -44,8 +44,8 @@ class Orthophoto:
         if not path.exists():
             raise SourceError(f"There is no orthophoto {source}: check the name.")
         raster = describe_folder(path, Path(self._links.name)) if path.is_dir() else path
-        self._raster = GeoRaster(raster, str(path), path.name)
-        self.name, self.short_name = self._raster.name, self._raster.short_name
+        self.name, self.short_name = str(path), path.name
+        self._raster = GeoRaster(raster, self.name)
         is_mercator = self._raster.crs == CRS.from_epsg(3857)
         self._wrap = 360 if self._raster.crs.is_geographic else 2 * HALF_WORLD_M if is_mercator else 0
         try:

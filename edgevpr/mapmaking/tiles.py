@@ -2,7 +2,7 @@
 joins them."""
 
 from pathlib import Path
-from typing import NamedTuple, TypeGuard
+from typing import TypeGuard
 from xml.sax.saxutils import escape
 
 import cv2
@@ -16,16 +16,6 @@ _TILE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 _TMS_RESOURCE = "tilemapresource.xml"  # by OSGeo's Tile Map Service, whose y counts from the south
 _MAX_JOINS = 50
 _MAX_DIFFERENCE_RATIO = 0.5  # ratio of the differences along two edges; of tiles that do not join it is near 1
-
-
-class _Window(NamedTuple):
-    """Tiles of one zoom: the least x and y, and the greatest plus 1."""
-
-    zoom: int
-    left: int
-    top: int
-    right: int
-    bottom: int
 
 
 def describe_folder(folder: Path, links: Path) -> str:
@@ -52,7 +42,22 @@ def describe_folder(folder: Path, links: Path) -> str:
         (links / str(x)).mkdir(exist_ok=True)
         (links / str(x) / str(y)).symlink_to(path.absolute())
     (_, left, top), (_, right, bottom) = (edge(list(tiles), axis=0).tolist() for edge in (np.min, np.max))
-    return _format_gdal_xml(links, _Window(zoom, left, top, right + 1, bottom + 1), len(first))
+    across, down, side_px, tile_m = right + 1 - left, bottom + 1 - top, len(first), 2 * HALF_WORLD_M / 2**zoom
+    # A tile that is not there is transparent, and coarser zooms are not asked for.
+    return f"""<GDAL_WMS>
+<Service name="TMS"><ServerUrl>file://{escape(str(links))}/${{x}}/${{y}}</ServerUrl></Service>
+<DataWindow>
+<UpperLeftX>{left * tile_m - HALF_WORLD_M!r}</UpperLeftX>
+<UpperLeftY>{HALF_WORLD_M - top * tile_m!r}</UpperLeftY>
+<LowerRightX>{(left + across) * tile_m - HALF_WORLD_M!r}</LowerRightX>
+<LowerRightY>{HALF_WORLD_M - (top + down) * tile_m!r}</LowerRightY>
+<TileLevel>{zoom}</TileLevel><TileX>{left}</TileX><TileY>{top}</TileY><YOrigin>top</YOrigin>
+<SizeX>{across * side_px}</SizeX><SizeY>{down * side_px}</SizeY>
+</DataWindow>
+<Projection>EPSG:3857</Projection><BandsCount>4</BandsCount><OverviewCount>0</OverviewCount>
+<BlockSizeX>{side_px}</BlockSizeX><BlockSizeY>{side_px}</BlockSizeY>
+<ZeroBlockHttpCodes>404</ZeroBlockHttpCodes>
+</GDAL_WMS>"""
 
 
 def _require_joining_rows(folder: Path, tiles: dict[tuple[int, ...], Path]) -> None:
@@ -77,23 +82,3 @@ def _require_joining_rows(folder: Path, tiles: dict[tuple[int, ...], Path]) -> N
 
 def _is_square(tile: object) -> TypeGuard[Image]:
     return isinstance(tile, np.ndarray) and tile.shape[0] == tile.shape[1] and not tile.shape[0] & tile.shape[0] - 1
-
-
-def _format_gdal_xml(folder: Path, window: _Window, side_px: int) -> str:
-    """Return the XML by which GDAL opens the tiles of a window, files x/y in a folder. A tile that is not there is
-    transparent, and coarser zooms are not asked for."""
-    tile_m = 2 * HALF_WORLD_M / 2**window.zoom
-    return f"""<GDAL_WMS>
-<Service name="TMS"><ServerUrl>file://{escape(str(folder))}/${{x}}/${{y}}</ServerUrl></Service>
-<DataWindow>
-<UpperLeftX>{window.left * tile_m - HALF_WORLD_M!r}</UpperLeftX>
-<UpperLeftY>{HALF_WORLD_M - window.top * tile_m!r}</UpperLeftY>
-<LowerRightX>{window.right * tile_m - HALF_WORLD_M!r}</LowerRightX>
-<LowerRightY>{HALF_WORLD_M - window.bottom * tile_m!r}</LowerRightY>
-<TileLevel>{window.zoom}</TileLevel><TileX>{window.left}</TileX><TileY>{window.top}</TileY><YOrigin>top</YOrigin>
-<SizeX>{(window.right - window.left) * side_px}</SizeX><SizeY>{(window.bottom - window.top) * side_px}</SizeY>
-</DataWindow>
-<Projection>EPSG:3857</Projection><BandsCount>4</BandsCount><OverviewCount>0</OverviewCount>
-<BlockSizeX>{side_px}</BlockSizeX><BlockSizeY>{side_px}</BlockSizeY>
-<ZeroBlockHttpCodes>404</ZeroBlockHttpCodes>
-</GDAL_WMS>"""

@@ -53,13 +53,7 @@ class Album:
 
     def __bool__(self) -> bool:
         """Return True if there is anywhere to look for pictures."""
-        return bool(self._finders or self._kept)
-
-    def cache_copy(self, name: str, image: Image) -> None:
-        """Keep a small copy of the picture `name`, uint8 (H, W[, 3]): no file has to be read for it any more."""
-        from edgevpr.frames.images import encode_small_jpeg
-
-        self._kept[name] = encode_small_jpeg(image, _SIDES_PX[0])
+        return bool(self._finders)
 
     def find_image(self, name: str) -> Image | None:
         """Return the picture `name`, uint8 (H, W[, 3]); None if there is none that can be read."""
@@ -75,7 +69,10 @@ class Album:
         picture = self._find(place.source_image)
         if picture is None:
             return None
-        self.cache_copy(place.source_image, picture.image)  # photographs are slow to decode
+        from edgevpr.frames.images import encode_small_jpeg
+
+        # Photographs are slow to decode: a small copy is kept, and no file is read for it any more.
+        self._kept[place.source_image] = encode_small_jpeg(picture.image, _SIDES_PX[0])
         tag = picture.tag() if lens and picture.tag else None
         if lens is None or tag is None:
             return picture
@@ -111,10 +108,6 @@ def _read_picture(path: Path, tag: Callable[[], GeoTag | None] | None = None) ->
         if path.is_file():
             return AlbumPicture(read_image(path), tag=tag)
     return None
-
-
-def _find_recorded(recorded: Mapping[str, Path], name: str) -> AlbumPicture | None:
-    return _read_picture(recorded[name]) if name in recorded else None
 
 
 def _find_in_folder(folder: Path, name: str) -> AlbumPicture | None:
@@ -182,7 +175,9 @@ def _open_orthophoto(source: str | Path, places: Sequence[Place]) -> Finder:
 def make_album(sources: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({})) -> Album:
     """Return the album of the pictures in `sources`: folders, or one video; and first those of a recording, `recorded`,
     by the names of its frames. Raises EdgevprError for a source that cannot be used."""
-    finders: list[Finder] = [partial(_find_recorded, recorded)] if recorded else []
+    finders: list[Finder] = []
+    if recorded:
+        finders.append(lambda name: _read_picture(recorded[name]) if name in recorded else None)
     if len(sources) == 1 and Path(sources[0]).is_file():
         return Album(*finders, _VideoFinder(Path(sources[0])))
     for folder in map(Path, sources):

@@ -16,7 +16,7 @@ from training_pictures import read_pictures
 
 from edgevpr.core.arrays import Image, Ints, Singles
 from edgevpr.core.errors import EdgevprError, UsageError
-from edgevpr.core.files import find_own_models
+from edgevpr.core.files import list_model_folders
 from edgevpr.core.text import progress
 from edgevpr.frames.images import list_images
 from edgevpr.techniques.regions import describe_regions, find_regions
@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--model", default="calc", metavar="NAME", help="the card of the backbone (calc)")
     parser.add_argument("--kind", required=True, choices=("vlad", *REGIONS), help="what the words are of")
     parser.add_argument("--count", type=int, required=True, metavar="N", help="the number of words")
-    parser.add_argument("--out", type=Path, default=find_own_models(), metavar="DIR", help="(your models folder)")
+    parser.add_argument("--out", type=Path, default=list_model_folders()[0], metavar="DIR", help="(your models folder)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="(1)")
     args = parser.parse_args(argv)
     backbone, rng = open_backbone(args.model, "features"), np.random.default_rng(args.seed)

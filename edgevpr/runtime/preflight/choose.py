@@ -129,7 +129,8 @@ def find_accuracy(label: str, camera: str | None, candidates: int | None = None)
     `camera`: "nadir" (looks down) or "forward" (None: forward). `candidates`: number of places compared with a query,
     if fewer than the technique's default (None: the default).
     """
-    figures = _read_accuracies()[camera or "forward"].get(_format_label(label, candidates))
+    name = label if candidates is None else f"{label}, {candidates} candidates"
+    figures = _read_accuracies()[camera or "forward"].get(name)
     return Accuracy(**figures) if figures else None
 
 
@@ -220,10 +221,6 @@ def describe_option(board: Board, option: Option, demand: Demand) -> str:
 
 def _get_recall(option: Option) -> float:
     return option.accuracy.recall_at_1 if option.accuracy else 0.0
-
-
-def _format_label(label: str, candidates: int | None) -> str:
-    return label if candidates is None else f"{label}, {candidates} candidates"
 
 
 @cache
