@@ -26,10 +26,10 @@ EXAMPLES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "map check": (("before a flight", "valley.gpkg"),),
     "map repair": (("after `map check` has named damage", "valley.gpkg"),),
     "map merge": (("two flights as one map", "all.gpkg monday.gpkg tuesday.gpkg"),),
-    "map shrink": (("the 500 best places, spread over the map", "valley.gpkg small.gpkg --places 500"),),
     "map subset": (
         ("the part of a folder of maps that a mission needs", "valley/ --mission plan.waypoints --out flight.gpkg"),
         ("the same in at most 50 MB", "valley/ --mission plan.plan --margin-m 300 --mb 50 --out flight.gpkg"),
+        ("the best places of a map in 5 MB", "valley.gpkg --mission 47.39,8.54,9000 --mb 5 --out small.gpkg"),
     ),
     "salience": (("how memorable an image is", "photos/0042.jpg"),),
     "match": (

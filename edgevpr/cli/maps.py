@@ -1,4 +1,4 @@
-"""`edgevpr map`: make, correct, move, calibrate, look into, check, repair, merge and shrink place maps; and `edgevpr
+"""`edgevpr map`: make, correct, move, calibrate, look into, check, repair and merge place maps; and `edgevpr
 salience`: print how memorable, static and full of information a picture is."""
 
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
@@ -19,7 +19,6 @@ from edgevpr.cli.shared import (
     check_output,
     describe_lost_calibration,
     make_config,
-    parse_count,
     parse_parameters,
     parse_positive,
     print_result,
@@ -41,7 +40,7 @@ _RECORDING_FLAGS = ("positions", "rate_hz")
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    maps = add_group(commands, "map", "build, inspect, check, repair, merge and shrink maps")
+    maps = add_group(commands, "map", "build, inspect, check, repair, merge and cut maps")
 
     def add_to_map(name: str, run: Callable[[Namespace], int], text: str, more: str | None = None) -> ArgumentParser:
         parser = add_command(maps, name, run, text)
@@ -73,10 +72,6 @@ def add(commands: Any) -> None:
     merge.add_argument("out", metavar="OUT", help="map to write")
     merge.add_argument("maps", metavar="MAP", nargs="+")
     add_json(merge)
-    shrink = add_to_map("shrink", run_map_shrink, "reduce a map to its best places, spread over its area")
-    shrink.add_argument("out", metavar="OUT", help="map to write")
-    shrink.add_argument("--places", type=parse_count, metavar="N", required=True, help="number of places to keep")
-    add_json(shrink)
     subset.add(add_to_map)
     salience = add_command(commands, "salience", run_salience, "print how memorable each image is")
     salience.add_argument("image", metavar="IMAGE")
@@ -307,16 +302,6 @@ def run_map_merge(args: Namespace) -> int:
     text.append(f"{args.out}: {merged['places']} places")
     text += describe_lost_calibration(args.out, were_calibrated)
     print_result({**merged, "lost_calibration": were_calibrated}, args.json, text)
-    return 0
-
-
-def run_map_shrink(args: Namespace) -> int:
-    """Run `map shrink`: make a smaller map of the most useful places of a map."""
-    from edgevpr.places.examine import shrink_map
-    from edgevpr.places.mapfiles import parse_map_path
-
-    kept, places = shrink_map(args.map, parse_map_path(args.out), args.places, progress)
-    print_result({"map": args.out, "kept": kept, "of": places}, args.json, f"{args.out}: {kept} of {places} places")
     return 0
 
 

@@ -10,6 +10,7 @@ from pictures import textured, write_flight
 
 from edgevpr.cli.main import main
 from edgevpr.mapmaking import calibrate
+from edgevpr.places.examine import shrink_map
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.calibration import read_calibration
 
@@ -94,9 +95,9 @@ def test_map_calibrate_refuses_other_pictures(bare, flight, capsys, flags, code,
 
 
 @pytest.mark.slow
-def test_map_shrink_keeps_the_calibration_and_map_merge_drops_it(bare, bare_map, flight, tmp_path, capsys):
+def test_shrink_map_keeps_the_calibration_and_map_merge_drops_it(bare, bare_map, flight, tmp_path, capsys):
     assert main(["map", "calibrate", str(bare), "--images", str(flight / "ref")]) == 0
-    assert main(["map", "shrink", str(bare), str(tmp_path / "small.gpkg"), "--places", "4"]) == 0
+    shrink_map(bare, tmp_path / "small.gpkg", 4)
     assert calibration_in(tmp_path / "small.gpkg") == calibration_in(bare)
     capsys.readouterr()
     merged = tmp_path / "merged.gpkg"

@@ -26,8 +26,8 @@ def test_schema_defines_every_command_and_no_other():
 
 
 def test_require_documented_refuses_other_fields():
-    whole = {"map": "m.gpkg", "kept": 3, "of": 5}
-    require_documented("edgevpr map shrink", json.dumps(whole))
-    for other in (whole | {"kept": "3"}, whole | {"more": 1}, {"map": "m.gpkg", "kept": 3}):
+    whole = {"path": "m.gpkg", "kept": 3, "dropped": 0, "original": None}
+    require_documented("edgevpr map repair", json.dumps(whole))
+    for other in (whole | {"kept": "3"}, whole | {"more": 1}, {"path": "m.gpkg", "kept": 3}):
         with pytest.raises(jsonschema.ValidationError):
-            require_documented("edgevpr map shrink", json.dumps(other))
+            require_documented("edgevpr map repair", json.dumps(other))

@@ -1,4 +1,4 @@
-"""`edgevpr salience`, maps that keep only what is worth remembering, and maps that shrink."""
+"""`edgevpr salience`, and maps that keep only what is worth remembering."""
 
 import json
 
