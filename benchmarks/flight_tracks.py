@@ -196,7 +196,7 @@ def reports(track: Track, site: Site, how: str, rng: np.random.Generator) -> lis
             lon_deg=lon_deg,
             alt_m=100.0,
             heading_deg=float(heading[number] % 360),
-            t_heard_s=t_s - 0.05,
+            t_received_s=t_s - 0.05,
             has_gps=False,
             velocity_m_s=velocity,
         )

@@ -261,8 +261,8 @@ def receiver_at(at_deg: tuple[float, float], sd_m: float, t_s: float, **other) -
     return Receiver(lat_deg=at_deg[0], lon_deg=at_deg[1], sd_m=sd_m, t_s=t_s, **other)
 
 
-def vehicle_at(lat_deg: float, lon_deg: float, t_heard_s: float, **other) -> Vehicle:
+def vehicle_at(lat_deg: float, lon_deg: float, t_received_s: float, **other) -> Vehicle:
     """What an autopilot says that is there."""
     known = {"alt_m": 300.0, "heading_deg": None, "has_gps": True} | other
-    known.setdefault("gps", receiver_at((lat_deg, lon_deg), 1.0, t_heard_s) if known["has_gps"] else None)
-    return Vehicle(lat_deg=lat_deg, lon_deg=lon_deg, t_heard_s=t_heard_s, **known)
+    known.setdefault("gps", receiver_at((lat_deg, lon_deg), 1.0, t_received_s) if known["has_gps"] else None)
+    return Vehicle(lat_deg=lat_deg, lon_deg=lon_deg, t_received_s=t_received_s, **known)

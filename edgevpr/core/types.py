@@ -61,10 +61,10 @@ class Vehicle:
 
     `lat_deg`, `lon_deg`, `alt_m`: its estimated position (metres above sea level), with the standard deviation
     `position_sd_m` of one axis (also None if the autopilot does not rely on it).
-    `heading_deg`: compass direction of the nose, 0..360. `t_heard_s`: when the report came, on the clock of the frames.
+    `heading_deg`: compass direction of the nose, 0..360. `t_received_s`: arrival of the report, by the frames' clock.
     `has_gps`: a GPS receiver had a 3D fix near the estimated position then. If False, the position may be wrong: an
     autopilot reports its estimate long after GPS is lost.
-    `roll_deg`, `pitch_deg`: positive with the right wing down, and with the nose up; both change by `tilting_deg_s`.
+    `roll_deg`, `pitch_deg`: positive with the right wing down, and with the nose up; `tilt_rate_deg_s`: rate of both.
     `height_m`: above the ground; its sources disagree by `height_doubt_m`. `velocity_m_s`: over the ground (east,
     north). `sink_m_s`: downwards. `innovation_ratio`: of measured positions to the filter's gate; above 1 it refuses
     them. `gps`: newest position of a receiver, near the estimate or not (None: none is recent).
@@ -74,11 +74,11 @@ class Vehicle:
     lon_deg: float
     alt_m: float
     heading_deg: float | None
-    t_heard_s: float
+    t_received_s: float
     has_gps: bool
     roll_deg: float | None = None
     pitch_deg: float | None = None
-    tilting_deg_s: float = 0.0
+    tilt_rate_deg_s: float = 0.0
     height_m: float | None = None
     height_doubt_m: float = 0.0
     velocity_m_s: tuple[float, float] | None = None
@@ -90,7 +90,7 @@ class Vehicle:
 
     def is_fresh(self, t_mono_s: float) -> bool:
         """Return True if the report came within one second of `t_mono_s`, such as the time of a frame."""
-        return abs(t_mono_s - self.t_heard_s) <= _MAX_REPORT_AGE_S
+        return abs(t_mono_s - self.t_received_s) <= _MAX_REPORT_AGE_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -291,7 +291,7 @@ class Conversation:
         if self.channel is Channel.VISION and self.autopilot.origin is None:
             self.send(messages.make_message_request(system_id, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
         vehicle, is_continuous = self.autopilot.vehicle, self.channel.is_continuous
-        is_silent = vehicle is None or now_s - vehicle.t_heard_s > REQUEST_INTERVAL_S
+        is_silent = vehicle is None or now_s - vehicle.t_received_s > REQUEST_INTERVAL_S
         is_slowed = self.autopilot.attitudes.rate_hz(now_s) < messages.attitude_hz(is_continuous) / 2
         is_slowed |= is_continuous and now_s - self.autopilot.imu_s > REQUEST_INTERVAL_S
         if is_silent or is_slowed or self._has_requested_continuous != is_continuous:

@@ -112,7 +112,7 @@ class Listener:
     def handle_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Process the specific force at `t_s` (m/s^2 along nose, right and down), and the attitude then."""
 
-    def believes_gps(self) -> bool:
+    def trusts_gps(self) -> bool:
         """Return False while matches prove the GPS receiver wrong."""
         return True
 
@@ -194,15 +194,15 @@ class Autopilot:
         """Return the last report, moved to `t_mono_s`: see `Conversation.predict_vehicle`."""
         vehicle, attitude = self.vehicle, self.attitudes.at(t_mono_s)
         if vehicle and vehicle.velocity_m_s and vehicle.is_fresh(t_mono_s):
-            east_m, north_m = ((t_mono_s - vehicle.t_heard_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
+            east_m, north_m = ((t_mono_s - vehicle.t_received_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
             lat_deg, lon_deg = offset_position(vehicle.lat_deg, vehicle.lon_deg, east_m, north_m)
             vehicle = replace(vehicle, lat_deg=lat_deg, lon_deg=lon_deg)
         if vehicle is None or attitude is None:
             return vehicle
-        _, roll_deg, pitch_deg, yaw_deg, tilting_deg_s = attitude
+        _, roll_deg, pitch_deg, yaw_deg, tilt_rate_deg_s = attitude
         heading_deg = None if vehicle.heading_deg is None else yaw_deg % 360
         return replace(
-            vehicle, roll_deg=roll_deg, pitch_deg=pitch_deg, tilting_deg_s=tilting_deg_s, heading_deg=heading_deg
+            vehicle, roll_deg=roll_deg, pitch_deg=pitch_deg, tilt_rate_deg_s=tilt_rate_deg_s, heading_deg=heading_deg
         )
 
     def handle(self, message: Message, now_s: float, address: Sender | None = None) -> bool:
@@ -255,7 +255,7 @@ class Autopilot:
                 self._flags, self._flags_s = message.flags, now_s
                 self.accuracy.handle(message, now_s)
                 if name == "ESTIMATOR_STATUS":
-                    self.px4.handle(message, now_s, self._receiver(now_s), self._listener.believes_gps())
+                    self.px4.handle(message, now_s, self._receiver(now_s), self._listener.trusts_gps())
             case "GLOBAL_POSITION_INT":
                 self._handle_position(message, now_s)
             case "ATTITUDE":
@@ -293,7 +293,7 @@ class Autopilot:
             heading_deg=message.hdg / 100 if message.hdg <= 36_000 else None,  # 65535: unknown
             sink_m_s=message.vz / 100,
             velocity_m_s=(east_m_s, north_m_s) if math.hypot(east_m_s, north_m_s) <= MAX_SPEED_M_S else None,
-            t_heard_s=now_s,
+            t_received_s=now_s,
             has_gps=has_gps,
             gps=gps,
             height_m=self.heights.now(now_s),

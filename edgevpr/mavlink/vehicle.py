@@ -24,13 +24,13 @@ _HAS_POSITION = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_POS_HORIZ_REL
 
 class Attitude(NamedTuple):
     """Roll (right wing down is positive), pitch (nose up) and yaw (clockwise from north) in degrees at time `t_s`, and
-    how fast roll and pitch change together (`tilting_deg_s`)."""
+    how fast roll and pitch change together (`tilt_rate_deg_s`)."""
 
     t_s: float
     roll_deg: float
     pitch_deg: float
     yaw_deg: float
-    tilting_deg_s: float = 0.0
+    tilt_rate_deg_s: float = 0.0
 
 
 class Attitudes:

@@ -136,7 +136,7 @@ def _read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
     t_frame_s = get_number(line, "t_frame_s")
     accepted = line.get("accepted") is True
     gps_position = _locate_gps(line, t_frame_s)
-    has_link = _is_fresh(get_number(line, "vehicle", "t_heard_s"), t_frame_s)
+    has_link = _is_fresh(get_number(line, "vehicle", "t_received_s"), t_frame_s)
     autopilot_position = get_point(line, "vehicle") if has_link else None
     # The confidence by which a match was judged: its own, or that of the flight so far where it is higher.
     confidences = get_number(line, "confidence"), get_number(line, "followed", "confidence")

@@ -36,7 +36,7 @@ def read_flight(path: Path) -> Record:
 def _read_tag(vehicle: dict[str, Any], t_frame_s: float) -> GeoTag | None:
     t_fix_s = vehicle["t_fix_s"]
     is_echo = t_fix_s is not None and t_frame_s - t_fix_s < _FIX_ECHO_S
-    if not vehicle["has_gps"] or is_echo or abs(t_frame_s - vehicle["t_heard_s"]) > _MAX_REPORT_AGE_S:
+    if not vehicle["has_gps"] or is_echo or abs(t_frame_s - vehicle["t_received_s"]) > _MAX_REPORT_AGE_S:
         return None
     attitude = vehicle["heading_deg"], vehicle["roll_deg"], vehicle["pitch_deg"]
     return make_tag(vehicle["lat_deg"], vehicle["lon_deg"], vehicle["alt_m"], attitude, vehicle["height_m"])

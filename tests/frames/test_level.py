@@ -184,7 +184,7 @@ def test_levelled_keeps_the_middle_of_a_steep_picture_in_place_of_what_is_below(
 def test_levelled_takes_from_the_vehicle_what_the_frame_does_not_know(ground):
     pose = {"heading_deg": 50, "roll_deg": 12, "pitch_deg": 8, "height_m": 120}
     known = taken(ground, **pose)
-    vehicle = Vehicle(lat_deg=50.0, lon_deg=8.0, alt_m=300.0, t_heard_s=0.0, has_gps=True, **pose)
+    vehicle = Vehicle(lat_deg=50.0, lon_deg=8.0, alt_m=300.0, t_received_s=0.0, has_gps=True, **pose)
     wrong = replace(vehicle, heading_deg=0.0, roll_deg=0.0, pitch_deg=0.0, height_m=50.0)
     by_frame = level_image(known, wrong, LENS, FOOTPRINT_M)
     by_vehicle = level_image(make_frame(known.image), vehicle, LENS, FOOTPRINT_M)

@@ -27,7 +27,7 @@ def test_its_position_is_known_while_it_is_fresh(autopilot):
         lon_deg=-14.5,
         alt_m=312.5,
         heading_deg=90.5,
-        t_heard_s=autopilot.clock.now_s,
+        t_received_s=autopilot.clock.now_s,
         has_gps=False,
         height_m=80.0,
         velocity_m_s=(12.5, -3.0),
@@ -39,7 +39,7 @@ def test_its_position_is_known_while_it_is_fresh(autopilot):
 
 
 def test_at_the_time_of_a_frame_it_is_where_its_velocity_takes_it(autopilot):
-    now_s = autopilot.position(vx=2000, vy=-1000).t_heard_s
+    now_s = autopilot.position(vx=2000, vy=-1000).t_received_s
     for seconds in (-0.4, 0.25):
         there = autopilot.at(now_s + seconds)
         off_m = offset_m(50.0, 8.0, there.lat_deg, there.lon_deg)

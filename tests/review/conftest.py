@@ -39,12 +39,12 @@ def flown(tmp_path_factory):
     assert main([*map(str, build), "--technique", "cohog", "--param", "w1=208", "--no-calibrate"]) == 0
 
     clock = FakeClock()
-    aircraft = Vehicle(lat_deg=50.0, lon_deg=8.0, alt_m=100.0, heading_deg=0.0, t_heard_s=0.0, has_gps=False)
+    aircraft = Vehicle(lat_deg=50.0, lon_deg=8.0, alt_m=100.0, heading_deg=0.0, t_received_s=0.0, has_gps=False)
 
     def vehicle() -> Vehicle:
         lat_deg = 50 + STEP_DEG * (clock() - 1000)
         receiver = receiver_at((lat_deg, 8.00126), 1.0, clock())
-        return replace(aircraft, lat_deg=lat_deg, t_heard_s=clock(), gps=receiver)
+        return replace(aircraft, lat_deg=lat_deg, t_received_s=clock(), gps=receiver)
 
     link = FakeLink(clock, vehicle=vehicle)
     flight = Flight(folder / "map.gpkg", folder / "flight.jsonl", clock, link, **{"source.rate_hz": 1.0})

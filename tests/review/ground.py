@@ -71,7 +71,7 @@ def flown_over(places: list[Place], count: int) -> list[tuple[str, dict]]:
             "located": None if refused else at,
             "accepted": not refused,
             "reason": LOW_REASON if is_low else UNSURE,
-            "vehicle": {**at, "t_heard_s": t_s, "gps": {"lat_deg": at["lat_deg"] + 3e-5, "lon_deg": 8.0, "t_s": t_s}},
+            "vehicle": {**at, "t_received_s": t_s, "gps": at | {"lat_deg": at["lat_deg"] + 3e-5, "t_s": t_s}},
             "t_frame_s": t_s,
         }
         lines.append(("query", query(place.source_image if number < 8 else f"q{number}", **found, t_mono_s=t_s)))

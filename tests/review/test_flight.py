@@ -54,7 +54,7 @@ def test_values_of_a_wrong_type_are_unknown(tmp_path):
         "costs": 3,
         "totals": {"used_mah": 10**400},
         "board": None,
-        "vehicle": {"lat_deg": True, "lon_deg": 8.0, "t_heard_s": None, "gps": "none"},
+        "vehicle": {"lat_deg": True, "lon_deg": 8.0, "t_received_s": None, "gps": "none"},
         "reason": 7,
         "place": 1e300,
         "fix": "sent",

@@ -186,18 +186,18 @@ class AutopilotOutput:
         used, and no position is sent."""
         with self._link.turn("gps"):
             self._link.send(*messages.make_named_values(self._clock.mono_s(), vpr_gps_m=float(off_m)))
-            self._navigator.believe_gps(not is_wrong or not have_agreed)
-            self._navigator.doubt_map(is_wrong and not have_agreed)
+            self._navigator.trust_gps(not is_wrong or not have_agreed)
+            self._navigator.distrust_map(is_wrong and not have_agreed)
 
     def correct_height(self, ratio: float, ratio_sd: float) -> None:
         """Set the height above ground by the pictures over that by the autopilot (1.0: they agree), and its error."""
         with self._link.turn("height"):
             self._navigator.correct_height(ratio, ratio_sd)
 
-    def begin_anew(self) -> None:
+    def reset_navigation(self) -> None:
         """Begin to navigate anew, since fixes err otherwise from now on."""
         with self._link.turn("anew"):
-            self._navigator.begin_anew()
+            self._navigator.reset_navigation()
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
         """Send health, load and temperature (None: unknown) of this computer, and ask for another source set if that is

@@ -1,4 +1,4 @@
-"""The check of each fix against where the path says that the aircraft is. `navigator` uses it."""
+"""The innovation gate: checks each fix against its prediction by the path. `navigator` uses it."""
 
 import math
 from dataclasses import dataclass
@@ -20,35 +20,35 @@ _CONFIRMATION_TIMEOUT_S = 2.5
 _DRIFT_M_S = 2.5  # of the path, that is allowed between two fixes that agree
 _TRACKED_DRIFT_M_S = 0.5  # the same, where visual odometry has tracked the path
 _FIXES_TO_OVERRULE_TRACK = 4
-_MAX_ROW_INTERVAL_S = 10.0
+_MAX_ROUTE_INTERVAL_S = 10.0
 _MAX_SPEED_M_S = 30.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedFix:
-    """The fix of a match (`seen`) and its prediction by the path, in metres east and north. `path_m` (2,): the point of
-    the path when the frame was taken; `off_m` (2,): the offset of the fix from that point; `expected_m` (2,): the
-    predicted offset; `covariance_m2` (2, 2): that of the prediction, without that of the fix."""
+    """The fix of a `match` and its prediction by the path, in metres east and north. `path_point_m` (2,): the point of
+    the path when the frame was taken; `offset_m` (2,): the offset of the fix from that point; `predicted_m`
+    (2,): its prediction; `covariance_m2` (2, 2): covariance of the prediction, without that of the fix."""
 
-    seen: PositionedMatch
-    path_m: Doubles
-    off_m: Doubles
-    expected_m: Doubles
+    match: PositionedMatch
+    path_point_m: Doubles
+    offset_m: Doubles
+    predicted_m: Doubles
     covariance_m2: Doubles
 
     @property
     def innovation_m(self) -> Doubles:
         """Offset of the fix from its prediction (2,)."""
-        return self.off_m - self.expected_m
+        return self.offset_m - self.predicted_m
 
 
 class GateResult(NamedTuple):
-    """Verdict on a fix: `why` it is not accepted (None: it is). `is_against`: it contradicts its prediction, and other
-    fixes agree with it; `is_lost`: the velocity of the path is wrong too."""
+    """Verdict on a fix: the `reason` not to accept it (None: accepted). `overrules_path`: it contradicts its
+    prediction, but other fixes agree with it; `restarts_path`: the velocity of the path is wrong too."""
 
-    why: Reason | None = None
-    is_against: bool = False
-    is_lost: bool = False
+    reason: Reason | None = None
+    overrules_path: bool = False
+    restarts_path: bool = False
 
 
 ACCEPTED = GateResult()
@@ -58,83 +58,85 @@ class Consistency:
     """Holds a fix that contradicts its prediction until a second, independent fix agrees with it. While GPS is trusted,
     contradicting fixes are rejected.
 
-    The path drifts slowly, so only another fix can tell whether a distant fix is wrong or the path. Two right fixes
-    have the same offset from the path; two wrong ones hardly ever do. A path that is wrong by more than a drift has no
-    such fixes: then four of different places that an aircraft can have flown through are accepted. Four are needed,
-    too, where visual odometry has tracked the path, since repetitive ground can give the same wrong fix twice."""
+    The path drifts slowly, so only another fix can tell whether a distant fix or the path is wrong. Two right fixes
+    have the same offset from the path; two wrong ones hardly ever do. If the path is wrong by more than a drift, right
+    fixes do not agree either: then four fixes at different places are accepted, if an aircraft can have flown from each
+    to the next. Four are also needed where visual odometry has tracked the path, since repetitive ground can give the
+    same wrong fix twice."""
 
     def __init__(self) -> None:
         self._agreeing: list[PredictedFix] = []  # held fixes: one, and later ones that agree with it
-        self._turn_deg: float | None = None  # of the last accepted fix: the error of the compass
-        self._flyable: list[PredictedFix] = []  # held fixes of different places, in a row that can be flown
+        self._heading_error_deg: float | None = None  # of the last accepted fix: the error of the compass
+        self._flyable: list[PredictedFix] = []  # held fixes at different places, along a route that can be flown
 
     def is_contradicted(self, now_s: float, is_tracked: bool) -> bool:
         """Return True while the last fix contradicts its prediction and another may still confirm it. On a path that
         `is_tracked`, a right fix would be confirmed soon."""
         timeout_s = _CONFIRMATION_TIMEOUT_S if is_tracked else _HELD_FIX_TIMEOUT_S
-        return bool(self._agreeing) and now_s - self._agreeing[-1].seen.t_s <= timeout_s
+        return bool(self._agreeing) and now_s - self._agreeing[-1].match.t_s <= timeout_s
 
     def judge(self, fix: PredictedFix, has_gps: bool, is_tracked: bool) -> GateResult:
         """Judge a fix by its prediction. `has_gps`: the autopilot has a trusted GPS; `is_tracked`: visual odometry has
         tracked the path."""
-        innovation_m, is_turned = fix.innovation_m, not fix.seen.is_turned_like(self._turn_deg)
-        sigmas = mahalanobis(innovation_m, fix.seen.covariance_m2 + fix.covariance_m2)
-        if sigmas <= _MAX_INNOVATION_SIGMA and not is_turned:
+        match, innovation_m = fix.match, fix.innovation_m
+        heading_agrees = match.heading_agrees_with(self._heading_error_deg)
+        sigmas = mahalanobis(innovation_m, match.covariance_m2 + fix.covariance_m2)
+        if sigmas <= _MAX_INNOVATION_SIGMA and heading_agrees:
             return self._accept(fix, ACCEPTED)
-        off_m, predicted_sd_m = math.hypot(*innovation_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
-        turned = Reason(ReasonCode.HELD_TURNED, {"turn_deg": fix.seen.turn_deg or 0.0})
+        error_m, predicted_sd_m = math.hypot(*innovation_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
+        wrong_heading = Reason(ReasonCode.HELD_TURNED, {"turn_deg": match.heading_error_deg or 0.0})
         if has_gps:
             self._agreeing, self._flyable = [], []
-            return GateResult(turned if is_turned else Reason(ReasonCode.HELD_OFF_GPS, {"off_m": off_m}))
+            return GateResult(Reason(ReasonCode.HELD_OFF_GPS, {"off_m": error_m}) if heading_agrees else wrong_heading)
         self._flyable = [held for held in self._flyable if _is_flyable(held, fix)]
-        if all(fix.seen.is_of_other_places(held.seen) for held in self._flyable):  # neighbours share places
+        if all(match.shares_no_place_with(held.match) for held in self._flyable):  # neighbours share places
             self._flyable.append(fix)
         if len(self._flyable) == _FIXES_TO_OVERRULE_TRACK:
-            return self._accept(fix, GateResult(is_against=True, is_lost=True))
-        if is_turned:
-            return GateResult(turned)
+            return self._accept(fix, GateResult(overrules_path=True, restarts_path=True))
+        if not heading_agrees:
+            return GateResult(wrong_heading)
         drift_m_s = _TRACKED_DRIFT_M_S if is_tracked else _DRIFT_M_S
         if self._agreeing and _compute_distance(self._agreeing[0], fix, drift_m_s) <= _MAX_DISAGREEMENT_SIGMA:
             self._agreeing.append(fix)
             is_enough = not is_tracked or len(self._agreeing) >= _FIXES_TO_OVERRULE_TRACK
             if is_enough and _is_independent(self._agreeing[0], fix, drift_m_s):
-                return self._accept(fix, GateResult(is_against=True))
+                return self._accept(fix, GateResult(overrules_path=True))
         else:
             self._agreeing = [fix]
-        return GateResult(Reason(ReasonCode.HELD_OFF_PATH, {"off_m": off_m, "accuracy_m": predicted_sd_m}))
+        return GateResult(Reason(ReasonCode.HELD_OFF_PATH, {"off_m": error_m, "accuracy_m": predicted_sd_m}))
 
     def _accept(self, fix: PredictedFix, verdict: GateResult) -> GateResult:
         self._agreeing, self._flyable = [], []
-        if fix.seen.turn_deg is not None:
-            self._turn_deg = fix.seen.turn_deg
+        if fix.match.heading_error_deg is not None:
+            self._heading_error_deg = fix.match.heading_error_deg
         return verdict
 
 
 def _compute_distance(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> float:
     """Return by how many standard deviations the innovations of two fixes differ; infinity if they are 30 s apart."""
-    if abs(other.seen.t_s - one.seen.t_s) > _HELD_FIX_TIMEOUT_S:
+    if abs(other.match.t_s - one.match.t_s) > _HELD_FIX_TIMEOUT_S:
         return math.inf
     return mahalanobis(other.innovation_m - one.innovation_m, _sum_covariances(one, other, drift_m_s))
 
 
 def _is_flyable(one: PredictedFix, other: PredictedFix) -> bool:
     """Return True if an aircraft can have flown from one fix to the other within ten seconds."""
-    apart_s = other.seen.t_s - one.seen.t_s
-    if not 0 < apart_s <= _MAX_ROW_INTERVAL_S or not other.seen.is_turned_like(one.seen.turn_deg):
+    apart_s = other.match.t_s - one.match.t_s
+    if not 0 < apart_s <= _MAX_ROUTE_INTERVAL_S or not other.match.heading_agrees_with(one.match.heading_error_deg):
         return False
-    flown_m = float(np.hypot(*(other.path_m + other.off_m - one.path_m - one.off_m)))
+    flown_m = float(np.hypot(*(other.path_point_m + other.offset_m - one.path_point_m - one.offset_m)))
     return flown_m <= _MAX_SPEED_M_S * apart_s
 
 
 def _is_independent(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> bool:
-    """Return True if two fixes are of different places, or so far apart that one wrong position would not agree."""
-    if other.seen.is_of_other_places(one.seen):
+    """Return True if two fixes are at different places, or so far apart that one wrong position would not fit both."""
+    if other.match.shares_no_place_with(one.match):
         return True
-    flown_m = other.path_m + other.expected_m - one.path_m - one.expected_m
+    flown_m = other.path_point_m + other.predicted_m - one.path_point_m - one.predicted_m
     return mahalanobis(flown_m, _sum_covariances(one, other, drift_m_s)) > _MAX_INNOVATION_SIGMA
 
 
 def _sum_covariances(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> Doubles:
-    drift_m = drift_m_s * abs(other.seen.t_s - one.seen.t_s)
-    both: Doubles = one.seen.scatter_m2 + other.seen.scatter_m2 + drift_m**2 * np.eye(2)
-    return both
+    drift_m = drift_m_s * abs(other.match.t_s - one.match.t_s)
+    total: Doubles = one.match.scatter_m2 + other.match.scatter_m2 + drift_m**2 * np.eye(2)
+    return total

@@ -1,4 +1,4 @@
-"""The filter of a path's errors: how far the aircraft is from its path by now. `navigation` uses it."""
+"""Estimates the errors of a path, such as the offset from the path to the aircraft. `navigation` uses it."""
 
 import math
 from dataclasses import dataclass, replace
@@ -9,28 +9,28 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.runtime.recognise.locate import mahalanobis
 
 GRAVITY_M_S2 = 9.80665
-# So long an error of the attitude of an autopilot that reckons lasts. Nothing but pictures shows it, and not all do: if
-# it wandered without end, every fix would be taken for a proof of it.
+# Time constant of the attitude error of an autopilot that dead-reckons. Only pictures show this error, and not all do:
+# if its variance grew without limit, every fix would be attributed to it.
 _ATTITUDE_ERROR_TIME_S = 20.0
-# The error of the attitude wanders up to nine times as fast as that of good gyros, as in PX4's simulator: by 0.1 in
-# eight seconds after GPS was lost. Of the last twenty pictures: the mean square of the leans that they show, over their
-# variances, is 0.2 in flights of ArduPilot's simulator and 1.3 in those of PX4's.
+# With poor gyros the attitude error wanders up to nine times as fast as with good ones: in PX4's simulator by 0.1 in
+# eight seconds after GPS was lost. The gyros are judged by the mean square of the attitude errors that the last twenty
+# pictures show, over their variances: 0.2 in flights of ArduPilot's simulator, 1.3 in those of PX4's.
 _MAX_NOISE_FACTOR = 8.0
 _ATTITUDE_ERROR_GAIN = 0.05
 _CALM_ERROR = 0.3
 _ROUGH_ERROR = 0.8
-# An autopilot that begins to reckon takes a new wind for a turn: the error of its attitude wanders so many times
-# faster, for about so long. In simulation, that of an ArduPilot plane was 4.5 degrees wrong after ten seconds.
+# An autopilot that starts to dead-reckon mistakes a new wind for a turn: its attitude error wanders so many times
+# faster, for about so long. In simulation, that of an ArduPilot plane was 4.5 degrees after ten seconds.
 _GPS_LOSS_NOISE_FACTOR = 6.0
 _GPS_LOSS_TIME_S = 10.0
-_MAX_INNOVATION_SIGMA = 4.0  # standard deviations: a stride that differs by more is not believed
+_MAX_INNOVATION_SIGMA = 4.0  # odometry that differs by more is not used
 _ODOMETRY_SD = 0.05  # error of scale and direction of all odometry steps
 _ODOMETRY_NOISE = 0.003  # its change in one second
-# Its heading goes wrong then too, and so the direction of strides changes so many times faster: that of an ArduPilot
-# plane by 6 degrees in 3 s. The turn of a match shows it (radians: standard deviation, and the most that counts).
+# Its heading goes wrong then too, and so the direction of odometry changes so many times faster: that of an ArduPilot
+# plane by 6 degrees in 3 s. The rotation of a match shows it (radians: standard deviation, and the most that is used).
 _GPS_LOSS_TURN_FACTOR = 10.0
-_TURN_SD = 0.035
-_MAX_TURN = 0.3
+_ROTATION_SD_RAD = 0.035
+_MAX_ROTATION_RAD = 0.3
 
 _C, _S, _B, _M, _F, _K = (slice(first, first + 2) for first in range(0, 12, 2))
 _SIZE = 12
@@ -52,13 +52,13 @@ class Drift:
     position_noise: float
     velocity_noise: float
     acceleration_noise: float
-    is_of_attitude: bool  # the path rests on the attitude, so that an error of it is one of the path's acceleration
-    # The autopilot follows our positions closely, and takes their errors for motion. So its attitude is taken for poor
-    # when GPS is lost, until pictures have shown that it is good.
+    is_of_attitude: bool  # the path is integrated by the attitude, whose error is one of the path's acceleration
+    # The autopilot follows our positions closely, and mistakes their errors for motion. So its attitude is assumed to
+    # be poor when GPS is lost, until pictures have shown that it is good.
     attitude_follows_positions: bool = False
 
 
-# Dead reckoning by an autopilot: nearly all of the error is wind that it does not know. In simulation, an ArduPilot
+# Dead reckoning by an autopilot: nearly all of the error is unknown wind. In simulation, the velocity of an ArduPilot
 # plane in a wind of 6 m/s was 5 m/s wrong 10 s after the loss of GPS, and up to 7.5 m/s later.
 DEAD_RECKONING = Drift(
     velocity_sd=4.0, acceleration_sd=0.1, position_noise=0.3, velocity_noise=0.5, acceleration_noise=0.03,
@@ -74,11 +74,11 @@ INERTIAL_PX4 = replace(INERTIAL, attitude_follows_positions=True)
 
 @dataclass(frozen=True, slots=True)
 class OdometryMeasurement:
-    """A stride (see `recognise.odometry`): by `moved_m` (2,), which exceeds the motion of the path by `off_m` (2,).
-    `sd_m` is the standard deviation of each axis."""
+    """A step of visual odometry (see `recognise.odometry`): the displacement `moved_m` (2,), by how much it exceeds
+    that of the path, `error_m` (2,), and the standard deviation `sd_m` of each axis."""
 
     moved_m: Doubles
-    off_m: Doubles
+    error_m: Doubles
     sd_m: float
 
 
@@ -86,27 +86,29 @@ class DriftFilter:
     """Kalman filter that estimates the errors of one path. `drift` is the size of these errors, `map_sd_m` the standard
     deviation, of one axis, of the error that all fixes share.
 
-    The state has six parts, each east and north: `c` (m), the offset from the path to the aircraft; `s` (m/s), by how
-    much the aircraft is faster than the path; `b` (m/s2), the part of gravity that an error of the attitude takes for
-    acceleration, the other way round, which for a path of accelerations is the rate of change of `s`; `m` (m), the
-    offset from GPS positions to fixes; `f` (m), the offset from the path to where the last frame's picture puts the
-    aircraft; and `k`, the error of scale and direction (radians, clockwise) of all strides.
+    The state has six parts, each east and north:
+    - `c` (m): the offset from the path to the aircraft
+    - `s` (m/s): the aircraft's velocity minus the path's
+    - `b` (m/s2): minus the acceleration that an attitude error makes of gravity; of a path of accelerations, ds/dt
+    - `m` (m): the offset from GPS positions to fixes
+    - `f` (m): the offset from the path to the position by the last frame's picture
+    - `k`: the error of scale and direction (radians, clockwise) of all odometry
 
-    A frame may have been taken seconds ago: it is compared with the path at that time. An error of the attitude moves
-    its `f`, and so its fix, by `lean_s2`, the height above the ground over gravity (0: it rests on no attitude), times
-    `b` the other way. A stride takes `f` from one frame to the next, with the errors of both.
+    A frame may have been taken seconds ago: it is compared with the path at that time. An attitude error shifts its
+    `f`, and so its fix, by minus `b` times `attitude_gain_s2`: the height above the ground over gravity (0: the picture
+    does not depend on the attitude). Odometry carries `f` from one frame to the next, with the errors of both.
     """
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift, self._map_sd_m = drift, map_sd_m
         self._x, self._p = np.zeros(_SIZE), np.zeros((_SIZE, _SIZE))
         self._frame = np.zeros((2, _SIZE)), 0.0  # its measurement matrix, and the variance of each axis
-        self._gps_loss = 0.0  # 1 when GPS is lost, then less and less
-        # Mean square of the leans of the last pictures, over their variances.
+        self._gps_loss = 0.0  # 1 when GPS is lost, then decaying
+        # Mean square of the attitude errors of the last pictures, over their variances.
         self._attitude_error = _ROUGH_ERROR if drift.attitude_follows_positions else 0.0
 
     def start(self, sd_m: float, velocity_sd_m_s: float) -> None:
-        """Begin with the aircraft on the path. `sd_m` and `velocity_sd_m_s` are the standard deviations, of one axis,
+        """Start with the aircraft on the path. `sd_m` and `velocity_sd_m_s` are the standard deviations, of one axis,
         of its offset and of the error of velocity."""
         self._x = np.zeros(_SIZE)
         sds = sd_m, velocity_sd_m_s, self._drift.acceleration_sd, self._map_sd_m, 0.0, _ODOMETRY_SD
@@ -122,7 +124,7 @@ class DriftFilter:
         else:
             move[_B, _B] = math.exp(-step_s / _ATTITUDE_ERROR_TIME_S) * _EYE
         drift = self._drift
-        # Poorness of the gyros, by the tilts that pictures have shown: gyros that tilt wrongly turn wrongly too.
+        # How poor the gyros are, by the attitude errors that pictures have shown. Poor gyros err in heading, too.
         share = (self._attitude_error - _CALM_ERROR) / (_ROUGH_ERROR - _CALM_ERROR)
         rough = 1.0 + _MAX_NOISE_FACTOR * min(1.0, max(0.0, share)) * drift.is_of_attitude
         wander = drift.acceleration_noise * (rough + _GPS_LOSS_NOISE_FACTOR * self._gps_loss)
@@ -133,37 +135,38 @@ class DriftFilter:
         self._gps_loss *= math.exp(-step_s / _GPS_LOSS_TIME_S)
 
     def lose_gps(self) -> None:
-        """Note that GPS is lost: the error of velocity becomes more uncertain, since nothing corrects it any more, and
-        so does that of the attitude of an autopilot that reckons."""
+        """Process the loss of GPS: the error of velocity becomes more uncertain, since nothing corrects it any more,
+        and so does the attitude error of an autopilot that dead-reckons."""
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
         self._gps_loss = 0.0 if self._drift.is_of_attitude else 1.0
         if self._drift.attitude_follows_positions:
             self._attitude_error = max(self._attitude_error, _ROUGH_ERROR)
 
     def correct_by_gps(
-        self, off_m: Doubles, sd_m: float, off_m_s: Doubles | None, velocity_sd_m_s: float, age_s: float = 0.0
+        self, offset_m: Doubles, sd_m: float, error_m_s: Doubles | None, velocity_sd_m_s: float, age_s: float = 0.0
     ) -> None:
-        """Correct the state by GPS, whose position is `off_m` (2,) metres beside the path and whose velocity exceeds
-        that of the path by `off_m_s` (2,; None: unknown), as it was `age_s` seconds ago. The standard deviations are
-        those of one axis."""
+        """Correct the state by GPS of `age_s` seconds ago: `offset_m` (2,) from the path to its position, and
+        `error_m_s` (2,), its velocity minus the path's (None: unknown). Standard deviations are those of one axis."""
         matrix = self._measure_motion(age_s)
-        off = off_m if off_m_s is None else np.concatenate([off_m, off_m_s])
+        errors = offset_m if error_m_s is None else np.concatenate([offset_m, error_m_s])
         variances = [sd_m**2] * 2 + [velocity_sd_m_s**2] * 2
-        self._correct(matrix[: off.size], off, np.diag(variances[: off.size]))
+        self._correct(matrix[: errors.size], errors, np.diag(variances[: errors.size]))
 
-    def add_frame(self, age_s: float, lean_s2: float, sd_m: float, stride: OdometryMeasurement | None = None) -> bool:
-        """Note a frame taken `age_s` ago. `sd_m` is the standard deviation, of each axis, by which its picture puts the
-        aircraft wrongly, beside what `lean_s2` does. Correct the state by the `stride` from the frame before (None: it
-        is unknown). Returns False if that contradicts the state, and is not used."""
-        self._frame = seen, variance_m2 = self._measure_position(age_s, lean_s2), sd_m**2
-        if stride is None:
+    def add_frame(
+        self, age_s: float, attitude_gain_s2: float, sd_m: float, odometry: OdometryMeasurement | None = None
+    ) -> bool:
+        """Process a frame taken `age_s` ago, and correct the state by the `odometry` since the frame before (None:
+        unknown). `sd_m` is the standard deviation of its position, of each axis, without the effect of the attitude
+        error. Returns False if the odometry contradicts the state and is not used."""
+        self._frame = position, variance_m2 = self._measure_position(age_s, attitude_gain_s2), sd_m**2
+        if odometry is None:
             self._begin_frame()
             return True
-        (east_m, north_m), matrix, go_on = stride.moved_m, seen - _FRAME, np.eye(_SIZE)
-        go_on[_F, _K] = [[east_m, north_m], [north_m, -east_m]]
-        x, p = go_on @ self._x, go_on @ self._p @ go_on.T
-        x[_F] += stride.off_m
-        p[_F, _F] += stride.sd_m**2 * _EYE
+        (east_m, north_m), matrix, transition = odometry.moved_m, position - _FRAME, np.eye(_SIZE)
+        transition[_F, _K] = [[east_m, north_m], [north_m, -east_m]]
+        x, p = transition @ self._x, transition @ self._p @ transition.T
+        x[_F] += odometry.error_m
+        p[_F, _F] += odometry.sd_m**2 * _EYE
         if mahalanobis(matrix @ x, matrix @ p @ matrix.T + variance_m2 * _EYE) > _MAX_INNOVATION_SIGMA:
             self._begin_frame()
             return False
@@ -171,35 +174,35 @@ class DriftFilter:
         self._correct(matrix, np.zeros(2), variance_m2 * _EYE)
         return True
 
-    def correct_by_turn(self, turn: float) -> None:
-        """Correct the direction of strides by a match, whose picture is turned by `turn` (radians, clockwise) against
-        the compass. One that is turned by far does not count: then strides contradict the path, and are not used. Nor
-        does one beside a path of accelerations, which the same compass has turned."""
-        if abs(turn) <= _MAX_TURN and not self._drift.is_of_attitude:
+    def correct_by_rotation(self, rotation: float) -> None:
+        """Correct the direction of odometry by a match whose picture is rotated by `rotation` (radians, clockwise)
+        against the compass. A large rotation is ignored, since odometry then contradicts the path and is not used; so
+        is any beside a path of accelerations, which has the same error of the compass."""
+        if abs(rotation) <= _MAX_ROTATION_RAD and not self._drift.is_of_attitude:
             matrix = np.zeros((1, _SIZE))
             matrix[0, _TURN] = 1.0
-            self._correct(matrix, np.array([turn]), np.array([[_TURN_SD**2]]))
+            self._correct(matrix, np.array([rotation]), np.array([[_ROTATION_SD_RAD**2]]))
 
-    def correct_by_fix(self, off_m: Doubles, covariance_m2: Doubles) -> None:
-        """Correct the state by the fix of the last frame, of covariance (2, 2), `off_m` (2,) metres from the path."""
-        self._correct(_FIX, off_m, covariance_m2)
+    def correct_by_fix(self, offset_m: Doubles, covariance_m2: Doubles) -> None:
+        """Correct the state by the fix of the last frame: its offset (2,) from the path and covariance (2, 2)."""
+        self._correct(_FIX, offset_m, covariance_m2)
 
     def correct_by_attitude_error(self, over_height: Doubles, sd: float) -> None:
-        """Correct the state by the error of the attitude that a picture shows (see `recognise.perspective`). Where
-        pictures show more than they may be wrong by, the gyros are poor and the error wanders faster."""
-        shown = float(np.mean(np.square(over_height))) / sd**2
-        self._attitude_error += _ATTITUDE_ERROR_GAIN * (shown - self._attitude_error)
+        """Correct the state by the attitude error that a picture shows (see `recognise.perspective`). If pictures show
+        more than their own standard deviation, the gyros are poor and the error wanders faster."""
+        normalized = float(np.mean(np.square(over_height))) / sd**2
+        self._attitude_error += _ATTITUDE_ERROR_GAIN * (normalized - self._attitude_error)
         matrix = np.zeros((2, _SIZE))
         matrix[:, _B] = _EYE / GRAVITY_M_S2
         self._correct(matrix, over_height, sd**2 * _EYE)
 
-    def reset_to_fix(self, off_m: Doubles, covariance_m2: Doubles) -> None:
-        """Correct the state by a fix that contradicts it: what was known of the position is forgotten."""
+    def reset_to_fix(self, offset_m: Doubles, covariance_m2: Doubles) -> None:
+        """Correct the state by a fix that contradicts it, after forgetting the position."""
         self._p[_C] = self._p[:, _C] = 0.0
         self._p[_C, _C] = 1e6 * _EYE
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
         self._begin_frame()
-        self.correct_by_fix(off_m, covariance_m2)
+        self.correct_by_fix(offset_m, covariance_m2)
 
     def predict_fix(self) -> tuple[Doubles, Doubles]:
         """Predict the fix of the last frame. Returns its offset (2,) from the path, metres, and the covariance (2, 2)
@@ -213,8 +216,8 @@ class DriftFilter:
         - covariance (4, 4) of both.
         """
         matrix = self._measure_motion(age_s)
-        off = matrix @ self._x
-        return off[:2], off[2:], matrix @ self._p @ matrix.T
+        errors = matrix @ self._x
+        return errors[:2], errors[2:], matrix @ self._p @ matrix.T
 
     def _measure_motion(self, age_s: float) -> Doubles:
         """Return the matrix (4, 12) that gives offset and error of velocity of the path `age_s` seconds ago."""
@@ -225,23 +228,23 @@ class DriftFilter:
 
     def _begin_frame(self) -> None:
         """Set `f` to where the aircraft was when the last frame was taken."""
-        seen, variance_m2 = self._frame
-        begin = np.eye(_SIZE)
-        begin[_F] = seen
-        self._x, self._p = begin @ self._x, begin @ self._p @ begin.T
+        position, variance_m2 = self._frame
+        transition = np.eye(_SIZE)
+        transition[_F] = position
+        self._x, self._p = transition @ self._x, transition @ self._p @ transition.T
         self._p[_F, _F] += variance_m2 * _EYE
 
-    def _correct(self, matrix: Doubles, seen: Doubles, covariance: Doubles) -> None:
-        """Do a Kalman update with the measurement matrix `matrix` (n, 12) and what was `seen` (n,)."""
+    def _correct(self, matrix: Doubles, measured: Doubles, covariance: Doubles) -> None:
+        """Do a Kalman update with the measurement matrix `matrix` (n, 12) and the values `measured` (n,)."""
         gain = np.linalg.solve(matrix @ self._p @ matrix.T + covariance, matrix @ self._p).T
-        self._x = self._x + gain @ (seen - matrix @ self._x)
+        self._x = self._x + gain @ (measured - matrix @ self._x)
         kept = np.eye(_SIZE) - gain @ matrix
         self._p = kept @ self._p @ kept.T + gain @ covariance @ gain.T  # Joseph form: keeps it positive semidefinite
 
-    def _measure_position(self, age_s: float, lean_s2: float) -> Doubles:
-        """Return the matrix (2, 12) that gives the offset from the path to the aircraft `age_s` seconds ago, where a
-        picture puts it with an error of the attitude that counts by `lean_s2`."""
+    def _measure_position(self, age_s: float, attitude_gain_s2: float) -> Doubles:
+        """Return the matrix (2, 12) that gives the offset from the path to the aircraft `age_s` seconds ago, by a
+        picture with this `attitude_gain_s2`."""
         matrix = np.zeros((2, _SIZE))
         matrix[:, _C], matrix[:, _S] = _EYE, -age_s * _EYE
-        matrix[:, _B] = (age_s**2 / 2 * self._drift.is_of_attitude - lean_s2) * _EYE
+        matrix[:, _B] = (age_s**2 / 2 * self._drift.is_of_attitude - attitude_gain_s2) * _EYE
         return matrix

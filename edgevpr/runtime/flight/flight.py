@@ -262,7 +262,7 @@ class Flight:
         """Level the pictures to come as those of a camera that looks there, and navigate by their fixes only."""
         self._parts.recogniser.change(mount=mount)
         if self._parts.autopilot:
-            self._parts.autopilot.begin_anew()
+            self._parts.autopilot.reset_navigation()
 
     def _end(self) -> None:
         parts, totals = self._parts, self.totals()

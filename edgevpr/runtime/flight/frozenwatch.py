@@ -241,7 +241,7 @@ class FrozenWatch:
         if was_frozen:
             return
         if self._autopilot:
-            self._autopilot.begin_anew()
+            self._autopilot.reset_navigation()
         if reason := self.reason:
             self._notifier.report("source", Severity.WARNING, reason, topic="frozen", state=str(reason))
 

@@ -1,4 +1,4 @@
-"""The watch over GPS: compares it with the matches. A GPS that is wrong is neither navigated by nor trusted."""
+"""The watch over GPS: compares it with the matches. A GPS that is wrong is not used for navigation."""
 
 import math
 
@@ -14,21 +14,21 @@ from edgevpr.runtime.flight.measurements import PositionedMatch, measure_for_gps
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# In standard deviations of match and receiver together. Errors of map and receiver last for minutes, so that averaging
-# does not reduce them: they are so large in one flight of 3000. With a standard deviation of 5 m for the map, the limit
-# is 23 m for good matches and a good receiver.
+# In standard deviations of match and receiver together: right ones differ by more in one flight of 3000. Errors of map
+# and receiver last for minutes, so averaging does not reduce them. With a standard deviation of 5 m for the map, the
+# limit is 23 m for good matches and a good receiver.
 _MAX_GPS_SIGMA = 4.0
 _MIN_GPS_ERROR_M = 15.0  # less is no danger, and may be a few bad seconds of the receiver
-# Beside the offset that matches and receiver had so far, in which the errors that last cancel out.
+# Deviation from the usual offset of matches from GPS, in which lasting errors of map and receiver cancel out.
 _MAX_MOVE_SIGMA = 3.5
 _MIN_MOVE_M = 7.0
 _MIN_USUAL_MATCHES = 10
 _MAX_USUAL_MATCHES = 60
 _MIN_MATCHES_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; takes 3 s at 1 Hz
-_MAX_MATCH_AGE_S = 30.0  # the matches in a row must be no older
-_MIN_DOUBTS = 5  # with others between them that agree
+_MAX_MATCH_AGE_S = 30.0  # of the matches in a row
+_MIN_DOUBTS = 5  # contradicting matches, with or without agreeing ones between them
 _DOUBT_WINDOW_S = 20.0
-_MAX_DRIFT_M_S = 10.0  # so fast the offset from GPS may change: a receiver may be led away
+_MAX_DRIFT_M_S = 10.0  # so fast the offset from GPS may change, as a spoofer leads the receiver away
 _REPORT_FACTOR = 2.0  # times the distance that was last reported
 
 
@@ -37,25 +37,25 @@ class GpsWatch:
     when they agree again. Every comparison is sent to the autopilot, and navigation does not use a GPS that is wrong.
 
     GPS `is_wrong` after three matches in a row that contradict it, of different places and with about the same offset
-    from GPS; it is right again after three matches in a row that agree with it. A match contradicts GPS that is far
-    from it, or that has moved away from where GPS was beside the matches before. Where the aircraft hovers, the same
-    place counts again if it agreed with GPS before. A jammer that comes and goes is found by five matches within
-    twenty seconds, whatever lies between, and GPS is not right again before there are fewer. `map_sd_m` is the standard
-    deviation of the error that all matches share."""
+    from GPS; it is right again after three matches in a row that agree with it. A match contradicts GPS if its offset
+    from GPS is large, or differs from the usual one of earlier matches. While the aircraft hovers, the same place
+    counts again if it agreed with GPS before. A jammer that comes and goes is found by five contradicting matches
+    within twenty seconds, and GPS is not right again before there are fewer. `map_sd_m` is the standard deviation of
+    the error that all matches share."""
 
     def __init__(self, map_sd_m: float, notifier: Notifier, autopilot: AutopilotOutput | None) -> None:
         self._map_sd_m, self._notifier, self._autopilot = map_sd_m, notifier, autopilot
-        self._against: list[tuple[PositionedMatch, Doubles]] = []  # matches with their offset (2,) from GPS
-        self._doubts: list[PositionedMatch] = []  # the last matches that contradicted it
+        self._against: list[tuple[PositionedMatch, Doubles]] = []  # contradicting matches, with offsets (2,) from GPS
+        self._doubts: list[PositionedMatch] = []  # contradicting matches of the last seconds
         self._agreeing = 0
-        self._usual_m, self._usual_count = np.zeros(2), 0  # the mean offset of matches that agreed, and their number
+        self._usual_m, self._usual_count = np.zeros(2), 0  # mean offset of the matches that agreed, and their number
         self._agreed: set[int] = set()  # places of the last match that agreed
         self._reported_m = math.inf  # the distance that was last reported
-        self._have_agreed = False  # GPS and map, in this flight
+        self._have_agreed = False  # whether GPS and map have agreed in this flight
         self.is_wrong = False
 
-    def begin_anew(self) -> None:
-        """Forget the offsets from GPS so far, since matches err otherwise from now on."""
+    def reset(self) -> None:
+        """Forget the offsets from GPS so far, since matches have other errors from now on."""
         self._against.clear()
         self._doubts.clear()
         self._usual_m, self._usual_count = np.zeros(2), 0
@@ -65,66 +65,67 @@ class GpsWatch:
         vehicle = event.vehicle
         if event.view.reason or vehicle is None or vehicle.gps is None:
             return
-        seen = measure_for_gps(event, vehicle)
-        if seen is None or not vehicle.is_fresh(seen.t_s):
+        match = measure_for_gps(event, vehicle)
+        if match is None or not vehicle.is_fresh(match.t_s):
             return
-        gps_deg = extrapolate(vehicle.gps, seen.t_s, vehicle.velocity_m_s or (0.0, 0.0))
-        off_m = np.array(offset_m(*gps_deg, seen.position.lat_deg, seen.position.lon_deg))
-        was_wrong, tilted_m = self.is_wrong, (vehicle.height_m or 0.0) * _compute_attitude_error(seen)
-        sd_m = math.hypot(worst_sd(seen.covariance_m2), vehicle.gps.sd_m, seen.frame.sd_m, tilted_m)
-        self._judge(seen, off_m, sd_m)
-        away_m = math.hypot(*off_m)
+        gps_deg = extrapolate(vehicle.gps, match.t_s, vehicle.velocity_m_s or (0.0, 0.0))
+        off_m = np.array(offset_m(*gps_deg, match.position.lat_deg, match.position.lon_deg))
+        was_wrong, tilt_error_m = self.is_wrong, (vehicle.height_m or 0.0) * _compute_attitude_error(match)
+        sd_m = math.hypot(worst_sd(match.covariance_m2), vehicle.gps.sd_m, match.frame.sd_m, tilt_error_m)
+        self._judge(match, off_m, sd_m)
+        distance_m = math.hypot(*off_m)
         if self._autopilot:
-            self._autopilot.compare_gps(away_m, self.is_wrong, self._have_agreed)
-        has_grown = self.is_wrong and away_m > _REPORT_FACTOR * self._reported_m
+            self._autopilot.compare_gps(distance_m, self.is_wrong, self._have_agreed)
+        has_grown = self.is_wrong and distance_m > _REPORT_FACTOR * self._reported_m
         if self.is_wrong != was_wrong or has_grown:
-            self._reported_m = away_m
+            self._reported_m = distance_m
             severity = Severity.WARNING if self.is_wrong else Severity.INFO
             note = Reason(ReasonCode.GPS_AGREES)
             if self.is_wrong:
-                note = Reason(ReasonCode.GPS_DIFFERS, {"off_m": away_m})
-            self._notifier.report("gps", severity, note, off_m=round(away_m, 1), is_wrong=self.is_wrong)
+                note = Reason(ReasonCode.GPS_DIFFERS, {"off_m": distance_m})
+            self._notifier.report("gps", severity, note, off_m=round(distance_m, 1), is_wrong=self.is_wrong)
 
-    def _judge(self, seen: PositionedMatch, off_m: Doubles, sd_m: float) -> None:
-        """Judge GPS anew by a match that is `off_m` (2,) metres from it, with a standard deviation of `sd_m` but for
-        the error that all matches share."""
+    def _judge(self, match: PositionedMatch, off_m: Doubles, sd_m: float) -> None:
+        """Judge GPS anew by a match that is `off_m` (2,) metres from it. `sd_m` is the standard deviation of this
+        offset, without the error that all matches share."""
         is_far = _is_beyond(off_m, _MIN_GPS_ERROR_M, _MAX_GPS_SIGMA * math.hypot(sd_m, self._map_sd_m))
         is_usual_known = self._usual_count >= _MIN_USUAL_MATCHES
         has_moved = is_usual_known and _is_beyond(off_m - self._usual_m, _MIN_MOVE_M, _MAX_MOVE_SIGMA * sd_m)
-        self._doubts = [other for other in self._doubts if seen.t_s - other.t_s <= _DOUBT_WINDOW_S]
+        self._doubts = [other for other in self._doubts if match.t_s - other.t_s <= _DOUBT_WINDOW_S]
         if not is_far and not has_moved:
             self._against.clear()
             self._agreeing += 1
             self._usual_count = min(self._usual_count + 1, _MAX_USUAL_MATCHES)
             self._usual_m = self._usual_m + (off_m - self._usual_m) / self._usual_count
-            self._agreed = set(seen.places)
+            self._agreed = set(match.places)
             if self._agreeing >= _MIN_MATCHES_IN_A_ROW and len(self._doubts) < _MIN_DOUBTS:
                 self.is_wrong, self._have_agreed = False, True
             return
-        places, has_agreed = set(seen.places), bool(self._agreed & set(seen.places))
+        places, has_agreed = set(match.places), bool(self._agreed & set(match.places))
 
-        def is_news_beside(other: PositionedMatch) -> bool:
+        def is_independent_of(other: PositionedMatch) -> bool:
             return has_agreed or not set(other.places) >= places
 
-        if all(map(is_news_beside, self._doubts)):
-            self._doubts.append(seen)
+        if all(map(is_independent_of, self._doubts)):
+            self._doubts.append(match)
         self._agreeing = 0
         self._against = [
             (other, other_m)
             for other, other_m in self._against
-            if seen.t_s - other.t_s <= _MAX_MATCH_AGE_S
-            and math.hypot(*(off_m - other_m)) <= 2 * math.hypot(2 * sd_m, _MAX_DRIFT_M_S * (seen.t_s - other.t_s))
-            and is_news_beside(other)
+            if match.t_s - other.t_s <= _MAX_MATCH_AGE_S
+            and math.hypot(*(off_m - other_m)) <= 2 * math.hypot(2 * sd_m, _MAX_DRIFT_M_S * (match.t_s - other.t_s))
+            and is_independent_of(other)
         ]
-        self._against.append((seen, off_m))
+        self._against.append((match, off_m))
         is_proven = len(self._against) >= _MIN_MATCHES_IN_A_ROW or len(self._doubts) >= _MIN_DOUBTS
         self.is_wrong = self.is_wrong or is_proven
 
 
-def _compute_attitude_error(seen: PositionedMatch) -> float:
-    """Return the tangent of the least error of the reported attitude that the picture of a match shows: a match is off
-    GPS by as much of the height."""
-    return max(0.0, math.hypot(*seen.lean.over_height) - seen.lean.sd) if seen.lean else 0.0
+def _compute_attitude_error(match: PositionedMatch) -> float:
+    """Return the tangent of the least error of the reported attitude that the picture of a match shows: by this share
+    of the height the match is off GPS."""
+    error = match.attitude_error
+    return max(0.0, math.hypot(*error.over_height) - error.sd) if error else 0.0
 
 
 def _is_beyond(off_m: Doubles, *limits_m: float) -> bool:

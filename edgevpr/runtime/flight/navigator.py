@@ -1,7 +1,7 @@
-"""Navigation in flight: takes the vehicle's motion from the link and the matches from the loop, and decides which
-position is sent to the autopilot. Through a continuous channel (GPS_INPUT, ODOMETRY) a position is sent many times a
-second, otherwise single fixes. The link calls it in its own thread, the loop of `flight` (through `autopilot`) in the
-main one, each within a turn (`mavlink/turns.py`): it needs no lock."""
+"""Decides which positions are sent to the autopilot, by the vehicle's motion from the link and the matches from the
+loop. Through a continuous channel (GPS_INPUT, ODOMETRY) a position is sent many times a second, otherwise single fixes.
+The link calls it in its own thread, the loop of `flight` (through `autopilot`) in the main one, each within a turn
+(`mavlink/turns.py`), so it needs no lock."""
 
 import math
 from dataclasses import dataclass
@@ -25,41 +25,40 @@ from edgevpr.runtime.flight.measurements import (
     shared_time_error_m,
     worst_sd,
 )
-from edgevpr.runtime.flight.navigation import Navigation, NavState, rests_on_gps
-from edgevpr.runtime.flight.output import Output, OutputWatch
+from edgevpr.runtime.flight.navigation import Navigation, NavState, is_gps_aided
+from edgevpr.runtime.flight.output import INFLUENCE_S, Output, OutputWatch
 from edgevpr.runtime.flight.path import to_ground_acceleration
 from edgevpr.runtime.flight.slew import Slew
 from edgevpr.runtime.recognise.recognition import Recognition
 
-_LOST_M = 50.0  # a position is sent up to this error
-_LOST_S = 60.0  # and, as a single fix, for so long after a match
+_MAX_ERROR_M = 50.0  # a position with a larger error is not sent
+_MAX_INTERIM_S = 60.0  # single fixes without a match are sent for so long after the last match, odometry or GPS
 # By accelerations alone we know no more than the autopilot, which has them too. So a continuous position ends so long
-# after the last picture that shows a place or the motion over ground, and so long after GPS, until there is such a
-# picture: sent for half a minute, it led a PX4 copter 246 m away, and for ten seconds 46 m (alone: 25 m).
-_BLIND_S = 10.0
-_PX4_BLIND_S = 5.0  # PX4 goes on by itself for as long again: in 10 s by tilted accelerations it was led 70 m away
-_GPS_CARRIES_S = 3.0
+# after the last picture that gave a match or odometry or, until there is one, so long after GPS: sent for half a
+# minute, it led a PX4 copter 246 m away, and for ten seconds 46 m (alone: 25 m).
+_MAX_BLIND_S = 10.0
+_PX4_MAX_BLIND_S = 5.0  # PX4 dead-reckons for as long again: by 10 s of tilted accelerations it was led 70 m away
+_MAX_SINCE_GPS_S = 3.0
 _ALT_SD_M = 3.0
 # An autopilot takes the ten positions of a second as independent. Their errors are correlated for about five seconds:
-# fifty of them say as much as one, so each is sent with its error times this. Without it, they outweighed the gyros:
-# an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
-# A smaller factor would be the more honest claim, and lets the loop run away: benchmarks/results/loop.md.
+# fifty of them carry the information of one, so each claims its error times this. Without it, they outweighed the
+# gyros: an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
+# A smaller factor would be closer to the true error, but lets the loop run away: benchmarks/results/loop.md.
 CORRELATION_FACTOR = math.sqrt(50)
 _PX4_CORRELATION_FACTOR = 1.5
 _ATTITUDE_ERROR_VALID_S = 5.0
 _PX4_CHANNELS = Channel.SENSOR, Channel.VISION
-_OURS_FOR_S = 10.0  # so long after our last position an autopilot that has GPS may still be where that put it
-# A receiver that has been lost and is steady for so long is left to the autopilot; until the second time "no fix" is
-# sent as GPS_INPUT, by which ArduPilot returns to its receiver at once (AP_GPS::update_primary).
-_BACK_S = 1.0
-_TAKEN_BACK_S = 3.0
-_UNHEARD_S = 5.0
+# From the first to the second of these times after a lost receiver has become steady, "no fix" is sent as GPS_INPUT, so
+# that ArduPilot returns to its receiver at once (AP_GPS::update_primary).
+_GPS_BACK_FROM_S = 1.0
+_GPS_BACK_UNTIL_S = 3.0
+_REPORT_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """Advice on an accepted match: the `fix` to be sent or, if it is None, the reason `why` not. `is_held`: it is held
-    back, since it contradicts the expected position."""
+    """Advice on an accepted match: the `fix` to send or, if it is None, the reason `why` not. `is_held`: the fix is
+    held back, since it contradicts the predicted position."""
 
     fix: Fix | None
     why: Reason | None = None
@@ -73,19 +72,19 @@ def _withhold(code: ReasonCode) -> Advice:
 class Navigator(Listener):
     """Navigates for one autopilot: estimates the aircraft's position, and decides what is sent. `map_sd_m` is the
     standard deviation of the error that all fixes share, `every_s` the time between two queries. With `is_muted`, in a
-    dry run, nothing is given but advice. `is_level`: the camera hangs in a gimbal, whatever the airframe's attitude.
-    `age`: the hidden delay of the pictures, by the motion that is reported."""
+    dry run, it only gives advice. `is_level`: the camera hangs in a gimbal and stays level at any attitude. `age`
+    estimates the hidden delay of the pictures by the reported motion."""
 
     def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False, is_level: bool = False) -> None:
         self._is_muted, self._is_level = is_muted, is_level
-        self._map_sd_m, self._next_s = map_sd_m, min(every_s, INTERIM_FIX_INTERVAL_S)  # from one fix to the next
+        self._map_sd_m, self._fix_interval_s = map_sd_m, min(every_s, INTERIM_FIX_INTERVAL_S)
         self._navigation = Navigation(DEAD_RECKONING, map_sd_m)
         self._consistency, self.age = Consistency(), AgeWatch()
         self._slew = Slew()
         self._vehicle: Vehicle | None = None
         self._attitude: Attitude | None = None
-        self._appeared_s = self._attitude_error_s = -math.inf
-        self._channel, self._believes_gps, self._doubts_map = Channel.COMMAND, True, False
+        self._autopilot_since_s = self._attitude_error_s = -math.inf
+        self._channel, self._trusts_gps, self._distrusts_map = Channel.COMMAND, True, False
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch, self._sent_s = OutputWatch(), -math.inf
         self._height_ratio, self._height_ratio_sd = 1.0, 0.0
@@ -93,54 +92,54 @@ class Navigator(Listener):
 
     @property
     def has_gps(self) -> bool:
-        """True if the autopilot's position rests on a GPS that is believed."""
+        """True if the autopilot's position rests on a trusted GPS."""
         return self._navigation.has_gps
 
-    def believe_gps(self, believes: bool) -> None:
+    def trust_gps(self, is_trusted: bool) -> None:
         """Set whether GPS is used for navigation."""
-        self._believes_gps = believes
+        self._trusts_gps = is_trusted
 
-    def doubt_map(self, doubts: bool) -> None:
+    def distrust_map(self, is_distrusted: bool) -> None:
         """Set whether the map has contradicted GPS from the first match on. One of them is wrong, and nothing shows
-        which: no position is sent, also after GPS is lost."""
-        self._doubts_map = doubts
+        which: no position is sent, even after GPS is lost."""
+        self._distrusts_map = is_distrusted
 
-    def believes_gps(self) -> bool:
-        return self._believes_gps
+    def trusts_gps(self) -> bool:
+        return self._trusts_gps
 
     def correct_height(self, ratio: float, ratio_sd: float = 0.0) -> None:
-        """Set the height above ground by the pictures over that by the autopilot (1.0: they agree). Where they do not,
-        motion between pictures is corrected by it. The ground may change back at once, so positions claim as much, or
-        `ratio_sd`, the share by which the ratio may be wrong."""
+        """Set the ratio of the height above ground by the pictures to that by the autopilot (1.0: they agree).
+        Odometry is scaled by it. The ground may change back at any time, so the claimed error contains the deviation
+        from 1.0 or `ratio_sd`, the relative error of the ratio, if that is larger."""
         self._height_ratio, self._height_ratio_sd = ratio, ratio_sd
 
     def handle_channel(self, channel: Channel) -> None:
-        """Note the channel by which positions are sent. With a continuous one, the autopilot's velocity comes from our
-        positions, and we must not use it: the path is then summed up from accelerations."""
-        before, self._channel = self._channel, channel
-        if _choose_drift(channel) is not _choose_drift(before):
-            self.begin_anew()
+        """Set the channel by which positions are sent. With a continuous one, the autopilot's velocity comes from our
+        positions and must not be used: the path is then integrated from accelerations."""
+        old_channel, self._channel = self._channel, channel
+        if _choose_drift(channel) is not _choose_drift(old_channel):
+            self.reset_navigation()
 
-    def begin_anew(self) -> None:
-        """Note that from now on fixes err otherwise than those before: begin again at the autopilot's position."""
+    def reset_navigation(self) -> None:
+        """Restart at the autopilot's position, since the fixes from now on have other errors than those before."""
         self._navigation, self._consistency = Navigation(_choose_drift(self._channel), self._map_sd_m), Consistency()
         self._watch = OutputWatch()
 
     def handle_autopilot(self, t_s: float) -> None:
-        """Note that at `t_s` an autopilot was first heard, or that another one has taken its place."""
-        self._appeared_s, self._vehicle = t_s, None
+        """Process the first message of an autopilot, or of one that has replaced it, at `t_s`."""
+        self._autopilot_since_s, self._vehicle = t_s, None
 
     def handle_vehicle(self, vehicle: Vehicle) -> None:
         """Process a report of position and velocity."""
         self._vehicle = vehicle
-        if rests_on_gps(vehicle) and vehicle.t_heard_s - self._sent_s > _OURS_FOR_S:
-            self._sent_s = -math.inf  # nothing of ours is left in its estimate
+        if is_gps_aided(vehicle) and vehicle.t_received_s - self._sent_s > INFLUENCE_S:
+            self._sent_s = -math.inf  # our positions no longer affect its estimate
         navigation = self._navigation
-        navigation.add_report(vehicle, self._believes_gps, self._sent_s > -math.inf)
-        self._watch.update(vehicle, navigation.fixed_s, navigation.has_gps)
+        navigation.add_report(vehicle, self._trusts_gps, self._sent_s > -math.inf)
+        self._watch.update(vehicle, navigation.last_fix_s, navigation.has_gps)
         if navigation.path_velocity_m_s is not None:
             has_gps = navigation.has_gps and not self._channel.is_continuous
-            self.age.add_motion(vehicle.t_heard_s, navigation.path_velocity_m_s, vehicle.heading_deg, has_gps)
+            self.age.add_motion(vehicle.t_received_s, navigation.path_velocity_m_s, vehicle.heading_deg, has_gps)
 
     def handle_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
         """Process the specific force that the accelerometers measure, m/s2 (nose, right, down), and the attitude."""
@@ -149,66 +148,64 @@ class Navigator(Listener):
         self._navigation.add_acceleration(t_s, acceleration_m_s2)
 
     def handle_frame(self, event: Recognition, is_query: bool = True) -> None:
-        """Process the frame of an event without an accepted match, or of one that is no query: its motion since the
-        frame before."""
+        """Process the frame of an event without an accepted match, or one that is no query and only gives odometry."""
         if frame := self._measure(event):
             self._navigation.add_frame(frame, is_query)
 
     def advise(self, event: Recognition, now_s: float) -> Advice:
         """Process an accepted match, and advise what to send for it. Raises ValueError for a position off the Earth."""
         frame = self._measure(event)
-        seen = position_match(event, frame) if frame else None
-        if seen is None:
+        match = position_match(event, frame) if frame else None
+        if match is None:
             return _withhold(ReasonCode.PLACE_WITHOUT_POSITION)
         if event.view.reason:
             return _withhold(ReasonCode.NOT_BELOW_AIRCRAFT)
-        vehicle, late_m = self._vehicle, shared_time_error_m(event, event.vehicle or self._vehicle)
-        accuracy_m = math.hypot(seen.accuracy_m, late_m)
-        fix = Fix(seen.position.lat_deg, seen.position.lon_deg, accuracy_m, seen.t_s)
+        vehicle, time_error_m = self._vehicle, shared_time_error_m(event, event.vehicle or self._vehicle)
+        accuracy_m = math.hypot(match.accuracy_m, time_error_m)
+        fix = Fix(match.position.lat_deg, match.position.lon_deg, accuracy_m, match.t_s)
         if vehicle is None or not vehicle.is_fresh(now_s):
-            return self._advise_unheard(fix, now_s)
+            return self._advise_without_report(fix, now_s)
         if vehicle.velocity_m_s is None:
             return _withhold(ReasonCode.NO_TELEMETRY) if self._channel.is_continuous else Advice(fix)
-        compared = self._navigation.compare(seen)
-        if compared is None:
-            self._navigation.begin(seen.position, worst_sd(seen.scatter_m2), seen.t_s, vehicle.t_heard_s)
+        predicted = self._navigation.predict_fix(match)
+        if predicted is None:
+            self._navigation.start_at_fix(match.position, worst_sd(match.scatter_m2), match.t_s, vehicle.t_received_s)
             return _withhold(ReasonCode.CONTINUOUS) if self._channel.is_continuous else Advice(fix)
-        is_followed = self._navigation.is_followed(seen.t_s)
-        verdict = self._consistency.judge(compared, self.has_gps, is_followed)
-        if verdict.why:
-            return Advice(None, verdict.why, is_held=True)
-        self._navigation.correct_by_fix(compared, verdict)
-        self._shared_sd_m = math.hypot(self._map_sd_m, late_m)
-        if seen.lean:
-            self._attitude_error_s = seen.t_s
+        verdict = self._consistency.judge(predicted, self.has_gps, self._navigation.is_tracked(match.t_s))
+        if verdict.reason:
+            return Advice(None, verdict.reason, is_held=True)
+        self._navigation.correct_by_fix(predicted, verdict)
+        self._shared_sd_m = math.hypot(self._map_sd_m, time_error_m)
+        if match.attitude_error:
+            self._attitude_error_s = match.t_s
         return self._advise_improvement(vehicle, vehicle.velocity_m_s, now_s)
 
     def make_interim_fix(self, now_s: float) -> Fix | None:
-        """Return a fix by what the matches before have shown, for the time in which none is accepted; None where the
-        autopilot is no better off with it, or a match has contradicted what is known."""
+        """Return a fix predicted from earlier matches, for the time in which none is accepted; None if it would not
+        improve the autopilot's position, or the last match contradicts the prediction."""
         vehicle = self._vehicle
         if self._is_muted or self._channel is not Channel.COMMAND or self.age.is_unknown:
             return None
-        if self._consistency.is_contradicted(now_s, self._navigation.is_followed(now_s)):
+        if self._consistency.is_contradicted(now_s, self._navigation.is_tracked(now_s)):
             return None
         if vehicle is None or vehicle.velocity_m_s is None or not vehicle.is_fresh(now_s):
             return None
-        if rests_on_gps(vehicle) or self._estimate(now_s) is None:
+        if is_gps_aided(vehicle) or self._estimate(now_s) is None:
             return None
         return self._advise_improvement(vehicle, vehicle.velocity_m_s, now_s).fix
 
     def knows_position(self, now_s: float) -> bool:
-        """Tell whether the position is known well enough to be sent through a continuous channel."""
+        """Return True if the position is known well enough to be sent through a continuous channel."""
         return self._estimate(now_s) is not None
 
     def accuracy_m(self, now_s: float) -> float | None:
-        """Return how well the position is known: metres, standard deviation of one axis (None: it is not known)."""
+        """Return the accuracy of the position: metres, standard deviation of one axis (None: position unknown)."""
         estimate = self._navigation.estimate_state(now_s)
         return None if estimate is None else self._claimed_m(estimate)
 
     def estimate_state(self, t_s: float) -> MotionState | None:
-        """Return position and motion at `t_s`, to be sent through a continuous channel; None if they are not known well
-        enough. `t_s` must be later than in the last call."""
+        """Return position and motion at `t_s` for a continuous channel; None if they are not known well enough. `t_s`
+        must be later than in the last call."""
         if self._is_muted:
             return None
         vehicle, estimate = self._vehicle, self._estimate(t_s)
@@ -220,18 +217,18 @@ class Navigator(Listener):
         self._watch.record_sent(t_s)
         lat_deg, lon_deg, lag_m = self._slew.follow(estimate)
         east, north = estimate.velocity_m_s
-        attitude, alike = self._attitude, self._correlation_factor(t_s)
+        attitude, factor = self._attitude, self._correlation_factor(t_s)
         is_reserve, receiver = self.output is Output.RESERVE, vehicle.gps
         return MotionState(
             t_mono_s=t_s,
             lat_deg=lat_deg,
             lon_deg=lon_deg,
-            # The autopilot's own altitude may come from us: beside a receiver it is the receiver's.
+            # The autopilot's own altitude may come from us, so beside a receiver that of the receiver is sent.
             alt_m=receiver.alt_m if is_reserve and receiver and receiver.alt_m is not None else vehicle.alt_m,
             velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
-            accuracy_m=alike * math.hypot(self._claimed_m(estimate), lag_m),
+            accuracy_m=factor * math.hypot(self._claimed_m(estimate), lag_m),
             alt_accuracy_m=_ALT_SD_M,
-            speed_accuracy_m_s=alike * estimate.speed_accuracy_m_s,
+            speed_accuracy_m_s=factor * estimate.speed_accuracy_m_s,
             attitude=None if attitude is None else _in_radians(attitude),
             is_reserve=is_reserve,
         )
@@ -240,12 +237,12 @@ class Navigator(Listener):
         """Decide what is sent now."""
         if vehicle is None:
             return Output.STARTING
-        uses_gps = rests_on_gps(vehicle)
+        uses_gps = is_gps_aided(vehicle)
         if uses_gps and not self._channel.is_beside_gps:
             return Output.GPS_IN_USE
         if estimate is None:
             return Output.STARTING if self.output is Output.STARTING else Output.UNKNOWN
-        if self._navigation.is_in_doubt or self._doubts_map:
+        if self._navigation.is_in_doubt or self._distrusts_map:
             return Output.CONTRADICTS_GPS
         if self._watch.withdrawn:
             return self._watch.withdrawn
@@ -255,16 +252,16 @@ class Navigator(Listener):
         if self._channel is not Channel.GPS_INPUT:
             return Output.BESIDE_GPS
         was_lost = self.output in (Output.SENDING, Output.GPS_BACK)
-        if was_lost and receiver.steady_for_s < _TAKEN_BACK_S:
-            return Output.GPS_BACK if receiver.steady_for_s >= _BACK_S else Output.SENDING
+        if was_lost and receiver.steady_for_s < _GPS_BACK_UNTIL_S:
+            return Output.GPS_BACK if receiver.steady_for_s >= _GPS_BACK_FROM_S else Output.SENDING
         return Output.RESERVE
 
-    def _advise_unheard(self, fix: Fix, now_s: float) -> Advice:
+    def _advise_without_report(self, fix: Fix, now_s: float) -> Advice:
         """Advise on a fix without a recent report: the autopilot has no position, or its report is still to come."""
         if self._channel.is_continuous:
             return _withhold(ReasonCode.NO_TELEMETRY)
-        since_s = max(self._appeared_s, self._vehicle.t_heard_s if self._vehicle else -math.inf)
-        return Advice(fix) if now_s - since_s > _UNHEARD_S else _withhold(ReasonCode.NO_TELEMETRY)
+        since_s = max(self._autopilot_since_s, self._vehicle.t_received_s if self._vehicle else -math.inf)
+        return Advice(fix) if now_s - since_s > _REPORT_TIMEOUT_S else _withhold(ReasonCode.NO_TELEMETRY)
 
     def _measure(self, event: Recognition) -> FrameMeasurement | None:
         vehicle = event.vehicle or self._vehicle
@@ -273,57 +270,57 @@ class Navigator(Listener):
 
     def _estimate(self, t_s: float) -> NavState | None:
         estimate = self._navigation.estimate_state(t_s)
-        if estimate is None or estimate.accuracy_m > _LOST_M:
+        if estimate is None or estimate.accuracy_m > _MAX_ERROR_M:
             return None
-        shown_s, gps_s = self._navigation.shown_s, self._navigation.gps_s
+        last_vision_s, last_gps_s = self._navigation.last_vision_s, self._navigation.last_gps_s
         if self._channel.is_continuous:
-            # Before, a channel beside GPS has carried us too, and ends without a gap; on PX4 ours would only begin.
-            is_carried = self._channel.is_beside_gps and t_s - gps_s <= _GPS_CARRIES_S
-            blind_s = _PX4_BLIND_S if self._channel in _PX4_CHANNELS else _BLIND_S
-            is_known = t_s - shown_s <= blind_s or is_carried
+            # A channel beside GPS was sending before GPS was lost: it goes on without a gap. On PX4 it only starts now.
+            is_gps_recent = self._channel.is_beside_gps and t_s - last_gps_s <= _MAX_SINCE_GPS_S
+            max_blind_s = _PX4_MAX_BLIND_S if self._channel in _PX4_CHANNELS else _MAX_BLIND_S
+            is_known = t_s - last_vision_s <= max_blind_s or is_gps_recent
         else:
-            is_known = t_s - max(shown_s, gps_s) <= _LOST_S
+            is_known = t_s - max(last_vision_s, last_gps_s) <= _MAX_INTERIM_S
         return estimate if is_known else None
 
     def _advise_improvement(self, vehicle: Vehicle, velocity_m_s: tuple[float, float], now_s: float) -> Advice:
         """Advise what to send to an autopilot that reports a position of its own: a fix only if ours is better."""
         if self._channel.is_continuous:
             return _withhold(ReasonCode.CONTINUOUS)
-        if rests_on_gps(vehicle):  # ArduPilot refuses a fix then, and PX4's velocity jumps by the gain that it has
-            return _withhold(ReasonCode.HAS_GPS if self._believes_gps else ReasonCode.HAS_WRONG_GPS)
-        if self._doubts_map:
+        if is_gps_aided(vehicle):  # ArduPilot refuses a fix then, and PX4's velocity jumps by the gain that it has
+            return _withhold(ReasonCode.HAS_GPS if self._trusts_gps else ReasonCode.HAS_WRONG_GPS)
+        if self._distrusts_map:
             return _withhold(ReasonCode.MAP_CONTRADICTS_GPS)
         estimate = self._navigation.estimate_state(now_s)
         if estimate is None:
             return _withhold(ReasonCode.NO_TELEMETRY)
-        here, claimed_m = estimate.position, self._claimed_m(estimate)
+        ours, claimed_m = estimate.position, self._claimed_m(estimate)
         east_m_s, north_m_s = velocity_m_s
-        since_s = now_s - vehicle.t_heard_s
-        there = offset_position(vehicle.lat_deg, vehicle.lon_deg, since_s * east_m_s, since_s * north_m_s)
-        off_m = float(distance_m(*there, here.lat_deg, here.lon_deg))
+        age_s = now_s - vehicle.t_received_s
+        theirs_deg = offset_position(vehicle.lat_deg, vehicle.lon_deg, age_s * east_m_s, age_s * north_m_s)
+        off_m = float(distance_m(*theirs_deg, ours.lat_deg, ours.lon_deg))
         # Mean square errors: of our estimate 2 * accuracy_m**2 (two axes), of the autopilot's position off_m**2 more.
         if off_m**2 <= 2 * estimate.accuracy_m**2:
             figures = {"off_m": off_m, "accuracy_m": estimate.accuracy_m}
             return Advice(None, Reason(ReasonCode.NOT_BETTER, figures))
         # Lead by the drift of half the time to the next fix, so that the autopilot is right in the middle of it. Now it
         # is off by this lead, in one direction: half of its square is added to the variance of each axis.
-        ahead_m = [self._next_s / 2 * each for each in self._navigation.path_drift_m_s()]
-        at = offset_position(here.lat_deg, here.lon_deg, *ahead_m)
-        return Advice(Fix(*at, math.hypot(claimed_m, math.hypot(*ahead_m) / math.sqrt(2)), now_s))
+        lead_m = [self._fix_interval_s / 2 * drift_m_s for drift_m_s in self._navigation.path_drift_m_s()]
+        sent_deg = offset_position(ours.lat_deg, ours.lon_deg, *lead_m)
+        return Advice(Fix(*sent_deg, math.hypot(claimed_m, math.hypot(*lead_m) / math.sqrt(2)), now_s))
 
     def _correlation_factor(self, t_s: float) -> float:
-        """Return the factor of the errors of a continuous position. PX4 is told them as they are, while pictures show
-        how wrong its attitude is, or need none: then our errors are not those that our own positions have caused."""
-        is_apart = self._is_level or t_s - self._attitude_error_s <= _ATTITUDE_ERROR_VALID_S
-        return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_apart else CORRELATION_FACTOR
+        """Return the factor for the claimed errors of a continuous position. For PX4 it is small while pictures measure
+        the error of its attitude, or need no attitude: then our positions do not feed back into our own errors."""
+        is_independent = self._is_level or t_s - self._attitude_error_s <= _ATTITUDE_ERROR_VALID_S
+        return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_independent else CORRELATION_FACTOR
 
     def _claimed_m(self, estimate: NavState) -> float:
-        """Return the accuracy to be sent with an estimate: never better than the error that all fixes share."""
+        """Return the accuracy to claim for an estimate: never better than the error that all fixes share."""
         return max(self._shared_sd_m, estimate.accuracy_m)
 
 
 def _choose_drift(channel: Channel) -> Drift:
-    """Return the errors of the path beside an autopilot that is told positions by a channel."""
+    """Return the errors of the path of an autopilot that gets positions by a channel."""
     if channel in _PX4_CHANNELS:
         return INERTIAL_PX4
     return INERTIAL if channel.is_continuous else DEAD_RECKONING

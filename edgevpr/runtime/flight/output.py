@@ -16,7 +16,7 @@ _MAX_ESTIMATE_ERROR_M = 15.0  # of the autopilot's estimate from a good receiver
 _MAX_ESTIMATE_ERROR_SD = 4.0
 _MIN_LED_AWAY_S = 2.0
 _MIN_STEADY_S = 3.0
-_INFLUENCE_S = 10.0  # so long after our last position an error of the estimate may still be ours
+INFLUENCE_S = 10.0  # so long our last position may affect the estimate of an autopilot that has GPS
 
 
 class Output(Enum):
@@ -63,8 +63,8 @@ class OutputWatch:
     def update(self, vehicle: Vehicle, match_s: float, has_gps: bool) -> None:
         """Process a report of the autopilot. `match_s` is the time of the last match that was believed; `has_gps`: a
         receiver is believed."""
-        now_s = vehicle.t_heard_s
-        is_led_away = has_gps and _is_off_receiver(vehicle) and now_s - self._sent_s <= _INFLUENCE_S
+        now_s = vehicle.t_received_s
+        is_led_away = has_gps and _is_off_receiver(vehicle) and now_s - self._sent_s <= INFLUENCE_S
         is_over_gate = (vehicle.innovation_ratio or 0.0) > _MAX_INNOVATION_RATIO
         is_refused = is_over_gate and not has_gps and now_s - self._sent_s <= 1.0
         self._led_away_since_s = min(self._led_away_since_s, now_s) if is_led_away else math.inf
@@ -74,7 +74,7 @@ class OutputWatch:
             self.withdrawn, self._withdrawn_s = Output.LEADS_AWAY, now_s
         elif now_s - self._refused_since_s >= _MIN_REFUSED_S and not is_proven:
             self.withdrawn, self._withdrawn_s = Output.REFUSED, now_s
-        elif match_s > self._withdrawn_s or (has_gps and not is_led_away and now_s - self._withdrawn_s > _INFLUENCE_S):
+        elif match_s > self._withdrawn_s or (has_gps and not is_led_away and now_s - self._withdrawn_s > INFLUENCE_S):
             self.withdrawn = None
 
 
@@ -83,6 +83,6 @@ def _is_off_receiver(vehicle: Vehicle) -> bool:
     receiver = vehicle.gps
     if receiver is None or receiver.steady_for_s < _MIN_STEADY_S:
         return False
-    receiver_deg = extrapolate(receiver, vehicle.t_heard_s)
+    receiver_deg = extrapolate(receiver, vehicle.t_received_s)
     off_m = float(distance_m(*receiver_deg, vehicle.lat_deg, vehicle.lon_deg))
     return off_m > max(_MAX_ESTIMATE_ERROR_M, _MAX_ESTIMATE_ERROR_SD * receiver.sd_m)

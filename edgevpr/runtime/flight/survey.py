@@ -21,7 +21,7 @@ from edgevpr.core.types import Position, Vehicle
 from edgevpr.frames.level import Mount
 from edgevpr.mavlink.receivers import extrapolate
 from edgevpr.runtime.flight.measurements import FrameMeasurement, picture_error_m, position_match
-from edgevpr.runtime.flight.navigation import rests_on_gps
+from edgevpr.runtime.flight.navigation import is_gps_aided
 from edgevpr.runtime.recognise.locate import mahalanobis
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -119,7 +119,7 @@ class MapSurvey:
         vehicle, located, view = event.vehicle, event.located, event.view
         if event.frame is None or event.frame.t_mono_s - self._last_s < _MIN_INTERVAL_S:
             return False
-        if vehicle is None or vehicle.gps is None or vehicle.gps.sd_m > _MAX_GPS_SD_M or not rests_on_gps(vehicle):
+        if vehicle is None or vehicle.gps is None or vehicle.gps.sd_m > _MAX_GPS_SD_M or not is_gps_aided(vehicle):
             return False
         # Without a view or a pose, the point under the camera is not known within metres.
         if located is None or located.heading_deg is None or view.reason:
@@ -129,7 +129,7 @@ class MapSurvey:
         t_s, height_m = event.frame.t_mono_s, located.height_m or vehicle.height_m
         frame_sd_m = picture_error_m(vehicle, height_m or 0.0, event.frame.t_sd_s)
         match = position_match(event, FrameMeasurement(t_s=t_s, sd_m=frame_sd_m))
-        jacobian = self._compute_jacobian(vehicle, height_m, match.turn_deg or 0.0) if match else None
+        jacobian = self._compute_jacobian(vehicle, height_m, match.heading_error_deg or 0.0) if match else None
         if match is None or jacobian is None or not vehicle.is_fresh(t_s):
             return False
         # The autopilot's position, since it knows the lag of its receiver.
@@ -161,15 +161,15 @@ class MapSurvey:
         shifted = [replace(sample, off_m=sample.off_m - sample.jacobian[:, 2:4] @ change) for sample in self._samples]
         self._mount, self._samples = mount, deque(shifted, maxlen=_MAX_SAMPLES)
 
-    def _compute_jacobian(self, vehicle: Vehicle, height_m: float | None, turn_deg: float) -> Doubles | None:
+    def _compute_jacobian(self, vehicle: Vehicle, height_m: float | None, heading_error_deg: float) -> Doubles | None:
         """Return the derivative (2, 6) of a match by offset, mount, scale (left at 0) and time; None if it is unknown.
-        `turn_deg` is the error of the compass that the picture shows."""
+        `heading_error_deg` is the error of the compass that the picture shows."""
         roll_deg, pitch_deg = (0.0, 0.0) if self._is_level else (vehicle.roll_deg, vehicle.pitch_deg)
         inputs = vehicle.heading_deg, height_m, roll_deg, pitch_deg, *(vehicle.velocity_m_s or (None,))
         if not all(each is not None and math.isfinite(each) for each in inputs) or not height_m or height_m <= 0:
             return None
         heading, roll, pitch = (math.radians(each or 0.0) for each in (vehicle.heading_deg, roll_deg, pitch_deg))
-        heading += math.radians(turn_deg)
+        heading += math.radians(heading_error_deg)
         ahead_m, right_m = height_m * math.cos(roll), height_m * math.cos(pitch)  # an airframe that banks turns it too
         east, north = vehicle.velocity_m_s or (0.0, 0.0)
         return np.array(

@@ -191,7 +191,7 @@ class SurveyReporter:
         """Level the next pictures by the mount found; comparisons with GPS so far are void."""
         mount = Mount(*(self._reported.get(name, self._expected[name])[0] for name in _MOUNT_NAMES))
         self._survey.set_mount(mount)
-        self._gps.begin_anew()
+        self._gps.reset()
         self._set_mount(mount)
 
 

@@ -180,7 +180,7 @@ class Prior(RecordedPrior):
             vehicle = None
         known, reach = self._last_fix, None
         if vehicle and vehicle.has_gps:
-            known = Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_heard_s
+            known = Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_received_s
         elif known and frame.t_mono_s - known[1] > _MAX_FIX_AGE_S:
             known = None
         if known and self._reach_m_s:

@@ -46,20 +46,22 @@ def test_in_flight_a_fix_held_back_is_in_the_log_and_the_ground_is_told_once(rec
     assert sum(each.name == "vpr_place" for each in link.sent if each.get_type() == "NAMED_VALUE_INT") == 5
 
 
-def compared(off_m, t_s, places=1, *, path_m=0.0, expected_m=0.0, turn_deg=None):
+def compared(off_m, t_s, places=1, *, path_m=0.0, predicted_m=0.0, error_deg=None):
     """A fix off to the east, whose covariance is 5.5 m2 and that of its prediction 30.5 m2: together 6 m."""
     places = places if isinstance(places, tuple) else (places,)
     frame = FrameMeasurement(t_s=START_S + t_s, sd_m=0.0)
-    said = {"position": Position(*HOME), "accuracy_m": 1.0, "places": places, "turn_deg": turn_deg}
-    path, off, expected = (np.array([each, 0.0]) for each in (700.0 + path_m, off_m, expected_m))
-    seen = PositionedMatch(frame=frame, covariance_m2=5.5 * np.eye(2), **said)
-    return PredictedFix(seen=seen, path_m=path, off_m=off, expected_m=expected, covariance_m2=30.5 * np.eye(2))
+    said = {"position": Position(*HOME), "accuracy_m": 1.0, "places": places, "heading_error_deg": error_deg}
+    vectors_m = {"path_point_m": 700.0 + path_m, "offset_m": off_m, "predicted_m": predicted_m}
+    vectors_m = {name: np.array([east_m, 0.0]) for name, east_m in vectors_m.items()}
+    match = PositionedMatch(frame=frame, covariance_m2=5.5 * np.eye(2), **said)
+    return PredictedFix(match=match, covariance_m2=30.5 * np.eye(2), **vectors_m)
 
 
 def verdict_of(result):
     """ "." for a fix that is believed as expected, "a" against the path, "l" against a lost one, "h" if it is held."""
     verdicts = {(False, False, False): ".", (False, True, False): "a", (False, True, True): "l"}
-    return (verdicts | {(True, False, False): "h"})[result.why is not None, result.is_against, result.is_lost]
+    held = result.reason is not None
+    return (verdicts | {(True, False, False): "h"})[held, result.overrules_path, result.restarts_path]
 
 
 @pytest.mark.parametrize(
@@ -82,8 +84,8 @@ def verdict_of(result):
         # The same place is another one if the aircraft has flown on by more than 24 m.
         ([(100, 0), (100, 2, 1, {"path_m": 24.0})], False, "hh"),
         ([(100, 0), (100, 2, 1, {"path_m": 24.1})], False, "ha"),
-        ([(100, 0, 1, {"expected_m": 3.0}), (110, 2, 1, {"path_m": 13.9, "expected_m": 13.1})], False, "hh"),
-        ([(100, 0, 1, {"expected_m": 3.0}), (110, 2, 1, {"path_m": 14.1, "expected_m": 13.1})], False, "ha"),
+        ([(100, 0, 1, {"predicted_m": 3.0}), (110, 2, 1, {"path_m": 13.9, "predicted_m": 13.1})], False, "hh"),
+        ([(100, 0, 1, {"predicted_m": 3.0}), (110, 2, 1, {"path_m": 14.1, "predicted_m": 13.1})], False, "ha"),
         # Four of different places that an aircraft of 30 m/s can have flown through within 10 s: the path is lost.
         ([(100, 0, 1), (190, 3, 2), (280, 6, 3), (400.0, 10.0, 4)], False, "hhhl"),
         ([(100, 0, 1), (190, 3, 2), (280, 6, 3), (400.1, 10.0, 4)], False, "hhhh"),
@@ -91,9 +93,9 @@ def verdict_of(result):
         ([(100, 0, 1), (190, 3, 2), (280, 6, 3), (400.0, 10.0, 3)], False, "hhhh"),
         ([(100, 0, 1), (100, 0, 2), (190, 3, 3), (280, 6, 4)], True, "hhhh"),
         # Pictures that are suddenly turned against the compass, and a compass that was wrong from the start.
-        ([(0, second, second, {"turn_deg": turn}) for second, turn in enumerate((3, 180, 3))], False, ".h."),
-        ([(0, second, second, {"turn_deg": turn}) for second, turn in enumerate((3, *[100] * 5))], False, ".hhhl."),
-        ([(0, second, second, {"turn_deg": 140}) for second in range(3)], False, "..."),
+        ([(0, second, second, {"error_deg": turn}) for second, turn in enumerate((3, 180, 3))], False, ".h."),
+        ([(0, second, second, {"error_deg": turn}) for second, turn in enumerate((3, *[100] * 5))], False, ".hhhl."),
+        ([(0, second, second, {"error_deg": 140}) for second in range(3)], False, "..."),
     ],
 )
 def test_consistency_believes_what_others_prove_within_limits(fixes, is_tracked, verdicts):
@@ -107,8 +109,8 @@ def test_consistency_believes_what_others_prove_within_limits(fixes, is_tracked,
 def test_consistency_believes_no_fix_against_gps():
     judge = Consistency()
     for second in range(6):
-        why = judge.judge(compared(500.0, second, second), has_gps=True, is_tracked=False).why
-        assert why == Reason(ReasonCode.HELD_OFF_GPS, {"off_m": 500.0})
+        reason = judge.judge(compared(500.0, second, second), has_gps=True, is_tracked=False).reason
+        assert reason == Reason(ReasonCode.HELD_OFF_GPS, {"off_m": 500.0})
     assert not judge.is_contradicted(START_S + 5, is_tracked=False)
 
 
@@ -117,18 +119,18 @@ def test_consistency_is_in_doubt_until_another_should_have_agreed(is_tracked, go
     judge = Consistency()
     assert not judge.is_contradicted(START_S, is_tracked)
     for t_s in range(8):
-        why = judge.judge(compared(-100, t_s), has_gps=False, is_tracked=is_tracked).why
-        assert why == Reason(ReasonCode.HELD_OFF_PATH, {"off_m": 100.0, "accuracy_m": math.sqrt(30.5)})
+        reason = judge.judge(compared(-100, t_s), has_gps=False, is_tracked=is_tracked).reason
+        assert reason == Reason(ReasonCode.HELD_OFF_PATH, {"off_m": 100.0, "accuracy_m": math.sqrt(30.5)})
     assert judge.is_contradicted(START_S + 7 + good_for_s, is_tracked)
     assert not judge.is_contradicted(START_S + 7.1 + good_for_s, is_tracked), "no other has agreed"
-    assert judge.judge(compared(0.0, 9), has_gps=False, is_tracked=is_tracked).why is None
+    assert judge.judge(compared(0.0, 9), has_gps=False, is_tracked=is_tracked).reason is None
     assert not judge.is_contradicted(START_S + 9, is_tracked)
 
 
-@pytest.mark.parametrize(("before_deg", "turn_deg"), [(100.0, 0.0), (0.0, 100.0)])
-def test_consistency_reports_by_how_much_a_picture_is_turned(before_deg, turn_deg):
+@pytest.mark.parametrize(("before_deg", "error_deg"), [(100.0, 0.0), (0.0, 100.0)])
+def test_consistency_reports_by_how_much_a_picture_is_turned(before_deg, error_deg):
     judge = Consistency()
-    judge.judge(compared(0.0, 0, turn_deg=before_deg), has_gps=True, is_tracked=False)
+    judge.judge(compared(0.0, 0, error_deg=before_deg), has_gps=True, is_tracked=False)
     for has_gps in (True, False):
-        why = judge.judge(compared(0.0, 1, turn_deg=turn_deg), has_gps=has_gps, is_tracked=False).why
-        assert why == Reason(ReasonCode.HELD_TURNED, {"turn_deg": turn_deg})
+        reason = judge.judge(compared(0.0, 1, error_deg=error_deg), has_gps=has_gps, is_tracked=False).reason
+        assert reason == Reason(ReasonCode.HELD_TURNED, {"turn_deg": error_deg})

@@ -45,7 +45,7 @@ def test_pictures_that_stay_while_the_aircraft_flies_on_are_refused_until_they_m
     for picture in harm(last, flown.rng, 16):
         flown.see(picture, velocity_m_s=(speed_m_s, 0.0))
     assert flown.refused == [None] * (5 + within_s) + [STAY] * (17 - within_s)
-    flown.autopilot.begin_anew.assert_called_once()
+    flown.autopilot.reset_navigation.assert_called_once()
     flown.fly_on(6, speed_m_s, start_m=180.0)
     assert flown.refused[-4:] == [None] * 4
     assert flown.notes == [str(STAY), str(MOVE)]

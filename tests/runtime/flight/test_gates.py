@@ -33,8 +33,8 @@ class Known:
 
     def __init__(self, *, off_m=(0.0, 0.0), accuracy_m=2.0, shown_ago_s=0.0, gps_ago_s=NEVER_S, drift_m_s=(0.0, 0.0)):
         self.off_m, self.accuracy_m, self.drift_m_s = off_m, accuracy_m, drift_m_s
-        self.shown_s = self.fixed_s = NOW_S - shown_ago_s
-        self.gps_s, self.has_gps, self.is_in_doubt, self.path_velocity_m_s = NOW_S - gps_ago_s, False, False, None
+        self.last_vision_s = self.last_fix_s = NOW_S - shown_ago_s
+        self.last_gps_s, self.has_gps, self.is_in_doubt, self.path_velocity_m_s = NOW_S - gps_ago_s, False, False, None
         self.reports, self.frames, self.begun, self.contradicts_m = [], [], [], 0.0
         self.add_acceleration = self.correct_by_fix = lambda *_: None
 
@@ -52,16 +52,16 @@ class Known:
     def add_frame(self, frame, is_query):
         self.frames.append((frame, is_query))
 
-    def compare(self, seen):
+    def predict_fix(self, match):
         if self.contradicts_m is None:
             return None
-        here, off_m = np.zeros(2), np.array([self.contradicts_m, 0.0])
-        return PredictedFix(seen=seen, path_m=here, off_m=off_m, expected_m=here, covariance_m2=np.eye(2))
+        zero, off_m = np.zeros(2), np.array([self.contradicts_m, 0.0])
+        return PredictedFix(match=match, path_point_m=zero, offset_m=off_m, predicted_m=zero, covariance_m2=np.eye(2))
 
-    def begin(self, *how):
+    def start_at_fix(self, *how):
         self.begun.append(how)
 
-    def is_followed(self, t_s):
+    def is_tracked(self, t_s):
         return False
 
     def path_drift_m_s(self):
@@ -75,7 +75,7 @@ def navigate(channel=Channel.COMMAND, *, reports=None, is_heard=True, map_sd_m=1
     navigator._navigation = Known(**known)
     if is_heard:
         said = {"has_gps": False, "velocity_m_s": (0.0, 0.0)} | (reports or {})
-        navigator.handle_vehicle(vehicle_at(*HOME, said.pop("t_heard_s", NOW_S), **said))
+        navigator.handle_vehicle(vehicle_at(*HOME, said.pop("t_received_s", NOW_S), **said))
     return navigator
 
 
@@ -149,7 +149,7 @@ def test_no_position_is_sent_that_is_unknown_contradicted_or_withdrawn():
     assert (unknown.estimate_state(NOW_S), unknown.output) == (None, Output.UNKNOWN)
     in_doubt, doubted, withdrawn = (navigate(Channel.GPS_INPUT) for _ in range(3))
     in_doubt._navigation.is_in_doubt = True
-    doubted.doubt_map(True)
+    doubted.distrust_map(True)
     withdrawn._watch.withdrawn = Output.REFUSED
     for navigator in (in_doubt, doubted):
         assert (navigator.estimate_state(NOW_S), navigator.output) == (None, Output.CONTRADICTS_GPS)
@@ -205,7 +205,7 @@ def test_estimate_may_be_ours_for_ten_seconds(after_s, reports, is_ours):
     navigator = navigate(Channel.GPS_INPUT)
     assert navigator._navigation.reports == [(True, False)]
     navigator.estimate_state(NOW_S)
-    navigator.believe_gps(False)
+    navigator.trust_gps(False)
     navigator.handle_vehicle(vehicle_at(*HOME, NOW_S + after_s, velocity_m_s=(0.0, 0.0), **reports))
     assert navigator._navigation.reports[1:] == [(False, is_ours)]
 
@@ -248,7 +248,7 @@ TILTED = LevelledImage(np.zeros((8, 8), np.uint8), None, View(reason=Reason(Reas
         (Channel.COMMAND, {}, {"located": None}, 0.0, ReasonCode.PLACE_WITHOUT_POSITION),
         (Channel.COMMAND, {}, {"frame": None}, 0.0, ReasonCode.PLACE_WITHOUT_POSITION),
         (Channel.COMMAND, {}, {"picture": TILTED}, 0.0, ReasonCode.NOT_BELOW_AIRCRAFT),
-        (CONTINUOUS, {"t_heard_s": NOW_S - 1.1}, {}, 0.0, ReasonCode.NO_TELEMETRY),
+        (CONTINUOUS, {"t_received_s": NOW_S - 1.1}, {}, 0.0, ReasonCode.NO_TELEMETRY),
         (CONTINUOUS, {"velocity_m_s": None}, {}, 0.0, ReasonCode.NO_TELEMETRY),
         (Channel.COMMAND, {"velocity_m_s": None}, {}, 0.0, None),
         (CONTINUOUS, {}, {}, None, ReasonCode.CONTINUOUS),
@@ -280,7 +280,7 @@ def test_accuracy_of_a_fix_contains_the_error_of_its_time():
 
 @pytest.mark.parametrize("is_heard", [True, False])
 def test_autopilot_that_has_just_been_heard_is_sent_nothing_for_five_seconds(is_heard):
-    navigator = navigate(is_heard=is_heard, reports={"t_heard_s": NOW_S - 5.0})
+    navigator = navigate(is_heard=is_heard, reports={"t_received_s": NOW_S - 5.0})
     if not is_heard:
         navigator.handle_autopilot(NOW_S - 5.0)
     assert navigator.advise(matched(), NOW_S).why.code is ReasonCode.NO_TELEMETRY
@@ -288,7 +288,7 @@ def test_autopilot_that_has_just_been_heard_is_sent_nothing_for_five_seconds(is_
 
 
 def test_fix_is_sent_where_it_improves_the_position_of_the_autopilot():
-    reports = {"velocity_m_s": (10.0, -4.0), "t_heard_s": NOW_S - 0.5}
+    reports = {"velocity_m_s": (10.0, -4.0), "t_received_s": NOW_S - 0.5}
     same = navigate(reports=reports, off_m=(5.0, -2.0)).advise(matched(), NOW_S)
     assert same.why.code is ReasonCode.NOT_BETTER
     assert same.why.parameters == pytest.approx({"off_m": 0.0, "accuracy_m": 2.0}, abs=0.01)
@@ -304,9 +304,9 @@ def test_fix_is_sent_where_it_improves_the_position_of_the_autopilot():
 def test_no_fix_is_sent_beside_gps_or_where_the_map_contradicts_it():
     beside, doubted, unknown = (navigate(off_m=(10.0, 0.0), reports=said) for said in (GPS, {}, {}))
     assert beside.advise(matched(), NOW_S).why.code is ReasonCode.HAS_GPS
-    beside.believe_gps(False)
+    beside.trust_gps(False)
     assert beside.advise(matched(), NOW_S).why.code is ReasonCode.HAS_WRONG_GPS
-    doubted.doubt_map(True)
+    doubted.distrust_map(True)
     assert doubted.advise(matched(), NOW_S).why.code is ReasonCode.MAP_CONTRADICTS_GPS
     unknown._navigation.accuracy_m = None
     assert unknown.advise(matched(), NOW_S).why.code is ReasonCode.NO_TELEMETRY
@@ -319,7 +319,7 @@ def test_no_fix_is_sent_beside_gps_or_where_the_map_contradicts_it():
         {"channel": Channel.GPS_INPUT},
         {"is_heard": False},
         {"reports": {"velocity_m_s": None}},
-        {"reports": {"t_heard_s": NOW_S - 1.1}},
+        {"reports": {"t_received_s": NOW_S - 1.1}},
         {"reports": GPS},
         {"shown_ago_s": 60.1},
         {"off_m": (1.0, 0.0)},

@@ -68,16 +68,16 @@ def test_match_contradicts_gps_that_has_moved_beside_those_before(sd_m, before_m
         assert watched.matches(*[limit_m + beyond_m] * 3, begin_s=seconds) is is_wrong
 
 
-def test_begin_anew_forgets_how_matches_differed_from_gps():
+def test_reset_forgets_how_matches_differed_from_gps():
     watched = Watched()
     watched.matches(*[0.0] * 10)
-    watched.watch.begin_anew()
+    watched.watch.reset()
     assert not watched.matches(*[-7.1] * 3, begin_s=10), "no offset is usual yet"
     watched = Watched()
     watched.matches(100.0, 100.0)
-    watched.watch.begin_anew()
+    watched.watch.reset()
     assert not watched.matches(100.0, 100.0, begin_s=2)
-    watched.watch.begin_anew()
+    watched.watch.reset()
     watched.matches(*[0.0] * 9, begin_s=4)
     assert not watched.matches(*[7.1] * 3, begin_s=13)
 
@@ -119,11 +119,11 @@ def test_gps_is_right_again_after_three_that_agree():
     assert not jammed.match(0.0, 20.1, (21,))
 
 
-@pytest.mark.parametrize(("agreeing", "believes_gps"), [(2, True), (3, False)])
-def test_gps_is_believed_against_a_map_that_has_not_agreed_with_it(agreeing, believes_gps):
+@pytest.mark.parametrize(("agreeing", "trusts_gps"), [(2, True), (3, False)])
+def test_gps_is_believed_against_a_map_that_has_not_agreed_with_it(agreeing, trusts_gps):
     watched = Watched()
     assert watched.matches(*[0.0] * agreeing, *[100.0] * 3)
-    assert watched.navigator.believes_gps() is believes_gps
+    assert watched.navigator.trusts_gps() is trusts_gps
 
 
 def test_gps_is_reported_again_when_its_distance_has_doubled():

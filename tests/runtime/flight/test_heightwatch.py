@@ -21,7 +21,7 @@ class Watch:
             self.clock.now_s += every_s
             now_s = self.clock.now_s
             where = {"lat_deg": 50.0, "lon_deg": 8.0, "alt_m": 600.0, "heading_deg": None}
-            vehicle = Vehicle(**where, t_heard_s=now_s - age_s, has_gps=False, height_m=reported_m)
+            vehicle = Vehicle(**where, t_received_s=now_s - age_s, has_gps=False, height_m=reported_m)
             self.watch.update(
                 SimpleNamespace(
                     frame=SimpleNamespace(t_mono_s=now_s),

@@ -121,7 +121,7 @@ def test_map_that_never_agreed_with_gps_moves_no_aircraft_after_its_loss(watched
     air.gps_off_m = np.array([300.0, 0.0])
     air.fly(30)
     assert air.watch.is_wrong
-    assert air.navigator.believes_gps() is (agrees_s == 0)
+    assert air.navigator.trusts_gps() is (agrees_s == 0)
     air.lose_gps()
     sent = [fix for fix in air.fly(20).reports[-20:] if fix.sent]
     assert bool(sent) is (agrees_s > 0)

@@ -20,12 +20,10 @@ HOME = 47.0, 8.0
 STEP_S = 0.02
 
 
-def match_at(position, t_s, fix_sd_m, lean=None, **frame):
+def match_at(position, t_s, fix_sd_m, attitude_error=None, **frame):
     frame = FrameMeasurement(t_s=t_s, **{"sd_m": 0.0} | frame)
-    covariance_m2 = fix_sd_m**2 * np.eye(2)
-    return PositionedMatch(
-        frame=frame, position=position, accuracy_m=fix_sd_m, covariance_m2=covariance_m2, places=(1,), lean=lean
-    )
+    match = {"covariance_m2": fix_sd_m**2 * np.eye(2), "places": (1,), "attitude_error": attitude_error}
+    return PositionedMatch(frame=frame, position=position, accuracy_m=fix_sd_m, **match)
 
 
 class Flown:
@@ -85,7 +83,7 @@ class Flown:
 
     def take(self, seen_m, fix_sd_m=None, **match):
         seen = match_at(Position(*offset_position(*HOME, *seen_m)), self.seen_s, fix_sd_m or self.fix_sd_m, **match)
-        self.navigation.correct_by_fix(self.navigation.compare(seen))
+        self.navigation.correct_by_fix(self.navigation.predict_fix(seen))
 
     def fix(self):
         self.take(self.see())
@@ -98,11 +96,12 @@ def lengths(errors_m):
 def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopilot_that_reckons():
     flown = Flown(DEAD_RECKONING, fix_sd_m=0.5)
     flown.fly(10, has_gps=True, fixes=False)
-    lean_s2, wrong = 100 / GRAVITY_M_S2, np.array([0.06, 0.0])  # of the height: 3.4 degrees
+    attitude_gain_s2, wrong = 100 / GRAVITY_M_S2, np.array([0.06, 0.0])  # of the height: 3.4 degrees
 
     def fix():
         seen_m = flown.see(-100 * wrong)
-        flown.take(seen_m, lean=AttitudeError(tuple(flown.rng.normal(wrong, 0.02)), 0.02), lean_s2=lean_s2)
+        shown = AttitudeError(tuple(flown.rng.normal(wrong, 0.02)), 0.02)
+        flown.take(seen_m, attitude_error=shown, attitude_gain_s2=attitude_gain_s2)
 
     flown.fix = fix
     errors_m, said_m = flown.fly(120)
@@ -116,7 +115,7 @@ def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_rec
     monkeypatch.setattr(drift, "_GPS_LOSS_NOISE_FACTOR", upset)
     flown, frames = Flown(DEAD_RECKONING, wind=(5.0, 0.0), fix_sd_m=0.5), []
     flown.fly(30, has_gps=True, fixes=False)
-    loss_s, lean_s2 = flown.t_s, 100 / GRAVITY_M_S2
+    loss_s, attitude_gain_s2 = flown.t_s, 100 / GRAVITY_M_S2
 
     def fix():
         seen_m = flown.see((8.0 * min(1.0, max(0.0, flown.seen_s - loss_s) / 10.0), 0.0))
@@ -125,7 +124,7 @@ def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_rec
         if len(frames) > 1:
             (from_s, before), (to_s, now) = frames[-2:]
             stride = OdometryStep(from_s=from_s, to_s=to_s, moved_m=tuple(now - before), sd_m=0.7, inliers=100)
-        flown.take(seen_m, 1.0, lean_s2=lean_s2, sd_m=1.5, odometry=stride)
+        flown.take(seen_m, 1.0, attitude_gain_s2=attitude_gain_s2, sd_m=1.5, odometry=stride)
 
     flown.fix = fix
     errors_m, said_m = flown.fly(15)
@@ -136,7 +135,7 @@ def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_rec
 def test_where_no_picture_shows_an_error_of_the_attitude_a_fix_is_not_taken_for_one():
     flown = Flown(DEAD_RECKONING, wind=(5.0, 0.0), fix_sd_m=2.0)
     flown.fly(10, has_gps=True, fixes=False)
-    flown.fix = lambda: flown.take(flown.see(), lean_s2=18.0)
+    flown.fix = lambda: flown.take(flown.see(), attitude_gain_s2=18.0)
     flown.fly(60)
     errors_m, said_m = flown.fly(400)
     assert np.median(lengths(errors_m)) < 2.5
@@ -201,7 +200,7 @@ def test_receiver_that_contradicts_does_not_overrule_recent_matches():
     flown = Received().fly(20)
     for _ in range(5):
         flown.fly(1, off_m=150.0)
-        fix = flown.navigation.compare(match_at(Position(*HOME), flown.t_s, 1.0))
+        fix = flown.navigation.predict_fix(match_at(Position(*HOME), flown.t_s, 1.0))
         flown.navigation.correct_by_fix(fix)
     assert not flown.navigation.has_gps
     assert not flown.navigation.is_in_doubt
@@ -220,17 +219,17 @@ def test_strides_claim_what_unknown_ground_can_do(zoom, gap_s, least_m, most_m):
         stride = OdometryStep(
             from_s=flown.t_s - 1, to_s=flown.t_s, moved_m=(10.0, 0.0), sd_m=0.2, inliers=100, zoom=zoom
         )
-        flown.navigation._strides_since_fix.add(
+        flown.navigation._odometry_since_fix.add(
             np.array([10.0, 0.0]), zoom, FrameMeasurement(t_s=flown.t_s, sd_m=0.2, odometry=stride)
         )
         assert number or flown.navigation.estimate_state(flown.t_s)
-    assert least_m <= flown.navigation._strides_since_fix.error_m <= most_m
+    assert least_m <= flown.navigation._odometry_since_fix.error_m <= most_m
 
 
 def test_by_accelerations_alone_it_begins_with_a_fix():
     flown = Flown(INERTIAL)
     assert flown.navigation.estimate_state(0.0) is None
-    flown.navigation.begin(Position(*HOME), 3.0, -1.0, 0.0)
+    flown.navigation.start_at_fix(Position(*HOME), 3.0, -1.0, 0.0)
     assert flown.navigation.estimate_state(0.0).accuracy_m > 10, "nobody knows how fast it was"
     errors_m, _ = flown.fly(60)
     assert lengths(errors_m)[-20:].max() < 6.0

@@ -43,7 +43,7 @@ def test_fixes_that_err_otherwise_from_now_on_are_believed_where_it_begins_anew(
     air.fly(120)
     air.map_off = air.map_off - np.array((16.0, 0.0))
     if begins_anew:
-        air.navigator.begin_anew()
+        air.navigator.reset_navigation()
     air.advices.clear()
     held = [advice.is_held for _, advice in air.fly(30).advices]
     assert len(held) > 25

@@ -27,8 +27,8 @@ def withdrawn(*reports):
             watch.record_sent(t_s - known.get("sent_ago_s", 0.0))
         receiver = receiver_at(HOME, known["sd_m"], t_s, steady_for_s=known["steady_s"]) if has_gps else None
         vehicle = vehicle_at(*offset_position(*HOME, known["off_m"], 0.0), t_s, has_gps=has_gps, gps=receiver)
-        fixed_s = t_s - known.get("fixed_ago_s", math.inf)
-        watch.update(replace(vehicle, innovation_ratio=known["ratio"]), fixed_s, has_gps)
+        last_fix_s = t_s - known.get("fixed_ago_s", math.inf)
+        watch.update(replace(vehicle, innovation_ratio=known["ratio"]), last_fix_s, has_gps)
     return watch.withdrawn
 
 

@@ -38,13 +38,13 @@ def index():
     return index_of([0, 100, 200, 300, np.nan], [0, 10, 20, np.nan, 350])
 
 
-def vehicle(position, t_heard_s, has_gps=True):
+def vehicle(position, t_received_s, has_gps=True):
     return Vehicle(
         lat_deg=position.lat_deg,
         lon_deg=position.lon_deg,
         alt_m=0.0,
         heading_deg=None,
-        t_heard_s=t_heard_s,
+        t_received_s=t_received_s,
         has_gps=has_gps,
     )
 
