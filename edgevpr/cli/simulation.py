@@ -50,7 +50,8 @@ def run_simulate_flight(args: Namespace) -> int:
 
     shots = read_shots(args.track, args.height_m, args.every_m)
     taken = write_overflight(Path(args.out), Orthophoto(args.orthophoto), shots, args.fov_deg, args.seed)
-    written = sum(1 for _ in progress(taken, len(shots), "flying"))
+    if not (written := sum(1 for _ in progress(taken, len(shots), "flying"))):
+        raise UsageError(f"No picture of {args.track} shows ground of {args.orthophoto} alone: none was taken.")
     print(f"{args.out}: {written} images in images/, where they were taken in positions.csv")
     if beyond := len(shots) - written:
         print(f"{beyond} left out: they would show ground beyond the orthophoto")

@@ -90,6 +90,7 @@ def test_map_build_refuses_a_wrong_request(tmp_path, ground, capsys, flags, code
         (["--track", "t"], "--track goes with --orthophoto"),
         (["--orthophoto", "GROUND"], "needs its --track"),
         (["--orthophoto", "GROUND", "--track", "TRACK"], "give --height-m"),
+        (["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "900"], "none was taken"),
     ],
 )
 def test_simulate_flight_refuses_a_wrong_request(tmp_path, ground, track, capsys, flags, said):

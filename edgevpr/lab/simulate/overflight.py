@@ -15,7 +15,7 @@ from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph, view_on_ground
 from edgevpr.lab.simulate.generated import make_oscillation, write_shots
-from edgevpr.mapmaking.cuttings import MAX_WITHOUT_DATA, format_extent
+from edgevpr.mapmaking.cuttings import MAX_WITHOUT_DATA
 from edgevpr.mapmaking.missions import read_area
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
@@ -110,8 +110,7 @@ def photograph_ground(
 def write_overflight(
     folder: Path, orthophoto: Orthophoto, shots: list[GeoTag], fov_deg: float, seed: int
 ) -> Iterator[str]:
-    """Write the pictures with `write_shots`; those that would show ground beyond the orthophoto are left out. Raises
-    UsageError if that leaves none."""
+    """Write the pictures with `write_shots`; those that would show ground beyond the orthophoto are left out."""
     camera = Camera()
     camera = replace(camera, focal_px=float(camera.width / 2 / np.tan(np.radians(fov_deg / 2))))
     rng = np.random.default_rng((seed, 3))
@@ -122,12 +121,4 @@ def write_overflight(
             tag = replace(shot, heading_deg=pose.heading_deg, roll_deg=pose.roll_deg, pitch_deg=pose.pitch_deg)
             yield tag, picture
 
-    names = write_shots(folder, take_shots(), camera.jpeg_quality)
-    first = next(names, None)
-    if first is None:
-        raise UsageError(
-            f"No picture of the track shows {orthophoto.name}, which is at {format_extent(orthophoto.extent_deg)}: "
-            "pictures that leave it are not taken."
-        )
-    yield first
-    yield from names
+    return write_shots(folder, take_shots(), camera.jpeg_quality)
