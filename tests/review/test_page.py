@@ -7,9 +7,9 @@ import re
 import cv2
 import numpy as np
 import pytest
+from commands import refused, run
 from logs import query, write_log
 
-from edgevpr.cli.main import main
 from edgevpr.review.album import Album, make_album
 from edgevpr.review.logged import read_flight
 from edgevpr.review.page import make_flight_page
@@ -21,14 +21,6 @@ def page(path):
     return make_flight_page(read_flight(path), [], Album(), Album())
 
 
-def report(capsys, *argv):
-    """What the command says, and its exit code."""
-    code = main(["report", *map(str, argv)])
-    said = capsys.readouterr()
-    assert "Traceback" not in said.err
-    return code, (said.out + said.err).strip()
-
-
 def data_of(content):
     """The data of a page for its script."""
     return json.loads(re.search(r'id="page">(.*?)</script>', content)[1])
@@ -38,7 +30,7 @@ def data_of(content):
 def made(flown, tmp_path_factory):
     out = tmp_path_factory.mktemp("made") / "report.html"
     folders = ["--images", flown / "seen", "--map-images", flown / "ref"]
-    assert main(["report", *map(str, [flown / "flight.jsonl", "--out", out, *folders])]) == 0
+    assert run("report", flown / "flight.jsonl", "--out", out, *folders) == 0
     return out
 
 
@@ -94,17 +86,15 @@ def test_positions_that_cross_the_date_line_stay_together(tmp_path):
     assert data["ground"]["box"][2] == pytest.approx(222.6 + 2 * 30, rel=0.01)
 
 
-def test_a_map_that_is_not_there_is_no_reason_to_have_no_page(flown, tmp_path, capsys):
+def test_a_map_that_is_not_there_is_no_reason_to_have_no_page(flown, tmp_path):
     log = write_log(tmp_path / "log", ("start", {"map": str(tmp_path / "gone.gpkg")}), ("query", query("a")))
-    code, _ = report(capsys, log, "--out", tmp_path / "out.html")
+    assert run("report", log, "--out", tmp_path / "out.html") == 0
     data = data_of((tmp_path / "out.html").read_text("utf-8"))
-    assert code == 0
     assert "not drawn" in data["warnings"][-1]
     assert data["ground"]["layers"]
-    code, _ = report(capsys, log, "--out", tmp_path / "out.html", "--map", flown / "map.gpkg")
+    assert run("report", log, "--out", tmp_path / "out.html", "--map", flown / "map.gpkg") == 0
     data = data_of((tmp_path / "out.html").read_text("utf-8"))
     assert data["ground"]["layers"][0]["colour"] == "places"
-    assert code == 0
 
 
 @pytest.mark.parametrize(
@@ -123,7 +113,6 @@ def test_what_cannot_be_done_is_said_in_a_sentence(tmp_path, monkeypatch, capsys
     write_log(tmp_path / "LOG", ("query", query("a")))
     (tmp_path / "empty").touch()
     before = (tmp_path / "LOG").read_bytes()
-    got, sentence = report(capsys, *argv)
-    assert (got, said in sentence) == (code, True), sentence
+    assert said in refused(capsys, "report", *argv, code=code)
     assert (tmp_path / "LOG").read_bytes() == before
     assert not (tmp_path / "out.html").exists()
