@@ -1,9 +1,10 @@
 """Navigation between fixes: with a true flight beside it, how wrong it is, and whether it knows."""
 
-import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from air import HOME, Air, lengths
 from fakes import receiver_at, vehicle_at
 
 from edgevpr.core.geodesy import offset_m, offset_position
@@ -16,7 +17,6 @@ from edgevpr.runtime.flight.navigation import Navigation
 from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.perspective import AttitudeError
 
-HOME = 47.0, 8.0
 STEP_S = 0.02
 
 
@@ -26,86 +26,51 @@ def match_at(position, t_s, fix_sd_m, attitude_error=None, **frame):
     return PositionedMatch(frame=frame, position=position, accuracy_m=fix_sd_m, **match)
 
 
-class Flown:
-    """A flight in a wide circle whose autopilot has GPS until `loss_s`, then reckons with a wind that it does not know;
-    fixes of a standard deviation of `fix_sd_m` come once a second and are 0.4 s late."""
+class Flown(Air):
+    """A flight that has lost GPS after `gps_s`. Its matches all correct its navigation, as `look` makes them of the
+    time of a frame and of where it was taken (2,); nothing is sent."""
 
-    def __init__(self, drift, *, wind=(0.0, 0.0), fix_sd_m=2.0):
+    def __init__(self, gps_s, drift=DEAD_RECKONING, **how):
         self.navigation = Navigation(drift, 1.0)
-        self.rng = np.random.default_rng(7)
-        self.wind = np.array(wind)
-        self.fix_sd_m, self.late_steps = fix_sd_m, round(0.4 / STEP_S)
-        self.at_m, self.reckoned_m, self.step = np.zeros(2), np.zeros(2), 0
-        self.way = [self.at_m]
-        self.is_inertial = drift is INERTIAL
+        navigator = SimpleNamespace(
+            handle_vehicle=self.navigation.add_report,
+            handle_force=self.feel if drift is INERTIAL else lambda *_: None,
+            estimate_state=self.navigation.estimate_state,
+            make_interim_fix=lambda t_s: None,
+        )
+        super().__init__(navigator, speed_m_s=12.0, velocity_sd=0.0, **how)
+        self.look = lambda t_s, seen_m: (seen_m, {})
+        self.fly(gps_s).lose_gps()
 
-    @property
-    def t_s(self):
-        return self.step * STEP_S
+    def feel(self, t_s, force_m_s2, attitude):
+        self.navigation.add_acceleration(t_s, np.array(force_m_s2[1::-1]))
 
-    def velocity(self, t_s):
-        return 12 * np.array([math.sin(t_s / 20), math.cos(t_s / 20)])
-
-    def fly(self, seconds, *, has_gps=False, fixes=True):
-        """Fly on; return the errors of the navigation (N, 2) and what it says they are (N,), once a second."""
-        errors_m, said_m = [], []
-        for _ in range(round(seconds / STEP_S)):
-            self.step += 1
-            before, velocity = self.velocity(self.t_s - STEP_S), self.velocity(self.t_s)
-            self.at_m = self.at_m + STEP_S * (before + velocity) / 2
-            self.way.append(self.at_m)
-            self.reckoned_m = self.at_m if has_gps else self.reckoned_m + STEP_S * (velocity - self.wind)
-            if self.is_inertial:
-                felt = (velocity - before) / STEP_S + self.rng.normal(0, 0.2, 2)
-                self.navigation.add_acceleration(self.t_s, felt)
-            if self.step % 5 == 0:
-                said = {"has_gps": has_gps, "position_sd_m": 0.5 if has_gps else 20.0}
-                speed = tuple(velocity if has_gps else velocity - self.wind)
-                here = offset_position(*HOME, *self.reckoned_m)
-                self.navigation.add_report(vehicle_at(*here, self.t_s, velocity_m_s=speed, **said))
-            if self.step % 50 == 0 and self.step > self.late_steps:
-                if fixes:
-                    self.fix()
-                here = self.navigation.estimate_state(self.t_s)
-                off_m = offset_m(*HOME, here.position.lat_deg, here.position.lon_deg)
-                errors_m.append(np.array(off_m) - self.at_m)
-                said_m.append(here.accuracy_m)
-        return np.array(errors_m), np.array(said_m)
-
-    @property
-    def seen_s(self):
-        return (self.step - self.late_steps) * STEP_S
-
-    def see(self, off_m=(0.0, 0.0)):
-        """Where a match puts the aircraft (2,)."""
-        seen_m = self.way[self.step - self.late_steps] + self.rng.normal(0, self.fix_sd_m, 2)
-        return seen_m + off_m
-
-    def take(self, seen_m, fix_sd_m=None, **match):
-        seen = match_at(Position(*offset_position(*HOME, *seen_m)), self.seen_s, fix_sd_m or self.fix_sd_m, **match)
+    def match(self, step, vehicle):
+        if self.has_gps:
+            return
+        seen_m, more = self.look(step * STEP_S, self.way[step] + self.rng.normal(0, self.fix_sd_m, 2))
+        at = Position(*offset_position(*HOME, *seen_m))
+        seen = match_at(at, step * STEP_S, **{"fix_sd_m": self.fix_sd_m} | more)
         self.navigation.correct_by_fix(self.navigation.predict_fix(seen))
 
-    def fix(self):
-        self.take(self.see())
-
-
-def lengths(errors_m):
-    return np.hypot(*errors_m.T)
+    def errors(self, from_s):
+        """Errors of the navigation (N, 2), and what it said they were (N,)."""
+        states = [(t_s, state) for t_s, state in self.states if t_s > from_s]
+        errors_m = [self.off(state.position.lat_deg, state.position.lon_deg, t_s) for t_s, state in states]
+        return np.array(errors_m), np.array([state.accuracy_m for _, state in states])
 
 
 def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopilot_that_reckons():
-    flown = Flown(DEAD_RECKONING, fix_sd_m=0.5)
-    flown.fly(10, has_gps=True, fixes=False)
-    attitude_gain_s2, wrong = 100 / GRAVITY_M_S2, np.array([0.06, 0.0])  # of the height: 3.4 degrees
+    flown, wrong = Flown(10, fix_sd_m=0.5), np.array([0.06, 0.0])  # of the height: 3.4 degrees
 
-    def fix():
-        seen_m = flown.see(-100 * wrong)
+    def look(t_s, seen_m):
         shown = AttitudeError(tuple(flown.rng.normal(wrong, 0.02)), 0.02)
-        flown.take(seen_m, attitude_error=shown, attitude_gain_s2=attitude_gain_s2)
+        return seen_m - 100 * wrong, {"attitude_error": shown, "attitude_gain_s2": 100 / GRAVITY_M_S2}
 
-    flown.fix = fix
-    errors_m, said_m = flown.fly(120)
-    assert np.median(lengths(errors_m[20:])) < 1.5
+    flown.look = look
+    flown.fly(120)
+    errors_m, said_m = flown.errors(10)
+    assert np.median(lengths(errors_m[200:])) < 1.5
     assert (abs(errors_m) < 2 * said_m[:, None]).mean() > 0.9
 
 
@@ -113,31 +78,27 @@ def test_an_error_of_the_attitude_that_a_picture_shows_moves_no_fix_of_an_autopi
 def test_what_a_new_wind_does_to_the_attitude_of_an_autopilot_that_begins_to_reckon_is_allowed_for(upset, monkeypatch):
     """4.5 degrees within ten seconds, 100 m high: fixes and strides lead 8 m away, and claim a metre."""
     monkeypatch.setattr(drift, "_GPS_LOSS_NOISE_FACTOR", upset)
-    flown, frames = Flown(DEAD_RECKONING, wind=(5.0, 0.0), fix_sd_m=0.5), []
-    flown.fly(30, has_gps=True, fixes=False)
-    loss_s, attitude_gain_s2 = flown.t_s, 100 / GRAVITY_M_S2
+    flown, frames = Flown(30, wind=(5.0, 0.0), fix_sd_m=0.5), []
 
-    def fix():
-        seen_m = flown.see((8.0 * min(1.0, max(0.0, flown.seen_s - loss_s) / 10.0), 0.0))
-        frames.append((flown.seen_s, seen_m))
+    def look(t_s, seen_m):
+        seen_m[0] += 8.0 * np.clip((t_s - 30) / 10, 0, 1)
+        frames.append((t_s, seen_m))
         stride = None
         if len(frames) > 1:
             (from_s, before), (to_s, now) = frames[-2:]
             stride = OdometryStep(from_s=from_s, to_s=to_s, moved_m=tuple(now - before), sd_m=0.7, inliers=100)
-        flown.take(seen_m, 1.0, attitude_gain_s2=attitude_gain_s2, sd_m=1.5, odometry=stride)
+        return seen_m, {"fix_sd_m": 1.0, "attitude_gain_s2": 100 / GRAVITY_M_S2, "sd_m": 1.5, "odometry": stride}
 
-    flown.fix = fix
-    errors_m, said_m = flown.fly(15)
+    flown.look = look
+    errors_m, said_m = flown.fly(15).errors(30)
     holds = (abs(errors_m) < 2 * said_m[:, None]).mean() >= 0.92
     assert holds == (upset > 0)
 
 
 def test_where_no_picture_shows_an_error_of_the_attitude_a_fix_is_not_taken_for_one():
-    flown = Flown(DEAD_RECKONING, wind=(5.0, 0.0), fix_sd_m=2.0)
-    flown.fly(10, has_gps=True, fixes=False)
-    flown.fix = lambda: flown.take(flown.see(), attitude_gain_s2=18.0)
-    flown.fly(60)
-    errors_m, said_m = flown.fly(400)
+    flown = Flown(10, wind=(5.0, 0.0), fix_sd_m=2.0)
+    flown.look = lambda t_s, seen_m: (seen_m, {"attitude_gain_s2": 18.0})
+    errors_m, said_m = flown.fly(460).errors(70)
     assert np.median(lengths(errors_m)) < 2.5
     assert said_m.max() < 4.0, "and does not grow"
     assert (abs(errors_m) < 2 * said_m[:, None]).mean() > 0.9
@@ -227,9 +188,9 @@ def test_strides_claim_what_unknown_ground_can_do(zoom, gap_s, least_m, most_m):
 
 
 def test_by_accelerations_alone_it_begins_with_a_fix():
-    flown = Flown(INERTIAL)
+    flown = Flown(0, INERTIAL, fix_sd_m=2.0)
     assert flown.navigation.estimate_state(0.0) is None
     flown.navigation.start_at_fix(Position(*HOME), 3.0, -1.0, 0.0)
     assert flown.navigation.estimate_state(0.0).accuracy_m > 10, "nobody knows how fast it was"
-    errors_m, _ = flown.fly(60)
-    assert lengths(errors_m)[-20:].max() < 6.0
+    errors_m, _ = flown.fly(60).errors(40)
+    assert lengths(errors_m).max() < 6.0
