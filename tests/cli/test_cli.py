@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from commands import refused, run, run_json
-from pictures import textured
+from pictures import textured, write_flight
 
 from edgevpr.cli.examples import EXAMPLES
 from edgevpr.cli.main import EXIT_CODES, main, make_parser
@@ -21,18 +21,9 @@ from edgevpr.cli.main import EXIT_CODES, main, make_parser
 def flight(tmp_path_factory):
     """A folder of six pictures with positions, and the same six a little darker and shifted as queries."""
     folder = tmp_path_factory.mktemp("flight")
-    (folder / "ref").mkdir()
-    (folder / "query").mkdir()
-    rows = ["file,lat,lon,alt,yaw_deg"]
-    for number in range(6):
-        picture = textured(number, 240, 320)
-        cv2.imwrite(str(folder / "ref" / f"{number}.png"), picture)
-        seen_again = cv2.convertScaleAbs(np.roll(picture, 9, axis=1), alpha=0.8)
-        cv2.imwrite(str(folder / "query" / f"{number}.png"), seen_again)
-        rows.append(f"{number}.png,{50 + number * 0.001:.6f},8.0,100,{number}")
-    (folder / "positions.csv").write_text("\n".join(rows) + "\n")
-    truth = ["query_file,ref_files"] + [f"{number}.png,{number}.png" for number in range(6)]
-    (folder / "ground_truth.csv").write_text("\n".join(truth) + "\n")
+    pictures = [textured(number, 240, 320) for number in range(6)]
+    write_flight(folder / "ref", pictures)
+    write_flight(folder / "query", [cv2.convertScaleAbs(np.roll(each, 9, axis=1), alpha=0.8) for each in pictures])
     return folder
 
 
@@ -56,7 +47,7 @@ def test_match_finds_every_place_with_its_cost(capsys, flight, valley):
     flags = ("--images", flight / "query", "--min-score", "0.9999")
     assert not any(each["accepted"] or each["position"] for each in run_json(capsys, "match", valley, *flags))
     place, fix = found[2]["place"], found[2]["position"]
-    assert place == {"number": 3, "image": "2.png", "lat_deg": 50.002, "lon_deg": 8.0, "alt_m": 100.0}
+    assert place == {"number": 3, "image": "2.png", "lat_deg": 50.002, "lon_deg": 8.0, "alt_m": None}
     assert (fix["lat_deg"], fix["lon_deg"], fix["of_place"]) == (50.002, 8.0, True), "ahead, nothing else is known"
     assert fix["accuracy_m"] == pytest.approx(111, abs=1), "the distance between places"
     assert found[2]["from_gps_tag_m"] == 0
@@ -97,7 +88,7 @@ def test_main_exits_with_1_and_a_sentence_if_an_input_is_bad(capsys, flight, val
     query = flight / "query"
     for argv, says in [
         (["match", tmp_path / "no.gpkg", "--images", query], "There is no map"),
-        (["match", flight / "positions.csv", "--images", query], "not a place map"),
+        (["match", flight / "ref" / "0.png", "--images", query], "not a place map"),
         (["match", flight, "--images", query], f"edgevpr map subset {flight} --mission"),
         (
             ["run", "--map", flight, "--source", query, "--log", tmp_path / "x"],

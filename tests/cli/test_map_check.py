@@ -1,13 +1,12 @@
 """`edgevpr map check` and `map repair`, and what `map build` and `map merge` leave behind when they fail."""
 
-import contextlib
 import json
 import shutil
-import sqlite3
 
 import pytest
 from commands import refused, run_json
 from full_disk import no_file_larger_than
+from map_writer import write_sql
 from pictures import textured, write_flight
 
 from edgevpr.cli.main import main
@@ -39,12 +38,6 @@ def built(path, flight, *flags):
     return ["map", "build", str(path), "--images", str(flight / "images"), *technique, *flags]
 
 
-def damage(path, *statements):
-    with contextlib.closing(sqlite3.connect(path)) as db, db:
-        for statement in statements:
-            db.execute(statement)
-
-
 DAMAGE = (
     "UPDATE places SET fine = zeroblob(length(fine)) WHERE place_id = 2",
     "UPDATE places SET heading_deg = 'north' WHERE place_id = 4",
@@ -65,7 +58,7 @@ def test_map_repair_leaves_a_whole_map_alone(valley, capsys):
 
 
 def test_map_repair_drops_what_is_damaged_and_keeps_the_original(valley, capsys):
-    damage(valley, *DAMAGE)
+    write_sql(valley, *DAMAGE)
     before = valley.read_bytes()
     assert main(["map", "check", str(valley)]) == 1
     assert "  damaged     place 4: its heading_deg is 'north'" in capsys.readouterr().out.splitlines()
@@ -89,13 +82,13 @@ def test_map_repair_drops_what_is_damaged_and_keeps_the_original(valley, capsys)
         repaired.require_technique(damaged.spec)
     assert main(["map", "check", str(valley)]) == 0
     assert sorted(entry.name for entry in valley.parent.iterdir()) == [valley.name, original.name]
-    damage(valley, "UPDATE places SET fine = x'00' WHERE place_id = 1")
+    write_sql(valley, "UPDATE places SET fine = x'00' WHERE place_id = 1")
     assert "exists already" in refused(capsys, "map", "repair", valley, code=1)
     assert original.read_bytes() == before
 
 
 def test_map_repair_leaves_a_map_of_which_nothing_can_be_read(valley, capsys):
-    damage(valley, "UPDATE places SET coarse = x'00'")
+    write_sql(valley, "UPDATE places SET coarse = x'00'")
     before = valley.read_bytes()
     assert "restore" in refused(capsys, "map", "repair", valley, code=1)
     assert valley.read_bytes() == before
@@ -121,7 +114,7 @@ def test_map_merge_and_repair_leave_no_part_on_a_full_disk(valley, tmp_path, cap
     for bytes_at_most in (1, 5_000, 60_000):
         assert run_full(["map", "merge", str(out), str(valley)], bytes_at_most) == 1
         assert not list(out.parent.iterdir())
-    damage(valley, *DAMAGE)
+    write_sql(valley, *DAMAGE)
     before = valley.read_bytes()
     for bytes_at_most in (1, 5_000, 45_000):
         assert run_full(["map", "repair", str(valley)], bytes_at_most) == 1

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from commands import refused, run_json
+from map_writer import write_sql
 
 from edgevpr.cli.main import main
 from edgevpr.core.geodesy import distance_m, offset_position
@@ -230,12 +231,11 @@ def test_what_cannot_be_refined_says_why(tmp_path, flown, map_path, capsys):
 
 
 def test_a_place_that_cannot_be_read_is_left_alone(map_path):
-    import sqlite3
-
-    with sqlite3.connect(map_path) as db:
-        db.execute("UPDATE places SET landmarks = x'00' WHERE place_id = 3")
-        db.execute("UPDATE places SET up_deg = 5, pose_crc32 = 1 WHERE place_id = 5")
-    db.close()
+    write_sql(
+        map_path,
+        "UPDATE places SET landmarks = x'00' WHERE place_id = 3",
+        "UPDATE places SET up_deg = 5, pose_crc32 = 1 WHERE place_id = 5",
+    )
     with PlaceMap.open_for_adding(map_path) as place_map:
         found = refine(place_map, create_technique(place_map), iterate_silently)
     assert found.places == 27

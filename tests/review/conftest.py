@@ -1,16 +1,14 @@
 """A flight over a map, by the real recogniser, loop and log, for the tests of what is made of it afterwards."""
 
-import csv
 from dataclasses import replace
 
-import cv2
 import pytest
 from browser import driven
+from commands import run
 from fakes import FakeClock, FakeLink, FakeSource, receiver_at
 from flights import Flight
-from pictures import textured
+from pictures import textured, write_flight
 
-from edgevpr.cli.main import main
 from edgevpr.core.types import Frame, Vehicle
 from edgevpr.runtime.flight.startup import start_fields
 
@@ -24,19 +22,11 @@ def flown(tmp_path_factory):
     """A folder with a flight.jsonl, its map.gpkg, the pictures of the map (`ref`) and of the flight (`seen`), which
     have the same names. The GPS of the aircraft is 90 m beside the map's positions."""
     folder = tmp_path_factory.mktemp("flown")
-    pictures = {f"{number:02d}.png": textured(number, 240, 320) for number in range(SEEN)}
-    (folder / "ref").mkdir()
-    (folder / "seen").mkdir()
-    with open(folder / "positions.csv", "w", newline="") as handle:
-        table = csv.writer(handle)
-        table.writerow(("file", "lat", "lon"))
-        for number, (name, picture) in enumerate(pictures.items()):
-            cv2.imwrite(str(folder / "seen" / name), 255 - picture)
-            if number < PLACES:
-                cv2.imwrite(str(folder / "ref" / name), picture)
-                table.writerow((name, f"{50 + number * STEP_DEG:.4f}", 8.0))
-    build = ["map", "build", folder / "map.gpkg", "--images", folder / "ref", "--positions", folder / "positions.csv"]
-    assert main([*map(str, build), "--technique", "cohog", "--param", "w1=208", "--no-calibrate"]) == 0
+    pictures = {f"{number}.png": textured(number, 240, 320) for number in range(SEEN)}
+    write_flight(folder / "ref", list(pictures.values())[:PLACES], STEP_DEG)
+    write_flight(folder / "seen", [255 - picture for picture in pictures.values()])
+    flags = ["--technique", "cohog", "--param", "w1=208", "--no-calibrate"]
+    assert run("map", "build", folder / "map.gpkg", "--images", folder / "ref", *flags) == 0
 
     clock = FakeClock()
     aircraft = Vehicle(lat_deg=50.0, lon_deg=8.0, alt_m=100.0, heading_deg=0.0, t_received_s=0.0, has_gps=False)

@@ -4,22 +4,16 @@ What is damaged may be compared or not; what must not be is an end of the flight
 have.
 """
 
-import sqlite3
+from functools import partial
 
 import pytest
 from fakes import FakeSource
 from flights import PLACES, STEP_DEG, Flight, fly_acts, nothing, of_kind
+from map_writer import write_sql
 from pictures import textured
 
 from edgevpr.mavlink.messages import Health
 from edgevpr.runtime.flight.watching import MAX_FAILURES_IN_A_ROW
-
-
-def damaged(path, statement, *values):
-    """Another program writes to the map while it is flown with, and minds no rule of it."""
-    with sqlite3.connect(path) as db:
-        db.execute(statement, values)
-    db.close()
 
 
 def mapped(line):
@@ -33,7 +27,7 @@ def mapped(line):
 def test_a_damaged_fine_part_of_any_place_costs_one_query_and_then_only_where_it_may_be_seen(
     place_map, tmp_path, place
 ):
-    damage = lambda: damaged(place_map, "UPDATE places SET fine = x'00' WHERE place_id = ?", place)  # noqa: E731
+    damage = partial(write_sql, place_map, f"UPDATE places SET fine = x'00' WHERE place_id = {place}")
     queries, lines, flight = fly_acts(place_map, tmp_path / "log", [nothing, damage, *[nothing] * 10])
     assert len(queries) == 12
     assert queries[0]["accepted"]
@@ -59,8 +53,7 @@ def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
 ):
     health, whole = [], place_map.read_bytes()
 
-    def damage():
-        damaged(place_map, "UPDATE places SET fine = x'00'")
+    damage = partial(write_sql, place_map, "UPDATE places SET fine = x'00'")
 
     def look():
         health.append(link.health)

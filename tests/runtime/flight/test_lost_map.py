@@ -7,6 +7,7 @@ import sqlite3
 
 import pytest
 from flights import PLACES, fly_acts, nothing, of_kind
+from map_writer import write_sql
 
 from edgevpr.places.geopackage import encode_point
 from edgevpr.places.mapfile import PlaceMap
@@ -90,11 +91,9 @@ def test_another_map_in_its_place_is_refused_and_said_once(recording, tmp_path, 
     place_map, other = tmp_path / "m.gpkg", tmp_path / "other.gpkg"
     shutil.copy(recording / f"{technique}.gpkg", place_map)
     shutil.copy(place_map, other)
-    with sqlite3.connect(other) as db:
-        for place in range(1, PLACES + 1):
-            db.execute("UPDATE places SET geom = ? WHERE place_id = ?", (encode_point(10.0, place), place))
-        db.execute("UPDATE edgevpr_map SET value = '\"another\"' WHERE key = 'map_id'")
-    db.close()
+    for place in range(1, PLACES + 1):
+        write_sql(other, f"UPDATE places SET geom = x'{encode_point(10.0, place).hex()}' WHERE place_id = {place}")
+    write_sql(other, "UPDATE edgevpr_map SET value = '\"another\"' WHERE key = 'map_id'")
 
     def replace():
         if by == "copying":

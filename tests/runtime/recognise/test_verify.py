@@ -2,15 +2,14 @@
 
 import math
 import shutil
-import sqlite3
 import zlib
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from map_writer import write_sql
 from pictures_of_nothing import figures
 from sureness import landmarks_count, sure_rule, told
 from walks import map_of, walk_over
@@ -63,8 +62,8 @@ def mapped(whole, tmp_path):
 
 def keep(path, landmarks, checksum):
     """Write other landmarks for the second place."""
-    with closing(sqlite3.connect(path)) as db, db:
-        db.execute("UPDATE places SET landmarks = ?, landmarks_crc32 = ? WHERE place_id = 2", (landmarks, checksum))
+    blob, number = ("NULL", "NULL") if landmarks is None else (f"x'{landmarks.hex()}'", checksum)
+    write_sql(path, f"UPDATE places SET landmarks = {blob}, landmarks_crc32 = {number} WHERE place_id = 2")
 
 
 def asked(path, technique, query, rule=RULE, times=1, search=None, verify=True):
@@ -166,8 +165,7 @@ def test_ground_that_is_in_the_map_nearly_twice_is_not_accepted_for_its_landmark
     changed[:, :80] = frame(9).image[:, :80]
     path = map_of(tmp_path / "m.gpkg", technique, [*map(frame, range(PLACES)), far(changed)])
     if not has_landmarks:
-        with closing(sqlite3.connect(path)) as db, db:
-            db.execute("UPDATE places SET landmarks = NULL, landmarks_crc32 = NULL WHERE place_id != 2")
+        write_sql(path, "UPDATE places SET landmarks = NULL, landmarks_crc32 = NULL WHERE place_id != 2")
     event = asked(path, technique, frame(1, 20, -10), BY_LANDMARKS)
     assert event.best.place.source_image == "1.png"
     assert not event.accepted
