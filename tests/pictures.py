@@ -28,9 +28,9 @@ def _textured(seed: int, height: int, width: int) -> np.ndarray:
     return picture
 
 
-def rough_ground(side_px: int) -> np.ndarray:
+def rough_ground(side_px: int, seed: int = 3) -> np.ndarray:
     """Square grey ground with texture at all scales, of which pictures are taken."""
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(seed)
     octaves = [rng.random((2**octave, 2**octave), dtype=np.float32) / octave for octave in range(4, 11)]
     rough = sum(cv2.resize(each, (side_px, side_px), interpolation=cv2.INTER_CUBIC) for each in octaves)
     return cv2.normalize(rough, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)

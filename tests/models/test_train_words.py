@@ -2,10 +2,10 @@
 
 import shutil
 
-import cv2
 import numpy as np
 import pytest
 import train_words
+from pictures import textured, write_flight
 from training_pictures import read_pictures
 
 from edgevpr import techniques
@@ -24,17 +24,9 @@ def own_models(models, monkeypatch):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Twelve pictures of stripes at an angle of their own under spots of their own."""
-    folder, rng = tmp_path / "pictures", np.random.default_rng(0)
-    folder.mkdir()
-    y, x = np.mgrid[:120, :160]
-    for number in range(12):
-        angle = np.pi * number / 12
-        picture = 128 + 60 * np.sin((x * np.cos(angle) + y * np.sin(angle)) / 3)
-        spots = rng.normal(0, 25, (12, 16)).astype(np.float32)
-        picture += cv2.resize(spots, (160, 120), interpolation=cv2.INTER_CUBIC)
-        cv2.imwrite(str(folder / f"{number}.jpg"), np.clip(picture, 0, 255).astype(np.uint8))
-    return folder
+    """Twelve pictures."""
+    write_flight(tmp_path / "pictures", map(textured, range(12)))
+    return tmp_path / "pictures"
 
 
 def train(folder, out, *more):

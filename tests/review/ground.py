@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from logs import query
+from pictures import rough_ground
 
 from edgevpr.core.geodesy import offset_position, picture_axes
 from edgevpr.core.types import Place, Pose, Position
@@ -23,11 +24,7 @@ UNSURE = {"code": "LOW_CONFIDENCE", "parameters": {"confidence": 0.99, "needed":
 
 def landscape() -> np.ndarray:
     """The ground, BGR, a metre `METRE_PX` pixels, with ORIGIN in its middle and north up."""
-    rng = np.random.default_rng(7)
-    grey = np.zeros((560, 560), np.float32)
-    for cells in (35, 70, 140):
-        grey += cv2.resize(rng.random((cells, cells), np.float32), (560, 560), interpolation=cv2.INTER_CUBIC)
-    seen = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    seen = rough_ground(560)
     return np.dstack((seen, 255 - seen, seen // 2))
 
 

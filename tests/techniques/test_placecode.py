@@ -1,23 +1,12 @@
-import cv2
 import numpy as np
 import pytest
-from pictures import seen_from_above
+from pictures import seen_from_above, textured
 
 from edgevpr.techniques import placecode
 from edgevpr.techniques.gradients import normalise_blocks, orient_cells
 
 _CELL_PX = 512 / 12
 ALL = np.ones((31, 31), bool)
-
-
-def _picture(seed: int, side_px: int = 1024) -> np.ndarray:
-    """Ground of soft patches of several sizes."""
-    rng = np.random.default_rng(seed)
-    ground = sum(
-        cv2.resize(rng.random((n, n), dtype=np.float32), (side_px, side_px), interpolation=cv2.INTER_CUBIC)
-        for n in (6, 14, 40)
-    )
-    return cv2.normalize(ground, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 def _blocks(image: np.ndarray) -> np.ndarray:
@@ -27,7 +16,7 @@ def _blocks(image: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def town() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """Twelve grounds, the mean of their grids, and their codes."""
-    grounds = [_picture(seed) for seed in range(12)]
+    grounds = [textured(seed, 1024, 1024) for seed in range(12)]
     grids = np.stack([placecode.make_grid(_blocks(seen_from_above(ground, 512)), ALL, ALL)[0] for ground in grounds])
     mean = grids.mean(axis=0)
     return grounds, mean, placecode.pack_grids(grids, mean)
@@ -68,7 +57,7 @@ def test_the_scan_is_the_product_spelt_out(town):
     _, mean, _ = town
     rng = np.random.default_rng(1)
     codes = rng.integers(0, 256, (600, 144), dtype=np.uint8)  # a whole block of places and a part
-    asked = _ask(seen_from_above(_picture(22), 512), mean)
+    asked = _ask(seen_from_above(textured(22, 1024, 1024), 512), mean)
     signs = np.unpackbits(codes, axis=1) * 2.0 - 1
     np.testing.assert_allclose(placecode.scan_codes(asked, codes), (signs @ asked.T).max(axis=1) / 1152, atol=1e-6)
 

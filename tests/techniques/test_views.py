@@ -1,9 +1,8 @@
 """Queries from other heights: their views, and that `cohog` finds the place, the height and the rotation."""
 
-import cv2
 import numpy as np
 import pytest
-from pictures import seen_from_above
+from pictures import rough_ground, seen_from_above
 
 from edgevpr.core.contract import find_nearest_height
 from edgevpr.techniques import create
@@ -14,15 +13,8 @@ pytestmark = pytest.mark.slow
 SIDE_PX = 384
 
 
-def ground(seed):
-    """Ground of soft patches of several sizes, of which each height shows some."""
-    rng = np.random.default_rng(seed)
-    layers = [cv2.resize(rng.random((n, n)), (1100, 1100), interpolation=cv2.INTER_CUBIC) for n in (10, 22, 50, 100)]
-    return cv2.normalize(sum(layers), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-
-
 def seen(seed, height_ratio=1.0, turned_deg=0.0, right_px=0.0):
-    return seen_from_above(ground(seed), SIDE_PX, turned_deg, right_px, height=height_ratio)
+    return seen_from_above(rough_ground(1100, seed), SIDE_PX, turned_deg, right_px, height=height_ratio)
 
 
 @pytest.fixture(scope="module")

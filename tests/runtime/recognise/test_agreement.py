@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from pictures import textured
+from pictures import rough_ground, textured
 
 from edgevpr.runtime.recognise.agreement import (
     MIN_CONFIRMED_INLIERS,
@@ -22,12 +22,7 @@ HIGH = 480
 @pytest.fixture(scope="module")
 def landscape():
     """Ground with patches of all sizes, from which pictures are cut."""
-    rng = np.random.default_rng(7)
-    ground = sum(
-        cv2.normalize(cv2.GaussianBlur(rng.normal(size=(1200, 1600)), (0, 0), size), None, -1, 1, cv2.NORM_MINMAX)
-        for size in (2, 4, 8, 16)
-    )
-    return cv2.normalize(ground, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    return rough_ground(1600)
 
 
 def cut(landscape, x, y, up_deg=0.0, scale=1.0):
