@@ -38,7 +38,7 @@ from edgevpr.runtime.recognise.evidence import (
     DOWN_BARE,
     Evidence,
 )
-from edgevpr.runtime.recognise.judge import ConfidenceRule, accept_rule
+from edgevpr.runtime.recognise.judge import ConfidenceRule, make_accept_rule
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 
 PRECISIONS = (0.9, 0.99, 0.999)
@@ -130,12 +130,12 @@ def models_without(name: str, rows: Rows) -> Models:
 def judged(rows: Sequence[Row], models: Models) -> base.Row:
     """Judge the queries of one map, its own and those of other sites."""
     own, foreign = ([row for row in rows if row.kind == kind] for kind in ("own", "foreign"))
-    sure, right = np.array([_sure(models, row) for row in own]), np.array([row.right for row in own])
-    tenth = np.minimum((_BINS * sure).astype(int), _BINS - 1)
-    apart = np.bincount(tenth, sure - right) / len(own)  # of each bin, by its share of the queries
+    confidence_rule, right = np.array([_sure(models, row) for row in own]), np.array([row.right for row in own])
+    tenth = np.minimum((_BINS * confidence_rule).astype(int), _BINS - 1)
+    apart = np.bincount(tenth, confidence_rule - right) / len(own)  # of each bin, by its share of the queries
     made = {"set": rows[0].map, "use": base.use_of(rows[0].map), "queries": len(own), "right": int(right.sum())}
     made |= {"foreign": len(foreign), "roc_auc_score": roc_auc(np.array([row.score for row in own]), right)}
-    made |= {"roc_auc": roc_auc(sure, right), "ece": float(abs(apart).sum()), "precision": {}}
+    made |= {"roc_auc": roc_auc(confidence_rule, right), "ece": float(abs(apart).sum()), "precision": {}}
     for precision in PRECISIONS:
         taken = [row for row in own if _accepted(models, row, precision)]
         made["precision"][str(precision)] = {
@@ -152,9 +152,9 @@ def _sure(models: Models, row: Row) -> float:
 
 
 def _accepted(models: Models, row: Row, precision: float) -> bool:
-    sure = ConfidenceRule(models, precision)
+    confidence_rule = ConfidenceRule(models, precision)
     return row.veto is None and any(
-        sure.confidence(each) >= models[each.kind].threshold(precision) for each in _looks(row)
+        confidence_rule.confidence(each) >= models[each.kind].threshold(precision) for each in _looks(row)
     )
 
 
@@ -182,8 +182,8 @@ def followed(name: str, models: dict[str, Models]) -> base.Row:
     }
     made: base.Row = {"set": name, "ways": {}}
     with walks.map_of(DATA / name) as (place_map, index, technique):
-        rule = accept_rule(technique, walks.config().match)
-        rule = replace(rule, sure=ConfidenceRule(models[name], walks.config().match.accept_precision))
+        rule = make_accept_rule(technique, walks.config().match)
+        rule = replace(rule, confidence_rule=ConfidenceRule(models[name], walks.config().match.accept_precision))
         for way, paths in ways.items():
             counts = {}
             for mode in ("alone", "followed"):

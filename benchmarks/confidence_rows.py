@@ -20,7 +20,7 @@ from edgevpr.mapmaking.calibrate import count_queries, query_map
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.runtime.recognise.evidence import Evidence
-from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.judge import make_accept_rule
 
 # Sets of the same ground are one site.
 SITES = {"grief_stromovka_monthly": "stromovka", "grief_stromovka_seasons": "stromovka"}
@@ -65,8 +65,8 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
     dataset = walks.dataset_of(folder)
     scored = {query.path.name: query for query in dataset.queries}
     with walks.map_of(folder, images=folder / "ref") as (place_map, index, technique):
-        rule = accept_rule(technique, walks.config().match)
-        rule = replace(rule, sure=replace(rule.sure, precision=0.5))  # only what speaks against the best places refuses
+        rule = make_accept_rule(technique, walks.config().match)
+        rule = replace(rule, confidence_rule=replace(rule.confidence_rule, precision=0.5))  # only objections refuse
         walk = walks.walk(place_map, index, technique, rule=rule, all_evidence=True)
         for other in [each.name for each in base.find_sets()] + list(LIKE):
             if other != name and site_of(other) == site_of(name):
@@ -81,7 +81,7 @@ def _rows(name: str, folder: Path) -> Iterator[Row]:
                 kind = kind_of_match(found, query, dataset.references, index)
                 if kind == "ignored":
                     continue
-                refused = not event.accepted and event.confidence >= rule.sure.threshold(event.evidence)
+                refused = not event.accepted and event.confidence >= rule.confidence_rule.threshold(event.evidence)
                 yield Row(
                     map=name,
                     set=other,

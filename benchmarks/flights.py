@@ -49,7 +49,7 @@ from edgevpr.places.sequence import make_sequence_search
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.hints import Prior
-from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.judge import make_accept_rule
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -82,7 +82,7 @@ def _recogniser(
     config = walks.config()
     reach_m_s, rule = (
         config.match.reach_m_s,
-        accept_rule(technique, config.match, length, read_calibration_for(place_map)),
+        make_accept_rule(technique, config.match, length, read_calibration_for(place_map)),
     )
     return walks.walk(
         place_map,

@@ -15,7 +15,7 @@ from base import DATA
 
 from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.runtime.recognise.calibration import read_calibration_for
-from edgevpr.runtime.recognise.evidence import INLIERS_BY_CHANCE, count_neighbours
+from edgevpr.runtime.recognise.evidence import CHANCE_INLIERS, count_neighbours
 
 SETS = ("thumbs_essex", "corridor", "grief_stromovka_seasons")
 _BESIDE_LEFT_OUT = 8  # places along a way
@@ -39,7 +39,7 @@ def measure(name: str) -> base.Row:
                 is_right = found in query.right or found in query.ignored
                 row["right" if is_right else "wrong"] += 1
                 landmarks = with_landmarks.step(walks.frame(query.path)).evidence.landmarks
-                row["unproven"] += is_right and landmarks <= np.log1p(INLIERS_BY_CHANCE)
+                row["unproven"] += is_right and landmarks <= np.log1p(CHANCE_INLIERS)
             right_slots = [slot for slot in slots if dataset.references[slot] in {*query.right, *query.ignored}]
             away = [outside_neighbourhood(index, slot, slots, 0.0, max_slots=beside) for slot in right_slots]
             kept = np.all(away, axis=0)

@@ -22,9 +22,9 @@ from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import read_calibration_for
-from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
+from edgevpr.runtime.recognise.judge import AcceptRule, make_accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -88,8 +88,8 @@ def walk(
 ) -> Recogniser:
     """Return a walk over a map with the technique's own number of candidates, and the rule of the map unless another is
     given; `more` is anything else of a `Recogniser`."""
-    rule = rule or accept_rule(technique, config().match, 1, read_calibration_for(place_map))
-    settings = WalkSettings(
+    rule = rule or make_accept_rule(technique, config().match, 1, read_calibration_for(place_map))
+    settings = MatchSettings(
         candidates=technique.candidates, verify=verify, all_evidence=all_evidence, min_accuracy_m=min_accuracy_m
     )
     encoder = FrameEncoder(technique=technique, levelling=levelling)

@@ -41,8 +41,8 @@ def told(
 
 def sure_rule(confidence: Callable[[Figures], float], needed: float = NEEDED, **limits: float) -> AcceptRule:
     """The rule that accepts a match whose confidence is `needed`."""
-    sure = told(confidence, needed=needed)
-    return AcceptRule(**{"min_score": 0.0, "min_margin": 0.0, "neighbour_m": 50.0, "sure": sure, **limits})
+    no_limits = {"min_score": 0.0, "min_margin": 0.0, "neighbour_m": 50.0}
+    return AcceptRule(confidence_rule=told(confidence, needed=needed), **no_limits | limits)
 
 
 def bare_index(places: int) -> PlaceIndex:

@@ -14,12 +14,12 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
+from edgevpr.runtime.recognise.judge import AcceptRule, make_accept_rule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-USUAL = WalkSettings(candidates=50)
+USUAL = MatchSettings(candidates=50)
 
 
 def query_meter(clock: FakeClock | None = None) -> QueryMeter:
@@ -42,12 +42,12 @@ def walk_over(
     search: SequenceSearch | None = None,
     *,
     clock: FakeClock | None = None,
-    settings: WalkSettings = USUAL,
+    settings: MatchSettings = USUAL,
     encoder: dict | None = None,
     **more,
 ) -> Recogniser:
     """A recogniser over an open map, by the usual rule where none is given; `encoder` as in `map_of`."""
-    rule = rule or accept_rule(technique, load_config(None).match)
+    rule = rule or make_accept_rule(technique, load_config(None).match)
     matcher = Matcher(load_index(place_map, technique, 10**7), rule, search)
     of_frames = FrameEncoder(technique=technique, **(encoder or {}))
     return Recogniser(of_frames, place_map, matcher, query_meter(clock), settings=settings, **more)

@@ -34,7 +34,7 @@ from edgevpr.places.ranking import outside_neighbourhood
 from edgevpr.places.rows import escape_name
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import MIN_PLACES, MapCalibration, format_calibration
-from edgevpr.runtime.recognise.confidence import Figures, Logistic, Model, prior
+from edgevpr.runtime.recognise.confidence import Figures, Logistic, Model, read_shipped_model
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder
 from edgevpr.runtime.recognise.evidence import (
     AHEAD,
@@ -45,7 +45,7 @@ from edgevpr.runtime.recognise.evidence import (
     count_neighbours,
     list_evidence_kinds,
 )
-from edgevpr.runtime.recognise.judge import AcceptRule, ConfidenceRule, accept_rule
+from edgevpr.runtime.recognise.judge import AcceptRule, ConfidenceRule, make_accept_rule
 
 Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the frames of these names, as far as they are found
 
@@ -91,9 +91,9 @@ def query_map(
     the places of `place_map`, and `rule` is the rule for accepting a match. `pictures` are pairs of a place's number
     and its picture as it was encoded for the map. A place that is not in the index is left out."""
     rng = np.random.default_rng((_SEED, seed))
-    assert rule.sure is not None  # set for a technique that has a confidence model
-    sure = replace(rule.sure, precision=_EVEN_PRECISION)
-    rule = replace(rule, sure=sure)
+    assert rule.confidence_rule is not None  # set for a technique that has a confidence model
+    even_rule = replace(rule.confidence_rule, precision=_EVEN_PRECISION)
+    rule = replace(rule, confidence_rule=even_rule)
     search = MapSearch(technique, place_map, index, rule, meter=meter)
     for place_id, picture in pictures:
         if (slot := search.slots.get(place_id)) is None:
@@ -116,7 +116,7 @@ def query_map(
             )
             if way == THERE and not right and may_be_same[best] and not np.isnan(index.lat_deg[best]):
                 continue  # the two pictures may overlap: it is unknown whether the match is right
-            refused = not event.accepted and event.confidence >= sure.threshold(event.evidence)
+            refused = not event.accepted and event.confidence >= even_rule.threshold(event.evidence)
             yield QueryResult(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
 
 
@@ -146,7 +146,7 @@ def calibrate(
     require(len(index) >= MIN_PLACES, f"it has {len(index)} places, and {MIN_PLACES} are needed")
     is_placed = not technique.spec.looks_down or np.isnan(index.lat_deg).mean() <= _MAX_WITHOUT_POSITION
     require(is_placed, "its places have no positions, so nobody knows which of them show the same ground")
-    rule = accept_rule(technique, config)
+    rule = make_accept_rule(technique, config)
     if not technique.spec.looks_down:
         near_m = MapSearch(technique, place_map, index, rule, meter=meter).near_m
         described = (
@@ -199,18 +199,18 @@ def _fit_calibration(answers: Sequence[QueryResult], kinds: Sequence[str], preci
     asked for."""
     known = [answer for answer in answers if answer.evidence]
     made_of = f"{len(known)} answers of the map itself"
-    models = {kind: adapt_model(prior(kind), kind, known, made_of) for kind in kinds}
-    sure = ConfidenceRule(models, precision)
+    models = {kind: adapt_model(read_shipped_model(kind), kind, known, made_of) for kind in kinds}
+    rule = ConfidenceRule(models, precision)
     accepted = [
         answer
         for answer in answers
-        if (seen := answer.evidence) and not answer.refused and sure.confidence(seen) >= sure.threshold(seen)
+        if (seen := answer.evidence) and not answer.refused and rule.confidence(seen) >= rule.threshold(seen)
     ]
     there = [answer for answer in answers if answer.way == THERE]
     of_place: dict[int, list[float]] = {}  # confidence of each query, 0 for a wrong or refused match
     for answer in there:
         seen = answer.evidence if answer.right and not answer.refused else None
-        of_place.setdefault(answer.place_id, []).append(sure.confidence(seen) if seen else 0.0)
+        of_place.setdefault(answer.place_id, []).append(rule.confidence(seen) if seen else 0.0)
     return MapCalibration(
         models=models,
         made=date.today().isoformat(),

@@ -25,10 +25,10 @@ from edgevpr.places.retrieve import Query, compare_places, scan_index
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import read_calibration_for
-from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.evidence import (
-    SHARE_BY_CHANCE,
+    CHANCE_SHARE,
     SMALL_LEAD,
     LookAlike,
     LookAlikes,
@@ -37,7 +37,7 @@ from edgevpr.runtime.recognise.evidence import (
     list_evidence_kinds,
     log_share,
 )
-from edgevpr.runtime.recognise.judge import AcceptRule, accept_rule
+from edgevpr.runtime.recognise.judge import AcceptRule, make_accept_rule
 from edgevpr.runtime.recognise.opening import create_technique
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -74,7 +74,7 @@ class MapSearch:
         no ground (None: it shows ground everywhere)."""
         encoder = FrameEncoder(technique=self._technique, mask=None if shown is None else OverlayMask(shown, sha256=""))
         matcher = Matcher(among, self._rule, layers=self._layers)
-        settings = WalkSettings(candidates=self._technique.candidates, all_evidence=True)
+        settings = MatchSettings(candidates=self._technique.candidates, all_evidence=True)
         walk = Recogniser(encoder, self._place_map, matcher, self._meter, settings=settings)
         return walk.step(Frame(image=image, name=f"place {place_id}", t_mono_s=0.0))
 
@@ -115,7 +115,7 @@ def measure_look_alikes(
                 agree[one][two] = max(found, agree[one].get(two, found))
     best_beside = {slot: _find_best(others, is_beside(slot))[1] for slot, others in agree.items()}
     best_opposite = [_find_best(others, is_opposite(slot))[1] for slot, others in agree.items()]
-    usual, chance = float(np.median(list(best_beside.values()))), log_share(SHARE_BY_CHANCE)
+    usual, chance = float(np.median(list(best_beside.values()))), log_share(CHANCE_SHARE)
     # Along a way, pictures agree better with those before and after them than with as many others.
     overlap = usual >= max(chance, float(np.median(best_opposite)) + SMALL_LEAD)
     places = {}
@@ -169,7 +169,7 @@ def find_look_alikes(
     if not list_evidence_kinds(technique.spec):
         return
     index = load_index(place_map, technique, len(place_map) * compute_place_bytes(technique.spec))
-    rule = accept_rule(technique, MatchConfig(), 1, read_calibration_for(place_map))
+    rule = make_accept_rule(technique, MatchConfig(), 1, read_calibration_for(place_map))
     search = MapSearch(technique, place_map, index, rule, meter=QueryMeter(load_board("this")))
     for place_id, image, mask in pictures:
         slot = search.slots.get(place_id)

@@ -64,8 +64,8 @@ def test_match_reports_what_has_narrowed_each_query(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("known", "places_known", "more", "said"),
     [
-        ("heading", True, (), "No query has what `heading` needs: write yaw_deg into positions.csv"),
-        ("height,reach", False, (), "No place has what `reach` needs: write lat and lon"),
+        ("heading", True, (), "`heading` needs yaw_deg, which no query has"),
+        ("height,reach", False, (), "`reach` needs lat and lon, which no place has"),
         ("height,speed", True, (), "`known` names `speed`: use some of heading, height, reach"),
         ("height", True, ("--sequence", "2"), "2 queries are matched together"),
     ],

@@ -13,7 +13,7 @@ from edgevpr.core.types import Frame
 from edgevpr.mapmaking.look_alikes import MapSearch, measure_look_alikes
 from edgevpr.places.index import load_index
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.judge import make_accept_rule
 from edgevpr.techniques import create
 
 AHEAD = create("cohog")
@@ -64,7 +64,7 @@ def opened(path, pictures):
     """A map of these pictures, and what it knows of its look-alikes."""
     frames = [Frame(image=image, name=f"{number}.png", t_mono_s=0.0) for number, image in enumerate(pictures)]
     with PlaceMap.open(map_of(path / "m.gpkg", AHEAD, frames)) as place_map:
-        index, rule = load_index(place_map, AHEAD, 10**7), accept_rule(AHEAD, load_config(None).match)
+        index, rule = load_index(place_map, AHEAD, 10**7), make_accept_rule(AHEAD, load_config(None).match)
         near_m = MapSearch(AHEAD, place_map, index, rule, meter=query_meter()).near_m
         described = [(number + 1, AHEAD.encode(image)) for number, image in enumerate(pictures)]
         yield place_map, measure_look_alikes(AHEAD, place_map, index, near_m, described)
@@ -87,7 +87,7 @@ def test_measure_look_alikes_takes_neighbours_along_a_way_for_the_same_ground(tm
 @pytest.mark.parametrize("known", [False, True])
 def test_a_door_seen_from_where_its_twin_was_pictured_is_accepted_only_if_nobody_knows_of_the_twin(tmp_path, known):
     with opened(tmp_path, single_views()) as (place_map, look_alikes):
-        rule = accept_rule(AHEAD, load_config(None).match)
+        rule = make_accept_rule(AHEAD, load_config(None).match)
         walk = walk_over(place_map, AHEAD, replace(rule, look_alikes=look_alikes) if known else rule)
         event = walk.step(Frame(image=photographed(door(50, SPOT_PX)), name="query", t_mono_s=0.0))
         assert event.best.place.place_id == SECOND, "the regions prefer the wrong door"
@@ -97,7 +97,7 @@ def test_a_door_seen_from_where_its_twin_was_pictured_is_accepted_only_if_nobody
 
 def test_a_single_view_without_a_twin_is_accepted_by_its_regions(tmp_path):
     with opened(tmp_path, single_views()) as (place_map, look_alikes):
-        rule = replace(accept_rule(AHEAD, load_config(None).match), look_alikes=look_alikes)
+        rule = replace(make_accept_rule(AHEAD, load_config(None).match), look_alikes=look_alikes)
         walk = walk_over(place_map, AHEAD, rule)
         events = [
             walk.step(Frame(image=photographed(image, number), name="query", t_mono_s=0.0))

@@ -22,7 +22,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.runtime.recognise.calibration import read_calibration
 from edgevpr.runtime.recognise.confidence import Logistic
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.judge import make_accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling
 from edgevpr.techniques import create
 
@@ -68,7 +68,7 @@ def calibrated(place_map, pictures, technique=AHEAD, **more):
 
 
 def test_a_map_is_asked_for_each_picture_in_three_ways(place_map):
-    index, rule = load_index(place_map, AHEAD, 10**6), accept_rule(AHEAD, CONFIG)
+    index, rule = load_index(place_map, AHEAD, 10**6), make_accept_rule(AHEAD, CONFIG)
     pictures = [(number + 1, LevelledImage(frame(number).image, None, UNKNOWN_VIEW)) for number in range(3)]
     answers = list(query_map(AHEAD, place_map, index, rule, query_meter(), [*pictures, (99, pictures[0][1])]))
     assert Counter(each.way for each in answers) == {THERE: 3, LEFT_OUT: 3, MIRRORED: 3}

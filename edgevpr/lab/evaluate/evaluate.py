@@ -37,10 +37,10 @@ from edgevpr.power.equations import parse_pack, queries_ah
 from edgevpr.power.meter import QueryMeter, compute_query_cost
 from edgevpr.runtime.preflight.probe import compute_disk_bytes, compute_ram_bytes
 from edgevpr.runtime.recognise.calibration import read_calibration_for
-from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.hints import RecordedPrior, explain_useless, parse_known_fields
-from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.judge import make_accept_rule
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -106,8 +106,9 @@ def answer_queries(
     source, meter = open_source(str(dataset.ref_dir), live=False), QueryMeter(load_board("this"))
     frames = progress(read_frames(source), source.total, f"{spec.name}: references")
     with open_temporary_map(frames, technique, dataset.ref_dir, progress) as (place_map, index, not_done):
-        rule = accept_rule(technique, MatchConfig(), sequence, read_calibration_for(place_map))
-        follows = options.follow and sequence == 1 and rule.sure is not None
+        rule = make_accept_rule(technique, MatchConfig(), sequence, read_calibration_for(place_map))
+        follows = options.follow and sequence == 1 and rule.confidence_rule is not None
+        candidates = None if options.exact else options.candidates or technique.candidates
 
         def open_recogniser(length: int, follows: bool) -> Recogniser:
             return Recogniser(
@@ -115,7 +116,7 @@ def answer_queries(
                 place_map,
                 Matcher(index, rule, make_sequence_search(length)),
                 meter,
-                settings=WalkSettings(candidates=None if options.exact else options.candidates or technique.candidates),
+                settings=MatchSettings(candidates=candidates),
                 prior=prior,
                 place_filter=PlaceFilter(place_map, max_speed_m_s=None, is_live=False) if follows else None,
             )

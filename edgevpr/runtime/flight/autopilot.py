@@ -302,4 +302,4 @@ def combine_confidence(event: Recognition) -> float | None:
     """Return the confidence of a match, alone or by the flight so far, the higher (None: it is unknown)."""
     if event.confidence is None:
         return None
-    return max(event.confidence, event.followed.confidence if event.followed else 0.0)
+    return max(event.confidence, event.track.confidence if event.track else 0.0)

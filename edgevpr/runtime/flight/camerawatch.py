@@ -12,7 +12,7 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.messages import Severity
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.flight.notifier import Notifier
-from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -83,7 +83,7 @@ class MirrorWatch:
     def _matches_mirrored(self, event: Recognition, axis: int) -> bool:
         """Search the whole map for the flipped picture, by nothing that the flight knows."""
         assert event.frame is not None
-        now, settings = self._recogniser, WalkSettings(candidates=self._recogniser.candidates)
+        now, settings = self._recogniser, MatchSettings(candidates=self._recogniser.candidates)
         alone = Recogniser(now.encoder, now.place_map, Matcher(now.index, now.rule), self._meter, settings=settings)
         frame = replace(event.frame, image=np.flip(event.frame.image, axis).copy())
         return alone.step(frame, event.vehicle).accepted

@@ -119,7 +119,7 @@ class MapCoverageWatch:
         if event.failed or event.says_nothing or event.view.reason or (event.salience and event.salience.reason):
             return
         self._misses += 1
-        is_lost = event.followed is not None and event.followed.lost >= _LOST_PROBABILITY
+        is_lost = event.track is not None and event.track.lost >= _LOST_PROBABILITY
         self._misses_lost = self._misses_lost + 1 if is_lost else 0
         if self._map.is_active:
             if self._misses >= _MAX_MISSES_BETWEEN:

@@ -23,7 +23,7 @@ from edgevpr.places.sequence import compute_sequence_bytes, make_sequence_search
 from edgevpr.power import machine
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder, explain_failure
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -184,7 +184,7 @@ class _Bench:
         technique = self._technique
         rule = AcceptRule(min_score=technique.min_score, min_margin=technique.min_margin, neighbour_m=0.0)
         matcher = Matcher(index, rule, make_sequence_search(self.sequence))
-        settings = WalkSettings(candidates=candidates)
+        settings = MatchSettings(candidates=candidates)
         return Recogniser(FrameEncoder(technique=technique), place_map, matcher, self._meter, settings=settings)
 
 

@@ -144,7 +144,7 @@ def parse_model(stored: Mapping[str, Any]) -> Model:
 
 
 @lru_cache
-def prior(kind: str) -> Model:
+def read_shipped_model(kind: str) -> Model:
     """Return the shipped model for a kind of evidence (see `evidence`). Raises ModelError if its file is unusable."""
     path = find_shipped("models") / f"confidence_{kind}.json"
     try:

@@ -1,4 +1,4 @@
-"""The later stages of recognition: verify the best place of a ranking by landmarks, which had no part in finding it,
+"""The last stages of recognition: verify the best place of a ranking by landmarks, which were not used to find it,
 locate the aircraft by it, and decide."""
 
 from collections.abc import Collection
@@ -52,16 +52,16 @@ from edgevpr.runtime.recognise.place_filter import PlaceFilter, TrackEstimate
 from edgevpr.runtime.recognise.tilted import measure_again
 
 _MAX_SAME_GROUND = 12  # places that may show the same ground: so many overlap on kite_ochota, which has no positions
-# Of the votes of the best place, those that a place elsewhere has at rest: behind a display or figures nearly all have
-# 0.15 to 0.9 of them, on smooth ground some are at rest by chance with up to 0.065.
+# Share of the best place's votes from which on a place elsewhere counts as at rest. With a display in the pictures,
+# nearly all places have 0.15 to 0.9 of them; on smooth ground some are at rest by chance with up to 0.065.
 _MIN_REST_VOTES_SHARE = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matcher:
-    """What encoded frames are searched in, and how: an index, the rule for accepting its matches, and the search over
-    sequences of queries (None: each query is ranked alone). They belong together: another form of the vectors in RAM
-    gives other scores, and so needs other limits. `layers` are those of the index (None: those of the map)."""
+    """An index to search, the rule for accepting its matches, and the search over sequences of queries (None: each
+    query is ranked alone). They belong together: another form of the vectors in RAM gives other scores, and so needs
+    other limits. `layers` are those of the index (None: those of the map)."""
 
     index: PlaceIndex = field(kw_only=False)
     rule: AcceptRule = field(kw_only=False)
@@ -70,10 +70,10 @@ class Matcher:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WalkSettings:
+class MatchSettings:
     """Settings of the recogniser. `candidates` places are compared (None: all in full, see `places.retrieve.compare`).
-    `verify` turns the check by landmarks on; with `all_evidence` they are compared where they decide nothing, too, as a
-    model needs to be fitted. The accuracy of a position is never below `min_accuracy_m` (1-sigma)."""
+    `verify` turns the check by landmarks on; with `all_evidence` they are also compared where they decide nothing, to
+    fit a model. The accuracy of a position is never below `min_accuracy_m` (1-sigma)."""
 
     candidates: int | None = None
     verify: bool = True
@@ -96,56 +96,54 @@ class Verifier:
         return self._encoder.detect_landmarks(self._picture, count)
 
     def compare_best(self, ranking: Ranking) -> Agreement | None:
-        """Compare the landmarks of the query with those of the best place, expected to agree on the overlay that its
-        match gives. None if the place has no landmarks, or its match no shift or rotation."""
-        expected, known = self._place(ranking, int(ranking.slots[0]))
-        return compare_near(self.landmarks, known, expected) if expected and known is not None else None
+        """Compare the landmarks of the query with those of the best place, near the overlay that its match gives. None
+        if the place has no landmarks, or its match no shift or rotation."""
+        expected, landmarks = self._load_place(ranking, int(ranking.slots[0]))
+        return compare_near(self.landmarks, landmarks, expected) if expected and landmarks is not None else None
 
     def count_inliers(self, ranking: Ranking) -> int:
         """Return the number of landmarks of the query and of the best place that agree on the overlay of its match: 0
         if those of the place are unknown, or if they are at rest, as a display is."""
-        expected, known = self._place(ranking, int(ranking.slots[0]))
-        found = None if known is None else measure_agreement(self.landmarks, known, expected)
-        return 0 if found is None or found.is_at_rest else found.inliers
+        expected, landmarks = self._load_place(ranking, int(ranking.slots[0]))
+        agreement = None if landmarks is None else measure_agreement(self.landmarks, landmarks, expected)
+        return 0 if agreement is None or agreement.is_at_rest else agreement.inliers
 
     def count_rival(
         self,
         ranking: Ranking,
         neighbour_m: float,
-        same: Collection[int] = (),
+        same_ground: Collection[int] = (),
         max_slots: int = MAX_NEIGHBOUR_SLOTS,
     ) -> int:
         """Return the number of landmarks of the query and of the best place elsewhere (see `outside_neighbourhood`)
         that agree on the overlay of its match: 0 if there is no place elsewhere, the largest possible number if its
-        landmarks are unknown. Places with the numbers `same` are not elsewhere."""
-        away = ranking.slots[
-            outside_neighbourhood(self._index, int(ranking.slots[0]), ranking.slots, neighbour_m, same, max_slots)
-        ]
-        if not len(away):
+        landmarks are unknown. Places with the numbers `same_ground` are not elsewhere."""
+        slots, best = ranking.slots, int(ranking.slots[0])
+        rivals = slots[outside_neighbourhood(self._index, best, slots, neighbour_m, same_ground, max_slots)]
+        if not len(rivals):
             return 0
-        expected, known = self._place(ranking, int(away[0]))
-        return PLACE_LANDMARKS if known is None else measure_agreement(self.landmarks, known, expected).inliers
+        expected, landmarks = self._load_place(ranking, int(rivals[0]))
+        return PLACE_LANDMARKS if landmarks is None else measure_agreement(self.landmarks, landmarks, expected).inliers
 
     def find_same_ground(self, ranking: Ranking) -> tuple[int, ...]:
-        """Of the best few places compared, return the numbers of those that show the same ground as the best one: the
-        landmarks of both agree, on the overlay that follows from their matches. Empty if the best place has a position,
-        since distances then tell the same."""
+        """Return the numbers of the compared places that show the same ground as the best one: the landmarks of both
+        agree on the overlay that follows from their matches. Only the first few places are tried. Empty if the best
+        place has a position, since distances then tell the same."""
         slots = ranking.compared_slots[:_MAX_SAME_GROUND]
         if not slots or not np.isnan(self._index.lat_deg[slots[0]]):
             return ()
-        expected, known = self._place(ranking, slots[0])
-        if expected is None or known is None:
+        best, best_landmarks = self._load_place(ranking, slots[0])
+        if best is None or best_landmarks is None:
             return ()
-        others = {int(self._index.place_ids[slot]): self._place(ranking, slot) for slot in slots[1:]}
-        return tuple(
-            place_id
+        others = {int(self._index.place_ids[slot]): self._load_place(ranking, slot) for slot in slots[1:]}
+        agreements = {
+            place_id: measure_agreement(best_landmarks, landmarks, compose_overlays(best, other))
             for place_id, (other, landmarks) in others.items()
-            if other
-            and landmarks
-            and measure_agreement(known, landmarks, compose_overlays(expected, other)).inliers >= MIN_CONFIRMED_INLIERS
-        )
+            if other and landmarks
+        }
+        return tuple(place_id for place_id, found in agreements.items() if found.inliers >= MIN_CONFIRMED_INLIERS)
 
-    def _place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
+    def _load_place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
         """Return the overlay of the query on the place in row `slot`, by its match, and the place's landmarks (None:
         unknown). Both are None if the match has no shift."""
         match, cells = ranking.compared.get(slot), self._spec.cells
@@ -166,8 +164,8 @@ class Verifier:
 
     @property
     def _sides(self) -> tuple[float, float]:
-        """Width and height of the picture that a technique has made a square of, as shares of its longest side."""
-        if self._spec.looks_down:  # its picture was put into the square, and not stretched
+        """Width and height of the technique's square in the picture, as shares of the picture's longest side."""
+        if self._spec.looks_down:  # the picture was padded to the square, not stretched
             return 1.0, 1.0
         height, width = self._picture.image.shape[:2]
         return width / max(height, width), height / max(height, width)
@@ -175,16 +173,16 @@ class Verifier:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
-    """Verdict on a query, and what it was made by: the `hints` that narrowed the search, the `best` place with its
-    `findings` and the probability by its evidence that the match is right, and what the flight so far says of it.
-    None: there was no search, the match is judged by limits, or the flight is not followed."""
+    """Verdict on a query, and its basis: the `hints` that narrowed the search, the `best` place with its `findings`,
+    the probability by its evidence that the match is right (`confidence`), and the result of the place filter
+    (`track`). None: there was no search, the match is judged by limits, or there is no filter."""
 
     verdict: Verdict
     hints: Hints | None = None
     best: Candidate | None = None
     findings: Findings | None = None
     confidence: float | None = None
-    followed: TrackEstimate | None = None
+    track: TrackEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -194,7 +192,7 @@ class Decider:
     place_map: PlaceMap
     technique: Technique
     matcher: Matcher
-    settings: WalkSettings
+    settings: MatchSettings
     meter: QueryMeter
     accuracy_m: float
 
@@ -212,16 +210,17 @@ class Decider:
         place_filter: PlaceFilter | None,
     ) -> Decision:
         """Judge the best place of a ranking by its landmarks, the places around it, and the flight so far. If the
-        flight makes another place more likely, judge that one."""
-        index, rule, search, followed = self.matcher.index, self.matcher.rule, self.matcher.search, None
-        best, found = self._examine(ranking, query, verifier)
-        if place_filter and rule.sure and found.evidence:
+        flight so far makes another place more likely, judge that one."""
+        index, rule, search, track = self.matcher.index, self.matcher.rule, self.matcher.search, None
+        by_confidence = rule.confidence_rule
+        best, found = self._gather_findings(ranking, query, verifier)
+        if place_filter and by_confidence and found.evidence:
             with self.meter.step("locate"):
-                followed = place_filter.update(ranking, index, found.evidence, rule.sure, found.where)
-            if followed.slot is not None and followed.prefers_other(int(ranking.slots[0])):
-                ranking = ranking.promote(followed.slot)
-                best, found = self._examine(ranking, query, verifier)
-        found = replace(found, track_confidence=followed.confidence if followed else None)
+                track = place_filter.update(ranking, index, found.evidence, by_confidence, found.located)
+            if track.slot is not None and track.prefers_other(int(ranking.slots[0])):
+                ranking = ranking.promote(track.slot)
+                best, found = self._gather_findings(ranking, query, verifier)
+        found = replace(found, track_confidence=track.confidence if track else None)
         verdict = judge(found, index, rule, search)
         if verdict.accepted and self.technique.spec.looks_down and search is None:
             heading_deg = best.place.heading_deg
@@ -229,58 +228,60 @@ class Decider:
             tilt = self._measure_tilt(best, query)
             found = replace(
                 found,
-                # A recorded tilt is not refused for what a few regions show; the claim counts a contradiction.
+                # A recorded tilt is not refused for what a few regions show; a contradiction adds to the claimed error.
                 tilt=None if query.view.is_tilt_known else tilt,
-                where=add_tilt_covariance(found.where, tilt, query.view) if found.where else None,
+                located=add_tilt_covariance(found.located, tilt, query.view) if found.located else None,
                 at_rest_elsewhere=self._share_at_rest_elsewhere(best, ranking, query),
-                lead_over_turned=None if is_heading_known else self._lead_over_turned(best, found.evidence, query),
+                lead_over_rotated=None if is_heading_known else self._lead_over_rotated(best, found.evidence, query),
             )
             verdict = judge(found, index, rule, search)
-        confidence = rule.sure.limit_confidence(found.evidence) if rule.sure and found.evidence else None
-        return Decision(
-            verdict=verdict, hints=hints, best=best, findings=found, confidence=confidence, followed=followed
-        )
+        confidence = by_confidence.cap_confidence(found.evidence) if by_confidence and found.evidence else None
+        return Decision(verdict=verdict, hints=hints, best=best, findings=found, confidence=confidence, track=track)
 
-    def _examine(self, ranking: Ranking, query: EncodedFrame, verifier: Verifier) -> tuple[Candidate, Findings]:
+    def _gather_findings(self, ranking: Ranking, query: EncodedFrame, verifier: Verifier) -> tuple[Candidate, Findings]:
         """Verify the best place of a ranking by landmarks, locate the aircraft by it, and gather the evidence."""
         index, spec, step, rule = self.matcher.index, self.technique.spec, self.meter.step, self.matcher.rule
         with step("compare"):
             (best,) = load_candidates(ranking, index, self.place_map, first=1)
-        where = proof = evidence = None
-        is_worth_it = best.match.score >= rule.worth_a_look
-        # The newest query of a sequence need not be sure by itself.
-        verifies = is_worth_it and self.settings.verify and self.matcher.search is None and spec.cells is not None
+        located = agreement = evidence = None
+        all_evidence = self.settings.all_evidence
+        is_plausible = best.match.score >= rule.min_verify_score
+        # A sequence is judged as a whole, so its newest query is not verified.
+        verifies = is_plausible and self.settings.verify and self.matcher.search is None and spec.cells is not None
         if verifies and spec.looks_down:
             with step("verify"):
-                proof = verifier.compare_best(ranking)
-        if is_worth_it:
+                agreement = verifier.compare_best(ranking)
+        if is_plausible:
             with step("locate"):
                 places = load_candidates(
                     ranking, index, self.place_map, first=MAX_PLACES_CHECKED if spec.looks_down else 1
                 )
-                where = locate(places, spec.cells, query.view, proof)
-                if where is None and best.place.position:
-                    where = locate_at_place(best.place.position, self.accuracy_m)
-        same: Collection[int] = where.places if where else ()
-        if proof and not same:
+                located = locate(places, spec.cells, query.view, agreement)
+                if located is None and best.place.position:
+                    located = locate_at_place(best.place.position, self.accuracy_m)
+        same_ground: Collection[int] = located.places if located else ()
+        if agreement and not same_ground:
             with step("verify"):
-                same = verifier.find_same_ground(ranking)
-        if rule.sure:
-            evidence = gather_evidence(ranking, index, rule.neighbour_m, proof, same, spec.looks_down, rule.look_alikes)
-        is_ahead = verifies and not spec.looks_down  # landmarks then only speak for a match, where they can decide
-        if is_ahead and rule.sure and evidence and (self.settings.all_evidence or rule.sure.is_open(evidence)):
+                same_ground = verifier.find_same_ground(ranking)
+        near_m, by_confidence = rule.neighbour_m, rule.confidence_rule
+        if by_confidence:
+            evidence = gather_evidence(
+                ranking, index, near_m, agreement, same_ground, looks_down=spec.looks_down, look_alikes=rule.look_alikes
+            )
+        is_ahead = verifies and not spec.looks_down  # landmarks then only support a match, so compare them if undecided
+        if is_ahead and by_confidence and evidence and (all_evidence or by_confidence.is_undecided(evidence)):
             with step("verify"):
                 inliers = verifier.count_inliers(ranking)
-                rival = verifier.count_rival(ranking, rule.neighbour_m, max_slots=count_neighbours(rule.look_alikes))
+                rival = verifier.count_rival(ranking, near_m, max_slots=count_neighbours(rule.look_alikes))
             evidence = replace(evidence, proof=log_inlier_ratio(inliers, rival), landmarks=log_count(inliers))
-        if evidence and proof and evidence.is_hardly_ahead:
+        if evidence and agreement and evidence.has_small_lead:
             with step("verify"):
-                rival = verifier.count_rival(ranking, rule.neighbour_m, same)
+                rival = verifier.count_rival(ranking, near_m, same_ground)
             evidence = replace(evidence, rival=log_count(rival))
-        return best, Findings(ranking, proof=proof, where=where, evidence=evidence)
+        return best, Findings(ranking, agreement=agreement, located=located, evidence=evidence)
 
-    def _lead_over_turned(self, best: Candidate, evidence: Evidence | None, query: EncodedFrame) -> float | None:
-        """Return the lead, as in the evidence, over the same place if the picture is turned otherwise (None: no
+    def _lead_over_rotated(self, best: Candidate, evidence: Evidence | None, query: EncodedFrame) -> float | None:
+        """Return the lead, as in the evidence, over the same place with the picture at another rotation (None: no
         evidence is needed)."""
         if evidence is None:
             return None
@@ -299,8 +300,7 @@ class Decider:
             return convert_to_tilt(found, query.view.focal)
 
     def _share_at_rest_elsewhere(self, candidate: Candidate, ranking: Ranking, encoded: EncodedFrame) -> float:
-        """Return the share of a few places elsewhere that agree with the query at rest, as the best one (0: it is not
-        at rest, or there are none)."""
+        """Return the share of a few places elsewhere that agree with the query at rest; 0 if the best one does not."""
         best = candidate.match
         if not is_at_rest(best):
             return 0.0

@@ -1,9 +1,9 @@
 """Evidence of a match: the figures that its confidence is computed from (see `confidence`).
 
 There are four kinds: for a camera that looks straight down, with landmarks (DOWN) or without (DOWN_BARE), and for one
-that looks ahead (AHEAD, and AHEAD_PROVEN where landmarks speak for the match). A place *elsewhere* is outside the best
-place's neighbourhood. Regions *agree* if they show the same shift between query and place. Larger figures speak for the
-match, but for `rank_gap`.
+that looks ahead (AHEAD, and AHEAD_PROVEN where landmarks support the match). A place *elsewhere* is outside the best
+place's neighbourhood. Regions *agree* if they show the same shift between query and place. A larger figure supports the
+match, except `rank_gap`.
 
 * agree: logarithm of what `compute_share` returns, the share of regions that agree
 * lead: `agree` minus the largest `agree` of a place elsewhere
@@ -15,7 +15,7 @@ match, but for `rank_gap`.
 * proof: what `log_inlier_ratio` returns, of the landmarks (ahead)
 * twin: agreement of the place, in the map, with the one that looks most like it (see `LookAlike`), minus that of
   pictures of its own ground; from 0 on the two are *twins* (ahead). No model weighs it, nor the next one
-* apart: `agree` minus the agreement of these two places (ahead, in a map of single views)
+* apart: `agree` minus the agreement of these two places with each other (ahead, in a map of single views)
 * tried: `Ranking.tried`, which no model weighs (see `Model.chance`)
 """
 
@@ -34,33 +34,33 @@ AHEAD = "ahead"
 AHEAD_PROVEN = "ahead_proven"
 DOWN = "down"
 DOWN_BARE = "down_bare"
-_BARE = ("lead", "coverage", "structure")
-_LOOKING_DOWN = {DOWN: (*_BARE, "landmarks"), DOWN_BARE: _BARE}
-_MAP_AHEAD = ("coverage", "likeness", "structure")
-_PLACE_AHEAD = ("lead", "coverage", "rank_gap", "structure")
+_FIGURES_DOWN = ("lead", "coverage", "structure")
+_DOWN_FIGURES = {DOWN: (*_FIGURES_DOWN, "landmarks"), DOWN_BARE: _FIGURES_DOWN}
+_MAP_FIGURES_AHEAD = ("coverage", "likeness", "structure")
+_PLACE_FIGURES_AHEAD = ("lead", "coverage", "rank_gap", "structure")
 # Names of the evidence that tells whether a query shows ground of the map, and which of its places.
-MAP_FIGURES = {AHEAD: _MAP_AHEAD, AHEAD_PROVEN: _MAP_AHEAD, **_LOOKING_DOWN}
-PLACE_FIGURES = {AHEAD: _PLACE_AHEAD, AHEAD_PROVEN: (*_PLACE_AHEAD, "proof"), **_LOOKING_DOWN}
+MAP_FIGURES = {AHEAD: _MAP_FIGURES_AHEAD, AHEAD_PROVEN: _MAP_FIGURES_AHEAD, **_DOWN_FIGURES}
+PLACE_FIGURES = {AHEAD: _PLACE_FIGURES_AHEAD, AHEAD_PROVEN: (*_PLACE_FIGURES_AHEAD, "proof"), **_DOWN_FIGURES}
 _MIN_SHARE = 1e-3  # so that its logarithm exists
-# So many landmarks agree with a place that only looks alike. Were fewer told apart, wrong matches would scatter more.
-INLIERS_BY_CHANCE = 8
-SHARE_BY_CHANCE = 0.07  # that pictures of foreign ground reach; stands for a place elsewhere if there is none
-# A place that leads by a smaller factor must be told by its landmarks from the best one elsewhere.
+# So many landmarks agree with a place that only looks alike. Smaller numbers count as this one, since they scatter.
+CHANCE_INLIERS = 8
+CHANCE_SHARE = 0.07  # reached by pictures of foreign ground; stands for a place elsewhere if there is none
+# If a place leads by a smaller factor, its landmarks must distinguish it from the best one elsewhere.
 SMALL_LEAD = math.log(1.5)
 _MIN_LEAD = math.log(1.05)
-# Ahead, the most by which the regions of another place may rank better. Chosen on corridor, where one match was
-# accepted beside the right places.
+# Ahead, the most by which the regions of another place may rank better. Chosen on corridor, where one match next to the
+# right places was accepted.
 _MAX_RANK_GAP = 0.1
 _MIN_PROOF = math.log(2)
-# A place that has a twin must lead by this factor. Of thumbs_essex, the lift door of another floor, seen from where
-# this one was mapped, led by 2.
-_CLEAR_LEAD = math.log(4)
+# A place that has a twin must lead by this factor. In thumbs_essex, the lift door of another floor led by 2 when it was
+# seen from the spot where this one was mapped.
+_MIN_LEAD_OVER_TWIN = math.log(4)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
     """Evidence of a match, as the module describes it. None: this kind of evidence has no such figure, or it was not
-    asked for. `rival` is the number of landmarks, as `landmarks`, that agree with the best place elsewhere."""
+    measured. `rival` is, like `landmarks`, the number of those that agree with the best place elsewhere."""
 
     agree: float
     lead: float
@@ -88,13 +88,13 @@ class Evidence:
 
     @property
     def has_twin(self) -> bool:
-        """True if at least half as many landmarks agree with a place elsewhere, or the map knows a twin, and no place
-        elsewhere is clearly beaten: both show the same kind of thing."""
+        """True if the match may show another place that looks alike: at least half as many landmarks agree with a place
+        elsewhere, or the map knows a twin and the lead is not large."""
         is_alike = self.rival is not None and _to_count(self.landmarks or 0.0) < 2 * _to_count(self.rival)
-        return is_alike or (self.twin is not None and self.twin >= 0 and self.lead < _CLEAR_LEAD)
+        return is_alike or (self.twin is not None and self.twin >= 0 and self.lead < _MIN_LEAD_OVER_TWIN)
 
     @property
-    def leads(self) -> bool:
+    def is_unambiguous(self) -> bool:
         """True if no place elsewhere agrees about as well, by the regions, the landmarks, and what the map knows."""
         return self.lead >= _MIN_LEAD and not self.has_twin
 
@@ -102,21 +102,21 @@ class Evidence:
     def needs_landmarks(self) -> bool:
         """True if the landmarks of a match, ahead, do not prove it, and the regions alone cannot:
 
-        * The place hardly leads: ground beyond the map may be built like the map.
-        * It hardly leads, and the regions of another place rank better: twice as many landmarks must agree.
+        * The place has a small lead: ground outside the map may look like the map.
+        * It has a small lead, and the regions of another place rank better: twice as many landmarks must agree.
         * It is a single view (see `LookAlikes`), and the query agrees with it hardly better than the place that looks
           most like it does: from another spot, each of the two may look more like the other."""
         if self.likeness is None:
             return False
-        if self.is_hardly_ahead and (self.rank_gap or 0.0) > _MAX_RANK_GAP:
+        if self.has_small_lead and (self.rank_gap or 0.0) > _MAX_RANK_GAP:
             return (self.proof or 0.0) < _MIN_PROOF
         if self.apart is not None:
             return self.apart < SMALL_LEAD and not self.proof
-        return self.is_hardly_ahead and _to_count(self.landmarks or 0.0) <= INLIERS_BY_CHANCE
+        return self.has_small_lead and _to_count(self.landmarks or 0.0) <= CHANCE_INLIERS
 
     @property
-    def is_hardly_ahead(self) -> bool:
-        """True if a place elsewhere agrees nearly as well, so that its landmarks must be compared too."""
+    def has_small_lead(self) -> bool:
+        """True if a place elsewhere agrees nearly as well, so its landmarks must be compared too."""
         return self.lead < SMALL_LEAD
 
     def describe(self) -> dict[str, float | None]:
@@ -134,8 +134,8 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class LookAlike:
-    """What looks most like a place: the number of another place elsewhere, and the logarithm of how well both agree.
-    `own`: that of pictures of the place's own ground with each other, or by chance where there are none."""
+    """The place elsewhere that looks most like a place: its number, and the logarithm of how well both agree. `own`:
+    that of pictures of the place's own ground with each other, or by chance where there are none."""
 
     other_id: int
     agree: float
@@ -144,9 +144,9 @@ class LookAlike:
 
 @dataclass(frozen=True, slots=True)
 class LookAlikes:
-    """What a map, made looking ahead, knows of `places` that look alike, by their numbers. `overlap`: pictures that
-    were mapped one after the other show the same ground, as along a way. Else each place is a single view: what comes
-    before and after it in the file is another place."""
+    """The `places` of a map, made looking ahead, that look alike, by their numbers. `overlap`: pictures that were
+    mapped one after the other show the same ground, as along a road. Else each place is a single view: those before and
+    after it in the file are other places."""
 
     overlap: bool
     places: Mapping[int, LookAlike]
@@ -154,7 +154,7 @@ class LookAlikes:
     @property
     def twins(self) -> int:
         """Number of places that have a twin."""
-        return sum(each.agree >= each.own for each in self.places.values())
+        return sum(look_alike.agree >= look_alike.own for look_alike in self.places.values())
 
 
 def list_evidence_kinds(spec: TechniqueSpec) -> tuple[str, ...]:
@@ -168,38 +168,37 @@ def gather_evidence(
     ranking: Ranking,
     index: PlaceIndex,
     neighbour_m: float,
-    proof: Agreement | None,
-    same: Collection[int],
-    down: bool,
+    agreement: Agreement | None,
+    same_ground: Collection[int],
+    looks_down: bool,
     look_alikes: LookAlikes | None = None,
 ) -> Evidence | None:
     """Return the evidence for the best place; None if no place was compared or, ahead, a match has no `support`.
 
-    `down` tells whether the camera looks straight down. If so, `proof` is the agreement of the landmarks (None: not
-    compared), and the places with the numbers `same` show the same ground as the best one, so they are not elsewhere.
-    `look_alikes` are those of the map (None: unknown).
+    If the camera `looks_down`, `agreement` is that of the landmarks (None: not compared), and places with the numbers
+    `same_ground` show the same ground as the best one, so they are not elsewhere. `look_alikes` are those of the map
+    (None: unknown).
     """
     matches = {slot: ranking.compared[slot] for slot in ranking.compared_slots}
     support = {slot: match.support for slot, match in matches.items() if match.support}
-    if not matches or (not down and len(support) < len(matches)):
+    if not matches or (not looks_down and len(support) < len(matches)):
         return None
     slots = np.array(list(matches))
     best = int(slots[0])
     neighbours = count_neighbours(look_alikes)
-    distant = frozenset(
-        slots[outside_neighbourhood(index, best, slots, neighbour_m, same if down else (), neighbours)].tolist()
-    )
-    agree = {slot: compute_share(match) for slot, match in matches.items()}
-    rivals = (agree[slot] for slot in distant)
+    same_ids = same_ground if looks_down else ()
+    elsewhere = slots[outside_neighbourhood(index, best, slots, neighbour_m, same_ids, neighbours)].tolist()
+    shares = {slot: compute_share(match) for slot, match in matches.items()}
+    rival_share = max((shares[slot] for slot in elsewhere), default=CHANCE_SHARE)
     evidence = Evidence(
-        agree=log_share(agree[best]),
-        lead=log_share(agree[best]) - log_share(max(rivals, default=SHARE_BY_CHANCE)),
+        agree=log_share(shares[best]),
+        lead=log_share(shares[best]) - log_share(rival_share),
         coverage=log_share(matches[best].coverage or 0.0),
         structure=matches[best].structure or 0.0,
         tried=ranking.tried,
     )
-    if not down:
-        least_rank = min(each.log_rank for each in support.values())
+    if not looks_down:
+        least_rank = min(match_support.log_rank for match_support in support.values())
         best_support = support[best]
         rank_gap, likeness = best_support.log_rank - least_rank, best_support.likeness
         evidence = replace(evidence, rank_gap=rank_gap, likeness=likeness, proof=0.0)
@@ -208,9 +207,10 @@ def gather_evidence(
             return evidence
         apart = None if look_alikes.overlap else evidence.agree - look_alike.agree
         return replace(evidence, twin=look_alike.agree - look_alike.own, apart=apart)
-    if proof is None:
+    if agreement is None:
         return evidence
-    return replace(evidence, landmarks=log_count(proof.inliers if proof.is_expected and not proof.is_at_rest else 0))
+    is_valid = agreement.is_expected and not agreement.is_at_rest
+    return replace(evidence, landmarks=log_count(agreement.inliers if is_valid else 0))
 
 
 def count_neighbours(look_alikes: LookAlikes | None) -> int:
@@ -219,15 +219,15 @@ def count_neighbours(look_alikes: LookAlikes | None) -> int:
 
 
 def log_inlier_ratio(inliers: int, rival: int) -> float:
-    """Return the evidence of the landmarks, ahead, where `inliers` agree with those of the best place and `rival` with
-    those of the best place elsewhere: the logarithm of how many times more agree than with the rival and by chance. It
-    is 0 at least, so it never speaks against a match."""
-    return max(0.0, math.log(max(inliers, INLIERS_BY_CHANCE) / max(rival, INLIERS_BY_CHANCE)))
+    """Return the evidence of the landmarks, ahead: the logarithm of the ratio of `inliers`, those that agree with the
+    best place, to `rival`, those that agree with the best place elsewhere, both at least the number by chance. It is 0
+    at least, so it never counts against a match."""
+    return max(0.0, math.log(max(inliers, CHANCE_INLIERS) / max(rival, CHANCE_INLIERS)))
 
 
 def compute_share(match: FineMatch) -> float:
-    """Return the share of regions that agree on a shift. Ahead it is the geometric mean of the score and of the same
-    share of the place; down, `FineMatch.votes`, which counts how well the layouts agree, too."""
+    """Return the share of regions that agree on a shift: ahead, the geometric mean of the shares of the query's and of
+    the place's regions; down, `FineMatch.votes`, which counts how well the layouts agree, too."""
     if match.support is not None:
         return math.sqrt(match.score * match.support.back)
     return match.score if match.votes is None else match.votes

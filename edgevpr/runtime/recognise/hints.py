@@ -1,9 +1,8 @@
-"""Hints for a query beside its picture: where the aircraft can be, its heading, and the height it flies at. They narrow
-the recogniser's search of the map.
+"""Hints narrow the search of the map for a query: where the aircraft can be, its heading, and its height.
 
-In flight no hint is ever the only way to find a place: a compass may be wrong and a satellite position false. A query
-that is not accepted with hints is therefore followed by one without (`Prior`). Recorded queries that are measured need
-not follow each other: each is asked with what is known of it (`RecordedPrior`).
+In flight no hint is ever the only way to find a place: a compass may be wrong, and GPS may be spoofed. So a query that
+is not accepted with hints is followed by one without (`Prior`). Recorded queries are measured one by one, each with
+what is known of it (`RecordedPrior`).
 """
 
 import math
@@ -24,19 +23,19 @@ from edgevpr.runtime.recognise.belief import DEFAULT_MAX_SPEED_M_S
 from edgevpr.runtime.recognise.locate import Located
 
 KNOWN_FIELDS = ("heading", "height", "reach")  # what can be known of a recorded query
-RECORDED_REACH_M = 300.0  # a flight at 20 m/s reaches as much 15 s after its last position
+RECORDED_REACH_M = 300.0  # as far as an aircraft flies in 15 s at 20 m/s
 _MAX_FIX_AGE_S = 60.0
 _TRUST_ALL = (True, True)
-_SCALE_ERROR = 1.08  # the ratio of two heights from which on it is no error of a match
+_SCALE_ERROR = 1.08  # two heights whose ratio is larger differ by more than the error of a match
 _MIN_SCALE = 0.5
 _MIN_HEIGHTS = 3  # matches that agree on a small error of the recorded heights
 _MAX_HEIGHTS = 5  # matches whose heights are compared with the recorded ones
-# The flight so far narrows the search where it is so sure of its position. The area then has places enough to compare
-# the best one with: it is as large as that of recorded queries, and reaches over so many places.
+# The place filter narrows the search if its position has at least this probability. The area is large enough to contain
+# rivals of the best place: at least that of recorded queries, and so many times the distance of places.
 _MIN_MASS = 0.99
 _AREA_SD = 4.0
 _AREA_PLACES = 5.0
-# Field of a tag and column of positions.csv that a part needs. Without any height, it is the map's.
+# Field of a tag, and columns of positions.csv, that a known field needs. Without any height, it is the map's.
 _REQUIRED_FIELDS = {"heading": ("heading_deg", "yaw_deg"), "reach": ("position", "lat and lon")}
 
 
@@ -50,13 +49,13 @@ class Reach:
 
 @dataclass(frozen=True, slots=True)
 class Hints:
-    """Hints for one query: the area in which the aircraft is, and the heading of its nose, degrees. None: unknown."""
+    """Hints for one query: the area in which the aircraft is, and its heading, degrees. None: unknown."""
 
     reach: Reach | None = None
     heading_deg: float | None = None
 
     def fields(self) -> dict[str, float | bool | None]:
-        """Return these hints as fields of the flight log: the radius of the area (None: unknown), and if a heading is
+        """Return these hints as fields of the flight log: radius of the area (None: unknown), and whether a heading is
         known."""
         radius_m = round(self.reach.radius_m, 1) if self.reach else None
         return {"reach_m": radius_m, "heading": self.heading_deg is not None}
@@ -65,30 +64,30 @@ class Hints:
         """Return whether a match agrees with the area, and whether with the heading, as far as both are known.
         `heading_within_deg` is the largest error of a heading (None: headings are not compared)."""
         place, rotation_deg = match.place, match.match.rotation_deg
-        in_reach = in_heading = True
+        in_reach = heading_agrees = True
         if self.reach and place.position:
-            here, there = self.reach.position, place.position
-            away_m = distance_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
-            in_reach = bool(away_m <= self.reach.radius_m)
+            middle, position = self.reach.position, place.position
+            off_m = distance_m(middle.lat_deg, middle.lon_deg, position.lat_deg, position.lon_deg)
+            in_reach = bool(off_m <= self.reach.radius_m)
         if self.heading_deg is not None and place.heading_deg is not None and rotation_deg is not None:
             off_deg = wrap_deg(rotation_deg - (self.heading_deg - place.heading_deg))
-            in_heading = heading_within_deg is None or abs(off_deg) <= heading_within_deg
-        return in_reach, in_heading
+            heading_agrees = heading_within_deg is None or abs(off_deg) <= heading_within_deg
+        return in_reach, heading_agrees
 
-    def select(self, in_reach: bool, heading: bool) -> "Hints | None":
+    def select(self, trusts_reach: bool, trusts_heading: bool) -> "Hints | None":
         """Return those of these hints that are trusted; None if nothing is left."""
-        reach, heading_deg = self.reach if in_reach else None, self.heading_deg if heading else None
+        reach, heading_deg = self.reach if trusts_reach else None, self.heading_deg if trusts_heading else None
         return None if reach is None and heading_deg is None else Hints(reach, heading_deg)
 
 
 class RecordedPrior:
-    """Makes the hints for each recorded query from its own frame. `known` are members of `KNOWN_FIELDS`; what a frame
-    lacks of them is not known of it. The rest is as in `Prior`. `map_height_m` is the height at which the map was made
-    (None: it or those of the queries are unknown; `height` means the map's).
+    """Makes the hints for each recorded query from its own frame. `known`: the members of `KNOWN_FIELDS` to use, as far
+    as a frame has them. The rest is as in `Prior`. `map_height_m` is the height at which the map was made (None: it or
+    those of the queries are unknown; `height` means the map's).
 
-    The queries before count for one thing: recorded heights may all be wrong by one factor, as of a barometer over
-    sloping ground or by a wrong field of view. Until a match has confirmed them, all heights are searched. From then on
-    they are corrected by what matches show.
+    Earlier queries are used for one thing: recorded heights may all be wrong by one factor, as by a barometer over
+    sloping ground or a wrong field of view. Until a match has confirmed them, all heights are searched. From then on
+    they are corrected by the matches.
     """
 
     def __init__(
@@ -102,7 +101,7 @@ class RecordedPrior:
         self.searches_heights = True
 
     def make_hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
-        """Return the hints for a frame; `vehicle` and `margin_m`, of a flight, do not count."""
+        """Return the hints for a frame; `vehicle` and `margin_m`, of a flight, are not used."""
         ratio: float | None = self._height_error
         if self._map_height_m is not None:
             recorded_m = frame.height_m if frame.height_m and frame.height_m > 0 else None
@@ -116,14 +115,14 @@ class RecordedPrior:
 
     @property
     def _height_error(self) -> float:
-        """The heights by the last matches over those recorded, median; 1.0 if they are about the same."""
+        """Median ratio of the heights by the last matches to those recorded; 1.0 if they are about the same."""
         error = statistics.median(self._height_errors) if self._height_errors else 1.0
-        # The height of one match may be wrong by 8 %: few of them correct what is clearly wrong only.
-        same = _SCALE_ERROR if len(self._height_errors) >= _MIN_HEIGHTS else _SCALE_ERROR**2
-        return error if abs(math.log(error)) > math.log(same) else 1.0
+        # The height of one match may be wrong by 8 %, so a few matches correct only a clear error.
+        tolerance = _SCALE_ERROR if len(self._height_errors) >= _MIN_HEIGHTS else _SCALE_ERROR**2
+        return error if abs(math.log(error)) > math.log(tolerance) else 1.0
 
     def scale(self, height_ratios: Sequence[float]) -> float:
-        """Return how much more ground a picture shows than its recorded height says."""
+        """Return the ratio of the ground that a picture shows to that by its recorded height."""
         return self._height_error if self._map_height_m is None else 1.0
 
     def update(
@@ -135,7 +134,7 @@ class RecordedPrior:
         footprint_m: float | None = None,
         layers: Layers | None = None,
     ) -> None:
-        """Keep what an accepted match says of the recorded height. The arguments are as in `Prior.update`."""
+        """Record the error of the recorded height by an accepted match. The arguments are as in `Prior.update`."""
         ratio, pose = match.match.height_ratio, match.place.pose
         if not (accepted and ratio):
             return
@@ -145,18 +144,18 @@ class RecordedPrior:
             self._height_errors.append(self._height_error * ratio / self.height_ratio)
 
     def update_area(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
-        """Learn nothing, as `update`."""
+        """Do nothing: recorded queries do not depend on each other."""
 
 
 class Prior(RecordedPrior):
     """Makes the hints for each query of a flight, and decides whether hints are to be trusted.
 
-    `height_ratio` is the height of the camera over that of the map's pictures, by the last accepted match; where
-    pictures are scaled by known heights, it is how far these are wrong. `footprint_m` is that of the layer in which the
-    last match was (None: unknown, or its height tells it); the height ratio is relative to it. `searches_heights`: a
-    query that is not accepted there is searched at other heights too. `reach_m_s` is the highest speed (None: positions
-    give no hint), `heading_within_deg` the largest error of a known heading (None: headings give no hint). `is_live` is
-    False for recorded frames, for which the autopilot's reports do not hold.
+    `height_ratio` is the height of the camera over that of the map's pictures, by the last accepted match; if pictures
+    are scaled by known heights, the error of these. `footprint_m` is that of the layer in which the last match was
+    (None: unknown, or given by its height); the height ratio is relative to it. `searches_heights`: a query that is not
+    accepted there is searched at other heights too. `reach_m_s` is the highest speed (None: positions are no hint),
+    `heading_within_deg` the largest error of a known heading (None: headings are no hint). `is_live` is False for
+    recorded frames, to which the autopilot's reports do not belong.
     """
 
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
@@ -164,27 +163,27 @@ class Prior(RecordedPrior):
         self._reach_m_s, self._is_live = reach_m_s, is_live
         self._uses_hints = True
         self._trusted = _TRUST_ALL  # area and heading, by the last accepted match
-        self._last_fix: tuple[Position, float] | None = None  # and when the aircraft was there
-        self._estimate: tuple[Reach, float] | None = None  # where the flight so far puts it, and when
+        self._last_fix: tuple[Position, float] | None = None  # with its time
+        self._estimate: tuple[Reach, float] | None = None  # of the place filter, with its time
         self._all_hints: Hints | None = None
 
     def make_hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
         """Return the hints for a frame; None if there are none, or if hints are not trusted now.
 
-        `vehicle` is the autopilot's last report. `margin_m` metres are added to the distance that it can have flown. It
-        has flown from the autopilot's position if that has GPS (without, it drifts, and our own fix is better), else
-        from our last fix if that is at most a minute old. Without a highest speed, the area is where the flight so far
-        puts the aircraft, if it is sure.
+        `vehicle` is the autopilot's last report. The area is as far as the aircraft can have flown, and `margin_m`,
+        from the autopilot's position if that has GPS (else it drifts, and our own fix is better), or from our last fix
+        if that is at most a minute old. Without a highest speed, it is around the position by the place filter, if that
+        is certain.
         """
         if not self._is_live or (vehicle and not vehicle.is_fresh(frame.t_mono_s)):
             vehicle = None
-        known, reach = self._last_fix, None
+        start, reach = self._last_fix, None
         if vehicle and vehicle.has_gps:
-            known = Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_received_s
-        elif known and frame.t_mono_s - known[1] > _MAX_FIX_AGE_S:
-            known = None
-        if known and self._reach_m_s:
-            reach = Reach(known[0], margin_m + self._reach_m_s * abs(frame.t_mono_s - known[1]))
+            start = Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_received_s
+        elif start and frame.t_mono_s - start[1] > _MAX_FIX_AGE_S:
+            start = None
+        if start and self._reach_m_s:
+            reach = Reach(start[0], margin_m + self._reach_m_s * abs(frame.t_mono_s - start[1]))
         if self._estimate and self._reach_m_s is None:
             area, t_s = self._estimate
             if (since_s := abs(frame.t_mono_s - t_s)) <= _MAX_FIX_AGE_S:
@@ -195,8 +194,8 @@ class Prior(RecordedPrior):
         return self._all_hints.select(*self._trusted) if self._all_hints and self._uses_hints else None
 
     def scale(self, height_ratios: Sequence[float]) -> float:
-        """Return the factor to enlarge the next picture by, so that it is as if taken from one of the `height_ratios`:
-        between two of them less is found. Of a picture from above the edges are needed too: it is enlarged no more."""
+        """Return the factor to scale the next picture by, so that it looks as if taken at one of the `height_ratios`:
+        between two of them fewer matches are found. One from higher up goes to the nearest, as it needs its edges."""
         ratio = self.height_ratio
         if not height_ratios or abs(math.log(ratio)) <= math.log(_SCALE_ERROR):
             return 1.0
@@ -211,8 +210,8 @@ class Prior(RecordedPrior):
         footprint_m: float | None = None,
         layers: Layers | None = None,
     ) -> None:
-        """Keep position and height of an accepted match. The next query uses those hints that it agrees with. Until
-        there is one, queries with hints and without alternate. Its picture was enlarged by `scale`, so that by its
+        """Record position and height of an accepted match; the next query uses the hints that it agrees with. Until
+        there is one, queries with and without hints alternate. The query's picture was enlarged by `scale`, so by its
         height it shows `footprint_m` of ground (None: its height is unknown). `layers` are those of the map (None: it
         has one).
         """
@@ -231,17 +230,17 @@ class Prior(RecordedPrior):
         if match.match.height_ratio:
             height_ratio, layer_m = scale * match.match.height_ratio, self.footprint_m
             if layers and len(layers.footprints_m) > 1 and match.place.pose:
-                seen_m = height_ratio * match.place.pose.footprint_m
-                layer_m = footprint_m or layers.choose_footprint(seen_m)
-                height_ratio = seen_m / (layer_m or seen_m)
+                matched_m = height_ratio * match.place.pose.footprint_m
+                layer_m = footprint_m or layers.choose_footprint(matched_m)
+                height_ratio = matched_m / (layer_m or matched_m)
             if layer_m != self.footprint_m or abs(math.log(height_ratio / self.height_ratio)) > math.log(_SCALE_ERROR):
                 self.footprint_m, self.height_ratio = layer_m, height_ratio
         if match.place.position:
             self._last_fix = match.place.position, t_mono_s
 
     def update_area(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
-        """Keep where the flight so far puts the aircraft (None: unknown), with the probability `mass` that it is near
-        there. It holds until the next is sure too, or for a minute."""
+        """Record the position by the place filter (None: unknown), with the probability `mass` that the aircraft is
+        near it. It is used until the next certain one, or for a minute."""
         if estimate and mass >= _MIN_MASS:
             east_m2, _, north_m2 = estimate.covariance_m2
             self._estimate = Reach(estimate.position, _AREA_SD * math.sqrt(east_m2 + north_m2)), t_mono_s
@@ -262,19 +261,19 @@ def explain_useless(
     places: Collection[GeoTag] | Collection[Place],
     sequence: int,
 ) -> str | None:
-    """Return a sentence on why no query can be asked with what is `known` (see `RecordedPrior`); None if some can.
+    """Return a sentence on why no query can use the hints in `known` (see `RecordedPrior`); None if some can.
     `sequence` is the number of queries that are matched together."""
     if known and sequence > 1:
-        return f"{sequence} queries are matched together, and what is known narrows only single ones: leave one out."
+        return f"{sequence} queries are matched together, but `known` narrows single ones: leave one option out."
     for part, (field, columns) in _REQUIRED_FIELDS.items():
         for name, tags in (("query", queries), ("place", places)):
             if part in known and all(getattr(tag, field) is None for tag in tags):
-                return f"No {name} has what `{part}` needs: write {columns} into positions.csv, or leave `{part}` out."
+                return f"`{part}` needs {columns}, but no {name} has it: add it to positions.csv."
     return None
 
 
 def _drop_useless(reach: Reach | None, heading_deg: float | None, index: PlaceIndex) -> Hints | None:
-    """Return what narrows a search of the index; None if nothing does. An area of all places or of none does not."""
+    """Return the hints that narrow a search of the index; None: none does. An area of all places or none does not."""
     if reach and not 0 < index.find_within(reach.position, reach.radius_m).sum() < len(index):
         reach = None
     if not index.knows_headings:
@@ -283,10 +282,10 @@ def _drop_useless(reach: Reach | None, heading_deg: float | None, index: PlaceIn
 
 
 def to_expectation(hints: Hints | None, height_ratio: float, index: PlaceIndex) -> Expectation:
-    """Convert hints and height into what a search expects of each place of the index (see `Expectation`)."""
-    in_reach = turned_deg = None
+    """Convert hints and height to an `Expectation` of the places of the index."""
+    in_reach = rotation_deg = None
     if hints and hints.reach:
         in_reach = index.find_within(hints.reach.position, hints.reach.radius_m)
     if hints and hints.heading_deg is not None:
-        turned_deg = (hints.heading_deg - index.heading_deg.astype(float)) % 360
-    return Expectation(in_reach, turned_deg, height_ratio)
+        rotation_deg = (hints.heading_deg - index.heading_deg.astype(float)) % 360
+    return Expectation(in_reach, rotation_deg, height_ratio)

@@ -16,12 +16,12 @@ from edgevpr.places.sequence import compute_sequence_bytes, make_sequence_search
 from edgevpr.power.boards import Board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.recognise.calibration import read_calibration_for
-from edgevpr.runtime.recognise.decide import Matcher, WalkSettings
+from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
 from edgevpr.runtime.recognise.evidence import list_evidence_kinds
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability
 from edgevpr.runtime.recognise.hints import Prior, RecordedPrior
-from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.judge import make_accept_rule
 from edgevpr.runtime.recognise.levelling import Levelling, make_levelling
 from edgevpr.runtime.recognise.odometry import VisualOdometry
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
@@ -72,9 +72,9 @@ def open_recogniser(
         # Only matches that have a confidence can be followed, and only where no sequence is asked for.
         if tracks_flight and match.sequence is None and list_evidence_kinds(technique.spec):
             place_filter = PlaceFilter(place_map, max_speed_m_s=match.reach_m_s, is_live=is_live(source.uri))
-        rule = accept_rule(technique, match, length, read_calibration_for(place_map))
+        rule = make_accept_rule(technique, match, length, read_calibration_for(place_map))
         candidates, min_accuracy_m = match.candidates or technique.candidates, config.mavlink.min_accuracy_m
-        settings = WalkSettings(candidates=candidates, verify=match.verify, min_accuracy_m=min_accuracy_m)
+        settings = MatchSettings(candidates=candidates, verify=match.verify, min_accuracy_m=min_accuracy_m)
         recogniser = Recogniser(
             FrameEncoder(technique=technique, levelling=levelling, mask=mask, gate=gate),
             place_map,

@@ -120,16 +120,16 @@ class PlaceFilter:
         self._odometry = odometry if odometry and odometry.from_s == before_s else None
 
     def update(
-        self, ranking: Ranking, index: PlaceIndex, evidence: Evidence, sure: ConfidenceRule, where: Located | None
+        self, ranking: Ranking, index: PlaceIndex, evidence: Evidence, rule: ConfidenceRule, where: Located | None
     ) -> TrackEstimate:
         """Return the result of one pass together with the flight so far; nothing is kept before `commit`. `evidence` is
-        that of the best place of the `ranking`, and `sure` turns it into probabilities. `where` is the position of the
+        that of the best place of the `ranking`, and `rule` turns it into probabilities. `where` is the position of the
         aircraft computed from the best place (None: the position of the place itself is taken)."""
         if self._geometry is None or self._belief is None:
             self._geometry = _MapGeometry(self._map, index)
             self._belief = Belief(self._geometry.scale)
         geometry, near = self._geometry, self._geometry.scale.near
-        slots, proposed = _make_proposals(ranking, index, geometry, sure, evidence, where)
+        slots, proposed = _make_proposals(ranking, index, geometry, rule, evidence, where)
         self._next = copy.copy(self._belief)
         posterior = self._next.update(proposed, self._motion(geometry), len(index))
         slot, confidence = None, 0.0
@@ -169,7 +169,7 @@ class PlaceFilter:
         if self._odometry and self._elapsed_s > 0:
             east_m, north_m = self._odometry.moved_m
             velocity_m_s = east_m / self._elapsed_s, north_m / self._elapsed_s
-            return make_motion(self._elapsed_s, self._max_speed_m_s, velocity_m_s, is_seen=True)
+            return make_motion(self._elapsed_s, self._max_speed_m_s, velocity_m_s, is_visual=True)
         return make_motion(self._elapsed_s, self._max_speed_m_s, self._velocity_m_s)
 
     def _limit_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:
@@ -184,24 +184,24 @@ class PlaceFilter:
 
 
 def make_motion(
-    elapsed_s: float | None, speed_max: float, velocity: tuple[float, float] | None = None, is_seen: bool = False
+    elapsed_s: float | None, speed_max: float, velocity: tuple[float, float] | None = None, is_visual: bool = False
 ) -> Motion:
     """Return the motion in `elapsed_s` seconds, one second if they are unknown (None) or the clock was set back.
     `speed_max` is the highest speed, in units of the map a second, and `velocity` (east, north) that of odometry (None:
-    unknown), which is not used without a time or if it is too high to be true; for `is_seen` see `Motion`."""
+    unknown), which is not used without a time or if it is too high to be true; for `is_visual` see `Motion`."""
     if elapsed_s is None or not elapsed_s > 0:
         return Motion(reach=speed_max, elapsed_s=1.0)
-    elapsed_s, by = min(elapsed_s, _MAX_ELAPSED_S), None
+    elapsed_s, moved = min(elapsed_s, _MAX_ELAPSED_S), None
     if velocity is not None and math.hypot(*velocity) <= 2 * speed_max:  # no NaN, and possible if twice the truth
-        by = elapsed_s * np.asarray(velocity, float)
-    return Motion(reach=speed_max * elapsed_s, elapsed_s=elapsed_s, by=by, is_seen=is_seen)
+        moved = elapsed_s * np.asarray(velocity, float)
+    return Motion(reach=speed_max * elapsed_s, elapsed_s=elapsed_s, displacement=moved, is_visual=is_visual)
 
 
 def _make_proposals(
     ranking: Ranking,
     index: PlaceIndex,
     geometry: _MapGeometry,
-    sure: ConfidenceRule,
+    rule: ConfidenceRule,
     evidence: Evidence,
     where: Located | None,
 ) -> tuple[Ints, Proposals]:
@@ -223,8 +223,8 @@ def _make_proposals(
     votes = np.array([compute_share(ranking.compared[slot]) for slot in slots.tolist()])
     near = np.hypot(*(at - at[0]).T) <= geometry.scale.near
     near[0] = True  # even if its position is unknown
-    confidence = sure.confidence(evidence)
-    left = max(0.0, sure.compute_map_confidence(evidence) - confidence)
+    confidence = rule.confidence(evidence)
+    left = max(0.0, rule.compute_map_confidence(evidence) - confidence)
     p = np.zeros(len(slots))
     if evidence.has_twin:  # more votes only mean that it was pictured from nearer by
         votes = np.minimum(votes, _TWIN_SHARE * votes.max(initial=0))

@@ -18,7 +18,7 @@ from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.ranking import Ranking, merge_rankings
 from edgevpr.places.retrieve import Expectation, compare_places, scan_index
 from edgevpr.power.meter import QueryMeter
-from edgevpr.runtime.recognise.decide import Decider, Decision, Matcher, Verifier, WalkSettings
+from edgevpr.runtime.recognise.decide import Decider, Decision, Matcher, MatchSettings, Verifier
 from edgevpr.runtime.recognise.encoder import EncodedFrame, FrameEncoder, explain_failure
 from edgevpr.runtime.recognise.hints import RecordedPrior, to_expectation
 from edgevpr.runtime.recognise.judge import Verdict, check_texture
@@ -46,7 +46,7 @@ class Recogniser:
         matcher: Matcher,
         meter: QueryMeter,
         *,
-        settings: WalkSettings,
+        settings: MatchSettings,
         odometry: VisualOdometry | None = None,
         prior: RecordedPrior | None = None,
         place_filter: PlaceFilter | None = None,
@@ -138,7 +138,7 @@ class Recogniser:
         """Return the event of a frame; `failure` is the error that ended it (None: none did)."""
         decision = decision or Decision(verdict=Verdict(False, explain_failure(failure)))
         findings, accepted = decision.findings, decision.verdict.accepted
-        located = findings.where if findings and accepted else None
+        located = findings.located if findings and accepted else None
         left_out = tuple(islice(self.place_map.left_out.items(), self._left_out_reported, None))
         self._left_out_reported += len(left_out)
         return Recognition(
@@ -151,10 +151,10 @@ class Recogniser:
             hints=decision.hints,
             ranking=findings.ranking if findings else None,
             best=decision.best,
-            proof=findings.proof if findings else None,
+            agreement=findings.agreement if findings else None,
             evidence=findings.evidence if findings else None,
             confidence=decision.confidence,
-            followed=decision.followed,
+            track=decision.track,
             accepted=accepted,
             reason=decision.verdict.reason,
             says_nothing=query is not None and check_texture(query.descriptor, self.rule.min_quality) is not None,
@@ -198,8 +198,8 @@ class Recogniser:
         t_mono_s, accepted, footprint_m = query.frame.t_mono_s, decision.verdict.accepted, query.view.footprint_m
         if decision.best:
             self._prior.update(decision.best, accepted, t_mono_s, self._scale, footprint_m, self._layers)
-        if followed := decision.followed:
-            self._prior.update_area(followed.estimate, followed.mass, t_mono_s)
+        if track := decision.track:
+            self._prior.update_area(track.estimate, track.mass, t_mono_s)
         return decision
 
     def _search_heights(self, query: EncodedFrame, verifier: Verifier, place_filter: PlaceFilter | None) -> Decision:

@@ -35,10 +35,10 @@ class Recognition:
     hints: Hints | None = None  # that narrowed the search
     ranking: Ranking | None = None
     best: Candidate | None = None  # the first of the ranking
-    proof: Agreement | None = None  # of the landmarks
+    agreement: Agreement | None = None  # of the landmarks
     evidence: Evidence | None = None
     confidence: float | None = None  # probability, by the evidence, that the match is right (None: judged by limits)
-    followed: TrackEstimate | None = None  # the result together with the flight so far
+    track: TrackEstimate | None = None  # the result together with the flight so far
     accepted: bool = False  # `best` is taken for the place
     reason: Reason = NOT_SEARCHED  # why or why not
     says_nothing: bool = False  # too little to be recognised; a search was only made to continue a sequence
@@ -86,10 +86,10 @@ def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
         "view": event.view.fields() if event.view != UNKNOWN_VIEW else None,
         "salience": event.salience and event.salience.scores.rounded(),
         "stride": event.odometry and event.odometry.fields(),
-        "landmarks": event.proof and _landmarks(event.proof),
+        "landmarks": event.agreement and _landmarks(event.agreement),
         "confidence": event.confidence if exact else _round(event.confidence, 6),
         "evidence": evidence,
-        "followed": event.followed and _followed_fields(event.followed),
+        "followed": event.track and _followed_fields(event.track),
     }
     return {
         "query": event.frame and event.frame.name,
@@ -113,11 +113,11 @@ def _best_fields(candidate: Candidate | None) -> dict[str, Any]:
     return dict(zip(_OF_THE_BEST, (*named, *step), strict=True))
 
 
-def _landmarks(proof: Agreement) -> dict[str, Any]:
-    fields: dict[str, Any] = {"inliers": proof.inliers, "matched": proof.matched}
-    if proof.shift_share is not None:
-        fields["shift_share"] = [round(share, 4) for share in proof.shift_share]
-        fields |= {"rotation_deg": _round(proof.rotation_deg, 1), "scale": _round(proof.scale, 3)}
+def _landmarks(agreement: Agreement) -> dict[str, Any]:
+    fields: dict[str, Any] = {"inliers": agreement.inliers, "matched": agreement.matched}
+    if agreement.shift_share is not None:
+        fields["shift_share"] = [round(share, 4) for share in agreement.shift_share]
+        fields |= {"rotation_deg": _round(agreement.rotation_deg, 1), "scale": _round(agreement.scale, 3)}
     return fields
 
 

@@ -56,7 +56,7 @@ def _check_map(what: str, config: Config, board: Board) -> Finding:
     with closing(recogniser.place_map) as place_map:
         t_query_s, cost = measure_flight(recogniser)
         technique, confidence = explain_technique(recogniser, is_named=config.technique is not None), None
-        if recogniser.rule.sure:
+        if recogniser.rule.confidence_rule:
             calibration = read_calibration_for(place_map)
             confidence = calibration.described() if calibration else explain_not_calibrated(len(place_map))
     settings = config.mavlink

@@ -34,7 +34,7 @@ class Seen:
                     says_nothing=outcome == "0",
                     salience=SimpleNamespace(reason="grass" if outcome == "n" else None),
                     view=View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 50.0}) if outcome == "t" else None),
-                    followed=SimpleNamespace(lost=0.95 if outcome == "L" else 0.2),
+                    track=SimpleNamespace(lost=0.95 if outcome == "L" else 0.2),
                     frame=SimpleNamespace(t_mono_s=self.clock.now_s),
                 )
             )

@@ -168,4 +168,4 @@ def test_any_numbers_at_all_pass(ground, places):
 )
 def test_limit_motion_uses_no_time_and_no_velocity_that_cannot_be(elapsed_s, velocity, by, reach):
     motion = make_motion(elapsed_s, 30.0, velocity)
-    assert (motion.by if motion.by is None else tuple(motion.by), motion.reach) == (by, reach)
+    assert (motion.displacement if by is None else tuple(motion.displacement), motion.reach) == (by, reach)

@@ -22,12 +22,12 @@ from edgevpr.runtime.recognise.calibration import (
     read_calibration_for,
     require_usable,
 )
-from edgevpr.runtime.recognise.confidence import parse_model, prior
+from edgevpr.runtime.recognise.confidence import parse_model, read_shipped_model
 from edgevpr.runtime.recognise.evidence import MAP_FIGURES, PLACE_FIGURES
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.techniques import create
 
-SHIPPED = {kind: prior(kind) for kind in ("ahead", "ahead_proven")}
+SHIPPED = {kind: read_shipped_model(kind) for kind in ("ahead", "ahead_proven")}
 OWN = replace(SHIPPED["ahead"], made_of="this map")
 FOUND = MapCalibration(
     models={"ahead": OWN},
@@ -68,7 +68,7 @@ def flown(path):
         assert not event.failed, event.reason
         assert 0 <= event.confidence <= 1
         assert event.best.place.source_image == "1"
-        return recogniser.rule.sure.models
+        return recogniser.rule.confidence_rule.models
 
 
 def test_a_flight_decides_by_the_models_of_its_map(path, caplog):
@@ -115,7 +115,7 @@ def test_with_a_damaged_calibration_the_shipped_model_flies_and_it_is_said(path,
 
 @pytest.mark.parametrize("kind", MAP_FIGURES)
 def test_a_shipped_model_makes_a_probability_of_any_evidence(kind):
-    model = prior(kind)
+    model = read_shipped_model(kind)
     require_usable(kind, model)
     assert parse_model(json.loads(json.dumps(asdict(model)))) == model
     evidence = dict.fromkeys(MAP_FIGURES[kind] + PLACE_FIGURES[kind], 0.0)

@@ -11,7 +11,7 @@ from edgevpr.core.contract import FineMatch, Support
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.places.ranking import Ranking
 from edgevpr.runtime.recognise.calibration import require_usable
-from edgevpr.runtime.recognise.confidence import prior
+from edgevpr.runtime.recognise.confidence import read_shipped_model
 from edgevpr.runtime.recognise.evidence import (
     AHEAD,
     AHEAD_PROVEN,
@@ -49,11 +49,11 @@ def ahead(score, back=0.2, likeness=0.7, log_rank=0.0):
 
 def looked_ahead(matches, look_alikes=None):
     index = replace(INDEX, place_ids=np.arange(len(INDEX)))
-    return gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (), down=False, look_alikes=look_alikes)
+    return gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (), looks_down=False, look_alikes=look_alikes)
 
 
-def looked_down(matches, proof=None, same=()):
-    return gather_evidence(ranked(matches), INDEX, NEIGHBOUR_M, proof, same, down=True)
+def looked_down(matches, proof=None, same=(), tried=1.0):
+    return gather_evidence(replace(ranked(matches), tried=tried), INDEX, NEIGHBOUR_M, proof, same, looks_down=True)
 
 
 def test_evidence_has_the_names_that_models_ask_for():
@@ -157,8 +157,8 @@ def test_landmarks_count_where_they_are_expected_and_have_moved(proof, counts):
 def test_a_place_of_the_same_ground_is_not_elsewhere():
     matches = {5: FineMatch(0.2, coverage=0.3), 20: FineMatch(0.19, coverage=0.3), 28: FineMatch(0.05, coverage=0.3)}
     index = type(INDEX)(**(dict(INDEX.arrays) | {"place_ids": np.arange(101, 131)}), mean=INDEX.mean)
-    apart = gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (), down=True)
-    together = gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (121,), down=True)
+    apart = gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (), looks_down=True)
+    together = gather_evidence(ranked(matches), index, NEIGHBOUR_M, None, (121,), looks_down=True)
     assert (apart.lead, together.lead) == (pytest.approx(math.log(0.2 / 0.19)), pytest.approx(math.log(4)))
 
 
@@ -172,15 +172,15 @@ def test_no_share_makes_evidence_infinite(score):
 def test_where_nothing_was_compared_there_is_no_evidence():
     empty = Ranking(slots=np.array([3]), scores=np.array([0.2], np.float32), compared={})
     for down in (True, False):
-        assert gather_evidence(empty, INDEX, NEIGHBOUR_M, None, (), down=down) is None
+        assert gather_evidence(empty, INDEX, NEIGHBOUR_M, None, (), looks_down=down) is None
     assert looked_ahead({5: FineMatch(0.2)}) is None, "a technique that gives no support"
 
 
 def test_a_model_of_other_evidence_cannot_be_used():
-    model = prior(DOWN_BARE)
+    model = read_shipped_model(DOWN_BARE)
     require_usable(DOWN, model)
     with pytest.raises(ValueError, match="landmarks"):
-        require_usable(DOWN_BARE, prior(DOWN))
+        require_usable(DOWN_BARE, read_shipped_model(DOWN))
     with pytest.raises(ValueError, match="sideways"):
         require_usable("sideways", model)
     named = replace(model.of_place, names=("colour", *model.of_place.names[1:]))
@@ -190,10 +190,7 @@ def test_a_model_of_other_evidence_cannot_be_used():
 
 def test_with_a_known_heading_as_much_evidence_comes_less_often_by_chance():
     matches = {5: FineMatch(0.2, coverage=0.05, structure=1.5), 20: FineMatch(0.15, coverage=0.04)}
-    all_of_them, known = (
-        gather_evidence(replace(ranked(matches), tried=tried), INDEX, NEIGHBOUR_M, agreed(3), (), down=True).figures()
-        for tried in (1.0, 1 / 8)
-    )
-    model = prior(DOWN)
+    all_of_them, known = (looked_down(matches, agreed(3), tried=tried).figures() for tried in (1.0, 1 / 8))
+    model = read_shipped_model(DOWN)
     assert 0 < model.chance(known) == pytest.approx(model.chance(all_of_them) / 4)
     assert model.confidence(known) > model.confidence(all_of_them)

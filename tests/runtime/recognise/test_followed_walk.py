@@ -14,8 +14,8 @@ from edgevpr.core.config import load_config
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.types import Frame, Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.decide import WalkSettings
-from edgevpr.runtime.recognise.judge import accept_rule
+from edgevpr.runtime.recognise.decide import MatchSettings
+from edgevpr.runtime.recognise.judge import make_accept_rule
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.techniques import create
 
@@ -46,7 +46,7 @@ class Walk:
         self.confidence, self._t_s = 0.88, 0.0
         place_filter = PlaceFilter(place_map, max_speed_m_s=None, is_live=False) if follows else None
         rule = rule or sure_rule(lambda evidence: self.confidence, neighbour_m=30.0, min_quality=0.1)
-        settings = WalkSettings(candidates=42)
+        settings = MatchSettings(candidates=42)
         self.recogniser = walk_over(place_map, TECHNIQUE, rule, settings=settings, place_filter=place_filter)
 
     def see(self, place, confidence=None, elapsed_s=float(STRIDE), image=None):
@@ -74,10 +74,10 @@ def test_a_match_that_is_refused_alone_is_accepted_with_the_flight(flight, alone
     way = range(1, 19, STRIDE)
     alone_events, events = ([walk.see(place) for place in way] for walk in (alone, flight))
     assert not any(event.accepted for event in alone_events)
-    assert all(event.followed is None for event in alone_events)
+    assert all(event.track is None for event in alone_events)
     assert [event.accepted for event in events[:1] + events[3:]] == [False] + [True] * 3
-    assert events[0].followed.confidence == pytest.approx(0.88)
-    assert events[-1].followed.confidence > 0.9
+    assert events[0].track.confidence == pytest.approx(0.88)
+    assert events[-1].track.confidence > 0.9
     assert [event.best.place.source_image for event in events] == [f"{place}.png" for place in way]
     assert events[0].position is None
 
@@ -100,10 +100,10 @@ def test_the_flight_knows_which_of_two_places_that_look_the_same_it_is(flight, a
     assert alone.see(TWICE[1], 0.9).best.place.source_image == f"{TWICE[0]}.png"
     event = flight.see(TWICE[1], 0.9)
     assert event.best.place.source_image == f"{TWICE[1]}.png"
-    assert event.ranking.slots[0] == event.followed.slot == TWICE[1]
+    assert event.ranking.slots[0] == event.track.slot == TWICE[1]
     assert event.ranking.scores[0] == pytest.approx(event.best.match.score)
     assert sorted(event.ranking.slots.tolist()) == sorted(set(event.ranking.slots.tolist()))
-    assert event.followed.confidence > 0.5
+    assert event.track.confidence > 0.5
     if event.position:
         assert event.position.lat_deg == pytest.approx(50 + TWICE[1] * 0.0002)
 
@@ -111,7 +111,7 @@ def test_the_flight_knows_which_of_two_places_that_look_the_same_it_is(flight, a
 def test_an_aircraft_that_hovers_or_creeps_over_a_place_goes_on_recognising_it(whole_map):
     """With the models that are shipped."""
     with PlaceMap.open(whole_map) as place_map:
-        rule = accept_rule(TECHNIQUE, load_config(None).match)
+        rule = make_accept_rule(TECHNIQUE, load_config(None).match)
         hovering = Walk(place_map, rule)
         assert all(hovering.see(5, elapsed_s=1.0).accepted for _ in range(40))
         creeping = Walk(place_map, rule)
@@ -123,7 +123,7 @@ def test_pictures_that_say_nothing_or_cannot_be_used_do_not_lose_it(flight):
         flight.see(place)
     flat = np.full((120, 160), 90, np.uint8)
     event = flight.see(17, elapsed_s=1.0, image=flat)
-    assert (event.says_nothing, event.accepted, event.followed) == (True, False, None)
+    assert (event.says_nothing, event.accepted, event.track) == (True, False, None)
     assert flight.recogniser.step(Frame(image=None, name="none", t_mono_s=0.0)).failed
     assert any(flight.see(place).accepted for place in (19, 22))
 
@@ -135,4 +135,4 @@ def test_ground_that_is_not_in_the_map_is_not_accepted_for_the_flight(whole_map)
         assert [walk.see(place).accepted for place in range(1, 16, STRIDE)][-1]
         away = [walk.see(0, image=textured(900 + look)) for look in range(10)]
     assert not any(event.accepted for event in away)
-    assert all(event.followed.lost > 0.5 for event in away[5:])
+    assert all(event.track.lost > 0.5 for event in away[5:])

@@ -20,10 +20,10 @@ from edgevpr.runtime.recognise.judge import (
     AcceptRule,
     ConfidenceRule,
     Findings,
-    accept_rule,
     check_texture,
     is_at_rest,
     judge,
+    make_accept_rule,
 )
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.perspective import ShownTilt
@@ -58,30 +58,30 @@ def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted)
 
 
 @pytest.mark.parametrize(
-    ("confidence", "of_map", "lead", "is_open"),
+    ("confidence", "of_map", "lead", "is_undecided"),
     [(0.3, 0.5, 0.7, True), (NEEDED, 0.99, 0.7, False), (0.3, 0.49, 0.7, False), (0.3, 0.99, 0.0, False)],
 )
-def test_more_evidence_is_asked_for_only_where_it_can_decide(confidence, of_map, lead, is_open):
-    sure = told(lambda evidence: confidence, lambda evidence: of_map)
-    assert sure.is_open(replace(CLEAR, lead=lead)) == is_open
+def test_more_evidence_is_asked_for_only_where_it_can_decide(confidence, of_map, lead, is_undecided):
+    rule = told(lambda evidence: confidence, lambda evidence: of_map)
+    assert rule.is_undecided(replace(CLEAR, lead=lead)) == is_undecided
 
 
 def test_sureness_shows_no_more_than_the_data_support():
-    sure = ConfidenceRule(dict.fromkeys(MAP_FIGURES, Told(lambda evidence: 1.0, max_reported=0.9998)), 0.999)
-    assert (sure.confidence(CLEAR), sure.limit_confidence(CLEAR)) == (1.0, 0.9998)
-    down = accept_rule(create("cohog", {"camera": "nadir"}), load_config(None).match).sure
-    assert down.limit_confidence(replace(CLEAR, lead=30.0)) <= 1 - 1 / 10_000
+    rule = ConfidenceRule(dict.fromkeys(MAP_FIGURES, Told(lambda evidence: 1.0, max_reported=0.9998)), 0.999)
+    assert (rule.confidence(CLEAR), rule.cap_confidence(CLEAR)) == (1.0, 0.9998)
+    down = make_accept_rule(create("cohog", {"camera": "nadir"}), load_config(None).match).confidence_rule
+    assert down.cap_confidence(replace(CLEAR, lead=30.0)) <= 1 - 1 / 10_000
 
 
 def test_regions_ahead_that_prove_nothing_are_accepted_only_with_landmarks_or_by_the_flight():
     rule = sure_rule(lambda evidence: 1.0, needed=0.9999)
     hardly = replace(CLEAR, likeness=0.9, rank_gap=0.0, proof=0.0, lead=0.3)
-    assert rule.sure.confidence(hardly) == 0.9
+    assert rule.confidence_rule.confidence(hardly) == 0.9
     assert not judged(rule=rule, evidence=hardly).accepted
     assert judged(rule=rule, evidence=replace(hardly, landmarks=log_count(9))).accepted
     assert judged(rule=rule, evidence=hardly, track_confidence=0.9999).accepted
     twin = replace(hardly, landmarks=log_count(30), twin=0.1)
-    assert rule.sure.confidence(twin) == 0.5
+    assert rule.confidence_rule.confidence(twin) == 0.5
 
 
 @pytest.mark.parametrize(
@@ -105,13 +105,13 @@ def test_a_flight_that_makes_a_place_much_likelier_needs_the_precision_only(conf
 @pytest.mark.parametrize(("followed", "accepted"), [(0.99, True), (0.9899, False)])
 def test_a_flight_that_decides_is_sure_itself_however_little_is_asked(followed, accepted):
     rule = sure_rule(lambda evidence: 0.5)
-    rule = replace(rule, sure=replace(rule.sure, precision=0.5))
+    rule = replace(rule, confidence_rule=replace(rule.confidence_rule, precision=0.5))
     assert judged(rule=rule, evidence=CLEAR, track_confidence=followed).accepted is accepted
 
 
 @pytest.mark.parametrize(("lead", "code"), [(math.log(1.75), None), (math.log(1.74), ReasonCode.TURNED_AGREES)])
 def test_a_match_must_lead_over_the_picture_turned_otherwise(lead, code):
-    verdict = judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR, lead_over_turned=lead)
+    verdict = judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR, lead_over_rotated=lead)
     assert verdict.reason.code is (code or ReasonCode.ACCEPTED_BY_CONFIDENCE)
 
 
@@ -120,7 +120,7 @@ def test_a_match_must_lead_over_the_picture_turned_otherwise(lead, code):
     [
         ({"tilt": ShownTilt(math.tan(math.radians(60.1)), 0.0)}, ReasonCode.TILT_SHOWN),
         ({"tilt": ShownTilt(math.tan(math.radians(59.9)), 0.0)}, ReasonCode.ACCEPTED_BY_SCORE),
-        ({"where": DOUBTED}, ReasonCode.LOW_TEXTURE),
+        ({"located": DOUBTED}, ReasonCode.LOW_TEXTURE),
     ],
 )
 def test_a_match_is_refused_by_its_tilt_and_its_position(known, code):
@@ -154,7 +154,8 @@ def test_says_nothing_of_a_picture_of_enough_quality(quality, needed):
 
 
 def test_a_flight_may_know_better_than_the_scores_which_place_it_is():
-    rule = replace(accept_rule(create("cohog"), load_config(None, {}).match), sure=told(lambda evidence: 0.5))
+    rule = make_accept_rule(create("cohog"), load_config(None, {}).match)
+    rule = replace(rule, confidence_rule=told(lambda evidence: 0.5))
     assert judged((0.19, 0.2), rule, evidence=CLEAR, track_confidence=0.9999).accepted
     assert not judged((0.19, 0.2), rule, evidence=CLEAR).accepted
     assert not judged((0.19, 0.2), replace(rule, min_margin=0.0), evidence=CLEAR, track_confidence=0.9999).accepted
@@ -172,7 +173,7 @@ def test_a_match_that_offers_no_evidence_is_never_sure():
     assert not judged(rule=sure_rule(lambda evidence: 1.0)).accepted
 
 
-@pytest.mark.parametrize("limit", [{"min_score": 0.21}, {"min_margin": 0.11}, {"worth_a_look": 0.21}])
+@pytest.mark.parametrize("limit", [{"min_score": 0.21}, {"min_margin": 0.11}, {"min_verify_score": 0.21}])
 def test_limits_come_on_top_of_a_confidence(limit):
     assert judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR).accepted
     assert not judged(rule=sure_rule(lambda evidence: 1.0, **limit), evidence=CLEAR).accepted
@@ -180,7 +181,7 @@ def test_limits_come_on_top_of_a_confidence(limit):
 
 @pytest.mark.parametrize("score", [math.nan, 0.019])
 def test_a_score_that_says_nothing_makes_up_for_no_confidence(score):
-    assert not judged((score, 0.0), sure_rule(lambda evidence: 1.0, worth_a_look=0.02), evidence=CLEAR).accepted
+    assert not judged((score, 0.0), sure_rule(lambda evidence: 1.0, min_verify_score=0.02), evidence=CLEAR).accepted
 
 
 @pytest.mark.parametrize("kind", [DOWN, DOWN_BARE])
@@ -188,19 +189,19 @@ def test_a_score_that_says_nothing_makes_up_for_no_confidence(score):
 def test_a_place_that_is_not_ahead_of_one_elsewhere_is_never_sure(kind, precision):
     """Whatever the shipped models say."""
     config = load_config(None, {"match.accept_precision": precision}).match
-    sure = accept_rule(create("cohog", {"camera": "nadir"}), config).sure
+    rule = make_accept_rule(create("cohog", {"camera": "nadir"}), config).confidence_rule
     evidence = Evidence(agree=0.0, **dict.fromkeys(MAP_FIGURES[kind] + PLACE_FIGURES[kind], 5.0) | {"lead": 0.04})
-    assert sure.confidence(evidence) <= 0.5 < sure.threshold(evidence)
+    assert rule.confidence(evidence) <= 0.5 < rule.threshold(evidence)
 
 
 def test_a_sequence_and_a_technique_without_evidence_are_judged_by_limits():
     config = load_config(None).match
-    by_confidence, technique = accept_rule(create("cohog", {"w1": 208}), config), create("cohog")
-    assert by_confidence.sure
+    by_confidence, technique = make_accept_rule(create("cohog", {"w1": 208}), config), create("cohog")
+    assert by_confidence.confidence_rule
     assert (by_confidence.min_score, by_confidence.min_margin) == (0.0, -math.inf)
-    assert by_confidence.worth_a_look == technique.min_score / 2
-    assert accept_rule(create("cohog", {"w1": 208}), config, length=3).sure is None
-    assert accept_rule(create("hog"), config).sure is None
+    assert by_confidence.min_verify_score == technique.min_score / 2
+    assert make_accept_rule(create("cohog", {"w1": 208}), config, length=3).confidence_rule is None
+    assert make_accept_rule(create("hog"), config).confidence_rule is None
 
 
 def test_a_sequence_is_not_at_a_place_that_its_newest_query_was_not_compared_with():
@@ -252,7 +253,7 @@ def test_at_rest_is_what_neither_moved_nor_turned_nor_rose(shift_cells, rotation
 def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, inliers, rival, accepted):
     counted = {"landmarks": math.log1p(inliers), "rival": math.log1p(rival)}
     evidence = Evidence(agree=-2.0, lead=lead, coverage=-0.5, **counted)
-    verdict = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), proof=agreed(inliers), evidence=evidence)
+    verdict = judged((0.15, 0.14), sure_rule(lambda evidence: 1.0), agreement=agreed(inliers), evidence=evidence)
     assert verdict.accepted is accepted
     parameters = verdict.reason.parameters
     assert (parameters["landmarks"], parameters["rival_landmarks"]) == (inliers, rival)
@@ -275,7 +276,7 @@ def test_landmarks_must_tell_a_place_from_one_that_agrees_nearly_as_well(lead, i
     ],
 )
 def test_a_clear_vote_without_landmarks_that_agree_is_refused(score, proof, accepted):
-    assert judged((score, score - 0.1), proof=proof).accepted == accepted
+    assert judged((score, score - 0.1), agreement=proof).accepted == accepted
 
 
 PLACES = 80
@@ -327,11 +328,12 @@ def test_an_aircraft_that_leaves_the_mapped_way_is_not_followed_beyond_it(seed):
 
 def test_the_margin_of_a_mean_is_that_of_one_query_over_the_root_of_their_number():
     technique, config = create("hog"), load_config(None).match
-    assert accept_rule(technique, config, 9).min_margin == pytest.approx(technique.min_margin / math.sqrt(9))
-    assert accept_rule(technique, config).min_margin == technique.min_margin
+    assert make_accept_rule(technique, config, 9).min_margin == pytest.approx(technique.min_margin / math.sqrt(9))
+    assert make_accept_rule(technique, config).min_margin == technique.min_margin
     for length in (10, 40):
-        assert accept_rule(technique, config, length).min_margin == pytest.approx(technique.min_margin / math.sqrt(10))
+        rule = make_accept_rule(technique, config, length)
+        assert rule.min_margin == pytest.approx(technique.min_margin / math.sqrt(10))
     technique.min_margin = 1.0  # what is never to be accepted is not in a sequence either
-    assert accept_rule(technique, config, 9).min_margin == 1.0
+    assert make_accept_rule(technique, config, 9).min_margin == 1.0
     told = load_config(None, {"match.min_margin": 0.2}).match
-    assert accept_rule(technique, told, 9).min_margin == 0.2
+    assert make_accept_rule(technique, told, 9).min_margin == 0.2

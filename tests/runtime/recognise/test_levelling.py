@@ -20,7 +20,7 @@ from edgevpr.frames.mask import OverlayMask
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel, photograph
 from edgevpr.places.layers import Layers
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.decide import WalkSettings
+from edgevpr.runtime.recognise.decide import MatchSettings
 from edgevpr.runtime.recognise.hints import Prior, RecordedPrior
 from edgevpr.runtime.recognise.levelling import Levelling, centre_place, make_levelling
 from edgevpr.techniques import create
@@ -76,7 +76,7 @@ def place_map(ground, technique, tmp_path_factory):
 def walk(place_map, technique):
     def of(levelling, prior=None, mask=None):
         encoder = {"levelling": levelling, "mask": mask}
-        return walk_over(place_map, technique, settings=WalkSettings(), encoder=encoder, prior=prior)
+        return walk_over(place_map, technique, settings=MatchSettings(), encoder=encoder, prior=prior)
 
     return of
 

@@ -72,13 +72,13 @@ class Flight:
         compared = {slot: FineMatch(float(score)) for slot, score in zip(slots.tolist(), scores, strict=True)}
         counts = {"landmarks": math.log1p(80), "rival": math.log1p(rival)}
         evidence = Evidence(agree=-1.0, lead=lead, coverage=-1.0, **counts)
-        sure = told(lambda evidence: p, lambda evidence: p if of_map is None else of_map)
+        rule = told(lambda evidence: p, lambda evidence: p if of_map is None else of_map)
         where = None
         if self.has_poses:
             number = int(self.index.place_ids[best])
             where = Located(position=at(place), covariance_m2=(9.0, 1.0, 9.0), heading_deg=350.0, places=(number,))
         return self.follower.update(
-            Ranking(slots=slots, scores=scores, compared=compared), self.index, evidence, sure, where
+            Ranking(slots=slots, scores=scores, compared=compared), self.index, evidence, rule, where
         )
 
     def look(self, place, p=0.8, elapsed_s=float(STRIDE), velocity_m_s=None, moved_m=None, **more):
@@ -178,8 +178,8 @@ def test_a_place_that_says_the_same_as_the_best_one_is_no_other(posed_map):
         slots=slots, scores=np.array([0.3, 0.3], np.float32), compared={20: FineMatch(0.3), 40: FineMatch(0.3)}
     )
     follower = PlaceFilter(posed_map, max_speed_m_s=None, is_live=True)
-    sure = told(lambda evidence: 0.6, lambda evidence: 0.9)
-    followed = follower.update(ranking, IN_METRES, Evidence(agree=-1.0, lead=1.0, coverage=-1.0), sure, where)
+    rule = told(lambda evidence: 0.6, lambda evidence: 0.9)
+    followed = follower.update(ranking, IN_METRES, Evidence(agree=-1.0, lead=1.0, coverage=-1.0), rule, where)
     assert (followed.slot, followed.confidence) == (20, pytest.approx(0.6))
     assert followed.lost == pytest.approx(0.4)
 

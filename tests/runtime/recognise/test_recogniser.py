@@ -13,7 +13,7 @@ from edgevpr.core.errors import MapError, ModelError
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.recognise.decide import WalkSettings
+from edgevpr.runtime.recognise.decide import MatchSettings
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques import create
@@ -36,7 +36,7 @@ def whole_map(tmp_path_factory):
 @pytest.fixture
 def walk(whole_map, tmp_path, clock):
     """A recogniser over six places, whose meter has a clock to turn."""
-    settings = WalkSettings(candidates=42, min_accuracy_m=20.0)
+    settings = MatchSettings(candidates=42, min_accuracy_m=20.0)
     with PlaceMap.open(shutil.copy(whole_map, tmp_path)) as place_map:
         yield walk_over(place_map, create("cohog", {"w1": 208}), RULE, clock=clock, settings=settings)
 
@@ -112,7 +112,7 @@ def test_a_frame_that_could_not_be_read_is_an_event_too(walk):
 
 def test_the_accuracy_of_a_map_is_never_below_what_is_claimed_at_least(walk):
     walk.index.lat_deg[:] = np.linspace(50.0, 50.00001, PLACES)
-    settings = WalkSettings(min_accuracy_m=20.0)
+    settings = MatchSettings(min_accuracy_m=20.0)
     dense = Recogniser(walk.encoder, walk.place_map, walk.matcher, walk.meter, settings=settings)
     assert dense.accuracy_m == 20.0
     assert load_config(None).mavlink.min_accuracy_m == 5.0
@@ -129,6 +129,6 @@ def test_the_rivals_of_a_place_do_not_show_its_ground(tmp_path):
         return Frame(image=image, name=f"{east_m}", t_mono_s=0.0, position=at, heading_deg=0.0, pose=pose)
 
     with PlaceMap.open(map_of(tmp_path / "dense.gpkg", technique, map(cut, range(0, 880, 20)))) as place_map:
-        event = walk_over(place_map, technique, RULE, settings=WalkSettings(candidates=8)).step(cut(400))
+        event = walk_over(place_map, technique, RULE, settings=MatchSettings(candidates=8)).step(cut(400))
     away_m = 20.0 * abs(np.array(event.ranking.compared_slots) - event.ranking.compared_slots[0])
     assert (away_m > 140).sum() >= 3

@@ -19,7 +19,7 @@ from edgevpr.core.types import Frame, Position
 from edgevpr.frames.mask import OverlayMask
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.sequence import SequenceSearch
-from edgevpr.runtime.recognise.decide import Verifier, WalkSettings
+from edgevpr.runtime.recognise.decide import MatchSettings, Verifier
 from edgevpr.runtime.recognise.judge import AcceptRule
 from edgevpr.runtime.recognise.landmarks import detect_landmarks, pack_bytes, unpack_bytes
 from edgevpr.runtime.recognise.recognition import to_fields
@@ -69,7 +69,7 @@ def keep(path, landmarks, checksum):
 def asked(path, technique, query, rule=RULE, times=1, search=None, verify=True):
     """The event of a query; of the last, where it is asked several times."""
     with PlaceMap.open(path) as place_map:
-        settings = WalkSettings(candidates=technique.candidates, verify=verify)
+        settings = MatchSettings(candidates=technique.candidates, verify=verify)
         walk = walk_over(place_map, technique, rule, search, settings=settings)
         return [walk.step(query) for _ in range(times)][-1]
 
@@ -77,11 +77,11 @@ def asked(path, technique, query, rule=RULE, times=1, search=None, verify=True):
 def test_a_map_made_looking_down_has_landmarks_and_they_are_found_again(mapped, technique):
     event = asked(mapped, technique, frame(1, 20, -10), BY_LANDMARKS)
     assert event.accepted
-    assert event.reason.parameters["landmarks"] == event.proof.inliers
-    assert event.proof.inliers >= 10
-    assert np.array(event.proof.shift_share) * 320 == pytest.approx((20, -10), abs=1.5)
+    assert event.reason.parameters["landmarks"] == event.agreement.inliers
+    assert event.agreement.inliers >= 10
+    assert np.array(event.agreement.shift_share) * 320 == pytest.approx((20, -10), abs=1.5)
     said = to_fields(event)["landmarks"]
-    assert (said["inliers"], said["scale"]) == (event.proof.inliers, pytest.approx(1, abs=0.02))
+    assert (said["inliers"], said["scale"]) == (event.agreement.inliers, pytest.approx(1, abs=0.02))
 
 
 @pytest.fixture(scope="module")
@@ -98,9 +98,9 @@ def wide(seed, right_px=0, down_px=0):
 def proof_of(path, confidence, of_map=1.0, moved_px=(10, -16)):
     """What landmarks say of a query of the second place, whose match is so sure without them."""
     rule = sure_rule(lambda evidence: confidence)
-    rule = replace(rule, sure=told(lambda evidence: confidence, lambda evidence: of_map))
+    rule = replace(rule, confidence_rule=told(lambda evidence: confidence, lambda evidence: of_map))
     event = asked(path, create("cohog"), wide(1, *moved_px), rule)
-    assert event.proof is None, "they never speak against a match"
+    assert event.agreement is None, "they never speak against a match"
     assert event.best.place.place_id == 2
     return event.evidence.proof
 
@@ -187,7 +187,7 @@ def overlapping(tmp_path_factory, technique):
 def same_ground(path, technique, query):
     """The best place of a query, and the numbers of the places that show the same ground."""
     with PlaceMap.open(path) as place_map:
-        walk = walk_over(place_map, technique, BY_LANDMARKS, settings=WalkSettings())
+        walk = walk_over(place_map, technique, BY_LANDMARKS, settings=MatchSettings())
         event = walk.step(query)
         looked = Verifier(walk.encoder, event.picture, walk.index, place_map)
         return event, int(walk.index.place_ids[event.ranking.slots[0]]), set(looked.find_same_ground(event.ranking))
@@ -209,8 +209,8 @@ def test_a_place_without_landmarks_is_judged_as_ever(mapped, technique, blob):
     keep(mapped, blob, None if blob is None else zlib.crc32(blob))
     event = asked(mapped, technique, frame(1, 20, -10))
     assert (event.accepted, event.best, without.accepted) == (True, without.best, True)
-    assert event.proof is None or event.proof.inliers == 0
-    assert without.proof is None
+    assert event.agreement is None or event.agreement.inliers == 0
+    assert without.agreement is None
     assert "landmarks" not in to_fields(without)
 
 
@@ -236,4 +236,4 @@ def test_the_mask_holds_for_landmarks_too(whole, technique, tmp_path):
 
 
 def test_a_sequence_is_not_compared_by_landmarks(mapped, technique):
-    assert asked(mapped, technique, frame(1, 20, -10), times=3, search=SequenceSearch(2)).proof is None
+    assert asked(mapped, technique, frame(1, 20, -10), times=3, search=SequenceSearch(2)).agreement is None
