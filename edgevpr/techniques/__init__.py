@@ -77,6 +77,8 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
     for key, value in (settings or {}).items():
         if key not in defaults:
             hint = suggest(key, defaults, f"it has {', '.join(defaults)}.")
+            if key == "camera":
+                hint = "it takes images of every direction: leave out --camera."
             raise UsageError(f"{name} has no parameter `{key}`: {hint}")
         kind = type(defaults[key])
         try:
