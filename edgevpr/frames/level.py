@@ -77,7 +77,8 @@ class View:
     longest side. `aside_sd`: standard deviation of each, by the errors of a large tilt. `zoom`: factor by which the
     picture was enlarged; its longest side shows that many times less ground.
     `lean_m`: that offset on the ground (east, north), of a picture that was not warped because its lens is unknown.
-    `focal`: focal length in shares of the longest side. `reason`: why a tilted picture was not warped."""
+    `focal`: focal length in shares of the longest side. `turned_deg`: by how much the picture was turned clockwise.
+    `reason`: why a tilted picture was not warped."""
 
     up_deg: float | None = None
     footprint_m: float | None = None
@@ -86,6 +87,7 @@ class View:
     zoom: float = 1.0
     lean_m: tuple[float, float] | None = None
     focal: float | None = None
+    turned_deg: float = 0.0
     reason: Reason | None = None
 
     @property
@@ -182,6 +184,7 @@ def level_image(
         footprint_m=image_m and image_m / zoom,
         zoom=zoom,
         focal=out_px / side,
+        turned_deg=camera.top_deg or 0.0,
         aside=(0.0, 0.0) if below and camera.is_tilt_known else camera.aside(out_from_lens, zoom),
         aside_sd=camera.aside_sd(zoom),
     )

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from edgevpr.core.contract import Descriptor, Technique
+from edgevpr.core.contract import Descriptor, Perspective, Technique
 from edgevpr.core.errors import PlaceError
 from edgevpr.core.types import Candidate
 from edgevpr.frames.level import LevelledImage
@@ -47,7 +47,7 @@ from edgevpr.runtime.recognise.judge import (
 )
 from edgevpr.runtime.recognise.landmarks import PLACE_LANDMARKS, QUERY_LANDMARKS, Landmarks, unpack_bytes
 from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, add_tilt_covariance, locate, locate_at_place
-from edgevpr.runtime.recognise.perspective import ShownTilt, convert_to_tilt
+from edgevpr.runtime.recognise.perspective import CommonTilt, convert_to_tilt
 from edgevpr.runtime.recognise.place_filter import PlaceFilter, TrackEstimate
 from edgevpr.runtime.recognise.tilted import measure_again
 
@@ -187,7 +187,8 @@ class Decision:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decider:
-    """Decides on rankings of the places of a `matcher`. `accuracy_m` is that of a place's position as a fix."""
+    """Decides on rankings of the places of a `matcher`. `accuracy_m` is that of a place's position as a fix;
+    `common_tilt` is of the matches accepted so far."""
 
     place_map: PlaceMap
     technique: Technique
@@ -195,6 +196,7 @@ class Decider:
     settings: MatchSettings
     meter: QueryMeter
     accuracy_m: float
+    common_tilt: CommonTilt = field(default_factory=CommonTilt)
 
     def make_query(self, descriptor: Descriptor, expected: Expectation) -> Query:
         """Return the query of a descriptor to the places of the matcher."""
@@ -225,7 +227,10 @@ class Decider:
         if verdict.accepted and self.technique.spec.looks_down and search is None:
             heading_deg = best.place.heading_deg
             is_heading_known = hints is not None and hints.heading_deg is not None and heading_deg is not None
-            tilt = self._measure_tilt(best, query)
+            perspective = self._measure_perspective(best, query)
+            tilt = convert_to_tilt(perspective, query.view.focal)
+            if query.view.is_tilt_known and self.common_tilt.shown.is_clear:
+                tilt = max(tilt, self.common_tilt.shown, key=lambda each: each.tangent * each.is_clear)
             found = replace(
                 found,
                 # A recorded tilt is not refused for what a few regions show; a contradiction adds to the claimed error.
@@ -235,6 +240,8 @@ class Decider:
                 lead_over_rotated=None if is_heading_known else self._lead_over_rotated(best, found.evidence, query),
             )
             verdict = judge(found, index, rule, search)
+            if verdict.accepted and perspective:
+                self.common_tilt.add(perspective, query.view, best.place.place_id)
         confidence = by_confidence.cap_confidence(found.evidence) if by_confidence and found.evidence else None
         return Decision(verdict=verdict, hints=hints, best=best, findings=found, confidence=confidence, track=track)
 
@@ -291,13 +298,12 @@ class Decider:
                 compute_share(self.technique.match_rotated(query.descriptor, fine, best.match))
             )
 
-    def _measure_tilt(self, best: Candidate, query: EncodedFrame) -> ShownTilt:
-        """Return the tilt of the query against the place, as both show it."""
+    def _measure_perspective(self, best: Candidate, query: EncodedFrame) -> Perspective | None:
+        """Return the perspective of the query over the place (None: too few regions agree)."""
         with self.meter.step("compare"):
             fine, _ = self.place_map.read_fine_part(best.place.place_id)
-            if found := self.technique.measure_perspective(query.descriptor, fine, best.match):
-                found = measure_again(query.picture, self.technique, fine, found)
-            return convert_to_tilt(found, query.view.focal)
+            found = self.technique.measure_perspective(query.descriptor, fine, best.match)
+            return found and measure_again(query.picture, self.technique, fine, found)
 
     def _share_at_rest_elsewhere(self, candidate: Candidate, ranking: Ranking, encoded: EncodedFrame) -> float:
         """Return the share of a few places elsewhere that agree with the query at rest; 0 if the best one does not."""

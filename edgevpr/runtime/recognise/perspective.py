@@ -6,6 +6,8 @@ that grows with the square of its distance from the point under the camera. That
 the same for all landmarks, cannot be told from a shift: it is what a wrong attitude does to a position.
 """
 
+import cmath
+import logging
 import math
 from dataclasses import dataclass
 
@@ -16,6 +18,7 @@ from edgevpr.core.contract import Perspective
 from edgevpr.core.geodesy import fit_similarity, picture_axes
 from edgevpr.frames.level import View
 
+_log = logging.getLogger(__name__)
 _MIN_LANDMARKS = 12  # landmarks
 _POINT_SD = 2.5 / 640  # of a landmark, as a share of the longest side
 _SHEAR_SD = 0.01
@@ -28,7 +31,12 @@ _PLACE_SLOPE_SD = 0.1
 # Share by which scales differ by direction. Level views of aerial_garfield28 and aerial_caliterra have 0.07 at most,
 # those of 45 degrees 0.08 to 0.25; it is the square of the tangent of half the tilt.
 _CLEAR_STRETCH = 0.075
-_STRETCH_SD_SHARE = 0.3  # of the tilt by it: clear enough for what a match may claim, too little to refuse 30 degrees
+_TILT_SD_SHARE = 0.3  # of a tilt: clear enough for what a match may claim, too little to refuse 30 degrees
+# Of the mean of several matches: slopes of the ground, which a map of an orthophoto does not show.
+_COMMON_TILT_SD = math.tan(math.radians(2.0))
+_SCATTER_SHARE = 2 / 3  # from match to match, tilts scatter by less than their regions say (sat_marash: half)
+_COMMON_SD_SHARE = 0.15  # of a tilt: so large ones count little, which are mostly wrong
+_KEPT_SHARE = 0.98  # of a mean from match to match: a gimbal may move
 # Relief moves neighbouring landmarks alike: so many of them count as one. The place's own picture is tilted too.
 _CORRELATED_LANDMARKS = 5.0
 _PLACE_TILT_SD = math.tan(math.radians(0.5))
@@ -89,7 +97,46 @@ def convert_to_tilt(found: Perspective | None, focal: float | None) -> ShownTilt
     is_stretched = (largest - smallest) / (largest + smallest) >= _CLEAR_STRETCH
     if not is_stretched or (by_slope.is_clear and by_slope.tangent > by_stretch):
         return by_slope
-    return ShownTilt(by_stretch, _STRETCH_SD_SHARE * by_stretch)
+    return ShownTilt(by_stretch, _TILT_SD_SHARE * by_stretch)
+
+
+class CommonTilt:
+    """The tilt beyond the reported one that all images have alike, in the axes of the camera: that of a mount which
+    nobody told. It is the mean of what accepted matches show: few of them show a tilt clearly, in the image of a narrow
+    lens none, and tilts by the ground or by the images of places have another direction each time."""
+
+    def __init__(self) -> None:
+        self._weighted = 0j
+        self._weight = 0.0
+        self._place_id: int | None = None
+        self._has_warned = False
+
+    @property
+    def shown(self) -> ShownTilt:
+        """The mean so far."""
+        if not self._weight:
+            return ShownTilt(0.0, _UNKNOWN_TILT_SD)
+        sd = _SCATTER_SHARE / math.sqrt(self._weight)
+        return ShownTilt(abs(self._weighted) / self._weight, sd, _COMMON_TILT_SD)
+
+    def add(self, found: Perspective, view: View, place_id: int) -> None:
+        """Add the perspective of an accepted match; the same place again shows nothing new."""
+        if place_id == self._place_id or view.focal is None:
+            return
+        self._place_id = place_id
+        right, down = found.over_place[2, :2]
+        tilt = cmath.rect(view.focal, -math.radians(view.turned_deg)) * complex(right, down)
+        sd = math.hypot(view.focal * found.slope_sd, view.focal * _PLACE_SLOPE_SD, _COMMON_SD_SHARE * abs(tilt))
+        weight = sd**-2
+        self._weighted = _KEPT_SHARE * self._weighted + weight * tilt
+        self._weight = _KEPT_SHARE * self._weight + weight
+        if self.shown.is_clear and not self._has_warned:
+            self._has_warned = True
+            _log.warning(
+                "the camera is tilted by about %.0f degrees more than is reported: set source.mount_ahead_deg and "
+                "source.mount_right_deg (positions claim this error)",
+                self.shown.deg,
+            )
 
 
 def fit_attitude_error(asked: Array, known: Array, view: View, up_deg: float) -> AttitudeError | None:

@@ -24,6 +24,7 @@ from edgevpr.runtime.recognise.hints import RecordedPrior, to_expectation
 from edgevpr.runtime.recognise.judge import Verdict, check_texture
 from edgevpr.runtime.recognise.levelling import set_picture_heading
 from edgevpr.runtime.recognise.odometry import OdometryStep, VisualOdometry
+from edgevpr.runtime.recognise.perspective import CommonTilt
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -78,6 +79,7 @@ class Recogniser:
             self.candidates = candidates
         if mount is not None:
             self.encoder = self.encoder.replace_mount(mount)
+            self._decider = replace(self._decider, common_tilt=CommonTilt())
             self._odometry = VisualOdometry() if self._odometry else None  # no stride leads to the first frame
 
     @property

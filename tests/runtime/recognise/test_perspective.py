@@ -13,7 +13,7 @@ from edgevpr.frames.level import View
 from edgevpr.lab.simulate.camera import CameraPose
 from edgevpr.runtime.recognise.agreement import measure_agreement
 from edgevpr.runtime.recognise.landmarks import QUERY_LANDMARKS, detect_landmarks
-from edgevpr.runtime.recognise.perspective import convert_to_tilt, fit_attitude_error
+from edgevpr.runtime.recognise.perspective import CommonTilt, convert_to_tilt, fit_attitude_error
 
 FOCAL = 0.77  # shares of the longest side: 66 degrees across
 SEEN = View(aside=(0.0, 0.0), focal=FOCAL, up_deg=0.0)
@@ -123,3 +123,34 @@ def test_convert_to_tilt_of_a_narrow_lens_goes_by_the_stretch(tilt_deg, is_clear
     tilt = convert_to_tilt(Perspective(turn @ stretch, slope_sd=0.05, regions=100), focal=3.0)
     assert tilt.is_clear == is_clear
     assert tilt.deg == pytest.approx(tilt_deg if is_clear else 0.0, abs=0.1)
+
+
+def add_matches(tilt, slope_of_ground, seed=5, count=6, place_ids=None):
+    """Return the common tilt of matches whose camera leans by `tilt` in its own axes (right + down j, a tangent) over
+    ground that slopes in a fixed direction; the nose points anywhere, and each perspective is somewhat wrong."""
+    rng, common = np.random.default_rng(seed), CommonTilt()
+    for number in range(count):
+        turned_deg = float(rng.uniform(0, 360))
+        slope = (tilt * np.exp(1j * math.radians(turned_deg)) + slope_of_ground) / FOCAL
+        slope += 0.1 * complex(*rng.normal(size=2))
+        over_place = np.eye(3)
+        over_place[2, :2] = slope.real, slope.imag
+        view = replace(SEEN, turned_deg=turned_deg)
+        common.add(Perspective(over_place, slope_sd=0.15, regions=40), view, (place_ids or range(count))[number])
+    return common.shown
+
+
+def test_common_tilt_is_that_of_the_camera():
+    found = add_matches(0.3 - 0.2j, 0)
+    assert found.is_clear
+    assert found.deg == pytest.approx(math.degrees(math.atan(math.hypot(0.3, 0.2))), abs=5)
+
+
+@pytest.mark.parametrize("slope_of_ground", [0, 0.1])
+def test_common_tilt_of_a_level_camera_is_not_clear(slope_of_ground):
+    assert not any(add_matches(0, slope_of_ground, seed, 12).is_clear for seed in range(20))
+
+
+def test_common_tilt_counts_a_place_once():
+    assert add_matches(0.15, 0, place_ids=[7] * 6).sd == add_matches(0.15, 0, count=1).sd
+    assert not CommonTilt().shown.is_clear
