@@ -210,7 +210,7 @@ class FakeLink:
     def channel(self) -> Channel:
         return Channel.COMMAND
 
-    def listens(self) -> bool:
+    def is_alive(self) -> bool:
         return self.answer is not None
 
     def stats(self) -> LinkStats:
@@ -219,8 +219,8 @@ class FakeLink:
         return LinkStats(
             connected=True,
             trouble=None,
-            autopilot_heard=self.listens(),
-            autopilot_system_id=1 if self.listens() else None,
+            autopilot_heard=self.is_alive(),
+            autopilot_system_id=1 if self.is_alive() else None,
             sent=dict(sent),
             received={},
             acks=dict(self._acks),
@@ -245,7 +245,7 @@ class FakeLink:
         pass
 
     def _turn(self) -> None:
-        if not self.listens():
+        if not self.is_alive():
             self._waiting.drop_stale(self._clock())
             return
         while (sending := self._waiting.next(self._clock())) is not None:

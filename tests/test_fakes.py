@@ -98,7 +98,7 @@ def link(request):
 
     def is_ready():
         clock.now_s = time.monotonic() + ahead_s  # the link says nothing twice while its clock stands still
-        return real.listens() and real.vehicle()
+        return real.is_alive() and real.vehicle()
 
     try:
         with link_to(f"udpout:127.0.0.1:{number}", clock=clock) as real:
@@ -125,7 +125,7 @@ def test_send_fix_is_answered_or_dropped_and_link_reports_the_vehicle(link):
     assert wait_until(lambda: sending.answer) == "ACCEPTED"
     assert link.stats().fixes_sent == 1
     assert wait_until(lambda: link.stats().acks) == {"ACCEPTED": 1}
-    assert link.listens()
+    assert link.is_alive()
     vehicle = link.vehicle()
     assert (vehicle.lat_deg, vehicle.lon_deg, vehicle.alt_m) == (50.0, 8.0, 300.0)
     assert (vehicle.heading_deg, vehicle.has_gps) == (None, False)
@@ -170,7 +170,7 @@ def test_send_fix_waits_a_second_for_an_autopilot(kind):
     if kind == "real":
         link = link_to(f"udpout:127.0.0.1:{port.number}", clock=clock)
         link.start()
-    assert not link.listens()
+    assert not link.is_alive()
     assert link.vehicle() is None
     sending = link.send_fix(fix(clock))
     assert sending.sent is None

@@ -71,7 +71,7 @@ def choose_ardupilot_channel(kind: VehicleKind, parameters: Parameters) -> Chann
     `parameters` has values by name, without those that the autopilot does not have.
 
     A plane dead-reckons without GPS for as long as it flies, and accepts a fix at any time (`NavEKF3_core::setLatLng`).
-    Without GPS and optical flow a copter lands after some seconds and a rover stops, whatever single fixes say.
+    Without GPS and optical flow a copter lands after some seconds and a rover stops, even if it gets single fixes.
     """
     for number in range(len(RECEIVERS)):
         name = resolve_name(parameters, RECEIVERS[number])
@@ -96,7 +96,7 @@ def _has_other_receiver(parameters: Parameters, choice: ChannelChoice) -> bool:
 
 
 def _is_primary(parameters: Parameters, choice: ChannelChoice) -> bool:
-    """Return True if ArduPilot takes our receiver for the primary one (AP_GPS::update_primary)."""
+    """Return True if our receiver is ArduPilot's primary one (AP_GPS::update_primary)."""
     is_second = parameters.get("GPS_PRIMARY") == 1 and read_value(parameters, RECEIVERS[1], 0) != 0
     return int(is_second) == choice.receiver
 
@@ -142,7 +142,7 @@ def _check_lanes(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]
 
 
 def _check_own_receiver(*checks: Check) -> Check:
-    """Join the checks of the two receivers to one that goes by that of our own."""
+    """Join the checks of the two receivers into one, which applies that of our own receiver."""
     names = tuple(name for check in checks for name in check.names)
     return Check(names, lambda parameters, choice: checks[choice.receiver].find_changes(parameters, choice))
 
@@ -190,74 +190,74 @@ def _check_arming(parameters: Parameters, choice: ChannelChoice) -> Iterator[str
 _RULES = (
     require(_GPS_INPUT, "the index of the real receiver: 0 if GPS2_TYPE is 14, 1 if GPS1_TYPE is",
         Check(("GPS_PRIMARY", "GPS_AUTO_SWITCH", *RECEIVERS), _check_primary),
-        "With GPS_AUTO_SWITCH 0 or 4 it flies by us, the primary receiver, while GPS is good."),
+        "With GPS_AUTO_SWITCH 0 or 4 it uses our positions, of the primary receiver, while GPS is good."),
     recommend(_GPS_INPUT, "1; 4 is as good",
         Check(("GPS_AUTO_SWITCH", "GPS_PRIMARY", "GPS_BLEND_MASK", *RECEIVERS), _check_switch),
-        "With 0 our receiver is never used; with 2 a part of each position is ours while GPS is good."),
+        "With 0 our receiver is never used; with 2 each position is partly ours while GPS is good."),
     require(_GPS_INPUT, "1 or 5, where GPS_AUTO_SWITCH is 2",
         Check(("GPS_BLEND_MASK", "GPS_AUTO_SWITCH", *RECEIVERS), _check_blend),
-        "Without the bit 1, or with the bit 2, a large part of each position is ours while GPS is good."),
+        "Without bit 1, or with bit 2, a large part of each position is ours while GPS is good."),
     require(_GPS_INPUT, "0, or any value without the bit 1 (GPS); then EK3_PRIMARY may be any",
         Check(("EK3_AFFINITY", "EK3_PRIMARY", *RECEIVERS), _check_lanes),
-        "With the bit 1 a lane of the filter flies by us while GPS is good."),
-    # AP_GPS.cpp, get_lag: any delay is believed, but the filter's buffer ends (NavEKF3_core::setup_core).
+        "With bit 1 a lane of the filter uses our positions while GPS is good."),
+    # AP_GPS.cpp, get_lag: any delay is accepted, but the filter's buffer ends (NavEKF3_core::setup_core).
     require(_GPS_INPUT,
-        f"0 to {_MAX_GPS_DELAY_MS}: edgevpr reads it, and sends where it was so long ago (0: 0.2 s)",
+        f"0 to {_MAX_GPS_DELAY_MS}: edgevpr reads it, and sends the position of that time (0: 0.2 s)",
         _check_own_receiver(*(expect(0, name, allows=make_limit(_MAX_GPS_DELAY_MS)) for name in DELAYS)),
-        "The filter cannot take a position so far back, and would take it for a newer one.", "GPSn_DELAY_MS"),
-    # AP_NavEKF3_Measurements.cpp, CorrectGPSForAntennaOffset: it is taken off our position.
+        "The filter's buffer is shorter, so it would treat our position as a newer one.", "GPSn_DELAY_MS"),
+    # AP_NavEKF3_Measurements.cpp, CorrectGPSForAntennaOffset: it is subtracted from our position.
     require(_GPS_INPUT, f"within {MAX_OFFSET_M:g} m of 0 for our receiver",
         _check_own_receiver(*(expect(0, *list_axes(f"GPS{n}_POS"), allows=is_small_offset) for n in (1, 2))),
-        "We send the position of the vehicle itself, and an antenna's place would move it.", "GPSn_POS_*"),
+        "We send the position of the vehicle itself, which an antenna offset would shift.", "GPSn_POS_*"),
     require(_GPS_INPUT, "1",  # AP_AHRS_DCM.cpp and AP_AHRS.cpp, get_relative_position_D_home
         expect(1, "AHRS_GPS_USE", allows=lambda value: value in (0, 1)),
-        "With 2 the height can come from our receiver, and that is the autopilot's own height."),
+        "With 2 the height may come from our receiver, which repeats the autopilot's own height."),
     recommend(_ALL_CHANNELS, "AHRS_EKF_TYPE 3, EK3_ENABLE 1",  # AP_AHRS.cpp, handle_external_position_estimate
         join_checks(expect(1, "EK3_ENABLE"), expect(3, "AHRS_EKF_TYPE")),
-        "Only the third EKF takes our positions: use it, and reboot.", "AHRS_EKF_TYPE"),
+        "Only EKF3 accepts our positions: enable it, and reboot.", "AHRS_EKF_TYPE"),
     recommend(_CONTINUOUS, "3 in one set for GPS_INPUT; 6 in one set for ODOMETRY",
         Check(_name_sources("POSXY"), _check_source_set),
-        "No source set of the filter takes our position.", "EK3_SRCn_POSXY"),
+        "No source set of the filter uses our position.", "EK3_SRCn_POSXY"),
     require(_GPS_INPUT, "not 3",  # AP_NavEKF3_PosVelFusion.cpp, selectHeightForFusion
         _refuse_source("POSZ", _SOURCE_GPS, right=_SOURCE_BARO),
-        "The height would come from our receiver, and that is the autopilot's own height.", "EK3_SRCn_POSZ"),
+        "The height would come from our receiver, which repeats the autopilot's own height.", "EK3_SRCn_POSZ"),
     require(_GPS_INPUT, "not 8",  # EKFGSF_yaw.cpp: accelerations have to fit the receiver's velocity
         _refuse_source("YAW", _SOURCE_GSF, right=_SOURCE_COMPASS),
-        "The heading would come from our velocity, and that is computed with the autopilot's own heading.",
+        "The heading would come from our velocity, which is computed with the autopilot's own heading.",
         "EK3_SRCn_YAW"),
     recommend(_CONTINUOUS, f"above 0, up to {_MAX_GLITCH_RADIUS_M}",  # SelectVelPosFusion
         expect(25, "EK3_GLITCH_RAD", allows=lambda radius_m: 0 < radius_m <= _MAX_GLITCH_RADIUS_M),
-        "With 0 the filter refuses no position, not even a wrong one; with more it comes back to a right one late."),
+        "With 0 the filter refuses no position, not even a wrong one; with a larger value it recovers late."),
     recommend(_CONTINUOUS,
         "1, or with the bits 8 (GPS) and 262144 (vision); ARMING_SKIPCHK in newer firmware: without them",
-        Check(("ARMING_CHECK",), _check_arming), "It arms although our positions do not come, or contradict GPS."),
+        Check(("ARMING_CHECK",), _check_arming), "It arms even if our positions are missing or contradict GPS."),
     # AP_VisualOdom_MAV.cpp: VISO_VEL_M_NSE is the accuracy, whatever we send.
     require(_ODOMETRY, "not 6", _refuse_source("VELXY", _SOURCE_VISION, right=0),
         "Our velocity comes from the same matches as the position; the filter would trust it more than its gyros.",
         "EK3_SRCn_VELXY"),
     require(_ODOMETRY, "POSZ, VELZ and YAW not 6",
         join_checks(*(_refuse_source(*source) for source in _OWN_SOURCES)),
-        "Height, climb and heading in our ODOMETRY are the autopilot's own: it would measure itself.", "EK3_SRCn_*"),
+        "Height, climb and heading in our ODOMETRY are the autopilot's own: it would confirm itself.", "EK3_SRCn_*"),
     require(_ODOMETRY, "without the bit 8, where one set has GPS and one has us",
         Check(("EK3_SRC_OPTIONS", *_name_sources("POSXY")), _check_set_per_lane),
-        "Each lane of the filter has its own source set, so one flies by us while GPS is good."),
+        "Each lane of the filter has its own source set, so one uses our positions while GPS is good."),
     require(_ODOMETRY, "1", expect(1, "VISO_SCALE"),  # AP_VisualOdom_MAV, handle_pose_estimate
-        "It multiplies our distance from the origin."),
-    # AP_VisualOdom_Backend.cpp turns VISION_POSITION_DELTA only, AP_VisualOdom_IntelT265.cpp all, but is not ours.
+        "It scales our distance from the origin."),
+    # AP_VisualOdom_Backend.cpp rotates VISION_POSITION_DELTA only; AP_VisualOdom_IntelT265.cpp rotates all.
     recommend(_ODOMETRY, "0", expect(0, "VISO_ORIENT"),
-        "Our positions must not be turned; 4.7 does not turn those of ODOMETRY, but that may change."),
+        "Our positions must not be rotated; 4.7 does not rotate those of ODOMETRY, but that may change."),
     require(_ODOMETRY, f"within {MAX_OFFSET_M:g} m of 0",  # CorrectExtNavForSensorOffset
         expect(0, *list_axes("VISO_POS"), allows=is_small_offset),
-        "We send the position of the vehicle itself, and a camera's place would move it.", "VISO_POS_*"),
+        "We send the position of the vehicle itself, which a camera offset would shift.", "VISO_POS_*"),
     require(_ODOMETRY, f"10, the default; up to {MAX_DELAY_MS:g}",
         expect(10, "VISO_DELAY_MS", allows=make_limit(MAX_DELAY_MS)),  # AP_NavEKF3_Measurements.cpp, writeExtNavData
-        "We send the position of the moment, and it would be taken for an old one."),
+        "We send the current position, which would be treated as an old one."),
     require(_ODOMETRY, "0 to 100",  # AP_VisualOdom_MAV.cpp, handle_pose_estimate
         expect(0, "VISO_QUAL_MIN", allows=lambda quality: quality >= 0),
         "With -1 even a position that we call bad is used."),
     recommend(_ODOMETRY, f"up to {_MAX_VISION_SD_M}",  # handle_pose_estimate: the least deviation
         expect(0.2, "VISO_POS_M_NSE", allows=make_limit(_MAX_VISION_SD_M)),
-        "A good position counts for no more than a poor one."),
+        "With more, a good position has no more weight than a poor one."),
 )
 # fmt: on
 ARDUPILOT_TABLE = ParameterTable("ArduPilot", (*RECEIVERS, VISION), _RULES, choose_ardupilot_channel)

@@ -36,17 +36,17 @@ class RequestLink(AbstractContextManager["RequestLink"]):
     ports of autopilots do not answer without. It is a context manager, which raises LinkError when the link is lost.
 
     - `system_id`: that of the autopilot; None until its first heartbeat, if none was given.
-    - `heard`: number of messages from the autopilot, by name; `signed`: how many of them carry a signature.
+    - `received`: number of messages from the autopilot, by name; `signed`: how many of them carry a signature.
     - `says_version_1`: its last message was MAVLink 1; `round_trips_s`: seconds from each request to its answer.
     - `others`: system ids of other autopilots on the link; `reader` counts bytes that belong to no message."""
 
     def __init__(
         self, address: LinkAddress, own_id: int = 197, system_id: int | None = None, signing: Signing = NOT_SIGNING
     ) -> None:
-        """Open the link. `own_id` is our component id, `system_id` that of the autopilot (None: the first one heard).
+        """Open the link. `own_id` is our component id, `system_id` that of the autopilot (None: from a heartbeat).
         Raises LinkError."""
         self.system_id = system_id
-        self.heard: Counter[str] = Counter()
+        self.received: Counter[str] = Counter()
         self.signed = 0
         self.others: set[int] = set()
         self.says_version_1 = False
@@ -65,7 +65,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self._port.close()
         if isinstance(error, OSError):
-            raise LinkError(f"{self._address} was lost ({error.strerror or error}): look at the cable.") from error
+            raise LinkError(f"{self._address} was lost ({error.strerror or error}): check the cable.") from error
 
     def heartbeat(self, wait_s: float = HEARTBEAT_TIMEOUT_S) -> Message | None:
         """Wait for the heartbeat of an autopilot (None: none came); from then on all others are ignored."""
@@ -86,7 +86,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
                 continue
             self.round_trips_s.append(time.monotonic() - sent_s)
             if answer.get_type() != name and answer.result == mavlink.MAV_RESULT_DENIED:
-                # PX4 denies what it has not anew since it last streamed it: wait for the next of the stream.
+                # PX4 refuses a message that has not changed since it last streamed it: wait for the stream.
                 answer = self._wait_for(_STREAM_TIMEOUT_S, lambda message: message.get_type() == name)
             return answer if answer and answer.get_type() == name else None
         return None
@@ -148,15 +148,15 @@ class RequestLink(AbstractContextManager["RequestLink"]):
             return False
         if beats:
             self._port.answer_sender()
-        elif not self.heard:
+        elif not self.received:
             return False
-        self.heard[message.get_type()] += 1
+        self.received[message.get_type()] += 1
         self.signed += bool(message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
         self.says_version_1 = message.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V1
         return True
 
     def _send(self, message: Message) -> None:
-        """Send a message; what a full port does not take is lost, as on any line: every question is asked again."""
+        """Send a message; bytes that a full port does not accept are lost, so every request is repeated."""
         self.signing.stamp(self._packer)
         self._port.write(message.pack(self._packer))
         self._packer.seq = (self._packer.seq + 1) % 256
@@ -164,7 +164,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutopilotReading:
-    """All that an autopilot tells about itself; None and empty stand for what it did not answer."""
+    """All that an autopilot reports about itself; None or empty: not answered."""
 
     system_id: int
     firmware: str  # "ardupilot", "px4" or "other"
@@ -173,7 +173,7 @@ class AutopilotReading:
     version: tuple[int, int, int] | None
     version_text: str | None
     parameters: dict[str, float | int]
-    heard: tuple[str, ...]  # names of all messages received
+    received: tuple[str, ...]  # names of all messages received
     gps_fix: tuple[int | None, int | None]  # GPS_FIX_TYPE of both receivers
     filter_flags: int | None  # of EKF_STATUS_REPORT or ESTIMATOR_STATUS
     origin: tuple[float, float] | None  # of its local frame: latitude, longitude in degrees
@@ -192,15 +192,15 @@ class AutopilotReading:
 
 
 def read_autopilot(asking: RequestLink, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
-    """Read all that an autopilot tells about itself, in ten seconds; return None if no heartbeat comes. `wanted` maps a
-    firmware to the names of the parameters to be read; those that it has under another name are found too."""
+    """Read all that an autopilot reports about itself, in ten seconds; return None if no heartbeat comes. `wanted` maps
+    a firmware to the names of the parameters to read; parameters with another name in other releases are found too."""
     beat = asking.heartbeat()
     if beat is None:
         return None
     firmware = _FIRMWARES.get(beat.autopilot, "other")
     asking.listen(LISTEN_S)
-    said = asking.message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-    answers = bool(said or asking.heard["COMMAND_ACK"])
+    version_message = asking.message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+    answers = bool(version_message or asking.received["COMMAND_ACK"])
     is_px4 = firmware == "px4"
     numbers = (
         mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS if is_px4 else mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
@@ -212,22 +212,22 @@ def read_autopilot(asking: RequestLink, wanted: Mapping[str, Iterable[str]]) -> 
         mavlink.MAVLINK_MSG_ID_ATTITUDE,
     )
     names = tuple(wanted.get(firmware, ())) if answers else ()
-    # Without an answer each question would take three seconds. Of the last two it only counts that they are heard.
+    # Without an answer each request would take three seconds. Of the last two only the arrival matters.
     filter_state, first, second, origin, clock, *_ = (asking.message(each) if answers else None for each in numbers)
     parameters = asking.parameters(names, is_px4)
     others = (ALTERNATIVES.get(name) for name in names if name not in parameters)
     parameters |= asking.parameters(filter(None, others), is_px4)
-    packed = said.flight_sw_version if said else 0
+    packed = version_message.flight_sw_version if version_message else 0
     version = packed >> 24, packed >> 16 & 255, packed >> 8 & 255
     return AutopilotReading(
         system_id=beat.get_srcSystem(),
         firmware=firmware,
         vehicle=classify_vehicle(beat.type).value,
         is_armed=bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
-        version=version if said else None,
-        version_text=".".join(map(str, version)) + _RELEASES.get(packed & 255, "") if said else None,
+        version=version if version_message else None,
+        version_text=".".join(map(str, version)) + _RELEASES.get(packed & 255, "") if version_message else None,
         parameters=parameters,
-        heard=tuple(sorted(asking.heard)),
+        received=tuple(sorted(asking.received)),
         gps_fix=(first and first.fix_type, second and second.fix_type),
         filter_flags=filter_state and filter_state.flags,
         origin=(origin.latitude / 1e7, origin.longitude / 1e7) if origin else None,

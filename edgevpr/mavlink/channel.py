@@ -1,4 +1,4 @@
-"""Channels: the ways in which an autopilot can be sent a position. Which one it is follows from its parameters: see
+"""Channels: the messages by which positions are sent to an autopilot, chosen by its parameters: see
 `ardupilot_parameters` and `px4_parameters`."""
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ OLD_NAMES = {
 
 
 class Channel(Enum):
-    """A way to send an autopilot a position. COMMAND carries single fixes, which may be rare and late; the others are
+    """A message by which positions are sent. COMMAND carries single fixes, which may be rare and late; the others are
     continuous: they carry the estimate, ten times a second without a gap."""
 
     NONE = auto()  # nothing is sent: a parameter is dangerous, or not answered yet

@@ -74,7 +74,7 @@ class AutopilotClock:
         self._heartbeat_s = math.inf  # of the last heartbeat
         self._boot_ms: dict[str, int] = {}  # the last of each kind of message
         self._gap_end_s: float | None = None  # when a heartbeat came after a gap; None: it is the same boot
-        self._is_same_boot = False  # boot times have gone on since the gap
+        self._is_same_boot = False  # boot times have continued since the gap
         self._utc_ahead_s: float | None = None  # UTC less boot time
         self._utc_ahead_of_ours_s: float | None = None  # UTC less our time, where the boot time is not known
 
@@ -94,7 +94,7 @@ class AutopilotClock:
 
     def handle(self, message: Message, now_s: float) -> bool:
         """Process a message of the autopilot. Returns True if it shows that the autopilot has restarted: its boot time
-        goes back or, after a gap of heartbeats, does not go on."""
+        goes back or, after a gap of heartbeats, does not continue."""
         kind = message.get_type()
         if kind == "TIMESYNC" and message.tc1 > 0 and message.ts1 in self._requests_ns:
             if self._handle_answer(message.tc1 / 1e9, message.ts1 / 1e9, now_s):
@@ -131,8 +131,8 @@ class AutopilotClock:
         return None if self._utc_ahead_of_ours_s is None else t_mono_s + self._utc_ahead_of_ours_s
 
     def delay_s(self, boot_ms: int, now_s: float) -> float:
-        """Return how long a report of the boot time `boot_ms` was on its way, seconds; 0.0 where the boot time is not
-        known. It is no less than half the last round trip: if not the report, then what we send comes late."""
+        """Return the transport delay in seconds of a report with the boot time `boot_ms`; 0.0 if the boot time is not
+        known. It is at least half the last round trip: if the report is not late, then our messages are."""
         boot_s = self.boot_time_s(now_s)
         if boot_s is None:
             return 0.0

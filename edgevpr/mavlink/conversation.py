@@ -25,7 +25,7 @@ MAX_MESSAGES = 64
 HEARTBEAT_INTERVAL_S = 1.0
 STATE_INTERVAL_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
 HEALTH_TIMEOUT_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
-INTERIM_FIX_INTERVAL_S = 0.5  # from a single fix to the next one that no match asks for
+INTERIM_FIX_INTERVAL_S = 0.5  # between single fixes without a match
 REQUEST_INTERVAL_S = 5.0
 ORIGIN_TIMEOUT_S = 5.0  # an autopilot that has an origin sends it once a second when asked to
 
@@ -107,7 +107,7 @@ class Conversation:
         self.texts.put(severity, text, topic)
 
     def set_health(self, health: Health) -> None:
-        """Set the health to be sent in heartbeats. It holds for ten seconds; without a new call it is then CRITICAL."""
+        """Set the health to send in heartbeats. It is valid for ten seconds; without a new call it becomes CRITICAL."""
         self._health, self._health_set_s = health, self._clock()
 
     def request_position(self) -> None:
@@ -133,7 +133,7 @@ class Conversation:
             self.settings.signing.stamp(self._packer)
             try:
                 packet: bytes = message.pack(self._packer)
-            except (struct.error, OverflowError) as error:  # a value that its field cannot hold must not end the link
+            except (struct.error, OverflowError) as error:  # a value out of its field's range must not end the link
                 log.error("%s not sent: %s", message, error)
                 if sending:
                     sending.settle(False, Reason(ReasonCode.NOT_ENCODABLE, {"problem": str(error)}))
@@ -173,7 +173,7 @@ class Conversation:
     def announce_changes(self) -> None:
         """Announce what has changed with the autopilot and its answers since the last call."""
         now_s = self._clock()
-        is_alive = self.autopilot.listens(now_s)
+        is_alive = self.autopilot.is_alive(now_s)
         if is_alive and self._was_alive is False:
             self.announce(Severity.INFO, "autopilot is back", "autopilot")
         elif self._was_alive and not is_alive:
@@ -188,7 +188,7 @@ class Conversation:
     def break_off(self, lost_fixes: int) -> None:
         """Reset the state of a lost port. `lost_fixes` is the number of fixes discarded with it."""
         self.fixes.record_lost(lost_fixes)
-        self.autopilot.heartbeat_s = -math.inf  # another autopilot may be there when the port is open again
+        self.autopilot.heartbeat_s = -math.inf  # the reopened port may lead to another autopilot
         self.reader.parsers.clear()  # with incomplete messages
 
     def drop_stale(self) -> None:
@@ -207,7 +207,7 @@ class Conversation:
             is_stuck = now_s - self._health_set_s > HEALTH_TIMEOUT_S
             return messages.make_heartbeat(Health.CRITICAL if is_stuck else self._health), None
         system_id = self.autopilot.system_id
-        if system_id is not None and self.autopilot.listens(now_s):
+        if system_id is not None and self.autopilot.is_alive(now_s):
             if request := self.autopilot.clock.make_request(now_s):
                 return request, None
             self._request_reports(system_id, now_s)
@@ -230,7 +230,7 @@ class Conversation:
 
     def _next_interim_fix(self, now_s: float) -> FixTransmission | None:
         """Return a fix between two matches, if one is due and helps. ArduPilot corrects its position by it; PX4 may
-        correct its velocity too, and would confirm itself."""
+        correct its velocity, too, which would feed its own error back."""
         is_due = now_s >= self._interim_fix_due_s and self.autopilot.firmware == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
         if not is_due or not (fix := self.settings.listener.make_interim_fix(now_s)):
             return None
@@ -299,7 +299,7 @@ class Conversation:
             self.send(*messages.make_report_requests(system_id, self.autopilot.firmware, is_continuous))
 
     def _reset(self, why: ReasonCode) -> None:
-        """Start anew with an autopilot that has forgotten everything. `why` is reported for the awaited fixes."""
+        """Restart with an autopilot that has lost its state. `why` is reported for the awaited fixes."""
         self.fixes.cancel_awaited(Reason(why))
         self._has_requested_continuous = self._reported_channel = None
         self._origin_missing_since_s, self._has_set_origin = math.inf, False
@@ -315,7 +315,7 @@ class Conversation:
         self._restart_reported_s = now_s
 
     def _handle_stamp(self, message: Message, now_s: float) -> None:
-        """Announce a wrong time stamp of another program, which spoils ours too (ArduPilot)."""
+        """Announce a wrong time stamp of another program, by which ArduPilot misreads ours, too."""
         own_id = self._packer.srcSystem, self._packer.srcComponent
         sender, autopilot = (message.get_srcSystem(), message.get_srcComponent()), self.autopilot
         if sender in (own_id, (own_id[0], AUTOPILOT)) or autopilot.firmware != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:

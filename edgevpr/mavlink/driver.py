@@ -35,7 +35,7 @@ class Driver(Protocol):
         """Begin to send and receive. Raises LinkError for a fault that only the user can correct."""
 
     def wake(self) -> None:
-        """Send soon: there is something to be sent."""
+        """Wake the sender: a message is waiting."""
 
     def state(self) -> PortState:
         """Return the state of the port."""
@@ -103,7 +103,7 @@ class PortDriver:
                     self._work(self._writer, timeout_s=MAX_SLEEP_S)
             except (OSError, LinkError) as error:
                 self._handle_loss(error)
-            except Exception as error:  # a flight without a link is worse than one with a link opened anew
+            except Exception as error:  # a reopened link is better than none
                 log.exception("the link failed")
                 self._handle_loss(error)
         self._flush()
@@ -146,7 +146,7 @@ class PortDriver:
             beats = self._conversation.handle(data, self._turns.now_s(), line.port.sender)
             # An autopilot whose clock is old, which has the key, learns the time from what we send it.
             has_old_clock = OLD in self._settings.signing.verdicts
-            is_behind = has_old_clock and not self._conversation.autopilot.listens(self._turns.now_s())
+            is_behind = has_old_clock and not self._conversation.autopilot.is_alive(self._turns.now_s())
         if beats or is_behind:
             line.port.answer_sender()
 

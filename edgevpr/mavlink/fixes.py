@@ -1,4 +1,4 @@
-"""Position fixes on their way to the autopilot: those that wait to be sent, and those that wait for an answer. Used by
+"""Position fixes in transit to the autopilot: those that wait to be sent, and those that wait for an answer. Used by
 `conversation` inside turns only.
 
 A fix is never sent late, and after five unanswered ones almost none is sent. COMMAND_ACK does not say which fix it
@@ -20,7 +20,7 @@ from edgevpr.mavlink.messages import Fix, Severity
 
 MAX_QUEUED_FIXES = 8
 # The longest that a fix may wait, from `put` on and in all buffers together. types.MAX_FIX_AGE_S limits the age of its
-# frame, which the autopilot is told.
+# frame, which is sent with the fix.
 MAX_FIX_WAIT_S = 1.0
 MAX_UNANSWERED = 5  # this number of unanswered fixes in a row stops the sending, until one is answered
 RETRY_INTERVAL_S = 10.0  # while the sending is stopped, one fix is sent at this interval
@@ -82,7 +82,7 @@ class Fixes:
         self._last_answer: tuple[str, Reason] | None = None
         self._sent_s = -math.inf
         self._unanswered_row = 0  # fixes without an answer, in a row
-        self._is_stopped = False  # as the ground station was last told
+        self._is_stopped = False  # as last announced
         self._resumes_s = -math.inf
 
     def __len__(self) -> int:
@@ -134,14 +134,14 @@ class Fixes:
         return None
 
     def record_sent(self, sending: FixTransmission, now_s: float) -> None:
-        """Note that a fix was handed to the port."""
+        """Record that a fix was handed to the port."""
         sending.t_sent_s = self._sent_s = now_s
         self._unanswered_row += 1
         self._awaited.append((now_s, sending))
 
     def record_lost(self, count: int) -> None:
-        """Note that `count` fixes were thrown away with the port: they do not count as unanswered in a row, unless the
-        sending is stopped already, which only an answer ends."""
+        """Record that `count` fixes were lost with the port: they do not count as unanswered, unless sending is stopped
+        already, which only an answer ends."""
         if not self._is_stopped:
             self._unanswered_row -= count
         self.cancel_awaited(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))
@@ -153,23 +153,23 @@ class Fixes:
             self._resumes_s = now_s + ANSWER_TIMEOUT_S
         self._unanswered_row = 0
         self.time_out(now_s)
-        is_taken = result == "ACCEPTED"
+        is_accepted = result == "ACCEPTED"
         if (result, reason) != self._last_answer:
-            level = logging.INFO if is_taken else logging.WARNING
+            level = logging.INFO if is_accepted else logging.WARNING
             log.log(level, "the autopilot's answer to position fixes: %s (%s)", result, reason)
-            severity = Severity.INFO if is_taken or reason.code is ReasonCode.GPS_IN_USE else Severity.WARNING
-            text = "fixes are taken again" if is_taken else f"fixes refused: {reason.code.summary}"
-            if self._last_answer or not is_taken:
+            severity = Severity.INFO if is_accepted or reason.code is ReasonCode.GPS_IN_USE else Severity.WARNING
+            text = "fixes are accepted again" if is_accepted else f"fixes refused: {reason.code.summary}"
+            if self._last_answer or not is_accepted:
                 self._announce(severity, text, "fixes")
         self._last_answer = result, reason
-        if is_taken:
+        if is_accepted:
             self._accepted_s = now_s
         else:
             self.refusal = reason
         if not self._awaited:
             return None
         sent_s, sending = self._awaited.popleft()
-        sending.outcome = FixAnswer(result, None if is_taken else reason, now_s - sent_s)
+        sending.outcome = FixAnswer(result, None if is_accepted else reason, now_s - sent_s)
         return sending
 
     def time_out(self, now_s: float) -> None:
@@ -211,8 +211,8 @@ class Fixes:
 
 
 def compensate_lag(fix: Fix, now_s: float, lag_s: float, vehicle: Vehicle | None) -> Fix:
-    """Return a fix for an autopilot that takes what it receives at `now_s` as sent `lag_s` earlier: one that is so much
-    younger or, where it has no such age, the position of the vehicle so long ago."""
+    """Return a fix for an autopilot that treats a message received at `now_s` as sent `lag_s` earlier: a fix that is so
+    much younger or, if its age is less than that, the position of the vehicle so long ago."""
     younger_s = min(lag_s, max(0.0, now_s - fix.t_frame_s))
     fix = replace(fix, t_frame_s=fix.t_frame_s + younger_s)
     if younger_s == lag_s or vehicle is None or vehicle.velocity_m_s is None:

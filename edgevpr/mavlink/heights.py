@@ -42,11 +42,11 @@ class Altitudes(NamedTuple):
 
 class Heights:
     """Follows the height above the ground through new homes and origins. The height is 0 while the vehicle stands on
-    the ground, disarmed; if it is first heard in flight, its height above home is taken once.
+    the ground, disarmed; if its first report comes in flight, its height above home is used once.
 
     `takeoff_m`: height above the take-off point (None: no report yet). `jumped_m`: sum of jumps of the altitude since
-    take-off that neither a new home nor a new origin explains; the height leaves them out. `contradiction_m`: by how
-    much a range finder has disagreed for seconds (None: it has not)."""
+    take-off that neither a new home nor a new origin explains; the height leaves them out. `contradiction_m`: the
+    difference by which a range finder has disagreed for seconds (None: it agrees)."""
 
     def __init__(self, announce: Announce) -> None:
         self._announce = announce
@@ -58,7 +58,7 @@ class Heights:
         self._range: tuple[float, float] | None = None  # metres, time
         self._terrain: tuple[float, float] | None = None  # altitude of the ground below in metres, time
         self._takeoff_terrain_m: float | None = None  # altitude of the take-off point by the same terrain data
-        self._changing_since_s: float | None = None  # the range finder differs from what `contradiction_m` says
+        self._changing_since_s: float | None = None  # since when the range finder differs from `contradiction_m`
 
     def handle(self, message: Message, now_s: float, attitude: Attitude | None) -> None:
         """Process a TERRAIN_REPORT or a DISTANCE_SENSOR, slanted by the `attitude` (None: unknown)."""
@@ -97,7 +97,7 @@ class Heights:
 
     @property
     def doubt_m(self) -> float:
-        """By how much the height is in doubt, metres: by its jumps, and by a contradiction."""
+        """Possible error of the height, metres: by its jumps, and by a contradiction."""
         return max(abs(self.jumped_m), self.contradiction_m or 0.0)
 
     def _compute_change_m(self, last: Altitudes, altitudes: Altitudes) -> float:
@@ -155,11 +155,11 @@ class Heights:
         self._announce(Severity.WARNING, text, topic)
 
     def _handle_terrain(self, report: Message, now_s: float) -> None:
-        # A spacing of 0 says that the autopilot has no terrain data of this place.
+        # A spacing of 0 means that the autopilot has no terrain data here.
         is_known = report.spacing and math.isfinite(report.terrain_height + report.current_height)
         self._terrain = (report.terrain_height, now_s) if is_known else None
         if is_known and self._takeoff_terrain_m is None and self.takeoff_m is not None and not self._is_standing:
-            # Before version 4.7, ArduPilot's own height follows home, so it is taken only once.
+            # Before version 4.7, ArduPilot's own height follows home, so it is used only once.
             self._takeoff_terrain_m = report.terrain_height + report.current_height - self.takeoff_m
 
     def _compute_autopilot_height_m(self, now_s: float) -> float:

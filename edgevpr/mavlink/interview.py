@@ -15,12 +15,12 @@ from edgevpr.mavlink.parameters import ALTERNATIVES, Decision, ParameterTable
 from edgevpr.mavlink.px4_parameters import PX4_TABLE
 from edgevpr.mavlink.wire import Message, mavlink, read_parameter_value
 
-MAX_PARALLEL_REQUESTS = 10  # ArduPilot drops what comes on top of 20 (GCS_Param.cpp, param_requests)
+MAX_PARALLEL_REQUESTS = 10  # ArduPilot drops requests beyond 20 (GCS_Param.cpp, param_requests)
 ROUND_INTERVAL_S = 1.0
 MIN_ROUND_INTERVAL_S = 0.1  # after a round in which all was answered
 MAX_SILENT_ROUNDS = 4  # rounds without any answer, after which the pauses grow
 MAX_PAUSE_S = 30.0
-REFRESH_INTERVAL_S = 2.0  # one known parameter is asked for again, so that a change in flight is noticed
+REFRESH_INTERVAL_S = 2.0  # one known parameter is requested again, to notice a change in flight
 MIN_ROUNDS_TO_ABSENT = 4
 MAX_LOSS_PROBABILITY = 1e-4  # that all answers for one parameter were lost
 MISSING_REPORT_DELAY_S = 10.0
@@ -36,13 +36,13 @@ log = logging.getLogger(__name__)
 class Interview:
     """Asks an autopilot for its version and for the parameters of its table, and chooses the channel.
 
-    What is not answered is asked again, a second later and, while nothing at all is answered, after growing pauses.
-    Known parameters are asked for again, one every two seconds, and values that arrive unasked are taken too; after a
-    change the channel is chosen anew. Old firmware is silent about a parameter that it does not have: it is taken to be
-    absent after four rounds in which others were answered, or more on a link that loses messages.
+    Unanswered requests are repeated, a second later or, while nothing at all is answered, after growing pauses. Known
+    parameters are requested again, one every two seconds, and values that arrive unrequested are used too; after a
+    change the channel is chosen again. Old firmware does not answer for a parameter that it does not have: this counts
+    as absent after four rounds in which others were answered, or more on a link that loses messages.
 
-    `choice` is the channel. Until the first questions it is command 43003, for programs that send fixes by themselves
-    and want no reports; then `Channel.NONE` until all that it depends on is known."""
+    `choice` is the channel. Before the first requests it is command 43003, for programs that send fixes by themselves
+    and need no reports; then `Channel.NONE` until all parameters that it depends on are known."""
 
     def __init__(self, announce: Announce) -> None:
         self._announce = announce
@@ -124,7 +124,7 @@ class Interview:
             self._decide()
 
     def _record_answer(self, name: str) -> None:
-        """Note that the autopilot answered for one parameter: so it receives us, and may not have the others."""
+        """Record an answer for one parameter: the autopilot receives our requests, and may not have the others."""
         self._version_requests *= bool(self._values)
         self._silent_rounds = 0
         self._answers += name in self._waiting
@@ -134,8 +134,8 @@ class Interview:
             self._due_s = min(self._due_s, self._asked_s + interval_s)
 
     def _mark_absent(self) -> None:
-        """Take those for absent that were asked for in vain so often that a loss of all answers is next to impossible,
-        by the share of answers that arrive. Of others that may be absent too, one answer counts as lost."""
+        """Mark parameters as absent that were requested so often that a loss of all answers is next to impossible, by
+        the share of answers that arrive. For others that may be absent too, one answer counts as lost."""
         unknown = {name for name in self._unanswered.keys() - self._values.keys() if not self._is_known(name)}
         lost = sum(self._unanswered[name] for name in self._values) + len(unknown - self._absent)
         arrives = (self._answers + 1) / (self._answers + lost + 2)
@@ -181,7 +181,7 @@ class Interview:
         return [sorted(names)[self._refresh_index % len(names)]] if names else []
 
     def _decide(self) -> None:
-        """Choose the channel anew, and report it if anything about it has changed."""
+        """Choose the channel again, and report it if anything about it has changed."""
         if not self._has_begun:
             return
         table = self._table

@@ -130,33 +130,33 @@ class Link:
     def channel(self) -> Channel:
         return self.conversation.channel
 
-    def listens(self) -> bool:
-        """Return True if a fix can be sent now: the port is connected and the autopilot has been heard lately."""
+    def is_alive(self) -> bool:
+        """Return True if a fix can be sent now: the port is connected and the autopilot has sent a heartbeat lately."""
         with self.turn("listens"):
-            return self._driver.state()[0] and self.conversation.autopilot.listens(self.turns.now_s())
+            return self._driver.state()[0] and self.conversation.autopilot.is_alive(self.turns.now_s())
 
     def stats(self) -> LinkStats:
         with self.turn("stats"):
-            said, autopilot, fixes = self.conversation, self.conversation.autopilot, self.conversation.fixes
+            conversation, autopilot, fixes = self.conversation, self.conversation.autopilot, self.conversation.fixes
             connected, trouble, reopened = self._driver.state()
             return LinkStats(
                 connected=connected,
                 trouble=trouble,
-                autopilot_heard=autopilot.listens(self.turns.now_s()),
+                autopilot_heard=autopilot.is_alive(self.turns.now_s()),
                 autopilot_system_id=autopilot.system_id,
-                sent=dict(said.sent),
-                received=dict(said.reader.received),
+                sent=dict(conversation.sent),
+                received=dict(conversation.reader.received),
                 acks=dict(autopilot.acks),
                 dropped_stale_fixes=fixes.dropped,
                 withheld_fixes=fixes.withheld,
-                commands=dict(said.requests.results),
-                ignored_requests=said.requests.ignored,
+                commands=dict(conversation.requests.results),
+                ignored_requests=conversation.requests.ignored,
                 unanswered_fixes=fixes.unanswered,
                 refused_why=fixes.refusal.code.summary if fixes.refusal else None,
                 foreign_messages=autopilot.identity.foreign_messages,
-                refused_signatures=dict(said.settings.signing.refused),
-                dropped_queue_full=said.dropped_queue_full,
-                bad_bytes=said.reader.bad_bytes,
+                refused_signatures=dict(conversation.settings.signing.refused),
+                dropped_queue_full=conversation.dropped_queue_full,
+                bad_bytes=conversation.reader.bad_bytes,
                 reopened=reopened,
                 used_share=autopilot.px4.used_share,
                 answered_s=dict(autopilot.answered_s),

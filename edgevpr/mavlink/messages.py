@@ -49,8 +49,8 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A position fix: the vehicle's place at `t_frame_s`, when the frame was taken (monotonic clock), and `accuracy_m`,
-    the standard deviation of one axis. Raises ValueError for no position, accuracy or time."""
+    """A fix: the vehicle's position at `t_frame_s`, when the frame was taken (monotonic clock), and `accuracy_m`, the
+    standard deviation of one axis. Raises ValueError for an invalid position, accuracy or time."""
 
     lat_deg: float
     lon_deg: float
@@ -61,7 +61,7 @@ class Fix:
         if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # in this form NaN is refused too
             raise ValueError(f"latitude {self.lat_deg}, longitude {self.lon_deg} is no place on the Earth")
         if not 0 < self.accuracy_m < math.inf:
-            raise ValueError(f"an accuracy of {self.accuracy_m} m says nothing: it must be finite and above zero")
+            raise ValueError(f"an accuracy of {self.accuracy_m} m is invalid: it must be finite and above zero")
         if not math.isfinite(self.t_frame_s):
             raise ValueError(f"the age of a frame taken at {self.t_frame_s} s cannot be computed")
 
@@ -195,7 +195,7 @@ def make_odometry(
 
 
 def make_vision_position(state: MotionState, origin: tuple[float, float, float]) -> Message:
-    """Make an ODOMETRY (331) that says a position, north, east, down of `make_origin` (latitude, longitude in degrees,
+    """Make an ODOMETRY (331) with a position, north, east, down of `make_origin` (latitude, longitude in degrees,
     altitude in metres above sea level), and nothing else. PX4 knows our clock by our answers to its TIMESYNC."""
     variances = [math.nan] * 21  # the upper triangle of 6 x 6, row by row
     variances[0] = variances[6] = state.accuracy_m**2
@@ -215,7 +215,7 @@ def make_vision_position(state: MotionState, origin: tuple[float, float, float])
 
 
 def _complete_odometry(state: MotionState, origin: tuple[float, float, float], **fields: Any) -> Message:
-    """Make an ODOMETRY with the position of a state beside `make_origin`, and with `fields`, those of the channel."""
+    """Make an ODOMETRY with the position of a state relative to the origin, and with `fields`, those of the channel."""
     east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
     return mavlink.MAVLink_odometry_message(
         child_frame_id=mavlink.MAV_FRAME_BODY_FRD,

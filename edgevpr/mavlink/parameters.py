@@ -20,8 +20,8 @@ MAX_DELAY_MS = 50.0  # we send the position of the moment, so at 25 m/s this is 
 
 
 class Check(NamedTuple):
-    """The `names` of the parameters that `find_changes` reads. It takes all values that were read, and the channel
-    chosen for them, and returns the changes, such as "GPS_PRIMARY=0"; none if the values are right."""
+    """The `names` of the parameters that `find_changes` reads. It gets all values that were read and the
+    channel chosen for them, and returns the changes, such as "GPS_PRIMARY=0"; none if the values are right."""
 
     names: tuple[str, ...]
     find_changes: Callable[[Parameters, ChannelChoice], Iterable[str]]
@@ -29,8 +29,8 @@ class Check(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ParameterRule:
-    """A row of a table: its `label`, as a pilot looks for it, the `channels` that it matters for, the values that are
-    `right`, in words, and `why`: what happens with a wrong one, in a sentence."""
+    """A row of a table: its `label`, by which a pilot finds it, the `channels` that it matters for, the values that are
+    `right`, in words, and `why`: the effect of a wrong one, in a sentence."""
 
     label: str
     channels: tuple[Channel, ...]
@@ -55,7 +55,7 @@ class ParameterFault:
 
     @property
     def brief(self) -> str:
-        """The advice for a ground station, which shows forty letters."""
+        """The advice for a ground station, in forty characters."""
         return f"set {self.changes[0]}{' ...' if self.changes[1:] else ''}"
 
 

@@ -22,7 +22,7 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 MAX_GPS_DISAGREEMENT_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
 MAX_SPEED_M_S = 150.0  # over ground: a small aircraft is never faster, so such a report is wrong
-_MIN_HPA = 300.0  # of the air where anything flies
+_MIN_HPA = 300.0  # of the air at any height of flight
 _MAX_HPA = 1100.0
 _MILLI_G_M_S2 = 9.80665e-3
 
@@ -31,7 +31,7 @@ _TIMED_REPORTS = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU")
 _MOTION_REPORTS = (*_TIMED_REPORTS, *GPS_REPORTS)
 _ORIGIN_TIMEOUT_S = 2.0  # of the request: an autopilot that has not answered by then has no origin
 _ORIGIN_REQUEST_INTERVAL_S = 10.0
-REPLACEMENT_SILENCE_S = 30.0  # a flight controller that restarts is back within 20 s; who speaks meanwhile is not it
+REPLACEMENT_SILENCE_S = 30.0  # a restarting flight controller is back within 20 s; a sender before that is another
 
 log = logging.getLogger(__name__)
 
@@ -48,9 +48,9 @@ class Endpoint(NamedTuple):
 
 
 class Identity:
-    """Decides which sender is our autopilot, `kept`: the first one heard or, with `system_id` set, the first with that
-    system id. A sender with another system id never takes its place; one with the same at another address does so once
-    our autopilot has been silent for 30 s: then it `has_moved`. `foreign_messages` counts the messages of others."""
+    """Decides which sender is our autopilot, `kept`: the first or, with `system_id` set, the first with that system id.
+    A sender with another system id never replaces it; one with the same at another address does so once our autopilot
+    has been silent for 30 s: then it `has_moved`. `foreign_messages` counts the messages of others."""
 
     def __init__(self, system_id: int | None = None) -> None:
         self.kept: Endpoint | None = None
@@ -101,10 +101,10 @@ class Listener:
     does nothing. The link's thread calls the methods, which never block and never raise."""
 
     def handle_autopilot(self, t_s: float) -> None:
-        """Note that at `t_s` an autopilot was first heard, has restarted, or that another one has taken its place."""
+        """Process the appearance of an autopilot at `t_s`: the first, a restarted one, or another one."""
 
     def handle_channel(self, channel: Channel) -> None:
-        """Note the channel by which positions are sent, when it is first chosen and when it changes."""
+        """Process the channel by which positions are sent, when it is first chosen and when it changes."""
 
     def handle_vehicle(self, vehicle: Vehicle) -> None:
         """Process a report of the vehicle's position and velocity."""
@@ -121,13 +121,13 @@ class Listener:
         return None
 
     def make_interim_fix(self, now_s: float) -> Fix | None:
-        """Return a fix to be sent between two matches, where fixes are single; None: it would not help."""
+        """Return a fix to send between two matches, if fixes are single; None: it would not help."""
         return None
 
 
 class Autopilot:
-    """The state of the autopilot and its vehicle, from all messages received, of which `identity` decides whose they
-    are. `component_id` is our component id, `system_id` that of the autopilot (None: of the first one heard)."""
+    """The state of the autopilot and its vehicle, by the messages received; `identity` selects those of our autopilot.
+    `component_id` is our component id, `system_id` that of the autopilot (None: that of the first one)."""
 
     def __init__(self, component_id: int, system_id: int | None, listener: Listener, announce: Announce) -> None:
         self.identity = Identity(system_id)
@@ -136,20 +136,20 @@ class Autopilot:
         self.firmware: int = mavlink.MAV_AUTOPILOT_GENERIC  # MAV_AUTOPILOT; this until its heartbeat
         self._listener, self._component_id, self._announce = listener, component_id, announce
         self.heartbeat_s = -math.inf  # the time of its last heartbeat through the port now open
-        self.answer: str | None = None  # name of a MAV_RESULT, if the message heard last answers a fix
-        self.has_restarted = False  # as the message heard last shows
+        self.answer: str | None = None  # name of a MAV_RESULT, if the last message answers a fix
+        self.has_restarted = False  # as the last message shows
         self._reset()
 
     def _reset(self) -> None:
         self.interview = Interview(self._announce)
         self.is_armed: bool | None = None  # None: no heartbeat yet
         self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
-        self._origin_s = self._asked_origin_s = self._gps_s = self._flags_s = -math.inf  # when last heard, or asked
+        self._origin_s = self._asked_origin_s = self._gps_s = self._flags_s = -math.inf  # times of the last ones
         self._lacked_origin, self._flags = False, 0
         self.pressure_alt_m: float | None = None  # metres in the standard atmosphere, by its barometer
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
         self.attitudes, self.heights, self.accuracy = Attitudes(), Heights(self._announce), PositionAccuracy()
-        self.clock, self.imu_s = AutopilotClock(), -math.inf  # when its accelerometers were last heard
+        self.clock, self.imu_s = AutopilotClock(), -math.inf  # when accelerations were last received
         self.px4 = Px4Fusion()
         self.receivers, self.foreign_stamps = Receivers(), ForeignStamps()
         self.report_delay = ReportDelay(self._announce)
@@ -163,7 +163,7 @@ class Autopilot:
         """Return `t_mono_s` as a time stamp for it; None: not known yet. A PX4 converts stamps of our clock itself."""
         return t_mono_s if self.firmware == mavlink.MAV_AUTOPILOT_PX4 else self.clock.stamp_s(t_mono_s)
 
-    def listens(self, now_s: float) -> bool:
+    def is_alive(self, now_s: float) -> bool:
         """Return True if the autopilot's heartbeat came in the last five seconds, through the port now open."""
         return now_s - self.heartbeat_s <= HEARTBEAT_TIMEOUT_S
 
@@ -239,7 +239,7 @@ class Autopilot:
         if kind in _TIMED_REPORTS:
             self.report_delay.update(self.clock.delay_s(message.time_boot_ms, now_s), now_s)
         if kind in _MOTION_REPORTS and self.report_delay.is_late:
-            return  # on a link that is full, or after we were stopped: what it says is past
+            return  # an outdated report, as on a link that is full, or after our process was paused
         match kind:
             case "COMMAND_ACK" if message.command == POSITION_FIX and message.result != mavlink.MAV_RESULT_IN_PROGRESS:
                 entry = mavlink.enums["MAV_RESULT"].get(message.result)
@@ -274,7 +274,7 @@ class Autopilot:
         """Process a GLOBAL_POSITION_INT. One off the Earth, or at 0, 0, is no position: `vehicle` is then None."""
         gps, lat_deg, lon_deg = self._receiver(now_s), message.lat / 1e7, message.lon / 1e7
         is_near = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= MAX_GPS_DISAGREEMENT_M)
-        # By a continuous channel the estimate may be made of our own positions: it says nothing about the receiver.
+        # With a continuous channel the estimate may come from our own positions: it proves nothing about the receiver.
         has_gps = bool(gps) and (is_near or self.interview.choice.channel.is_continuous) and self.px4.uses_gps
         if gps and has_gps:
             self.accuracy.record_accuracy(gps.sd_m, now_s)
@@ -304,7 +304,7 @@ class Autopilot:
         self._listener.handle_vehicle(self.vehicle)
 
     def _receiver(self, now_s: float) -> Receiver | None:
-        """Return the newest report of the best GPS receiver that is not played by us; None if none has a fix."""
+        """Return the last report of the best GPS receiver except the one that we simulate; None if none has a fix."""
         choice = self.interview.choice
         own = GPS_REPORTS[choice.receiver] if choice.channel is Channel.GPS_INPUT else None
         return self.receivers.choose_best(now_s, own)

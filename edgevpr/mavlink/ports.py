@@ -1,6 +1,6 @@
-"""Ports of four kinds: UDP out, UDP in, TCP and serial. None of them blocks once it is open, and all behave alike after
-every fault: pymavlink's own connections may spin, hang or raise. A `PacketWriter` writes packets
-to an open port: no position fix leaves late from a buffer, be it ours or that of the operating system."""
+"""Ports of four kinds: UDP out, UDP in, TCP and serial. None of them blocks once it is open, and all handle every
+fault in the same way: pymavlink's own connections may spin, hang or raise. A `PacketWriter` writes packets to an open
+port: no position fix leaves late from a buffer, be it ours or that of the operating system."""
 
 import errno
 import fcntl
@@ -20,7 +20,7 @@ from edgevpr.mavlink.fixes import FixTransmission
 
 CONNECT_TIMEOUT_S = 1.0
 TCP_TIMEOUT_MS = 1000  # if the other end has not confirmed bytes by then, the connection is closed and they are lost
-TCP_BUFFER_BYTES = 8192  # doubled by the system: some 30 messages; left to itself it takes megabytes
+TCP_BUFFER_BYTES = 8192  # doubled by the system: some 30 messages; its default is megabytes
 READ_BYTES = 65_536
 LOST = Reason(ReasonCode.LINK_LOST)
 WRITE_TIMEOUT_S = 0.5  # a port that has accepted no byte for this time is reopened: waiting bytes would leave late
@@ -246,7 +246,7 @@ class PacketWriter:
         elif self._blocked_since_s is None:
             self._blocked_since_s = self._clock()
         elif self._clock() - self._blocked_since_s > WRITE_TIMEOUT_S:
-            raise ConnectionError("the port takes no more bytes")
+            raise ConnectionError("the port accepts no more bytes")
 
     def take_sent_fixes(self) -> list[FixTransmission]:
         """Return the fixes that have left since the last call, now sent. Raises ConnectionError if one is too late."""

@@ -1,10 +1,10 @@
-"""Use of GPS and of our positions by a PX4, as its filter's report (ESTIMATOR_STATUS) tells it.
+"""Whether a PX4 uses GPS and our positions, by its filter's report (ESTIMATOR_STATUS).
 
-PX4 does not reset its position to a GPS that comes back while it takes positions of ours, however far off these are
-(EKF2, `isGnssPosResetAllowed`). So they have to stop before it can use GPS again, and they stop only where PX4 shows
-that it would: it fuses the velocity of its receiver, which needs no position of ours, as soon as its checks of the
+PX4 does not reset its position to a GPS that comes back while it uses our positions, however far off these are (EKF2,
+`isGnssPosResetAllowed`). So ours have to stop before it can use GPS again, and they stop only when PX4 shows that it
+would: it fuses the velocity of its receiver, for which our positions do not matter, as soon as its checks of the
 receiver pass. Read in the sources of 1.18 (`Ekf::get_ekf_soln_status`, `getHorizontalVelocityInnovationTestRatio`), and
-held beside a real 1.17.0 and 1.18-beta1."""
+compared with a real 1.17.0 and 1.18-beta1."""
 
 import math
 
@@ -15,20 +15,19 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 _FUSES_ABSOLUTE = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
 _FUSES_ANY = mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
-_SENSOR_TIMEOUT_S = 6.0  # so long after our last message 296 the flag may still be about ours: PX4 waits for 5 s
-_VISION_TIMEOUT_S = 1.0  # of ODOMETRY, whose flag is another one, it only has to notice the end
-_MIN_UNUSED_S = 2.0  # of a receiver with a fix: one that has just lost it, or got it, is judged by its reports
+_SENSOR_TIMEOUT_S = 6.0  # so long after our last message 296 its flag may still mean ours: PX4 waits for 5 s
+_VISION_TIMEOUT_S = 1.0  # ODOMETRY has a flag of its own, so only its end must be noticed
+_MIN_UNUSED_S = 2.0  # of a receiver with a fix, which may have got or lost it a moment ago
 _SENDING_TIMEOUT_S = 1.0
 # A receiver that has come back has to be steady for so long before it is left to PX4: less would follow a flapping one.
 _MIN_STEADY_S = 1.5
-_FIRST_PAUSE_S = 30.0  # from a try that PX4 did not take to the next; twice as long each time
+_FIRST_PAUSE_S = 30.0  # after an attempt that PX4 did not use; twice as long each time
 _MAX_PAUSE_S = 240.0
 
 
 class Px4Fusion:
-    """Keeps whether PX4 `uses_gps` while a receiver has a fix: with EKF2_GPS_CTRL=0, or when it rejects GPS, it does
-    not. Of its reports while our positions are sent, `used` and `unused` count those that say that they are fused, or
-    not."""
+    """Infers whether PX4 `uses_gps` while a receiver has a fix: with EKF2_GPS_CTRL=0, or when it rejects GPS, it does
+    not. `used` and `unused` count its reports while our positions are sent, by whether it fuses them."""
 
     def __init__(self) -> None:
         self.uses_gps = True
@@ -41,14 +40,14 @@ class Px4Fusion:
 
     @property
     def used_share(self) -> float | None:
-        """Share of the reports that say that our positions are used; None without one."""
+        """Share of the reports by which our positions are used; None without a report."""
         count = self.used + self.unused
         return self.used / count if count else None
 
     def make_state_message(
         self, state: MotionState | None, is_vision: bool, origin: tuple[float, float, float] | None, now_s: float
     ) -> Message | None:
-        """Make the message that tells PX4 a state (None: unknown), by message 296 or, if it `is_vision`, by ODOMETRY,
+        """Make the message that sends PX4 a state (None: unknown), by message 296 or, if it `is_vision`, by ODOMETRY,
         which needs the `make_origin` of its local frame: latitude, longitude in degrees, altitude in metres."""
         if state is None or (is_vision and origin is None):
             return None
@@ -59,9 +58,9 @@ class Px4Fusion:
             else messages.make_position_sensor(state)
         )
 
-    def handle(self, report: Message, now_s: float, receiver: Receiver | None, is_believed: bool = True) -> None:
+    def handle(self, report: Message, now_s: float, receiver: Receiver | None, is_trusted: bool = True) -> None:
         """Process an ESTIMATOR_STATUS. `receiver` is the best GPS receiver that has a fix (None: none has), which
-        `is_believed` unless matches prove it wrong."""
+        `is_trusted` unless matches prove it wrong."""
         is_fusing = bool(report.flags & _FUSES_ABSOLUTE)
         self._reports_fusion |= is_fusing
         silent_s = now_s - self._sent_s
@@ -85,9 +84,9 @@ class Px4Fusion:
             self._infer_gps_use(is_fusing, now_s)
         elif not self.uses_gps or silent_s < _SENDING_TIMEOUT_S:
             is_due = now_s >= self._next_try_s and receiver.steady_for_s >= _MIN_STEADY_S
-            self._unused_since_s, self.uses_gps = None, takes_velocity and is_due and is_believed
+            self._unused_since_s, self.uses_gps = None, takes_velocity and is_due and is_trusted
         elif not takes_velocity:
-            self._infer_gps_use(False, now_s)  # it does not take what we have stopped for
+            self._infer_gps_use(False, now_s)  # it does not use the GPS that we have stopped for
 
     def _infer_gps_use(self, is_fusing: bool, now_s: float) -> None:
         """Infer whether PX4 uses GPS while it uses none of our positions: whether it fuses a position."""

@@ -28,9 +28,9 @@ _ODOMETRY = (Channel.VISION,)
 
 _GPS_POSITION_BIT = 1  # bit of EKF2_GPS_CTRL
 _HEIGHT_FROM_VISION = 3  # value of EKF2_HGT_REF
-_MAX_SD_M = 10  # the least error that the filter takes a position to have
+_MAX_SD_M = 10  # the least error that the filter assumes of a position
 _MAX_GATE_SD = 10
-_DELAY_CONSEQUENCE = "We send the position of the moment, and it would be taken for an old one."
+_DELAY_CONSEQUENCE = "We send the current position, which would be treated as an old one."
 
 
 def choose_px4_channel(_kind: VehicleKind, parameters: Parameters) -> ChannelChoice:
@@ -51,37 +51,37 @@ def choose_px4_channel(_kind: VehicleKind, parameters: Parameters) -> ChannelCho
 _RULES = (
     recommend(_ALL_CHANNELS, "7, the default: with the bit 1",  # gps_control.cpp, controlGnssPosFusion
         expect(7, "EKF2_GPS_CTRL", allows=lambda value: has_bit(value, _GPS_POSITION_BIT)),
-        "GPS is not used for the position: it flies by us alone. That is for an aircraft without GPS only."),
+        "GPS is not used for the position, only ours: this is for an aircraft without GPS."),
     require(_ALL_CHANNELS, "0", expect(0, "EKF2_GPS_MODE"),  # gps_control.cpp, isGnssPosResetAllowed
-        "GPS that comes back far from our position is refused for as long as airspeed or optical flow is used."),
+        "GPS that comes back far from our position is refused as long as airspeed or optical flow is used."),
     recommend(_CONTINUOUS, "0 or 1", expect(1, "EKF2_HGT_REF", allows=lambda value: value != _HEIGHT_FROM_VISION),
         "We send no height: with 3 (vision) it never gets ready to arm."),  # flown
     recommend(_ALL_CHANNELS, "1", expect(1, "SYS_HAS_GPS"),
-        "With 0 it arms without GPS, so that the start may be unknown. That is for an aircraft without GPS only."),
+        "With 0 it arms without GPS, so the start may be unknown: this is for an aircraft without GPS."),
     # aux_global_position.cpp: a slot whose number is 0 at the start does not exist.
     recommend(_MESSAGE_296, f"{SENSOR_ID}", expect(SENSOR_ID, "EKF2_AGP0_ID"),
-        "It is the number that our positions carry; with another they are not used."),
+        "Our positions carry this number; with another they are not used."),
     require(_MESSAGE_296, f"1, the default; up to {_MAX_SD_M}",  # flown
         expect(1, "EKF2_AGP0_NOISE", allows=make_limit(_MAX_SD_M)),
-        "It hardly follows us, and takes positions that are far off: with 50 it was 20 m off, and all seemed well."),
+        "It hardly follows our positions, and accepts ones that are far off: with 50 it was 20 m off, unnoticed."),
     require(_MESSAGE_296, f"3, the default; up to {_MAX_GATE_SD}",
         expect(3, "EKF2_AGP0_GATE", allows=make_limit(_MAX_GATE_SD)),  # fuseHorizontalPosition
         "The filter refuses no position, not even a wrong one."),
     recommend(_MESSAGE_296, "0", expect(0, "EKF2_AGP0_MODE"),  # aux_global_position_control.cpp, isResetAllowed
-        "With airspeed or optical flow it never comes back to us, once it has left the gate."),
+        "With airspeed or optical flow it never returns to our positions after it has left the gate."),
     require(_MESSAGE_296, f"0; up to {MAX_DELAY_MS:g}",  # aux_global_position_control.cpp, bufferData
         expect(0, "EKF2_AGP0_DELAY", allows=make_limit(MAX_DELAY_MS)), _DELAY_CONSEQUENCE),
     require(_ODOMETRY, "0", expect(0, "EKF2_EV_NOISE_MD"),  # params_external_vision.yaml
-        "With 1 each position is taken to be good to EKF2_EVP_NOISE (0.1 m), whatever we send."),
+        "With 1 each position is assumed to be accurate to EKF2_EVP_NOISE (0.1 m), whatever we claim."),
     require(_ODOMETRY, f"0.1, the default; up to {_MAX_SD_M}",  # flown
         expect(0.1, "EKF2_EVP_NOISE", allows=make_limit(_MAX_SD_M)),
-        "It hardly follows us, and takes positions that are far off: with 20 it was 35 m off, and landed."),
+        "It hardly follows our positions, and accepts ones that are far off: with 20 it was 35 m off, and landed."),
     require(_ODOMETRY, f"5, the default; up to {_MAX_GATE_SD}",
         expect(5, "EKF2_EVP_GATE", allows=make_limit(_MAX_GATE_SD)),  # ev_pos_control.cpp, controlEvPosFusion
         "The filter refuses no position, not even a wrong one."),
     require(_ODOMETRY, f"within {MAX_OFFSET_M:g} m of 0",  # ev_pos_control.cpp, pos_offset_body
         expect(0, *list_axes("EKF2_EV_POS"), allows=is_small_offset),
-        "We send the position of the vehicle itself, and a camera's place would move it.", "EKF2_EV_POS_*"),
+        "We send the position of the vehicle itself, which a camera offset would shift.", "EKF2_EV_POS_*"),
     require(_ODOMETRY, f"0; up to {MAX_DELAY_MS:g}",
         expect(0, "EKF2_EV_DELAY", allows=make_limit(MAX_DELAY_MS)), _DELAY_CONSEQUENCE),
 )

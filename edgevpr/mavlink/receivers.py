@@ -1,7 +1,7 @@
 """The GPS receivers of an autopilot, by their own messages: GPS_RAW_INT and GPS2_RAW.
 
-Nothing that edgevpr sends can be in them, but for the one receiver that it plays itself (GPS_INPUT), which is left out.
-The autopilot's estimate is another matter: it may be made of our own positions.
+Our own positions cannot be in them, except in those of the receiver that edgevpr simulates (GPS_INPUT), which is left
+out. The autopilot's estimate, in contrast, may be derived from our positions.
 """
 
 import math
@@ -14,14 +14,14 @@ from edgevpr.mavlink.wire import Message, mavlink
 GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
 GPS_TIMEOUT_S = 2.5  # reports come at least once a second, and one may be lost
 DEFAULT_GPS_SD_M = 5.0  # of a receiver that does not report its accuracy
-MAX_PLAUSIBLE_SD_M = 15.0  # one that is worse is no reason to do without our own positions
-# From the moment that a receiver measures to the arrival of its report: next to nothing in PX4's simulator, 0.1 s and
+MAX_PLAUSIBLE_SD_M = 15.0  # a receiver with a larger one does not replace our positions
+# From the measurement of a receiver to the arrival of its report: next to nothing in PX4's simulator, 0.1 s and
 # up to 0.2 s until the next report in ArduPilot's.
 RECEIVER_LAG_S = 0.1
 _ACCURACY_UNKNOWN = (0, 2**32 - 1)  # of h_acc: not sent, and not known
 _SPEED_UNKNOWN = 2**16 - 1
-_MAX_STEP_M = 8.0  # from one report to the next, beside what its own velocity explains: more is a jump
-_MAX_GAP_S = 1.5  # a receiver that was silent for longer has to be steady anew
+_MAX_STEP_M = 8.0  # from one report to the next, beyond the motion by its own velocity: more is a jump
+_MAX_GAP_S = 1.5  # a receiver that was silent for longer is no longer steady
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Receivers:
 
     def choose_best(self, now_s: float, own: str | None = None) -> Receiver | None:
         """Return the newest report of the most accurate receiver that had a fix in the last 2.5 s; None if there is
-        none. `own` is the name of the report of the receiver that edgevpr plays."""
+        none. `own` is the name of the report of the receiver that edgevpr simulates."""
         real = (tracked for name, tracked in self._tracked.items() if name != own)
         recent = [tracked for tracked in real if now_s - tracked.report.t_s <= GPS_TIMEOUT_S]
         if not recent:

@@ -212,5 +212,5 @@ def _read_stamp(path: Path) -> int:
     except OSError as error:
         raise ConfigError(f"{path}: the time of signed messages cannot be read ({error.strerror}).") from error
     if not (text.isascii() and text.isdigit() and int(text) <= _MAX_STAMP):
-        raise ConfigError(f"{path} holds no time of signed messages: set the clock, and delete the file.")
+        raise ConfigError(f"{path} contains no time of signed messages: set the clock, and delete the file.")
     return int(text)

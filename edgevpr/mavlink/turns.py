@@ -6,7 +6,7 @@ from threading import RLock
 
 
 class Turns:
-    """Gives turns to one thread at a time. A conversation depends only on their times and on its input."""
+    """Gives turns to one thread at a time. A conversation depends only on the times of its turns and on its input."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -20,7 +20,7 @@ class Turns:
 
     @contextmanager
     def take_turn(self, what: str) -> Iterator[None]:
-        """Context manager: take a turn in the flight's thread, or go on with its own. `what` names it."""
+        """Context manager: take a turn in the flight's thread, or continue the one it has. `what` names it."""
         with self._lock:
             if self._t_s is not None:
                 yield

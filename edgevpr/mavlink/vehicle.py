@@ -24,7 +24,7 @@ _HAS_POSITION = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_POS_HORIZ_REL
 
 class Attitude(NamedTuple):
     """Roll (right wing down is positive), pitch (nose up) and yaw (clockwise from north) in degrees at time `t_s`, and
-    how fast roll and pitch change together (`tilt_rate_deg_s`)."""
+    the rate of roll and pitch together (`tilt_rate_deg_s`)."""
 
     t_s: float
     roll_deg: float
@@ -40,7 +40,7 @@ class Attitudes:
         self._kept: tuple[Attitude, ...] = ()
 
     def rate_hz(self, now_s: float) -> float:
-        """Return how many attitudes a second have come in the last three seconds."""
+        """Return the rate at which attitudes have come in the last three seconds."""
         return sum(now_s - attitude.t_s <= _HISTORY_S for attitude in self._kept) / _HISTORY_S
 
     def handle(self, message: Message, now_s: float) -> None:
@@ -80,7 +80,7 @@ class PositionAccuracy:
         # PX4 calls it constant too while it stands still with GPS.
         is_constant = message.flags & mavlink.EKF_CONST_POS_MODE and not is_px4
         if is_constant or not message.flags & _HAS_POSITION:
-            self._last_known = self._reported = None  # the position is still reported, but is an old one
+            self._last_known = self._reported = None  # the position is still reported, but outdated
         elif is_px4:
             # PX4 reports that of both axes together, larger than that of one: a cautious value. 0: it has none.
             sd_m = message.pos_horiz_accuracy
@@ -91,7 +91,7 @@ class PositionAccuracy:
         return self._ratio[0] if self._ratio and now_s - self._ratio[1] <= MAX_FILTER_REPORT_AGE_S else None
 
     def record_accuracy(self, sd_m: float, now_s: float) -> None:
-        """Note that at `now_s` the position is known this well, by GPS or by an accepted fix of ours."""
+        """Record the accuracy of the position at `now_s`, by GPS or by an accepted fix of ours."""
         self._last_known = sd_m, now_s
 
     def now(self, now_s: float) -> float | None:

@@ -44,7 +44,7 @@ class PacketReader:
                 self.bad_bytes += len(message.data)
                 continue
             if isinstance(message, mavlink.MAVLink_unknown):
-                self.received["UNKNOWN"] += 1  # one name for all: there are 16 million message numbers
+                self.received["UNKNOWN"] += 1  # one name for all, as there are 16 million message numbers
             elif self._admits(message):
                 self.received[message.get_type()] += 1
                 yield message

@@ -42,7 +42,7 @@ def test_all_that_an_autopilot_says_is_read(address):
     assert abs(said.clock_ahead_s) < 60
     assert said.round_trip_s > 0
     assert (said.answers, said.signs, said.says_version_1, said.other_systems) == (True, False, False, ())
-    assert {"GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT"} <= set(said.heard)
+    assert {"GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT"} <= set(said.received)
     assert peer.names() == READ_ONLY, "nothing is ever set"
     assert {message.command for message in peer.heard if message.get_type() == "COMMAND_LONG"} == {512}
     assert {message.get_srcComponent() for message in peer.heard} == {197}
@@ -93,7 +93,7 @@ def test_a_second_autopilot_is_named_and_not_listened_to(address):
             assert asking.heartbeat(60).get_srcSystem() == 4
             asking.listen(0.3)
         assert asking.others == {3}
-        assert asking.heard.keys() == {"HEARTBEAT"}
+        assert asking.received.keys() == {"HEARTBEAT"}
     assert {message.get_srcSystem() for message in other.heard} <= {4}
 
 

@@ -173,7 +173,7 @@ def test_the_ground_station_hears_each_reason_once_and_that_fixes_are_taken_agai
     assert texts == [
         (6, "edgevpr: fixes refused: GPS in use"),
         (4, "edgevpr: fixes refused: wrong format"),
-        (6, "edgevpr: fixes are taken again"),
+        (6, "edgevpr: fixes are accepted again"),
     ]
     assert caplog.text.count("the autopilot's answer") == 4
 

@@ -149,7 +149,7 @@ def test_a_device_that_another_program_probes_when_it_appears_is_opened_later(tm
             wait_until(lambda: "in use by another program" in link.stats().trouble, "finding it in use")
         wait_until(lambda: link.stats().connected, "opening it")
         os.write(master, BEAT.pack(mavlink.MAVLink(None, 7, 1)))
-        wait_until(link.listens, "hearing the autopilot")
+        wait_until(link.is_alive, "hearing the autopilot")
         assert link.stats().trouble is None
     os.close(master)
     os.close(slave)

@@ -117,7 +117,7 @@ class AutopilotOutput:
                 fix, sending = self._send_match(event)
             else:
                 self._navigator.handle_frame(event)
-            is_heard = self._link.listens()
+            is_heard = self._link.is_alive()
         if sending and is_heard:
             sending.wait(_MAX_SEND_WAIT_S)
         with self._link.turn("use of its fix"):

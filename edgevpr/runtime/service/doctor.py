@@ -130,7 +130,7 @@ def _check_signing(reading: AutopilotReading) -> Finding:
 
 def _check_state(reading: AutopilotReading) -> Iterator[Finding]:
     """Check what the autopilot sends and knows at this moment."""
-    if missing := [name for name in _NEEDED_MESSAGES if name not in reading.heard]:
+    if missing := [name for name in _NEEDED_MESSAGES if name not in reading.received]:
         yield report_fault("streams", FindingCode.STREAMS_MISSING, missing=" and no ".join(missing))
     else:
         yield report_ok("streams", FindingCode.STREAMS_RECEIVED)

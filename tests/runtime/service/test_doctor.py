@@ -33,7 +33,7 @@ COPTER = AutopilotReading(
     version=(4, 6, 2),
     version_text="4.6.2",
     parameters=PLAIN | {"GPS2_TYPE": 14},
-    heard=("ATTITUDE", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
+    received=("ATTITUDE", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
     gps_fix=(3, None),
     filter_flags=READY,
     origin=(50.0, 14.0),
@@ -67,7 +67,7 @@ def wrong(reading: AutopilotReading, link=UDP, plan=FIXES) -> dict:
 BARE = replace(COPTER, parameters=PLAIN)
 VISUAL = replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1})
 HOVERING = replace(COPTER, vehicle="plane", parameters=PLAIN | {"Q_ENABLE": 1})
-MUTE = replace(COPTER, answers=False, version=None, parameters={}, heard=(), filter_flags=None, origin=None)
+MUTE = replace(COPTER, answers=False, version=None, parameters={}, received=(), filter_flags=None, origin=None)
 SIGNED = replace(MUTE, signs=True, is_signed_to=True)
 
 
@@ -145,7 +145,7 @@ def test_check_autopilot_wants_a_source_set_and_an_origin_for_odometry():
         ({"origin": None}, "origin", ()),
         ({"clock_ahead_s": 86_400.0}, "clock", ("timedatectl set-ntp true",)),
         ({"clock_ahead_s": -86_400.0}, "clock", ("timedatectl set-ntp true",)),
-        ({"heard": ("ATTITUDE",)}, "streams", ()),
+        ({"received": ("ATTITUDE",)}, "streams", ()),
     ],
 )
 def test_check_autopilot_finds_each_fault_alone(change, what, changes):
