@@ -149,7 +149,7 @@ def test_a_peer_that_does_not_read_never_blocks_the_sender(clock):
             return link.stats().trouble is not None
 
         wait_until(stuck, "filling the line")
-        assert link.stats().trouble in ("the port takes no more bytes", "Connection timed out")
+        assert link.stats().trouble in ("the port accepts no more bytes", "Connection timed out")
         peer = Peer(server.accept())
         peer.expect("STATUSTEXT")
         assert peer.receiver.bad_bytes == 0  # the rest of a message cut in two went with the old connection
