@@ -69,12 +69,6 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
             2,
             "give nadir",
         ),
-        (["--orthophoto", "GROUND", "--footprint-m", "8000", "--spacing-m", "20"], 2, "--footprint-m is 8000"),
-        (
-            ["--orthophoto", "GROUND", "--footprint-m", "80", "--spacing-m", "20", "--area", "-35.36,149.16,500"],
-            2,
-            "The area does not touch",
-        ),
         (["--orthophoto", "nothing.tif", "--footprint-m", "80", "--spacing-m", "20"], 1, "no orthophoto nothing.tif"),
     ],
 )

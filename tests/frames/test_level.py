@@ -77,15 +77,6 @@ def test_levelled_gives_one_taken_from_straight_above(ground, pose, shown, below
     assert not below or is_steep or found.view.aside == (0.0, 0.0)
 
 
-def test_levelled_knows_the_point_under_the_camera(ground):
-    """With the nose up and to the east, the camera looks ahead: it hangs west of what it sees."""
-    view = level_image(taken(ground, heading_deg=90, pitch_deg=30), None, LENS, FOOTPRINT_M).view
-    away = HEIGHT_M * math.tan(math.radians(30)) / FOOTPRINT_M
-    assert view.aside == pytest.approx((-away, 0.0), abs=1e-9)
-    view = level_image(taken(ground, heading_deg=0, roll_deg=20), None, LENS, FOOTPRINT_M).view  # it looks to the left
-    assert view.aside == pytest.approx((HEIGHT_M * math.tan(math.radians(20)) / FOOTPRINT_M, 0.0), abs=1e-9)
-
-
 @pytest.mark.parametrize("up_deg", [90.0, 180.0, 270.0])
 def test_levelled_with_a_camera_that_is_mounted_turned(ground, up_deg):
     """A quarter turn of the camera to the right turns its picture by one to the left."""

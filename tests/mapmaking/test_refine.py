@@ -18,6 +18,7 @@ from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.text import iterate_silently
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.images import read_image
+from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.lab.simulate.camera import Camera, light_scene, photograph
 from edgevpr.lab.simulate.generated import plan_mapping_flight, to_position
 from edgevpr.lab.simulate.landscape import make_scene
@@ -51,15 +52,14 @@ def flown(tmp_path_factory):
     (folder / "images").mkdir()
     shot_of, rng = photographer(7)
     poses = plan_mapping_flight(7).poses[: 14 * LEGS]
-    with open(folder / "positions.csv", "w", newline="") as handle:
-        table = csv.writer(handle)
-        table.writerow(("file", "lat", "lon"))
-        for number, pose in enumerate(poses):
-            cv2.imwrite(str(folder / "images" / f"{number:03d}.jpg"), shot_of(pose))
-            true, (east_m, north_m) = to_position(pose), rng.normal(0, NOISE_M, 2)
-            east_m += GLITCH_M if number == 9 else 0.0
-            lat_deg, lon_deg = offset_position(true.lat_deg, true.lon_deg, east_m, north_m)
-            table.writerow((f"{number:03d}.jpg", f"{lat_deg:.8f}", f"{lon_deg:.8f}"))
+    tags = {}
+    for number, pose in enumerate(poses):
+        cv2.imwrite(str(folder / "images" / f"{number:03d}.jpg"), shot_of(pose))
+        true, (east_m, north_m) = to_position(pose), rng.normal(0, NOISE_M, 2)
+        east_m += GLITCH_M if number == 9 else 0.0
+        at = Position(*offset_position(true.lat_deg, true.lon_deg, east_m, north_m))
+        tags[f"{number:03d}.jpg"] = GeoTag(position=at)
+    write_positions(folder / "positions.csv", tags)
     return folder, poses
 
 

@@ -1,6 +1,5 @@
 """A map of pictures cut from one large picture of the ground, and a flight over it, for the tests of pages."""
 
-import csv
 from pathlib import Path
 
 import cv2
@@ -75,13 +74,3 @@ def flown_over(places: list[Place], count: int) -> list[tuple[str, dict]]:
         if refused:
             lines[-1][1]["fix"] = None
     return lines
-
-
-def write_positions(path: Path, places: list[Place]) -> None:
-    """Write the table of the positions of the places' pictures, and of the headings of their tops."""
-    with open(path, "w", newline="") as handle:
-        table = csv.writer(handle)
-        table.writerow(("file", "lat", "lon", "yaw_deg"))
-        for each in places:
-            up_deg = each.pose.up_deg if each.pose else ""
-            table.writerow((each.source_image, each.position.lat_deg, each.position.lon_deg, up_deg))

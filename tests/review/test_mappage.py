@@ -8,10 +8,11 @@ from shutil import copyfile
 import pytest
 from browser import opened
 from commands import refused
-from ground import STEP_M, places_in, position, write_positions
+from ground import STEP_M, places_in, position
 
 from edgevpr.cli.main import main
 from edgevpr.core.types import Position
+from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.review.mappage import find_gaps, find_inconsistent_tags
 
@@ -26,7 +27,11 @@ def mapped(tmp_path_factory):
     places = places_in(folder / "ref")
     copyfile(folder / "ref" / places[5].source_image, folder / "ref" / TWIN)
     far = replace(places[5], source_image=TWIN, position=Position(*position(300.0, 0.0)), pose=None)
-    write_positions(folder / "ref" / "positions.csv", [*places, far])
+    tags = {
+        each.source_image: GeoTag(position=each.position, heading_deg=each.pose and each.pose.up_deg)
+        for each in [*places, far]
+    }
+    write_positions(folder / "ref" / "positions.csv", tags)
     argv = ["map", "build", folder / "valley.gpkg", "--images", folder / "ref", "--camera", "nadir", "--no-refine"]
     assert main([*map(str, argv), "--no-calibrate", "--technique", "cohog"]) == 0
     with PlaceMap.open_for_adding(folder / "valley.gpkg") as place_map, place_map.transaction():

@@ -7,7 +7,6 @@ import pytest
 from distorted_cameras import DistortedCamera, fisheye, wide
 from pictures import rough_ground
 
-from edgevpr.api import Map
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import offset_m, offset_position
@@ -92,16 +91,6 @@ def test_every_camera_finds_its_position_in_every_cameras_map(maps, lenses, grou
 def test_without_its_calibration_positions_would_be_off(maps, ground):
     found = off_m(maps["straight"], CAMERAS["wide"], ground, fov_deg=SEEN_DEG["wide"])
     assert max(each or math.inf for each in found) > 5.0
-
-
-def test_from_python_a_picture_through_a_lens_needs_a_height(maps, lenses, ground, tmp_path):
-    config = tmp_path / "flight.yaml"
-    config.write_text(f"source: {{lens: {lenses['wide']}}}\n")
-    image = CAMERAS["wide"].photograph(ground, M_PER_PX, east_m=250.0, north_m=200.0, **STRAIGHT)
-    with Map(maps["wide"], config=config) as opened:
-        with pytest.raises(UsageError, match="height_m"):
-            opened.match(image)
-        assert opened.match(image, height_m=100.0).accepted
 
 
 def test_a_field_of_view_that_contradicts_the_calibration_is_refused(maps, lenses, ground):
