@@ -5,94 +5,55 @@ from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
+from drawing import any_colour, colour_shares, fill, grained, make_clouds, write_text
 
 Draw = Callable[[np.random.Generator, int, int], np.ndarray]
 SIZES = ((480, 640), (360, 640), (576, 720), (240, 320), (720, 1280), (240, 640))  # height, width
-_FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_PLAIN, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX)
 _BARS = ((191, 191, 191), (0, 191, 191), (191, 191, 0), (0, 191, 0), (191, 0, 191), (0, 0, 191), (191, 0, 0))  # BGR
 
 
-def _filled(height: int, width: int, colour) -> np.ndarray:
-    return np.full((height, width, 3), colour, np.uint8)
-
-
-def _colour(rng: np.random.Generator, low: int = 0, high: int = 256) -> tuple[int, ...]:
-    return tuple(int(value) for value in rng.integers(low, high, 3))
-
-
-def _write(
-    picture: np.ndarray, rng: np.random.Generator, text: str, at: tuple[float, float], size: float = 1.0
-) -> None:
-    """Write a text that begins at shares of the width and the height, in white or a light colour."""
-    height, width = picture.shape[:2]
-    scale = size * height / 480 * rng.uniform(0.8, 1.2)
-    where = int(at[0] * width), int(at[1] * height)
-    colour = (255, 255, 255) if rng.random() < 0.7 else _colour(rng, 150)
-    cv2.putText(picture, text, where, int(rng.choice(_FONTS)), scale, colour, int(rng.integers(1, 4)), cv2.LINE_AA)
-
-
-def grained(picture: np.ndarray, rng: np.random.Generator, sigma: float) -> np.ndarray:
-    return np.clip(picture + rng.normal(0, sigma, picture.shape), 0, 255).astype(np.uint8)
-
-
-def _clouded(rng: np.random.Generator, height: int, width: int, finest: float, octaves: int) -> np.ndarray:
-    """Make noise of several octaves, float32 (H, W) 0..1; the finest has `finest` spots across the width."""
-    total = np.zeros((height, width), np.float32)
-    for octave in range(octaves):
-        across = max(2, int(finest / 2**octave))
-        small = rng.random((max(2, across * height // width), across), dtype=np.float32)
-        total += cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC) * 2**octave
-    return cv2.normalize(total, None, 0, 1, cv2.NORM_MINMAX)
-
-
-def _as_picture(share: np.ndarray, dark, light) -> np.ndarray:
-    """Colour shares 0..1 (H, W) from one colour to another."""
-    dark, light = (np.broadcast_to(np.asarray(colour, np.float32), 3) for colour in (dark, light))
-    return np.clip(dark + share[..., None] * (light - dark), 0, 255).astype(np.uint8)
-
-
 def _bars(rng, height, width):
-    picture = _filled(height, width, 0)
+    picture = fill(height, width, 0)
     edges = np.linspace(0, width, len(_BARS) + 1).astype(int)
     low = int(height * rng.uniform(0.6, 1.0))
     for left, right, colour in zip(edges[:-1], edges[1:], _BARS, strict=True):
         picture[:low, left:right] = colour
         picture[low:, left:right] = colour[::-1] if rng.random() < 0.5 else rng.integers(0, 60)
     if rng.random() < 0.7:
-        _write(picture, rng, "NO SIGNAL", (0.25, 0.55), 1.6)
+        write_text(picture, rng, "NO SIGNAL", (0.25, 0.55), 1.6)
     return grained(picture, rng, rng.choice((0, 2, 6)))
 
 
 def _blue(rng, height, width):
-    picture = _filled(height, width, (int(rng.integers(120, 256)), int(rng.integers(0, 60)), int(rng.integers(0, 60))))
+    picture = fill(height, width, (int(rng.integers(120, 256)), int(rng.integers(0, 60)), int(rng.integers(0, 60))))
     for row in range(int(rng.integers(1, 6))):
         text = str(rng.choice(("NO SIGNAL", "VIDEO LOSS", "CH 5  5865 MHz", "CHECK CONNECTION", "RX1 LOST", "AV1")))
-        _write(picture, rng, text, (rng.uniform(0.02, 0.5), 0.15 + 0.16 * row), rng.uniform(0.6, 2))
+        write_text(picture, rng, text, (rng.uniform(0.02, 0.5), 0.15 + 0.16 * row), rng.uniform(0.6, 2))
     return grained(picture, rng, rng.choice((0, 3)))
 
 
 def _logo(rng, height, width):
-    picture = _filled(height, width, _colour(rng, 0, 40))
+    picture = fill(height, width, any_colour(rng, 0, 40))
     x, y = int(rng.uniform(0.2, 0.8) * width), int(rng.uniform(0.2, 0.8) * height)
     size = int(rng.uniform(0.05, 0.2) * height)
-    cv2.ellipse(picture, (x, y), (2 * size, size), 0, 0, 360, _colour(rng, 100), -1)
-    cv2.ellipse(picture, (x, y), (size, size // 2), 30, 0, 360, _colour(rng), int(rng.integers(2, 9)))
-    _write(picture, rng, "DVR", (max(0, x - size) / width, y / height), rng.uniform(0.8, 2))
+    cv2.ellipse(picture, (x, y), (2 * size, size), 0, 0, 360, any_colour(rng, 100), -1)
+    cv2.ellipse(picture, (x, y), (size, size // 2), 30, 0, 360, any_colour(rng), int(rng.integers(2, 9)))
+    write_text(picture, rng, "DVR", (max(0, x - size) / width, y / height), rng.uniform(0.8, 2))
     return picture
 
 
 def _card(rng, height, width):
     """Draw a test card: grid, circle, wedges, grey steps."""
-    picture, step = _filled(height, width, 128), int(rng.integers(16, 64))
+    picture, step = fill(height, width, 128), int(rng.integers(16, 64))
     for x in range(step // 2, width, step):
         cv2.line(picture, (x, 0), (x, height), (255, 255, 255), 1)
     for y in range(step // 2, height, step):
         cv2.line(picture, (0, y), (width, y), (255, 255, 255), 1)
-    cv2.circle(picture, (width // 2, height // 2), int(0.45 * height), _colour(rng), int(rng.integers(2, 10)))
+    cv2.circle(picture, (width // 2, height // 2), int(0.45 * height), any_colour(rng), int(rng.integers(2, 10)))
     for at in range(12):
         left, right = width // 4 + at * width // 24, width // 4 + (at + 1) * width // 24
         picture[height // 3 : height // 2, left:right] = int(255 * at / 11)
-        picture[height // 2 : 2 * height // 3, left:right] = _colour(rng)
+        picture[height // 2 : 2 * height // 3, left:right] = any_colour(rng)
     every = np.arange(width // 4, 3 * width // 4)
     stripes = 255 * ((every**2 // (width * rng.integers(2, 9))) % 2)
     picture[2 * height // 3 : 3 * height // 4, every] = stripes.astype(np.uint8)[:, None]
@@ -103,7 +64,7 @@ def figures(picture, rng):
     """Write the figures that a flight controller writes over a picture."""
     texts = ("16.2V", "12.4A", "ALT 83m", "GPS 14", "12:31", "ACRO", "RSSI 87", "HOME 412m", "-35.363261", "DISARMED")
     for text in rng.permutation(texts)[: rng.integers(3, len(texts) + 1)]:
-        _write(picture, rng, str(text), (rng.uniform(0, 0.85), rng.uniform(0.06, 0.97)), rng.uniform(0.5, 1.1))
+        write_text(picture, rng, str(text), (rng.uniform(0, 0.85), rng.uniform(0.06, 0.97)), rng.uniform(0.5, 1.1))
     return picture
 
 
@@ -125,23 +86,23 @@ def display(picture, rng):
 
 
 def _display_on_dark(rng, height, width):
-    ground = _as_picture(_clouded(rng, height, width, 8, 3), 0, rng.uniform(5, 40))
+    ground = colour_shares(make_clouds(rng, height, width, 8, 3), 0, rng.uniform(5, 40))
     return display(grained(ground, rng, rng.uniform(0.5, 4)), rng)
 
 
 def _specks(rng, height, width):
-    picture, dark = _filled(height, width, int(rng.choice((0, 90, 128, 220)))), rng.random() < 0.5
+    picture, dark = fill(height, width, int(rng.choice((0, 90, 128, 220)))), rng.random() < 0.5
     for _ in range(int(rng.integers(3, 150))):
         at = int(rng.integers(width)), int(rng.integers(height))
-        cv2.circle(picture, at, int(rng.integers(1, 9)), _colour(rng, 0, 100) if dark else _colour(rng, 120), -1)
+        cv2.circle(picture, at, int(rng.integers(1, 9)), any_colour(rng, 0, 100) if dark else any_colour(rng, 120), -1)
     return cv2.GaussianBlur(picture, (0, 0), 1.5) if rng.random() < 0.5 else picture
 
 
 def _scratches(rng, height, width):
-    picture = _filled(height, width, int(rng.integers(0, 256)))
+    picture = fill(height, width, int(rng.integers(0, 256)))
     for _ in range(int(rng.integers(2, 40))):
         ends = [(int(rng.integers(width)), int(rng.integers(height))) for _ in range(2)]
-        cv2.line(picture, *ends, _colour(rng), int(rng.integers(1, 5)), cv2.LINE_AA)
+        cv2.line(picture, *ends, any_colour(rng), int(rng.integers(1, 5)), cv2.LINE_AA)
     return picture
 
 
@@ -155,7 +116,7 @@ def _interlaced(rng, height, width):
     share = np.repeat(share[:, None], width, axis=1)
     if rng.random() < 0.5:
         share = cv2.resize(np.ascontiguousarray(share.T), (width, height))
-    return grained(_as_picture(share, _colour(rng), _colour(rng)), rng, rng.choice((0, 3, 10)))
+    return grained(colour_shares(share, any_colour(rng), any_colour(rng)), rng, rng.choice((0, 3, 10)))
 
 
 def _torn(rng, height, width):
@@ -171,15 +132,15 @@ def _horizon(rng, height, width):
     y, x = np.mgrid[:height, :width]
     line = height * rng.uniform(0.2, 0.8) + np.tan(rng.normal(0, 0.3)) * (x - width / 2)
     below = np.clip((y - line) / rng.uniform(1, 12) + 0.5, 0, 1)
-    picture = _as_picture(below, _colour(rng, 120), _colour(rng, 0, 140))
+    picture = colour_shares(below, any_colour(rng, 120), any_colour(rng, 0, 140))
     return grained(cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 3)), rng, rng.choice((0, 2, 5)))
 
 
 def _sky(rng, height, width):
-    share = _clouded(rng, height, width, rng.uniform(16, 200), int(rng.integers(3, 7)))
+    share = make_clouds(rng, height, width, rng.uniform(16, 200), int(rng.integers(3, 7)))
     share = np.clip((share - rng.uniform(0.2, 0.6)) * rng.uniform(1, 5), 0, 1)
     share = share + np.linspace(0, rng.uniform(0, 0.5), height)[:, None]
-    picture = _as_picture(share, (220, 160, 90), (250, 250, 250))
+    picture = colour_shares(share, (220, 160, 90), (250, 250, 250))
     if rng.random() < 0.4:
         cv2.circle(picture, (int(rng.integers(width)), int(rng.integers(height))), height // 8, (255, 255, 255), -1)
         picture = cv2.GaussianBlur(picture, (0, 0), height / 60)
@@ -187,7 +148,7 @@ def _sky(rng, height, width):
 
 
 def _cap(rng, height, width):
-    picture = _filled(height, width, 0) + rng.normal(rng.uniform(0, 8), rng.uniform(0.5, 6), (height, width, 1))
+    picture = fill(height, width, 0) + rng.normal(rng.uniform(0, 8), rng.uniform(0.5, 6), (height, width, 1))
     picture = picture + rng.normal(0, rng.uniform(0, 3), (1, width, 1))  # the columns of a sensor differ
     hot = rng.random((height, width)) < rng.uniform(0, 2e-3)
     picture[hot] = rng.uniform(60, 255)
@@ -196,20 +157,20 @@ def _cap(rng, height, width):
 
 def _fog(rng, height, width):
     base, depth = rng.uniform(90, 220), rng.uniform(2, 25)
-    share = _clouded(rng, height, width, rng.uniform(4, 60), 4)
-    return grained(_as_picture(share, base - depth, base + depth), rng, rng.uniform(0, 4))
+    share = make_clouds(rng, height, width, rng.uniform(4, 60), 4)
+    return grained(colour_shares(share, base - depth, base + depth), rng, rng.uniform(0, 4))
 
 
 def _bright(rng, height, width):
     """Draw over-exposed ground: white, with a few greys left."""
-    share = _clouded(rng, height, width, rng.uniform(10, 120), 4)
-    return grained(_as_picture(np.clip(share * 3 + rng.uniform(-0.6, 0.6), 0, 1), 150, 255), rng, rng.uniform(0, 2))
+    share = make_clouds(rng, height, width, rng.uniform(10, 120), 4)
+    return grained(colour_shares(np.clip(share * 3 + rng.uniform(-0.6, 0.6), 0, 1), 150, 255), rng, rng.uniform(0, 2))
 
 
 def _white_noise(rng, height, width):
     middle, sigma = rng.uniform(40, 200), rng.uniform(5, 90)
     channels = 1 if rng.random() < 0.6 else 3
-    return np.clip(_filled(height, width, 0) + rng.normal(middle, sigma, (height, width, channels)), 0, 255).astype(
+    return np.clip(fill(height, width, 0) + rng.normal(middle, sigma, (height, width, channels)), 0, 255).astype(
         np.uint8
     )
 
@@ -220,15 +181,15 @@ def _banded_noise(rng, height, width):
     along, across = np.exp(rng.uniform(np.log(0.5), np.log(25), 2))
     noise = cv2.GaussianBlur(noise, (0, 0), along, sigmaY=along if rng.random() < 0.6 else across)
     noise = noise / noise.std() * rng.uniform(15, 70) + rng.uniform(60, 190)
-    return np.clip(noise[..., None] + _filled(height, width, 0), 0, 255).astype(np.uint8)
+    return np.clip(noise[..., None] + fill(height, width, 0), 0, 255).astype(np.uint8)
 
 
 def _snow(rng, height, width):
     """Draw the snow of an analogue receiver: dots that run along the rows."""
     noise = cv2.GaussianBlur(rng.random((height, width)).astype(np.float32), (0, 0), rng.uniform(0.5, 3), sigmaY=0.1)
-    picture = _as_picture(cv2.normalize(noise, None, 0, 1, cv2.NORM_MINMAX), 0, 255)
+    picture = colour_shares(cv2.normalize(noise, None, 0, 1, cv2.NORM_MINMAX), 0, 255)
     if rng.random() < 0.5:
-        _write(picture, rng, "NO SIGNAL", (rng.uniform(0, 0.4), rng.uniform(0.3, 0.8)), 1.6)
+        write_text(picture, rng, "NO SIGNAL", (rng.uniform(0, 0.4), rng.uniform(0.3, 0.8)), 1.6)
     return picture
 
 
@@ -237,15 +198,15 @@ def _blocks(rng, height, width):
     size = int(rng.choice((8, 16, 32)))
     small = rng.normal(128, rng.uniform(5, 60), (-(-height // size), -(-width // size), 1))
     picture = cv2.resize(small, None, fx=size, fy=size, interpolation=cv2.INTER_NEAREST)[:height, :width, None]
-    return grained(picture + _filled(height, width, 0), rng, rng.choice((0, 2)))
+    return grained(picture + fill(height, width, 0), rng, rng.choice((0, 2)))
 
 
 def _tiles(rng, height, width):
     """Draw one small patch over and over."""
     side_y, side_x = (int(side) for side in rng.integers(12, 130, 2))
-    patch = _as_picture(_clouded(rng, side_y, side_x, rng.uniform(4, 40), 3), _colour(rng), _colour(rng))
+    patch = colour_shares(make_clouds(rng, side_y, side_x, rng.uniform(4, 40), 3), any_colour(rng), any_colour(rng))
     if rng.random() < 0.3:
-        cv2.circle(patch, (side_x // 2, side_y // 2), min(side_x, side_y) // 4, _colour(rng), -1)
+        cv2.circle(patch, (side_x // 2, side_y // 2), min(side_x, side_y) // 4, any_colour(rng), -1)
     times = -(-height // side_y), -(-width // side_x), 1
     return grained(np.tile(patch, times)[:height, :width], rng, rng.choice((0, 2)))
 
@@ -254,7 +215,7 @@ def _checks(rng, height, width):
     side_y, side_x = (int(side) for side in rng.integers(6, 90, 2))
     y, x = np.mgrid[:height, :width]
     share = ((y // side_y + x // side_x) % 2).astype(np.float32)
-    return grained(_as_picture(share, _colour(rng), _colour(rng)), rng, rng.choice((0, 3)))
+    return grained(colour_shares(share, any_colour(rng), any_colour(rng)), rng, rng.choice((0, 3)))
 
 
 NOTHING: dict[str, Draw] = {
@@ -263,10 +224,10 @@ NOTHING: dict[str, Draw] = {
     "no signal: logo": _logo,
     "no signal: snow": _snow,
     "test card": _card,
-    "display on blank": lambda rng, *size: display(_filled(*size, int(rng.choice((0, 16, 60, 128)))), rng),
+    "display on blank": lambda rng, *size: display(fill(*size, int(rng.choice((0, 16, 60, 128)))), rng),
     "display on dark": _display_on_dark,
     "display on fog": lambda rng, *size: display(_fog(rng, *size), rng),
-    "blank": lambda rng, *size: grained(_filled(*size, _colour(rng)), rng, rng.choice((0, 0.5, 1))),
+    "blank": lambda rng, *size: grained(fill(*size, any_colour(rng)), rng, rng.choice((0, 0.5, 1))),
     "specks": _specks,
     "scratches": _scratches,
     "interlaced": _interlaced,
