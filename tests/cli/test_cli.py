@@ -166,12 +166,8 @@ def test_debug_shows_the_traceback(capsys, caplog, tmp_path):
     assert any(record.exc_info for record in caplog.records)
 
 
-def test_quiet_shows_no_progress(capsys, tmp_path):
-    folder = tmp_path / "flight"
-    folder.mkdir()
-    for number in range(3):
-        cv2.imwrite(str(folder / f"{number}.png"), textured(number))
-    words = ["map", "build", "--images", folder, "--technique", "hog"]
+def test_quiet_shows_no_progress(capsys, flight, tmp_path):
+    words = ["map", "build", "--images", flight / "ref", "--technique", "hog"]
     assert main([*map(str, words), str(tmp_path / "one.gpkg")]) == 0
     assert "mapping" in capsys.readouterr().err
     assert main(["-q", *map(str, words), str(tmp_path / "two.gpkg")]) == 0

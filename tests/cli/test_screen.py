@@ -1,7 +1,6 @@
 """Names, passwords and halves of characters on their way to the terminal."""
 
 import logging
-import os
 import sys
 
 import cv2
@@ -10,7 +9,7 @@ from pictures import textured
 
 from edgevpr.cli.main import main
 from edgevpr.cli.screen import LineFormatter
-from edgevpr.core.text import decode_name, escape_unprintable, redact_passwords, sanitize
+from edgevpr.core.text import escape_unprintable, redact_passwords, sanitize
 
 REDDENING = "\x1b[31m.jpg"  # a name that would make all that follows red
 
@@ -37,11 +36,6 @@ def said(capfd, *words):
 def test_escape_unprintable_escapes_what_a_terminal_acts_on(text, printed):
     assert escape_unprintable(text) == printed
     printed.encode("utf-8")
-
-
-def test_decode_name_gives_utf_8():
-    assert decode_name(os.fsdecode(b"caf\xe9.jpg")) == "caf\\xe9.jpg"
-    assert decode_name("café.jpg") == "café.jpg"
 
 
 @pytest.mark.parametrize(

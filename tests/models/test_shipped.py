@@ -10,7 +10,6 @@ from edgevpr.core.config import load_config
 from edgevpr.core.files import find_shipped
 from edgevpr.runtime.recognise.gate_networks import Memorability
 from edgevpr.techniques.card import load_card
-from edgevpr.techniques.words import load_words
 
 MODELS = find_shipped("models")
 
@@ -26,15 +25,6 @@ def test_the_card_is_of_the_file():
     assert hashlib.sha256(card.file_path.read_bytes()).hexdigest() == card.sha256
     assert card.licence == "MIT"
     assert "train_calc.py" in card.source
-
-
-@pytest.mark.parametrize(("kind", "count"), [("vlad", 64), ("regions", 256), ("bow", 10_000)])
-def test_the_words_of_the_defaults_are_there(kind, count):
-    words, _ = load_words("calc", kind, count)
-    assert words.shape == (count, 128)
-    lengths = np.linalg.norm(words, axis=1)
-    assert lengths.min() > 0.2  # means of vectors of length 1
-    assert lengths.max() < 1.02
 
 
 def test_all_of_it_fits_the_wheel():

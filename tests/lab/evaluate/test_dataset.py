@@ -13,9 +13,7 @@ from edgevpr.lab.evaluate.dataset import load_dataset, open_folder
 def folder(tmp_path):
     """Three queries, three references; no ground truth yet."""
     for split in ("query", "ref"):
-        (tmp_path / split).mkdir()
-        for name in "abc":
-            cv2.imwrite(str(tmp_path / split / f"{name}.png"), np.zeros((8, 8), np.uint8))
+        write_pictures(tmp_path / split, ["a.png", "b.png", "c.png"])
     return tmp_path
 
 

@@ -4,12 +4,12 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import pytest
 import yaml
 from answering_autopilot import AnsweringAutopilot
 from loopback import free_port
-from pictures import textured
+from pictures import textured, write_flight
+from walks import map_of
 
 from edgevpr import techniques
 from edgevpr.cli.main import main
@@ -29,13 +29,9 @@ ITEMS = ["configuration", "board", "map", "source", "link", "log"]
 def flight_folder(tmp_path_factory) -> Path:
     """A folder with a map of `hog` and the images it was made of."""
     folder = tmp_path_factory.mktemp("flight")
-    (folder / "images").mkdir()
-    technique = techniques.create("hog")
-    with PlaceMap.create(folder / "valley.gpkg", technique.spec) as place_map:
-        for seed in range(2):
-            image = textured(seed)
-            cv2.imwrite(str(folder / "images" / f"{seed}.png"), image)
-            place_map.add(Frame(image=image, name=f"{seed}.png", t_mono_s=0.0), technique.encode(image))
+    frames = [Frame(image=textured(seed), name=f"{seed}.png", t_mono_s=0.0) for seed in range(2)]
+    write_flight(folder / "images", [frame.image for frame in frames])
+    map_of(folder / "valley.gpkg", techniques.create("hog"), frames)
     return folder
 
 

@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from pictures import textured
+from pictures import textured, write_flight
 
 from edgevpr.cli.main import main
 from edgevpr.core.config import load_config
@@ -21,9 +21,7 @@ def shown(place, figures):
 
 
 def test_mask_of_map_and_flight_leaves_a_display_out(tmp_path):
-    (tmp_path / "ref").mkdir()
-    for place in range(4):
-        cv2.imwrite(str(tmp_path / "ref" / f"{place}.png"), shown(place, "BAT 16.2V HOME 412m ALT"))
+    write_flight(tmp_path / "ref", [shown(place, "BAT 16.2V HOME 412m ALT") for place in range(4)])
     allowed = np.full((240, 320), 255, np.uint8)
     allowed[:60], allowed[190:] = 0, 0
     cv2.imwrite(str(tmp_path / "mask.png"), allowed)
