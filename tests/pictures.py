@@ -60,5 +60,5 @@ def write_flight(folder: Path, pictures: Iterable[np.ndarray], step_deg: float =
     for number, picture in enumerate(pictures):
         cv2.imwrite(str(folder / f"{number}.png"), picture)
         t_utc_s = None if start_s is None else start_s + number
-        tags[f"{number}.png"] = GeoTag(position=Position(50 + number * step_deg, 8.0), heading_deg=0.0, t_utc_s=t_utc_s)
+        tags[f"{number}.png"] = GeoTag(position=Position(50 + number * step_deg, 8.0), t_utc_s=t_utc_s)
     write_positions(folder / "positions.csv", tags)

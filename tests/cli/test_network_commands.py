@@ -12,7 +12,6 @@ from edgevpr.core.errors import ConfigError
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight.pick import explain_technique
 from edgevpr.runtime.recognise.opening import open_recogniser
-from edgevpr.techniques import create, vectors
 
 
 @pytest.fixture
@@ -28,10 +27,6 @@ def built(flight, *flags):
     path = flight / "m.gpkg"
     assert main(["map", "build", str(path), "--images", str(flight / "ref"), *flags]) == 0
     return path
-
-
-def test_forms_have_the_same_names_everywhere():
-    assert create("hog").spec.forms == FORMS == vectors.FORMS
 
 
 def test_match_uses_one_map_in_all_forms(capsys, flight):

@@ -40,8 +40,3 @@ def test_open_file_refuses_pipes_and_devices(path, tmp_path):
     with pytest.raises(OSError, match="pipe"):
         open_file(tmp_path / path, 3000)  # an absolute path stays one
     assert len(os.listdir("/proc/self/fd")) == before
-
-
-def test_read_file_refuses_a_folder(tmp_path):
-    with pytest.raises(IsADirectoryError):
-        read_file(tmp_path, 3000)

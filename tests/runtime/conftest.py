@@ -1,15 +1,13 @@
 """One recorded flight for all tests of flights: thirty places, 111 m apart on a line to the north, and maps of them."""
 
-import csv
 import shutil
 from functools import partial
 from pathlib import Path
 
-import cv2
 import pytest
 from fakes import FakeClock, FakeLink
-from flights import PLACES, STEP_DEG, flight_over
-from pictures import textured
+from flights import PLACES, STEP_DEG, flight_over, pictures
+from pictures import write_flight
 
 from edgevpr.cli.main import main
 from edgevpr.runtime.flight import systemd
@@ -26,15 +24,8 @@ def recording(tmp_path_factory):
     technique."""
     folder = tmp_path_factory.mktemp("recording")
     for name in ("seen", "blind"):
-        (folder / name / "images").mkdir(parents=True)
-    with open(folder / "seen" / "positions.csv", "w", newline="") as handle:
-        table = csv.writer(handle)
-        table.writerow(("file", "lat", "lon"))
-        for number in range(PLACES):
-            name = f"{number:02d}.png"
-            for each in ("seen", "blind"):
-                cv2.imwrite(str(folder / each / "images" / name), textured(number, 240, 320))
-            table.writerow((name, f"{50 + number * STEP_DEG:.4f}", 8.0))
+        write_flight(folder / name / "images", pictures(PLACES), STEP_DEG)
+    (folder / "blind" / "images" / "positions.csv").unlink()
     for technique, parameters in TECHNIQUES.items():
         flags = [word for parameter in parameters for word in ("--param", parameter)]
         built = ["map", "build", folder / f"{technique}.gpkg", "--images", folder / "seen" / "images"]

@@ -69,7 +69,3 @@ def test_encode_leaves_out_masked_pixels(name, parameters):
 def test_wrong_names_and_parameters_are_explained(name, parameters, says):
     with pytest.raises(UsageError, match=says):
         create(name, parameters)
-
-
-def test_parameters_are_read_from_text():
-    assert create("cohog", {"w1": "256", "gt": "0.45"}).spec.parameters["w1"] == 256
