@@ -1,7 +1,7 @@
-"""Why a match was accepted or refused, and a fix sent or not: codes with parameters, and the one table of sentences.
+"""Reasons why a match was accepted or refused, or a fix was or was not sent: codes, parameters and sentences.
 
-Programs, tests and counts work on the code and its parameters; people read the sentence, which may change at any time.
-The table of `edgevpr check` and `doctor` is `findingcodes` in `runtime/service`."""
+Programs, tests and statistics use the code and its parameters. The sentence is for people and may change at any time.
+The findings of `edgevpr check` and `doctor` have their own table, `runtime/service/findingcodes.py`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,44 +17,44 @@ _FIGURES = (
     "confidence {confidence:probability}, {needed:probability} needed: ",
     "{regions_ratio:.1f} times as many regions agree as for the runner-up ({regions_share:.0%})",
     ", {landmarks:.0f} landmarks agree",
-    ", and {rival_landmarks:.0f} with a place elsewhere",
-    ", and {landmarks_ratio:.2f} times as many landmarks",
+    ", against {rival_landmarks:.0f} for a place elsewhere",
+    ", {landmarks_ratio:.2f} times as many landmarks as for the runner-up",
     ", {coverage_share:.1%} of the place agrees",
 )
 
 
 class Code(Enum):
-    """A code has a `summary` of a few words and the parts of its sentence (none: the summary), in which names in braces
-    are parameters. A part is left out if a parameter of it is unknown."""
+    """A code with a `summary` of a few words, and the `parts` of its sentence: templates with parameters in braces (if
+    none are given, the summary is the sentence). A part is omitted if any of its parameters is unknown."""
 
     def __init__(self, summary: str, *parts: str) -> None:
         self.summary, self.parts = summary, parts or (summary,)
 
     @property
     def parameters(self) -> frozenset[str]:
-        """Names of the parameters of the sentence."""
+        """Names of the parameters that the sentence uses."""
         return frozenset(name for part in self.parts for name in _list_names(part))
 
 
 class ReasonCode(Code):
-    """The codes of matches and fixes, of notes of a flight, and of the channel to the autopilot."""
+    """Codes for matches, fixes, notes of a flight, the channel to the autopilot, and changes by the governor."""
 
-    # Of a match that was accepted
+    # Match accepted
     ACCEPTED_BY_CONFIDENCE = "accepted", *_FIGURES
-    ACCEPTED_BY_SCORE = "accepted", "score {score:.3f}, {lead:.3f} ahead of any place elsewhere"
+    ACCEPTED_BY_SCORE = "accepted", "score {score:.3f}, {lead:.3f} ahead of the best place elsewhere"
     ACCEPTED_WITHOUT_RIVAL = "accepted", "score {score:.3f}; there is no place elsewhere to compare with"
 
-    # Of an image that was not searched
+    # Image not searched
     NOT_SEARCHED = "not searched"
     PICTURES_STAY = "camera frozen: images do not change"
     PICTURES_REPEAT = "camera frozen: images repeat"
-    AGE_UNKNOWN = "age of images unknown", "{summary}: none is used, as they do not fit the aircraft's motion"
+    AGE_UNKNOWN = "age of images unknown", "{summary}: they do not fit the aircraft's motion, so none is used"
     LOW_TEXTURE = "too little texture in the image", "{summary}: {usable:.0%} usable, {needed:.0%} needed"
     TILTED = "the image is not levelled", "{summary}: it is tilted {tilt_deg:.0f} degrees"
     TILTED_WITHOUT_HEADING = "the image is not levelled", "{summary}: tilted {tilt_deg:.0f} degrees, heading unknown"
     TILTED_OFF_GROUND = (
         "the image is not levelled",
-        "{summary}: it shows {shown:.0%} of the ground under it at a tilt of {tilt_deg:.0f} degrees",
+        "{summary}: tilted {tilt_deg:.0f} degrees, it shows {shown:.0%} of the ground below the camera",
     )
     NOT_MEMORABLE = "not memorable", "{summary}: {measure} {score:.2f}, {needed:.2f} needed"
     UNUSABLE = "unusable", "{problem}"
@@ -62,51 +62,51 @@ class ReasonCode(Code):
     PLACE_UNREADABLE = "a place cannot be read", "{problem}"
     UNFORESEEN = "unexpected error", "unexpected {error} ({problem}): report it with the output of --debug"
 
-    # Of a match that was refused
+    # Match refused
     LOW_SCORE = "not similar enough to any place", "{summary}: score {score:.3f}, {needed:.3f} needed"
-    LOW_LEAD = "too little ahead of a place elsewhere", "{summary}: {lead:.3f}, {needed:.3f} needed"
-    NO_RIVAL = "no place elsewhere to compare with", "{summary}: the score alone does not decide"
-    PLACE_UNREAD = "a place that cannot be read may be the right one"
+    LOW_LEAD = "lead over the best place elsewhere too small", "{summary}: {lead:.3f}, {needed:.3f} needed"
+    NO_RIVAL = "no place elsewhere to compare with", "{summary}: the score alone is not enough"
+    PLACE_UNREAD = "an unreadable place may be the correct one"
     NOT_CALIBRATED = "map is not calibrated", "{summary}: no confidence available"
     LOW_CONFIDENCE = "confidence too low", "{summary}: ", *_FIGURES
-    ELSEWHERE_AGREES_BETTER = "a place elsewhere agrees better", "{summary}: ", *_FIGURES
-    TRACK_CONTRADICTS = "the track filter contradicts it", "{summary}: ", *_FIGURES
-    TURNED_AGREES = "the same place agrees nearly as well at another rotation", "{summary}: ", *_FIGURES
+    ELSEWHERE_AGREES_BETTER = "a place elsewhere matches better", "{summary}: ", *_FIGURES
+    TRACK_CONTRADICTS = "the track filter contradicts the match", "{summary}: ", *_FIGURES
+    TURNED_AGREES = "the same place matches nearly as well at another rotation", "{summary}: ", *_FIGURES
     ELSEWHERE_AT_REST = (
-        "places elsewhere agree without a shift too",
-        "{summary}, as under an overlay: mask it (`source.mask`)",
+        "places elsewhere match without any shift too",
+        "{summary}, as an overlay in the image would make them: mask the overlay (`source.mask`)",
     )
     LANDMARKS_DISAGREE = "landmarks and regions disagree on the offset", "{summary}: {landmarks:.0f} support another"
-    FEW_LANDMARKS = "too few landmarks agree", "{summary}: {landmarks:.0f}, {needed:.0f} needed at such a score"
+    FEW_LANDMARKS = "too few landmarks agree", "{summary}: {landmarks:.0f}, {needed:.0f} needed at this score"
     TILT_SHOWN = (
-        "the image looks tilted, and its tilt is not known",
-        "{summary}: by about {tilt_deg:.0f} degrees; set `source.mount_ahead_deg`, or record roll and pitch",
+        "the image looks tilted, but its tilt is unknown",
+        "{summary}: about {tilt_deg:.0f} degrees; set `source.mount_ahead_deg`, or record roll and pitch",
     )
-    POSITIONS_DISAGREE = "places of the same ground disagree on the position", "{summary} by {apart_m:.0f} m"
+    POSITIONS_DISAGREE = "places that show the same ground disagree on the position", "{summary} by {apart_m:.0f} m"
     SEQUENCE_INCOMPLETE = "the sequence is not complete yet", "{summary}: {queries:.0f} queries of {needed:.0f}"
     NEWEST_DISAGREES = "the newest query resembles other places more"
-    NEWEST_LEFT = "the newest queries show other ground than those before"
+    NEWEST_LEFT = "the newest queries show different ground from the earlier ones"
     LOW_LEAD_SPEED = (
-        "its lead over the best match at another assumed speed is too small",
+        "lead over the best match at another assumed speed too small",
         "{summary}: {lead:.3f}, {needed:.3f} needed",
     )
 
-    # Of a fix that was not sent
+    # Fix not sent
     DRY_RUN = "dry run: no fix is sent"
-    NO_LINK = "there is no link"
+    NO_LINK = "there is no link to the autopilot"
     PLACE_WITHOUT_POSITION = "the place has no position"
     INVALID_POSITION = "its position is invalid", "{problem}"
-    NOT_BELOW_AIRCRAFT = "not sent: the image is not levelled, so it does not show what is under the aircraft"
+    NOT_BELOW_AIRCRAFT = "not sent: the image is not levelled, so it does not show the ground below the aircraft"
     NO_TELEMETRY = "not sent: no telemetry from the autopilot yet"
-    CONTINUOUS = "taken into the continuous position"
+    CONTINUOUS = "included in the continuous position"
     HAS_GPS = "not needed: the autopilot has GPS"
-    HAS_WRONG_GPS = "not sent: the autopilot has GPS, which the map contradicts, and takes no fix"
-    MAP_CONTRADICTS_GPS = "not sent: the map has contradicted GPS from the first match on"
+    HAS_WRONG_GPS = "not sent: the map contradicts the autopilot's GPS, but it accepts no fixes while it has GPS"
+    MAP_CONTRADICTS_GPS = "not sent: the map has contradicted GPS since the first match"
     NOT_BETTER = (
         "not needed: the autopilot's position is as good",
-        "not needed: the autopilot is {off_m:.1f} m from our position, which is good to {accuracy_m:.1f} m",
+        "not needed: the autopilot is {off_m:.1f} m from our position, which is accurate to {accuracy_m:.1f} m",
     )
-    HELD_TURNED = "held back: contradicts compass", "held back: rotated {turn_deg:.0f} degrees against the compass"
+    HELD_TURNED = "held back: contradicts compass", "held back: rotated {turn_deg:.0f} degrees from the compass heading"
     HELD_OFF_GPS = "held back: far from GPS", "held back: {off_m:.0f} m from the position by GPS and earlier fixes"
     HELD_OFF_PATH = (
         "held back: far from the predicted position",
@@ -114,68 +114,68 @@ class ReasonCode(Code):
     )
     PAUSED = "not sent: paused by the ground station"
     PARAMETER_DANGEROUS = "not sent: a parameter is dangerous", "not sent: set {changes}. {why}"
-    PARAMETERS_UNANSWERED = "not sent: parameters not answered", "not sent: no answer for {names} from the autopilot"
-    FIXES_UNANSWERED = "not sent: five fixes in a row had no answer"
+    PARAMETERS_UNANSWERED = "not sent: parameters not reported", "not sent: the autopilot has not reported {names}"
+    FIXES_UNANSWERED = "not sent: the autopilot has not answered five fixes in a row"
     ANSWERS_BEGIN_AGAIN = "not sent: the autopilot has only just resumed answering"
     FRAME_TOO_OLD = "its frame is too old", "its frame is {age_s:.1f} s old, and the limit is {limit_s:g} s"
     SUPERSEDED = "replaced by a newer fix"
     NO_AUTOPILOT = "no autopilot to receive it", "{summary} within {limit_s:g} s"
     CLOCK_UNKNOWN = "the autopilot's clock was not known", "{summary} within {limit_s:g} s"
-    NOT_ENCODABLE = "it does not fit its message", "{summary} ({problem})"
+    NOT_ENCODABLE = "it cannot be encoded in its message", "{summary} ({problem})"
     LINK_LOST = "the link was lost before it was sent"
 
-    # Of a fix without an answer
-    NO_ANSWER = "it had no answer", "{summary} within {limit_s:g} s"
+    # Fix without an answer
+    NO_ANSWER = "it got no answer", "{summary} within {limit_s:g} s"
     LINK_LOST_BEFORE_ANSWER = "the link was lost before its answer came"
     ENDED_BEFORE_ANSWER = "the flight ended before its answer came"
     AUTOPILOT_REPLACED = "another autopilot has taken its place"
     AUTOPILOT_RESTARTED = "the autopilot has restarted"
 
-    # Of an autopilot's answer to fixes, or of its silence: "it" is the autopilot, and a summary has 26 bytes at most
-    TAKEN = "taken", "it takes them"
-    GPS_IN_USE = "GPS in use", "one of its GPS receivers has a fix, and with GPS it takes no other position"
-    NOT_STARTED = "filter not started", "its position filter has not started: a plane starts it with GPS only"
-    NO_ORIGIN = "no origin", "it has no origin, so it takes no position: it must have had GPS once, or be sent one"
+    # The autopilot's answer to fixes, or its silence: "it" is the autopilot, and a summary has at most 26 bytes
+    TAKEN = "accepted", "it accepts them"
+    GPS_IN_USE = "GPS in use", "one of its GPS receivers has a fix, and with GPS it accepts no other position"
+    NOT_STARTED = "filter not started", "its position filter has not started: on a plane it starts only with GPS"
+    NO_ORIGIN = "no origin", "it has no origin, so it accepts no position: it needs GPS once, or an origin sent to it"
     NOT_ARMED = "not armed", "it is not armed: on the ground it has no dead-reckoned position to correct"
-    NOT_RECKONING = "no source of position", "it estimates no position: it has neither GPS, airspeed, flow nor vision"
-    OTHER_AID = "not dead reckoning", "it takes a fix only while it dead-reckons without any aid"
-    NOT_PLAUSIBLE = "fix not plausible", "it dead-reckons, and the fix does not fit, or it has no origin"
-    NOT_SAID = "see its log", "it gives no reason: GPS just in use, no origin, or no source of position"
+    NOT_RECKONING = "no source of position", "it estimates no position: it has no GPS, airspeed, optical flow or vision"
+    OTHER_AID = "not dead reckoning", "it accepts a fix only while it dead-reckons without any other aiding"
+    NOT_PLAUSIBLE = "fix not plausible", "it is dead-reckoning, but the fix is not plausible or it has no origin"
+    NOT_SAID = "see its log", "it gives no reason: perhaps it just regained GPS, or has no origin or position source"
     OTHER_ANSWER = "see its log", "it answers {result}"
     WRONG_FORM = "wrong format", "it rejects their format"
     NO_COMMAND = (
-        "43003 not known",
-        "its firmware has no command 43003, or was built without it, as on boards with 1 MB of flash",
+        "43003 not supported",
+        "its firmware has no command 43003, or was built without it, as for boards with 1 MB of flash",
     )
     NO_COMMAND_ANSWERED = (
         "signing? system id?",
-        "it answers no command of ours: does its port take signed messages only, does another vehicle have its ",
+        "it answers none of our commands: does its port accept only signed messages, does another vehicle have its ",
         "system id, or does the line carry nothing towards it?",
     )
     FIXES_NOT_ANSWERED = (
         "no command 43003?",
-        "it answers other commands: is its firmware built without 43003, or does another program have our ",
+        "it answers other commands: is its firmware built without 43003, or does another program use our ",
         "component id?",
     )
 
-    # Notes of a flight. The ground station is sent the summary where the sentence is too long for a STATUSTEXT.
-    FAILING = "frames fail in a row", "{count:.0f} frames in a row have failed"
-    NOT_FAILING = "frames are recognised again"
+    # Notes of a flight. The ground station gets the summary if the sentence is too long for a STATUSTEXT.
+    FAILING = "frames keep failing", "{count:.0f} frames in a row have failed"
+    NOT_FAILING = "frames no longer fail"
     NOTHING_SHOWN = "camera image is blank"
-    GROUND_SHOWN = "camera shows ground again"
-    MAP_LEFT = "map left"
-    MAP_FOUND = "map found again"
+    GROUND_SHOWN = "camera sees the ground again"
+    MAP_LEFT = "aircraft has left the map"
+    MAP_FOUND = "aircraft is back on the map"
     TILT_TOO_LARGE = "tilt too large"
-    TILT_FINE = "tilt is fine again"
+    TILT_FINE = "tilt is acceptable again"
     MAP_LOST = "map cannot be read, see the log"
     MAP_BACK = "map can be read again"
     PICTURES_MOVE = "camera works again: images change"
     AGE_KNOWN = "age of images known again"
-    DELAY_FOUND = "images are late: corrected", "images are {delay_s:.1f} s older than they claim: corrected"
-    DELAY_GONE = "images are as old as they claim"
+    DELAY_FOUND = "images are late: corrected", "images are {delay_s:.1f} s older than their timestamps: corrected"
+    DELAY_GONE = "images are as old as their timestamps say"
     PICTURES_TURNED = (
-        "images are turned",
-        "images are turned {turn_deg:.0f} degrees against the heading: if the compass is right, ",
+        "images are rotated",
+        "images are rotated {turn_deg:.0f} degrees from the heading: if the compass is right, ",
         "set source.up_deg: {up_deg:.0f}",
     )
     PICTURES_MIRRORED = "images are mirrored", "{summary}, so none can match: switch off mirror or flip in the camera"
@@ -193,24 +193,24 @@ class ReasonCode(Code):
     HOT = "companion hot", "{summary}", " at {temperature_c:.0f} C", ": improve its cooling"
     COOL = "companion is cool again", "{summary}", " at {temperature_c:.0f} C"
 
-    # Of the channel to the autopilot: "it" is the autopilot
-    BY_GPS_INPUT = "GPS_INPUT", "GPS_INPUT, as its {parameter} is 14"
-    BY_ODOMETRY = "ODOMETRY", "ODOMETRY, as its {parameter} is 1", "; without GPS by source set {source_set:.0f}"
-    BY_MESSAGE_296 = "message 296", "message 296, as its {parameter} fuses positions"
+    # Channel to the autopilot: "its" parameters are the autopilot's
+    BY_GPS_INPUT = "GPS_INPUT", "GPS_INPUT, because its {parameter} is 14"
+    BY_ODOMETRY = "ODOMETRY", "ODOMETRY, because its {parameter} is 1", "; source set {source_set:.0f} without GPS"
+    BY_MESSAGE_296 = "message 296", "message 296, because its {parameter} lets it fuse positions"
     COMMAND_TO_PLANE = "command 43003, which a dead-reckoning plane accepts at any time"
     COMMAND_NEEDS_FLOW = (
         "command 43003",
-        "command 43003, for a {vehicle} with optical flow; else set {change}",
+        "command 43003, which a {vehicle} accepts only with optical flow; without it, set {change}",
     )
-    COMMAND_WITHOUT_296 = "command 43003", "command 43003, as it has no {parameter} for message 296 (1.18 has)"
+    COMMAND_WITHOUT_296 = "command 43003", "command 43003, because it has no {parameter} for message 296 (PX4 1.18 has)"
     COMMAND_FOR_296 = (
         "command 43003",
-        "command 43003, as its {parameter} fuses no positions of message 296: set it, and reboot",
+        "command 43003, because its {parameter} does not let it fuse message 296: set it, and reboot the autopilot",
     )
     COMMAND_TO_ANY = "command 43003, the only channel used with unknown firmware"
-    PARAMETER_WEAK = "a parameter should change", "set {changes}. {why}"
+    PARAMETER_WEAK = "a parameter should be changed", "set {changes}. {why}"
 
-    # Of a change of the governor
+    # Change by the governor
     BOARD_HOT = "the board is too hot", "{temperature_c:.0f} °C, and the limit is {limit_c:.0f} °C"
     BOARD_SLOW = "the board throttles itself"
     CORES_TAKEN = "too much CPU used", "{taken:.0%} of all cores used, {allowed:.0%} allowed"
@@ -221,7 +221,7 @@ class ReasonCode(Code):
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """A code with the parameters of this case, numbers or text (None or missing: unknown). `str` gives the sentence."""
+    """A code and its parameters in this case, numbers or text (None or missing: unknown). `str` gives the sentence."""
 
     code: Code
     parameters: Parameters = field(default_factory=dict)
@@ -230,7 +230,7 @@ class Reason:
         return "".join(self._fill(part) for part in self.code.parts) or self.code.summary
 
     def fields(self) -> dict[str, Any]:
-        """Return the reason as fields of the flight log and of JSON, without unknown parameters."""
+        """Return the reason as fields for the flight log and JSON, without unknown parameters."""
         values = {name: value for name, value in self.parameters.items() if value is not None}
         return {"code": self.code.name, "parameters": values}
 
@@ -239,7 +239,7 @@ class Reason:
             return ""
         try:
             return _SentenceFormatter().vformat(part, (), {"summary": self.code.summary, **self.parameters})
-        except (ValueError, TypeError):  # of a log that is damaged
+        except (ValueError, TypeError):  # parameters from a damaged log
             return ""
 
 
@@ -247,7 +247,7 @@ NOT_SEARCHED = Reason(ReasonCode.NOT_SEARCHED)
 
 
 class _SentenceFormatter(Formatter):
-    """Formats parameters; the format `probability` is that of `format_probability`."""
+    """Formats parameters; the format `probability` calls `format_probability`."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         if format_spec == "probability":
@@ -256,7 +256,7 @@ class _SentenceFormatter(Formatter):
 
 
 def read_reason(fields: object) -> Reason | None:
-    """Return the reason that was written as `fields`; None if they are none of this version."""
+    """Return the reason written as `fields`; None if this version has no such reason."""
     match fields:
         case {"code": str() as name, "parameters": dict() as parameters} if name in ReasonCode.__members__:
             return Reason(ReasonCode[name], {key: value for key, value in parameters.items() if _is_plain(value)})

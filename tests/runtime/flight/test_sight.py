@@ -48,10 +48,10 @@ def seen(notifier, clock, link):
 
 def test_the_map_is_left_after_thirty_queries_without_a_match_and_found_with_two(seen, tmp_path):
     assert seen.look("+++" + "-" * 29) == []
-    assert seen.look("-") == ["map left"]
-    assert seen.look("-" * 50) == ["map left"]
-    assert seen.look("+--") == ["map left"]
-    assert seen.look("+") == ["map left", "map found again"]
+    assert seen.look("-") == ["aircraft has left the map"]
+    assert seen.look("-" * 50) == ["aircraft has left the map"]
+    assert seen.look("+--") == ["aircraft has left the map"]
+    assert seen.look("+") == ["aircraft has left the map", "aircraft is back on the map"]
     assert [(line["kind"], line["note"]["code"]) for line in read_log(tmp_path / "log")] == [
         ("sight", "MAP_LEFT"),
         ("sight", "MAP_FOUND"),
@@ -63,9 +63,9 @@ def test_the_map_is_left_after_thirty_queries_without_a_match_and_found_with_two
     ("outcomes", "texts"),
     [
         ("+++" + "L" * 9, []),
-        ("+++" + "L" * 10, ["map left"]),  # the flight knows to be lost
+        ("+++" + "L" * 10, ["aircraft has left the map"]),  # the flight knows to be lost
         ("-" * 100 + "++" + "-" * 100, []),  # it was hardly ever recognised
-        ("+++" + "-" * 30 + ("+" + "-" * 10) * 5, ["map left"]),  # matches far apart
+        ("+++" + "-" * 30 + ("+" + "-" * 10) * 5, ["aircraft has left the map"]),  # matches far apart
     ],
 )
 def test_the_map_is_left_and_found_by_several_queries_only(seen, outcomes, texts):
@@ -74,22 +74,22 @@ def test_the_map_is_left_and_found_by_several_queries_only(seen, outcomes, texts
 
 @pytest.mark.parametrize("outcome", "0xtnu")
 def test_what_says_nothing_of_the_map_does_not_count(seen, outcome):
-    assert "map left" not in seen.look("+++" + "-" * 29 + outcome * 40)
-    assert seen.look("-")[-1] == "map left"
+    assert "aircraft has left the map" not in seen.look("+++" + "-" * 29 + outcome * 40)
+    assert seen.look("-")[-1] == "aircraft has left the map"
 
 
 def test_a_tilt_is_told_when_it_lasts_five_seconds_and_when_it_is_over_for_as_long(seen, tmp_path):
     assert seen.look("-" + "t" * 5) == []
     assert seen.look("t") == ["tilt too large"]
     assert seen.look("-----") == ["tilt too large"]
-    assert seen.look("-") == ["tilt too large", "tilt is fine again"]
+    assert seen.look("-") == ["tilt too large", "tilt is acceptable again"]
     assert [line["kind"] for line in read_log(tmp_path / "log")] == ["tilt", "tilt"]
 
 
 @pytest.mark.slow
 def test_a_flight_that_leaves_its_map_and_comes_back_says_so(make_flight, clock, link):
     lines = make_flight().fly(FakeSource([*pictures(8), *pictures(40, first=100), *pictures(8)], clock))
-    assert link.texts() == [(4, "edgevpr: map left"), (6, "edgevpr: map found again")]
+    assert link.texts() == [(4, "edgevpr: aircraft has left the map"), (6, "edgevpr: aircraft is back on the map")]
     assert [line["note"]["code"] for line in of_kind(lines, "sight")] == ["MAP_LEFT", "MAP_FOUND"]
 
 
