@@ -56,7 +56,7 @@ def off(solved, position, log):
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.2])
-def test_noisy_positions_become_exact_by_ties_and_wrong_ties_are_named(wrong):
+def test_solve_graph_makes_noisy_positions_exact_and_names_wrong_ties(wrong):
     position, log = flight()
     ties, lies = ties_of(position, log, wrong=wrong)
     solved = solve_graph(recorded_of(position), ties)
@@ -70,7 +70,7 @@ def test_noisy_positions_become_exact_by_ties_and_wrong_ties_are_named(wrong):
 
 
 @pytest.mark.slow
-def test_covariances_are_those_of_the_errors():
+def test_solve_graph_gives_covariances_that_are_those_of_the_errors():
     position, log = flight(legs=3, a_leg=8)
     far, turned = [], []
     for seed in range(30):

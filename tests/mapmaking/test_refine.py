@@ -89,7 +89,7 @@ def errors_m(place_map, poses):
     return np.array(off_m), np.array(turned_deg)
 
 
-def test_pictures_say_where_they_lie(flown, map_path, capsys):
+def test_refine_moves_places_to_where_their_pictures_lie(flown, map_path, capsys):
     _, poses = flown
     with PlaceMap.open(map_path) as place_map:
         before_m, _ = errors_m(place_map, poses)
@@ -115,7 +115,7 @@ def test_pictures_say_where_they_lie(flown, map_path, capsys):
 
 
 @pytest.mark.parametrize("wrong", [lambda lat, lon: (lon, lat), lambda lat, lon: (lat, -lon)])
-def test_exchanged_lat_and_lon_and_a_lost_sign_are_noticed(map_path, capsys, wrong):
+def test_refine_notices_exchanged_lat_and_lon_and_a_lost_sign(map_path, capsys, wrong):
     east_deg = 120.0  # the flight is moved to where its longitude could be a latitude
     with PlaceMap.open_for_adding(map_path) as place_map, place_map.transaction():
         for place in list(place_map.read_places()):
@@ -125,7 +125,7 @@ def test_exchanged_lat_and_lon_and_a_lost_sign_are_noticed(map_path, capsys, wro
     assert (refined["refined"], refined["is_mirrored"]) == (0, True)
 
 
-def test_refining_again_begins_with_what_was_recorded(map_path, capsys):
+def test_refine_begins_again_with_what_was_recorded(map_path, capsys):
     def positions():
         with PlaceMap.open(map_path) as place_map:
             return [(place.position, place.pose) for place in place_map.read_places()]
@@ -176,7 +176,7 @@ def refined_of(path, images=None):
         (range(1, 9), lambda number, place: None if number % 2 else place.position, 4, 4),
     ],
 )
-def test_maps_of_any_kind_are_refined_as_far_as_they_can_be(
+def test_refine_refines_maps_of_any_kind_as_far_as_they_can_be(
     built, tmp_path, numbers, position, refined, without_position
 ):
     path = some_of(built, tmp_path / "m.gpkg", numbers, *([position] if position else []))
@@ -190,7 +190,7 @@ def test_maps_of_any_kind_are_refined_as_far_as_they_can_be(
 
 
 @pytest.mark.data
-def test_where_landmarks_are_missing_votes_tie_pictures(tmp_path):
+def test_refine_ties_pictures_by_votes_where_landmarks_are_missing(tmp_path):
     folder = _DATA / "aerial_garfield28"
     if not folder.is_dir():
         pytest.skip("the pictures are not here")
@@ -209,7 +209,7 @@ def test_where_landmarks_are_missing_votes_tie_pictures(tmp_path):
     assert found.ties > 65, "of a hundred pairs many overlap by a strip only"
 
 
-def test_places_of_a_surveyed_picture_stay(built, tmp_path):
+def test_refine_leaves_places_of_a_surveyed_picture(built, tmp_path):
     from edgevpr.core.types import Pose
 
     with PlaceMap.open(built) as there, PlaceMap.create(tmp_path / "m.gpkg", there.spec) as place_map:
@@ -223,14 +223,14 @@ def test_places_of_a_surveyed_picture_stay(built, tmp_path):
     assert place.pose == lies
 
 
-def test_what_cannot_be_refined_says_why(tmp_path, flown, map_path, capsys):
+def test_map_refine_says_why_a_map_cannot_be_refined(tmp_path, flown, map_path, capsys):
     path = tmp_path / "hog.gpkg"
     assert main(["map", "build", str(path), "--images", str(flown[0] / "images"), "--technique", "hog"]) == 0
     assert "refined:" not in capsys.readouterr().out, "a map of another kind is built as it was"
     assert "--camera nadir" in refused(capsys, "map", "refine", path)
 
 
-def test_a_place_that_cannot_be_read_is_left_alone(map_path):
+def test_refine_leaves_a_place_that_cannot_be_read(map_path):
     write_sql(
         map_path,
         "UPDATE places SET landmarks = x'00' WHERE place_id = 3",

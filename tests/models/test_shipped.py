@@ -19,7 +19,7 @@ def shipped_alone(tmp_path, monkeypatch):
     monkeypatch.setenv("EDGEVPR_MODELS", str(tmp_path))
 
 
-def test_the_card_is_of_the_file():
+def test_card_is_of_its_file():
     card = load_card("calc")
     assert card.path.parent == MODELS
     assert hashlib.sha256(card.file_path.read_bytes()).hexdigest() == card.sha256
@@ -27,7 +27,7 @@ def test_the_card_is_of_the_file():
     assert "train_calc.py" in card.source
 
 
-def test_all_of_it_fits_the_wheel():
+def test_models_fit_the_wheel():
     assert (MODELS / "calc.onnx").stat().st_size < 2_000_000
     assert sum(path.stat().st_size for path in MODELS.rglob("*") if path.is_file()) < 4_200_000
 

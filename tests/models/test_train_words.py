@@ -34,7 +34,7 @@ def train(folder, out, *more):
 
 
 @pytest.mark.parametrize(("kind", "technique"), [("vlad", "netvlad"), ("regions", "region_vlad")])
-def test_words_make_the_technique_work(kind, technique, folder, own_models, capsys):
+def test_train_words_makes_the_technique_work(kind, technique, folder, own_models, capsys):
     (folder / "broken.jpg").write_bytes(b"\xff\xd8\xff nothing")
     train(folder, own_models, "--kind", kind, "--count", "8")
     said = capsys.readouterr()
@@ -47,6 +47,6 @@ def test_words_make_the_technique_work(kind, technique, folder, own_models, caps
     assert np.linalg.norm(vector) == pytest.approx(1, abs=1e-3)
 
 
-def test_more_words_than_descriptors_allow_are_refused(folder, own_models):
+def test_train_words_refuses_more_words_than_descriptors_allow(folder, own_models):
     with pytest.raises(UsageError, match=r"at most \d+ words"):
         train(folder, own_models, "--kind", "vlad", "--count", "5000")

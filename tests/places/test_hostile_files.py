@@ -34,12 +34,12 @@ def map_path(valley, tmp_path):
 
 @pytest.mark.parametrize("name", ["", "a\0b.gpkg", "\ud800.gpkg", "/"])
 @pytest.mark.parametrize("use", [PlaceMap.open, PlaceMap.open_for_adding, lambda path: PlaceMap.create(path, SPEC)])
-def test_a_name_that_no_file_can_have_is_a_wrong_request(use, name):
+def test_place_map_refuses_a_name_that_no_file_can_have(use, name):
     with pytest.raises(UsageError):
         use(name)
 
 
-def test_a_name_that_is_not_utf_8_is_a_name(tmp_path):
+def test_place_map_takes_a_name_that_is_not_utf_8(tmp_path):
     path = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.gpkg")
     PlaceMap.create(path, SPEC).close()
     with PlaceMap.open(path) as place_map:
@@ -48,7 +48,7 @@ def test_a_name_that_is_not_utf_8_is_a_name(tmp_path):
 
 @pytest.mark.parametrize("end", ["", "-wal", "-journal"])
 @pytest.mark.parametrize("use", [PlaceMap.open, PlaceMap.open_for_adding])
-def test_a_pipe_is_refused_and_not_waited_for(map_path, use, end):
+def test_place_map_refuses_a_pipe_and_does_not_wait_for_it(map_path, use, end):
     path = map_path.with_name(map_path.name + end)
     path.unlink(missing_ok=True)
     os.mkfifo(path)
@@ -91,7 +91,7 @@ for _key, _value in WRONG_VALUES:
 
 
 @pytest.mark.parametrize(("change", "says"), TAMPERED.items(), ids=range(len(TAMPERED)))
-def test_a_map_that_was_tampered_with_is_refused_in_a_sentence(map_path, change, says):
+def test_place_map_refuses_a_map_that_was_tampered_with_in_a_sentence(map_path, change, says):
     write_sql(map_path, change)
     for use in (PlaceMap.open, PlaceMap.open_for_adding):
         with pytest.raises(MapError, match=says) as caught:
@@ -99,7 +99,7 @@ def test_a_map_that_was_tampered_with_is_refused_in_a_sentence(map_path, change,
         assert len(str(caught.value)) < 1500
 
 
-def test_a_summary_says_what_it_can(map_path):
+def test_describe_map_says_what_it_can(map_path):
     write_sql(
         map_path,
         "UPDATE gpkg_contents SET min_x = NULL, max_y = 'north'",
@@ -110,7 +110,7 @@ def test_a_summary_says_what_it_can(map_path):
     assert (info.places, info.extent, info.first_time) == (PLACES, None, None)
 
 
-def test_bits_flipped_in_the_header_are_a_sentence(map_path):
+def test_place_map_reads_a_header_with_bits_flipped_or_refuses_it(map_path):
     rng, whole = np.random.default_rng(1), map_path.read_bytes()
     for _ in range(60):
         data = bytearray(whole)
@@ -124,7 +124,7 @@ def test_bits_flipped_in_the_header_are_a_sentence(map_path):
                 place_map.read_fine_part(place_id)
 
 
-def test_a_damaged_page_hides_only_the_places_on_it(map_path):
+def test_check_places_misses_only_the_places_on_a_damaged_page(map_path):
     page_bytes, data, lost = 4096, map_path.read_bytes(), []
     for page in range(1, len(data) // page_bytes):
         damaged = bytearray(data)
@@ -144,7 +144,7 @@ def test_a_damaged_page_hides_only_the_places_on_it(map_path):
     assert sorted(lost)[len(lost) * 9 // 10] <= 8
 
 
-def test_a_large_value_is_not_read(map_path):
+def test_place_map_leaves_out_a_place_with_a_large_value(map_path):
     if sys.version_info < (3, 11):
         pytest.skip("this Python cannot ask SQLite for it")
     write_sql(map_path, "UPDATE places SET source_image = CAST(zeroblob(300000) AS TEXT) WHERE place_id = 3")
@@ -153,7 +153,7 @@ def test_a_large_value_is_not_read(map_path):
         assert list(place_map.left_out) == [3]
 
 
-def test_a_name_and_a_time_that_cannot_be_written_cost_no_place(map_path):
+def test_place_map_keeps_a_place_whose_name_and_time_cannot_be_written(map_path):
     odd = dataclasses.replace(frame(41), name=os.fsdecode(b"\xff\xfe.jpg"), t_utc_s=1.7e12)
     later = dataclasses.replace(frame(42), name="\ud800.jpg", t_utc_s=1e308)
     with PlaceMap.open_for_adding(map_path) as place_map:
@@ -166,7 +166,7 @@ def test_a_name_and_a_time_that_cannot_be_written_cost_no_place(map_path):
     assert (second.source_image, second.t_utc_s) == ("\\ud800.jpg", None)
 
 
-def test_two_programs_never_add_to_one_map_at_once(map_path):
+def test_open_for_adding_admits_one_program_at_a_time(map_path):
     with PlaceMap.open_for_adding(map_path) as place_map:
         second = subprocess.run(
             [sys.executable, map_writer.__file__, str(map_path), "1"], capture_output=True, text=True, timeout=60

@@ -67,7 +67,7 @@ def test_map_page_shows_places_and_their_problems(browser, mapped):
 
 
 @pytest.mark.slow
-def test_a_page_is_never_written_over_the_map(mapped, capsys):
+def test_map_page_is_never_written_over_the_map(mapped, capsys):
     before = (mapped / "valley.gpkg").read_bytes()
     assert "another name" in refused(capsys, "map", "info", mapped / "valley.gpkg", "--page", mapped / "valley.gpkg")
     assert (mapped / "valley.gpkg").read_bytes() == before
@@ -91,7 +91,7 @@ def test_find_gaps_where_a_picture_is_missing_between_others(tmp_path):
     assert find_gaps([replace(place, pose=None) for place in places]) == ([], 0.0, 0.0)
 
 
-def test_find_tags_off_names_those_far_from_their_pictures(tmp_path):
+def test_find_inconsistent_tags_names_those_far_from_their_pictures(tmp_path):
     places = [
         replace(place, pose=replace(place.pose, recorded=Position(*position(0.1 * at, 400.0 if at == 4 else 0.0))))
         for at, place in enumerate(places_in(tmp_path))

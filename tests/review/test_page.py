@@ -44,7 +44,7 @@ def test_make_flight_page_of_a_real_flight_has_all_parts(made):
     assert data["warnings"] == [], "nothing is missing"
 
 
-def test_query_and_match_stand_side_by_side_though_their_pictures_have_one_name(made, flown):
+def test_flight_page_shows_query_and_match_side_by_side_though_their_pictures_have_one_name(made, flown):
     data = data_of(made.read_text("utf-8"))
     (seen_as, seen), (found_as, found) = (
         (caption, cv2.imdecode(np.frombuffer(base64.b64decode(data["pictures"][at].partition(",")[2]), np.uint8), 0))
@@ -56,7 +56,7 @@ def test_query_and_match_stand_side_by_side_though_their_pictures_have_one_name(
     assert abs(seen.astype(int) - found).mean() > 20
 
 
-def test_only_pictures_of_the_folders_that_are_given_are_shown(tmp_path):
+def test_make_album_finds_pictures_of_the_folders_that_are_given_only(tmp_path):
     folder = tmp_path / "given"
     folder.mkdir()
     cv2.imwrite(str(tmp_path / "secret.png"), np.full((20, 20), 90, np.uint8))
@@ -68,7 +68,7 @@ def test_only_pictures_of_the_folders_that_are_given_are_shown(tmp_path):
         assert album.find_image(name) is None
 
 
-def test_names_in_the_log_are_text_and_nothing_else(tmp_path):
+def test_flight_page_takes_names_in_the_log_as_text(tmp_path):
     nasty = query(
         NASTY, reason={"code": "UNUSABLE", "parameters": {"problem": NASTY}}, reference_image=NASTY, accepted=False
     )
@@ -80,13 +80,13 @@ def test_names_in_the_log_are_text_and_nothing_else(tmp_path):
     assert not {"\x1b", "\u202e"} & set(content)
 
 
-def test_positions_that_cross_the_date_line_stay_together(tmp_path):
+def test_flight_page_keeps_positions_across_the_date_line_together(tmp_path):
     at = [{"position": None, "fix": None, "located": {"lat_deg": 0.0, "lon_deg": lon}} for lon in (179.999, -179.999)]
     data = data_of(page(write_log(tmp_path / "log", *(("query", query("a", **each)) for each in at))))
     assert data["ground"]["box"][2] == pytest.approx(222.6 + 2 * 30, rel=0.01)
 
 
-def test_a_map_that_is_not_there_is_no_reason_to_have_no_page(flown, tmp_path):
+def test_report_makes_a_page_without_the_map(flown, tmp_path):
     log = write_log(tmp_path / "log", ("start", {"map": str(tmp_path / "gone.gpkg")}), ("query", query("a")))
     assert run("report", log, "--out", tmp_path / "out.html") == 0
     data = data_of((tmp_path / "out.html").read_text("utf-8"))
@@ -108,7 +108,7 @@ def test_a_map_that_is_not_there_is_no_reason_to_have_no_page(flown, tmp_path):
         (["empty", "--out", "out.html"], 1, "holds no line of a flight log"),
     ],
 )
-def test_what_cannot_be_done_is_said_in_a_sentence(tmp_path, monkeypatch, capsys, argv, code, said):
+def test_report_refuses_what_cannot_be_done_in_a_sentence(tmp_path, monkeypatch, capsys, argv, code, said):
     monkeypatch.chdir(tmp_path)
     write_log(tmp_path / "LOG", ("query", query("a")))
     (tmp_path / "empty").touch()

@@ -32,7 +32,7 @@ def _best_shift(asked: np.ndarray, code: np.ndarray) -> list[int]:
 
 
 @pytest.mark.parametrize(("right", "down"), [(0, 0), (2, 0), (0, -3), (-2, 1), (1, 3)])
-def test_a_moved_camera_finds_the_place_and_how_far_it_moved(town, right, down):
+def test_scan_codes_finds_the_place_of_a_moved_camera_and_how_far_it_moved(town, right, down):
     grounds, mean, codes = town
     asked = _ask(seen_from_above(grounds[5], 512, 0.0, round(_CELL_PX * right), round(_CELL_PX * down)), mean)
     assert placecode.scan_codes(asked, codes).argmax() == 5
@@ -53,7 +53,7 @@ def test_what_a_mask_hides_says_nothing(town):
     assert abs(asked).sum(axis=1).max() == 1152 / 2
 
 
-def test_the_scan_is_the_product_spelt_out(town):
+def test_scan_codes_is_the_product_spelt_out(town):
     _, mean, _ = town
     rng = np.random.default_rng(1)
     codes = rng.integers(0, 256, (600, 144), dtype=np.uint8)  # a whole block of places and a part
@@ -63,7 +63,7 @@ def test_the_scan_is_the_product_spelt_out(town):
 
 
 @pytest.mark.parametrize(("right", "down"), [(0, 0), (1, 0), (1, 1), (-3, 2), (-1, -3)])
-def test_of_many_places_the_best_are_looked_at_under_every_shift(town, right, down):
+def test_scan_in_two_steps_looks_at_the_best_of_many_places_under_every_shift(town, right, down):
     grounds, mean, codes = town
     many = np.concatenate([np.random.default_rng(3).integers(0, 256, (5000, 144), dtype=np.uint8), codes])
     asked = _ask(seen_from_above(grounds[5], 512, 0.0, round(_CELL_PX * right), round(_CELL_PX * down)), mean)

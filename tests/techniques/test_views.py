@@ -24,7 +24,7 @@ def town():
     return technique, places, np.stack([place.coarse for place in places])
 
 
-def test_a_hypothesis_is_a_height_and_a_rotation():
+def test_decode_hypothesis_gives_a_height_and_a_rotation():
     assert decode_hypothesis(0) == (0.5, 0)
     assert decode_hypothesis(2 * ROTATIONS + 7) == (1.0, 7)
     nearest = [find_nearest_height(HEIGHT_RATIOS, ratio) for ratio in (0.1, 0.58, 0.6, 0.9, 1.3, 5)]
@@ -35,7 +35,7 @@ def test_a_hypothesis_is_a_height_and_a_rotation():
     ("height_ratio", "turned_deg"),
     list(zip([0.5, 0.6, 0.7, 0.84, 1.0, 1.0, 1.19, 1.42, 1.7, 2.0], [0, 130] * 5, strict=True)),
 )
-def test_a_query_from_another_height_is_found_with_its_height_rotation_and_shift(town, height_ratio, turned_deg):
+def test_cohog_finds_a_query_from_another_height_with_its_height_rotation_and_shift(town, height_ratio, turned_deg):
     technique, places, rows = town
     query = technique.encode(seen(3, height_ratio, turned_deg, right_px=24))
     matches = {}
