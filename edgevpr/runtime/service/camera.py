@@ -1,5 +1,5 @@
-"""Checks of the source of frames, for `edgevpr check` and `doctor`: the device or the program that reads the camera,
-the cable, and a first frame that fits the lens."""
+"""Checks of the frame source for `edgevpr check` and `doctor`: the device or program that reads the camera, the ribbon
+cable, and whether a first frame matches the lens calibration."""
 
 import re
 import subprocess
@@ -18,16 +18,16 @@ from edgevpr.runtime.recognise.levelling import load_calibrated_lens
 from edgevpr.runtime.service.finding import Finding, check_device, report_fault, report_ok, run_check
 from edgevpr.runtime.service.findingcodes import FindingCode
 
-FRAME_WAIT_S = 65.0  # longer than any source takes to report that it is lost; a pipeline that starts slowly takes most
+FRAME_WAIT_S = 65.0  # longer than any source needs to report that it is lost; slow pipelines take longest
 _FRAMELESS_CONDITIONS = (Condition.LOST, Condition.FROZEN, Condition.DAMAGED, Condition.LATE)
-_LIST_TIMEOUT_S = 10.0  # for the program to list the cameras
+_LIST_TIMEOUT_S = 10.0  # for the program's --list-cameras
 _CAMERA_LINE = re.compile(r"(?m)^\s*(\d+) : (\S+)")
 _LIBCAMERA_DEVICES = ("media*", "video*", "dma_heap/*")  # below /dev
 
 
 def check_camera(uri: str, root: Path = Path("/")) -> Iterator[Finding]:
-    """Check the device or the program by which a live source is read. Other sources have no finding. `root` is the root
-    of the file system with /dev."""
+    """Check the device or program that a live source is read through. Other sources yield no finding. `root`: root of
+    the file system that contains /dev."""
     if uri.startswith("/dev/"):
         yield check_device("camera", uri, root)
     elif is_program_uri(uri):
@@ -35,8 +35,8 @@ def check_camera(uri: str, root: Path = Path("/")) -> Iterator[Finding]:
 
 
 def _check_program(what: str, uri: str, root: Path) -> Finding:
-    """Check that the program that reads a camera is installed; for one on a Raspberry Pi's ribbon, check its devices,
-    and that the program lists it."""
+    """Check that the program that reads a camera is installed. For a Raspberry Pi camera on a ribbon cable, also check
+    its devices, and that the program lists the camera."""
     from edgevpr.frames.programs import require_program  # loads FFmpeg
 
     program = require_program(uri)
@@ -59,8 +59,8 @@ def _check_program(what: str, uri: str, root: Path) -> Finding:
 
 
 def check_frame(what: str, config: SourceConfig) -> Finding:
-    """Open the source, wait for a frame, 65 s at most, and check its age. Raises ImageError if it does not fit the
-    lens, SourceError if the source cannot be opened, and ConfigError for a calibration that cannot be used."""
+    """Open the source, wait up to 65 s for a frame, and check its age. Raises ImageError if the frame does not match
+    the lens calibration, SourceError if the source cannot be opened, ConfigError if the calibration cannot be used."""
     assert config.uri is not None
     lens, begin_s = load_calibrated_lens(config), time.monotonic()
     with closing(open_source(config.uri, live=True)) as source:
@@ -79,15 +79,15 @@ def check_frame(what: str, config: SourceConfig) -> Finding:
 
 
 def _read_size(source: Source) -> tuple[int, int] | None:
-    """Wait for a frame, 65 s at most; return its width and height in pixels (None: no frame came)."""
+    """Wait up to 65 s for a frame; return its width and height in pixels (None: no frame arrived)."""
     begin_s = time.monotonic()
-    is_hopeless = False
-    while not (is_hopeless or source.ended) and time.monotonic() < begin_s + FRAME_WAIT_S:
-        is_hopeless = source.condition in _FRAMELESS_CONDITIONS  # asked before the frame is read: a last one may wait
+    is_failed = False
+    while not (is_failed or source.ended) and time.monotonic() < begin_s + FRAME_WAIT_S:
+        is_failed = source.condition in _FRAMELESS_CONDITIONS  # read first: a last frame may still be queued
         try:
             frame = source.read(0.25)
         except ImageError:
-            if source.is_live:  # not damaged, but of a kind that the flight would refuse
+            if source.is_live:  # the frame is intact, but a flight would refuse it
                 raise
             continue
         if frame:

@@ -1,5 +1,5 @@
-"""`edgevpr check`: checks whether a configuration is ready to fly. It opens everything that `edgevpr run` opens, and
-closes it again."""
+"""`edgevpr check`: checks whether a configuration is ready to fly, by opening and closing everything that `edgevpr run`
+opens."""
 
 import time
 from contextlib import closing
@@ -29,8 +29,8 @@ from edgevpr.runtime.service.findingcodes import FindingCode
 
 
 def check_configuration(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
-    """Check everything that a flight needs, and return a finding for each part. It waits for a frame of the source and
-    a heartbeat of the autopilot, unless `offline`: then it is enough that source and link can be opened."""
+    """Check everything that a flight needs, and return a finding for each part. Waits for a frame from the source and a
+    heartbeat from the autopilot; if `offline`, only checks that source and link can be opened."""
     try:
         config = load_config(config_path)
     except EdgevprError as error:
@@ -41,9 +41,9 @@ def check_configuration(config_path: str | Path, *, offline: bool = False) -> li
         board = resolve_board(load_board(config.board), source, config.memory)
         findings.append(report_ok("board", FindingCode.BOARD_KNOWN, board=board.title, memory_mb=board.memory_max_mb))
         findings.append(run_check("map", lambda what: _check_map(what, config, board)))
-    except ConfigError as error:  # without a board the cost of the map is unknown
+    except ConfigError as error:  # the cost of a query cannot be estimated without a board
         findings.append(report_error("board", error))
-    show_waiting("opening the source" if offline else f"waiting for a frame of the source, {FRAME_WAIT_S:g} s at most")
+    show_waiting("opening the source" if offline else f"waiting up to {FRAME_WAIT_S:g} s for a frame from the source")
     findings.append(run_check("source", lambda what: _check_source(what, source, offline)))
     show_waiting("waiting for the flight controller")
     findings.append(run_check("link", lambda what: _check_link(what, config.mavlink, offline)))
@@ -76,7 +76,7 @@ def _check_source(what: str, settings: SourceConfig, offline: bool) -> Finding:
     if is_live(uri) and (cause := find_missing_cause(uri)):
         return report_fault(what, FindingCode.CAMERA_ABSENT, problem=cause)
     with closing(open_source(uri, live=True)) as source:
-        # Wait until FFmpeg has given up (10 s at most): a capture that returns while Python ends aborts the process.
+        # Wait until FFmpeg gives up (at most 10 s): a capture that returns while Python exits aborts the process.
         while source.condition is Condition.OPENING:
             time.sleep(0.05)
         return report_ok(what, FindingCode.SOURCE_OPENED, uri=uri, state=source.state)

@@ -1,4 +1,4 @@
-"""`edgevpr doctor`: checks whether flight controller and board are set up for edgevpr. It only reads, never writes."""
+"""`edgevpr doctor`: checks whether flight controller and board are set up for edgevpr. It changes neither."""
 
 from collections.abc import Iterable, Iterator
 
@@ -17,17 +17,17 @@ from edgevpr.runtime.service.finding import Finding, check_machine, report_error
 from edgevpr.runtime.service.findingcodes import FindingCode
 from edgevpr.runtime.service.rules import RULES
 
-_MAX_ROUND_TRIP_S = 0.25  # fixes would be as late
-_MAX_BAD_BYTES = 300  # the rest of a message or two at the start is usual
+_MAX_ROUND_TRIP_S = 0.25  # a slow link delays fixes too
+_MAX_BAD_BYTES = 300  # the remainder of one or two messages at the start is normal
 _NEEDED_MESSAGES = ("GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT")
 _MAX_CLOCK_DIFFERENCE_S = 60.0
 _GPS_FIX_TYPE_3D = 3
 
 
 def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], AutopilotReading | None]:
-    """Check the autopilot at the other end of the link `address`, and this machine. Return the findings, and what was
-    read from the autopilot (None: nothing could be read). Raises ConfigError for a board that is unknown or a signing
-    key that cannot be used."""
+    """Check the autopilot at the other end of the link `address`, and this machine. Return the findings and the
+    autopilot's reading (None: nothing could be read). Raises ConfigError for an unknown board or a signing key that
+    cannot be used."""
     settings, source = config.mavlink, config.source
     signing = open_signing(settings, is_read_only=True)
     machine_findings = list(check_machine(load_board(config.board), config.log, address))
@@ -53,7 +53,7 @@ def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], Au
 
 
 def explain_silence(address: LinkAddress, inquiry: RequestLink) -> Finding:
-    """Return the finding that explains, by what else has arrived, why no heartbeat of the autopilot was received."""
+    """Return the finding that explains, from what was received instead, why no autopilot heartbeat was received."""
     link = str(address)
     if refused := inquiry.signing.refused:
         cause = max(refused, key=lambda reason: refused[reason])
@@ -73,8 +73,8 @@ def explain_silence(address: LinkAddress, inquiry: RequestLink) -> Finding:
 
 
 def check_autopilot(reading: AutopilotReading, address: LinkAddress, sends_fixes: bool) -> Iterator[Finding]:
-    """Check what was read from the autopilot against what the flight will do, and yield a finding for each check: those
-    for every autopilot, and those of the rules of its firmware."""
+    """Check an autopilot's reading for a flight that sends fixes or not. Yield a finding for each check that applies to
+    every autopilot, then for each rule of its firmware."""
     yield _check_link(reading, address)
     yield _check_signing(reading)
     if reading.other_systems:
@@ -95,10 +95,10 @@ def check_autopilot(reading: AutopilotReading, address: LinkAddress, sends_fixes
 
 def _check_firmware(reading: AutopilotReading) -> Finding:
     rules = RULES[reading.firmware]
-    known = {"firmware": rules.name, "version": reading.version_text or "of unknown version"}
+    facts = {"firmware": rules.name, "version": reading.version_text or "of unknown version"}
     if reading.version is None or reading.version[:2] < rules.min_version:
-        return report_fault("firmware", FindingCode.FIRMWARE_OLD, least=".".join(map(str, rules.min_version)), **known)
-    return report_ok("firmware", FindingCode.FIRMWARE_KNOWN, vehicle=reading.vehicle, **known)
+        return report_fault("firmware", FindingCode.FIRMWARE_OLD, least=".".join(map(str, rules.min_version)), **facts)
+    return report_ok("firmware", FindingCode.FIRMWARE_KNOWN, vehicle=reading.vehicle, **facts)
 
 
 def _check_link(reading: AutopilotReading, address: LinkAddress) -> Finding:
@@ -129,7 +129,7 @@ def _check_signing(reading: AutopilotReading) -> Finding:
 
 
 def _check_state(reading: AutopilotReading) -> Iterator[Finding]:
-    """Check what the autopilot sends and knows at this moment."""
+    """Check the autopilot's current state: streams, filter, GPS, origin and clock."""
     if missing := [name for name in _NEEDED_MESSAGES if name not in reading.received]:
         yield report_fault("streams", FindingCode.STREAMS_MISSING, missing=" and no ".join(missing))
     else:
@@ -157,7 +157,7 @@ def _check_state(reading: AutopilotReading) -> Iterator[Finding]:
 def _check_filter(reading: AutopilotReading) -> Finding:
     if (flags := reading.filter_flags) is None:
         return report_fault("filter", FindingCode.FILTER_UNKNOWN)
-    # ArduPilot's filter assumes a constant position when it has nothing to navigate by; PX4's also while it stands.
+    # ArduPilot's filter assumes a constant position if it has no aiding source. PX4's also does so on the ground.
     is_lost = flags & mavlink.EKF_CONST_POS_MODE and reading.firmware != "px4"
     if flags & mavlink.EKF_ATTITUDE and flags & mavlink.EKF_POS_HORIZ_ABS and not is_lost:
         return report_ok("filter", FindingCode.FILTER_READY, flags=flags)

@@ -1,5 +1,4 @@
-"""Findings of `edgevpr check` and `edgevpr doctor`, and the checks of this machine: memory, devices, and the disk of
-the logs."""
+"""Findings of `edgevpr check` and `edgevpr doctor`, and the checks of this machine: memory, devices and log disk."""
 
 import grp
 import os
@@ -21,14 +20,14 @@ from edgevpr.power.boards import Board
 from edgevpr.runtime.service.findingcodes import FindingCode
 
 MIN_LOG_SPACE_MB = 10  # some hours of queries
-_SYSTEM_GROUPS = ("root", "tty")  # not for users: a login shell holds the device, or a udev rule is missing
+_SYSTEM_GROUPS = ("root", "tty")  # no user belongs here: a login shell holds the device, or a udev rule is missing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """Result of one check. `what`: name of what was checked. `reason`: what was found, by a code with parameters.
-    `changes`: the exact changes that put it right if it is not `ok`, such as `GPS2_TYPE=14`. `exit_code`: that of a
-    command with such a result, and of a flight that would end by it."""
+    """Result of one check. `what`: name of the item checked. `reason`: the result, as a code with parameters.
+    `changes`: the exact changes that fix the item if it is not `ok`, such as `GPS2_TYPE=14`. `exit_code`: exit code of
+    the command, and of a flight that would end because of this fault."""
 
     what: str
     ok: bool
@@ -49,22 +48,22 @@ class Finding:
 
 
 def report_ok(what: str, code: Code, **parameters: float | str | None) -> Finding:
-    """Return a finding with nothing to change."""
+    """Return a finding that needs no change."""
     return Finding(what=what, ok=True, reason=Reason(code, parameters))
 
 
 def report_fault(what: str, code: Code, *changes: str, **parameters: float | str | None) -> Finding:
-    """Return a finding with something wrong, which `changes` put right."""
+    """Return a finding of a fault that `changes` fix."""
     return Finding(what=what, ok=False, reason=Reason(code, parameters), changes=changes, exit_code=1)
 
 
 def report_error(what: str, error: EdgevprError) -> Finding:
-    """Return the finding of an error that would end a flight."""
+    """Return the finding for an error that would end a flight."""
     return replace(report_fault(what, ReasonCode.UNUSABLE, problem=str(error)), exit_code=error.exit_code)
 
 
 def run_check(what: str, check: Callable[[str], Finding]) -> Finding:
-    """Return the finding of a `check`, which takes the name of what it checks, or that of the error that it raises."""
+    """Call `check` with the name `what`. Return its finding or, if it raises an error, a finding for that error."""
     try:
         return check(what)
     except EdgevprError as error:
@@ -74,7 +73,7 @@ def run_check(what: str, check: Callable[[str], Finding]) -> Finding:
 
 
 def format_findings(findings: Iterable[Finding]) -> Iterator[str]:
-    """Yield the findings as lines of text: one for each finding, then one for each of its changes."""
+    """Yield lines of text: one for each finding, each followed by one line for each of its changes."""
     for finding in findings:
         yield f"{'ok   ' if finding.ok else 'WRONG'}  {finding.what:<14} {finding.reason}"
         yield from (f"{'':<22}change: {change}" for change in finding.changes)
@@ -83,8 +82,8 @@ def format_findings(findings: Iterable[Finding]) -> Iterator[str]:
 def check_machine(
     board: Board, log: LogConfig, address: LinkAddress | None, root: Path = Path("/")
 ) -> Iterator[Finding]:
-    """Check this machine, as `board`, for a flight with a `log` over the link `address` (None: no link). `root` is the
-    root of the file system with /proc, /sys and /dev."""
+    """Check memory, serial port and log disk of this machine for a flight as `board`. `address`: the MAVLink link
+    (None: no link). `root`: root of the file system that contains /proc, /sys and /dev."""
     yield _check_memory(board.memory_max_mb, root)
     if address and address.kind == "serial":
         yield check_device("serial", address.where, root)
@@ -92,8 +91,8 @@ def check_machine(
 
 
 def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
-    """Check that a device file exists, that no other program has it open, and that this user may use it; and that a
-    serial port is not a console. `what` names the check in the finding."""
+    """Check that a device file exists, that no other program has it open, and that this user may access it. If `what`,
+    the name of the finding, is "serial", also check that the port is not a console."""
     file = root / path.lstrip("/")
     try:
         status, port = file.stat(), file.resolve()
@@ -123,10 +122,10 @@ def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
 
 
 def check_log(what: str, file: str | None) -> Finding:
-    """Check that the flight log `file` can be written, if there is one."""
+    """Check that the flight log `file` can be written (None or empty: no log is configured)."""
     if not file:
         return report_ok(what, FindingCode.NO_LOG)
-    # A log is not opened for the check: if root checked, it would leave a file that the service may not write.
+    # Do not open the log for this check: run by root, that would create a file that the service cannot write.
     path = Path(file).absolute()
     if path.is_dir() or not path.parent.is_dir():
         return report_fault(what, FindingCode.LOG_NOT_A_FILE, path=str(path))
@@ -151,8 +150,8 @@ def _check_memory(needed_mb: float, root: Path) -> Finding:
 
 
 def _find_console(port: Path, root: Path) -> str | None:
-    """Return the name of a port as the kernel's console, now or after the next start, e.g. "ttyS0"; None if the kernel
-    has no console on it."""
+    """Return the name, e.g. "ttyS0", under which the kernel uses a port as its console, now or after the next boot;
+    None if the port is not a console."""
     texts = (machine.read_text(root / name) or "" for name in ("proc/cmdline", "boot/firmware/cmdline.txt"))
     words = " ".join(texts).split()
     consoles = (word.removeprefix("console=").split(",")[0] for word in words if word.startswith("console="))
@@ -160,11 +159,11 @@ def _find_console(port: Path, root: Path) -> str | None:
 
 
 def _find_program(port: Path, root: Path) -> tuple[str | None, bool]:
-    """Return the program that uses a device, as "NAME (process PID)", None if none is seen; and whether the device is
-    its terminal, as it is of a login shell. Only root sees the open files of other users' programs."""
+    """Return the program that uses a device, as "NAME (process PID)" (None: none found), and whether the device is the
+    program's terminal, as with a login shell. Only root can see the open files of other users' programs."""
     device = port.stat().st_rdev
     major, minor = os.major(device), os.minor(device)
-    terminal = str(minor & 0xFF | major << 8 | (minor & ~0xFF) << 12)  # the number that proc(5) calls tty_nr
+    terminal = str(minor & 0xFF | major << 8 | (minor & ~0xFF) << 12)  # tty_nr of proc(5)
     for process in sorted((root / "proc").glob("[0-9]*"), key=lambda folder: int(folder.name)):
         if process.name == str(os.getpid()):
             continue

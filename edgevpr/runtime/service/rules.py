@@ -1,8 +1,8 @@
-"""Rules of `edgevpr doctor` for each firmware: whether the channel that the flight will choose can carry positions to
-this vehicle, and which parameters to change if not.
+"""Rules of `edgevpr doctor` for each firmware: whether this vehicle can use positions from the channel that the flight
+will choose, and if not, which parameters to change.
 
-Every rule of ArduPilot is based on the sources of 4.7-dev, every rule of PX4 on those of 1.17-alpha; their channels
-were flown in simulation with GPS taken away, with PX4 1.17.0 and 1.18-beta1.
+The rules are based on the sources of ArduPilot 4.7-dev and PX4 1.17-alpha. The channels were flown without GPS in
+simulation, those of PX4 with 1.17.0 and 1.18-beta1.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,10 +23,10 @@ _SOURCE_OPTICAL_FLOW = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FirmwareRules:
-    """Rules of one firmware. `min_version`: first version (major, minor) that takes position fixes. `parameters`: names
-    of the parameters to be read. `check` checks what was read from an autopilot for a flight that sends fixes or not.
-    `port_changes` takes a baud rate and returns the parameters that the autopilot's serial port needs for it, each as a
-    text such as "SERIALn_PROTOCOL=2" (n: the number of the port)."""
+    """Rules of one firmware. `min_version`: first version (major, minor) that accepts position fixes. `parameters`:
+    names of the parameters to read. `check` yields findings on an autopilot's reading; its flag is True for a flight
+    that sends fixes. `port_changes` returns the parameters that the autopilot's serial port needs for a baud rate, each
+    as a text such as "SERIALn_PROTOCOL=2" (n: number of the port)."""
 
     name: str
     min_version: tuple[int, int]
@@ -52,7 +52,7 @@ def _report_channel(choice: ChannelChoice) -> Finding:
 
 
 def _check_parameters(table: ParameterTable, choice: ChannelChoice, reading: AutopilotReading) -> Iterator[Finding]:
-    """Check the parameters that change what our messages do: one finding for each row of the table that is broken."""
+    """Check the parameters that affect our messages: yield one finding for each rule of the table that is violated."""
     faults = table.find_faults(choice, reading.parameters)
     for fault in faults:
         yield Finding(what=fault.rule.label, ok=False, reason=fault.reason, changes=fault.changes, exit_code=1)
@@ -61,10 +61,10 @@ def _check_parameters(table: ParameterTable, choice: ChannelChoice, reading: Aut
 
 
 def _check_single_fixes(choice: ChannelChoice, reading: AutopilotReading, sends_fixes: bool) -> Finding:
-    """Check the use of command 43003, which sends single fixes: something else, such as airspeed or optical flow, must
-    carry the vehicle's position from one fix to the next."""
+    """Check the use of command 43003. It sends single fixes, so the autopilot must track its position between them by
+    another sensor, such as airspeed or optical flow."""
     parameters = reading.parameters
-    hovers = parameters.get("Q_ENABLE") == 1  # only planes have it, whatever type the heartbeat reports
+    hovers = parameters.get("Q_ENABLE") == 1  # only planes have this parameter, whatever type the heartbeat reports
     if reading.kind is VehicleKind.PLANE and not hovers:
         return _report_channel(choice)
     flow = parameters.get("FLOW_TYPE", 0)
@@ -82,8 +82,8 @@ def _check_single_fixes(choice: ChannelChoice, reading: AutopilotReading, sends_
 
 
 def _report_dry_run(choice: ChannelChoice, reading: AutopilotReading) -> Finding:
-    """Return the finding about a continuous channel in a dry run, which sends no positions: ArduPilot does not arm
-    without positions on every channel that is set up."""
+    """Return the fault of a continuous channel in a dry run: no positions are sent, and ArduPilot does not arm unless
+    it receives positions on every channel that is configured."""
     change = "VISO_TYPE=0"
     if choice.channel is Channel.GPS_INPUT:
         name = resolve_name(reading.parameters, RECEIVERS[choice.receiver])
@@ -99,7 +99,7 @@ def _check_px4(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Findin
         yield _report_channel(choice)
     elif AGP_CONTROL in reading.parameters:
         yield replace(_report_channel(choice), ok=False, changes=(f"{AGP_CONTROL}={POSITION_BIT}",), exit_code=1)
-        choice = replace(choice, channel=Channel.SENSOR)  # for the other parameters that it will need
+        choice = replace(choice, channel=Channel.SENSOR)  # check the parameters that this channel will need
     elif reading.kind is VehicleKind.PLANE:
         yield _report_channel(choice)
     else:
@@ -130,7 +130,7 @@ RULES = {
         min_version=(1, 15),
         parameters=PX4_TABLE.names,
         check=_check_px4,
-        # TELEM 2, the usual port for a companion.
+        # TELEM 2 is the usual port for a companion computer.
         port_changes=lambda baud: ("MAV_1_CONFIG=102", "MAV_1_MODE=2", f"SER_TEL2_BAUD={baud}"),
     ),
 }

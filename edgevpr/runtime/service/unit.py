@@ -1,4 +1,4 @@
-"""The systemd unit of a flight, which `edgevpr service print` prints; deploy/README.md installs it."""
+"""The systemd unit of a flight, printed by `edgevpr service print` (installation: deploy/README.md)."""
 
 import re
 
@@ -8,7 +8,7 @@ from edgevpr.power.boards import Board
 
 
 def render_unit(board: Board) -> str:
-    """Return the text of deploy/edgevpr.service with the limits of a board."""
+    """Return the text of deploy/edgevpr.service with the memory and CPU limits of a board."""
     changed = {
         "# Board: ": escape_unprintable(board.name),
         "MemoryMax=": f"{board.memory_max_mb * 1e6:.0f}",
