@@ -1,10 +1,10 @@
 """Choice of a technique for a board, by accuracy and cost.
 
-The accuracy of each technique, for a camera that looks down or forward, is that which `make results` measured on image
-sets. Its figures (accuracy.json) are installed with the program, so that no cost is ever shown without accuracy.
+The accuracy of each technique, for a downward or forward camera, was measured on image sets by `make results`. These
+figures (accuracy.json) are installed with the program, so that every cost can be shown with its accuracy.
 
-An option is a technique in one form. Of those that fit the board, the most accurate is chosen. A technique that
-accepted a wrong place on the image sets is never chosen automatically: its fixes would be sent.
+An option is a technique in one form. The most accurate option that fits the board is chosen. A technique that accepted
+a wrong place on the image sets is never chosen automatically, because its fixes would be sent.
 """
 
 import json
@@ -23,17 +23,17 @@ from edgevpr.power.boards import Board
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
 ACCURACY_PATH = Path(__file__).with_name("accuracy.json")
-_MAX_OBJECTIONS = 3  # named if nothing can be chosen
+_MAX_OBJECTIONS = 3  # reported if no option can be chosen
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accuracy:
-    """Accuracy of a technique in one form. `recall_at_1`: share of queries whose best place is right, 0..1, the mean
-    over the `sets` image sets that nothing was tuned on, with `queries` queries in total.
+    """Accuracy of a technique in one form. `recall_at_1`: share of queries whose best place is correct, 0..1, averaged
+    over the `sets` image sets not used for tuning, with `queries` queries in total.
 
-    The other fields are numbers of queries. `asked`: all queries of all image sets, also of those used for tuning.
-    `accepted`: their best place was accepted. `accepted_wrong`: it was accepted, and wrong. `accepted_elsewhere`: it
-    was accepted, and not even a neighbour of the right place.
+    The other fields are numbers of queries. `asked`: all queries of all image sets, including those used for tuning.
+    `accepted`: the best place was accepted. `accepted_wrong`: it was accepted, but wrong. `accepted_elsewhere`: it was
+    accepted, but wrong and not even a neighbour of the correct place.
     """
 
     recall_at_1: float
@@ -46,9 +46,9 @@ class Accuracy:
 
     @property
     def neighbours(self) -> str:
-        """Number of accepted wrong places that are neighbours of the right one, such as " (+3 beside)" ("": none)."""
+        """Number of accepted wrong places that neighbour the correct one, such as " (+3 adjacent)" ("": none)."""
         count = self.accepted_wrong - self.accepted_elsewhere
-        return f" (+{count} beside)" if count else ""
+        return f" (+{count} adjacent)" if count else ""
 
     def __str__(self) -> str:
         return (
@@ -59,8 +59,8 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demand:
-    """Requirements of a flight: places in RAM, queries per second, MB of RAM for the map's index, the direction of the
-    camera ("nadir" or "forward"; None: forward)."""
+    """Requirements of a flight: number of places in RAM, queries per second, MB of RAM for the map's index, and camera
+    direction ("nadir" or "forward"; None: forward)."""
 
     places: int
     rate_hz: float
@@ -73,10 +73,10 @@ class Demand:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """Whether a technique fits on a board, and what it takes there. `t_query_s`: wall seconds of a query. `cpu_s`: its
-    CPU-seconds of all cores together. `map_ram_mb`, `map_disk_mb`: size of the map's index in RAM, and of the map file.
-    `process_ram_mb`: RAM of the process with the index. `reachable_hz`: most queries per second. `misfit`: reason why
-    it does not fit, as words that follow a name (None: it fits)."""
+    """Whether a technique fits a board, and its cost there. `t_query_s`: wall seconds per query. `cpu_s`: CPU-seconds
+    per query, summed over all cores. `map_ram_mb`, `map_disk_mb`: size of the map's index in RAM, and of the map file.
+    `process_ram_mb`: RAM of the process with the index. `reachable_hz`: maximum queries per second. `misfit`: reason
+    why it does not fit, worded to follow a name (None: it fits)."""
 
     t_query_s: float
     cpu_s: float
@@ -89,8 +89,8 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Option:
-    """An option to choose (see the module), with its costs on the board and its `fit`. `label` is its unique name,
-    `name` that of the technique. `accuracy` is None if it was not measured."""
+    """A technique in one form, with its costs on the board and its `fit`. `label`: unique name of the option. `name`:
+    name of the technique. `accuracy`: None if it was not measured."""
 
     label: str
     name: str
@@ -100,20 +100,20 @@ class Option:
 
     @property
     def objection(self) -> str | None:
-        """Reason not to choose the option automatically, as words that follow its label; None if there is none."""
+        """Reason not to choose the option automatically, worded to follow its label; None if there is none."""
         if self.fit.misfit:
             return self.fit.misfit
         if self.accuracy is None:
-            return "was never measured: set it by name to use it"
+            return "was never measured: name it to use it"
         if self.accuracy.accepted_elsewhere:
-            return f"accepted {self.accuracy.accepted_elsewhere} wrong places: set it by name to use it"
+            return f"accepted {self.accuracy.accepted_elsewhere} wrong places: name it to use it"
         if self.costs.sequence > 1:
-            return "needs a flight along the mapped way: set it by name to use it"
+            return "needs a flight along the mapped route: name it to use it"
         return None
 
 
 def make_option(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Option:
-    """Make the option of the technique `name`. `label` is technique and form; `costs` are those on `board`."""
+    """Make the option of the technique `name`. `label`: technique and form. `costs`: costs on `board`."""
     return Option(
         label=label,
         name=name,
@@ -126,8 +126,8 @@ def make_option(board: Board, label: str, name: str, costs: TechniqueCosts, dema
 def find_accuracy(label: str, camera: str | None, candidates: int | None = None) -> Accuracy | None:
     """Return the accuracy of `label` (technique and form, see `techniques.labelled`); None if it was not measured.
 
-    `camera`: "nadir" (looks down) or "forward" (None: forward). `candidates`: number of places compared with a query,
-    if fewer than the technique's default (None: the default).
+    `camera`: "nadir" or "forward" (None: forward). `candidates`: number of places compared with a query, if fewer than
+    the technique's default (None: the default).
     """
     name = label if candidates is None else f"{label}, {candidates} candidates"
     figures = _read_accuracies()[camera or "forward"].get(name)
@@ -135,36 +135,36 @@ def find_accuracy(label: str, camera: str | None, candidates: int | None = None)
 
 
 def list_fewer_candidates(label: str, camera: str | None) -> tuple[int, ...]:
-    """Return the numbers of candidates, below the default, with which a technique was measured, largest first."""
+    """Return the numbers of candidates below the default that a technique was measured with, largest first."""
     names = _read_accuracies()[camera or "forward"]
-    matches = (re.fullmatch(rf"{re.escape(label)}, (\d+) candidates", name) for name in names)
-    return tuple(sorted((int(match[1]) for match in matches if match), reverse=True))
+    measured_labels = (re.fullmatch(rf"{re.escape(label)}, (\d+) candidates", name) for name in names)
+    return tuple(sorted((int(match[1]) for match in measured_labels if match), reverse=True))
 
 
 def choose_best(options: Sequence[Option], board: Board) -> Option | None:
-    """Choose the most accurate option without an objection, the cheaper one (in CPU time) of two alike. Options of the
-    board's own technique (`board.technique`) go before all others, even if none was measured, since the profile names
-    it. Returns None if no option is suitable."""
-    sound = [option for option in options if option.objection is None]
-    preferred = [option for option in sound if option.name == board.technique]
+    """Choose the most accurate option without an objection; of equally accurate ones, the one with less CPU time.
+    Options of the technique that the board's profile names (`board.technique`) take precedence, even if none of them
+    was measured. Returns None if no option is suitable."""
+    suitable = [option for option in options if option.objection is None]
+    preferred = [option for option in suitable if option.name == board.technique]
     unmeasured = (option for option in options if not (option.accuracy or option.fit.misfit))
-    if not preferred and (named := next((option for option in unmeasured if option.name == board.technique), None)):
-        return named
-    return max(preferred or sound, key=lambda option: (_get_recall(option), -option.fit.cpu_s), default=None)
+    if not preferred and (default := next((option for option in unmeasured if option.name == board.technique), None)):
+        return default
+    return max(preferred or suitable, key=lambda option: (_get_recall(option), -option.fit.cpu_s), default=None)
 
 
 def explain_no_choice(options: Sequence[Option], board: Board) -> str:
-    """Return the reason why `choose_best` returned None."""
+    """Return a sentence that explains why `choose_best` returned None."""
     objections = (f"{option.label} {option.objection}" for option in options[:_MAX_OBJECTIONS])
     return f"no technique suits {board.title}: {', and '.join(objections)}"
 
 
 def check_fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
-    """Check whether a technique fits: its index into the budget of RAM for the map, its process into the board's
-    memory, its queries into the CPU time.
+    """Check whether a technique fits a board: its index within the RAM budget of the map, its process within the
+    board's memory, and its queries within the CPU time.
 
-    A query must end before the next one begins, and before its fix is too old to be sent. All queries together may use
-    the share `cpu_share` of the cores.
+    A query must end before the next one begins, and before its fix is too old to send. Together, queries may use the
+    share `cpu_share` of the cores.
     """
     map_ram_mb = costs.ram_bytes_per_place * demand.places / 1e6
     process_ram_mb = costs.process_mb + map_ram_mb
@@ -172,14 +172,14 @@ def check_fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
     reachable_hz = min(1 / query.wall_s, board.cores * board.cpu_share / query.cpu_s)
     shortfalls = []
     if map_ram_mb > demand.budget_mb:
-        shortfalls.append(f"its map takes {map_ram_mb:.1f} MB of RAM and {demand.budget_mb:.1f} are allowed")
+        shortfalls.append(f"its map needs {map_ram_mb:.1f} MB of RAM ({demand.budget_mb:.1f} MB allowed)")
     if process_ram_mb > board.memory_max_mb:
-        shortfalls.append(f"the process takes {process_ram_mb:.0f} MB and {board.memory_max_mb:.0f} are allowed")
+        shortfalls.append(f"the process needs {process_ram_mb:.0f} MB ({board.memory_max_mb:.0f} MB allowed)")
     if reachable_hz < demand.rate_hz:
-        shortfalls.append(f"it reaches {_round_down(reachable_hz):g} Hz of {demand.rate_hz:g}")
+        shortfalls.append(f"it reaches {_round_down(reachable_hz):g} Hz ({demand.rate_hz:g} Hz needed)")
     if query.wall_s > MAX_FIX_AGE_S:
-        limit = f"no fix of a frame older than {MAX_FIX_AGE_S:g} s is ever sent"
-        shortfalls.append(f"a query takes {query.wall_s:.1f} s, and {limit}")
+        limit = f"fixes from frames older than {MAX_FIX_AGE_S:g} s are never sent"
+        shortfalls.append(f"a query takes {query.wall_s:.1f} s, but {limit}")
     return Fit(
         t_query_s=query.wall_s,
         cpu_s=query.cpu_s,
@@ -192,11 +192,9 @@ def check_fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
 
 
 def list_preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
-    """Return the techniques to try if the user names none, best first: the board's own, then those offered to any
-    board.
-
-    For a `camera` that looks down ("nadir"), only techniques with a parameter `camera` are listed. Raises ConfigError
-    if the board's profile names a technique that does not exist.
+    """Return the techniques to try if the user names none, best first: the one that the board's profile names, then the
+    defaults. For a downward camera ("nadir"), only techniques with a parameter `camera` are listed. Raises ConfigError
+    if the board's profile names an unknown technique.
     """
     preferred = board.technique
     if preferred is not None and not techniques.is_known(preferred):
@@ -209,10 +207,10 @@ def list_preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
 
 
 def describe_option(board: Board, option: Option, demand: Demand) -> str:
-    """Return the accuracy of an option, the figures of its fit and, if it does not fit, why not and what would help."""
+    """Return the accuracy of an option, the figures of its fit and, if it does not fit, the reason."""
     fit = option.fit
     figures = (
-        f"{option.accuracy or 'never measured'}; {demand} take {fit.map_ram_mb:.1f} of {demand.budget_mb:.1f} MB, the "
+        f"{option.accuracy or 'never measured'}; {demand} need {fit.map_ram_mb:.1f} of {demand.budget_mb:.1f} MB, the "
         f"process {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, and {_round_down(fit.reachable_hz):g} Hz "
         f"with {board.cores * board.cpu_share:.2g} of {board.cores} cores ({demand.rate_hz:g} Hz needed)"
     )
@@ -230,6 +228,6 @@ def _read_accuracies() -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def _round_down(value: float) -> float:
-    """Round down to two significant digits, so that a rate reported as reached is really reached."""
+    """Round down to two significant digits, so that a reported rate is never above the rate reached."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
     return math.floor(value / step) * step

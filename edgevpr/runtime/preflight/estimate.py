@@ -1,5 +1,5 @@
-"""Estimate of a flight before take-off: memory, time, charge and accuracy of each technique on a board, from costs
-measured on some machine. `edgevpr profile` shows it.
+"""Estimate of a flight before take-off, shown by `edgevpr profile`: memory, time, charge and accuracy of each technique
+on a board, computed from costs measured on this machine.
 
 `dataclasses.asdict` of a FlightEstimate can be written as JSON.
 """
@@ -19,10 +19,10 @@ from edgevpr.runtime.preflight.trial import Trial
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightPlan(Demand):
-    """Plan of a flight: its demands of a technique (`Demand`), and what its energy is computed from.
+    """Plan of a flight: its requirements (`Demand`), and the inputs of its energy budget.
 
-    `flight_min`: minutes in the air. `pack`: the aircraft's battery. `regulator_efficiency`: share of the pack's energy
-    that reaches the board, 0..1.
+    `flight_min`: flight time in minutes. `pack`: the aircraft's battery. `regulator_efficiency`: share of the pack's
+    energy that reaches the board, 0..1.
     """
 
     flight_min: float
@@ -32,12 +32,12 @@ class FlightPlan(Demand):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueEstimate:
-    """Estimate of one technique, in one form, on the board. `option` has its costs there, its fit and its accuracy.
+    """Estimate of one technique, in one form, on the board. `option`: its costs on the board, its fit and its accuracy.
 
     `query`: time, utilisation and charge of a query (symbols and equations: see `power.equations`).
-    `flight_mah`: charge that the board draws in the flight. `flight_marginal_mah`: the part of it that the queries add
-    (equation 5.7). All charges are drawn from the pack; `flight_pack_frac` is `flight_mah` as a share of its capacity,
-    and so the share of its endurance that the aircraft loses.
+    `flight_mah`: charge that the board draws during the flight. `flight_marginal_mah`: the part that the queries add to
+    an idle board (equation 5.7). `flight_pack_frac`: `flight_mah` as a share of the pack's capacity, which is also the
+    share of its endurance that the aircraft loses. All charges are drawn from the pack.
     """
 
     option: Option
@@ -51,10 +51,10 @@ class TechniqueEstimate:
 class FlightEstimate:
     """Estimates of all techniques on one board.
 
-    `times`: "measured" (on this machine, for this machine), "scaled" (from this machine to the board, by `ratio`) or
-    "unscaled" (this machine's, since the speed of the board is unknown). `recommended`: label of the option
-    to use (None: there is none). `reason`: why it is recommended, or why none is, in a sentence. `notes`: remarks on
-    the estimate. `unusable`: techniques that cannot be used here, each with the reason.
+    `times`: "measured" (the board is this machine), "scaled" (from this machine to the board, by `ratio`) or "unscaled"
+    (this machine's times, because the speed of the board is unknown). `recommended`: label of the recommended option
+    (None: no option is suitable). `reason`: sentence that explains the recommendation, or why there is none. `notes`:
+    remarks on the estimate. `unusable`: the reason for each technique that cannot be used on this machine.
     """
 
     board: str
@@ -70,8 +70,8 @@ class FlightEstimate:
 
 
 def estimate_flight(board: Board, ratio: Speed | None, trials: Iterable[Trial], plan: FlightPlan) -> FlightEstimate:
-    """Estimate every technique of `trials`, which were made on this machine, for a flight of `board`, whose speed is
-    `ratio` of this machine's (see `compare_speed`)."""
+    """Estimate every technique of `trials` for a flight with `board`. The trials were run on this machine. `ratio`:
+    speed of the board relative to this machine (see `compare_speed`)."""
     trials = list(trials)
     rows: list[TechniqueEstimate] = []
     for trial in trials:
@@ -101,7 +101,7 @@ def _estimate_option(option: Option, board: Board, plan: FlightPlan) -> Techniqu
     )
     flight_s = 60 * plan.flight_min
     marginal_mah = queries_ah(min(plan.rate_hz, option.fit.reachable_hz) * flight_s, query.marginal_mah)
-    # Equation 5.7 leaves out the idle power between two queries, which the pack supplies too.
+    # Equation 5.7 omits the idle power between queries, which the pack also supplies.
     idle_mah = 1000 * pack_ah(board.idle_w * flight_s, plan.pack, plan.regulator_efficiency)
     return TechniqueEstimate(
         option=option,
@@ -116,7 +116,7 @@ def _recommend(rows: list[TechniqueEstimate], board: Board, plan: FlightPlan) ->
     """Return `recommended` and `reason` as in `FlightEstimate`."""
     options = [row.option for row in rows]
     if not options:
-        return None, "None: no technique can be used here."
+        return None, "None: no technique can be used on this machine."
     chosen = choose_best(options, board)
     if chosen is None:
         return None, f"None: {explain_no_choice(options, board)}."
@@ -127,8 +127,8 @@ def _recommend(rows: list[TechniqueEstimate], board: Board, plan: FlightPlan) ->
     return chosen.label, (
         f"{chosen.label}: {why}; {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
         f"{fit.reachable_hz:.3g} Hz ({plan.rate_hz:g} needed), {fit.cpu_s / fit.t_query_s / board.cores:.0%} of "
-        f"the CPU during a query, and {row.flight_marginal_mah:.3g} mAh a flight in addition to "
-        f"{row.flight_mah - row.flight_marginal_mah:.3g} of the idle board."
+        f"the CPU during a query, and {row.flight_marginal_mah:.3g} mAh per flight in addition to the "
+        f"{row.flight_mah - row.flight_marginal_mah:.3g} mAh of the idle board."
     )
 
 
@@ -136,20 +136,20 @@ def _list_notes(board: Board, ratio: Speed | None) -> Iterator[str]:
     score = board.benchmark_score
     if ratio is None:
         yield (
-            f"The times are this machine's, unscaled, not measured on this board: its speed is not known "
-            f"({score.source})."
+            f"The times are this machine's: they are neither measured on the board nor scaled to it, because its speed "
+            f"is unknown ({score.source})."
         )
     elif ratio != SAME_MACHINE:
         unverified = "" if score.verified else "unverified; "
         yield (
-            f"The times are scaled from this machine, not measured on this board: networks and full comparisons to "
-            f"{ratio.products:.2g} of its speed, everything else to {ratio.passes:.2g} ({unverified}the board by "
-            f"{score.source}; this machine by edgevpr's micro-benchmark)."
+            f"The times are scaled from this machine, not measured on the board: networks and full comparisons run at "
+            f"{ratio.products:.2g} times this machine's speed, everything else at {ratio.passes:.2g} times "
+            f"({unverified}board speed: {score.source}; this machine's speed: edgevpr's micro-benchmark)."
         )
         if score.arm64_mips:
             yield (
-                f"Those of cohog are the instructions that it takes on an ARM core (`make bench-arm64`), at "
-                f"{score.arm64_mips:g} million a second."
+                f"The times of cohog are computed from its instruction counts on an ARM core (`make bench-arm64`), at "
+                f"{score.arm64_mips:g} million instructions per second."
             )
     if not board.verified:
         yield f"The power of {board.title} is unverified: {board.source}."

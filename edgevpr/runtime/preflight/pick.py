@@ -1,4 +1,4 @@
-"""Automatic choice of a technique if none is named, and what the one that flies costs the board."""
+"""Automatic choice of a technique for a new map, and the cost of a flight's technique on its board."""
 
 import logging
 from dataclasses import replace
@@ -31,8 +31,8 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
     """Choose a technique for a new map of `places` places by its accuracy and its cost on the board, and log the reason
     (see `choose`). `camera`: "nadir" or "forward" (None: forward).
 
-    If the board can afford none, the first usable one of `list_preferred` is taken, and the log says what is lacking: a
-    map is built once, and may be flown on a larger board. Raises ModelError if no technique can be used at all.
+    If none fits the board, choose the first usable technique of `list_preferred` and log why it does not fit: a map is
+    built once, and may be flown on a larger board. Raises ModelError if no technique can be used at all.
     """
     board = load_board(board_name)
     demand = Demand(places=places, rate_hz=board.rate_hz, budget_mb=board.budget_mb, camera=camera)
@@ -45,7 +45,7 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
             continue
         options.append(make_option(board, _make_label(technique.spec), name, _measure_costs(technique, board), demand))
     if not options:
-        raise ModelError("No technique can be used here: mend the problems listed above, or name another one.")
+        raise ModelError("No technique can be used: fix the problems listed above, or name another technique.")
     chosen = choose_best(options, board)
     if chosen is None:
         _log.warning("using technique %s anyway: %s", options[0].name, explain_no_choice(options, board))
@@ -56,10 +56,10 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
 
 
 def explain_technique(recogniser: Recogniser, is_named: bool) -> str:
-    """Return the technique that a flight uses, and why, in one line for the log. `is_named`: the configuration names
-    it."""
+    """Return one line for the log: the technique that a flight uses, and why. `is_named`: the configuration names the
+    technique."""
     spec = recogniser.technique.spec
-    parts = ["configured" if is_named else "the map was built with it"]
+    parts = ["set in the configuration" if is_named else "the map was built with it"]
     if weights := describe_weights(spec):
         parts.append(f"weights of {weights}")
     if left_out := len(recogniser.place_map) - len(recogniser.index):
@@ -68,8 +68,8 @@ def explain_technique(recogniser: Recogniser, is_named: bool) -> str:
 
 
 def measure_flight(recogniser: Recogniser) -> tuple[float, str]:
-    """Measure what a flight costs its board. Returns the seconds that a query takes, and accuracy and cost as text.
-    Raises EdgevprError, and OSError if there is no room for a small temporary map."""
+    """Measure the cost of a flight on its board. Returns the seconds per query, and accuracy and cost as text. Raises
+    EdgevprError, and OSError if there is no space for a small temporary map."""
     board, spec = recogniser.meter.board, recogniser.technique.spec
     costs = _measure_costs(recogniser.technique, board)
     costs = replace(
@@ -88,40 +88,40 @@ def measure_flight(recogniser: Recogniser) -> tuple[float, str]:
 
 
 def list_safe_candidates(technique: Technique) -> tuple[int, ...]:
-    """Return the numbers of candidates, below the technique's default, with which it accepted no query as a place far
-    from the right one on the image sets, largest first."""
+    """Return the numbers of candidates below the technique's default with which it accepted no place far from the
+    correct one on the image sets, largest first."""
     label, camera = _make_label(technique.spec), _read_camera(technique.spec)
     measured = ((count, find_accuracy(label, camera, count)) for count in list_fewer_candidates(label, camera))
     return tuple(count for count, accuracy in measured if accuracy and not accuracy.accepted_elsewhere)
 
 
 def make_camera_setting(name: str, camera: str | None) -> dict[str, str]:
-    """Return the setting that tells the technique `name` the direction of the camera; empty if the direction is unknown
-    (None) or the technique has no such parameter."""
+    """Return the camera-direction setting for the technique `name`; empty if the direction is unknown (None) or the
+    technique has no such parameter."""
     return {"camera": camera} if camera and "camera" in techniques.read_parameters(name) else {}
 
 
 def _make_label(spec: TechniqueSpec) -> str:
-    """Return the name and form of a technique. If it matches in a way that was not measured, the label says so too."""
+    """Return the name and form of a technique, with ", thesis" for cohog without the vote, which was not measured."""
     return techniques.format_name(spec.name, spec.form) + (
         "" if spec.name != "cohog" or _uses_vote(spec) else ", thesis"
     )
 
 
 def _uses_vote(spec: TechniqueSpec) -> bool:
-    """Return True if a technique is `cohog` with the vote, whose costs and accuracy were measured: only then it scores
-    quickly, looking ahead, or has several heights, looking down."""
+    """Return True if a technique is `cohog` with the vote, whose costs and accuracy were measured. Only the vote has
+    quick scores (forward camera) or several height ratios (downward camera)."""
     return bool(spec.in_full or spec.height_ratios)
 
 
 def _read_camera(spec: TechniqueSpec) -> str | None:
-    """Return the camera direction that a technique is set to, "nadir" or "forward"; None if it has no such setting."""
+    """Return a technique's camera direction, "nadir" or "forward"; None if it has no such parameter."""
     camera = spec.parameters.get("camera")
     return None if camera is None else str(camera)
 
 
 def _measure_costs(technique: Technique, board: Board) -> TechniqueCosts:
-    """Measure the costs of a technique here, and convert them to `board`."""
+    """Measure the costs of a technique on this machine, and convert them to `board`."""
     spec = technique.spec
     work = count_work(spec.name, spec.parameters) if _uses_vote(spec) else None
     return scale_to_board(measure_costs(technique), board, compare_speed(board), work)

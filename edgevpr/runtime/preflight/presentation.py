@@ -1,39 +1,43 @@
-"""Estimates for people: a table of at most 120 columns with a line per technique, and notes."""
+"""Estimates as text for people: tables of at most 120 columns with one row per technique, and notes."""
 
 from edgevpr.core.text import align_table, wrap_sentence
 from edgevpr.runtime.preflight.estimate import FlightEstimate, TechniqueEstimate
 
-# The columns of the two tables: what each technique needs and draws, and what it finds.
-_NEEDS_COLUMNS = ("technique", "fits", "map MB", "RAM MB", "t_e s", "t_m s", "U_e", "U_m", "Hz")
-_DRAWS_COLUMNS = ("mAh/query", "mAh/flight", "marginal", "of pack")
-_FINDS_COLUMNS = ("technique", "recall@1", "accepted", "wrong", "sets", "queries", "automatic choice")
+# Columns of the two tables: cost of each technique (resources, then charge), and its accuracy.
+_RESOURCE_COLUMNS = ("technique", "fits", "map MB", "RAM MB", "t_e s", "t_m s", "U_e", "U_m", "Hz")
+_CHARGE_COLUMNS = ("mAh/query", "mAh/flight", "marginal", "of pack")
+_ACCURACY_COLUMNS = ("technique", "recall@1", "accepted", "wrong", "sets", "queries", "automatic choice")
 
 
 def format_table(estimate: FlightEstimate) -> str:
-    """Format an estimate as text: the recommended technique, tables of what each needs, draws and finds, why techniques
-    do not fit, and notes."""
+    """Format an estimate as text: the recommended technique, tables of cost and accuracy, the reasons why techniques do
+    not fit or cannot be used, and notes."""
     plan, rows = estimate.plan, estimate.techniques
     heading = (
         f"{estimate.title}: {plan}, {plan.rate_hz:g} Hz, {plan.flight_min:g} min, {plan.pack.cells}S"
         f"{plan.pack.capacity_mah} at {plan.regulator_efficiency:.0%} regulator efficiency; times measured"
         + {"measured": "", "scaled": ", scaled", "unscaled": " here, unscaled"}[estimate.times]
     )
-    needs = align_table(
-        [_NEEDS_COLUMNS + _DRAWS_COLUMNS, *map(_make_needs_row, rows), *([name, "n/a"] for name in estimate.unusable)],
+    costs = align_table(
+        [
+            _RESOURCE_COLUMNS + _CHARGE_COLUMNS,
+            *map(_make_cost_row, rows),
+            *([name, "n/a"] for name in estimate.unusable),
+        ],
         left=2,
     )
-    finds = align_table([_FINDS_COLUMNS, *(_make_finds_row(row, estimate.recommended) for row in rows)])
+    accuracies = align_table([_ACCURACY_COLUMNS, *(_make_accuracy_row(row, estimate.recommended) for row in rows)])
     notes = [f"{row.option.label} {row.option.fit.misfit}." for row in rows if row.option.fit.misfit]
     for why in dict.fromkeys(estimate.unusable.values()):
         names = [name for name, problem in estimate.unusable.items() if problem == why]
         notes.append(f"{', '.join(names)} cannot be used: {why}")
     notes += estimate.notes
-    answer = wrap_sentence(f"Recommended: {estimate.reason}")
+    recommendation = wrap_sentence(f"Recommended: {estimate.reason}")
     text = [line for note in notes for line in wrap_sentence(note)]
-    return "\n".join([*answer, "", heading, "", *needs, "", *finds, "", *text])
+    return "\n".join([*recommendation, "", heading, "", *costs, "", *accuracies, "", *text])
 
 
-def _make_needs_row(row: TechniqueEstimate) -> list[str]:
+def _make_cost_row(row: TechniqueEstimate) -> list[str]:
     option, fit, query = row.option, row.option.fit, row.query
     return [
         option.label,
@@ -52,7 +56,7 @@ def _make_needs_row(row: TechniqueEstimate) -> list[str]:
     ]
 
 
-def _make_finds_row(row: TechniqueEstimate, recommended: str | None) -> list[str]:
+def _make_accuracy_row(row: TechniqueEstimate, recommended: str | None) -> list[str]:
     option, accuracy = row.option, row.option.accuracy
     if accuracy is None:
         return [option.label, "?", "?", "?", "", "", "never measured"]

@@ -1,4 +1,4 @@
-"""Costs of a technique on this machine, measured in a short trial on generated pictures."""
+"""Costs of a technique on this machine, measured in a short trial on generated images."""
 
 import itertools
 import math
@@ -34,8 +34,8 @@ _TRIAL_PLACES = 6
 _MAX_TRIES = 5  # of each picture, at most
 _STEPS = ("encode", "scan", "compare", "verify")
 _SCANNED_PLACES = 4096
-_MAX_SCANNED_BYTES = 8 << 20  # a small board has no more free before the map is loaded
-_PYMAVLINK_MB = 12.0  # what importing pymavlink adds to the resident memory (measured on x86-64)
+_MAX_SCANNED_BYTES = 8 << 20  # a small board has no more RAM free before the map is loaded
+_PYMAVLINK_MB = 12.0  # resident memory added by importing pymavlink (measured on x86-64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,14 +43,14 @@ class TechniqueCosts:
     """Costs of a technique on one machine, measured or converted. A `StageCost` is wall time and CPU time.
 
     `encode`: cost of encoding one frame. `match_per_place`: cost of comparing a query with one place, read from the map
-    file. `compare_once`: part of comparing that does not grow with the number of places; if fewer than `in_full` places
-    are compared, a proportional share of it.
-    `candidates`: number of places compared in a larger map, after all its places are scanned in RAM (None: the
-    technique has one stage, and compares all). `scan_per_place`: cost of scanning one place. `scan_once`: cost of
-    preparing a query for the scan.
+    file. `compare_once`: part of the comparison that does not grow with the number of places; if fewer than `in_full`
+    places are compared, only a proportional share of it is paid.
+    `candidates`: number of places compared after all places of the map are scanned in RAM (None: the technique has one
+    stage, and compares all places). `scan_per_place`: cost of scanning one place. `scan_once`: cost of preparing a
+    query for the scan.
     `tries_rotations`: more candidates are compared in a large map (see `compute_candidate_factor`).
     `process_mb`: peak resident memory of the process without a map.
-    `is_network`: pictures go through a network. `sequence`: number of queries matched together.
+    `is_network`: images are encoded by a network. `sequence`: number of queries matched together.
     """
 
     encode: StageCost
@@ -77,22 +77,22 @@ class TechniqueCosts:
 
 
 def compute_ram_bytes(spec: TechniqueSpec, sequence: int) -> int:
-    """Return the bytes of RAM that a place takes in a flight that matches `sequence` queries together."""
+    """Return the bytes of RAM per place in a flight that matches `sequence` queries together."""
     return compute_place_bytes(spec) + compute_sequence_bytes(sequence)
 
 
 def compute_disk_bytes(spec: TechniqueSpec) -> int:
-    """Return the bytes that a place takes in the map file, with the most landmarks that it may have."""
+    """Return the bytes per place in the map file, with the maximum number of landmarks."""
     return spec.coarse.nbytes + (spec.fine.nbytes if spec.fine else 0) + (MAX_LANDMARK_BYTES if spec.cells else 0)
 
 
 def measure_costs(technique: Technique, *, repeat_s: float = 0.0, meter: QueryMeter | None = None) -> TechniqueCosts:
-    """Measure the costs of a technique on this machine. Pictures of noise, whose every region has structure and so
-    costs the most to match, go through the steps of a query, first with an empty map, then with a small map on disk,
+    """Measure the costs of a technique on this machine. The steps of a query are run on images of noise, which cost the
+    most to match because every region has structure: first while a small map is filled, then with that map on disk,
     then with a large index.
 
-    Each picture is tried again for about `repeat_s` seconds per map, and the least CPU time counts, since the time of
-    other programs is no cost of the technique. Raises ModelError for a technique that fails on a picture.
+    Each image is matched repeatedly for about `repeat_s` seconds per map, and the least CPU time is taken, because time
+    spent in other programs is no cost of the technique. Raises ModelError if the technique fails on an image.
     """
     bench = _Bench(technique, meter or QueryMeter(load_board("this")), repeat_s)
     spec, candidates = technique.spec, technique.candidates
@@ -100,29 +100,29 @@ def measure_costs(technique: Technique, *, repeat_s: float = 0.0, meter: QueryMe
         peak_is_new = machine.reset_peak()
         bench.fill(trial_map)
         index = load_index(trial_map, technique, _TRIAL_PLACES * compute_place_bytes(spec))
-        # For a technique with one stage the small map shows only how much memory a query takes.
+        # For a technique with one stage, only the memory of a query is measured with the small map.
         small = bench.try_map(trial_map, index, 1, _MAX_TRIES if spec.fine else 1)
         process_mb = machine.read_peak_mb() if peak_is_new else machine.read_rss_mb()
         large_index = _repeat_places(technique, index)
-        times = compute_candidate_factor(bool(spec.height_ratios), len(large_index))
-        most, fewer = (round(count / times) for count in (candidates, max(spec.in_full or 1, candidates // 2)))
+        factor = compute_candidate_factor(bool(spec.height_ratios), len(large_index))
+        most, fewer = round(candidates / factor), round(max(spec.in_full or 1, candidates // 2) / factor)
         large = bench.try_map(trial_map, large_index, most)
         half = bench.try_map(trial_map, large_index, fewer) if spec.in_full else large
-    once = _find_least([steps.scan for steps in small]) if spec.fine else NO_COST
-    # The time of scanning six places is not spent on them, but on preparing the query and on the call.
-    scan = _subtract(_find_least([steps.scan if spec.fine else steps.match for steps in large]), once)
-    scan *= 1 / len(large_index)
-    compare, part = (_find_least([steps.compare for steps in tries]) for tries in (large, half))
+    scan_once = _find_least([steps.scan for steps in small]) if spec.fine else NO_COST
+    # With six places, the time of a scan is query preparation and call overhead only.
+    scan_per_place = _subtract(_find_least([steps.scan if spec.fine else steps.match for steps in large]), scan_once)
+    scan_per_place *= 1 / len(large_index)
+    full_compare, half_compare = (_find_least([steps.compare for steps in tries]) for tries in (large, half))
     if spec.in_full:
-        one_more = _subtract(compare, part) * (1 / max(1, times * (most - fewer)))
-        # Only an accepted query is verified: of the pictures of noise, the one that is in the map.
+        match_per_place = _subtract(full_compare, half_compare) * (1 / max(1, factor * (most - fewer)))
+        # Only an accepted query is verified: here, the noise image that is in the map.
         verify = max((steps.verify for steps in large), key=lambda cost: cost.wall_s)
-        compare_once = _subtract(compare, one_more * candidates) + verify
+        compare_once = _subtract(full_compare, match_per_place * candidates) + verify
     else:
-        one_more, compare_once = compare * (1 / candidates) if spec.fine else scan, NO_COST
+        match_per_place, compare_once = full_compare * (1 / candidates) if spec.fine else scan_per_place, NO_COST
     return TechniqueCosts(
         encode=_find_least([steps.encode for steps in [*small, *large]]),
-        match_per_place=one_more,
+        match_per_place=match_per_place,
         compare_once=compare_once,
         in_full=spec.in_full or 1,
         tries_rotations=bool(spec.height_ratios),
@@ -130,26 +130,26 @@ def measure_costs(technique: Technique, *, repeat_s: float = 0.0, meter: QueryMe
         disk_bytes_per_place=compute_disk_bytes(spec),
         process_mb=process_mb + (0.0 if "pymavlink" in sys.modules else _PYMAVLINK_MB),
         candidates=candidates if spec.fine else None,
-        scan_per_place=scan if spec.fine else NO_COST,
-        scan_once=once,
+        scan_per_place=scan_per_place if spec.fine else NO_COST,
+        scan_once=scan_once,
         is_network=spec.model_sha256 is not None,
         sequence=bench.sequence,
     )
 
 
 class _Bench:
-    """Measures the steps of a technique on the same pictures of noise, again and again. `sequence`: number of queries
-    that the technique matches together. `repeat_s`: seconds for the repetitions."""
+    """Measures the steps of a technique repeatedly on the same noise images. `sequence`: number of queries that the
+    technique matches together. `repeat_s`: seconds for the repetitions."""
 
     def __init__(self, technique: Technique, meter: QueryMeter, repeat_s: float) -> None:
         self.sequence = technique.spec.sequence
         self._technique, self._meter, self._repeat_s = technique, meter, repeat_s
-        rng = Random(0)  # not NumPy's: it takes 2.5 MB, and a flight needs it for nothing else
+        rng = Random(0)  # NumPy's generator would load 2.5 MB that a flight needs for nothing else
         pictures = [np.frombuffer(rng.randbytes(480 * 640), np.uint8) for _ in range(_TRIAL_PICTURES)]
         self._images = [picture.reshape(480, 640) for picture in pictures]
 
     def fill(self, trial_map: PlaceMap) -> None:
-        """Add the trial's places to a map, all of them copies of the first picture."""
+        """Add the trial's places to a map; all are copies of the first image."""
         encoder = FrameEncoder(technique=self._technique)
         frame = Frame(image=self._images[0], name="trial", t_mono_s=0.0)
         try:
@@ -162,8 +162,8 @@ class _Bench:
     def try_map(
         self, place_map: PlaceMap, index: PlaceIndex, candidates: int, max_tries: int = _MAX_TRIES
     ) -> list[StepCosts]:
-        """Match each picture several times (`max_tries` at most) with `place_map`, of which `index` is in RAM and
-        `candidates` places are compared. Returns one `Steps` per picture: the least cost of every step."""
+        """Match each image up to `max_tries` times with `place_map`, whose `index` is in RAM, comparing `candidates`
+        places. Returns one `StepCosts` per image: the least cost of each step."""
         recogniser = self._open_recogniser(place_map, index, candidates)
         times_s = (0.1 * number for number in itertools.count())
 
@@ -171,7 +171,7 @@ class _Bench:
             return [_match_picture(recogniser, image, next(times_s)).steps for image in self._images]
 
         for _ in range(math.ceil((self.sequence - 1) / len(self._images))):
-            match_pictures()  # the frames of the first rounds fill the sequence
+            match_pictures()  # fill the sequence before measuring
         end_s, rounds = time.monotonic() + self._repeat_s, [match_pictures()]
         while len(rounds) < max_tries and time.monotonic() < end_s:
             rounds.append(match_pictures())
@@ -196,7 +196,7 @@ def _match_picture(recogniser: Recogniser, image: Image, t_mono_s: float) -> Rec
 
 
 def _repeat_places(technique: Technique, index: PlaceIndex) -> PlaceIndex:
-    """Return an index of some thousand places without positions, by repeating the places of `index`."""
+    """Return an index of several thousand places without positions, made by repeating the places of `index`."""
     count = max(_TRIAL_PLACES, min(_SCANNED_PLACES, _MAX_SCANNED_BYTES // technique.spec.row.nbytes))
     unknown = np.full(count, np.nan)
     return PlaceIndex(
@@ -210,14 +210,14 @@ def _repeat_places(technique: Technique, index: PlaceIndex) -> PlaceIndex:
 
 
 def _subtract(cost: StageCost, part: StageCost) -> StageCost:
-    """Return `cost` minus `part`, but at least a thousandth of `cost`, since clocks are not exact."""
+    """Return `cost` minus `part`, but at least a thousandth of `cost`, because clocks are not exact."""
     least = cost * 0.001
     return StageCost(max(cost.wall_s - part.wall_s, least.wall_s), max(cost.cpu_s - part.cpu_s, least.cpu_s))
 
 
 def _find_least(costs: list[StageCost]) -> StageCost:
-    """Return the least cost of several tries: the least CPU time, and as wall time the least CPU time too or, if that
-    is less, the least wall time. So the wall time spent waiting for other programs is left out, and work on several
-    cores, whose wall time is less than its CPU time, is kept."""
+    """Return the least cost of several tries: the least CPU time, and as wall time the lesser of the least wall time
+    and the least CPU time. This excludes time spent waiting for other programs, and still allows for work on several
+    cores, whose wall time is less than its CPU time."""
     cpu_s = min(cost.cpu_s for cost in costs)
     return StageCost(min(cpu_s, *(cost.wall_s for cost in costs)), cpu_s)

@@ -1,9 +1,9 @@
-"""Conversion of costs measured on this machine to another board. Memory stays unchanged.
+"""Conversion of costs measured on this machine to another board. Memory is not converted.
 
-Times are converted by the ratio of the machines' speeds: of the board by its profile, of this machine by the
-micro-benchmark. For cohog on a board whose profile gives instructions per second of one core (`arm64_mips`), they are
-computed from the instructions that `make bench-arm64` counted: these are of the board's own instruction set, and other
-programs cannot disturb the count.
+Times are scaled by the ratio of the machines' speeds: the board's from its profile, this machine's from the
+micro-benchmark. For cohog on a board whose profile gives instructions per second of one core (`arm64_mips`), times are
+computed from the instruction counts of `make bench-arm64` instead: they are for the board's own instruction set, and
+unaffected by other programs.
 """
 
 import json
@@ -19,16 +19,16 @@ from edgevpr.power.speed import REFERENCE_PASSES_HZ, REFERENCE_PRODUCTS_HZ, Spee
 from edgevpr.runtime.preflight.probe import TechniqueCosts
 
 SAME_MACHINE = Speed(1.0, 1.0)
-# Score at products as a share of `single`, for boards where it was not measured: that of the Raspberry Pi 4, the
-# lowest that is known (Pi 5: 0.21), so that the estimate does not promise too much.
+# Speed at matrix products as a share of `single`, for boards where it was not measured: the Raspberry Pi 4's, which is
+# the lowest known (Pi 5: 0.21), so that the estimate is conservative.
 UNKNOWN_PRODUCTS = 0.15
 COUNTED_PATH = Path(__file__).with_name("counted.json")
 _COUNTED_SETTINGS = {"w1": 512, "w2": 16, "bins": 8, "entropy": "shannon", "matching": "displacement"}
 
 
 def count_work(name: str, parameters: Mapping[str, Any]) -> dict[str, float] | None:
-    """Return the number of instructions that the technique `name` with these parameters takes on an ARM core, by the
-    name of the field of `TechniqueCosts` that they are the cost of; None if they were not counted."""
+    """Return the instruction counts of the technique `name` with these parameters on an ARM core, by the field of
+    `TechniqueCosts` that they determine; None if they were not counted."""
     if name != "cohog" or any(parameters.get(key, value) != value for key, value in _COUNTED_SETTINGS.items()):
         return None
     work: dict[str, float] = _read_counts()[parameters.get("camera", "forward")]
@@ -36,29 +36,29 @@ def count_work(name: str, parameters: Mapping[str, Any]) -> dict[str, float] | N
 
 
 def compare_speed(board: Board) -> Speed | None:
-    """Return the speed of `board` divided by that of this machine, which is measured now unless it is the board; None
-    if the speed of the board is unknown."""
+    """Return the speed of `board` divided by that of this machine (None: the speed of the board is unknown). Unless the
+    board is this machine, runs the micro-benchmark."""
     if board.is_this_machine():
         return SAME_MACHINE
     speed = _compute_board_speed(board.benchmark_score)
     if speed is None:
         return None
-    here = run_micro_benchmark()
-    return Speed(products=speed.products / here.products, passes=speed.passes / here.passes)
+    this = run_micro_benchmark()
+    return Speed(products=speed.products / this.products, passes=speed.passes / this.passes)
 
 
 def scale_to_board(
     costs: TechniqueCosts, board: Board, ratio: Speed | None, work: Mapping[str, float] | None = None
 ) -> TechniqueCosts:
-    """Convert costs measured on this machine to `board`, by the `ratio` that `compare_speed` returns, or by the counted
-    instructions (`work`) if they and the board's `arm64_mips` are known. Without a ratio, times stay unchanged."""
+    """Convert costs measured on this machine to `board`: from the instruction counts `work` if they and the board's
+    `arm64_mips` are known, else by the `ratio` of `compare_speed`. Without a ratio, times stay unchanged."""
     if ratio in (None, SAME_MACHINE):
         return costs
     if work and (mips := board.benchmark_score.arm64_mips):
         times = {stage: StageCost(count / (1e6 * mips), count / (1e6 * mips)) for stage, count in work.items()}
-        return replace(costs, **times)  # type: ignore[arg-type]  # they are fields of TechniqueCosts
-    # A network's layers are products, and so is the comparison of all regions with all regions. Work on pictures and on
-    # rows of the index is passes.
+        return replace(costs, **times)  # type: ignore[arg-type]  # all are fields of TechniqueCosts
+    # The layers of a network and the comparison of all regions with all regions are matrix products. Work on images and
+    # on rows of the index is passes over memory.
     encode_by, threads = (ratio.products, board.threads) if costs.is_network else (ratio.passes, board.cores)
     match_by = ratio.passes if costs.candidates is None else ratio.products
     return replace(
@@ -72,9 +72,9 @@ def scale_to_board(
 
 
 def _compute_board_speed(score: MachineSpeed) -> Speed | None:
-    """Return the speed of a board relative to the reference (None: unknown). That of an aarch64 board follows from
-    `arm64_mips` and the instructions counted for a round of the micro-benchmark, unless its `products` are known. Of
-    others `single` is that at passes, and a modest share of it that at products."""
+    """Return the speed of a board relative to the reference (None: unknown). For an aarch64 board it is computed from
+    `arm64_mips` and the instructions counted for a round of the micro-benchmark. For other boards, the speed at passes
+    is `single`, and the speed at products a small share of it. A known `products` score takes precedence."""
     if mips := score.arm64_mips:
         products = 1e6 * mips / float(_read_counts()["products"]) / REFERENCE_PRODUCTS_HZ
         return Speed(score.products or products, 1e6 * mips / float(_read_counts()["passes"]) / REFERENCE_PASSES_HZ)
@@ -84,8 +84,7 @@ def _compute_board_speed(score: MachineSpeed) -> Speed | None:
 
 
 def _scale_cost(cost: StageCost, ratio: float, threads: int) -> StageCost:
-    """Return the cost of a stage where a thread is `ratio` times as fast and the stage may use at most `threads`
-    threads."""
+    """Return the cost of a stage on a machine with threads `ratio` times as fast, of which it may use `threads`."""
     busy_cores = cost.cpu_s / cost.wall_s if cost.wall_s else 0.0
     if busy_cores <= 1:
         return cost * (1 / ratio)
@@ -95,6 +94,6 @@ def _scale_cost(cost: StageCost, ratio: float, threads: int) -> StageCost:
 
 @cache
 def _read_counts() -> dict[str, Any]:
-    """Return the counted instructions: of cohog by camera direction, and of a round of each micro-benchmark."""
+    """Return the instruction counts: of cohog by camera direction, and of one round of each micro-benchmark."""
     content: dict[str, Any] = json.loads(COUNTED_PATH.read_text("utf-8"))
     return content

@@ -1,5 +1,5 @@
-"""Trials of techniques, each in a child process with all its forms: the memory that one has loaded is not counted for
-another, and a library that crashes on this processor fails only its own trials."""
+"""Trials of techniques. All forms of a technique run in one child process of its own, so that memory that one technique
+has loaded is not counted for another, and a library that crashes on this processor fails only its own trials."""
 
 import ctypes
 import gc
@@ -22,15 +22,15 @@ from edgevpr.runtime.recognise.opening import make_technique
 from edgevpr.techniques.card import describe_weights
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
-_REPEAT_S = 0.5  # of each picture; twice as long gives the same figures
+_REPEAT_S = 0.5  # per image; twice as long gives the same figures
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """A trial of a technique in one form, to be run or done. `label` is its unique name.
+    """A trial of a technique in one form, pending or finished. `label`: unique name of the trial.
 
-    When it is done, it has the `costs`, or the `problem`, a sentence that says why the technique cannot be used here.
-    `parameters`: all parameters of the technique when it was tried. `weights`: name of its network's weights (None: no
+    A finished trial has `costs` or `problem`, a sentence that explains why this machine cannot run the technique.
+    `parameters`: all parameters of the technique in the trial. `weights`: name of its network's weights (None: no
     network).
     """
 
@@ -44,21 +44,21 @@ class Trial:
 
 
 def list_trials(names: Iterable[str], settings: Mapping[str, Mapping[str, Any]] | None = None) -> tuple[Trial, ...]:
-    """Return the trials to run: one for each technique of `names` in each of its forms, or only one if it has no forms
-    or its settings name one. `settings` are by technique name. Raises UsageError for an unknown name, ModelError for a
-    card that is incomplete."""
+    """Return the trials to run: one for each form of each technique of `names`, or one for a technique that has no
+    forms or whose settings name one. `settings`: by technique name. Raises UsageError for an unknown name, ModelError
+    for an incomplete model card."""
     trials = []
     for name in names:
-        given = dict((settings or {}).get(name, {}))
-        is_one = "form" in given or "form" not in techniques.read_parameters(name)
-        for variant in (given,) if is_one else ({**given, "form": form} for form in FORMS):
+        chosen = dict((settings or {}).get(name, {}))
+        has_one_form = "form" in chosen or "form" not in techniques.read_parameters(name)
+        for variant in (chosen,) if has_one_form else ({**chosen, "form": form} for form in FORMS):
             trials.append(Trial(label=techniques.format_name(name, variant.get("form")), name=name, settings=variant))
     return tuple(trials)
 
 
 def run_trials(trials: Sequence[Trial], threads: int) -> Iterator[Trial]:
-    """Run `trials`, those of one technique in one child process, and yield each with its result. A technique
-    that cannot be used has one result, labelled with its name. `threads`: number of threads for networks."""
+    """Run `trials`, with one child process per technique, and yield each with its result. A technique that cannot be
+    used yields a single result, labelled with its name. `threads`: number of threads for networks."""
     for name, forms in groupby(trials, lambda trial: trial.name):
         variants = list(forms)
         with ProcessPoolExecutor(1, get_context("spawn"), _begin_child, (os.getpid(),)) as pool:
@@ -67,18 +67,18 @@ def run_trials(trials: Sequence[Trial], threads: int) -> Iterator[Trial]:
             except EdgevprError as error:
                 yield replace(variants[0], label=name, problem=str(error))
             except BrokenProcessPool:
-                why = f"Trying {name} ended its process: memory ran out, or a library does not suit this processor."
+                why = f"The trial of {name} crashed: memory ran out, or a library does not support this processor."
                 yield replace(variants[0], label=name, problem=why)
 
 
 def _begin_child(parent_pid: int) -> None:
-    """Make the kernel kill this process when its parent ends in any way, even if a library here is in an endless loop.
-    Exits at once if the parent has ended already."""
+    """Make the kernel kill this process whenever its parent exits, even if a library is stuck in an endless loop. Exits
+    at once if the parent has already exited."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent_pid:
         sys.exit(1)
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it without a traceback of its own
-    os.dup2(2, 1)  # what a library prints does not go into the answer of the program
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends this process without a second traceback
+    os.dup2(2, 1)  # keep the output of libraries out of the program's standard output
 
 
 def _run_in_child(trials: list[Trial], threads: int) -> list[Trial]:
@@ -88,7 +88,7 @@ def _run_in_child(trials: list[Trial], threads: int) -> list[Trial]:
         costs = measure_costs(technique, repeat_s=_REPEAT_S)
         spec = technique.spec
         results.append(replace(trial, costs=costs, weights=describe_weights(spec), parameters=spec.parameters))
-        # Memory that this form took is released, or it would be counted for the next one.
+        # Release the memory of this form; otherwise it would be counted for the next one.
         del technique
         gc.collect()
         if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # musl has none

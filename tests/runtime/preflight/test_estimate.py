@@ -71,8 +71,8 @@ def test_estimate_charges_no_rate_that_is_out_of_reach():
     ("board", "ratio", "times", "notes"),
     [
         ("rpi-4b", SAME_MACHINE, "measured", ()),
-        ("rpi-4b", SLOWER, "scaled", ("0.056 of its speed", "1741 million")),
-        ("odroid-xu4", SLOWER, "scaled", ("networks and full comparisons to 0.0", "8.5 W")),
+        ("rpi-4b", SLOWER, "scaled", ("0.056 times this machine's speed", "1741 million")),
+        ("odroid-xu4", SLOWER, "scaled", ("networks and full comparisons run at 0.0", "8.5 W")),
         ("thesis-xeon", None, "unscaled", ("no published figure", "The power of the thesis's server")),
         ("rpi-zero-2w", SAME_MACHINE, "measured", ("The power of Raspberry Pi Zero 2 W is unverified",)),
     ],
