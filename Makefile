@@ -76,8 +76,9 @@ bench-arm64: $(VENV)/installed
 hostile: $(VENV)/installed
 	$(BIN)/python benchmarks/hostile.py
 
-# Routers for the tests, without what their windows need (1 GB). Where they cannot be had, their tests are skipped.
-CLIENTS := MAVProxy==1.8.75
+# Ground stations' programs for the tests, without what their windows need (1 GB). Where they cannot be had, their tests
+# are skipped.
+CLIENTS := MAVProxy==1.8.75 mavsdk==4.1.0
 $(VENV)/clients/installed: $(VENV)/installed
 	@missing=; for each in $(CLIENTS); do \
 	    $(BIN)/python -m pip install --quiet --disable-pip-version-check --retries 1 --timeout 20 --upgrade --no-deps \

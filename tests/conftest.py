@@ -25,6 +25,7 @@ LONGEST = (
     "test_gate",
     "test_frames_live",
     "test_fixes",
+    "test_ground_stations",
     "test_memory",
     "test_demo",
     "test_profile_command",

@@ -1,19 +1,18 @@
 """A flight beside other programs on the only port of the flight controller: the routers themselves, configured as
 docs/how-to/beside-other-software.md says, with the ports and addresses of the test put in."""
 
-import os
 import re
 import shlex
 import shutil
 import signal
 import subprocess
-import sys
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import pytest
 from flight_process import start
 from flights import of_kind
+from ground_stations import mavproxy_with
 from loopback import free_port, wait_until
 from mavlink_peers import AutopilotThread, Peer, SerialCable, UdpPort
 
@@ -23,7 +22,6 @@ from edgevpr.runtime.flight.flightlog import read_log
 pytestmark = [pytest.mark.process, pytest.mark.network]
 
 PAGE = Path(__file__).parents[3] / "docs/how-to/beside-other-software.md"
-CLIENTS = Path(os.environ.get("EDGEVPR_CLIENTS") or Path(sys.prefix) / "clients")
 EDGEVPR = 197
 needs_router = pytest.mark.skipif(
     shutil.which("mavlink-routerd") is None,
@@ -38,28 +36,22 @@ def written(section: str, language: str) -> str:
 
 
 @contextmanager
-def running(command, folder, **environment):
-    """A router, which is killed at the end."""
-    how = {"cwd": folder, "env": {**os.environ, "HOME": str(folder), **environment}, "stdin": subprocess.PIPE}
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **how) as router:
-        try:
-            yield
-        finally:
-            router.kill()
-
-
 def mavlink_router(put, folder):
     settings = folder / "main.conf"
     settings.write_text("[General]\nTcpServerPort = 0\n\n" + put(written("mavlink-router owns it", "ini")))
-    return running(["mavlink-routerd", "-c", settings], folder)
+    router = subprocess.Popen(["mavlink-routerd", "-c", settings], stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        router.kill()
+        router.wait()
 
 
+@contextmanager
 def mavproxy(put, folder):
-    if not (CLIENTS / "MAVProxy").is_dir():
-        pytest.skip(f"MAVProxy is not in {CLIENTS}: `make test` puts it there, where it can be had")
     _, *flags = shlex.split(put(written("MAVProxy owns it", "sh")))
-    command = [sys.executable, CLIENTS / "bin" / "mavproxy.py", *flags, "--default-modules=link"]
-    return running([*command, f"--logfile={folder / 'mavproxy.tlog'}"], folder, PYTHONPATH=str(CLIENTS), TERM="dumb")
+    with mavproxy_with(folder, *flags):
+        yield
 
 
 @pytest.mark.parametrize(
