@@ -1,9 +1,9 @@
-"""Log files that grow in flight: each write is done completely or not at all, and a full file is renamed. All functions
-raise OSError.
+"""Log files that grow in flight: each write is complete or undone, and a full file is renamed. All functions raise
+OSError.
 
 Renamed files are called NAME-0001.jsonl, NAME-0002.jsonl, ... in the folder of NAME.jsonl ("numbered files" below). A
-new number is one more than the highest, so numbers show the order: the clock of an aircraft may be wrong. Symbolic
-links are followed: the numbered files are in the folder of the link's target.
+new number is one above the highest, so numbers give the order even if the aircraft's clock is wrong. Symbolic links are
+followed: the numbered files are in the folder of the link's target.
 """
 
 import errno
@@ -16,23 +16,23 @@ from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
 
-LOG_FILE_MODE = 0o640  # whatever the umask: positions are private, but the group that reads logs may read them
-_MAX_NUMBER = 999_999  # a file name with eight digits has a date, and is not one of these
+LOG_FILE_MODE = 0o640  # regardless of the umask: positions are private, but the group that reads logs may read them
+_MAX_NUMBER = 999_999  # a file name with eight digits contains a date, and is not a numbered file
 _NUMBERED_NAME = re.compile(r"(.+)-(\d{4,6})", re.DOTALL)
 
 
 def open_appending(path: str | Path) -> FileIO:
-    """Open a file, or a character device, for appending and reading, without blocking. A new file gets the mode 0640.
-    The result has no buffer: a write that has returned is safe even if this process is killed next."""
+    """Open a file or a character device for appending and reading, without blocking. A new file gets the mode 0640. The
+    result is unbuffered: once a write has returned, its data survive if this process is killed."""
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
     try:
         descriptor, is_new = os.open(path, flags | os.O_EXCL, LOG_FILE_MODE), True
-    except FileExistsError:  # or a link to a file, which may not be there yet
+    except FileExistsError:  # a file, or a link whose target may not exist yet
         descriptor, is_new = os.open(path, flags, LOG_FILE_MODE), False
     try:
         kind = os.fstat(descriptor).st_mode
         if not (stat.S_ISREG(kind) or stat.S_ISCHR(kind)):
-            raise OSError(errno.EINVAL, "it is a pipe or a disk and not a file", str(path))
+            raise OSError(errno.EINVAL, "it is a pipe or a disk, not a file", str(path))
         if is_new:
             with suppress(OSError):  # FAT has no permissions
                 os.fchmod(descriptor, LOG_FILE_MODE)
@@ -43,14 +43,14 @@ def open_appending(path: str | Path) -> FileIO:
 
 
 def append_bytes(file: BinaryIO, data: bytes) -> None:
-    """Append all of `data`. If that fails, cut the file back to its old length, where possible."""
+    """Append all of `data`. If that fails, truncate the file to its old length if possible."""
     end = file.seek(0, os.SEEK_END)
     try:
         rest = memoryview(data)
-        while rest:  # a nearly full disk writes a part, and reports only at the next write that it is full
+        while rest:  # a nearly full disk accepts a part, and only the next write fails
             written = file.write(rest)
-            if not written:  # such as a terminal that is stopped
-                raise OSError(errno.EAGAIN, "it takes no more data at the moment")
+            if not written:  # for example a stopped terminal
+                raise OSError(errno.EAGAIN, "it cannot accept more data at the moment")
             rest = rest[written:]
     except OSError:
         with suppress(OSError):
@@ -59,13 +59,13 @@ def append_bytes(file: BinaryIO, data: bytes) -> None:
 
 
 def sync_file(file: BinaryIO) -> None:
-    """Flush a regular file's data from the system's cache to the disk; do nothing for a device."""
+    """Flush a regular file's data from the system's cache to disk; do nothing for a device."""
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         os.fdatasync(file.fileno())
 
 
 def sync_folder(path: str | Path) -> None:
-    """Flush the folder of the file `path` (links followed), and so its name, to the disk. Errors are ignored."""
+    """Flush the folder of the file `path` (links followed), and so the file's name, to disk. Errors are ignored."""
     with suppress(OSError):
         folder = os.open(os.path.dirname(os.path.realpath(path)), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
@@ -75,8 +75,8 @@ def sync_folder(path: str | Path) -> None:
 
 
 def try_lock(file: BinaryIO) -> bool:
-    """Lock an open file until it is closed. Return False if another process holds the lock, else True: also for a
-    device, and on a file system without locks."""
+    """Lock an open file until it is closed. Return False if another process holds the lock. Return True otherwise,
+    also for a device and on a file system without locks."""
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         try:
             fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -88,7 +88,7 @@ def try_lock(file: BinaryIO) -> bool:
 
 
 def is_same_file(file: BinaryIO, path: str | Path) -> bool:
-    """Return True if the open `file` is still the one at `path`: it was not renamed, replaced or deleted."""
+    """Return True if the open `file` is still the file at `path`, not renamed, replaced or deleted."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
     except OSError:
@@ -96,7 +96,7 @@ def is_same_file(file: BinaryIO, path: str | Path) -> bool:
 
 
 def list_numbered(path: str | Path) -> list[Path]:
-    """List the numbered files of `path` (see the module), the lowest number first."""
+    """List the numbered files of `path` (see the module docstring), lowest number first."""
     return [file for _, file in _find_numbered(Path(os.path.realpath(path)))]
 
 
@@ -108,7 +108,7 @@ def list_related(path: str | Path) -> list[Path]:
 
 
 def create_numbered(path: str | Path) -> Path:
-    """Create an empty file with the next number, so that no other process takes the number. Return its path."""
+    """Create an empty file with the next number, which reserves the number for this process. Return its path."""
     path = Path(os.path.realpath(path))
     for number in range(max((number for number, _ in _find_numbered(path)), default=0) + 1, _MAX_NUMBER + 1):
         target = path.with_name(f"{path.stem}-{number:04d}{path.suffix}")
@@ -120,7 +120,7 @@ def create_numbered(path: str | Path) -> Path:
 
 def rotate_file(path: str | Path) -> Path:
     """Rename a file to a numbered file with the next number, and return its new path."""
-    target = create_numbered(path)  # FAT has no hard links, and a plain rename would replace what is there
+    target = create_numbered(path)  # FAT has no hard links, and a plain rename would replace an existing file
     try:
         os.replace(os.path.realpath(path), target)
     except OSError:
@@ -131,11 +131,11 @@ def rotate_file(path: str | Path) -> Path:
 
 
 def delete_oldest(path: str | Path, max_bytes: float) -> bool:
-    """Delete the oldest numbered files of `path` until the others take at most `max_bytes` together. A file that a
-    process has locked stays. Return True if any was deleted."""
+    """Delete the oldest numbered files of `path` until the others have at most `max_bytes` together. Files locked by a
+    process are kept. Return True if any file was deleted."""
     sizes = {}
     for file in list_numbered(path):
-        with suppress(FileNotFoundError):  # another process deletes as well
+        with suppress(FileNotFoundError):  # another process may delete files too
             sizes[file] = os.lstat(file).st_size
     kept_bytes = before_bytes = sum(sizes.values())
     for file, size in sizes.items():

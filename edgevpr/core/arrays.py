@@ -1,9 +1,9 @@
-"""Type aliases of the arrays that functions take and return. Docstrings of the functions give contents and shapes.
+"""Type aliases for array arguments and results. The docstrings of the functions give contents and shapes.
 
 `Floats` is float32 or float64, for functions that work with both. `Singles` and `Doubles` are used where the width is
-part of a format or of a memory budget.
+part of a format or a memory budget.
 
-An array whose dtype is only known when the program runs, such as a part of a descriptor, is an `Array`.
+An array whose dtype is known only at run time, such as a part of a descriptor, is an `Array`.
 """
 
 from typing import Any, TypeAlias
@@ -20,7 +20,7 @@ Bools: TypeAlias = NDArray[np.bool_]
 # Points and directions on the ground or in a picture: east + i north, or right + i up.
 Complexes: TypeAlias = NDArray[np.complexfloating[Any, Any]]
 
-# Numbers that identify something: rows ("slots") of an index, ids of places, regions of a picture.
+# Integers that identify something: rows ("slots") of an index, ids of places, regions of a picture.
 Ints: TypeAlias = NDArray[np.integer[Any]]
 
 # Packed bits, and raw bytes read from a file.
@@ -29,14 +29,14 @@ Bytes: TypeAlias = NDArray[np.uint8]
 # uint8, (H, W) grey or (H, W, 3) blue, green, red.
 Image: TypeAlias = NDArray[np.uint8]
 
-# bool, (H, W): False where a picture shows something that is not ground, such as a display drawn over it.
+# bool, (H, W): False where a picture does not show the ground, for example under an on-screen display.
 Mask: TypeAlias = NDArray[np.bool_]
 
-# Degrees of WGS 84, one or many.
+# Degrees on WGS 84, one or many.
 Degrees: TypeAlias = float | Floats
 
-# A point (lat_deg, lon_deg) in degrees of WGS 84, without an altitude.
+# A point (lat_deg, lon_deg) in degrees on WGS 84, without altitude.
 LatLon: TypeAlias = tuple[float, float]
 
-# A covariance on the ground or on a picture: variance along the first axis, covariance, variance along the second.
+# A covariance on the ground or in a picture: variance along the first axis, covariance, variance along the second.
 Covariance: TypeAlias = tuple[float, float, float]

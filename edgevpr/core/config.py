@@ -1,6 +1,6 @@
-"""The configuration of all commands, and `build`, which makes frozen dataclasses from YAML mappings and checks them.
+"""The configuration of all commands, and `build`, which makes checked frozen dataclasses from YAML mappings.
 
-An unknown key, a wrong type or a value out of range raises ConfigError with one clear sentence.
+An unknown key, a wrong type or a value out of range raises ConfigError with a one-sentence message.
 """
 
 import os
@@ -18,30 +18,30 @@ from edgevpr.core.text import suggest
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-FORMS = ("float", "8bit", "1bit")  # number formats of vectors in RAM, from large to small: see techniques.vectors
-MIN_RATE_HZ = 0.01  # of queries
+FORMS = ("float", "8bit", "1bit")  # number formats of vectors in RAM, largest first: see techniques.vectors
+MIN_RATE_HZ = 0.01  # rate of queries
 MAX_RATE_HZ = 60.0
-BUDGET_RANGE_MB = (1, 65_536)  # of the index in RAM
+BUDGET_RANGE_MB = (1, 65_536)  # size of the index in RAM
 SOURCE_HELP = (
     "a folder of images, a video file, a camera (/dev/video0, or rpicam for the ribbon camera of a Raspberry Pi), a "
-    "stream (rtsp://, udp://, rtp://, tcp://, http://, FILE.sdp), or gst: and a GStreamer pipeline"
+    "stream (rtsp://, udp://, rtp://, tcp://, http://, FILE.sdp), or gst: followed by a GStreamer pipeline"
 )
 
 _MAX_INTEGER = 2**63
-_MAX_VALUE_CHARS = 80  # characters of a wrong value in a message
-_NOT_IN_NAMES = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")  # no file name has it; other surrogates are raw bytes
+_MAX_VALUE_CHARS = 80  # characters shown of a wrong value in a message
+_NOT_IN_NAMES = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")  # other surrogates stand for raw bytes in file names
 
 T = TypeVar("T", bound="DataclassInstance")
-_TYPE_NAMES = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", list: "a list"}
+_TYPE_NAMES = {float: "a number", int: "a whole number", str: "text", bool: "true or false", list: "a list"}
 _TYPE_NAMES |= {dict: "a section"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Key:
-    """A configuration key. `flags`: the options that set it on the command line (empty: none), `metavar`: the
-    placeholder of their value (None: argparse's own), `text`: their help. The value must be None, or lie `within` two
-    numbers (None: any) and be one of `choices` (empty: any). The option of a boolean key has no value: giving it sets
-    the key to `sets`. `name`: dotted name, such as "source.rate_hz"; `kind`: type of its value if not None."""
+    """A configuration key. `flags`: command-line options that set it (empty: none); `metavar`: placeholder for their
+    value (None: argparse's default); `text`: their help. A value other than None must lie `within` two numbers (None:
+    any) and be one of `choices` (empty: any). The option of a boolean key has no value: giving it sets the key to
+    `sets`. `name`: dotted name, such as "source.rate_hz"; `kind`: type of its value unless it is None."""
 
     flags: tuple[str, ...] = ()
     metavar: str | None = None
@@ -54,8 +54,8 @@ class Key:
 
 
 def key(default: Any = MISSING, flag: str = "", text: str = "", **rules: Any) -> Any:
-    """Make the dataclass field of a `Key` with the fields `rules`. `default` MISSING: a value must be given. `flag` has
-    its flags and their placeholder, such as "--rate-hz HZ"."""
+    """Make the dataclass field for a `Key`; `rules` are further fields of the `Key`. `default` MISSING: a value is
+    required. `flag`: its flags and their placeholder, such as "--rate-hz HZ"."""
     words = flag.split()
     flags = tuple(word for word in words if word.startswith("-"))
     metavar = words[-1] if len(words) > len(flags) else None
@@ -76,13 +76,13 @@ class SourceConfig:
     camera: str | None = key(
         None,
         "--camera",
-        "nadir: camera looks straight down; forward: ahead (default: as in the map; forward for a new map)",
+        "nadir: camera looks straight down; forward: it looks ahead (default: as in the map; forward for a new map)",
         choices=("nadir", "forward"),
     )
     rate_hz: float | None = key(
         None, "--rate-hz HZ", "queries per second (default: the board's)", within=(MIN_RATE_HZ, MAX_RATE_HZ)
     )
-    mask: str | None = key(None, "--mask PNG", "mask image, black where frames show an overlay instead of the ground")
+    mask: str | None = key(None, "--mask PNG", "mask image, black where frames show an overlay, not the ground")
     lens: str | None = key(None, "--lens FILE", "camera calibration (OpenCV, ROS or Kalibr YAML), to undistort images")
     fov_deg: float | None = key(
         None, "--fov-deg DEG", "field of view across the longest side of the image, in degrees", within=(5, 150)
@@ -90,7 +90,7 @@ class SourceConfig:
     up_deg: float = key(
         0.0,
         "--up-deg DEG",
-        "direction of the top of the image when the aircraft heads north, in degrees (default: 0)",
+        "compass direction of the top of the image when the nose points north, in degrees (default: 0)",
         within=(0, 360),
     )
     mount_ahead_deg: float = bounded_key(-45, 45, default=0.0)
@@ -119,12 +119,12 @@ class MatchConfig:
     accept_precision: float = key(
         0.999,
         "--accept-precision P",
-        "required share of right matches among those accepted (default: 0.999)",
+        "required share of accepted matches that are correct (default: 0.999)",
         within=(0.5, 0.999999),
     )
-    min_score: float | None = key(None, "--min-score S", "minimum score to accept", within=(0, 1))
+    min_score: float | None = key(None, "--min-score S", "minimum score of an accepted match", within=(0, 1))
     min_margin: float | None = key(
-        None, "--min-margin M", "minimum lead over the best place elsewhere to accept", within=(0, 1)
+        None, "--min-margin M", "minimum lead of an accepted match over the best place elsewhere", within=(0, 1)
     )
     verify: bool = True
     neighbour_m: float = bounded_key(0, 10_000, default=50.0)
@@ -139,7 +139,7 @@ class MatchConfig:
 @dataclass(frozen=True, slots=True)
 class MemoryConfig:
     budget_mb: float | None = key(
-        None, "--budget-mb MB", "memory limit of the index in MB (default: the board's)", within=BUDGET_RANGE_MB
+        None, "--budget-mb MB", "memory limit for the index in MB (default: the board's)", within=BUDGET_RANGE_MB
     )
 
 
@@ -165,11 +165,15 @@ class SourceSetsConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MavlinkConfig:
-    link: str | None = key(None, "--link URL", "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, serial:DEV:BAUD")
+    link: str | None = key(
+        None,
+        "--link URL",
+        "MAVLink connection to the autopilot: udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT or serial:DEV:BAUD",
+    )
     component_id: int = bounded_key(1, 255, default=197)
     system_id: int | None = bounded_key(1, 255, default=None)
     send_fixes: bool = key(
-        True, "--dry-run", "send no position; decide, log and announce everything else as in a flight", sets=False
+        True, "--dry-run", "send no positions; do, log and announce everything else as in a flight", sets=False
     )
     max_fix_age_s: float = bounded_key(0.1, 5, default=1.0)
     min_accuracy_m: float = bounded_key(1, 10_000, default=5.0)
@@ -183,7 +187,7 @@ class MavlinkConfig:
 class LogConfig:
     path: str | None = key("edgevpr-flight.jsonl", "--log FILE", "flight log to write (JSON lines)")
     max_mb: float | None = bounded_key(1, 1_000_000, default=200.0)
-    record: str | None = key(None, "--record FOLDER", "folder for a recording, for `edgevpr replay`")
+    record: str | None = key(None, "--record FOLDER", "record the flight to this folder, for `edgevpr replay`")
     record_mb: float = bounded_key(10, 1_000_000, default=8000.0)
 
 
@@ -200,11 +204,11 @@ class BatteryConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
-    """The whole configuration. A key has its type, default, limits and flag here; `deploy/config.yaml` explains it."""
+    """The whole configuration: types, defaults, limits and flags. `deploy/config.yaml` explains the keys."""
 
     board: str = key("this", "--board NAME", "hardware profile (default: this computer)")
     map: str | None = key(None, "--map MAP", "map file")
-    technique: str | None = key(None, "--technique NAME", "use this technique")
+    technique: str | None = key(None, "--technique NAME", "require this technique")
     source: SourceConfig = SourceConfig()
     match: MatchConfig = MatchConfig()
     memory: MemoryConfig = MemoryConfig()
@@ -216,8 +220,8 @@ class Config:
 
 
 def list_keys(cls: type = Config, prefix: str = "") -> Iterator[Key]:
-    """Yield the keys of the dataclass `cls` and of its sections, in the order of the fields. `prefix` is put before
-    each name: the dotted name of the section that `cls` is, such as "source." ("": the whole configuration)."""
+    """Yield the keys of the dataclass `cls` and of its sections, in the order of the fields. `prefix` begins each name:
+    the dotted name of the section `cls`, such as "source." ("": the whole configuration)."""
     hints = typing.get_type_hints(cls)
     for spec in fields(cls):
         kind = _get_class(hints[spec.name])
@@ -228,9 +232,9 @@ def list_keys(cls: type = Config, prefix: str = "") -> Iterator[Key]:
 
 
 def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None) -> Config:
-    """Load the file `path` (None: no file, all defaults), and replace values by `overrides` ({"source.rate_hz": 2.0};
-    None values are ignored). Raises ConfigError, which names the file, the key and what to do."""
-    from edgevpr.core.yamlfile import read_yaml  # loads PyYAML, which the list of flags does not need
+    """Load the configuration file `path` (None: all defaults) and replace values with `overrides`, such as
+    {"source.rate_hz": 2.0}; None values are ignored. Raises ConfigError that names the file, the key and the remedy."""
+    from edgevpr.core.yamlfile import read_yaml  # loads PyYAML, which listing the flags does not need
 
     config = Config() if path is None else build(Config, read_yaml(path), str(path))
     mapping = asdict(config)
@@ -245,15 +249,16 @@ def load_config(path: str | Path | None, overrides: dict[str, Any] | None = None
 
 
 def resolve_log_paths(log: LogConfig, folder: str) -> LogConfig:
-    """Return settings of logs and recordings whose paths, where relative, are relative to `folder`."""
+    """Return the settings with relative paths of logs and recordings resolved against `folder`."""
     path, record = (value and os.path.join(folder, value) for value in (log.path, log.record))
     return replace(log, path=path, record=record)
 
 
 def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -> T:
-    """Build the frozen dataclass `cls` from a mapping. In messages, `where` is the file and `prefix` begins each key.
+    """Build the frozen dataclass `cls` from a mapping. `where` and `prefix` are for messages: the file, and the start
+    of each key.
 
-    Raises ConfigError for a key that is unknown or missing, and for a value of a wrong type or out of range.
+    Raises ConfigError for an unknown or missing key, and for a value of the wrong type or out of range.
     """
     hints = typing.get_type_hints(cls)
     specs = {spec.name: spec for spec in fields(cls)}
@@ -267,7 +272,7 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
         if name in mapping:
             values[name] = _convert(mapping[name], hints[name], spec.metadata.get("key", _ANY), where, prefix + name)
         elif spec.default is MISSING and spec.default_factory is MISSING:
-            raise ConfigError(f"{where}: the key `{prefix}{name}` is missing: add it.")
+            raise ConfigError(f"{where}: key `{prefix}{name}` is missing: add it.")
     return cls(**values)
 
 
@@ -278,16 +283,16 @@ def _convert(value: Any, hint: Any, rules: Key, where: str, name: str) -> Any:
         return None
     if is_dataclass(kind):
         if not isinstance(value, dict):
-            raise ConfigError(f"{what} is a section: write its keys below it, indented.")
+            raise ConfigError(f"{what} is a section: write its keys below it and indent them.")
         return build(kind, value, where, f"{name}.")
     if value is None:
-        raise ConfigError(f"{what} has no value: write one.")
+        raise ConfigError(f"{what} has no value: give it one.")
     if isinstance(value, int) and abs(value) > _MAX_INTEGER:
         raise ConfigError(f"{what} has too many digits: write a smaller number.")
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if isinstance(value, str) and _NOT_IN_NAMES.search(value):
-        raise ConfigError(f"{what} holds a character that no file name can have ({value!a:.60}): remove it.")
+        raise ConfigError(f"{what} contains a character that no file name can have ({value!a:.60}): remove it.")
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise ConfigError(f"{what} must be {_TYPE_NAMES.get(kind, kind)}, not {value!r:.{_MAX_VALUE_CHARS}}.")
     if limits and not limits[0] <= value <= limits[1]:
@@ -299,7 +304,7 @@ def _convert(value: Any, hint: Any, rules: Key, where: str, name: str) -> Any:
 
 
 def _get_class(hint: Any) -> type:
-    """Return the class of a type hint, without None or parameters: dict for `dict[str, Any] | None`."""
+    """Return the class of a type hint without None and type parameters: dict for `dict[str, Any] | None`."""
     options = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     kind: type = next(option for option in options if option is not type(None))
     return typing.get_origin(kind) or kind

@@ -1,5 +1,5 @@
-"""The contract of a technique: its specification, its descriptor of an image, and its comparison of query and place.
-All of edgevpr uses techniques only through these types; `edgevpr/techniques` implements them."""
+"""The interface of a technique: its specification, its descriptor of an image, and its comparison of query and place.
+The rest of edgevpr uses techniques only through these types; `edgevpr/techniques` implements them."""
 
 import math
 from collections.abc import Sequence
@@ -25,30 +25,30 @@ class PartSpec:
 
 
 def find_nearest_height(height_ratios: Sequence[float], height_ratio: float) -> float:
-    """Return the member of `height_ratios` whose quotient with `height_ratio` is nearest to 1."""
+    """Return the member of `height_ratios` that is nearest to `height_ratio` by their quotient."""
     return min(height_ratios, key=lambda ratio: abs(math.log(ratio / height_ratio)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueSpec:
-    """The specification of a technique: the form of its descriptors, and its optional abilities.
+    """The specification of a technique: the format of its descriptors, and its optional abilities.
 
-    A map file stores the fields from `name` to `packed`; only a technique that equals them can use it.
+    A map file stores the fields from `name` to `packed`; only a technique with equal fields can use the map.
     `coarse`, `fine`: the two parts of a place's descriptor. `fine` None: there is no fine part.
     `model_sha256`: hash of the network file. None: no network is used.
     `packed`: the row of a place in the index in RAM, made by `Technique.pack`. None: the row is the coarse part.
 
     A map does not store the other fields. They describe optional abilities:
-    `form`: how numbers of vectors are stored in RAM, one of `forms`, which go from large to small. None: no choice.
+    `form`: number format of vectors in RAM, one of `forms`, which are listed largest first. None: no choice.
     `sequence`: default number of queries that are matched together.
-    `scan_counts`: the score of the scan is a part of the final score (see `places.retrieve`).
-    `heading_within_deg`: only rotations of the query within so many degrees of the expected one are tried, where the
-    headings are known. None: headings are not used.
+    `scan_counts`: the score of the scan is part of the final score (see `places.retrieve`).
+    `heading_within_deg`: if headings are known, only rotations of the query within this many degrees of the expected
+    one are tried. None: headings are not used.
     `cells`: number of cells of `FineMatch.shift_cells` along a picture's side. None: matches have no such shift.
-    `looks_down`: pictures show what is under the camera, so that shifts give metres.
-    `height_ratios`: heights of the camera, over that of the map, at which a query can be recognised.
-    `in_full`: most candidates that are compared by `match`. Of more, those with the best estimates by
-    `Technique.score_quickly` are chosen. None: all candidates are compared by `match`.
+    `looks_down`: pictures show the ground below the camera, so shifts can be converted to metres.
+    `height_ratios`: camera heights, relative to that of the map, at which a query can be recognised.
+    `in_full`: maximum number of candidates compared by `match`. If there are more, those with the best
+    `Technique.score_quickly` estimates are chosen. None: all candidates are compared by `match`.
     """
 
     name: str
@@ -77,10 +77,10 @@ class TechniqueSpec:
 class Descriptor:
     """The descriptor of one image.
 
-    `coarse`: becomes one row of the index in RAM (see `Technique.pack`). `fine`: stays in the map file and is read for
-    candidates only (None: the technique has none). `quality`: share of the image that holds information, 0..1.
-    Of a query, where the technique needs it: `regions`, the descriptors of its regions; `good`, bool, True for regions
-    that are compared; `picture`, which is encoded again in other rotations.
+    `coarse`: becomes one row of the index in RAM (see `Technique.pack`). `fine`: stays in the map file and is read only
+    for candidates (None: the technique has none). `quality`: share of the image that has usable content, 0..1.
+    For queries of techniques that need it: `regions`, the descriptors of its regions; `good`, bool, True for regions to
+    compare; `picture`, which is encoded again at other rotations.
     """
 
     coarse: np.ndarray
@@ -93,9 +93,9 @@ class Descriptor:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The prepared picture that a descriptor was made from. `grey` is float32 (side, side), None if the picture is
-    never rotated. `allowed` is bool (side, side), True for pixels that may be used (None: all). `seen` is bool, one
-    for each block of cells, True if all of its pixels are allowed."""
+    """The prepared picture from which a descriptor was made. `grey`: float32 (side, side), None if the picture is never
+    rotated. `allowed`: bool (side, side), True for pixels that may be used (None: all). `seen`: bool, one for each
+    block of cells, True if all of its pixels are allowed."""
 
     grey: np.ndarray | None
     allowed: np.ndarray | None
@@ -104,12 +104,12 @@ class Picture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Support:
-    """Agreement of all regions of query and place with one displacement: the shift that `FineMatch.shift_cells` gives.
+    """Support from all regions of query and place for one displacement, `FineMatch.shift_cells`.
 
-    `back`: share (0..1) of the place's regions whose most similar region of the query lies at this displacement.
-    `likeness`: mean cosine similarity of each region of the query to the most similar one of the place, anywhere.
-    `log_rank`: for each region of the query, the place's regions are ranked by similarity; mean natural logarithm of
-    the rank (from 1) of the region at this displacement.
+    `back`: share (0..1) of the place's regions whose most similar region in the query is at this displacement.
+    `likeness`: mean cosine similarity of each region of the query to the most similar region anywhere in the place.
+    `log_rank`: for each region of the query, the place's regions are ranked by similarity to it; this is the mean
+    natural logarithm of the rank (from 1) of the region at this displacement.
     """
 
     back: float
@@ -119,17 +119,17 @@ class Support:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FineMatch:
-    """Result of comparing the query with one place: `score`, 0..1. Only some techniques give the rest (else None).
+    """Result of comparing the query with one place: `score`, 0..1. The other fields are None for some techniques.
 
-    `shift_cells`: offset (dx right, dy down) from the middle of the place's picture to that of the query's, in cells of
-    the place. `covariance_cells2`: covariance (var x, cov xy, var y) of this offset.
+    `shift_cells`: offset (dx right, dy down) from the centre of the place's picture to the centre of the query's, in
+    cells of the place. `covariance_cells2`: covariance (var x, cov xy, var y) of this offset.
     `rotation_deg`: rotation of the camera since the place was mapped, clockwise, 0..360.
-    `height_ratio`: height of the camera above the ground, divided by its height when the place was mapped.
+    `height_ratio`: height of the camera above ground, divided by its height when the place was mapped.
     `coverage`: share (0..1) of the place's regions that agree with this shift, each counted once.
     `support`: further measures of the agreement with this shift.
-    `structure`: how well the structures of both pictures agree at this shift, and with a camera that looks straight
-    down, how much better than at others, in standard deviations (see `techniques.overlay`).
-    `votes`: `score` before it counted the structures."""
+    `structure`: how well the structures in both pictures agree at this shift; for a camera that looks straight down,
+    how much better than at other shifts, in standard deviations (see `techniques.overlay`).
+    `votes`: `score` before the structures were included."""
 
     score: float = field(kw_only=False)
     shift_cells: tuple[float, float] | None = None
@@ -144,9 +144,9 @@ class FineMatch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Perspective:
-    """Perspective of a query over a place. The homography `over_place` (3, 3) maps points of the query's picture to
-    the place's: (right, down, 1) from the middle, in longest sides; its last value is 1. `regions` agree on it.
-    `slope_sd`: standard deviation of `slope`, along each axis."""
+    """Perspective of a query relative to a place. `over_place`: homography (3, 3) from points in the query's picture to
+    points in the place's: (right, down, 1) from the centre, in longest sides; its last element is 1. `regions`: number
+    of regions that agree with it. `slope_sd`: standard deviation of `slope` along each axis."""
 
     over_place: np.ndarray
     slope_sd: float
@@ -154,37 +154,37 @@ class Perspective:
 
     @property
     def slope(self) -> float:
-        """Change of scale across the query's picture, relative, per longest side: the tangent of its tilt over the
+        """Relative change of scale across the query's picture, per longest side: the tangent of its tilt divided by the
         focal length."""
         return float(np.hypot(*self.over_place[2, :2]))
 
     @property
     def scales(self) -> tuple[float, float]:
-        """Largest and smallest scale at the middle of the query's picture, by direction. Of a tilted one, their ratio
-        is the cosine of the tilt, whatever the lens."""
+        """Largest and smallest scale over all directions at the centre of the query's picture. If it is tilted, their
+        ratio is the cosine of the tilt, whatever the lens."""
         derivative = self.over_place[:2, :2] - np.outer(self.over_place[:2, 2], self.over_place[2, :2])
         largest, smallest = np.linalg.svd(derivative, compute_uv=False)
         return float(largest), float(smallest)
 
 
 class Technique(Protocol):
-    """A technique of place recognition: it describes pictures (`encode`), and compares a query with all places by their
-    coarse parts (`score_places`), then with some by their fine parts (`match`). Needed only with the ability:
-    `match` with `spec.fine`, `pack` with `spec.packed`, `score_quickly` with `spec.in_full`, `match_rotated`,
+    """A place recognition technique. It encodes pictures (`encode`), compares a query with all places by their coarse
+    parts (`score_places`), then with some by their fine parts (`match`). Some methods are needed only with an ability:
+    `match` with `spec.fine`, `pack` with `spec.packed`, `score_quickly` with `spec.in_full`, and `match_rotated`,
     `match_at_rest` and `measure_perspective` with `spec.looks_down`."""
 
     spec: TechniqueSpec
-    candidates: int  # places compared after the scan, unless the configuration sets another number
-    min_score: float  # least score of an accepted match, unless the configuration sets another
-    min_margin: float  # least margin of an accepted match over the best place elsewhere, likewise
-    min_quality: float  # least `Descriptor.quality` of a query that holds enough to be recognised
+    candidates: int  # default number of places compared after the scan
+    min_score: float  # default minimum score of an accepted match
+    min_margin: float  # default minimum lead of an accepted match over the best place elsewhere
+    min_quality: float  # minimum `Descriptor.quality` of a query that can be recognised
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:
-        """Encode an image, uint8 (H, W[, 3]). `mask`, bool (H, W), is False for pixels to be ignored (None: none)."""
+        """Encode an image, uint8 (H, W[, 3]). `mask`: bool (H, W), False for pixels to ignore (None: use all)."""
 
     def pack(self, coarse: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        """Pack coarse parts (N, *coarse.shape) to rows of the index (N, *row.shape). `mean`, of `coarse.shape`, is the
-        mean of all coarse parts of the map."""
+        """Pack coarse parts (N, *coarse.shape) into rows of the index (N, *row.shape). `mean`: mean of all coarse parts
+        of the map, of `coarse.shape`."""
 
     def score_places(
         self,
@@ -195,30 +195,31 @@ class Technique(Protocol):
         height_ratio: float | None = None,
         in_reach: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Score all places of the index, given as `rows` (N, *row.shape). Returns the scores, float32 (N,), and the
-        score of each hypothesis that `match` can try, float32 (N, H), -inf if it is ruled out (None: no choice).
+        """Score all places of the index, `rows` (N, *row.shape). Return the scores, float32 (N,), and a score for each
+        place and hypothesis (such as a rotation) that `match` can test, float32 (N, H), -inf for those ruled out; None
+        instead of the latter if there is only one hypothesis.
 
-        `mean`: mean coarse part of the map, for a technique that packs (else None).
-        `turned_deg`: expected `FineMatch.rotation_deg` of each place, float (N,), NaN: unknown. Other rotations are
+        `mean`: mean of the map's coarse parts, for techniques that pack them (else None).
+        `turned_deg`: expected `FineMatch.rotation_deg` at each place, float (N,), NaN: unknown. Other rotations are
         ruled out. None: nothing is expected. Given only to a technique with `spec.heading_within_deg`.
-        `height_ratio`: expected `FineMatch.height_ratio` (None: 1). `in_reach`, bool (N,): places that are looked at
-        closer (None: all). Both are given only to one with `spec.height_ratios`."""
+        `height_ratio`: expected `FineMatch.height_ratio` (None: 1). `in_reach`: bool (N,), places to examine more
+        closely (None: all). Both are given only to a technique with `spec.height_ratios`."""
 
     def match(self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None) -> FineMatch:
-        """Compare the query with the fine part of one place under `hypotheses` (None: all). These are numbers from 0 to
-        H - 1, the columns of the scores of hypotheses that `score_places` returns."""
+        """Compare the query with the fine part of one place under `hypotheses` (None: all): numbers from 0 to H - 1,
+        the columns of the second result of `score_places`."""
 
     def score_quickly(
         self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None
     ) -> tuple[float, list[int] | None]:
-        """Estimate the score that `match` would give from a part of the query's regions. Returns it with a list of only
-        the best hypothesis, to be given to `match` (None: there are no hypotheses)."""
+        """Estimate the score that `match` would return, from a part of the query's regions. Return it and the best
+        hypothesis, as a list to pass to `match` (None: there are no hypotheses)."""
 
     def match_rotated(self, query: Descriptor, fine: np.ndarray, match: FineMatch) -> FineMatch:
-        """Compare the query with the place of a `match` again, at its height, but under other rotations only."""
+        """Compare the query with the place of a `match` again, at the same height but only at other rotations."""
 
     def measure_perspective(self, query: Descriptor, fine: np.ndarray, match: FineMatch) -> Perspective | None:
-        """Measure the perspective of the query over the place of a `match`; None if too little of them agrees."""
+        """Measure the perspective of the query over the place of a `match`; None if too few regions agree."""
 
     def match_at_rest(self, query: Descriptor, fine: np.ndarray) -> FineMatch:
-        """Compare the query with a place as if it had been taken from the same height, not turned."""
+        """Compare the query with a place as if taken from the same height and without rotation."""

@@ -1,8 +1,8 @@
-"""The errors that a user can meet. Every message is one sentence that names the cause and says what to do."""
+"""The errors that a user can see. Every message is one sentence that names the cause and says what to do."""
 
 
 class EdgevprError(Exception):
-    """Base class: something that the program works with (a file, a link, a map) cannot be used. Exit code 1."""
+    """Base class: something that the program needs (a file, a link, a map) cannot be used. Exit code 1."""
 
     exit_code = 1
 
@@ -14,11 +14,11 @@ class UsageError(EdgevprError):
 
 
 class ConfigError(UsageError):
-    """A configuration, board or model file is missing, or its content is wrong."""
+    """A configuration, board or model file is missing or has invalid content."""
 
 
 class ImageError(EdgevprError):
-    """One image, or `count` images of a video, cannot be used; others may be usable."""
+    """One image, or `count` images of a video, cannot be used; the others may be usable."""
 
     def __init__(self, message: str, count: int = 1) -> None:
         super().__init__(message)
@@ -34,15 +34,15 @@ class MapError(EdgevprError):
 
 
 class MapBusyError(MapError):
-    """Another program is writing to a place map at this moment."""
+    """Another program is writing to the place map."""
 
 
 class PlaceError(MapError):
-    """One place of a map cannot be used; others may be usable. `place_id` is the place's number in the map file `path`,
-    and `problem` says in a few words what is wrong."""
+    """One place of a map cannot be used; the others may be usable. `place_id`: the place's number in the map file
+    `path`. `problem`: what is wrong, in a few words."""
 
     def __init__(self, path: object, place_id: int, problem: str) -> None:
-        super().__init__(f"{path}: place {place_id} is damaged ({problem}): `edgevpr map check` says what else is.")
+        super().__init__(f"{path}: place {place_id} is damaged ({problem}): `edgevpr map check` lists all damage.")
         self.place_id, self.problem = place_id, problem
 
 
@@ -51,11 +51,11 @@ class LinkError(EdgevprError):
 
 
 class LinkAddressError(LinkError):
-    """The address of a MAVLink link is wrong, so that opening it again will not help. Exit code 2."""
+    """The address of a MAVLink link is invalid, so retrying will not help. Exit code 2."""
 
     exit_code = 2
 
 
 class ModelError(EdgevprError):
     """A network cannot be used. The cause is its card (the YAML file that describes it), its file, its output, the
-    words (learnt region descriptors) made with it, or onnxruntime."""
+    visual vocabulary trained with it, or onnxruntime."""

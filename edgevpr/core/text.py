@@ -1,4 +1,4 @@
-"""Text output of all commands: escaping of text of foreign origin, tables, lines of JSON, and progress."""
+"""Text output of all commands: escaping of untrusted text, tables, JSON lines, and progress."""
 
 import json
 import logging
@@ -18,44 +18,44 @@ from threading import Event, Thread
 from typing import Any, TextIO, TypeVar
 
 T = TypeVar("T")
-# Called with items, their number (0: unknown) and a label; yields the items unchanged and shows the progress.
+# Called with items, their number (0: unknown) and a label; yields the items unchanged and shows progress.
 Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]
-# user:password@ of an address. A password may hold `@` and, wrongly, `/`: all up to the last @ of the word is replaced.
-# An address that was handled as a path has only one `/` after the colon.
+# user:password@ in an address. A password may contain `@` and, although invalid, `/`: everything up to the last @ of
+# the word is replaced. An address that was handled as a path has only one `/` after the colon.
 _PASSWORD = re.compile(r"(\w:/{1,2}[^\s/:@]*):\S*@")
-# Passwords and keys in the query part of an address, such as ?token=abc, which cameras use too.
+# Passwords and keys in the query part of an address, such as ?token=abc; cameras use these too.
 _SECRET = re.compile(r"(?i)([?&](?:password|passwd|passwort|pass|pwd|token|secret|api_?key|key|auth)=)[^&\s#]*")
 _LINE_COLUMNS = 120
 _TERMINAL_COLUMNS = 79
-_MAX_ODDS_WRONG = 1e-3  # of all matches: fewer are not to be told apart in per cent
+_MAX_ODDS_WRONG = 1e-3  # up to this probability of an error, per cent would show no difference: odds are shown
 _MIN_WRONG = 1e-6
-_MAX_SILENCE_S = 5.0  # a line is written after so long a silence
-_MIN_ESTIMATE_S = 10.0  # no remaining time is shown if it, or the time since the start, is shorter
+_MAX_SILENCE_S = 5.0  # a progress line is written at least this often
+_MIN_ESTIMATE_S = 10.0  # the remaining time is shown only if it and the time since the start are at least this long
 
 
 def escape_unprintable(text: str, keep: str = "") -> str:
-    """Escape characters that a terminal acts on or cannot show: control characters, line breaks, marks that change the
-    direction of writing, bytes that are not UTF-8. The characters in `keep` stay as they are."""
-    if text.isprintable():  # false if there is any such character
+    """Escape characters that a terminal interprets or cannot show: control characters, line breaks, marks that change
+    the writing direction, bytes that are not UTF-8. The characters in `keep` are left unchanged."""
+    if text.isprintable():  # False if the text has any such character
         return text
     return "".join(char if char.isprintable() or char in keep else _escape_character(char) for char in text)
 
 
 def _escape_character(char: str) -> str:
-    if "\udc80" <= char <= "\udcff":  # a byte that is not UTF-8, as Python hands it over
+    if "\udc80" <= char <= "\udcff":  # Python's surrogate for a byte that is not UTF-8
         return f"\\x{ord(char) - 0xDC00:02x}"
     return char.encode("unicode_escape").decode("ascii")
 
 
 def redact_passwords(text: str) -> str:
-    """Replace passwords and keys in the addresses of a text by ***: rtsp://user:***@host/path?token=***."""
+    """Replace passwords and keys in the addresses in a text with ***: rtsp://user:***@host/path?token=***."""
     if ":/" not in text:
         return text
     return _SECRET.sub(r"\1***", _PASSWORD.sub(r"\1:***@", text))
 
 
 def sanitize(text: str, keep: str = "") -> str:
-    """Make a text fit for messages: see `redact_passwords` and `escape_unprintable`, which also explains `keep`."""
+    """Make a text safe for messages: apply `redact_passwords` and `escape_unprintable`, which explains `keep`."""
     return escape_unprintable(redact_passwords(text), keep)
 
 
@@ -65,22 +65,21 @@ def decode_name(name: str) -> str:
 
 
 def suggest(name: str, names: Iterable[str], otherwise: str) -> str:
-    """Return "did you mean `X`?" with the one of `names` that is most similar to `name`; `otherwise` if none
-    is similar."""
-    near = get_close_matches(name, list(names), n=1)
-    return f"did you mean `{near[0]}`?" if near else otherwise
+    """Return "did you mean `X`?" with the member of `names` most similar to `name`; `otherwise` if none is similar."""
+    matches = get_close_matches(name, list(names), n=1)
+    return f"did you mean `{matches[0]}`?" if matches else otherwise
 
 
 def align_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
-    """Format rows of cells as a table, one line for each row (which may be shorter than others). The first `left`
-    columns are flush left, the others flush right."""
+    """Format rows of cells as a table, one line per row; rows may differ in length. The first `left` columns are
+    left-aligned, the others right-aligned."""
     widths = [max(map(len, cells)) for cells in zip_longest(*rows, fillvalue="")]
     lines = ([f"{cell:{'<' if i < left else '>'}{widths[i]}}" for i, cell in enumerate(row)] for row in rows)
     return ["  ".join(line).rstrip() for line in lines]
 
 
 def format_markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
-    """Return a Markdown table: the first `left` columns flush left, the others flush right."""
+    """Return a Markdown table: the first `left` columns left-aligned, the others right-aligned."""
     ruler = ["---"] * left + ["---:"] * (len(headings) - left)
     return "\n".join("| " + " | ".join(line) + " |" for line in (headings, ruler, *rows))
 
@@ -91,15 +90,15 @@ def wrap_sentence(text: str) -> list[str]:
 
 
 def format_json_line(value: Any) -> bytes:
-    """Write a value as one line of JSON, without passwords. Dataclasses become objects, members of
-    an Enum their names, NaN and infinities null."""
+    """Encode a value as one line of JSON, without passwords. Dataclasses become objects, Enum members their names, NaN
+    and infinities null."""
     text = json.dumps(_to_json(value), ensure_ascii=False, allow_nan=False)
-    # Text that is not UTF-8 (a foreign file name) becomes a \u escape, which JSON reads back unchanged.
+    # Text that is not UTF-8 (a file name) becomes a \u escape, which JSON reads back unchanged.
     return text.encode("utf-8", "backslashreplace") + b"\n"
 
 
 def _to_json(value: Any) -> Any:
-    """Convert `value` to JSON types; numbers get seven decimals (a centimetre of latitude) or, if below 1, 7 digits."""
+    """Convert `value` to JSON types. Numbers keep 7 decimals (1 cm of latitude) or, below 1, 7 significant digits."""
     if isinstance(value, str):
         return redact_passwords(value)
     if value is None or isinstance(value, (bool, int)):
@@ -116,13 +115,13 @@ def _to_json(value: Any) -> Any:
         return [_to_json(item) for item in value]
     if is_dataclass(value) and not isinstance(value, type):
         return _to_json(asdict(value))
-    if hasattr(value, "tolist"):  # NumPy's scalars and arrays
+    if hasattr(value, "tolist"):  # NumPy scalars and arrays
         return _to_json(value.tolist())
     return redact_passwords(str(value))
 
 
 def is_quiet() -> bool:
-    """Return True if edgevpr is to log warnings only: then no progress is shown either."""
+    """Return True if edgevpr logs only warnings; it then shows no progress either."""
     return logging.getLogger("edgevpr").level > logging.INFO
 
 
@@ -133,9 +132,9 @@ def progress(
     stream: TextIO | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[T]:
-    """Yield the items of `iterable`; write to `stream` (None: stderr) how many of `total` (0: unknown) are done, and an
-    estimate of the remaining time. On a terminal the line, which `label` begins, is redrawn; elsewhere a new line is
-    written for every tenth of the work (of unknown total: for every 100 items), and if the last one is 5 s old."""
+    """Yield the items of `iterable` and write progress to `stream` (None: stderr): `label`, how many of `total` (0:
+    unknown) are done, and the estimated remaining time. On a terminal the line is redrawn. Elsewhere a new line is
+    written for every tenth of the work (every 100 items if the total is unknown), and at least every 5 s."""
     if is_quiet():
         yield from iterable
         return
@@ -153,7 +152,7 @@ def progress(
             step, text = done // (1 if terminal else 100), f"{label}  {done}"
         if step != last_step or clock() - last_s >= _MAX_SILENCE_S:
             last_step, last_s = step, clock()
-            # The cursor goes back to the start of the line, so that an error message is written over it.
+            # The cursor returns to the start of the line, so an error message overwrites it.
             stream.write(f"{text:<{width}}\r" if terminal else f"{text}\n")
             width = len(text)
             stream.flush()
@@ -162,13 +161,13 @@ def progress(
 
 
 def iterate_silently(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
-    """Return `items`: the `Progress` that shows nothing."""
+    """Return `items` unchanged: a `Progress` that shows nothing."""
     return items
 
 
 @contextmanager
 def show_elapsed(text: str) -> Iterator[None]:
-    """Write `text` and the seconds so far to stderr every 5 s until the body of `with` has ended."""
+    """Write `text` and the elapsed seconds to stderr every 5 s until the `with` block ends."""
     stream, ended, began_s = sys.stderr, Event(), time.monotonic()
 
     def report() -> None:
@@ -184,15 +183,15 @@ def show_elapsed(text: str) -> Iterator[None]:
         reporter.join()
 
 
-def _format_time_left(passed_s: float, done: int, total: int) -> str:
-    left_s = passed_s / done * (total - done)
-    if min(passed_s, left_s) < _MIN_ESTIMATE_S:
+def _format_time_left(elapsed_s: float, done: int, total: int) -> str:
+    left_s = elapsed_s / done * (total - done)
+    if min(elapsed_s, left_s) < _MIN_ESTIMATE_S:
         return ""
     return f", {left_s:.0f} s left" if left_s < 100 else f", {left_s / 60:.0f} min left"
 
 
-def show_waiting(text: str, stream: TextIO | None = None) -> None:
-    """Show on a terminal what the program waits for, in a line that the next call replaces; "" clears the line."""
+def show_wait(text: str, stream: TextIO | None = None) -> None:
+    """Show on a terminal what the program is waiting for, on a line that the next call replaces; "" clears it."""
     stream = stream or sys.stderr
     if stream.isatty():
         stream.write(f"{text[:_TERMINAL_COLUMNS]:<{_TERMINAL_COLUMNS}}\r")
@@ -200,7 +199,7 @@ def show_waiting(text: str, stream: TextIO | None = None) -> None:
 
 
 def format_probability(probability: float) -> str:
-    """Show the probability of being right: "98.1 %" or, from 99.9 % on, "1 in 3,000 wrong", at most 1 in 1,000,000."""
+    """Format the probability of being right: "98.1 %" or, from 99.9 %, "1 in 3,000 wrong" (at most 1 in 1,000,000)."""
     wrong = max(1 - probability, _MIN_WRONG)
     if not wrong <= _MAX_ODDS_WRONG:  # NaN as well
         return f"{100 * probability:.1f} %"
@@ -209,5 +208,5 @@ def format_probability(probability: float) -> str:
 
 def format_offset(east_m: float, north_m: float) -> str:
     """Format an offset on the ground: "3.1 m east and 1.2 m south"."""
-    side, end = "east" if east_m > 0 else "west", "north" if north_m > 0 else "south"
-    return f"{abs(east_m):.1f} m {side} and {abs(north_m):.1f} m {end}"
+    east_west, north_south = "east" if east_m > 0 else "west", "north" if north_m > 0 else "south"
+    return f"{abs(east_m):.1f} m {east_west} and {abs(north_m):.1f} m {north_south}"

@@ -1,4 +1,4 @@
-"""The values that packages pass to each other: frozen dataclasses."""
+"""Frozen dataclasses that the packages exchange."""
 
 import math
 from dataclasses import dataclass
@@ -8,15 +8,15 @@ import numpy as np
 from edgevpr.core.contract import FineMatch
 from edgevpr.core.reasons import Reason
 
-# ArduPilot treats an older frame as 5 s old, and would then correct the position by too little: no such fix is sent.
+# ArduPilot treats an older frame as 5 s old and would correct the position by too little, so no such fix is sent.
 MAX_FIX_AGE_S = 5.0
 _MAX_REPORT_AGE_S = 1.0
-FRAME_TIME_SD_S = 0.03  # standard deviation of the time of a frame: what a camera takes to expose and to send varies
+FRAME_TIME_SD_S = 0.03  # standard deviation of a frame's time: exposure and transfer times of a camera vary
 
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """A point on the WGS-84 ellipsoid; `alt_m` is metres above sea level, None where unknown."""
+    """A point on the WGS-84 ellipsoid. `alt_m`: metres above sea level, None if unknown."""
 
     lat_deg: float
     lon_deg: float
@@ -25,12 +25,12 @@ class Position:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pose:
-    """Direction and size on the ground of a place's picture, for a camera that looks straight down.
+    """Orientation and size on the ground of a place's picture, for a camera that looks straight down.
 
     `up_deg`: compass direction (0..360) of the picture's top. `footprint_m`: ground length of its longest side.
-    `covariance_m2`: covariance (variance east, covariance, variance north) of the place's position, the middle of the
-    picture. `is_surveyed`: cut from an orthophoto, so that the pose needs no refinement. `recorded`: the place's
-    position before refinement (None: refinement did not move it).
+    `covariance_m2`: covariance (variance east, covariance, variance north) of the place's position, the centre of the
+    picture. `is_surveyed`: the picture was cut from an orthophoto, so the pose needs no refinement. `recorded`: the
+    place's position before refinement (None: refinement did not move it).
     """
 
     up_deg: float
@@ -42,9 +42,9 @@ class Pose:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Receiver:
-    """The newest report of a GPS receiver: standard deviation `sd_m` of one axis, time of arrival `t_s` on the clock of
-    the frames, velocity over the ground (east, north), and altitude above sea level (None: unknown). `steady_for_s`:
-    since when its fixes have no gap, jump or implausible accuracy."""
+    """The newest report of a GPS receiver: standard deviation `sd_m` per axis, arrival time `t_s` on the clock of the
+    frames, velocity over ground (east, north), and altitude above sea level (None: unknown). `steady_for_s`: seconds
+    for which its fixes have had no gap, jump or implausible accuracy."""
 
     lat_deg: float
     lon_deg: float
@@ -60,14 +60,14 @@ class Vehicle:
     """The state of the aircraft as the autopilot reports it. None: unknown.
 
     `lat_deg`, `lon_deg`, `alt_m`: its estimated position (metres above sea level), with the standard deviation
-    `position_sd_m` of one axis (also None if the autopilot does not rely on it).
-    `heading_deg`: compass direction of the nose, 0..360. `t_received_s`: arrival of the report, by the frames' clock.
-    `has_gps`: a GPS receiver had a 3D fix near the estimated position then. If False, the position may be wrong: an
-    autopilot reports its estimate long after GPS is lost.
-    `roll_deg`, `pitch_deg`: positive with the right wing down, and with the nose up; `tilt_rate_deg_s`: rate of both.
-    `height_m`: above the ground; its sources disagree by `height_doubt_m`. `velocity_m_s`: over the ground (east,
-    north). `sink_m_s`: downwards. `innovation_ratio`: of measured positions to the filter's gate; above 1 it refuses
-    them. `gps`: newest position of a receiver, near the estimate or not (None: none is recent).
+    `position_sd_m` per axis (also None if the autopilot does not trust its position).
+    `heading_deg`: compass direction of the nose, 0..360. `t_received_s`: arrival of the report, on the frames' clock.
+    `has_gps`: a GPS receiver had a 3D fix near the estimated position at that time. If False, the position may be
+    wrong: an autopilot goes on reporting its estimate long after it has lost GPS.
+    `roll_deg`, `pitch_deg`: positive for right wing down and for nose up; `tilt_rate_deg_s`: rate of both together.
+    `height_m`: above ground; `height_doubt_m`: by how much its sources disagree. `velocity_m_s`: over ground (east,
+    north). `sink_m_s`: velocity down. `innovation_ratio`: innovation of measured positions over the filter's gate;
+    above 1 the filter refuses them. `gps`: newest receiver position, near the estimate or not (None: none is recent).
     `t_fix_s`: time of the newest fix from edgevpr that may already affect the position (-inf: none does)."""
 
     lat_deg: float
@@ -89,19 +89,19 @@ class Vehicle:
     t_fix_s: float = -math.inf
 
     def is_fresh(self, t_mono_s: float) -> bool:
-        """Return True if the report came within one second of `t_mono_s`, such as the time of a frame."""
+        """Return True if the report arrived within one second of `t_mono_s`, for example the time of a frame."""
         return abs(t_mono_s - self.t_received_s) <= _MAX_REPORT_AGE_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
-    """One picture and the data known of it (None: unknown).
+    """One picture and its metadata (None: unknown).
 
-    `image`: uint8, (H, W) grey or (H, W, 3) BGR. `t_mono_s`: time of taking, seconds of the monotonic clock; `t_sd_s`:
-    its standard deviation; `delay_sd_s`: of a hidden delay beside it, as is usual for such a camera. `t_utc_s`: seconds
-    since 1970. `heading_deg`: 0..360 clockwise from true north.
-    `roll_deg`, `pitch_deg`: of the airframe, positive with the right wing down, and with the nose up; of a camera on a
-    gimbal, its deviation from straight down. `height_m`: above the ground.
+    `image`: uint8, (H, W) grey or (H, W, 3) BGR. `t_mono_s`: capture time, seconds on the monotonic clock; `t_sd_s`:
+    its standard deviation; `delay_sd_s`: standard deviation of a further delay that the timestamps of such a camera
+    usually hide. `t_utc_s`: seconds since 1970. `heading_deg`: 0..360 clockwise from true north.
+    `roll_deg`, `pitch_deg`: attitude of the airframe, positive for right wing down and for nose up; for a camera on a
+    gimbal, its deviation from straight down. `height_m`: above ground.
     """
 
     image: np.ndarray
@@ -120,8 +120,8 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Salience:
-    """MS, SS and ES of a frame (thesis 3.2.4), each 0..1: how memorable, static and full of information it is (None:
-    not computed). `is_low`: the frame is below a threshold, and is a place only to close a long gap between places."""
+    """MS, SS and ES of a frame (thesis 3.2.4), each 0..1: how memorable, static and rich in information it is (None:
+    not computed). `is_low`: the frame is below a threshold and was stored only to bridge a long gap between places."""
 
     memorability: float | None
     staticity: float | None
@@ -130,18 +130,18 @@ class Salience:
 
     @property
     def scores(self) -> dict[str, float | None]:
-        """Return the three scores by their names."""
+        """Return the three scores by name."""
         return {"memorability": self.memorability, "staticity": self.staticity, "entropy": self.entropy}
 
     def rounded(self) -> dict[str, float | None]:
-        """Return the three scores by their names, rounded to four decimals for output."""
+        """Return the three scores by name, rounded to four decimals for output."""
         return {name: score if score is None else round(score, 4) for name, score in self.scores.items()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """A place of the map without its descriptors. Units are those of `Frame`; None is unknown. `place_id`: number in
-    the map; `source_image`: name of its picture; `quality`: that of its `Descriptor`."""
+    """A place of the map, without its descriptors. Units are as in `Frame`; None: unknown. `place_id`: number in the
+    map; `source_image`: name of its picture; `quality`: `Descriptor.quality` of its picture."""
 
     place_id: int
     source_image: str
@@ -155,8 +155,8 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A place that the query may show, and the result `match` of comparing the two. Retrieval returns a list of them,
-    the best first."""
+    """A place that the query may show, and the result `match` of comparing the two. Retrieval returns a list of
+    candidates, best first."""
 
     place: Place
     match: FineMatch
@@ -164,7 +164,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class StageCost:
-    """Cost of one stage of the work: elapsed (wall) seconds, and CPU-seconds of all threads of the process."""
+    """Cost of one processing stage: elapsed (wall) seconds, and CPU seconds of all threads of the process."""
 
     wall_s: float
     cpu_s: float
@@ -176,7 +176,7 @@ class StageCost:
         return StageCost(self.wall_s * times, self.cpu_s * times)
 
     def utilisation(self, cores: int) -> float:
-        """Return U of equation 5.1 of the thesis: the share of all `cores` that was busy, 0..1."""
+        """Return U in equation 5.1 of the thesis: the share of all `cores` that was busy, 0..1."""
         return min(1.0, self.cpu_s / (self.wall_s * cores)) if self.wall_s > 0 else 0.0
 
 
@@ -186,8 +186,8 @@ NO_COST = StageCost(0.0, 0.0)
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepCosts:
     """Costs of the steps of a query: `read` the picture, `prepare` it (level it), test its salience (`gate`), `encode`
-    it, measure the `stride` since the frame before, `scan` all places, `compare` the candidates, `verify` the best one
-    by its landmarks, `locate` the aircraft. A step that was not reached has no cost; only flights read and stride."""
+    it, measure the motion since the previous frame (`stride`), `scan` all places, `compare` the candidates, `verify`
+    the best one by landmarks, `locate` the aircraft. A step not reached costs nothing; only flights read and stride."""
 
     read: StageCost = NO_COST
     prepare: StageCost = NO_COST
@@ -201,22 +201,22 @@ class StepCosts:
 
     @property
     def encoding(self) -> StageCost:
-        """Cost of encoding as the thesis defines it: the steps before matching, without `read`."""
+        """Cost of encoding as defined in the thesis: all steps before matching except `read`."""
         return self.prepare + self.gate + self.encode
 
     @property
     def match(self) -> StageCost:
-        """Cost of matching as the thesis defines it: all steps after encoding."""
+        """Cost of matching as defined in the thesis: all steps after encoding."""
         return self.stride + self.scan + self.compare + self.verify + self.locate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryCost:
-    """Cost of one query by equations 5.1-5.7 of the thesis, for the stages of encoding and matching.
+    """Cost of one query by equations 5.1-5.7 of the thesis, for the encoding and matching stages.
 
-    `t_*_s`: elapsed seconds. `u_*`: utilisation of all cores, 0..1. `cpu_s`: CPU-seconds of both. `rss_mb`: resident
-    memory of the process now. `used_mah`: charge drawn from the battery; `marginal_mah`: the part that would not be
-    drawn without the query.
+    `t_*_s`: elapsed seconds. `u_*`: utilisation of all cores, 0..1. `cpu_s`: CPU seconds of both. `rss_mb`: current
+    resident memory of the process. `used_mah`: charge drawn from the battery; `marginal_mah`: the part that would not
+    have been drawn without the query.
     """
 
     t_encode_s: float = 0.0
@@ -236,9 +236,9 @@ class QueryCost:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixReport:
-    """The outcome of the position fix of one query, the name of its frame. `sent`: False if not, for the reason `why`;
-    None while it waits to be sent or, over TCP, to be acknowledged. `answer`: the autopilot's, the name of a MAV_RESULT
-    (None: none yet). `lat_deg`, `lon_deg` and `accuracy_m`: the position, None if there was nothing to send."""
+    """The outcome of the position fix for one query. `query`: name of its frame. `sent`: False if it was not sent, for
+    the reason `why`; None while it waits to be sent or, over TCP, acknowledged. `answer`: name of the MAV_RESULT that
+    the autopilot returned (None: none yet). `lat_deg`, `lon_deg`, `accuracy_m`: None if there was nothing to send."""
 
     query: str
     sent: bool | None

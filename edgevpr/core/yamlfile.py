@@ -1,5 +1,5 @@
-"""Reading of YAML files of any origin; the only module that imports PyYAML. Aliases and duplicate keys are errors, so
-that time and memory grow only with the length of the file, which is limited."""
+"""Reads untrusted YAML files; the only module that imports PyYAML. Aliases and duplicate keys are errors, so time and
+memory grow only with the length of the file, which is limited."""
 
 from copy import deepcopy
 from functools import lru_cache
@@ -11,16 +11,16 @@ import yaml
 from edgevpr.core.errors import ConfigError
 from edgevpr.core.files import read_file
 
-MAX_FILE_BYTES = 100_000  # the longest shipped file has 6,000; PyYAML reads some 100,000 a second
+MAX_FILE_BYTES = 100_000  # the longest shipped file has 6,000; PyYAML reads about 100,000 bytes a second
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Loader that refuses aliases and duplicate keys."""
+    """Loader that rejects aliases and duplicate keys."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         event = self.peek_event()  # type: ignore[no-untyped-call]  # PyYAML
         if isinstance(event, yaml.AliasEvent):
-            raise _error(f"the alias `*{event.anchor}`: write its value out", event.start_mark)
+            raise _error(f"alias `*{event.anchor}` is not allowed: write out its value", event.start_mark)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
@@ -28,7 +28,7 @@ class _StrictLoader(yaml.SafeLoader):
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
                 if key.value in lines:
-                    raise _error(f"the key `{key.value}` stands in line {lines[key.value]} already", key.start_mark)
+                    raise _error(f"the key `{key.value}` is already in line {lines[key.value]}", key.start_mark)
                 lines[key.value] = key.start_mark.line + 1
         return super().construct_mapping(node, deep)
 
@@ -38,8 +38,8 @@ def _error(problem: str, mark: Any) -> yaml.YAMLError:
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Read a YAML mapping; an empty file gives {}. Raises ConfigError for a file that is missing, unreadable, too large
-    or not a mapping, for a duplicate key, and for aliases (`*name`), which can make a small file huge."""
+    """Read a YAML mapping; {} for an empty file. Raises ConfigError for a file that is missing, unreadable, too large
+    or not a mapping, for a duplicate key, and for an alias (`*name`), which can make a small file expand hugely."""
     try:
         data = read_file(path, MAX_FILE_BYTES)
     except OSError as error:
@@ -51,7 +51,7 @@ def parse_yaml(data: bytes, path: str | Path) -> dict[str, Any]:
     """Parse the bytes of the YAML file `path`; raises ConfigError as `read_yaml` does."""
     try:
         content = deepcopy(_load(data.decode("utf-8-sig")))
-    # An impossible date or a number of 5000 digits is a ValueError, deep nesting a RecursionError.
+    # An impossible date or a number of 5000 digits raises ValueError, deep nesting RecursionError.
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
@@ -60,11 +60,11 @@ def parse_yaml(data: bytes, path: str | Path) -> dict[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, dict):
-        raise ConfigError(f"{path} must hold `key: value` lines, not {type(content).__name__}.")
+        raise ConfigError(f"{path} must contain `key: value` lines, not a {type(content).__name__}.")
     return content
 
 
-# Commands read some files several times, all boards above all, and PyYAML takes 3 to 8 ms for each on a workstation.
+# Commands read some files several times, above all the boards, and PyYAML needs 3 to 8 ms each on a workstation.
 @lru_cache(maxsize=32)
 def _load(text: str) -> Any:
     return yaml.load(text, _StrictLoader)

@@ -13,7 +13,7 @@ from typing import Any
 from edgevpr.core.arrays import Image
 from edgevpr.core.config import Config, build, list_keys
 from edgevpr.core.errors import EdgevprError, ImageError, UsageError
-from edgevpr.core.text import show_waiting
+from edgevpr.core.text import show_wait
 from edgevpr.frames.images import read_image
 from edgevpr.mavlink.signing import NOT_SIGNING
 from edgevpr.power.boards import Board, resolve_board
@@ -87,7 +87,7 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
                 again.run()
         except TapeEnded as end:
             why_ended = str(end) or "the recording ends there"
-        show_waiting("")
+        show_wait("")
         return ReplayResult(
             flown=flown,
             lines=list(read_log(again_log)) if again_log else [],
@@ -110,7 +110,7 @@ def _silence_log() -> Iterator[None]:
 
 def _read_frame(folder: Path, number: int) -> Image:
     """Read a recorded frame. Raises TapeEnded for one that cannot be read, for instance after a power cut."""
-    show_waiting(f"replaying  {number}")
+    show_wait(f"replaying  {number}")
     try:
         return read_image(frame_path(folder, number))
     except ImageError as error:

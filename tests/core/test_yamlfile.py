@@ -36,7 +36,7 @@ def refused(tmp_path):
 
 def test_read_yaml_names_both_lines_of_a_duplicate_key(refused):
     said = refused("source: {uri: a}\nmap: m.gpkg\nsource: {uri: b}\n")
-    assert "config.yaml, line 3 is not valid YAML (the key `source` stands in line 1 already)" in said
+    assert "config.yaml, line 3 is not valid YAML (the key `source` is already in line 1)" in said
     assert "line 2" in refused("source:\n  {uri: a, rate_hz: 1, uri: b}\n")
     assert "line 4" in refused('match:\n  min_score: 0.5\n  form: float\n  "min_score": 0.6\n')
 
@@ -70,9 +70,9 @@ def test_load_config_refuses_a_number_of_hundreds_of_digits(number, says, refuse
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (r'"a\0b"', "`map` holds a character that no file name can have"),
-        (r'"\ud800"', "`map` holds a character that no file name can have"),
-        ("[" + "x, " * 9000 + "x]", "`map` must be a text, not ['x', 'x'"),
+        (r'"a\0b"', "`map` contains a character that no file name can have"),
+        (r'"\ud800"', "`map` contains a character that no file name can have"),
+        ("[" + "x, " * 9000 + "x]", "`map` must be text, not ['x', 'x'"),
         ("2001-02-30", "is not valid YAML"),
         ("!!python/object/apply:os.system [id]", "is not valid YAML"),
         ("m.gpkg\n? " + "k" * 50_000 + "\n: 1", "key `kkkk"),

@@ -101,7 +101,7 @@ def test_report_makes_a_page_without_the_map(flown, tmp_path):
     ("argv", "code", "said"),
     [
         (["LOG", "--out", "LOG"], 2, "give another name"),
-        (["LOG", "--out", "no/such/out.html"], 2, "there is no such folder: create it first"),
+        (["LOG", "--out", "no/such/out.html"], 2, "its folder does not exist: create it first"),
         (["gone", "--out", "out.html"], 2, "there is no such flight log"),
         (["LOG", "--out", "out.html", "--map", "gone.gpkg"], 1, "There is no map"),
         (["LOG", "--out", "out.html", "--images", "gone"], 2, "there is no such folder"),

@@ -43,7 +43,7 @@ def test_the_fingerprint_changes_with_all_that_a_descriptor_depends_on(models):
         ({"sha256": "abc"}, r"`sha256` must be the 64 hexadecimal digits that `sha256sum tiny.onnx` prints"),
         ({"file": "../tiny.onnx"}, "write the name of a file that lies beside the card"),
         ({"file": "tiny.yaml"}, "`file` is `tiny.yaml`, which is the name of a card: write that of the ONNX file"),
-        ({"file": "a\0.onnx"}, r"tiny.yaml: `file` holds a character that no file name can have"),
+        ({"file": "a\0.onnx"}, r"tiny.yaml: `file` contains a character that no file name can have"),
         ({"outputs": {}}, "`outputs` is empty"),
         ({"input": {**CARD["input"], "colour": "gray"}}, "`input.colour` is `gray`: write grey, bgr or rgb"),
         (

@@ -9,7 +9,7 @@ from pathlib import Path
 from edgevpr.core.config import Config, MavlinkConfig, SourceConfig, load_config
 from edgevpr.core.errors import ConfigError, EdgevprError, UsageError
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.core.text import show_waiting
+from edgevpr.core.text import show_wait
 from edgevpr.core.types import MAX_FIX_AGE_S
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import find_missing_cause, is_live, open_source, read_intervals
@@ -43,11 +43,11 @@ def check_configuration(config_path: str | Path, *, offline: bool = False) -> li
         findings.append(run_check("map", lambda what: _check_map(what, config, board)))
     except ConfigError as error:  # the cost of a query cannot be estimated without a board
         findings.append(report_error("board", error))
-    show_waiting("opening the source" if offline else f"waiting up to {FRAME_WAIT_S:g} s for a frame from the source")
+    show_wait("opening the source" if offline else f"waiting up to {FRAME_WAIT_S:g} s for a frame from the source")
     findings.append(run_check("source", lambda what: _check_source(what, source, offline)))
-    show_waiting("waiting for the flight controller")
+    show_wait("waiting for the flight controller")
     findings.append(run_check("link", lambda what: _check_link(what, config.mavlink, offline)))
-    show_waiting("")
+    show_wait("")
     return [*findings, run_check("log", lambda what: check_log(what, config.log.path))]
 
 

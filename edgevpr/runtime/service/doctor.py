@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from edgevpr.core.config import Config
 from edgevpr.core.errors import LinkError
 from edgevpr.core.reasons import ReasonCode
-from edgevpr.core.text import show_waiting
+from edgevpr.core.text import show_wait
 from edgevpr.frames.source import is_live
 from edgevpr.mavlink.address import LinkAddress
 from edgevpr.mavlink.asking import HEARTBEAT_TIMEOUT_S, AutopilotReading, RequestLink, read_autopilot
@@ -34,10 +34,10 @@ def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], Au
     if (uri := source.uri) and is_live(uri):
         camera_findings = list(check_camera(uri))
         if all(finding.ok for finding in camera_findings):
-            show_waiting(f"waiting for a frame of {uri}")
+            show_wait(f"waiting for a frame of {uri}")
             camera_findings.append(run_check("frames", lambda what: check_frame(what, source)))
         machine_findings += camera_findings
-    show_waiting(f"asking the autopilot at {address}")
+    show_wait(f"asking the autopilot at {address}")
     reading = None
     try:
         with RequestLink(address, settings.component_id, settings.system_id, signing) as inquiry:
@@ -48,7 +48,7 @@ def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], Au
                 autopilot_findings = [explain_silence(address, inquiry)]
     except LinkError as error:
         reading, autopilot_findings = None, [report_error("link", error)]
-    show_waiting("")
+    show_wait("")
     return autopilot_findings + machine_findings, reading
 
 
