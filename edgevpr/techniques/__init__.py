@@ -1,7 +1,7 @@
-"""The registry of the techniques of place recognition: their names, their parameters, and how to make one.
+"""Registry of the place-recognition techniques: their names, their parameters, and a function that creates one.
 
-Map building, flights and evaluations make every technique here; its module is imported only then. "The thesis", in this
-package, is Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*. A card is a YAML file about a network.
+Map building, flights and evaluations create every technique here; its module is imported only then. "The thesis" is
+Mubariz Zaffar, *Visual Place Recognition for Autonomous Robots*. A card is a YAML file that describes a network.
 """
 
 import inspect
@@ -14,7 +14,7 @@ from edgevpr.core.contract import Technique
 from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.text import suggest
 
-# The class or function that makes each technique of edgevpr itself.
+# The class or function that creates each built-in technique.
 _FACTORIES = {
     "cohog": "cohog:CoHog",
     "hog": "vectors:Hog",
@@ -29,15 +29,15 @@ _FACTORIES = {
     "cross_region_bow": "regions:cross_region_bow",
 }
 # The default is the first of these that fits the board. Networks are never the default: they need onnxruntime in RAM,
-# and weights that a person has chosen. Nor is `seqslam`: a sequence needs a flight along the mapped route.
+# and weights that the user has chosen. Nor is `seqslam`: a sequence needs a flight along the mapped route.
 DEFAULT_TECHNIQUES = ("cohog", "hog")
-CONFIDENCE_TECHNIQUE = "cohog"  # the one whose matches have a confidence
+CONFIDENCE_TECHNIQUE = "cohog"  # the only technique whose matches have a confidence
 _TYPE_NAMES = {int: "a whole number", float: "a number", str: "a word"}
 
 
 def list_techniques() -> tuple[str, ...]:
-    """Return the names of all techniques: those of edgevpr, then the networks whose cards give a descriptor. Cards that
-    cannot be read are left out; one with the name of a technique of edgevpr only supplies its weights."""
+    """Return the names of all techniques: the built-in ones, then the networks whose cards have a descriptor.
+    Unreadable cards are skipped. A card with the name of a built-in technique only supplies its weights."""
     from edgevpr.techniques.card import list_cards, load_card
 
     def is_technique(card: str) -> bool:
@@ -50,7 +50,7 @@ def list_techniques() -> tuple[str, ...]:
 
 
 def is_known(name: str) -> bool:
-    """Tell whether `name` is a technique or the card of a network."""
+    """Return True if `name` is a technique or the card of a network."""
     from edgevpr.techniques.card import list_cards
 
     return name in _FACTORIES or name in list_cards()
@@ -58,19 +58,19 @@ def is_known(name: str) -> bool:
 
 def read_parameters(name: str) -> dict[str, Any]:
     """Return the parameters of the technique `name`, each with its default. Raises UsageError for an unknown technique
-    or a network that gives feature maps only, ModelError for a card that cannot be read."""
+    or a network that only outputs feature maps, and ModelError for a card that cannot be read."""
     return {key: p.default for key, p in inspect.signature(_find_factory(name)).parameters.items()}
 
 
 def format_name(name: str, form: str | None) -> str:
-    """Return the technique and its `form` (see the glossary) as one name, such as "hog 8bit". The default form `float`,
-    and None (the technique has no forms), are left out."""
+    """Return the technique and its `form` (see the glossary) as one name, such as "hog 8bit". The form is omitted if it
+    is the default, `float`, or None (the technique has no forms)."""
     return name if form in (None, "float") else f"{name} {form}"
 
 
 def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
-    """Make the technique `name`. `settings` are values of its parameters by name (None: all defaults); a text is
-    converted to the type of its parameter. Raises UsageError for an unknown technique or parameter and for a wrong
+    """Create the technique `name`. `settings` are parameter values by name (None: use the defaults); a string is
+    converted to the type of its parameter. Raises UsageError for an unknown technique or parameter and for an invalid
     value, and ModelError for a network that cannot be used."""
     defaults = read_parameters(name)
     values = {}
@@ -78,7 +78,7 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
         if key not in defaults:
             hint = suggest(key, defaults, f"it has {', '.join(defaults)}.")
             if key == "camera":
-                hint = "it takes images of every direction: leave out --camera."
+                hint = "it works with every camera direction: leave out --camera."
             raise UsageError(f"{name} has no parameter `{key}`: {hint}")
         kind = type(defaults[key])
         try:
@@ -90,8 +90,8 @@ def create(name: str, settings: dict[str, Any] | None = None) -> Technique:
 
 
 def _find_factory(name: str) -> Callable[..., Any]:
-    """Return the class or function that makes the technique `name`; its arguments are the technique's parameters.
-    Raises as `read_parameters` does."""
+    """Return the class or function that creates the technique `name`; its arguments are the technique's parameters.
+    Raises the errors of `read_parameters`."""
     if name in _FACTORIES:
         factory: Callable[..., Any] = resolve_name(f"edgevpr.techniques.{_FACTORIES[name]}")
         return factory
@@ -101,7 +101,7 @@ def _find_factory(name: str) -> Callable[..., Any]:
 
     card = load_card(name)
     if not card.is_technique:
-        raise UsageError(f"The network `{name}` gives no descriptor: use it as the `model` of a technique.")
+        raise UsageError(f"The network `{name}` has no descriptor output: use it as the `model` of a technique.")
     from edgevpr.techniques.network import make_from_card
 
     return partial(make_from_card, card)

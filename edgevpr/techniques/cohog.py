@@ -1,9 +1,9 @@
-"""`cohog`: HOG descriptors of the informative regions of a picture, matched by one product (thesis, chapter 6).
+"""`cohog`: HOG descriptors of the informative regions of a picture, matched by one matrix product (thesis, chapter 6).
 
 A place is 31x31 overlapping blocks, also called regions, each described by the histograms of its 2x2 cells. A query
-uses only its *good* blocks, those of high entropy. Each of them finds its most similar block in the place. In the
-thesis the score is the mean of these cosines (`matching: thesis`). Here, by default, each good block also votes for the
-displacement of the picture. docs/explanation/how-cohog-matches.md follows a query through all that makes the score.
+uses only its *good* blocks, those of high entropy. Each of them is matched to its most similar block of the place. In
+the thesis the score is the mean of these cosines (`matching: thesis`). Here, by default, each good block also votes for
+the displacement of the picture. docs/explanation/how-cohog-matches.md explains every step of the score.
 
 The blocks are the fine part: 8 bits per value, 31 KB per place, on disk. The coarse part stays in RAM and selects the
 places that are compared in full (see `placecode` and, for a nadir camera, which looks straight down, `layout`).
@@ -55,13 +55,13 @@ from edgevpr.techniques.views import HEIGHT_RATIOS, QueryViews, ViewRegions, com
 @dataclass(eq=False, kw_only=True)
 class CoHog:
     """The technique CoHOG. `w1`: side of the scaled picture in pixels (W1 = H1 of the thesis). `w2`: side of a cell in
-    pixels (W2 = H2). `bins`: orientations (L). `gt`: least entropy of a good block, 0 to 1 (GT; below 0: the default
+    pixels (W2 = H2). `bins`: orientations (L). `gt`: minimum entropy of a good block, 0 to 1 (GT; below 0: the default
     for `entropy`). `entropy`: "shannon" or "filled_bins". `matching`: "displacement" or "thesis", see above; the map
     does not record it.
 
-    With `camera` "nadir" the picture is put into a square with its proportions kept, so that a rotated picture shows
-    the same ground. A query is tried under hypotheses: five heights (with `matching` "thesis" one) in 24 rotations each
-    (see `views`)."""
+    With `camera` "nadir" the picture is padded to a square, not stretched, so that a rotated picture shows the same
+    ground. A query is tried under hypotheses: five heights (one if `matching` is "thesis") with 24 rotations each (see
+    `views`)."""
 
     w1: int = 512
     w2: int = 16
@@ -77,7 +77,7 @@ class CoHog:
             self.gt = tuning.DEFAULT_GT[self.entropy]
         self._side = self.w1 // self.w2 - 1  # blocks along one side
         self._is_nadir, self._votes = self.camera == "nadir", self.matching == "displacement"
-        finds_height = self._is_nadir and self._votes  # the thesis's score does not tell two heights apart
+        finds_height = self._is_nadir and self._votes  # the thesis's score cannot distinguish two heights
         self.min_score, self.min_margin = tuning.ACCEPT_LIMITS[self.camera if self._votes else "thesis"]
         self.min_quality = tuning.MIN_QUALITY[self.entropy]
         self.candidates = tuning.CANDIDATES[self.camera]
@@ -86,7 +86,7 @@ class CoHog:
         if finds_height:
             self._hypotheses = range(len(HEIGHT_RATIOS) * ROTATIONS)
         # Converts blocks, float32 (N, 4 bins), to the vectors of length 1 that `matching` compares.
-        self._comparable: Callable[[Singles], Singles] = self._make_patterns if self._votes else normalise_rows
+        self._make_vectors: Callable[[Singles], Singles] = self._make_patterns if self._votes else normalise_rows
         self._query: Descriptor | None = None
         self._views: QueryViews | None = None
         code = PartSpec((placecode.SIDE, placecode.SIDE, self.bins), "|u1")
@@ -110,9 +110,9 @@ class CoHog:
             "camera": tuning.VOTE_WEIGHTS,
             "matching": tuning.MATCHINGS,
         }
-        for what, values in allowed.items():
-            if (value := getattr(self, what)) not in values:
-                raise UsageError(f"cohog has no {what} `{value}`: use {' or '.join(sorted(values))}.")
+        for name, values in allowed.items():
+            if (value := getattr(self, name)) not in values:
+                raise UsageError(f"cohog has no {name} `{value}`: use {' or '.join(sorted(values))}.")
         w1, w2, bins = self.w1, self.w2, self.bins
         if not (w2 >= 2 and w1 % w2 == 0 and w1 // w2 > placecode.SIDE and w1 <= 4096 and 2 <= bins <= 64):
             raise UsageError(
@@ -122,7 +122,7 @@ class CoHog:
         if self.camera == "nadir" and bins != tuning.NADIR_BINS:
             raise UsageError(f"cohog with `camera` nadir uses {tuning.NADIR_BINS} bins, not {bins}: leave `bins` out.")
         if self.gt > 1:
-            raise UsageError(f"cohog: gt is {self.gt:g}; it is a share of the largest entropy, 0 to 1.")
+            raise UsageError(f"cohog: gt is {self.gt:g}; it must be a share of the largest entropy, 0 to 1.")
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` bool (H, W) is False is never good. A dim
@@ -137,10 +137,10 @@ class CoHog:
         grey = stretch_contrast(grey, allowed, pixel_px, *tuning.CONTRAST[self.camera])
         blocks, seen, good = self._make_good_blocks(grey, allowed, self.w2)
         regions = blocks.reshape(-1, 4 * self.bins)
-        # The square root of each value in 8 bits: most values are small, and the root keeps more of their digits.
+        # Store square roots in 8 bits: most values are small, and their roots lose less precision.
         stored = np.rint(255 * np.sqrt(regions)).astype(np.uint8)
         if self._is_nadir:
-            # In float64 a rounded number of the layout is the same on every processor.
+            # In float64, so that the layout is rounded to the same values on every processor.
             coarse = layout.encode_place(self._make_patterns(regions.astype(np.float64)), good.ravel(), self._side)
         else:
             coarse = np.rint(255 * placecode.make_grid(blocks, seen, np.ones_like(seen))[0]).astype(np.uint8)
@@ -179,9 +179,9 @@ class CoHog:
         in_reach: Bools | None = None,
     ) -> tuple[Singles, Singles | None]:
         """Score all places; for the arguments see `Technique.score_places`. With a forward camera `rows` are place
-        codes uint8 (N, B), compared under shifts. With a nadir camera they are layouts uint8 (N, 1120), compared from
-        the one of five heights that is nearest to `height_ratio`. Returns scores float32 (N,) in 0..1 and, with a nadir
-        camera, the score of each hypothesis, float32 (N, 120): 24 rotations from each height, -inf if not tried."""
+        codes uint8 (N, B), compared under shifts. With a nadir camera they are layouts uint8 (N, 1120), compared at the
+        one of five heights that is nearest to `height_ratio`. Returns scores float32 (N,) in 0..1 and, with a nadir
+        camera, the score of each hypothesis, float32 (N, 120): 24 rotations at each height, -inf if not tried."""
         if not self._is_nadir:
             views = self._make_views(query)
             mean_grid = np.zeros(1, np.float32) if mean is None else mean / 255
@@ -189,17 +189,17 @@ class CoHog:
             signs = placecode.make_hypotheses(*grid, mean_grid)
             return np.clip(placecode.scan_in_two_steps(signs, rows), 0, 1), None
         ratio = find_nearest_height(HEIGHT_RATIOS, height_ratio or 1.0)
-        self._make_views(query).forget_other_heights(ratio)
+        self._make_views(query).discard_other_heights(ratio)
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
-        of_ratio = layout.scan_places(
+        ratio_scores = layout.scan_places(
             lambda turn, grid: self._make_field(query, first + turn, grid), rows, turned_deg, in_reach
         )
         scores = np.full((len(rows), len(HEIGHT_RATIOS) * ROTATIONS), -np.inf, np.float32)
-        scores[:, first : first + ROTATIONS] = of_ratio
-        return np.clip(of_ratio.max(axis=1), 0, 1), scores
+        scores[:, first : first + ROTATIONS] = ratio_scores
+        return np.clip(ratio_scores.max(axis=1), 0, 1), scores
 
     def _make_field(self, query: Descriptor, number: int, grid: layout.Grid) -> Singles:
-        """Return the layout of a query under the hypothesis `number`, (C, m, m). It is cached for the newest query."""
+        """Return the layout of a query under the hypothesis `number`, (C, m, m), cached for the latest query."""
         fields = self._make_views(query).fields
         if (number, grid.side) not in fields:
             view = self._make_views(query).make_regions(number, self._make_patterns)
@@ -208,10 +208,10 @@ class CoHog:
 
     def match(self, query: Descriptor, fine: Bytes, hypotheses: Sequence[int] | None = None) -> FineMatch:
         """Compare the query with a place, whose blocks are `fine`: compute C = A B^T (thesis 6.2.3), with A the good
-        regions of the query and B those of the place, then the score by `matching` (0 without a good region). A nadir
-        query is tried under `hypotheses` (None: all); the one with the highest score counts, and `fit_alignment`
-        refines its shift, rotation and height. Last, the less the structures of both agree (see `overlay`), the less is
-        the score."""
+        regions of the query and B those of the place, then the score according to `matching` (0 without a good region).
+        A nadir query is tried under `hypotheses` (None: all); the one with the highest score counts, and
+        `fit_alignment` refines its shift, rotation and height. Finally, the score is lowered if the structures of the
+        two pictures agree poorly (see `overlay`)."""
         reference = self._restore_regions(fine)
         if self._is_nadir:
             best, match, nearest = self._find_best_hypothesis(query, reference, hypotheses)
@@ -222,17 +222,17 @@ class CoHog:
             match, _ = self._match_view(self._make_view(query, self._hypotheses[0]), reference)
         if match.shift_cells is None:
             return match
-        structure = self._measure_agreement(query, reference, match)
-        least, most = tuning.STRUCTURE_LIMITS[self.camera]
-        counts = min(max(structure, least), most) / most
-        return replace(match, score=match.score * counts, votes=match.score, structure=structure)
+        agreement = self._measure_agreement(query, reference, match)
+        min_agreement, max_agreement = tuning.STRUCTURE_LIMITS[self.camera]
+        factor = min(max(agreement, min_agreement), max_agreement) / max_agreement
+        return replace(match, score=match.score * factor, votes=match.score, structure=agreement)
 
     def match_rotated(self, query: Descriptor, fine: Bytes, match: FineMatch) -> FineMatch:
         """See `Technique.match_rotated`."""
         ratio = find_nearest_height(HEIGHT_RATIOS, match.height_ratio or 1.0)
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
-        off_deg = np.abs(wrap_deg(360 * np.arange(ROTATIONS) / ROTATIONS - (match.rotation_deg or 0.0)))
-        return self.match(query, fine, (first + np.flatnonzero(off_deg >= tuning.MIN_ROTATED_DEG)).tolist())
+        offset_deg = np.abs(wrap_deg(360 * np.arange(ROTATIONS) / ROTATIONS - (match.rotation_deg or 0.0)))
+        return self.match(query, fine, (first + np.flatnonzero(offset_deg >= tuning.MIN_ROTATED_DEG)).tolist())
 
     def measure_perspective(self, query: Descriptor, fine: Bytes, match: FineMatch) -> Perspective | None:
         """See `Technique.measure_perspective`."""
@@ -240,22 +240,22 @@ class CoHog:
         turn = round((match.rotation_deg or 0.0) / step_deg) % ROTATIONS
         view = self._make_view(query, HEIGHT_RATIOS.index(ratio) * ROTATIONS + turn)
         nearest = find_most_similar(view.regions, self._restore_regions(fine))
-        scale, off_deg = compute_scale(self._side + 1, ratio), (match.rotation_deg or 0.0) - turn * step_deg
-        found = fit_perspective(
+        scale, offset_deg = compute_scale(self._side + 1, ratio), (match.rotation_deg or 0.0) - turn * step_deg
+        fit = fit_perspective(
             locate_regions(view.numbers, view.side),
             locate_regions(nearest, self._side),
-            complex((match.height_ratio or 1.0) / scale * np.exp(1j * np.radians(off_deg))),
+            complex((match.height_ratio or 1.0) / scale * np.exp(1j * np.radians(offset_deg))),
             complex(*(match.shift_cells or (0.0, 0.0))),
         )
-        if found is None:
+        if fit is None:
             return None
-        place_from_view, sd, regions = found
-        cells, turned = (self._side + 1) * scale, np.radians(turn * step_deg)
-        view_from_query = cells * np.exp(1j * turned)
+        place_from_view, sd, regions = fit
+        cells, turn_rad = (self._side + 1) * scale, np.radians(turn * step_deg)
+        view_from_query = cells * np.exp(1j * turn_rad)
         right, down = view_from_query.real, view_from_query.imag
-        over_place = place_from_view @ [[right, -down, 0], [down, right, 0], [0, 0, 1]]
-        over_place[:2] /= self._side + 1
-        return Perspective(over_place, cells * sd, regions)
+        place_from_query = place_from_view @ [[right, -down, 0], [down, right, 0], [0, 0, 1]]
+        place_from_query[:2] /= self._side + 1
+        return Perspective(place_from_query, cells * sd, regions)
 
     def match_at_rest(self, query: Descriptor, fine: Bytes) -> FineMatch:
         """See `Technique.match_at_rest`."""
@@ -284,22 +284,22 @@ class CoHog:
         return best, replace(matches[best], rotation_deg=360 * turn / ROTATIONS, height_ratio=scale), nearest[best]
 
     def _measure_agreement(self, query: Descriptor, reference: Singles, match: FineMatch) -> float:
-        """Lay a query over a place as `match` says (see `overlay`); `reference` are the regions of the place. Returns
-        how well their structures agree, or with a nadir camera, how far this stands out."""
+        """Overlay a query on a place according to their `match` (see `overlay`); `reference` are the regions of the
+        place. Returns the agreement of their structures or, with a nadir camera, its prominence."""
         views, cells = self._make_views(query), self._side + 1
         is_known = reference.any(axis=1).reshape(self._side, self._side)
         place = overlay.compute_structure(reference, is_known, tuning.SURROUND_SD_CELLS[self.camera])
         if self._is_nadir:
-            laid = overlay.overlay_query(*views.halved, match, cells)
+            warped = overlay.overlay_query(*views.halved, match, cells)
             return overlay.measure_prominence(
-                self._make_structure(*self._make_blocks(*laid, len(laid[0]) // cells)), place
+                self._make_structure(*self._make_blocks(*warped, len(warped[0]) // cells)), place
             )
         if views.structure is None:
             views.structure = self._make_structure(views.make_blocks(1.0, 0)[0], views.seen)
         return overlay.compute_agreement(views.structure, place, match.shift_cells or (0.0, 0.0))
 
     def _make_structure(self, blocks: Singles, seen: Bools) -> Singles:
-        """Return the structure of a picture (see `overlay`) that has these blocks, float32 (n, n, 4 bins)."""
+        """Return the structure (see `overlay`) of the picture with these blocks, float32 (n, n, 4 bins)."""
         return overlay.compute_structure(
             self._make_patterns(blocks.reshape(-1, 4 * self.bins)), seen, tuning.SURROUND_SD_CELLS[self.camera]
         )
@@ -320,17 +320,17 @@ class CoHog:
         ), None
 
     def _restore_regions(self, fine: Bytes) -> Singles:
-        """Restore the vectors that are compared from the `fine` part of a place, which holds square roots of blocks."""
-        return self._comparable(np.square(fine, dtype=np.float32))
+        """Restore the vectors to compare from the `fine` part of a place, which stores square roots of blocks."""
+        return self._make_vectors(np.square(fine, dtype=np.float32))
 
     def _make_view(self, query: Descriptor, number: int) -> ViewRegions:
         """Return the good regions of a query under the hypothesis `number`."""
-        return self._make_views(query).make_regions(number, self._comparable)
+        return self._make_views(query).make_regions(number, self._make_vectors)
 
     def _make_views(self, query: Descriptor) -> QueryViews:
         if query is not self._query or self._views is None:
             if query.regions is None or query.good is None or query.picture is None:
-                raise ValueError("a place that was read from a map is no query")
+                raise ValueError("a place that was read from a map cannot be a query")
             square = query.regions.reshape(self._side, self._side, -1), query.good.reshape(self._side, -1)
             self._views = QueryViews(query.picture, square, self.w2, lambda *view: self._make_good_blocks(*view)[::2])
             self._query = query
@@ -341,9 +341,9 @@ class CoHog:
         return normalise_rows(regions @ make_slow_patterns(self.bins))
 
     def _match_view(self, view: ViewRegions, reference: Singles) -> tuple[FineMatch, Ints]:
-        if self._votes:  # with a nadir camera, landmarks tell more than the support of all regions
+        if self._votes:  # with a nadir camera, landmarks are better evidence than the support of all regions
             return match_view(view, reference, tuning.VOTE_WEIGHTS[self.camera], with_support=not self._is_nadir)
-        likeness = view.regions @ reference.T
-        nearest = likeness.argmax(axis=1)
-        score = np.clip(likeness[np.arange(len(nearest)), nearest].mean(), 0, 1) if len(nearest) else 0
+        similarities = view.regions @ reference.T
+        nearest = similarities.argmax(axis=1)
+        score = np.clip(similarities[np.arange(len(nearest)), nearest].mean(), 0, 1) if len(nearest) else 0
         return FineMatch(float(score)), nearest

@@ -1,9 +1,9 @@
 """Stretches the contrast of pictures taken in low light or fog, for `cohog`.
 
-The entropy of dim ground is that of a blank wall. Such a picture is *stretched* to more grey levels, and smoothed
-before, since the stretch amplifies the sensor's noise. A picture with enough contrast, or with next to none, is left as
-it is: noise must not pass for ground. Results are rounded alike on every processor (see `gradients`): means of whole
-grey levels are exact, and products and sums are computed one by one."""
+Dim ground has as little entropy as a blank wall. Such a picture is smoothed, since stretching amplifies sensor noise,
+and then *stretched* to more grey levels. A picture with enough contrast, or almost none, is left unchanged: noise must
+not look like ground. Results are rounded equally on every processor (see `gradients`): means of whole grey levels are
+exact, and products and sums are computed one by one."""
 
 import math
 
@@ -13,11 +13,11 @@ import numpy as np
 from edgevpr.core.arrays import Array, Mask, Singles
 from edgevpr.techniques.gradients import round_levels
 
-_BLOCKS_PER_SIDE = 64  # whose means give the contrast: they hold little of the noise
-_CLIPPED_SHARE = 0.01  # of the blocks, darker than the range, and brighter
-# Least contrast of ground, in grey levels: this, or that of noise of 3 levels in means of few pixels.
+_BLOCKS_PER_SIDE = 64  # the contrast is measured on means of blocks, which have little noise
+_CLIPPED_SHARE = 0.01  # of the blocks, at the dark end and at the bright end each
+# Minimum contrast of ground, in grey levels; where a block has few pixels, noise of 3 levels needs more.
 _MIN_CONTRAST_LEVELS = 4.0
-_NOISE_LEVELS = 3 * 4.65  # between the hundredths of a normal distribution
+_NOISE_LEVELS = 3 * 4.65  # from the 1st to the 99th percentile of a normal distribution
 _MAX_SIGMA_PIXELS = 1.4
 _SMOOTHING_ROUNDS = 4  # fewer cannot reach `_MAX_SIGMA_PIXELS`
 
@@ -30,22 +30,22 @@ def stretch_contrast(
     target_levels: float,
     sigma_pixels: float,
 ) -> Singles:
-    """Return a square picture, stretched if its contrast is below `min_levels`: at half of it or less to
-    `target_levels`, which is at most four times `min_levels`. For each doubling of the contrast it is blurred by
-    `sigma_pixels`, in pixels of the original picture.
+    """Return a square picture, stretched if its contrast is below `min_levels`. A contrast of at most half of that
+    becomes `target_levels`, which is at most four times `min_levels`. Each doubling of the contrast blurs the picture
+    by `sigma_pixels`, in pixels of the original picture.
 
-    Contrast is the range of grey levels, without the darkest and the brightest hundredth, of the means of small blocks
-    of pixels that are `allowed`, bool (side, side) (None: all). `grey` is float32 (side, side), 0 to 255; the same
-    array is returned if its contrast is enough or too low. `pixel_px`: width and height, in pixels of the square, of a
-    pixel of the original picture."""
+    Contrast is the range of the mean grey levels of small blocks, without the darkest and the brightest 1 %. Only
+    blocks of `allowed` pixels, bool (side, side), count (None: all). `grey` is float32 (side, side), 0 to 255; the same
+    array is returned if its contrast is sufficient or too low. `pixel_px`: width and height, in pixels of the square,
+    of a pixel of the original picture."""
     low, high = _find_range(grey, allowed)
     range_levels = high - low
     noise_levels = _NOISE_LEVELS * math.sqrt(pixel_px[0] * pixel_px[1]) * _BLOCKS_PER_SIDE / len(grey)
     if not max(_MIN_CONTRAST_LEVELS, noise_levels) <= range_levels < min_levels:
         return grey
     ratio = min_levels / range_levels
-    gain = min(ratio * ratio * ratio, target_levels / range_levels)  # from 1 on: no jump
-    # A bright display must not bleed into the ground beside it.
+    gain = min(ratio * ratio * ratio, target_levels / range_levels)  # starts at 1, without a jump
+    # A bright on-screen display must not bleed into the ground beside it.
     picture = grey.copy() if allowed is None else np.where(allowed, grey, np.float32((low + high) / 2))
     sigma = min(_MAX_SIGMA_PIXELS, sigma_pixels * math.log2(gain))
     across, down = (min(max(1, round(pixels)), len(grey) // 4) for pixels in pixel_px)
@@ -80,15 +80,15 @@ def _average_blocks(whole: Array) -> Array:
 
 
 def _smooth_rows(grey: Array, sigma_pixels: float, pixel_px: int) -> None:
-    """Smooth (H, W) in place along its rows, by `sigma_pixels` pixels of `pixel_px` each: each round averages every
-    pixel with the two that are `pixel_px` away."""
-    beside = np.float32(sigma_pixels * sigma_pixels / (2 * _SMOOTHING_ROUNDS))
-    middle = np.float32(1) - 2 * beside
-    sides, step = np.empty_like(grey), pixel_px
+    """Smooth (H, W) in place along its rows, with a sigma of `sigma_pixels` pixels of `pixel_px` each. Each round
+    averages every pixel with the two that are `pixel_px` away."""
+    side_weight = np.float32(sigma_pixels * sigma_pixels / (2 * _SMOOTHING_ROUNDS))
+    middle_weight = np.float32(1) - 2 * side_weight
+    neighbours, step = np.empty_like(grey), pixel_px
     for _ in range(_SMOOTHING_ROUNDS):
-        np.add(grey[:, : -2 * step], grey[:, 2 * step :], out=sides[:, step:-step])
-        np.add(grey[:, :1], grey[:, step : 2 * step], out=sides[:, :step])
-        np.add(grey[:, -2 * step : -step], grey[:, -1:], out=sides[:, -step:])
-        sides *= beside
-        grey *= middle
-        grey += sides
+        np.add(grey[:, : -2 * step], grey[:, 2 * step :], out=neighbours[:, step:-step])
+        np.add(grey[:, :1], grey[:, step : 2 * step], out=neighbours[:, :step])
+        np.add(grey[:, -2 * step : -step], grey[:, -1:], out=neighbours[:, -step:])
+        neighbours *= side_weight
+        grey *= middle_weight
+        grey += neighbours

@@ -1,9 +1,9 @@
 """The displacement vote of `cohog`: regions that show the same place have all moved by the same shift.
 
 Every good region of the query has a most similar region in the place, the *reference*. The shift between the two, in
-cells, is its vote. If the place is the same, the votes pile up on one shift. The regions of a picture of another kind
-(a test card) may all resemble the same few of the place, so the different regions among the agreeing votes are counted
-as well. Regions are numbered row by row."""
+cells, is its vote. If the place is the same, most votes fall on one shift. In an unrelated picture (a test card), all
+regions may resemble the same few regions of the place, so the distinct regions among the agreeing votes are counted as
+well. Regions are numbered row by row."""
 
 import math
 from dataclasses import replace
@@ -17,55 +17,55 @@ from edgevpr.core.contract import FineMatch, Support
 from edgevpr.core.geodesy import fit_similarity
 from edgevpr.techniques.views import ViewRegions
 
-_SHIFT_SPREAD_CELLS = 3  # between near and far ground, if the camera looks ahead
-_RANK_STEP = 4  # every fourth region is ranked: ranks cost more than all the rest
-_REGIONS_PER_PRODUCT = 256  # compared with all of a place: their similarities, a megabyte, stay in the cache
+_SHIFT_SPREAD_CELLS = 3  # between near and far ground, with a forward camera
+_RANK_STEP = 4  # every fourth region is ranked: ranking takes longer than everything else
+_REGIONS_PER_PRODUCT = 256  # compared with a place at once: their similarities, a megabyte, stay in the cache
 _FIT_ROUNDS = 8
 _MAX_RESIDUAL_CELLS = 1.5  # largest distance of an agreeing region from the fit
-# Beyond these another hypothesis is nearer, or the pairs are of different places.
+# Beyond these limits another hypothesis is nearer, or the pairs show different places.
 _MAX_ROTATION_DEG = 16.0
 _MAX_SCALE = 1.6
 _MIN_PAIRS = 8
-_Grid = tuple[Ints, int]  # numbers of regions, row by row, and the regions along one side
+_Grid = tuple[Ints, int]  # numbers of regions, row by row, and the number of regions along one side
 
 
 def find_displacement(numbers: Ints, nearest: Ints, sides: tuple[int, int], weights: tuple[float, ...]) -> FineMatch:
     """Find the shift on which most regions agree. `numbers` and `nearest` are int (G,): the good regions of the query,
-    and for each the most similar region of the reference. `sides` are the regions along one side of the query's grid
-    and of the reference's, both even or both odd. A shift is counted from the middle of one grid to that of the other.
+    and the most similar region of the reference for each. `sides` are the numbers of regions along one side of the
+    query's grid and of the reference's, both even or both odd. A shift is measured between the centres of the grids.
 
-    A vote that is n cells off a shift, along rows or columns, has the weight `weights[n]`; one further off has none.
-    The peak is the shift with the largest sum of weights. The score is its share of all votes, 0 without any region.
+    A vote that is n cells from a shift, along rows or columns, has the weight `weights[n]`; votes further away have
+    none. The peak has the largest sum of weights. The score is its share of all votes, 0 without any region.
     """
     if not len(numbers):
         return FineMatch(0.0, shift_cells=(0.0, 0.0), covariance_cells2=(0.0, 0.0, 0.0), coverage=0.0)
-    room = len(weights) - 1
-    step, votes, around = _count_votes(numbers, nearest, sides, weights)
-    wide = len(votes)
+    border = len(weights) - 1
+    step, votes, vote_sums = _count_votes(numbers, nearest, sides, weights)
+    width = len(votes)
     peak_weights = _make_peak_weights(weights)
-    peak_y, peak_x = divmod(int(around.argmax()), around.shape[1])
+    peak_y, peak_x = divmod(int(vote_sums.argmax()), vote_sums.shape[1])
     size = len(peak_weights)
     agreeing = votes[peak_y : peak_y + size, peak_x : peak_x + size] * peak_weights
     count = float(agreeing.sum())
     shares_x, shares_y = agreeing.sum(axis=0) / count, agreeing.sum(axis=1) / count
-    off = np.arange(-room, room + 1)
-    mean_x, mean_y = float(shares_x @ off), float(shares_y @ off)
+    offsets = np.arange(-border, border + 1)
+    mean_x, mean_y = float(shares_x @ offsets), float(shares_y @ offsets)
     # A shift is known to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
     covariance = (
-        float(shares_x @ (off - mean_x) ** 2) + 1 / 12,
-        float((off - mean_y) @ agreeing @ (off - mean_x)) / count,
-        float(shares_y @ (off - mean_y) ** 2) + 1 / 12,
+        float(shares_x @ (offsets - mean_x) ** 2) + 1 / 12,
+        float((offsets - mean_y) @ agreeing @ (offsets - mean_x)) / count,
+        float(shares_y @ (offsets - mean_y) ** 2) + 1 / 12,
     )
-    none = sum(sides) // 2 - 1  # the index of a shift of 0, along one side
-    near = np.zeros((wide, wide), bool)
+    zero_index = sum(sides) // 2 - 1  # the index of a shift of 0, along one side
+    near = np.zeros((width, width), bool)
     near[peak_y : peak_y + size, peak_x : peak_x + size] = True
-    agreed = np.zeros(sides[1] ** 2, bool)
-    agreed[nearest[near.ravel().take(step)]] = True
+    is_matched = np.zeros(sides[1] ** 2, bool)
+    is_matched[nearest[near.ravel().take(step)]] = True
     return FineMatch(
         count / len(numbers),
-        shift_cells=(peak_x - none + mean_x, peak_y - none + mean_y),
+        shift_cells=(peak_x - zero_index + mean_x, peak_y - zero_index + mean_y),
         covariance_cells2=covariance,
-        coverage=np.count_nonzero(agreed) / len(agreed),
+        coverage=np.count_nonzero(is_matched) / len(is_matched),
     )
 
 
@@ -75,7 +75,7 @@ def compute_vote_share(numbers: Ints, nearest: Ints, sides: tuple[int, int], wei
 
 
 def find_most_similar(regions: Singles, reference: Singles) -> Ints:
-    """Return the number of the most similar region of a place, whose regions are `reference` (N, P), for each of
+    """Return the number of the most similar region of a place, among its regions `reference` (N, P), for each of
     `regions` (G, P): int (G,)."""
     nearest = np.empty(len(regions), np.intp)
     for first in range(0, len(regions), _REGIONS_PER_PRODUCT):
@@ -88,8 +88,8 @@ def match_view(
     view: ViewRegions, reference: Singles, weights: tuple[float, ...], with_support: bool
 ) -> tuple[FineMatch, Ints]:
     """Match a view of the query with a place, whose regions are `reference` float32 (side * side, P), by vote.
-    `weights` is that of `find_displacement`, and `with_support` tells whether the match gets its `support`. Returns the
-    match, and the number of the most similar region of the place for each region of the view, int (G,)."""
+    `weights` is as in `find_displacement`; `with_support`: measure the `support` of the match. Returns the match, and
+    the number of the most similar region of the place for each region of the view, int (G,)."""
     nearest = find_most_similar(view.regions, reference)
     match = find_displacement(view.numbers, nearest, (view.side, math.isqrt(len(reference))), weights)
     if with_support and len(nearest):
@@ -101,28 +101,28 @@ def match_view(
 def measure_support(
     numbers: Ints, regions: Singles, reference: Singles, nearest: Ints, shift_cells: tuple[float, float] | None
 ) -> Support:
-    """Measure how all regions of query and place support the shift that a vote has found. `numbers` int (G,) and
-    `regions` float32 (G, P) are the numbers and vectors of the query's good regions. `reference` float32 (side * side,
-    P) are all regions of the place, `nearest` int (G,) the most similar of them for each. The grids have one size."""
+    """Measure how well all regions of query and place support the shift found by vote. `numbers` int (G,) and `regions`
+    float32 (G, P) are the numbers and vectors of the query's good regions. `reference` float32 (side * side, P) are all
+    regions of the place; `nearest` int (G,) has the most similar of them for each. The grids have the same size."""
     side = math.isqrt(len(reference))
     back = (reference @ regions.T).argmax(axis=1)
-    of_y, of_x = np.divmod(numbers, side)
-    step_x, step_y = (round(step) for step in shift_cells or (0.0, 0.0))
+    query_y, query_x = np.divmod(numbers, side)
+    shift_x, shift_y = (round(cells) for cells in shift_cells or (0.0, 0.0))
     y, x = np.divmod(np.arange(len(reference)), side)
-    off = np.maximum(abs(x - of_x[back] - step_x), abs(y - of_y[back] - step_y))
+    distance = np.maximum(abs(x - query_x[back] - shift_x), abs(y - query_y[back] - shift_y))
     return Support(
-        back=float((off <= _SHIFT_SPREAD_CELLS).mean()),
+        back=float((distance <= _SHIFT_SPREAD_CELLS).mean()),
         likeness=float(np.einsum("ij,ij->i", regions, reference[nearest]).mean()),
         log_rank=_compute_log_rank(
-            regions[::_RANK_STEP], reference, of_x[::_RANK_STEP] + step_x, of_y[::_RANK_STEP] + step_y, side
+            regions[::_RANK_STEP], reference, query_x[::_RANK_STEP] + shift_x, query_y[::_RANK_STEP] + shift_y, side
         ),
     )
 
 
 def _compute_log_rank(regions: Singles, reference: Singles, x: Ints, y: Ints, side: int) -> float:
-    """Return the mean logarithm of a rank, 0 for the best possible. Each of the query's `regions` (n, P) has moved to
-    the position `x`, `y` of the place. Its rank says how many regions of the place resemble it more than the best of
-    the 3x3 regions around that position."""
+    """Return the mean log rank of the query's `regions` (n, P), 0 for the best possible. `x` and `y` are the positions
+    in the place to which they moved. The rank of a region counts the regions of the place that resemble it more than
+    the best of the 3x3 regions around its position."""
     rows = np.flatnonzero((x >= 0) & (x < side) & (y >= 0) & (y < side))
     if not len(rows):
         return math.log(len(reference))
@@ -141,56 +141,56 @@ def _count_votes(
     """Count the votes for each shift; for the arguments see `find_displacement`. Returns the number of the shift that
     each region votes for, int (G,); the number of votes for each shift, on a grid with a border, float32 (n, n); and
     the weighted sum of the votes around each shift, on a grid without this border."""
-    # Both are numbered on a grid as wide as there are shifts, so that their difference is the number of the shift. A
-    # border around the possible shifts leaves room for the square around the peak.
-    room = len(weights) - 1
-    of_query, of_reference = sides
-    wide = of_query + of_reference - 1 + 2 * room
-    first = (of_query - 1 + room) * (wide + 1)
-    step = _number_regions(of_reference, wide)[nearest] - _number_regions(of_query, wide)[numbers] + first
-    votes = np.bincount(step, minlength=wide * wide).reshape(wide, wide).astype(np.float32)
-    around = cv2.filter2D(votes, -1, _make_peak_weights(weights), borderType=cv2.BORDER_CONSTANT)
-    return step, votes, around[room : wide - room, room : wide - room]
+    # Regions are numbered on a grid as wide as there are shifts, so that the difference of two numbers is the number of
+    # their shift. A border around the possible shifts leaves room for the square around the peak.
+    border = len(weights) - 1
+    query_side, reference_side = sides
+    width = query_side + reference_side - 1 + 2 * border
+    first = (query_side - 1 + border) * (width + 1)
+    step = _number_regions(reference_side, width)[nearest] - _number_regions(query_side, width)[numbers] + first
+    votes = np.bincount(step, minlength=width * width).reshape(width, width).astype(np.float32)
+    vote_sums = cv2.filter2D(votes, -1, _make_peak_weights(weights), borderType=cv2.BORDER_CONSTANT)
+    return step, votes, vote_sums[border : width - border, border : width - border]
 
 
 @lru_cache
-def _number_regions(side: int, wide: int) -> Ints:
-    """Return the numbers of `side` x `side` regions in the corner of a grid of width `wide`: int (side * side,)."""
-    return np.add.outer(np.arange(side) * wide, np.arange(side)).ravel()
+def _number_regions(side: int, width: int) -> Ints:
+    """Return the numbers of `side` x `side` regions in the corner of a grid of width `width`: int (side * side,)."""
+    return np.add.outer(np.arange(side) * width, np.arange(side)).ravel()
 
 
 @lru_cache
 def _make_peak_weights(weights: tuple[float, ...]) -> Singles:
     """Return the weights of the votes for the shifts around a peak, with the peak in the middle: float32 (2 n - 1, 2 n
     - 1) for n `weights`, see `find_displacement`."""
-    off = np.abs(np.arange(1 - len(weights), len(weights)))
-    return np.array(weights, np.float32)[np.maximum.outer(off, off)]
+    distance = np.abs(np.arange(1 - len(weights), len(weights)))
+    return np.array(weights, np.float32)[np.maximum.outer(distance, distance)]
 
 
 def fit_alignment(query: _Grid, place: _Grid, match: FineMatch) -> FineMatch:
-    """Fit a shift, a rotation and a scale, by least squares, to pairs of a region of the `query` and its most similar
-    region of the `place`: the numbers of these regions, int (G,), and the side of their grid. The fit is repeated, each
-    time with the pairs that agree with the last one, at first with the shift of the `match`.
+    """Fit a shift, a rotation and a scale, by least squares, to the regions of the `query` and their most similar
+    regions of the `place`: numbers of regions, int (G,), and the side of their grid. The fit is repeated, each time
+    with the pairs that agree with the previous one, first with the shift of the `match`.
 
-    Returns the match with the exact position; the covariance is that of the residuals of single regions. Returns the
-    match as it is if fewer than 8 pairs agree, or if the rotation or scale belongs to another hypothesis."""
+    Returns the match with the refined position; its covariance is that of the residuals of single regions. Returns the
+    match unchanged if fewer than 8 pairs agree, or if the rotation or scale belongs to another hypothesis."""
     points, targets = locate_regions(*query), locate_regions(*place)
     rotation, shift = 1 + 0j, complex(*(match.shift_cells or (0.0, 0.0)))
-    for again in range(_FIT_ROUNDS + 1):
-        off = targets - rotation * points - shift
-        near = np.maximum(abs(off.real), abs(off.imag)) <= _MAX_RESIDUAL_CELLS
+    for fit_round in range(_FIT_ROUNDS + 1):
+        residuals = targets - rotation * points - shift
+        near = np.maximum(abs(residuals.real), abs(residuals.imag)) <= _MAX_RESIDUAL_CELLS
         if np.count_nonzero(near) < _MIN_PAIRS:
             return match
-        if again == _FIT_ROUNDS:
+        if fit_round == _FIT_ROUNDS:
             break
         if np.ptp(points[near].real) == np.ptp(points[near].imag) == 0:
-            return match  # one point has no rotation
+            return match  # a single point has no rotation
         rotation, shift = fit_similarity(points[near], targets[near])
         if not 1 / _MAX_SCALE < abs(rotation) < _MAX_SCALE:
             return match
         if abs(np.angle(rotation, deg=True)) > _MAX_ROTATION_DEG:
             return match
-    x, y = off[near].real, off[near].imag
+    x, y = residuals[near].real, residuals[near].imag
     # A region is matched to one cell at best: 1/12 is the variance of a uniform distribution over one cell.
     covariance = float(x.var()) + 1 / 12, float(np.mean(x * y) - x.mean() * y.mean()), float(y.var()) + 1 / 12
     return replace(

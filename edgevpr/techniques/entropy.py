@@ -1,7 +1,7 @@
 """Entropy of an image around each pixel, and the blocks of high entropy: the good blocks of CoHOG (thesis 6.2.1).
 
-Both entropy maps take the histogram of the intensities inside a disc around each pixel (81 pixels for radius 5),
-counting only pixels inside the image, and divide by 8 bits, the most that 256 intensities can have."""
+Both entropies use the histogram of the intensities in a disc around each pixel (81 pixels for radius 5), counting only
+pixels inside the image. They are divided by 8 bits, the maximum for 256 intensities."""
 
 from functools import lru_cache, reduce
 
@@ -11,7 +11,7 @@ import numpy as np
 from edgevpr.core.arrays import Array, Bools, Bytes, Singles
 
 DISC_RADIUS_PX = 5
-SHANNON_SIDE_PX = 100  # the authors' public code takes the Shannon entropy of a copy of this size
+SHANNON_SIDE_PX = 100  # the authors' public code uses a copy of this size
 # Sizes of the parts that are computed at once, so that the sums stay in cache.
 _STRIP_ROWS = 32
 _STRIP_PIXELS = 256
@@ -23,21 +23,21 @@ _COUNT_LOG2 = np.arange(256, dtype=np.float32) * _LOG2[:256]
 
 
 def compute_filled_bins(grey: Bytes) -> Singles:
-    """Compute log2 of the number of different intensities in each disc, over 8: the algorithm printed in thesis 6.2.1.
-    uint8 (H, W) to float32 (H, W) in 0..1."""
+    """Compute log2 of the number of distinct intensities in each disc, divided by 8: the algorithm printed in thesis
+    6.2.1. uint8 (H, W) to float32 (H, W) in 0..1."""
     r = DISC_RADIUS_PX
-    # Copies of the border add no intensity to a disc: the pixel copied is nearer to its middle.
+    # Copies of the border add no intensity: the original pixel is nearer the disc's centre, so it is in the disc.
     padded = cv2.copyMakeBorder(grey, r, r, r, r, cv2.BORDER_REPLICATE)
     entropy = np.empty(grey.shape, np.float32)
     for top in range(0, len(grey), _STRIP_ROWS):
-        different = _count_different(padded[top : top + _STRIP_ROWS + 2 * r])
-        entropy[top : top + _STRIP_ROWS] = _LOG2_OVER_8[different]
+        distinct_count = _count_distinct(padded[top : top + _STRIP_ROWS + 2 * r])
+        entropy[top : top + _STRIP_ROWS] = _LOG2_OVER_8[distinct_count]
     return entropy
 
 
 def compute_shannon(grey: Bytes) -> Array:
-    """Compute the Shannon entropy (bits) of the intensities in each disc, over 8, from a 100x100 copy scaled back up,
-    as the authors' public code does: uint8 (H, W) to float32 (H, W) in 0..1."""
+    """Compute the Shannon entropy (bits) of the intensities in each disc, divided by 8, on a 100x100 copy, and enlarge
+    it, as the authors' public code does: uint8 (H, W) to float32 (H, W) in 0..1."""
     height, width = grey.shape
     return cv2.resize(_compute_shannon_map(_make_shannon_copy(grey)), (width, height), interpolation=cv2.INTER_LINEAR)
 
@@ -52,31 +52,31 @@ def average_blocks(per_pixel: Array, cell_px: int) -> Array:
 
 
 def find_good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: Bools | bool = True) -> Bools:
-    """Find the good blocks (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). `which` names the
+    """Find the good blocks (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). `which` is the
     entropy: "filled_bins" or "shannon". `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool
     (H/cell_px - 1, W/cell_px - 1), False where `among`, bool of this shape, is False (True: consider all).
 
-    Cheap bounds of the Shannon entropy decide nearly every block; it is computed only at the pixels that the others
-    depend on. The result is that of the whole map."""
+    Cheap bounds of the Shannon entropy decide nearly every block. The entropy is computed only at the pixels of the
+    other blocks; the result is the same as with the whole map."""
     if which == "filled_bins":
         return (average_blocks(compute_filled_bins(grey), cell_px) >= threshold) & among
     small = _make_shannon_copy(grey)
-    # The entropy of the last four bits is at most that of all; within 16 k values the others add at most log2 k.
+    # The entropy of the lower four bits is a lower bound. Among 16 k values the upper bits add at most log2 k.
     entropy = _compute_shannon_map(small & 15)
-    at_most = entropy + _LOG2_OVER_8[(_compute_range(small) >> 4) + 1]
+    upper = entropy + _LOG2_OVER_8[(_compute_range(small) >> 4) + 1]
     down, across = (_make_block_matrix(side, cell_px) for side in grey.shape)
 
-    def means(values: Array) -> Singles:
+    def average(values: Array) -> Singles:
         return np.asarray(down @ values @ across.T)
 
-    undecided = (means(entropy) < threshold + _MAX_ROUNDING) & (means(at_most) >= threshold - _MAX_ROUNDING)
+    undecided = (average(entropy) < threshold + _MAX_ROUNDING) & (average(upper) >= threshold - _MAX_ROUNDING)
     undecided &= among
     if undecided.any():
-        matters = (down.T @ undecided @ across > 0) & (entropy < at_most)
-        entropy[matters] = _compute_shannon_pixels(small, matters)
-        if (np.abs(means(entropy)[undecided] - threshold) < _MAX_ROUNDING).any():
+        needed = (down.T @ undecided @ across > 0) & (entropy < upper)
+        entropy[needed] = _compute_shannon_pixels(small, needed)
+        if (np.abs(average(entropy)[undecided] - threshold) < _MAX_ROUNDING).any():
             return (average_blocks(compute_shannon(grey), cell_px) >= threshold) & among
-    return (means(entropy) >= threshold) & among
+    return (average(entropy) >= threshold) & among
 
 
 def _make_shannon_copy(grey: Bytes) -> Array:
@@ -102,9 +102,8 @@ def _compute_range(grey: Bytes) -> Array:
     return cv2.subtract(cv2.dilate(grey, square), cv2.erode(grey, square))
 
 
-def _count_different(padded: Array) -> Array:
-    """Count the different intensities in each disc, by unions of sets of 256 bits; shapes as in
-    `_combine_over_disc`."""
+def _count_distinct(padded: Array) -> Array:
+    """Count the distinct intensities in each disc by unions of 256-bit sets; for shapes see `_combine_over_disc`."""
     bit, word_of = np.left_shift(np.uint64(1), padded & 63, dtype=np.uint64), padded >> 6
     unions = (_combine_over_disc(bit * (word_of == word), np.bitwise_or) for word in range(4))
     sizes: Array = reduce(np.add, (np.bitwise_count(union).astype(np.int16) for union in unions))
@@ -112,8 +111,8 @@ def _count_different(padded: Array) -> Array:
 
 
 def _compute_shannon_map(small: Array) -> Singles:
-    """Compute the Shannon entropy of the disc of every pixel, in bits over 8: uint8 (H, W) to float32 (H, W)."""
-    padded = np.pad(small.astype(np.int16), DISC_RADIUS_PX, constant_values=-1)  # -1: outside, no intensity
+    """Compute the Shannon entropy of the disc of every pixel, in bits divided by 8: uint8 (H, W) to float32 (H, W)."""
+    padded = np.pad(small.astype(np.int16), DISC_RADIUS_PX, constant_values=-1)  # -1: outside the image
     sums = np.zeros(small.shape, np.float32)
     present = np.flatnonzero(np.bincount(small.ravel()))[:, None, None]
     for start in range(0, len(present), _STRIP_INTENSITIES):
@@ -127,10 +126,10 @@ def _compute_shannon_map(small: Array) -> Singles:
 
 
 def _compute_shannon_pixels(small: Bytes, pixels: Bools) -> Singles:
-    """Compute `_compute_shannon_map` at the P True pixels of a bool (H, W) only, each from its own histogram: float32
+    """Compute `_compute_shannon_map` at the P True pixels of bool (H, W) only, each from its own histogram: float32
     (P,)."""
     r = DISC_RADIUS_PX
-    padded = np.pad(small.astype(np.int16), r, constant_values=256)  # 256: outside
+    padded = np.pad(small.astype(np.int16), r, constant_values=256)  # 256: outside the image
     down, right = np.nonzero(np.hypot(*np.mgrid[-r : r + 1, -r : r + 1]) <= r)
     disc = down * padded.shape[1] + right
     row, col = np.nonzero(pixels)
@@ -152,17 +151,17 @@ def _combine_over_disc(planes: Array, combine: np.ufunc) -> Array:
     r, pitch = DISC_RADIUS_PX, planes.shape[-1]
     half_width = [int((r * r - dy * dy) ** 0.5) for dy in range(r + 1)]
     flat = planes.ravel()
-    first = r * pitch + r  # the middle of the first disc
-    discs = flat.size - 2 * first
+    first_centre = r * pitch + r  # index in `flat`
+    discs = flat.size - 2 * first_centre
     out = np.empty(planes.shape, planes.dtype)
-    at_middles = out.reshape(-1)[:discs]
-    at_middles[:] = 0
+    disc_values = out.reshape(-1)[:discs]
+    disc_values[:] = 0
     row = flat.copy()
     for half in range(r + 1):
         if half:
             combine(row[half:-half], flat[: -2 * half], out=row[half:-half])
             combine(row[half:-half], flat[2 * half :], out=row[half:-half])
         for dy in (dy for dy in range(-r, r + 1) if half_width[abs(dy)] == half):
-            start = first + dy * pitch
-            combine(at_middles, row[start : start + discs], out=at_middles)
+            start = first_centre + dy * pitch
+            combine(disc_values, row[start : start + discs], out=disc_values)
     return out[..., : planes.shape[-2] - 2 * r, : pitch - 2 * r]

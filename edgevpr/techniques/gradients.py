@@ -1,8 +1,8 @@
 """Histograms of oriented gradients over cells and blocks, for `hog`, `cohog` and the training of CALC, and the
 low-frequency ("slow") patterns of blocks.
 
-A map made on one processor flies on another, so all operations must be rounded alike on all of them: products, sums and
-roots are computed one by one. Fused operations of OpenCV, and products of matrices, are rounded differently.
+A map made on one processor is used on another, so results must be rounded equally on all of them: products, sums and
+roots are computed one by one. OpenCV's fused operations and matrix products are rounded differently.
 """
 
 from functools import lru_cache
@@ -14,11 +14,11 @@ from edgevpr.core.arrays import Array, Bytes, Image, Ints, Mask, Singles
 
 _STRIP_ROWS = 64  # rows computed at once, so that the planes of a strip stay in cache
 _SIGN_BIT = np.uint32(1 << 31)
-# Fitted for the smallest maximum error over -45..45 degrees (2e-6 of the magnitude): see _vote_by_octant.
+# Fitted for the smallest maximum error over -45..45 degrees (2e-6 of the magnitude): see `_sum_octants`.
 _P = 2.904936713
 _Q = 2.067222680
 _R = 0.162280117
-# Rows: the sums of _vote_by_octant. Columns: 0, 45, ... 315 degrees (x to the right, y down).
+# Rows: the sums of `_sum_octants`. Columns: 0, 45, ... 315 degrees (x to the right, y down).
 _ORIENTATIONS = np.array(
     [
         [0.25, 0, 0, 0, 0.25, 0, 0, 0],
@@ -32,8 +32,8 @@ _ORIENTATIONS = np.array(
     ],
     np.float32,
 )
-# Weights of the cells top left, top right, bottom left, bottom right, and the frequencies over the orientations that
-# are kept with them (None: all).
+# Weights of the cells top left, top right, bottom left, bottom right, and the frequencies over the orientations to keep
+# for them (None: all).
 _PATTERN_WAVES = (
     ((1, 1, 1, 1), None),
     ((1, -1, 1, -1), (0, 1, 2)),
@@ -62,8 +62,8 @@ def make_mask_square(mask: Mask | None, side_px: int) -> Mask | None:
 
 
 def pad_to_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
-    """Put a picture into the middle of a square, its border repeated outwards. Returns the square, and bool (side,
-    side), True for pixels of the picture that `mask` allows (None: all)."""
+    """Pad a picture to a square by repeating its border on both sides. Returns the square, and bool (side, side), True
+    for pixels of the picture that `mask` allows (None: all)."""
     height, width = image.shape[:2]
     side = max(height, width)
     top, left = (side - height) // 2, (side - width) // 2
@@ -124,22 +124,22 @@ def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
     A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from its diagonal, whose orientation gets m -
     |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the x axis if g < 0. With v = sqrt(2) m
     sin(phi) and u = sqrt(2) m cos(phi), g = v (_P m + _R u) / (_Q m + u) to 2e-6 m. Each plane is summed over the cells
-    once as it is, and once with its signs flipped by those of dx, dy or both; sums and differences of these are the
-    orientations."""
+    once unchanged, and once with its signs flipped by those of dx, dy or both. The orientations are sums and
+    differences of these."""
     across, along = np.abs(dx), np.abs(dy)
     u = across + along
     g = np.subtract(along, across, out=along)
-    m, spare = _compute_magnitude(dx, dy, across)
-    below = np.multiply(m, _Q, out=spare)
-    below += u
-    below += 1e-20  # never 0
+    m, scratch = _compute_magnitude(dx, dy, across)
+    denominator = np.multiply(m, _Q, out=scratch)
+    denominator += u
+    denominator += 1e-20  # never 0
     u *= _R
     u += m * _P
     g *= u
-    g /= below
+    g /= denominator
     size_g = np.abs(g, out=u)
     diagonal = np.subtract(m, size_g, out=m)
-    twice_y = np.add(size_g, g, out=below)
+    twice_y = np.add(size_g, g, out=denominator)
     twice_x = np.subtract(size_g, g, out=g)
 
     sign_x = np.bitwise_and(dx.view(np.uint32), _SIGN_BIT)
@@ -148,19 +148,19 @@ def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
     sums = np.empty((8, height // cell_px, width), np.float32)
     flipped = size_g.view(np.uint32)
 
-    def add_up(row: int, plane: Singles, flip: Array | None = None) -> None:
+    def sum_plane(row: int, plane: Singles, flip: Array | None = None) -> None:
         if flip is not None:
             plane = np.bitwise_xor(plane.view(np.uint32), flip, out=flipped).view(np.float32)
         np.add.reduce(plane.reshape(-1, cell_px, width), axis=1, out=sums[row])
 
-    add_up(0, twice_x)
-    add_up(1, twice_x, sign_x)
-    add_up(2, twice_y)
-    add_up(3, twice_y, sign_y)
-    add_up(4, diagonal)
-    add_up(5, diagonal, sign_x)
-    add_up(6, diagonal, sign_y)
-    add_up(7, diagonal, sign_x ^ sign_y)
+    sum_plane(0, twice_x)
+    sum_plane(1, twice_x, sign_x)
+    sum_plane(2, twice_y)
+    sum_plane(3, twice_y, sign_y)
+    sum_plane(4, diagonal)
+    sum_plane(5, diagonal, sign_x)
+    sum_plane(6, diagonal, sign_y)
+    sum_plane(7, diagonal, sign_x ^ sign_y)
     cell_sums = np.add.reduce(sums.reshape(8, 1, -1, cell_px), axis=3)
     votes = np.add.reduce(cell_sums * _ORIENTATIONS[:, :, None], axis=0)
     oriented: Singles = np.maximum(votes, 0, out=votes).T.reshape(height // cell_px, width // cell_px, 8)
@@ -170,9 +170,9 @@ def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
 def _compute_magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[Array, Array]:
     """Return the length of each gradient, written to `out` if given, and an array of its shape that the caller may
     overwrite."""
-    squares, spare = np.multiply(dx, dx, out=out), dy * dy
-    squares += spare
-    return cv2.sqrt(squares, squares), spare
+    squares, scratch = np.multiply(dx, dx, out=out), dy * dy
+    squares += scratch
+    return cv2.sqrt(squares, squares), scratch
 
 
 def normalise_blocks(cells: Singles) -> Singles:
@@ -193,10 +193,10 @@ def normalise_rows(rows: Singles) -> Singles:
 
 @lru_cache
 def make_slow_patterns(bins: int) -> Singles:
-    """Return the patterns of low ("slow") frequency of a block of 2x2 cells of `bins` orientations: float32 (4 * bins,
+    """Return the low-frequency ("slow") patterns of a block of 2x2 cells of `bins` orientations: float32 (4 * bins,
     patterns), one per column, orthonormal. A pattern is a wave over the cells (mean, left against right, top against
     bottom, diagonal against diagonal) times a wave over the orientations. Of the 32 patterns of 8 orientations these
-    are the 20 with the most power on the tuning sets; recall does not fall."""
+    are the 20 with the most power on the tuning sets, which give the same recall."""
     frequency = _list_frequencies(bins)
     return np.vstack(
         [
@@ -212,9 +212,9 @@ def make_slow_patterns(bins: int) -> Singles:
 def make_waves(bins: int) -> Singles:
     """Return the real Fourier series over `bins` orientations: float32 (bins, bins), one wave per row, each of length
     1. The constant comes first, then cosine and sine of each frequency (the highest of an even number: cosine only)."""
-    turn = 2 * np.pi * np.arange(bins) / bins
+    angle = 2 * np.pi * np.arange(bins) / bins
     frequency, number = _list_frequencies(bins), np.arange(bins)
-    series = np.cos(frequency[:, None] * turn - np.pi / 2 * (number[:, None] % 2 == 0) * (number[:, None] > 0))
+    series = np.cos(frequency[:, None] * angle - np.pi / 2 * (number[:, None] % 2 == 0) * (number[:, None] > 0))
     unit: Singles = (series / np.linalg.norm(series, axis=1, keepdims=True)).astype(np.float32)
     return unit
 

@@ -1,10 +1,11 @@
 """The coarse stage of `cohog` for a camera that looks straight down: a place is the *layout* of its structures.
 
-The patterns of a picture's good regions (see `make_slow_patterns`) are averaged in the cells of a square grid, less the
-mean of the surroundings. A query is laid over a place under each of 24 rotations, 15 degrees apart, and every shift by
-whole cells that covers enough of the place. The score is the correlation of the two fields where they overlap, over the
-scatter of independent fields of that strength. All places are compared by a coarse grid, under every second rotation,
-and only the best pairs of a place and a rotation by a fine one. A place keeps both in RAM, in 4 bits a number."""
+The patterns of a picture's good regions (see `make_slow_patterns`) are averaged in the cells of a square grid, minus
+the mean of their surroundings. A query is compared with a place under each of 24 rotations, 15 degrees apart, and every
+whole-cell shift that covers enough of the place. The score is the correlation of the two fields where they overlap,
+divided by the scatter of independent fields of that strength. All places are compared on a coarse grid, under every
+second rotation, and only the best pairs of a place and a rotation on a fine grid. A place stores both in RAM, in 4 bits
+a value."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,36 +33,36 @@ class Grid:
 
 COARSE = Grid(8, (0, 1, 2, 3, 4, 7, 8, 13))
 FINE = Grid(12, (0, 1, 2, 3, 4, 7, 8, 9, 12, 13, 15, 17))
-PLACE_BYTES = (COARSE.size + FINE.size) // 2  # of a place
+PLACE_BYTES = (COARSE.size + FINE.size) // 2  # of a place in RAM
 ROTATIONS = 24
 _SURROUND_SD = 0.25  # standard deviation of the surroundings of a cell, as a share of the place's side
 _MIN_SEEN_SHARE = 0.1  # of a cell that good regions must cover
-_MIN_STRENGTH = 0.01  # of a cell; weaker ones are noise
-_MAX_LEVEL = 7  # of a stored number, on either side of 0
-_LEVEL_PERCENTILE = 99  # percentile of a place's numbers that becomes the highest level
+_MIN_STRENGTH = 0.01  # of a cell; weaker cells are noise
+_MAX_LEVEL = 7  # of a stored value, on either side of 0
+_LEVEL_PERCENTILE = 99  # percentile of a place's values that becomes the highest level
 _MIN_OVERLAP = {8: 0.5, 12: 0.35}  # share of the place that the query covers, by the side of the grid
 _MIN_LARGER_OVERLAP = {8: 1.0, 12: 0.75}  # the same, for a query that shows more ground than a place
-_MIN_SCATTER = 0.3  # of the usual one; below it, an overlap is too small or too empty to count
-# Pairs of a place and a rotation that are compared by the fine grid, if headings are known for all places, and if not.
+_MIN_SCATTER = 0.3  # share of the usual scatter; an overlap with less is too small or too empty to count
+# Pairs of a place and a rotation that are compared on the fine grid if all headings are known, and if not.
 _FINE_PAIRS = (1000, 2000)
-_RIVAL_PLACES = 2048  # out of reach that are scored
+_RIVAL_PLACES = 2048  # places out of reach that are scored
 _ROWS_PER_PRODUCT = 256
 _TINY = 1e-9
 
-# Gives the field of the query under a rotation, in steps of 15 degrees, on a grid.
+# Returns the field of the query on a grid, under a rotation in steps of 15 degrees.
 Fields = Callable[[int, Grid], Singles]
 
-_EMPTY_BYTE = 0x88  # a byte of two numbers that are 0
+_EMPTY_BYTE = 0x88  # a byte of two zeros
 
 # The two numbers of each byte, the low half first.
 _BYTE_NUMBERS = np.stack(np.divmod(np.arange(256), 16)[::-1], axis=1).astype(np.float32) - (_MAX_LEVEL + 1)
 
 
 def make_field(grid: Grid, patterns: Array, numbers: Ints, sides: tuple[int, int]) -> Array:
-    """Lay the patterns of good regions on a grid. `patterns` (G, 20) are those of the regions with these `numbers`, int
-    (G,), row by row of `sides[0]` x `sides[0]` regions; a place has `sides[1]` along a side, and the same middle.
-    Returns the field (C, m, m) of C channels. m is `grid.side` or, for a picture of more ground, larger by an even
-    number."""
+    """Average the patterns of good regions in the cells of a grid. `patterns` (G, 20) belong to the regions `numbers`,
+    int (G,), counted row by row in `sides[0]` x `sides[0]` regions. A place has `sides[1]` along a side, and the same
+    centre. Returns the field (C, m, m) of C channels; m is `grid.side` or, for a picture of more ground, an even number
+    larger."""
     side, place_side = sides
     whole = np.zeros((side * side, len(grid.channels) + 1), patterns.dtype)
     whole[numbers, :-1] = patterns[:, grid.channels]
@@ -78,8 +79,8 @@ def make_field(grid: Grid, patterns: Array, numbers: Ints, sides: tuple[int, int
 
 
 def encode_place(patterns: Array, good: Bools, side: int) -> Bytes:
-    """Return the coarse part of a place, uint8 (NBYTES,), from the patterns (side * side, 20) of all its regions, of
-    which those are used that are `good`, bool (side * side,)."""
+    """Return the coarse part of a place, uint8 (PLACE_BYTES,), from the patterns (side * side, 20) of all its regions;
+    only those that are `good`, bool (side * side,), are used."""
     numbers = np.flatnonzero(good)
     stored = []
     for grid in (COARSE, FINE):
@@ -94,11 +95,11 @@ def encode_place(patterns: Array, good: Bools, side: int) -> Bytes:
 
 
 def scan_places(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools | None) -> Singles:
-    """Score all places by their coarse parts, `rows` uint8 (N, NBYTES), under each rotation: float32 (N, 24).
-    `turned_deg` (N,) is the rotation under which each place is expected: only the nearest step and the two next to it
-    are scored, and the others are -inf (NaN or None: all are scored). `likely` bool (N,): places that may be compared
-    by the fine grid (None: all). A pair that is has a score of 0 to 1; any other has its score by the coarse grid, less
-    1. Of the places that are not likely some two thousand are scored, evenly chosen, as rivals."""
+    """Score all places by their coarse parts, `rows` uint8 (N, PLACE_BYTES), under each rotation: float32 (N, 24).
+    `turned_deg` (N,) is the expected rotation of each place: only the nearest step and its two neighbours are scored,
+    and the others are -inf (NaN or None: all are scored). `likely` bool (N,): places that may be compared on the fine
+    grid (None: all). A pair compared there scores 0 to 1; any other has its coarse score minus 1. Of the places that
+    are not likely, about two thousand, evenly chosen, are scored as rivals."""
     scores = np.full((len(rows), ROTATIONS), -np.inf, np.float32)
     if likely is not None and (step := np.count_nonzero(~likely) // _RIVAL_PLACES) > 1:
         sample = likely.copy()
@@ -119,10 +120,10 @@ def scan_places(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely:
             tried = np.arange(ROTATIONS)
         scores[np.arange(len(rows))[group][:, None], tried] = pairs
     scores -= 1
-    chances = scores if likely is None else np.where(likely[:, None], scores, -np.inf)
-    count = min(_FINE_PAIRS[int(turns.min() < 0)], chances.size)
-    best = np.argpartition(-chances, count - 1, axis=None)[:count]
-    slots, best_turns = np.divmod(best[np.isfinite(chances.flat[best])], ROTATIONS)
+    pair_scores = scores if likely is None else np.where(likely[:, None], scores, -np.inf)
+    count = min(_FINE_PAIRS[int(turns.min() < 0)], pair_scores.size)
+    best = np.argpartition(-pair_scores, count - 1, axis=None)[:count]
+    slots, best_turns = np.divmod(best[np.isfinite(pair_scores.flat[best])], ROTATIONS)
     for turn in np.unique(best_turns):
         best_slots = np.sort(slots[best_turns == turn])
         pairs = _compare_fields(FINE, [fields(int(turn), FINE)], rows[best_slots, COARSE.size // 2 :])
@@ -132,8 +133,8 @@ def scan_places(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely:
 
 def compute_agreement(query: Array, place: Array, shift: tuple[float, float]) -> float:
     """Return the score (see `scan_places`), 0 to 1, of the fine field of a query, (C, m, m), on that of a place, (C, n,
-    n), if the query's middle lies `shift` (dx, dy) from the place's, as shares of the place's side, or up to a cell
-    off."""
+    n), if the query's centre is at `shift` (dx, dy) from the place's, as shares of the place's side, or up to a cell
+    away."""
     n = place.shape[1]
     dx, dy = (round(share * n) for share in shift)
     padded = _pad_field(query, n)
@@ -152,13 +153,13 @@ def compute_agreement(query: Array, place: Array, shift: tuple[float, float]) ->
 
 def _compare_fields(grid: Grid, queries: list[Singles], packed: Bytes) -> Singles:
     """Compare R fields of the query with N places, uint8 (N, B): the best score over all shifts, float32 (N, R). The
-    scatter is estimated from the query's cells that lie on the place, and the mean strength of the place's."""
+    scatter is estimated from the query's cells on the place and the mean strength of the place's cells."""
     shifted = [_shift_field(query, grid.side) for query in queries]
     fields = np.concatenate(shifted) if len(shifted) > 1 else shifted[0]  # a megabyte: no needless copy
     strengths = [(query**2).sum(axis=0, keepdims=True) for query in queries]
     scatter = np.concatenate([_shift_field(strength, grid.side).sum(axis=1) for strength in strengths])
-    least = [_MIN_SCATTER**2 * float(strength.mean()) * grid.side**2 for strength in strengths]
-    fields /= np.sqrt(np.maximum(scatter, np.repeat(least, [len(query) for query in shifted])) + _TINY)[:, None]
+    min_scatter = [_MIN_SCATTER**2 * float(strength.mean()) * grid.side**2 for strength in strengths]
+    fields /= np.sqrt(np.maximum(scatter, np.repeat(min_scatter, [len(query) for query in shifted])) + _TINY)[:, None]
     best = np.empty((len(packed), len(queries)), np.float32)
     last_filled, kept = None, fields
     for start in range(0, len(packed), _ROWS_PER_PRODUCT):
@@ -180,7 +181,7 @@ def _measure_strength(field: Array) -> float:
 
 
 def _pad_field(query: Array, n: int) -> Array:
-    """Put `n` empty cells around a field (C, m, m), in a tenth of the time of `np.pad`."""
+    """Pad a field (C, m, m) with `n` empty cells on each side, in a tenth of the time of `np.pad`."""
     m = query.shape[1]
     bordered = np.zeros((len(query), m + 2 * n, m + 2 * n), query.dtype)
     bordered[:, n : n + m, n : n + m] = query
@@ -188,7 +189,7 @@ def _pad_field(query: Array, n: int) -> Array:
 
 
 def _shift_field(query: Singles, n: int) -> Singles:
-    """Return a field (C, m, m) of a query as it lies on a place of `n` x `n` cells under each shift: (S, C n n)."""
+    """Return the part of a query's field (C, m, m) on a place of `n` x `n` cells, for each shift: (S, C n n)."""
     windows = sliding_window_view(_pad_field(query, n), (n, n), axis=(1, 2)).transpose(1, 2, 0, 3, 4)  # (K, K, C, n, n)
     y, x = _list_shifts(query.shape[1], n)
     return windows[y, x].reshape(len(y), -1)
@@ -196,19 +197,19 @@ def _shift_field(query: Singles, n: int) -> Singles:
 
 @lru_cache
 def _list_shifts(m: int, n: int) -> tuple[Ints, Ints]:
-    """Return where the windows of `n` cells begin, on a query of `m` cells with a border of n on every side, under
-    which the query covers enough of a place: int (S,), int (S,)."""
+    """Return the first row and column, int (S,) each, of the windows of `n` cells, on a query of `m` cells with a
+    border of n on every side, in which the query covers enough of a place."""
     first = np.arange(m + n + 1)
     covered = np.minimum(first + n, m + n) - np.maximum(first, n)
-    least = _MIN_OVERLAP[n] if m == n else _MIN_LARGER_OVERLAP[n]
-    y, x = np.nonzero(np.outer(covered.clip(0), covered.clip(0)) >= least * n * n)
+    min_overlap = _MIN_OVERLAP[n] if m == n else _MIN_LARGER_OVERLAP[n]
+    y, x = np.nonzero(np.outer(covered.clip(0), covered.clip(0)) >= min_overlap * n * n)
     return y, x
 
 
 @lru_cache
 def _make_pooling(side: int, place_side: int, cells: int) -> Singles:
-    """Return the weights, float32 (m, side), by which `side` regions in a row are averaged in m cells with the same
-    middle, of which `cells` are as long as the `encode_place` regions of a place."""
+    """Return the weights, float32 (m, side), that average `side` regions in a row in m cells with the same centre.
+    `cells` of them are as long as the `place_side` regions of a place."""
     pitch = place_side / cells
     m = cells + 2 * max(0, int(np.ceil((side / pitch - cells) / 2 - _TINY)))
     begins = (np.arange(m)[:, None] - m / 2) * pitch
@@ -221,8 +222,8 @@ def _make_pooling(side: int, place_side: int, cells: int) -> Singles:
 @lru_cache
 def _make_distance_weights(cells: int, sd: float) -> Singles:
     """Return Gaussian weights of the distances between cells in a row, float32 (cells, cells)."""
-    away = np.subtract.outer(np.arange(cells), np.arange(cells))
-    weights: Singles = np.exp(-(away**2) / (2 * sd**2)).astype(np.float32)
+    distance = np.subtract.outer(np.arange(cells), np.arange(cells))
+    weights: Singles = np.exp(-(distance**2) / (2 * sd**2)).astype(np.float32)
     return weights
 
 

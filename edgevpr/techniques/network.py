@@ -1,9 +1,9 @@
-"""Techniques that describe a picture by one vector of a network: its descriptor, or what a *head*, such as a pooling,
-makes of its feature map. A card whose network gives a descriptor is a technique of its name.
+"""Techniques that describe a picture by one vector from a network: its descriptor, or the output of a *head*, such as a
+pooling, on its feature map. A card whose network outputs a descriptor is a technique of the same name.
 
-The techniques of the thesis take parameters: `model` names the card of the network, `form` is "float", "8bit" or "1bit"
-(see `vectors`), and `threads` is the number of threads of the network. A map depends on neither `form` nor
-`threads`."""
+The techniques of the thesis have parameters: `model` is the name of the network's card, `form` is "float", "8bit" or
+"1bit" (see `vectors`), and `threads` is the number of threads that the network uses. A map depends on neither `form`
+nor `threads`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -29,12 +29,12 @@ _MARGINS = {
     "netvlad": (0.13, 0.105, 0.085),  # 0.104, 0.081, 0.067
     "region_vlad": (0.075, 0.055, 0.03),  # 0.060, 0.042, 0.021
 }
-Head = Callable[[Singles], Singles]  # from an output of a network to a vector, float32 (D,)
+Head = Callable[[Singles], Singles]  # converts an output of a network to a vector, float32 (D,)
 
 
 class NetworkVector(VectorTechnique):
-    """A technique whose vector `head` makes of one output of a network (None: it is the output itself). The head raises
-    ModelError for a feature map that is too small. `spec`: further arguments of `VectorTechnique`."""
+    """A technique whose vector `head` computes from one output of a network (None: the output is the vector). The head
+    raises ModelError if the feature map is too small. `spec`: further arguments of `VectorTechnique`."""
 
     def __init__(self, name: str, backbone: Backbone, head: Head | None, **spec: Any) -> None:
         self._backbone, self._head = backbone, head or np.asarray
@@ -47,8 +47,8 @@ class NetworkVector(VectorTechnique):
 
 
 def calc(model: str = "calc", form: str = "float", threads: int = 1) -> NetworkVector:
-    """Make `calc`: the descriptor of an autoencoder that learned to give the HOG of a picture from a changed copy of
-    it, compared by cosine (Merrill and Huang, "Lightweight Unsupervised Deep Loop Closure", RSS 2018: 1064 numbers from
+    """Make `calc`: the descriptor of an autoencoder trained to predict the HOG of a picture from a distorted copy of
+    it, compared by cosine (Merrill and Huang, "Lightweight Unsupervised Deep Loop Closure", RSS 2018: 1064 values from
     a grey, histogram-equalised picture of 160x120)."""
     return NetworkVector(
         "calc", open_backbone(model, "descriptor", threads), None, parameters={"model": model}, form=form
@@ -58,11 +58,11 @@ def calc(model: str = "calc", form: str = "float", threads: int = 1) -> NetworkV
 def alexnet(
     *, model: str = "calc", form: str = "float", threads: int = 1, dims: int = 1064, seed: int = 0
 ) -> NetworkVector:
-    """Make `alexnet`: all activations of one layer, reduced to `dims` by a Gaussian random projection that is drawn
+    """Make `alexnet`: all activations of one layer, reduced to `dims` values by a Gaussian random projection generated
     from `seed`, compared by cosine.
 
-    Sünderhauf et al., "On the Performance of ConvNet Features for Place Recognition", IROS 2015, in the form of thesis
-    4.2.1: `conv3` of AlexNet. The form `1bit` is the locality-sensitive hash of the paper's section IV-D."""
+    Sünderhauf et al., "On the Performance of ConvNet Features for Place Recognition", IROS 2015, as in thesis 4.2.1:
+    `conv3` of AlexNet. The form `1bit` is the locality-sensitive hash of the paper's section IV-D."""
     if not (8 <= dims <= 65_536 and 0 <= seed < 2**31):
         raise UsageError(f"alexnet cannot use dims={dims}, seed={seed}: dims must be 8 to 65536, seed 0 or more.")
     backbone = open_backbone(model, "features", threads)
@@ -71,30 +71,30 @@ def alexnet(
 
 
 def amosnet(model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> NetworkVector:
-    """Make `amosnet`: the largest activations over a pyramid of grids of 1x1 to `levels` x `levels` cells, divided by
-    their sum, compared by L1 difference.
+    """Make `amosnet`: the largest activations in the cells of a pyramid of grids, 1x1 to `levels` x `levels`, divided
+    by their sum, compared by L1 distance.
 
-    Chen et al., "Deep Learning Features at Scale for Visual Place Recognition", ICRA 2017, in the form of thesis 4.2.1:
-    `conv5` of a network trained from scratch on the places of SPED (its card is `model`), with spatial pyramid pooling.
-    Divided by the sum, more places of the tuning sets are found."""
+    Chen et al., "Deep Learning Features at Scale for Visual Place Recognition", ICRA 2017, as in thesis 4.2.1: `conv5`
+    of a network trained from scratch on the places of SPED (its card is `model`), with spatial pyramid pooling.
+    Dividing by the sum finds more places in the tuning sets."""
     return _make_pyramid("amosnet", model, form, threads, levels)
 
 
 def hybridnet(model: str = "calc", form: str = "float", threads: int = 1, levels: int = 4) -> NetworkVector:
-    """Make `hybridnet`: `amosnet` with other weights, started from CaffeNet (Chen et al., ICRA 2017; thesis 4.2.1).
-    Give their card as `model`."""
+    """Make `hybridnet`: `amosnet` with other weights, fine-tuned from CaffeNet (Chen et al., ICRA 2017; thesis 4.2.1).
+    Give the card of these weights as `model`."""
     return _make_pyramid("hybridnet", model, form, threads, levels)
 
 
 def netvlad(
     *, model: str = "calc", form: str = "float", threads: int = 1, words: int = 64, assignment: str = "soft"
 ) -> NetworkVector:
-    """Make `netvlad`: VLAD of the activations at each position about `words` learned visual words, compared by cosine.
+    """Make `netvlad`: VLAD of the activations at each position with `words` learned visual words, compared by cosine.
     The `assignment` of a position to the words is "soft" or "hard".
 
-    Arandjelović et al., "NetVLAD: CNN architecture for weakly supervised place recognition", CVPR 2016, in the form of
-    thesis 4.2.1, not whitened. Words are learned afterwards, as those that the paper's training starts from (section
-    3.1)."""
+    Arandjelović et al., "NetVLAD: CNN architecture for weakly supervised place recognition", CVPR 2016, as in thesis
+    4.2.1, not whitened. The words are learned for a finished network, like those with which the paper's training starts
+    (section 3.1)."""
     if assignment not in ("soft", "hard"):
         raise UsageError(f"netvlad has no assignment `{assignment}`: use soft or hard.")
     backbone = open_backbone(model, "features", threads)
@@ -111,11 +111,11 @@ def netvlad(
 def region_vlad(
     *, model: str = "calc", form: str = "float", threads: int = 1, regions: int = 400, words: int = 256
 ) -> NetworkVector:
-    """Make `region_vlad`: VLAD of the `regions` regions of the highest energy (see `find_regions`) about `words`
-    learned visual words, compared by cosine; zeros for a picture without any region.
+    """Make `region_vlad`: VLAD of the `regions` regions of highest energy (see `find_regions`) with `words` learned
+    visual words, compared by cosine. A picture without any region gives zeros.
 
     Khaliq et al., "A Holistic Visual Place Recognition Approach Using Lightweight CNNs for Significant ViewPoint and
-    Appearance Changes", T-RO 2019, in the form of thesis 4.2.1: 400 regions of `conv4`, 256 words."""
+    Appearance Changes", T-RO 2019, as in thesis 4.2.1: 400 regions of `conv4`, 256 words."""
     backbone = open_region_backbone("region_vlad", model, threads, regions)
     learned, sha256 = load_words(model, "regions", words)
 
@@ -127,10 +127,10 @@ def region_vlad(
 
 
 def make_from_card(card: Card, form: str = "float", threads: int = 1) -> NetworkVector:
-    """Make the technique of a card: the vector of its network. A map records no parameters, since the hash of the
-    network covers them. No match is accepted until the configuration sets a minimum margin."""
+    """Make the technique of a card: its vector is the network's descriptor. A map records no parameters, since the hash
+    of the network covers them. No match is accepted until the configuration sets a minimum margin."""
     backbone = Backbone(card, "descriptor", threads)
-    # None: in maps of earlier versions more was hashed here.
+    # None: earlier versions hashed more values here, and their maps must stay valid.
     sha256 = compute_digest([backbone.sha256, None, card.similarity, None])
     technique = NetworkVector(card.name, backbone, None, form=form, similarity=card.similarity, model_sha256=sha256)
     noise = np.random.default_rng(0).integers(0, 256, (card.input.height, card.input.width), np.uint8)
@@ -154,9 +154,9 @@ def _make_pyramid(name: str, model: str, form: str, threads: int, levels: int) -
 
 
 def pool_pyramid(features: Singles, levels: int) -> Singles:
-    """Pool the maxima of a spatial pyramid (He et al. 2014, section 2.2): float32 (C, H, W) to float32 (C * sum of
-    n^2,), the largest activation of each channel in each cell of one grid of n x n after the other, n = 1 to `levels`.
-    Raises ModelError for a feature map smaller than a grid."""
+    """Max-pool a feature map over a spatial pyramid (He et al. 2014, section 2.2): float32 (C, H, W) to float32 (C *
+    sum of n^2,), the largest activation of each channel in each cell of the grids of n x n cells, n = 1 to `levels` in
+    turn. Raises ModelError if the feature map is smaller than a grid."""
     _, height, width = features.shape
     if levels > min(height, width):
         raise ModelError(
@@ -174,15 +174,15 @@ def pool_pyramid(features: Singles, levels: int) -> Singles:
 
 
 def make_gaussian_projection(size: int, length: int, seed: int) -> Callable[[Singles], Singles]:
-    """Make a Gaussian random projection of float32 of `size` values in any shape to float32 (length,), which keeps
-    angles, and lengths on average. Raises ModelError if `length` is larger than `size`.
+    """Make a Gaussian random projection of float32 arrays of `size` values, of any shape, to float32 (length,). It
+    preserves angles, and lengths on average. Raises ModelError if `length` is larger than `size`.
 
-    The rows of its matrix are the cyclic shifts of *one* Gaussian vector, applied after a random sign for each
-    activation (Hinrichs and Vybíral 2011): the product is a correlation, computed by the Fourier transform. For 43 008
-    activations and 1064 dimensions the matrix would take 183 MB."""
+    Each activation is multiplied by a random sign. The rows of the matrix are the cyclic shifts of *one* Gaussian
+    vector (Hinrichs and Vybíral 2011), so the product is a correlation, computed by the Fourier transform. For 43 008
+    activations and 1064 dimensions a full matrix would take 183 MB."""
     if length > size:
         raise ModelError(
-            f"A feature map of {size} values cannot be projected to {length} dimensions: ask for at most {size}."
+            f"A feature map of {size} values cannot be projected to {length} dimensions: use at most {size}."
         )
     row, signs = make_gaussian_row(size, seed)
     spectrum = np.conj(np.fft.rfft(row))  # row j of the matrix is the Gaussian vector shifted by j: a correlation
@@ -195,9 +195,9 @@ def make_gaussian_projection(size: int, length: int, seed: int) -> Callable[[Sin
 
 
 def make_gaussian_row(size: int, seed: int) -> tuple[Doubles, Singles]:
-    """Make the Gaussian vector float64 (size,) and the signs float32 (size,), +1 or -1, of a seed. They must be the
-    same for as long as a map is used, which NumPy promises for the raw numbers of PCG64 only (NEP 19): first two for
-    each pair of Gaussian values (Box and Muller 1958), then one for each sign."""
+    """Make the Gaussian vector float64 (size,) and the signs float32 (size,), +1 or -1, of a seed. They must stay the
+    same as long as a map is used. NumPy guarantees that only for the raw numbers of PCG64 (NEP 19), so these are used:
+    first two for each pair of Gaussian values (Box and Muller 1958), then one for each sign."""
     pairs = -(-size // 2)
     raw = np.random.PCG64(seed).random_raw(2 * pairs + size)
     uniform = ((raw[: 2 * pairs] >> np.uint64(11)) + 0.5) * 2.0**-53  # never 0

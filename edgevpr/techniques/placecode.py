@@ -1,9 +1,9 @@
-"""The coarse stage of `cohog` for a camera that looks ahead: a place is 144 bytes, found even if the camera has moved.
+"""The coarse stage of `cohog` for a forward camera: a place is 144 bytes, and is found even if the camera has moved.
 
-The block-normalised HOG is averaged over 12x12 cells (its *grid*), less the map's mean grid. The L orientations of each
-cell are written as a Fourier series, since neighbouring ones are correlated, and only the signs of its coefficients are
-kept. A query is compared under every shift of its grid, a *hypothesis*: hypotheses and places are two matrices,
-compared by one product."""
+The block-normalised HOG is averaged over 12x12 cells (its *grid*), minus the map's mean grid. The L orientations of
+each cell are written as a Fourier series, since neighbouring ones are correlated, and only the signs of its
+coefficients are kept. A query is compared under every shift of its grid, a *hypothesis*: one product of two matrices
+compares hypotheses and places."""
 
 from functools import lru_cache
 
@@ -29,17 +29,17 @@ SHIFTS = np.stack([_DX[_HAS_OVERLAP], _DY[_HAS_OVERLAP]], axis=1).astype(np.int8
 
 
 def make_grid(blocks: Singles, seen: Bools, counted: Bools) -> tuple[Singles, Bools]:
-    """Make the grid of a picture from its blocks float32 (n, n, 4 L), each of L orientations for its 2x2 cells: from
-    the middle square, at least 12 wide, of those `seen`, bool (n, n), so that it holds no border of the picture. The
-    blocks `counted`, bool (n, n), are averaged in each of 12x12 larger cells, which has length 1, so that contrast and
-    haze do not count. Returns the grid float32 (12, 12, L), and bool (12, 12), True where at least half of the cell is
-    counted."""
+    """Make the grid of a picture from its blocks float32 (n, n, 4 L), each of L orientations for its 2x2 cells. Only
+    the central square of the blocks `seen`, bool (n, n), at least 12 wide, is used: it has no border of the picture.
+    The blocks `counted`, bool (n, n), are averaged in each of 12x12 larger cells, normalised to length 1, so that
+    contrast and haze do not count. Returns the grid float32 (12, 12, L), and bool (12, 12), True where at least half of
+    the cell is counted."""
     n = max(min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())), SIDE)
-    middle, at = slice((len(seen) - n) // 2, (len(seen) + n) // 2), _list_blocks(n)
+    middle, block_numbers = slice((len(seen) - n) // 2, (len(seen) + n) // 2), _list_blocks(n)
     per_block, counts = blocks[middle, middle].reshape(n * n, 4, -1).mean(axis=1), counted[middle, middle].ravel()
-    cells = (per_block * counts[:, None])[at].mean(axis=1)
+    cells = (per_block * counts[:, None])[block_numbers].mean(axis=1)
     cells /= np.maximum(np.linalg.norm(cells, axis=-1, keepdims=True), 1e-6)
-    return cells.reshape(SIDE, SIDE, -1), (counts[at].mean(axis=1) >= 0.5).reshape(SIDE, SIDE)
+    return cells.reshape(SIDE, SIDE, -1), (counts[block_numbers].mean(axis=1) >= 0.5).reshape(SIDE, SIDE)
 
 
 def compute_deviations(grids: Floats, mean: Floats) -> Array:
@@ -57,17 +57,17 @@ def pack_grids(grids: Floats, mean: Floats) -> Bytes:
 
 def make_hypotheses(grid: Singles, seen: Bools, mean: Floats) -> Singles:
     """Make the hypotheses of a query, float32 (S, 144 L), from its `grid` and `seen` (see `make_grid`) and the map's
-    mean (12, 12, L). Row s is the signs of the query (0 where nothing is seen), moved by shift s of `SHIFTS`."""
+    mean (12, 12, L). Row s has the signs of the query (0 where nothing is seen), shifted by `SHIFTS[s]`."""
     signs = np.where(compute_deviations(grid, mean) >= 0, np.float32(1), np.float32(-1)) * seen[..., None]
     queries = np.zeros((len(SHIFTS), *signs.shape), np.float32)
-    for at, (dx, dy) in enumerate(SHIFTS.tolist()):
-        queries[at, _slice_target(dy), _slice_target(dx)] = signs[_slice_target(-dy), _slice_target(-dx)]
+    for row, (dx, dy) in enumerate(SHIFTS.tolist()):
+        queries[row, _slice_target(dy), _slice_target(dx)] = signs[_slice_target(-dy), _slice_target(-dx)]
     return queries.reshape(len(SHIFTS), -1)
 
 
 def scan_codes(queries: Singles, codes: Bytes) -> Singles:
     """Compare every hypothesis, `queries` float32 (S, 8 B), with every place, `codes` uint8 (N, B). Returns the best
-    score of each place, float32 (N,): the share of equal bits less that of different ones (1: the same picture, 0:
+    score of each place, float32 (N,): the share of equal bits minus that of different ones (1: the same picture, 0:
     chance)."""
     by_bit = queries.T
     best = np.empty(len(codes), np.float32)
@@ -97,8 +97,8 @@ def scan_in_two_steps(queries: Singles, codes: Bytes) -> Singles:
 
 @lru_cache
 def _make_blur_weights() -> Singles:
-    """Return the weights, float32 (E, S), by which `scan_in_two_steps` averages: row e has the weight of each of all S
-    shifts in the mean around the e-th of the E shifts whose dx and dy are even."""
+    """Return the weights, float32 (E, S), by which `scan_in_two_steps` averages: row e has the weights of all S shifts
+    in the mean around the e-th of the E shifts with even dx and dy."""
     kept = SHIFTS[(SHIFTS % 2 == 0).all(axis=1)]
     weight = np.maximum(1 - abs(kept[:, None] - SHIFTS) / 2, 0).prod(axis=2)
     weights: Singles = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -107,14 +107,14 @@ def _make_blur_weights() -> Singles:
 
 @lru_cache(maxsize=8)
 def _list_blocks(n: int) -> Ints:
-    """Return the blocks that are averaged in each of the 12x12 cells of a grid, 9 for a cell (some may be equal), by
-    their numbers, row by row, in the picture's n x n blocks: int (144, 9)."""
-    at = np.floor((np.arange(SIDE * _SAMPLES_PER_SIDE) + 0.5) / (SIDE * _SAMPLES_PER_SIDE) * n).astype(np.intp)
-    numbers = np.add.outer(at * n, at).reshape(SIDE, _SAMPLES_PER_SIDE, SIDE, _SAMPLES_PER_SIDE)
+    """Return the numbers of the blocks that are averaged in each of the 12x12 cells of a grid, 9 per cell (some may be
+    equal), counted row by row in the picture's n x n blocks: int (144, 9)."""
+    samples = np.floor((np.arange(SIDE * _SAMPLES_PER_SIDE) + 0.5) / (SIDE * _SAMPLES_PER_SIDE) * n).astype(np.intp)
+    numbers = np.add.outer(samples * n, samples).reshape(SIDE, _SAMPLES_PER_SIDE, SIDE, _SAMPLES_PER_SIDE)
     return numbers.swapaxes(1, 2).reshape(SIDE**2, _SAMPLES_PER_SIDE**2)
 
 
 def _slice_target(step: int) -> slice:
     """Return the slice of one axis of the grid to which cells are copied when the grid is moved by `step` cells along
-    it; they are copied from that of `-step`."""
+    it; they are copied from the slice of `-step`."""
     return slice(max(0, step), SIDE + min(0, step))

@@ -1,9 +1,9 @@
-"""Techniques that match regions of a feature map: `rmac` takes squares, `cross_region_bow` takes active areas. Both
-scan the map by one vector per picture, then compare the best places region by region.
+"""Techniques that match regions of a feature map: `rmac` uses squares, `cross_region_bow` uses active areas. Both scan
+the map with one vector per picture, then compare the best places region by region.
 
-Cross-Region-BoW and Region-VLAD (see `network`) find regions in the same way: in each channel, activations above zero
-that touch one another, corners included. Those of the highest mean (*energy*) over all channels are kept, each
-described by the sum of all channels' activations in the box around it, of length 1."""
+Cross-Region-BoW and Region-VLAD (see `network`) find regions in the same way: the 8-connected components of positive
+activations in each channel. The regions with the highest mean activation (*energy*) over all channels are kept. Each is
+described by the sums of all channels' activations in its bounding box, L2-normalised."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,15 +22,15 @@ from edgevpr.techniques.words import compute_bag_of_words, load_words, normalise
 _TINY = 1e-12
 Describe = Callable[[Singles], tuple[Singles, Singles]]
 Square = tuple[int, int, int]  # top, left, side, in cells of a feature map
-_RMAC_OVERLAP_SHARE = 0.4  # wanted, of neighbouring squares (Tolias et al. 2016, section 3.2)
+_RMAC_OVERLAP_SHARE = 0.4  # target for neighbouring squares (Tolias et al. 2016, section 3.2)
 _RMAC_SCALES = 3
 
 
 class RegionTechnique(VectorTechnique):
-    """Base of the techniques that scan by one vector and compare the best places by their regions. `describe` turns a
-    feature map, float32 (C, H, W), into the vector float32 (D,) and the regions float32 (N, C), each of length 1 (rows
-    of zeros if fewer than N are found). `quality` turns bool (N,), True for each region found, into the quality, 0 to
-    1."""
+    """Base class of the techniques that scan with one vector and compare the best places by their regions. `describe`
+    converts a feature map, float32 (C, H, W), to the vector float32 (D,) and the regions float32 (N, C), each of length
+    1 (rows of zeros if fewer than N are found). `quality` converts bool (N,), True for each region found, to the
+    quality, 0 to 1."""
 
     candidates = 40
 
@@ -42,7 +42,7 @@ class RegionTechnique(VectorTechnique):
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]) to coarse float16 (D,), fine int8 (N, C), `regions` float32 (N, C) of length 1, and
-        `good` bool (N,), True for each region found. Where `mask` is False, pixels get the mean of the others."""
+        `good` bool (N,), True for each region found. Pixels where `mask` is False get the mean of the others."""
         vector, regions = self._describe(self._backbone.run(image, mask))
         good: Array = np.any(regions, axis=1)
         return Descriptor(
@@ -60,13 +60,12 @@ class RegionTechnique(VectorTechnique):
 
 
 def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTechnique:
-    """Make `rmac`: each square region of a feature map is described by its largest activations, at three scales. For
-    the parameters see `network`.
+    """Make `rmac`: square regions of a feature map at three scales, each described by its largest activations. For the
+    parameters see `network`.
 
-    Tolias, Sicre and Jégou, "Particular object retrieval with integral max-pooling of CNN activations", ICLR 2016, in
-    the form of thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised, matched mutually without a check of
-    geometry. The coarse part is the sum of the squares' vectors, the quality the share of squares with any
-    activation."""
+    Tolias, Sicre and Jégou, "Particular object retrieval with integral max-pooling of CNN activations", ICLR 2016, as
+    in thesis 4.2.1: `conv5_2` of VGG-16, power- and L2-normalised, matched mutually without geometric verification. The
+    coarse part is the sum of the squares' vectors; the quality is the share of squares with any activation."""
     backbone = open_backbone(model, "features", threads)
     squares = make_square_regions(*backbone.shape[1:])
 
@@ -82,12 +81,12 @@ def rmac(model: str = "calc", form: str = "float", threads: int = 1) -> RegionTe
 def cross_region_bow(
     *, model: str = "calc", form: str = "float", threads: int = 1, regions: int = 200, words: int = 10_000
 ) -> RegionTechnique:
-    """Make `cross_region_bow`: the `regions` regions of the highest energy of a feature map, scanned as a bag of
-    `words` visual words.
+    """Make `cross_region_bow`: the `regions` regions of highest energy in a feature map, scanned as a bag of `words`
+    visual words.
 
     Chen, Maffra, Sa and Chli, "Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place Recognition",
-    IROS 2017, in the form of thesis 4.2.1, with one feature map where the paper finds regions in `conv5_3` of VGG-16
-    and describes them from `conv5_2`."""
+    IROS 2017, as in thesis 4.2.1, but with one feature map: the paper finds regions in `conv5_3` of VGG-16 and
+    describes them from `conv5_2`."""
     backbone = open_region_backbone("cross_region_bow", model, threads, regions)
     learned, sha256 = load_words(model, "bow", words)
 
@@ -105,22 +104,22 @@ def cross_region_bow(
 
 def open_region_backbone(technique: str, model: str, threads: int, regions: int) -> Backbone:
     """Open the network of the card `model` for a `technique` that finds `regions` regions in its feature map. Raises
-    UsageError for a number of regions outside 1 to 10 000."""
+    UsageError unless `regions` is 1 to 10,000."""
     if not 1 <= regions <= 10_000:
-        raise UsageError(f"{technique}: regions is {regions}; it must be 1 to 10000.")
+        raise UsageError(f"{technique}: regions is {regions}; it must be 1 to 10,000.")
     return open_backbone(model, "features", threads)
 
 
 def make_square_regions(height: int, width: int) -> list[Square]:
     """Return the squares of R-MAC at three scales over a feature map (Tolias et al. 2016, section 3.2): at scale l they
-    are 2 min(H, W) / (l + 1) wide, evenly spaced, l along the short side and l + m - 1 along the long one, with the m
-    that brings the overlap at the first scale closest to 40 %. Raises ModelError for a feature map less than 2 wide."""
+    are 2 min(H, W) / (l + 1) wide, evenly spaced, l along the short side and l + m - 1 along the long one, where m
+    brings the overlap at the first scale closest to 40 %. Raises ModelError for a feature map less than 2 wide."""
     short, long = min(height, width), max(height, width)
     if 2 * short // (_RMAC_SCALES + 1) < 1:
         raise ModelError(
             f"A feature map of {height}x{width} is too small for the regions of R-MAC: it must be at least 2 wide."
         )
-    # A square feature map has one region at the first scale; for others 2 to 7 are tried, as in the authors' code.
+    # A square feature map has one region at the first scale; others have 2 to 7, as in the authors' code.
     m = 1
     if long > short:
         m = min(range(2, 8), key=lambda n: abs(1 - (long - short) / (n - 1) / short - _RMAC_OVERLAP_SHARE))
@@ -137,8 +136,8 @@ def make_square_regions(height: int, width: int) -> list[Square]:
 
 
 def pool_squares(features: Singles, regions: list[Square]) -> Singles:
-    """Return the largest activation of each channel in each of R squares, as signed square root (the power
-    normalisation of thesis 4.2), of length 1: (C, H, W) to float32 (R, C)."""
+    """Return the largest activation of each channel in each of R squares, power-normalised (signed square root, thesis
+    4.2), then L2-normalised: (C, H, W) to float32 (R, C)."""
     vectors = np.stack([features[:, y : y + side, x : x + side].max(axis=(1, 2)) for y, x, side in regions])
     return normalise_rows(np.sign(vectors) * np.sqrt(np.abs(vectors)))
 
@@ -148,17 +147,17 @@ def _space_evenly(length: int, side: int, count: int) -> list[int]:
 
 
 def find_regions(features: Singles, count: int) -> Ints:
-    """Find the `count` regions of the highest energy in a feature map float32 (C, H, W), or all if there are fewer.
-    Returns boxes int (N, 4) in its cells: (top, left, bottom, right), bottom and right excluded, highest energy first;
-    of equals, by channel, from the top, then from the left."""
+    """Find the `count` regions of highest energy in a feature map float32 (C, H, W), or all if there are fewer. Returns
+    boxes int (N, 4) in its cells: (top, left, bottom, right), bottom and right exclusive, highest energy first. Ties
+    are sorted by channel, from the top, then from the left."""
     channels, height, width = features.shape
-    # All channels in one tall picture, an empty row between them: one search instead of one per channel.
+    # Stack the channels into one tall picture with empty rows between them: one search instead of one per channel.
     tall = np.zeros((channels, height + 1, width), np.float32)
     np.maximum(features, 0, out=tall[:, :height])
     tall = tall.reshape(-1, width)
-    count_found, labels, stats, _ = cv2.connectedComponentsWithStats((tall > 0).view(np.uint8), connectivity=8)
+    label_count, labels, stats, _ = cv2.connectedComponentsWithStats((tall > 0).view(np.uint8), connectivity=8)
     left, top, wide, high, area = stats[1:].T
-    sums = np.bincount(labels.ravel(), weights=tall.ravel(), minlength=count_found)[1:]
+    sums = np.bincount(labels.ravel(), weights=tall.ravel(), minlength=label_count)[1:]
     energy = (sums / area).astype(np.float32)
     channel, row = np.divmod(top, height + 1)
     best = np.lexsort((left, row, channel, -energy))[:count]
@@ -166,23 +165,23 @@ def find_regions(features: Singles, count: int) -> Ints:
 
 
 def describe_regions(features: Singles, boxes: Ints) -> Singles:
-    """Describe the regions of a feature map (C, H, W) in `boxes`, int (N, 4) (see `find_regions`), by the sums of
-    activations by channel, of length 1: float32 (N, C)."""
+    """Describe the regions of a feature map (C, H, W) in `boxes`, int (N, 4) (see `find_regions`), by the sum of the
+    activations of each channel, L2-normalised: float32 (N, C)."""
     channels, height, width = features.shape
-    sums = np.zeros((height + 1, width + 1, channels), np.float64)  # of everything above and to the left
+    sums = np.zeros((height + 1, width + 1, channels), np.float64)  # integral image of each channel
     sums[1:, 1:] = features.transpose(1, 2, 0)
     np.cumsum(sums, axis=0, out=sums)
     np.cumsum(sums, axis=1, out=sums)
     top, left, bottom, right = boxes.T
-    boxed = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    regions: Singles = normalise_rows(boxed).astype(np.float32)
+    box_sums = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    regions: Singles = normalise_rows(box_sums).astype(np.float32)
     return regions
 
 
 def score_mutual_pairs(query: Singles, place: Singles) -> float:
     """Score two sets of regions of length 1, `query` (N, D) and `place` (M, D), from 0 to 1: the sum of the cosines of
-    the pairs of which each is the other's best match, over the larger number of regions (by which the papers do not
-    divide). Negative cosines count 0; all-zero rows are not regions."""
+    mutual best matches, divided by the larger number of regions (the papers do not divide). Negative cosines count as
+    0, and all-zero rows are not regions."""
     query_regions, place_regions = (int(regions.any(axis=1).sum()) for regions in (query, place))
     if not query_regions or not place_regions:
         return 0.0
@@ -194,7 +193,7 @@ def score_mutual_pairs(query: Singles, place: Singles) -> float:
 
 
 def to_bytes(vectors: Singles) -> Array:
-    """Store directions in 8 bits: float32 (N, D) to int8 (N, D), each row scaled by its largest magnitude."""
+    """Quantise directions to 8 bits: float32 (N, D) to int8 (N, D), each row scaled by its largest magnitude."""
     largest = np.maximum(np.abs(vectors).max(axis=1, keepdims=True), _TINY)
     stored: Array = np.rint(127 / largest * vectors).astype(np.int8)
     return stored

@@ -1,8 +1,8 @@
 """`seqslam`: small patch-normalised pictures, compared by their absolute differences, in sequences (Milford and Wyeth
 2012, "SeqSLAM: Visual route-based navigation for sunny summer days and stormy winter nights").
 
-This file computes the difference of one picture from every place and enhances its local contrast. `places.sequence`
-searches the trajectories, for this technique by default.
+This module computes the difference of one picture from every place and enhances the local contrast. `places.sequence`
+searches for trajectories; this technique uses it by default.
 """
 
 import math
@@ -14,7 +14,7 @@ from edgevpr.core.arrays import Array, Doubles, Image, Mask, Singles
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import UsageError
 
-_SEQUENCE_QUERIES = 10  # queries that are matched together, unless the configuration sets another number
+_SEQUENCE_QUERIES = 10  # queries matched together, unless the configuration sets another number
 _WINDOW_PLACES = 10  # R_window of the paper: five places before and five after
 _MEAN_LEVEL = 128  # of a pixel as bright as the mean of its patch
 _LEVELS_PER_SD = 28  # eight bits reach 4.5 standard deviations either way
@@ -73,10 +73,9 @@ class SeqSlam:
         # With one query, the nearest neighbour of each row is that query: K=1 is the fastest way to all sums of
         # absolute differences.
         differences = cv2.batchDistance(rows, query.coarse[None], cv2.CV_32S, normType=cv2.NORM_L1, K=1)[0][:, 0]
-        most = _WINDOW_PLACES / math.sqrt(
-            _WINDOW_PLACES + 1
-        )  # (n - 1) / sqrt(n): none of n values is farther from their mean
-        return (0.5 - enhance_contrast(differences) / (2 * most)).astype(np.float32), None
+        # None of n values is more than (n - 1) / sqrt(n) standard deviations from their mean.
+        max_deviation = _WINDOW_PLACES / math.sqrt(_WINDOW_PLACES + 1)
+        return (0.5 - enhance_contrast(differences) / (2 * max_deviation)).astype(np.float32), None
 
 
 def normalise_patches(pixels: Singles, allowed: Singles) -> tuple[Singles, Singles]:
@@ -91,8 +90,8 @@ def normalise_patches(pixels: Singles, allowed: Singles) -> tuple[Singles, Singl
 
 def enhance_contrast(differences: Array) -> Doubles:
     """Enhance the local contrast of the query's differences from the places along the map: int32 (N,) to float64 (N,).
-    From each difference the mean of those up to five places away is subtracted, and the rest is divided by their
-    (sample) standard deviation; 0 where they are all equal. Sums of whole numbers keep a long map precise."""
+    The mean of the differences up to five places away is subtracted from each, and the result is divided by their
+    (sample) standard deviation; 0 where they are all equal. Integer sums stay exact on a long map."""
     whole = differences.astype(np.int64)
     first = np.maximum(np.arange(len(whole)) - _WINDOW_PLACES // 2, 0)
     last = np.minimum(np.arange(len(whole)) + _WINDOW_PLACES // 2 + 1, len(whole))

@@ -1,9 +1,9 @@
-"""Views of a query: its picture as seen from other heights and under other headings, for `cohog`.
+"""Views of a query: its picture as seen from other heights and at other headings, for `cohog`.
 
 A query of a camera that looks straight down is compared with a place under several *hypotheses*: a height ratio (the
-camera's height above the ground over that when the place was mapped) and a rotation of the camera since then, in steps
-of 15 degrees. A view undoes both. Few regions agree by chance more easily than many: factors, measured with foreign
-pictures of the tuning sets from the air, make the shares of agreeing votes comparable."""
+camera's height above the ground divided by that when the place was mapped) and a rotation of the camera since then, in
+steps of 15 degrees. A view undoes both. Few regions agree by chance more easily than many. Factors, measured with
+foreign pictures of the aerial tuning sets, make the shares of agreeing votes comparable."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,15 +16,15 @@ from edgevpr.core.arrays import Array, Bools, Ints, Mask, Singles
 from edgevpr.core.contract import Picture
 from edgevpr.techniques.layout import ROTATIONS
 
-# Each is about 1.4 times the one before: the votes of a view still agree where the height is 1.2 times off.
+# Each is about 1.4 times the previous one: the votes of a view still agree if the height is wrong by a factor of 1.2.
 HEIGHT_RATIOS = (0.5, 0.7, 1.0, 1.42, 2.0)
 QUARTERS = 4
 STEPS_PER_QUARTER = ROTATIONS // QUARTERS
 _CHANCE_EXPONENT = 0.72  # the share that agrees by chance falls with this power of the number of regions
 _LARGER_VIEW_FACTORS = {1.42: 0.87, 2.0: 0.8}  # a larger view has more places to agree on
 
-# Encodes a square picture, float32 (side, side), with its allowed pixels, bool of the same shape or None, in cells of a
-# number of pixels. Returns blocks float32 (n, n, 4 bins), and which of them are good, bool (n, n).
+# Encodes a square picture, float32 (side, side), with its allowed pixels, bool of the same shape or None, in cells of
+# this many pixels. Returns blocks float32 (n, n, 4 bins), and bool (n, n), True for good blocks.
 Encode = Callable[[Singles, Mask | None, int], tuple[Singles, Bools]]
 Describe = Callable[[Singles], Singles]
 
@@ -32,8 +32,8 @@ Describe = Callable[[Singles], Singles]
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewRegions:
     """The good regions of a view, to be compared with a place: their `numbers` int (G,), row by row on a grid of `side`
-    x `side` regions, and their vectors `regions` float32 (G, P), each of length 1. `factor`: factor by which the share
-    of agreeing votes is multiplied to give the score (see above)."""
+    x `side` regions, and their vectors `regions` float32 (G, P), each of length 1. `factor`: the score is the share of
+    agreeing votes times this factor (see above)."""
 
     numbers: Ints
     regions: Singles
@@ -59,10 +59,10 @@ def compute_scale(cells: int, ratio: float) -> float:
 
 
 class QueryViews:
-    """The views of one query, each made when it is first asked for. `square` is the unchanged view: its blocks float32
-    (n, n, 4 bins), and bool (n, n), True for good blocks. `encode` makes such a pair of another view, with cells of
-    `cell_px` pixels. Views beyond a quarter turn have the same cells, turned. `seen` bool (n, n) is True for blocks of
-    the unchanged view that lie on allowed pixels only."""
+    """The views of one query, each made on first use. `square` is the unchanged view: its blocks float32 (n, n, 4
+    bins), and bool (n, n), True for good blocks. `encode` makes such a pair for another view, with cells of `cell_px`
+    pixels. Views rotated by quarter turns reuse the same cells, rotated. `seen` bool (n, n) is True for blocks of the
+    unchanged view that lie on allowed pixels only."""
 
     def __init__(self, picture: Picture, square: tuple[Singles, Bools], cell_px: int, encode: Encode) -> None:
         self._picture, self._cell_px, self._encode, self.seen = picture, cell_px, encode, picture.seen
@@ -73,8 +73,8 @@ class QueryViews:
         self._regions: dict[tuple[int, Describe], ViewRegions] = {}
         self.fields: dict[tuple[int, int], Singles] = {}  # layouts, by the number of the hypothesis and the grid's side
 
-    def forget_other_heights(self, ratio: float) -> None:
-        """Forget the views of other height ratios than this, but for the unchanged one: they take megabytes."""
+    def discard_other_heights(self, ratio: float) -> None:
+        """Discard the views of other height ratios, except the unchanged one: they take megabytes."""
         self._encoded = {key: view for key, view in self._encoded.items() if key[0] == ratio or key == (1.0, 0)}
         self._scaled = {key: picture for key, picture in self._scaled.items() if key == ratio}
         self._regions = {key: view for key, view in self._regions.items() if decode_hypothesis(key[0])[0] == ratio}
@@ -97,8 +97,8 @@ class QueryViews:
             blocks, good = self.make_blocks(ratio, turn)
             side = max(count_cells(self._side + 1, ratio) - 1, self._side)  # regions along a side, at least a place's
             if ratio > 1:
-                ground = compute_scale(self._side + 1, ratio) ** 2  # over that of the place
-                factor = ground * _LARGER_VIEW_FACTORS[ratio]  # no more than one in `ground` of the votes can agree
+                area_ratio = compute_scale(self._side + 1, ratio) ** 2  # relative to the place
+                factor = area_ratio * _LARGER_VIEW_FACTORS[ratio]  # at most one in `area_ratio` votes can agree
             else:
                 factor = 1.0 if ratio == 1 else min(1.0, (int(good.sum()) / self._good) ** _CHANCE_EXPONENT)
             self._regions[number, describe] = ViewRegions(
@@ -111,7 +111,7 @@ class QueryViews:
 
     @cached_property
     def halved(self) -> tuple[Array, Mask]:
-        """The picture in half as many pixels along a side, at least two a cell: grey float32 (side, side), and bool
+        """The picture with half as many pixels along a side, at least two per cell: grey float32 (side, side), and bool
         (side, side), True for allowed pixels."""
         grey, allowed = self._resize_picture((self._side + 1) * max(2, self._cell_px // 2))
         return grey, allowed.astype(bool)
@@ -119,7 +119,7 @@ class QueryViews:
     def _resize_picture(self, side: int) -> tuple[Array, Array]:
         """Return the picture with `side` pixels along a side: grey float32, and uint8, 1 for allowed pixels."""
         if self._picture.grey is None or self._picture.allowed is None:
-            raise ValueError("the query has no picture to turn")
+            raise ValueError("the query has no picture to rotate")
         grey: Array = self._picture.grey
         allowed: Array = self._picture.allowed.astype(np.uint8)
         if side == len(grey):
@@ -128,8 +128,8 @@ class QueryViews:
         return grey, cv2.resize(allowed, (side, side), interpolation=cv2.INTER_NEAREST)
 
     def _warp_picture(self, ratio: float, within: int) -> tuple[Array, Array, int]:
-        """Return the picture of the view of the height ratio `ratio`, rotated by `within` steps of 15 degrees, as three
-        things: grey float32 (side, side); bool (side, side), True for allowed pixels; and a cell's side in pixels."""
+        """Return the picture of the view of the height ratio `ratio`, rotated by `within` steps of 15 degrees: grey
+        float32 (side, side); bool (side, side), True for allowed pixels; and the side of a cell in pixels."""
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
         side = count_cells(self._side + 1, ratio) * cell_px
         if ratio not in self._scaled:
@@ -144,8 +144,8 @@ class QueryViews:
 
 
 def rotate_blocks(blocks: Singles, quarters: int) -> Singles:
-    """Turn the blocks (side, side, 4 L) of a picture counter-clockwise by `quarters` quarter turns; the number L of
-    orientations must be a multiple of 4. The result equals the blocks of the turned picture, but for rounding."""
+    """Rotate the blocks (side, side, 4 L) of a picture counter-clockwise by `quarters` quarter turns; the number L of
+    orientations must be a multiple of 4. The result equals the blocks of the rotated picture, except for rounding."""
     for _ in range(quarters % QUARTERS):
         cells = blocks.reshape(*blocks.shape[:-1], 4, -1)[..., [1, 3, 0, 2], :]
         oriented = np.roll(cells, -(cells.shape[-1] // QUARTERS), axis=-1)  # orientations turn from x to y (down)

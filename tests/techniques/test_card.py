@@ -41,14 +41,14 @@ def test_the_fingerprint_changes_with_all_that_a_descriptor_depends_on(models):
     ("changes", "says"),
     [
         ({"sha256": "abc"}, r"`sha256` must be the 64 hexadecimal digits that `sha256sum tiny.onnx` prints"),
-        ({"file": "../tiny.onnx"}, "write the name of a file that lies beside the card"),
-        ({"file": "tiny.yaml"}, "`file` is `tiny.yaml`, which is the name of a card: write that of the ONNX file"),
+        ({"file": "../tiny.onnx"}, "write the name of a file in the same folder as the card"),
+        ({"file": "tiny.yaml"}, "`file` is `tiny.yaml`, which is the name of a card: write the name of the ONNX file"),
         ({"file": "a\0.onnx"}, r"tiny.yaml: `file` contains a character that no file name can have"),
         ({"outputs": {}}, "`outputs` is empty"),
         ({"input": {**CARD["input"], "colour": "gray"}}, "`input.colour` is `gray`: write grey, bgr or rgb"),
         (
             {"input": {**CARD["input"], "layout": "CHW"}},
-            "`input.layout` is `CHW`: export the network again with the axes in the order NCHW",
+            "`input.layout` is `CHW`: export the network again with its axes in the order NCHW",
         ),
         ({"input": {**CARD["input"], "mean": [1.0, 2.0]}}, "`input.mean` is .*: write one number or 1"),
         ({"input": {**CARD["input"], "std": [0.0]}}, "`input.std` is .* all above 0"),

@@ -17,7 +17,7 @@ REGIONS = 31
 ALLOWED = np.ones((SIDE_PX, SIDE_PX), bool)
 SEEN = np.ones((REGIONS, REGIONS), bool)
 
-structure = partial(overlay.compute_structure, around_cells=3.0)
+structure = partial(overlay.compute_structure, sd_cells=3.0)
 
 
 def make_ground(seed):

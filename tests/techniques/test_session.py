@@ -36,10 +36,10 @@ def test_a_batch_of_any_size_counts_as_one(models):
     ("fault", "says"),
     [
         ("no onnx", "cannot be opened as an ONNX model"),
-        ("weights outside", "cannot be opened as an ONNX model with its weights inside"),
+        ("weights outside", "cannot be opened as an ONNX model with embedded weights"),
         ("other size", r"Got: 32 Expected: 40"),
         ("nan", "not finite, or beyond .* for `features`"),
-        ("zeros", "gives only zeros for `features`"),
+        ("zeros", "outputs only zeros for `features`"),
     ],
 )
 def test_a_file_that_must_not_fly_is_one_sentence(models, monkeypatch, fault, says):
@@ -55,14 +55,14 @@ def test_a_file_that_must_not_fly_is_one_sentence(models, monkeypatch, fault, sa
     ("card", "output", "says"),
     [
         ({"outputs": {"features": "conv5"}}, "features", "conv5"),
-        ({"outputs": {"features": "descriptor"}}, "features", r"is \(1, 16\) and `features` must be \(1, C, H, W\)"),
-        ({"outputs": {"descriptor": "features"}}, "descriptor", r"is \(1, 4, 10, 14\) and .* must be \(1, D\)"),
-        ({"outputs": {"features": "features"}}, "descriptor", "names no output for `descriptor`"),
+        ({"outputs": {"features": "descriptor"}}, "features", r"is \(1, 16\), but `features` must be \(1, C, H, W\)"),
+        ({"outputs": {"descriptor": "features"}}, "descriptor", r"is \(1, 4, 10, 14\), but .* must be \(1, D\)"),
+        ({"outputs": {"features": "features"}}, "descriptor", "lists no output for `descriptor`"),
         ({"input": {**CARD["input"], "colour": "rgb"}}, "features", r"Got: 3 Expected: 1"),
         (
             {"sha256": "0" * 64},
             "features",
-            "is not the file of its card: its SHA-256 is [0-9a-f]{64} and the card says 0",
+            "does not match its card: its SHA-256 is [0-9a-f]{64}, and the card expects 0",
         ),
         ({"file": "gone.onnx"}, "features", "gone.onnx cannot be read"),
     ],
@@ -122,7 +122,7 @@ def test_without_onnxruntime_the_others_fly(models):
     done = subprocess.run([sys.executable, "-c", BROKEN], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("onnxruntime cannot be imported (")
-    assert done.stdout.endswith("hog, cohog and seqslam fly without it.\n")
+    assert done.stdout.endswith("hog, cohog and seqslam work without it.\n")
     assert done.stdout.count("\n") == 1
 
 

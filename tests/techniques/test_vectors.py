@@ -81,7 +81,7 @@ def test_a_form_may_have_its_own_rule():
 
 
 def test_numbers_beyond_half_precision_are_an_error_and_not_infinite():
-    with pytest.raises(ModelError, match="half precision"):
+    with pytest.raises(ModelError, match="half-precision range"):
         Given(similarity="l1").encode(np.full(LENGTH, 1e6, np.float32))
     assert Given().encode(np.full(LENGTH, 1e6, np.float32)).quality == 1
 

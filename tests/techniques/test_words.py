@@ -43,8 +43,8 @@ def test_words_of_another_network_are_refused(folder):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"words": np.zeros((2, 2), np.float16)}, r"must hold 3 words.*\(2, 2\)"),
-        ({"words": np.full((3, 2), np.nan, np.float16)}, "must hold 3 words"),
+        ({"words": np.zeros((2, 2), np.float16)}, r"must have 3 words.*\(2, 2\)"),
+        ({"words": np.full((3, 2), np.nan, np.float16)}, "must have 3 words"),
         ({"words": np.array([{}, {}, {}], object)}, "cannot be read"),
     ],
 )
