@@ -41,8 +41,8 @@ def format_build(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
         yield f"  left out: {result.without_heading} tilted by more than 20 degrees, heading unknown (add yaw_deg)"
     if result.not_memorable:
         yield f"  left out: {result.not_memorable} that are not memorable"
-    if result.without_data or result.says_nothing:
-        yield f"  left out: {result.without_data} without data, {result.says_nothing} with too little texture"
+    if result.without_data or result.low_texture:
+        yield f"  left out: {result.without_data} without data, {result.low_texture} with too little texture"
     if result.white:
         yield f"  {result.white} of the places are white over a third or more: clouds and snow do not stay"
     if result.of_low_quality:

@@ -119,7 +119,7 @@ def measure_ground(place_map: PlaceMap) -> CoveredGround | None:
 @dataclass(slots=True, kw_only=True)
 class MappingResult:
     """Counts of frames. `added`: new places; of these, `without_position` have no position, and `of_low_quality` only
-    closed a gap. `already_here`: frames in the map before. `says_nothing`: frames with too little information.
+    closed a gap. `already_here`: frames in the map before. `low_texture`: frames with too little information.
     `tilted`: frames that are tilted too far to be levelled, `without_heading`: those that a heading is missing for.
     `not_memorable`: frames left out because they failed a salience criterion. `without_data`: places left out because
     the orthophoto has no data there. `white`: places cut from it that are white over a third or more."""
@@ -128,7 +128,7 @@ class MappingResult:
     without_position: int = 0
     already_here: int = 0
     of_low_quality: int = 0
-    says_nothing: int = 0
+    low_texture: int = 0
     tilted: int = 0
     without_heading: int = 0
     not_memorable: int = 0
@@ -182,7 +182,7 @@ def build_map(
             continue
         of_name = ids_by_image.get((escape_name(frame.name),), ())
         if check_texture(encoded.descriptor, min_quality):
-            result.says_nothing += 1
+            result.low_texture += 1
         elif any(place_map.has_descriptor(place_id, encoded.descriptor.coarse) for place_id in of_name):
             result.already_here += 1
         else:

@@ -33,7 +33,7 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
     built = run_json(capsys, "map", "build", place_map, *cut, "--area", track, "--no-calibrate")
     assert built["technique"] == "cohog"
     assert 15 <= built["places"] == built["added"]
-    assert (built["without_position"], built["without_data"], built["says_nothing"]) == (0, 0, 0)
+    assert (built["without_position"], built["without_data"], built["low_texture"]) == (0, 0, 0)
     with PlaceMap.open(place_map) as opened:
         assert opened.spec.parameters["camera"] == "nadir"
         places = list(opened.read_places())

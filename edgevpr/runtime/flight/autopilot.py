@@ -20,7 +20,7 @@ from edgevpr.runtime.flight.notifier import Alert, Notifier
 from edgevpr.runtime.flight.output import Output
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# While an autopilot is heard, a fix is sent within a fraction of a millisecond. The loop waits for that, at most this
+# To an autopilot that is alive, a fix is sent within a fraction of a millisecond. The loop waits for that, at most this
 # long, so that the log line of the query can say whether the fix was sent.
 _MAX_SEND_WAIT_S = 0.02
 
@@ -74,7 +74,7 @@ class AutopilotOutput:
 
     def state(self) -> dict[str, Any]:
         """Return the state of the link for the status: `trouble`, why the port could not be opened or was lost (None:
-        data arrives); `autopilot`, the system id of the one heard (None: none is); the name of the `channel` of
+        data arrives); `autopilot`, the system id of the one that is alive (None: none); the name of the `channel` of
         positions; `fixes`, a summary; and `accuracy_m` of our position."""
         with self._link.turn("state"):
             stats = self._link.stats()
@@ -117,8 +117,8 @@ class AutopilotOutput:
                 fix, sending = self._send_match(event)
             else:
                 self._navigator.handle_frame(event)
-            is_heard = self._link.is_alive()
-        if sending and is_heard:
+            is_alive = self._link.is_alive()
+        if sending and is_alive:
             sending.wait(_MAX_SEND_WAIT_S)
         with self._link.turn("use of its fix"):
             if sending:
@@ -135,8 +135,8 @@ class AutopilotOutput:
             return self._navigator.age.correct(frame)
 
     def check_age(self, event: Recognition) -> Recognition:
-        """Return an event with a match, without it if its picture is of unknown age, and report when that begins and
-        ends, and the delay that is taken out."""
+        """Return an event with a match, or without it if the age of its picture is unknown. Report when that begins and
+        ends, and the delay that is corrected."""
         with self._link.turn("age"):
             age = self._navigator.age
             age.judge(event)
@@ -151,7 +151,7 @@ class AutopilotOutput:
 
     @property
     def age_summary(self) -> str | None:
-        """What people should know of the age of the pictures (None: nothing)."""
+        """Remark on the age of the pictures (None: nothing to report)."""
         note = _UNKNOWN_AGE if self._unknown_age.is_active else self._delay_note
         return None if note is None else str(note)
 
@@ -161,12 +161,12 @@ class AutopilotOutput:
         return Reason(ReasonCode.DELAY_FOUND, {"delay_s": self._delay_s}) if is_late else None
 
     def add_motion(self, event: Recognition) -> None:
-        """Report to the navigator the motion that a picture shows which is no query."""
+        """Give the navigator the odometry of a picture that is no query."""
         with self._link.turn("saw"):
             self._navigator.handle_frame(event, is_query=False)
 
     def needs_motion_frames(self) -> bool:
-        """Return True if the position rests on matches, so that the motion between two of them is useful."""
+        """Return True if the position depends on matches, so that odometry between two of them is useful."""
         with self._link.turn("wants strides"):
             return not self._navigator.has_gps
 
@@ -182,8 +182,8 @@ class AutopilotOutput:
 
     def compare_gps(self, off_m: float, is_wrong: bool, have_agreed: bool) -> None:
         """Send the distance `off_m` (metres) from GPS to a match. While GPS `is_wrong`, since it contradicts the map,
-        the navigator does not use it. Where they never `have_agreed`, the map is as likely to be wrong: then GPS is
-        used, and no position is sent."""
+        the navigator does not use it. If they never `have_agreed`, the map is as likely to be wrong: then GPS is used,
+        and no position is sent."""
         with self._link.turn("gps"):
             self._link.send(*messages.make_named_values(self._clock.mono_s(), vpr_gps_m=float(off_m)))
             self._navigator.trust_gps(not is_wrong or not have_agreed)
@@ -195,7 +195,7 @@ class AutopilotOutput:
             self._navigator.correct_height(ratio, ratio_sd)
 
     def reset_navigation(self) -> None:
-        """Begin to navigate anew, since fixes err otherwise from now on."""
+        """Restart the navigation, since fixes from now on have other errors."""
         with self._link.turn("anew"):
             self._navigator.reset_navigation()
 
@@ -225,7 +225,7 @@ class AutopilotOutput:
             self._link.send(messages.make_source_set(number, stats.autopilot_system_id or 0))
 
     def _report_output(self) -> None:
-        """Report what a continuous channel carries, where that has changed."""
+        """Report what a continuous channel sends, if that has changed."""
         output = self._navigator.output
         if self._link.channel.is_continuous and output is not self._output:
             self._output = output
@@ -274,15 +274,15 @@ class SourceSets:
         return self._with_gps is not None and self._without is not None
 
     def choose_set(self, now_s: float, has_gps: bool, has_own: bool, answered_s: float) -> int | None:
-        """Return the number of the set to ask for now (None: none). `has_gps`: there is a GPS that is believed;
-        `has_own`: our own position is known well enough; `answered_s`: when such a question was last answered."""
+        """Return the number of the set to ask for now (None: none). `has_gps`: there is a trusted GPS; `has_own`:
+        our own position is known well enough; `answered_s`: when such a request was last answered."""
         if not has_gps:
             self._bad_s = now_s
         number = self._without if not has_gps and has_own else None
         if self._requested is not None and now_s - self._bad_s > _MIN_GPS_GOOD_S:
             number = self._with_gps
-        is_heard = answered_s >= self._requested_s or now_s - self._requested_s < _SOURCE_SET_RETRY_S
-        if number is None or (number == self._requested and is_heard):
+        is_alive = answered_s >= self._requested_s or now_s - self._requested_s < _SOURCE_SET_RETRY_S
+        if number is None or (number == self._requested and is_alive):
             return None
         self._requested, self._requested_s = number, now_s
         return number
@@ -299,7 +299,7 @@ def report_unsent(event: Recognition, why: Reason) -> FixReport:
 
 
 def combine_confidence(event: Recognition) -> float | None:
-    """Return the confidence of a match, alone or by the flight so far, the higher (None: it is unknown)."""
+    """Return the higher confidence of a match, alone or by the flight so far (None: unknown)."""
     if event.confidence is None:
         return None
     return max(event.confidence, event.track.confidence if event.track else 0.0)

@@ -65,7 +65,7 @@ class MirrorWatch:
         """Count a query without a match, and try its picture mirrored if it is time to."""
         if event.accepted:
             self._tries = _MAX_TRIES
-        has_ground = event.is_query and not (event.failed or event.says_nothing or event.view.reason)
+        has_ground = event.is_query and not (event.failed or event.lacks_texture or event.view.reason)
         if self._tries == _MAX_TRIES or event.frame is None or not has_ground:
             return
         self._misses += 1

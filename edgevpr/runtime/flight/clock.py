@@ -4,8 +4,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-# Pictures of queries further apart share too little ground to show the motion of an aeroplane. Between those so far
-# apart others show it: 100 m high, at 20 m/s, they share more than half.
+# Pictures further apart share too little ground for the visual odometry of an aeroplane. Between such queries other
+# pictures are taken: 100 m high, at 20 m/s, they share more than half of the ground.
 _MAX_QUERY_INTERVAL_S = 4.0
 _ODOMETRY_INTERVAL_S = 2.0
 
@@ -37,8 +37,8 @@ class Pace:
         """Return the seconds until the next frame is due; 0 or less: it is due."""
         return self._due_s - self._clock.mono_s()
 
-    def taken(self, step_s: float | None = None) -> None:
-        """Note that a frame has been taken. The next is due after `step_s` (None: by the rate), or later by as much as
+    def record_frame(self, step_s: float | None = None) -> None:
+        """Record that a frame was taken. The next is due after `step_s` (None: by the rate), or later by as much as
         the rate has been lowered."""
         wait_s = 1 / self.rate_hz if step_s is None else step_s * self._requested_hz / self.rate_hz
         self._due_s = max(self._due_s + wait_s, self._clock.mono_s())

@@ -7,9 +7,9 @@ from edgevpr.mavlink.messages import Severity
 from edgevpr.power.thermal import ThermalState
 from edgevpr.runtime.flight.notifier import Notifier
 
-# Seconds between two reports of a problem at least, and without it until it counts as over: an under-voltage blinks.
+# Least time between two reports of a problem, and without the problem until it is over: under-voltage flickers.
 _MIN_REPORT_INTERVAL_S = 30.0
-# Fields of the state that are problems, each with the notes that it has begun and that it is over.
+# Fields of the state that are problems, each with the notes for its start and its end.
 _NOTES = {
     "under_voltage": (ReasonCode.UNDER_VOLTAGE, ReasonCode.SUPPLY_FINE),
     "throttled": (ReasonCode.THROTTLED, ReasonCode.FULL_SPEED),
@@ -22,33 +22,33 @@ class CompanionWatch:
 
     def __init__(self, notifier: Notifier) -> None:
         self._notifier = notifier
-        self._seen_s: dict[str, float] = {}  # when each problem was last seen
+        self._last_true_s: dict[str, float] = {}  # when each problem was last reported by the board
         self._reported_s: dict[str, float] = {}  # when each problem was last reported, as begun or as over
-        self._holding: dict[str, str] = {}  # problems that were reported and are not over, with their texts
+        self._active: dict[str, str] = {}  # reported problems that are not over, with their texts
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """Texts of the problems that hold."""
-        return tuple(self._holding.values())
+        """Texts of the present problems."""
+        return tuple(self._active.values())
 
     def take(self, now_s: float, state: ThermalState) -> None:
-        """Take a reading once a second, and report what has changed. An unknown value (None) changes nothing."""
+        """Process a reading, once a second, and report changes. An unknown value (None) changes nothing."""
         for problem in _NOTES:
             value: bool | None = getattr(state, problem)
             if value:
-                self._seen_s[problem] = now_s
-            holds = now_s - self._seen_s.get(problem, -math.inf) < _MIN_REPORT_INTERVAL_S
+                self._last_true_s[problem] = now_s
+            is_active = now_s - self._last_true_s.get(problem, -math.inf) < _MIN_REPORT_INTERVAL_S
             is_early = now_s - self._reported_s.get(problem, -math.inf) < _MIN_REPORT_INTERVAL_S
-            if not is_early and (holds or value is not None) and holds != (problem in self._holding):
-                self._report(now_s, problem, holds, state)
+            if not is_early and (is_active or value is not None) and is_active != (problem in self._active):
+                self._report(now_s, problem, is_active, state)
 
-    def _report(self, now_s: float, problem: str, holds: bool, state: ThermalState) -> None:
-        code = _NOTES[problem][0 if holds else 1]
+    def _report(self, now_s: float, problem: str, is_active: bool, state: ThermalState) -> None:
+        code = _NOTES[problem][0 if is_active else 1]
         note = Reason(code, {"temperature_c": state.temperature_c} if code.parameters else {})
         self._reported_s[problem] = now_s
-        if holds:
-            self._holding[problem] = str(note)
+        if is_active:
+            self._active[problem] = str(note)
         else:
-            del self._holding[problem]
-        severity = Severity.WARNING if holds else Severity.INFO
+            del self._active[problem]
+        severity = Severity.WARNING if is_active else Severity.INFO
         self._notifier.report("companion", severity, note, topic=f"companion {problem}", why=state.why)

@@ -111,7 +111,7 @@ class Flight:
             source = io.open_source(step_s)
             stack.callback(source.close)
             if link and not source.is_live and settings.send_fixes:
-                _log.warning("%s is a recording: its fixes do not say where you are", camera.uri)
+                _log.warning("%s is a recording: its fixes are not the position of this vehicle", camera.uri)
             notifier = Notifier(flight_log, link)
             autopilot = None
             if link:
@@ -162,7 +162,7 @@ class Flight:
         }
 
     def _remarks(self) -> tuple[str | None, ...]:
-        """Return what people should know beside the counts, each a few words (None: nothing)."""
+        """Return remarks for the status beside the counts, each in a few words (None: nothing)."""
         held = self._governing.governor.held
         age = self._parts.autopilot.age_summary if self._parts.autopilot else None
         return self._commands.summary, age, held, self._map_watch.summary, self._parts.flight_log.state
@@ -186,8 +186,8 @@ class Flight:
         if frame is None:
             return
         if is_query:
-            pace.taken(source.step_s)
-        if is_paused:  # the newest picture is dropped, so that none is old when the flight goes on
+            pace.record_frame(source.step_s)
+        if is_paused:  # the newest picture is dropped, so that none is old when the flight resumes
             return
         with meter.measure_cost(thread_only=True) as work:
             with self._parts.io.stop.allow_interrupt():

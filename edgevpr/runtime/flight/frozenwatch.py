@@ -1,10 +1,10 @@
-"""Watch over the camera's pictures: while the aircraft moves, pictures that stay the same are frozen, whatever noise,
-clock or display they carry, and so are those that repeat earlier ones of this flight, as a clip that is played again.
+"""Detects frozen pictures. While the aircraft moves, pictures that stay the same are frozen, whatever noise, clock or
+display they show, and so are those that repeat earlier ones of this flight, as from a clip that is played again.
 
-Both are pictures that equal an earlier one, although the aircraft has turned or flown on so far that they cannot.
-Rotation is the soundest witness, since gyroscopes measure it for every camera. Velocity times time over height is the
-second, for a camera that looks down, as far as an autopilot that is led by our own positions can be trusted. A picture
-whose texture cannot show a motion, as over water, in fog or in the dark, is not judged.
+Both equal an earlier picture, although the aircraft has turned or flown so far that they cannot. Rotation is the best
+evidence, since gyroscopes measure it for every camera. Velocity times time over height is the second, for a camera that
+looks down, as far as an autopilot that follows our own positions can be trusted. A picture whose texture cannot show a
+motion, as over water, in fog or in the dark, is not judged.
 """
 
 import math
@@ -25,52 +25,51 @@ from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.levelling import read_camera_lens
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-# Motions are shares of the picture's longest side. A picture that has moved by 0.012 is not taken for unmoved.
+# Motions are shares of the picture's longest side. A motion of 0.012 is detected.
 MIN_MOTION_SHARE = 0.03  # least motion by the aircraft that contradicts an unmoved picture
-MIN_PROOF_SHARE = 0.09  # sum of such motions by which pictures are frozen: one reset of the heading is no proof
-_MAX_SINGLE_SHARE = 0.04  # that one rotation, or one repeated picture, counts for
+MIN_PROOF_SHARE = 0.09  # sum of such motions that proves pictures frozen: one reset of the heading is no proof
+_MAX_SINGLE_SHARE = 0.04  # most that one rotation, or one repeated picture, counts
 _PROOF_WINDOW_S = 20.0
-_MIN_FROZEN_S = 2.5  # that pictures stay the same, or that lie between a picture and its repetition
-# Repeated pictures in a row, in flight, that are a proof by themselves: a route that is flown again, 500 m high with a
-# gimbal, shows one picture in five as before to within the resolution.
+_MIN_FROZEN_S = 2.5  # for which pictures stay the same, or between a picture and its repetition
+# So many repeated pictures in a row, in flight, are a proof by themselves: on a route that is flown again, 500 m high
+# with a gimbal, one picture in five equals an earlier one to within the resolution.
 _MIN_REPEATS = 8
 _ROTATION_ERROR_DEG = 2.0  # attitude, and time of the frame
 _SPEED_ERROR_M_S = 2.0  # less counts as hovering
-_PATH_DRIFT_M_S = 6.0  # by which a way of a minute may be wrong, as the wind changes
+_PATH_DRIFT_M_S = 6.0  # of a path of a minute, as the wind changes
 _MIN_FLIGHT_SPEED_M_S = 3.0
 _MAX_HEIGHT_RATIO = 1.5  # the ground may be lower than the height says
-_MAX_SPEED_M_S = 100.0  # a velocity that is reported beyond is wrong
+_MAX_SPEED_M_S = 100.0  # a larger reported velocity is wrong
 _MAX_HEIGHT_M = 10_000.0  # and so is a height
-_MIN_HEIGHT_M = 5.0  # below, a height over ground is too uncertain as a measure
-_MAX_STEP_S = 5.0  # from picture to picture, for which a velocity is taken
-_HEADING_JUMP_DEG = 30.0  # an autopilot that has turned by more, and by more than the next a second,
-_HEADING_JUMP_DEG_S = 60.0  # has corrected its heading
+_MIN_HEIGHT_M = 5.0  # a smaller height over ground is too uncertain
+_MAX_STEP_S = 5.0  # between pictures; the velocity is not integrated over a longer time
+_HEADING_JUMP_DEG = 30.0  # a larger change of heading, with the next for each second, is a correction by the autopilot
+_HEADING_JUMP_DEG_S = 60.0
 _RMS_RADIUS_SHARE = 0.36  # root mean square distance of a picture's points from its middle
-_MAX_FOV_DEG = 120.0  # of a lens that is unknown
+_MAX_FOV_DEG = 120.0  # assumed of an unknown lens
 _MIN_SAME_SHARE = 0.75  # share of the blocks that must be unmoved
 _MIN_BLOCKS = BLOCK_COUNT // 3  # that can be judged
 _BLOCK_MEMORY = 8  # pictures: time constant of the share of pictures in which a block stays while most others move
-_MAX_STAY_SHARE = 0.5  # of the blocks, in a picture that says which ones always stay
+_MAX_STAY_SHARE = 0.5  # of the blocks, in a picture from which the blocks that always stay are learnt
 _MAX_REMEMBERED = 300  # pictures; 4 MB
 _REMEMBER_INTERVAL_S = 0.5
 _MIN_THUMB_CORRELATION = 0.97  # least correlation of the coarsest copies
 _MAX_CANDIDATES = 3  # earlier pictures that are compared block by block
-_NEW_AFTER_STAY = 3  # pictures after which the camera is taken as back
+_NEW_AFTER_STAY = 3  # new pictures after which the camera counts as back
 _NEW_AFTER_REPEATS = 10  # the same, after a clip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Optics:
-    """What an aircraft's motion does to the pictures of its camera. `focal_share`: focal length in shares of the
-    picture's longest side. `looks_down`: else ahead. `is_level`: it hangs in a gimbal that keeps roll and pitch out."""
+    """The effect of the aircraft's motion on the pictures of its camera. `focal_share`: focal length in shares of the
+    picture's longest side. `looks_down`: else ahead. `is_level`: a gimbal compensates roll and pitch."""
 
     focal_share: float
     looks_down: bool
     is_level: bool
 
     def compute_rotation_share(self, then: Vehicle | None, now: Vehicle | None) -> float:
-        """Return by how much a picture moves at least by the rotation of the aircraft between two reports; 0 where it
-        is unknown."""
+        """Return the least motion of a picture by the rotation of the aircraft between two reports; 0 if unknown."""
         if then is None or now is None:
             return 0.0
         names = "roll_deg", "pitch_deg", "heading_deg"
@@ -82,15 +81,15 @@ class Optics:
         return math.hypot(min(1.0, shift), _RMS_RADIUS_SHARE * _subtract_error(about_deg))
 
     def compute_travel_share(self, moved_m: float, height_m: float | None) -> float:
-        """Return by how much a picture moves at least if the aircraft has moved by `moved_m`; 0 if the camera does not
-        look down, or the height is unknown."""
+        """Return the least motion of a picture if the aircraft has moved by `moved_m`; 0 if the camera does not look
+        down, or the height is unknown."""
         if not self.looks_down or height_m is None or not _MIN_HEIGHT_M <= height_m <= _MAX_HEIGHT_M:
             return 0.0
         return max(0.0, moved_m) * self.focal_share / (_MAX_HEIGHT_RATIO * height_m)
 
 
 def read_optics(source: SourceConfig, recogniser: Recogniser) -> Optics:
-    """Return the optics of a configured camera; a lens that is unknown is taken as the widest usual one."""
+    """Return the optics of a configured camera; an unknown lens is assumed to be the widest usual one."""
     lens = read_camera_lens(source)
     focal_share = 0.5 / math.tan(math.radians(lens.fov_deg if lens else _MAX_FOV_DEG) / 2)
     looks_down = recogniser.technique.spec.looks_down
@@ -99,8 +98,8 @@ def read_optics(source: SourceConfig, recogniser: Recogniser) -> Optics:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimedPicture:
-    """A picture, and what is known of the aircraft when it was taken (`vehicle` None: nothing). `path_m` (2,): way
-    flown since the start of the flight, by velocities, metres east and north."""
+    """A picture with the report of the aircraft at its time (`vehicle`; None: none). `path_m` (2,): displacement since
+    the start of the flight, by velocities, metres east and north."""
 
     picture: CoarsePicture
     t_s: float
@@ -110,15 +109,15 @@ class TimedPicture:
 
 class FrozenWatch:
     """Judges each picture of a live camera before it is recognised, and reports once when pictures are frozen
-    (`is_frozen`) and once when they move again. Some have been recognised by then: the `autopilot` (None: there is no
-    link) navigates anew, so that nothing that is sent rests on them."""
+    (`is_frozen`) and once when they move again. Some have been recognised by then, so the navigation of the `autopilot`
+    (None: there is no link) is reset, and no position that is sent depends on them."""
 
     def __init__(self, notifier: Notifier, optics: Optics, autopilot: AutopilotOutput | None = None) -> None:
         self.is_frozen = False
         self._notifier, self._optics, self._autopilot = notifier, optics, autopilot
         self._first: TimedPicture | None = None  # of the pictures in a row that are the same
         self._newest: TimedPicture | None = None
-        self._turned_from: Vehicle | None = None
+        self._rotation_start: Vehicle | None = None
         self._flown_share = 0.0
         self._rotations: deque[tuple[float, float]] = deque()  # of this row: time and share of each
         self._repeats: deque[tuple[float, float]] = deque()
@@ -164,7 +163,7 @@ class FrozenWatch:
         return TimedPicture(picture=picture, t_s=t_s, vehicle=vehicle, path_m=path_m)
 
     def _begin_row(self, now: TimedPicture) -> None:
-        self._first, self._turned_from, self._flown_share = now, now.vehicle, 0.0
+        self._first, self._rotation_start, self._flown_share = now, now.vehicle, 0.0
         self._rotations.clear()
         last = self._remembered[-1] if self._remembered else None
         if last is None or now.t_s - last.t_s >= _REMEMBER_INTERVAL_S:
@@ -174,21 +173,22 @@ class FrozenWatch:
         """Process a picture that equals the first one of its row."""
         self._new_in_a_row = 0
         self._flown_share = max(self._flown_share, self._compute_flown_share(first, now, _SPEED_ERROR_M_S))
-        turned_share = self._optics.compute_rotation_share(self._turned_from, now.vehicle)
-        if turned_share >= MIN_MOTION_SHARE:
-            self._rotations.append((now.t_s, min(turned_share, _MAX_SINGLE_SHARE)))
-        if turned_share >= MIN_MOTION_SHARE or self._turned_from is None:
-            self._turned_from = now.vehicle
+        rotation_share = self._optics.compute_rotation_share(self._rotation_start, now.vehicle)
+        if rotation_share >= MIN_MOTION_SHARE:
+            self._rotations.append((now.t_s, min(rotation_share, _MAX_SINGLE_SHARE)))
+        if rotation_share >= MIN_MOTION_SHARE or self._rotation_start is None:
+            self._rotation_start = now.vehicle
 
     def _find_repeat(self, now: TimedPicture) -> bool:
-        """Return whether a picture equals an earlier one of the flight, and count what contradicts that."""
+        """Return whether a picture equals an earlier one of the flight, and count the motion that contradicts this."""
         if not self._remembered:
             return False
-        alike = np.array([each.picture.thumb for each in self._remembered]) @ now.picture.thumb
-        for number in np.argsort(alike)[: -_MAX_CANDIDATES - 1 : -1].tolist():
+        correlations = np.array([each.picture.thumb for each in self._remembered]) @ now.picture.thumb
+        for number in np.argsort(correlations)[: -_MAX_CANDIDATES - 1 : -1].tolist():
             then = self._remembered[number]
-            # A copy, here and where it is kept, since the blocks of all that is remembered would take 20 MB.
-            if alike[number] >= _MIN_THUMB_CORRELATION and self._is_same(CoarsePicture(then.picture.grey), now.picture):
+            # A copy without blocks, here and where it is kept: the blocks of all remembered pictures would take 20 MB.
+            is_similar = correlations[number] >= _MIN_THUMB_CORRELATION
+            if is_similar and self._is_same(CoarsePicture(then.picture.grey), now.picture):
                 self._handle_repeat(then, now)
                 return True
         return False
@@ -199,10 +199,10 @@ class FrozenWatch:
             return
         velocity_m_s = _read_velocity(now.vehicle)
         flies_on = velocity_m_s is not None and math.hypot(*velocity_m_s) >= _MIN_FLIGHT_SPEED_M_S
-        if flies_on and self._optics.looks_down:  # the horizon ahead stays for long
+        if flies_on and self._optics.looks_down:  # the horizon ahead stays the same for long
             self._repeats_in_a_row += 1
-        turned_share = self._optics.compute_rotation_share(then.vehicle, now.vehicle)
-        share = max(turned_share, self._compute_flown_share(then, now, _PATH_DRIFT_M_S))
+        rotation_share = self._optics.compute_rotation_share(then.vehicle, now.vehicle)
+        share = max(rotation_share, self._compute_flown_share(then, now, _PATH_DRIFT_M_S))
         if share >= MIN_MOTION_SHARE:
             self._repeats.append((now.t_s, min(share, _MAX_SINGLE_SHARE)))
 
@@ -253,7 +253,7 @@ def _read_velocity(vehicle: Vehicle | None) -> tuple[float, float] | None:
 
 
 def _compute_change_deg(then: Vehicle, now: Vehicle, name: str) -> float:
-    """Return by how much an angle has changed; 0 if it is unknown."""
+    """Return the change of an angle; 0 if it is unknown."""
     before, after = getattr(then, name), getattr(now, name)
     if before is None or after is None or not math.isfinite(before + after):
         return 0.0

@@ -1,4 +1,4 @@
-"""Watch over the height above the ground that is reported, by the scale of the pictures. A wrong height makes each
+"""Compares the reported height above the ground with the scale of the pictures. A wrong height makes each
 picture's footprint, the motion between two pictures and the correction of tilt wrong."""
 
 import statistics
@@ -11,9 +11,9 @@ from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.recognition import Recognition
 
 MIN_CONTRADICTION_RATIO = 1.25
-MIN_CORRECTION_RATIO = 1.1  # a height that is farther off than this is corrected by; five matches scatter by less
+MIN_CORRECTION_RATIO = 1.1  # a larger error is corrected; five matches scatter by less
 MATCHES_IN_A_ROW = 5
-_GROUND_CHANGE_SHARE = 0.3  # share of the height by which ground that has begun to change may go on, unseen by matches
+_GROUND_CHANGE_SHARE = 0.3  # of the height: further change, between matches, of ground that has begun to change
 MIN_HEIGHT_M = 1.0  # a height below this, as on the ground, is compared as this
 
 
@@ -40,8 +40,8 @@ class HeightWatch:
 
     @property
     def ratio_sd(self) -> float:
-        """By how much that ratio may be wrong, a share: by what the newest match contradicts it, as over ground that
-        has begun to fall or rise, and by what it may go on to. 0.0: by no more than matches scatter."""
+        """Relative error of that ratio: the deviation of the newest match, as over ground that has begun to fall or
+        rise, plus its further change. 0.0: no more than the scatter of matches."""
         change = self._ratios[-1] / self.ratio if self._heights_m else 1.0
         return (
             0.0

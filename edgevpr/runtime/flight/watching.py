@@ -1,5 +1,5 @@
-"""Observers of the events of a flight (each the `Recognition` of a frame): they count them, and report when a problem
-begins and when it ends. The loop of `flight` calls `update` of each class with every event; an exception in it does not
+"""Observers of the events of a flight (each the `Recognition` of a frame): they count events, and report the start and
+the end of problems. The loop of `flight` calls `update` of each class with every event; an exception in it does not
 end the flight."""
 
 import logging
@@ -22,7 +22,7 @@ MAX_BLANK_IN_A_ROW = 10  # pictures with too little texture
 _MIN_ON_MAP = 3  # accepted matches before the aircraft counts as over the map, and can leave it
 _MAX_MISSES = 30  # queries in a row that are not accepted; ten are usual over poor ground
 _LOST_PROBABILITY = 0.9
-_MAX_LOST_MISSES = 10  # the same, if the place filter takes the aircraft for lost in each
+_MAX_LOST_MISSES = 10  # the same, if the place filter says in each that the aircraft is lost
 _MIN_TO_RETURN = 2  # accepted matches by which the aircraft is over the map again
 _MAX_MISSES_BETWEEN = 10  # between two of these
 _MIN_TILT_S = 5.0  # longer than a gust, and than the change from one turn to the next
@@ -53,12 +53,12 @@ class Tally:
         self.unusable += event.failed and not event.is_query
         self.failed += event.is_query and event.failed
         self.failed_in_a_row = self.failed_in_a_row + 1 if event.failed else 0
-        self.blank_in_a_row = self.blank_in_a_row + 1 if event.says_nothing else 0
+        self.blank_in_a_row = self.blank_in_a_row + 1 if event.lacks_texture else 0
 
 
 class MapWatch:
-    """Reports damage of the map: each place that cannot be read in the flight log, only the first to people; and when
-    the whole file cannot be read, or can again. `left_out` is the number of places left out."""
+    """Reports damage of the map: each unreadable place in the flight log, but only the first to people; and when the
+    file becomes unreadable, or readable again. `left_out` is the number of places left out."""
 
     def __init__(self, notifier: Notifier) -> None:
         self.left_out = 0
@@ -116,7 +116,7 @@ class MapCoverageWatch:
             if self._accepted >= _MIN_TO_RETURN:
                 self._map.update(False)
             return
-        if event.failed or event.says_nothing or event.view.reason or (event.salience and event.salience.reason):
+        if event.failed or event.lacks_texture or event.view.reason or (event.salience and event.salience.reason):
             return
         self._misses += 1
         is_lost = event.track is not None and event.track.lost >= _LOST_PROBABILITY
@@ -180,8 +180,8 @@ class SurveyReporter:
             for name, measure in survey.measures.items()
             if measure.differs_from(self._expected[name])
         }
-        said = "; ".join(sentence for sentence, _ in sentences.values()) or "map and camera agree with GPS"
-        self._notifier.log("survey", said=said, **survey.fields())
+        summary = "; ".join(sentence for sentence, _ in sentences.values()) or "map and camera agree with GPS"
+        self._notifier.log("survey", said=summary, **survey.fields())
         self._reported |= {name: survey.measures[name].value for name in names}
         for name, (sentence, ground) in sentences.items():
             if name in names:

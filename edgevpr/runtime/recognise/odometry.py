@@ -41,20 +41,20 @@ class OdometryStep:
         return replace(self, moved_m=(factor * east_m, factor * north_m), sd_m=factor * self.sd_m)
 
     def fields(self) -> dict[str, Any]:
-        """Return this stride as fields of the flight log."""
+        """Return this step as fields of the flight log."""
         moved_m = [round(each, 2) for each in self.moved_m]
         rest = {"sd_m": round(self.sd_m, 3), "inliers": self.inliers, "zoom": round(self.zoom, 4)}
         return {"from_s": self.from_s, "moved_m": moved_m, **rest}
 
 
 class VisualOdometry:
-    """Measures the stride to each frame from the one before it."""
+    """Measures the motion to each frame from the one before."""
 
     def __init__(self) -> None:
         self._previous: tuple[float, View, Landmarks] | None = None
 
     def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
-        """Return the stride to a frame taken at `t_s`; None if it is not known. The next one begins there."""
+        """Return the motion to a frame taken at `t_s`; None if it is unknown. The next one starts there."""
         stored, self._previous = self._previous, (t_s, view, landmarks.best(PLACE_LANDMARKS))
         if stored is None or not 0 < t_s - stored[0] <= _MAX_ELAPSED_S:
             return None

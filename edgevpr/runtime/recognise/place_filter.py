@@ -1,4 +1,4 @@
-"""Follows a flight from query to query: turns the result of each query into proposals for a belief (see `belief`).
+"""Tracks a flight over the places of a map: converts the result of each query to proposals for a `belief`.
 
 The best place of a *search pass*, one search of the map for one query, has a confidence. The rest of the probability
 that the query shows ground of the map at all is spread over the other places compared.
@@ -29,16 +29,16 @@ from edgevpr.runtime.recognise.judge import ConfidenceRule
 from edgevpr.runtime.recognise.locate import Located, covariance_matrix, to_triple
 from edgevpr.runtime.recognise.odometry import OdometryStep
 
-_TWIN_SHARE = 0.5  # share of the best place's votes from which on its twins are as likely, as in `Evidence.has_twin`
+_TWIN_SHARE = 0.5  # of the best place's votes: its twins are as likely from there on, as in `Evidence.has_twin`
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
-_SHARPNESS = 10.0  # two places are as likely as the ratio of their votes to this power
-_RIGHT_AMONG_OTHERS = 0.7  # if the best place is wrong, so often the right one is among the others
+_SHARPNESS = 10.0  # the odds of two places are the ratio of their votes to this power
+_OTHERS_RIGHT_SHARE = 0.7  # how often the right place is among the others, if the best one is wrong
 _MAX_PROPOSED = 20  # most places that one query proposes
 # Distances that count as one position, in places and in footprints; and the probability that is more likely than not.
 _NEAR_PLACES = 3.0
 _NEAR_FOOTPRINT = 0.25
 _MIN_MAJORITY = 0.5
-_PLACES_A_QUERY = 3.0  # highest speed where the time or the positions are unknown
+_MAX_PLACES_PER_QUERY = 3.0  # highest speed where the time or the positions are unknown
 _MAX_ELAPSED_S = 3600.0
 _MIN_SPACING_M = 5.0
 
@@ -89,7 +89,7 @@ class _MapGeometry:
 
 
 class PlaceFilter:
-    """Follows one flight over one map. For each frame call `predict`, then `update` for each search pass, then `commit`
+    """Tracks one flight over one map. For each frame call `predict`, then `update` for each search pass, then `commit`
     to keep the belief of the last pass.
 
     `max_speed_m_s` is the highest speed of the aircraft (None: unknown). `is_live` is False for recorded frames, whose
@@ -101,8 +101,8 @@ class PlaceFilter:
         self._geometry: _MapGeometry | None = None
         self._belief: Belief | None = None
         self._next: Belief | None = None  # the belief after the last pass, until `commit`
-        self._first_sight: tuple[Doubles, float] | None = None  # position of the newest ground, first confidence
-        self._next_first_sight: tuple[Doubles, float] | None = None
+        self._first_view: tuple[Doubles, float] | None = None  # of the newest ground: position, first confidence
+        self._next_first_view: tuple[Doubles, float] | None = None
         self._t_now_s: float | None = None
         self._t_committed_s: float | None = None
         self._elapsed_s: float | None = None
@@ -120,16 +120,16 @@ class PlaceFilter:
         self._odometry = odometry if odometry and odometry.from_s == before_s else None
 
     def update(
-        self, ranking: Ranking, index: PlaceIndex, evidence: Evidence, rule: ConfidenceRule, where: Located | None
+        self, ranking: Ranking, index: PlaceIndex, evidence: Evidence, rule: ConfidenceRule, located: Located | None
     ) -> TrackEstimate:
         """Return the result of one pass together with the flight so far; nothing is kept before `commit`. `evidence` is
-        that of the best place of the `ranking`, and `rule` turns it into probabilities. `where` is the position of the
-        aircraft computed from the best place (None: the position of the place itself is taken)."""
+        that of the best place of the `ranking`, and `rule` converts it to probabilities. `located` is the position of
+        the aircraft computed from the best place (None: the position of the place itself is used)."""
         if self._geometry is None or self._belief is None:
             self._geometry = _MapGeometry(self._map, index)
             self._belief = Belief(self._geometry.scale)
         geometry, near = self._geometry, self._geometry.scale.near
-        slots, proposed = _make_proposals(ranking, index, geometry, rule, evidence, where)
+        slots, proposed = _make_proposals(ranking, index, geometry, rule, evidence, located)
         self._next = copy.copy(self._belief)
         posterior = self._next.update(proposed, self._motion(geometry), len(index))
         slot, confidence = None, 0.0
@@ -152,7 +152,7 @@ class PlaceFilter:
         )
 
     def update_without_match(self, index: PlaceIndex) -> None:
-        """Take a picture that shows too little: it does not tell whether the aircraft is over the map."""
+        """Process a picture with too little texture: it does not show whether the aircraft is over the map."""
         if self._geometry and self._belief:
             self._next = copy.copy(self._belief)
             self._next.update(None, self._motion(self._geometry), len(index))
@@ -161,11 +161,11 @@ class PlaceFilter:
     def commit(self) -> None:
         """Keep the belief of the last pass; without a pass since the last call the belief stays as it is."""
         self._belief, self._next = self._next or self._belief, None
-        self._first_sight, self._t_committed_s = self._next_first_sight, self._t_now_s
+        self._first_view, self._t_committed_s = self._next_first_view, self._t_now_s
 
     def _motion(self, geometry: _MapGeometry) -> Motion:
         if geometry.scale.is_ordinal or self._elapsed_s is None:
-            return make_motion(None, _PLACES_A_QUERY * geometry.scale.spacing)
+            return make_motion(None, _MAX_PLACES_PER_QUERY * geometry.scale.spacing)
         if self._odometry and self._elapsed_s > 0:
             east_m, north_m = self._odometry.moved_m
             velocity_m_s = east_m / self._elapsed_s, north_m / self._elapsed_s
@@ -173,14 +173,14 @@ class PlaceFilter:
         return make_motion(self._elapsed_s, self._max_speed_m_s, self._velocity_m_s)
 
     def _limit_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:
-        """Return `confidence`: over the same ground as the query before, of which repeated pictures prove nothing new,
-        at most that after the first picture there, or that of this pass `by_itself`."""
-        arrived = self._first_sight
-        if arrived is None or self._geometry is None or np.hypot(*(at - arrived[0])) >= self._geometry.scale.spacing:
-            self._next_first_sight = at, confidence
+        """Return `confidence`; over the same ground as the query before, where more pictures prove nothing new, at most
+        that after the first picture there, or that of this pass alone (`by_itself`)."""
+        first = self._first_view
+        if first is None or self._geometry is None or np.hypot(*(at - first[0])) >= self._geometry.scale.spacing:
+            self._next_first_view = at, confidence
             return confidence
-        self._next_first_sight = arrived
-        return min(confidence, max(arrived[1], by_itself))
+        self._next_first_view = first
+        return min(confidence, max(first[1], by_itself))
 
 
 def make_motion(
@@ -203,35 +203,35 @@ def _make_proposals(
     geometry: _MapGeometry,
     rule: ConfidenceRule,
     evidence: Evidence,
-    where: Located | None,
+    located: Located | None,
 ) -> tuple[Ints, Proposals]:
     """Return what the query proposes to the belief, as in `PlaceFilter.update`: the slots, int (K,), and these."""
     slots: Ints = np.array(ranking.compared_slots[:_MAX_PROPOSED])
     at = geometry.positions(slots, index)
-    # Of a match that is not worth locating the place is known, and not where in its picture the aircraft is.
-    spread = geometry.spread if where else max(geometry.spread, geometry.scale.near)
+    # If the match was not located, only its place is known, not where in its picture the aircraft is.
+    spread = geometry.spread if located else max(geometry.spread, geometry.scale.near)
     covariance = np.tile((1.0 if geometry.origin is None else spread**2) * np.eye(2), (len(slots), 1, 1))
     heading_deg = np.full(len(slots), np.nan)
     same = np.zeros(len(slots), bool)
-    if where and geometry.origin:
-        here, there = geometry.origin, where.position
-        at[0] = offset_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
+    if located and geometry.origin:
+        origin, position = geometry.origin, located.position
+        at[0] = offset_m(origin.lat_deg, origin.lon_deg, position.lat_deg, position.lon_deg)
         if not evidence.has_twin:  # of places that are equally likely none may be known better than the others
-            covariance[0] = covariance_matrix(where.covariance_m2)
-        heading_deg[0] = np.nan if where.heading_deg is None else where.heading_deg
-        same = np.isin(index.place_ids[slots], where.places) & (slots != slots[0])
+            covariance[0] = covariance_matrix(located.covariance_m2)
+        heading_deg[0] = np.nan if located.heading_deg is None else located.heading_deg
+        same = np.isin(index.place_ids[slots], located.places) & (slots != slots[0])
     votes = np.array([compute_share(ranking.compared[slot]) for slot in slots.tolist()])
     near = np.hypot(*(at - at[0]).T) <= geometry.scale.near
     near[0] = True  # even if its position is unknown
     confidence = rule.confidence(evidence)
     left = max(0.0, rule.compute_map_confidence(evidence) - confidence)
     p = np.zeros(len(slots))
-    if evidence.has_twin:  # more votes only mean that it was pictured from nearer by
+    if evidence.has_twin:  # more votes only mean that its picture was taken from nearer
         votes = np.minimum(votes, _TWIN_SHARE * votes.max(initial=0))
-        p[~same] = (confidence + _RIGHT_AMONG_OTHERS * left) * _compute_shares(votes[~same])
+        p[~same] = (confidence + _OTHERS_RIGHT_SHARE * left) * _compute_shares(votes[~same])
     else:
         p[near & ~same] = confidence * _compute_shares(votes[near & ~same])
-        p[~near & ~same] = _RIGHT_AMONG_OTHERS * left * _compute_shares(votes[~near & ~same])
+        p[~near & ~same] = _OTHERS_RIGHT_SHARE * left * _compute_shares(votes[~near & ~same])
     # The probability of a place without a position is given to no other place.
     is_placed = ~np.isnan(at[:, 0]) & ~same
     return slots[is_placed], Proposals(
@@ -240,7 +240,7 @@ def _make_proposals(
 
 
 def _compute_shares(votes: Doubles) -> Doubles:
-    """Return the share (K,) of each of K places in a probability. `votes` (K,) is what `compute_share` says of each."""
+    """Return the share (K,) of each of K places in a probability. `votes` (K,): `compute_share` of each."""
     if not len(votes):
         return votes
     weight: Doubles = (np.maximum(votes, 1e-6) / max(float(votes.max()), 1e-6)) ** _SHARPNESS

@@ -1,4 +1,4 @@
-"""Recognition of one frame, stage by stage: encode, search, verify, locate, decide, and follow the flight.
+"""Recognition of one frame, stage by stage: encode, search, verify, locate, decide, and track the flight.
 
 A flight, `match`, `eval` and the probe recognise by it. There is no link, flight log, thread or clock in here: the
 result depends only on what is passed in. A *search pass* is one search of the map for the query of a frame. A query may
@@ -36,7 +36,7 @@ class Recogniser:
     """Recognises places of an open map, frame after frame.
 
     `odometry` measures the motion between frames (None: it is not measured). `prior` makes hints that narrow each query
-    (None: the whole map is searched). `place_filter` follows the flight from query to query (None: each is judged
+    (None: the whole map is searched). `place_filter` tracks the flight from query to query (None: each is judged
     alone). Between two frames, `change` sets what the next is recognised with.
     """
 
@@ -80,7 +80,7 @@ class Recogniser:
         if mount is not None:
             self.encoder = self.encoder.replace_mount(mount)
             self._decider = replace(self._decider, common_tilt=CommonTilt())
-            self._odometry = VisualOdometry() if self._odometry else None  # no stride leads to the first frame
+            self._odometry = VisualOdometry() if self._odometry else None  # the next frame has no odometry
 
     @property
     def sequence(self) -> int:
@@ -137,7 +137,7 @@ class Recogniser:
         decision: Decision | None = None,
         failure: Exception | None = None,
     ) -> Recognition:
-        """Return the event of a frame; `failure` is the error that ended it (None: none did)."""
+        """Return the event of a frame; `failure` is the error that ended its recognition (None: no error)."""
         decision = decision or Decision(verdict=Verdict(False, explain_failure(failure)))
         findings, accepted = decision.findings, decision.verdict.accepted
         located = findings.located if findings and accepted else None
@@ -159,7 +159,7 @@ class Recogniser:
             track=decision.track,
             accepted=accepted,
             reason=decision.verdict.reason,
-            says_nothing=query is not None and check_texture(query.descriptor, self.rule.min_quality) is not None,
+            lacks_texture=query is not None and check_texture(query.descriptor, self.rule.min_quality) is not None,
             failed=failure is not None,
             map_lost=isinstance(failure, MapError) and not isinstance(failure, PlaceError),
             left_out=left_out,
@@ -175,14 +175,14 @@ class Recogniser:
         return self._prior.scale(self.technique.spec.height_ratios)
 
     def _measure_odometry(self, frame: Frame, view: View, verifier: Verifier) -> OdometryStep | None:
-        """Measure the stride of a frame from the one before, if its picture lies on the ground."""
+        """Measure the motion of a frame from the one before, if its picture is georeferenced."""
         if self._odometry is None or not view.is_georeferenced:
             return None
         with self.meter.step("stride"):
             return self._odometry.measure(frame.t_mono_s, view, verifier.landmarks)
 
     def _decide(self, query: EncodedFrame, verifier: Verifier, odometry_step: OdometryStep | None) -> Decision:
-        """Search the map for an encoded frame, and learn from the decision what the next query needs."""
+        """Search the map for an encoded frame, and update the hints for the next query by the decision."""
         place_filter = self._place_filter
         objection = check_texture(query.descriptor, self.rule.min_quality)
         objection = objection or query.view.reason or (query.salience.reason if query.salience else None)
@@ -205,7 +205,7 @@ class Recogniser:
         return decision
 
     def _search_heights(self, query: EncodedFrame, verifier: Verifier, place_filter: PlaceFilter | None) -> Decision:
-        """Search for a query as expected and, if nothing is accepted, at all other heights."""
+        """Search for a query at the expected height and, if nothing is accepted, at all others."""
         prior, search, height_ratios = self._prior, self.matcher.search, self.technique.spec.height_ratios
         margin_m = max(self.accuracy_m, self.rule.neighbour_m)
         hints = prior.make_hints(set_picture_heading(query.frame, query.view), query.vehicle, self.index, margin_m)
@@ -223,7 +223,7 @@ class Recogniser:
             if ratio != first:
                 other = self._search(query.descriptor, replace(expected, height_ratio=ratio), _LATER_PASS_SHARE)
                 ranking = merge_rankings(ranking, other)
-        # Matches of all passes are judged together: each can speak against the best one.
+        # Matches of all passes are judged together: each may be a rival of the best one.
         return self._decider.decide(ranking, query, hints, verifier, place_filter)
 
     def _search(self, descriptor: Descriptor, expected: Expectation, share: float = 1.0) -> Ranking:

@@ -41,7 +41,7 @@ class Recognition:
     track: TrackEstimate | None = None  # the result together with the flight so far
     accepted: bool = False  # `best` is taken for the place
     reason: Reason = NOT_SEARCHED  # why or why not
-    says_nothing: bool = False  # too little to be recognised; a search was only made to continue a sequence
+    lacks_texture: bool = False  # too little to be recognised; a search was only made to continue a sequence
     failed: bool = False  # the frame, a place or the technique was unusable
     map_lost: bool = False  # the whole map cannot be read
     left_out: tuple[tuple[int, str], ...] = ()  # places unreadable since the last event: number, and what is wrong
@@ -53,7 +53,7 @@ class Recognition:
 
     @property
     def view(self) -> View:
-        """The way in which the picture lies on the ground; `UNKNOWN_VIEW` without a picture."""
+        """The picture's view of the ground; `UNKNOWN_VIEW` without a picture."""
         return self.picture.view if self.picture else UNKNOWN_VIEW
 
     @property
@@ -74,7 +74,7 @@ class Recognition:
 
 def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
     """Return the event as a dict for the flight log (kind "query"), or with an `exact` confidence, of which six digits
-    would make 1 where it is nearly sure. `edgevpr match` and the status of a flight are made of it too.
+    would make 1 where it is nearly certain. `edgevpr match` and the status of a flight use it too.
 
     Always there: query, place (number), reference_image, score, position (of the place), shift, covariance and rotation
     of the match (all null if no place was found), accepted, reason, accuracy_m, located (the aircraft's position; null

@@ -85,29 +85,29 @@ def test_a_frame_that_cannot_be_read_is_logged_and_the_next_is_recognised(flight
 def test_frames_are_taken_evenly_and_a_late_one_does_not_hurry_the_next(clock):
     pace = Pace(2.0, clock.clock)
     assert pace.wait_s() == 0
-    pace.taken()
+    pace.record_frame()
     assert pace.wait_s() == pytest.approx(0.5)
     clock.now_s += 1.7
     assert pace.wait_s() == pytest.approx(-1.2)
-    pace.taken()
+    pace.record_frame()
     assert pace.wait_s() == 0, "what was missed is not made up for"
-    pace.taken()
+    pace.record_frame()
     assert pace.wait_s() == pytest.approx(0.5)
     pace.rate_hz = 1.0
     clock.now_s += 0.5
-    pace.taken()
+    pace.record_frame()
     assert pace.wait_s() == pytest.approx(1.0)
 
 
 def test_between_frames_that_are_far_apart_pictures_are_due_for_their_strides(clock):
     pace, due_s = Pace(0.1, clock.clock), []
-    pace.taken()
+    pace.record_frame()
     for _ in range(100):
         clock.now_s += 0.1
         if pace.is_odometry_due():
             due_s.append(10.0 - pace.wait_s())
     assert due_s == pytest.approx([2.0, 4.0, 6.0, 8.0], abs=0.15)
-    pace.taken()
+    pace.record_frame()
     pace.rate_hz = 0.5
     clock.now_s += 3.0
     assert not pace.is_odometry_due(), "queries show it themselves"
@@ -115,11 +115,11 @@ def test_between_frames_that_are_far_apart_pictures_are_due_for_their_strides(cl
 
 def test_frames_of_a_recording_come_by_its_steps_and_slower_as_the_rate_is_lowered(clock):
     pace = Pace(2.0, clock.clock)
-    pace.taken(3.0)
+    pace.record_frame(3.0)
     assert pace.wait_s() == pytest.approx(3.0)
     clock.now_s += 3.0
     pace.rate_hz = 1.0
-    pace.taken(0.25)
+    pace.record_frame(0.25)
     assert pace.wait_s() == pytest.approx(0.5)
 
 

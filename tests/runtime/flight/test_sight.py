@@ -31,7 +31,7 @@ class Seen:
                     is_query=outcome != "u",
                     accepted=outcome == "+",
                     failed=outcome == "x",
-                    says_nothing=outcome == "0",
+                    lacks_texture=outcome == "0",
                     salience=SimpleNamespace(reason="grass" if outcome == "n" else None),
                     view=View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": 50.0}) if outcome == "t" else None),
                     track=SimpleNamespace(lost=0.95 if outcome == "L" else 0.2),

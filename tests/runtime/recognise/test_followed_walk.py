@@ -123,7 +123,7 @@ def test_pictures_that_say_nothing_or_cannot_be_used_do_not_lose_it(flight):
         flight.see(place)
     flat = np.full((120, 160), 90, np.uint8)
     event = flight.see(17, elapsed_s=1.0, image=flat)
-    assert (event.says_nothing, event.accepted, event.track) == (True, False, None)
+    assert (event.lacks_texture, event.accepted, event.track) == (True, False, None)
     assert flight.recogniser.step(Frame(image=None, name="none", t_mono_s=0.0)).failed
     assert any(flight.see(place).accepted for place in (19, 22))
 

@@ -39,13 +39,13 @@ def test_what_says_nothing_is_not_searched_for(walk):
     picture = np.full((480, 640, 3), (180, 0, 0), np.uint8)
     cv2.putText(picture, "NO SIGNAL", (150, 260), cv2.FONT_HERSHEY_SIMPLEX, 2, (255, 255, 255), 3)
     event = walk.step(frame(picture))
-    assert (event.says_nothing, event.accepted, event.failed, event.is_query) == (True, False, False, True)
+    assert (event.lacks_texture, event.accepted, event.failed, event.is_query) == (True, False, False, True)
     assert (event.position, event.best, event.ranking) == (None, None, None)
     assert event.reason.code is ReasonCode.LOW_TEXTURE
     assert event.reason.parameters["needed"] == 0.4
     assert event.steps.scan == event.steps.compare == NO_COST, "the search is saved"
     after = walk.step(frame(textured(3, 240, 320)))
-    assert (after.accepted, after.says_nothing, after.best.place.source_image) == (True, False, "3.png")
+    assert (after.accepted, after.lacks_texture, after.best.place.source_image) == (True, False, "3.png")
 
 
 def test_no_picture_of_nothing_real_is_accepted(walk):
