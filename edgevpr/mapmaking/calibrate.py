@@ -1,15 +1,16 @@
-"""Calibration of a map: queries with known answers are made from the map's own pictures, and the confidence model is
-fitted to the results. This model computes the probability that a match is right from the *evidence* of the match:
-measurements by name, such as its score and margin.
+"""Calibrates a map: makes queries with known answers from the map's own pictures, and fits the confidence model to the
+results. This model computes the probability that a match is right from the *evidence* of the match: named measurements,
+such as its score and margin.
 
-Each picture is changed as by another day and season (see `changes`) and then looked for in the map in three ways:
+Each picture is altered as if taken on another day and in another season (see `changes`), then searched for in the map
+in three ways:
 * THERE: its place is in the map.
-* LEFT_OUT: without its place and all that may show the same ground. The best match is then a similar-looking place.
-* MIRRORED: as its mirror image, which shows ground that exists nowhere but looks like the country of the map. It only
-  counts in the figures that are reported of the map.
-The results show how much the places of this map look alike. So the fit moves the part of the shipped model that says
-which place it is (`Model.of_place`), and only as far as the results demand. The part that says whether the query shows
-ground of the map stays as shipped: pictures of foreign ground agree by chance to much the same degree in every map.
+* LEFT_OUT: its place and all that may show the same ground are removed. The best match is a similar-looking place.
+* MIRRORED: the query is its mirror image, which shows ground that exists nowhere but resembles the terrain of the map.
+  It only counts in the figures reported for the map.
+The results show how similar the places of this map look. The fit therefore adjusts the part of the shipped model that
+says which place it is (`Model.of_place`), and only as far as the results demand. The part that says whether the query
+shows mapped ground stays as shipped: pictures of other ground agree by chance to much the same degree in every map.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -47,29 +48,30 @@ from edgevpr.runtime.recognise.evidence import (
 )
 from edgevpr.runtime.recognise.judge import AcceptRule, ConfidenceRule, make_accept_rule
 
-Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the frames of these names, as far as they are found
+Pictures = Callable[[Sequence[str]], Iterable[Frame]]  # yields the frames with these names that can be found
 
 THERE = "there"
 LEFT_OUT = "left out"
 MIRRORED = "mirrored"
 FORWARD_QUERIES = 120
-NADIR_QUERIES = 60  # each takes longer
-_MAX_WITHOUT_POSITION = 0.2  # share of the places of a map that looks down, whose pictures overlap in any order
+NADIR_QUERIES = 60  # fewer, because each takes longer
+_MAX_WITHOUT_POSITION = 0.2  # share of places; in nadir maps the order of pictures does not show which ones overlap
 _LEFT_OUT_WEIGHT = 0.3  # weight of LEFT_OUT results: flights over ground outside the map are rarer
-# Strength with which the fit holds on to the shipped weights, and to the bias (see `fit_logistic`). Chosen on corridor
-# and sat_marash, with the other sets in view. Looking down, with 5 and a free bias, the pictures drawn by chance
-# decided whether 14 or 39 of 80 queries of sat_marash were accepted; ahead, a bias that is held costs corridor half.
+# Prior precisions of the weights and of the bias around the shipped model (see `fit_logistic`). Chosen on corridor and
+# sat_marash, while watching the other sets. For a nadir camera with 5 and a free bias, the random draw of pictures
+# decided whether 14 or 39 of 80 queries of sat_marash were accepted. For a forward camera, a fixed bias costs half of
+# the queries accepted on corridor.
 _PRIOR_PRECISIONS = {AHEAD: (50.0, 0.0), AHEAD_PROVEN: (50.0, 0.0), DOWN: (200.0, 200.0), DOWN_BARE: (200.0, 200.0)}
 _SEED = 15
-_EVEN_PRECISION = 0.5  # precision for which hardly any match is refused for low confidence
+_LOW_PRECISION = 0.5  # required precision at which low confidence refuses hardly any match
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryResult:
     """Result of one query made from a picture of the map. `place_id`: the place of this picture. `way`: how the query
-    was made (THERE, LEFT_OUT, MIRRORED). `right`: the best match is the right place. `evidence`: that of the best match
-    (None: the picture holds too little to be looked for). `refused`: the match was refused for another reason than low
-    confidence."""
+    was made (THERE, LEFT_OUT, MIRRORED). `right`: the best match is the right place. `evidence`: the evidence of the
+    best match (None: the picture has too little texture to search for). `refused`: the match was refused for a reason
+    other than low confidence."""
 
     place_id: int
     way: str
@@ -87,36 +89,36 @@ def query_map(
     pictures: Iterable[tuple[int, LevelledImage]],
     seed: int = 0,
 ) -> Iterator[QueryResult]:
-    """Run queries with changed pictures of the map's own places, in all three ways, and yield the results. `index` has
-    the places of `place_map`, and `rule` is the rule for accepting a match. `pictures` are pairs of a place's number
-    and its picture as it was encoded for the map. A place that is not in the index is left out."""
+    """Query the map with altered pictures of its own places, in all three ways, and yield the results. `index` holds
+    the places of `place_map`; `rule` decides whether a match is accepted. `pictures` are pairs of a place's number and
+    its picture as encoded for the map. Places that are not in the index are skipped."""
     rng = np.random.default_rng((_SEED, seed))
-    assert rule.confidence_rule is not None  # set for a technique that has a confidence model
-    even_rule = replace(rule.confidence_rule, precision=_EVEN_PRECISION)
-    rule = replace(rule, confidence_rule=even_rule)
+    assert rule.confidence_rule is not None  # set for techniques with a confidence model
+    low_precision_rule = replace(rule.confidence_rule, precision=_LOW_PRECISION)
+    rule = replace(rule, confidence_rule=low_precision_rule)
     search = MapSearch(technique, place_map, index, rule, meter=meter)
     for place_id, picture in pictures:
         if (slot := search.slots.get(place_id)) is None:
             continue
         may_be_same = search.find_same_ground(slot)
         ways = ((THERE, picture, index), (LEFT_OUT, picture, index.select(~may_be_same)))
-        for way, seen, among in (*ways, (MIRRORED, _mirror_picture(picture), index)):
-            if not len(among):
+        for way, original, candidates in (*ways, (MIRRORED, _mirror_picture(picture), index)):
+            if not len(candidates):
                 continue
-            image, shown = change_picture(seen.image, rng, technique.spec.looks_down, seen.mask)
-            event = search.find(place_id, image, shown, among)
+            image, mask = change_picture(original.image, rng, technique.spec.looks_down, original.mask)
+            event = search.find(place_id, image, mask, candidates)
             if event.evidence is None or event.best is None or event.confidence is None:
                 yield QueryResult(place_id=place_id, way=way, right=False, evidence=None)
                 continue
             best = search.slots[event.best.place.place_id]
-            beside = count_neighbours(rule.look_alikes)
+            max_slots = count_neighbours(rule.look_alikes)
             right = (
                 way == THERE
-                and not outside_neighbourhood(index, slot, np.array([best]), search.near_m, max_slots=beside)[0]
+                and not outside_neighbourhood(index, slot, np.array([best]), search.near_m, max_slots=max_slots)[0]
             )
             if way == THERE and not right and may_be_same[best] and not np.isnan(index.lat_deg[best]):
-                continue  # the two pictures may overlap: it is unknown whether the match is right
-            refused = not event.accepted and event.confidence >= even_rule.threshold(event.evidence)
+                continue  # the two pictures may overlap, so it is unknown whether the match is right
+            refused = not event.accepted and event.confidence >= low_precision_rule.threshold(event.evidence)
             yield QueryResult(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
 
 
@@ -128,24 +130,24 @@ def calibrate(
     pictures: Pictures,
     progress: Progress,
 ) -> MapCalibration:
-    """Calibrate a map that is open for adding, and store the result in the map. `pictures` opens the pictures of given
-    names; `progress` wraps the iteration over these frames, to show progress. `encoder` is that with which the map was
-    made.
-    Raises UsageError if the technique has no confidence model, the map has too few places, or too few of their
-    pictures are found. Raises MapError for a file that cannot be read or written.
+    """Calibrate a map that is open for adding, and store the result in it. `pictures` reads the pictures with given
+    names; `progress` wraps the iteration over these frames to report progress. `encoder` is the one that the map was
+    made with.
+    Raises UsageError if the technique has no confidence model, the map has too few places, or too few of their pictures
+    are found. Raises MapError if the map file cannot be read or written.
     """
 
-    def require(is_so: object, lacking: str) -> None:
-        if not is_so:
-            raise UsageError(f"{place_map.path} cannot be calibrated and flies with the shipped confidence: {lacking}.")
+    def require(condition: object, problem: str) -> None:
+        if not condition:
+            raise UsageError(f"{place_map.path} cannot be calibrated and flies with the shipped confidence: {problem}.")
 
     technique = encoder.technique
     kinds = list_evidence_kinds(technique.spec)
-    require(kinds, f"matches of {technique.spec.name} are judged by score and margin; only `cohog` has a confidence")
+    require(kinds, f"{technique.spec.name} judges matches by score and margin; only `cohog` computes a confidence")
     index = load_index(place_map, technique, len(place_map) * compute_place_bytes(technique.spec))
-    require(len(index) >= MIN_PLACES, f"it has {len(index)} places, and {MIN_PLACES} are needed")
-    is_placed = not technique.spec.looks_down or np.isnan(index.lat_deg).mean() <= _MAX_WITHOUT_POSITION
-    require(is_placed, "its places have no positions, so nobody knows which of them show the same ground")
+    require(len(index) >= MIN_PLACES, f"it has {len(index)} places, but {MIN_PLACES} are needed")
+    has_positions = not technique.spec.looks_down or np.isnan(index.lat_deg).mean() <= _MAX_WITHOUT_POSITION
+    require(has_positions, "too many places lack a position, so it is unknown which of them show the same ground")
     rule = make_accept_rule(technique, config)
     if not technique.spec.looks_down:
         near_m = MapSearch(technique, place_map, index, rule, meter=meter).near_m
@@ -159,11 +161,11 @@ def calibrate(
         (place_id, encoded.picture) for place_id, encoded in _read_mapped(encoder, place_map, pictures, progress, count)
     )
     answers = list(query_map(technique, place_map, index, rule, meter, as_mapped))
-    at_hand = len({answer.place_id for answer in answers})
+    place_count = len({answer.place_id for answer in answers})
     require(
-        at_hand >= MIN_PLACES,
-        f"the pictures of {at_hand} places are at hand, and those of {MIN_PLACES} are needed; give the pictures "
-        "that it was made of, with the same camera and mask",
+        place_count >= MIN_PLACES,
+        f"pictures of only {place_count} places were found, but {MIN_PLACES} are needed; give the pictures that it was "
+        "made from, with the same camera and mask",
     )
     calibration = replace(_fit_calibration(answers, kinds, config.accept_precision), look_alikes=rule.look_alikes)
     place_map.record_calibration(format_calibration(calibration))
@@ -171,68 +173,66 @@ def calibrate(
 
 
 def count_queries(technique: Technique) -> int:
-    """Return the number of pictures that are used to calibrate a map of this technique."""
+    """Return the number of pictures used to calibrate a map of this technique."""
     return NADIR_QUERIES if technique.spec.looks_down else FORWARD_QUERIES
 
 
 def _read_mapped(
     encoder: FrameEncoder, place_map: PlaceMap, pictures: Pictures, progress: Progress, count: int
 ) -> Iterator[tuple[int, EncodedFrame]]:
-    """Yield (a place's number, its picture as it was encoded for the map) for `count` pictures in random order, again
-    from the first one if there are fewer. A picture that has the name of a place's picture, but another content, is
-    left out."""
+    """Yield (a place's number, its picture as encoded for the map) for `count` pictures in random order, starting over
+    if there are fewer. A picture whose name matches that of a place, but whose content differs, is skipped."""
     ids_by_image = {name: ids for (name,), ids in place_map.select_ids("source_image").items() if isinstance(name, str)}
     names = sorted(ids_by_image)
-    names = [names[at] for at in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
+    names = [names[index] for index in np.random.default_rng(_SEED).permutation(len(names)).tolist()]
     frames = (frame for done in range(0, count, len(names)) for frame in pictures(names[: count - done]))
     for frame in progress(frames, count, "calibrating"):
         encoded = encoder.encode(frame)
-        of_name = ids_by_image.get(escape_name(frame.name), ())
-        if (
-            place_id := next((at for at in of_name if place_map.has_descriptor(at, encoded.descriptor.coarse)), None)
-        ) is not None:
-            yield place_id, encoded
+        for place_id in ids_by_image.get(escape_name(frame.name), ()):
+            if place_map.has_descriptor(place_id, encoded.descriptor.coarse):
+                yield place_id, encoded
+                break
 
 
 def _fit_calibration(answers: Sequence[QueryResult], kinds: Sequence[str], precision: float) -> MapCalibration:
-    """Fit the models of all `kinds` of evidence to the answers, and count those that are accepted at the `precision`
-    asked for."""
-    known = [answer for answer in answers if answer.evidence]
-    made_of = f"{len(known)} answers of the map itself"
-    models = {kind: adapt_model(read_shipped_model(kind), kind, known, made_of) for kind in kinds}
+    """Fit the models of all `kinds` of evidence to the answers, and count the answers accepted at the required
+    `precision`."""
+    usable = [answer for answer in answers if answer.evidence]
+    made_of = f"{len(usable)} answers of the map itself"
+    models = {kind: adapt_model(read_shipped_model(kind), kind, usable, made_of) for kind in kinds}
     rule = ConfidenceRule(models, precision)
     accepted = [
         answer
         for answer in answers
         if (seen := answer.evidence) and not answer.refused and rule.confidence(seen) >= rule.threshold(seen)
     ]
-    there = [answer for answer in answers if answer.way == THERE]
-    of_place: dict[int, list[float]] = {}  # confidence of each query, 0 for a wrong or refused match
-    for answer in there:
+    in_map = [answer for answer in answers if answer.way == THERE]
+    confidences: dict[int, list[float]] = {}  # of the queries of each place; 0 for a wrong or refused match
+    for answer in in_map:
         seen = answer.evidence if answer.right and not answer.refused else None
-        of_place.setdefault(answer.place_id, []).append(rule.confidence(seen) if seen else 0.0)
+        confidences.setdefault(answer.place_id, []).append(rule.confidence(seen) if seen else 0.0)
     return MapCalibration(
         models=models,
         made=date.today().isoformat(),
-        asked=len(there),
+        asked=len(in_map),
         precision=precision,
-        accepted=sum(answer.way == THERE for answer in accepted) / len(there),
+        accepted=sum(answer.way == THERE for answer in accepted) / len(in_map),
         accepted_wrong=sum(not answer.right for answer in accepted),
-        recognisable={place_id: round(float(np.mean(each)), 4) for place_id, each in sorted(of_place.items())},
+        recognisable={place_id: round(float(np.mean(values)), 4) for place_id, values in sorted(confidences.items())},
     )
 
 
 def adapt_model(model: Model, kind: str, answers: Iterable[QueryResult], made_of: str) -> Model:
-    """Return a copy of the confidence model `model`, of this kind of evidence, with its `of_place` fitted to the
-    answers of a map. Answers without evidence are ignored. `made_of`: a note, kept in the model, on the data that it
-    was fitted to."""
-    known = [(answer, answer.evidence) for answer in answers if answer.evidence and answer.way != MIRRORED]
-    # A best place that was not worth a look at its landmarks has none that agree.
-    rows = [{"landmarks": 0.0} | evidence.figures() for _, evidence in known]
-    right = np.array([answer.right for answer, _ in known], bool)
+    """Return a copy of `model`, the confidence model for this kind of evidence, with its `of_place` fitted to the
+    answers of a map. Answers without evidence are ignored. `made_of`: a note on the data that it was fitted to, stored
+    in the model."""
+    usable = [(answer, answer.evidence) for answer in answers if answer.evidence and answer.way != MIRRORED]
+    # If the landmarks of the best place were not compared, no landmarks agree.
+    rows = [{"landmarks": 0.0} | evidence.figures() for _, evidence in usable]
+    right = np.array([answer.right for answer, _ in usable], bool)
     of_place = model.of_place
-    if not right.all():  # wrong ones are needed to fit anything
-        weights = np.array([_LEFT_OUT_WEIGHT if answer.way == LEFT_OUT else 1.0 for answer, _ in known])
+    if not right.all():  # a fit needs wrong answers too
+        weights = np.array([_LEFT_OUT_WEIGHT if answer.way == LEFT_OUT else 1.0 for answer, _ in usable])
         of_place = fit_logistic(of_place, rows, right, weights, *_PRIOR_PRECISIONS[kind])
     return Model(
         of_map=model.of_map,
@@ -252,30 +252,30 @@ def fit_logistic(
     precision: float,
     bias_precision: float = 0.0,
 ) -> Logistic:
-    """Fit a logistic regression to N `rows` of evidence, of which `right`, bool (N,), is True for right matches;
-    `weights`, float (N,), are their weights.
+    """Fit a logistic regression to N `rows` of evidence. `right`, bool (N,), is True for right matches; `weights`,
+    float (N,), are the weights of the rows.
 
-    Gaussian priors hold the regression near `start`: its scaled coefficients with the variance 1 / `precision`, its
-    bias with 1 / `bias_precision` (0: the bias is free). With few rows the result stays close to `start`.
+    Gaussian priors keep the regression near `start`: variance 1 / `precision` for its scaled coefficients, and
+    1 / `bias_precision` for its bias (0: the bias is free). With few rows the result stays close to `start`.
     """
-    scales, mine = np.array(start.scales), make_evidence_matrix(rows, start.names) / np.array(start.scales)
-    middle = np.append(np.array(start.weights) * scales, start.bias)
+    scales, features = np.array(start.scales), make_evidence_matrix(rows, start.names) / np.array(start.scales)
+    prior_mean = np.append(np.array(start.weights) * scales, start.bias)
     precisions = np.append(np.full(len(scales), precision), bias_precision)
     sign = np.where(right, 1.0, -1.0)
 
-    def cost(at: Doubles) -> tuple[float, Doubles]:
-        logit = mine @ at[:-1] + at[-1]
-        off = at - middle
-        loss = weights @ np.logaddexp(0, -sign * logit) + precisions / 2 @ (off * off)
+    def cost(params: Doubles) -> tuple[float, Doubles]:
+        logit = features @ params[:-1] + params[-1]
+        offset = params - prior_mean
+        loss = weights @ np.logaddexp(0, -sign * logit) + precisions / 2 @ (offset * offset)
         slope = -weights * sign * np.exp(-np.logaddexp(0, sign * logit))
-        return float(loss), np.append(mine.T @ slope, slope.sum()) + precisions * off
+        return float(loss), np.append(features.T @ slope, slope.sum()) + precisions * offset
 
-    found = minimize(cost, middle, jac=True, method="L-BFGS-B").x
-    return Logistic(start.names, tuple((found[:-1] / scales).tolist()), start.scales, float(found[-1]))
+    fitted = minimize(cost, prior_mean, jac=True, method="L-BFGS-B").x
+    return Logistic(start.names, tuple((fitted[:-1] / scales).tolist()), start.scales, float(fitted[-1]))
 
 
 def make_evidence_matrix(rows: Sequence[Figures], names: Sequence[str]) -> Doubles:
-    """Return the evidence of N matches as a matrix, float64 (N, F), with a column for each of the F `names`."""
+    """Return the evidence of N matches as a matrix, float64 (N, F), with one column for each of the F `names`."""
     return np.array([[row[name] for name in names] for row in rows], float).reshape(len(rows), len(names))
 
 

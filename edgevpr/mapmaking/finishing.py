@@ -1,5 +1,5 @@
-"""What is done to a map once it has its places: their positions are refined, and its confidence is calibrated. The
-commands `edgevpr map refine` and `map calibrate` do one of these to an existing map."""
+"""Finishes a map once its places are made: refines their positions and calibrates its confidence. The commands
+`edgevpr map refine` and `map calibrate` each do one of these to an existing map."""
 
 import logging
 from collections.abc import Collection, Iterator
@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True)
 class FinishedMap:
     """Result of `finish_map`. `refined`, `calibration`: results of refining and calibrating (None: not done).
-    `not_done`: sentences on which of them was to be done and could not be, and why."""
+    `not_done`: a sentence for each requested step that failed, with the reason."""
 
     refined: "Refinement | None"
     calibration: MapCalibration | None
@@ -50,8 +50,8 @@ def finish_map(
     refine: bool = True,
     calibrate: bool = True,
 ) -> FinishedMap:
-    """Refine and calibrate an open map as far as its technique and its `pictures` (None: not at hand, so that it is not
-    calibrated) allow it. The result says what fails: a map is of use without."""
+    """Refine and calibrate an open map, as far as its technique allows. `pictures` None: not available, so the map is
+    not calibrated. The result lists what failed and nothing is raised, because a map is usable without these steps."""
     technique, refined, calibration, not_done = encoder.technique, None, None, []
     if refine and technique.spec.looks_down and not isinstance(pictures, Cuttings):
         try:
@@ -69,20 +69,20 @@ def finish_map(
 def refine_map(
     place_map: PlaceMap, technique: Technique, images: str | Path | None, progress: Progress
 ) -> "Refinement":
-    """Refine the positions of an open map (see `refine`). `images` is the folder of its pictures (None: not at hand).
-    Raises UsageError if the map's technique does not allow it, or SciPy is missing."""
+    """Refine the positions of an open map (see `refine`). `images` is the folder of its pictures (None: not available).
+    Raises UsageError if the map's technique cannot be refined, or SciPy is missing."""
     if not technique.spec.looks_down:
         raise UsageError(
-            f"{place_map.path} is of {technique.spec.name}, and not of a camera that looks straight down: only `cohog` "
-            "with `--camera nadir` can be refined."
+            f"{place_map.path} cannot be refined: it was made with {technique.spec.name}, not for a camera that looks "
+            "straight down. Only maps made with `cohog` and `--camera nadir` can be refined."
         )
     with _require_scipy():
         from edgevpr.mapmaking.refine import refine
     refined = refine(place_map, technique, progress, images)
     if refined.is_mirrored:
         _log.warning(
-            "lat and lon may be swapped, or the sign of one lost (south and west are negative): the pictures fit the "
-            "mirror image of their positions, so no place of %s is refined: check the columns, and make the map again",
+            "lat and lon may be swapped, or one has lost its sign (south and west are negative): the pictures fit the "
+            "mirror image of their positions, so %s is not refined: check the columns, then rebuild the map",
             place_map.path,
         )
     return refined
@@ -95,8 +95,8 @@ def calibrate_map(
     pictures: FlownPictures | Cuttings,
     progress: Progress,
 ) -> MapCalibration:
-    """Calibrate the confidence of an open map with the pictures that it was made from, as far as they can be read (see
-    `calibrate`). Raises UsageError if the map cannot be calibrated, or SciPy is missing."""
+    """Calibrate the confidence of an open map with the pictures that it was made from, skipping those that cannot be
+    read (see `calibrate`). Raises UsageError if the map cannot be calibrated, or SciPy is missing."""
     with _require_scipy():
         from edgevpr.mapmaking.calibrate import calibrate
 
@@ -110,14 +110,14 @@ def calibrate_map(
         first = next(read(names), None)
         if lens is None or first is None or not lacks_heading(first, lens):
             yield from read(names)
-        else:  # the images between show the motion
+        else:  # the motion between neighbours is needed, so every image is read
             yield from (frame for frame in find_headings(read(None), lens) if frame.name in names)
 
     return calibrate(encoder, place_map, match, QueryMeter(load_board("this")), frames, progress)
 
 
 def make_encoder(source: SourceConfig, pictures: FlownPictures | Cuttings | None, technique: Technique) -> FrameEncoder:
-    """Return the encoder of places: with mask and levelling, which pictures cut from an orthophoto do not need."""
+    """Return the encoder for places: with mask and levelling, which pictures cut from an orthophoto do not need."""
     if isinstance(pictures, Cuttings):
         return FrameEncoder(technique=technique)
     levelling = make_levelling(source, technique, below=True)
@@ -130,6 +130,6 @@ def _require_scipy() -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         raise UsageError(
-            f"Refining and calibrating a map need SciPy ({error}): install it on the machine that builds maps, with "
-            "`pip install scipy`, and run `edgevpr map refine` and `edgevpr map calibrate`."
+            f"Refining and calibrating a map require SciPy ({error}): run `pip install scipy` on the machine that "
+            "builds maps, then `edgevpr map refine` and `edgevpr map calibrate`."
         ) from error

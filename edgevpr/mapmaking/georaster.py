@@ -1,6 +1,6 @@
-"""A georeferenced picture, read with GDAL.
+"""Reads a georeferenced raster with GDAL.
 
-Other modules import rasterio (GDAL and PROJ) from here, where a clear error is raised if it is not installed.
+Other modules import rasterio (GDAL and PROJ) from here, because this module raises a clear error if it is missing.
 """
 
 import logging
@@ -15,7 +15,7 @@ from edgevpr.core.arrays import Bools, Image
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.core.types import Position
 
-# Size of GDAL's cache in MB, read when it is first used. The default is a twentieth of the RAM.
+# GDAL's block cache in MB; GDAL reads this on first use. Its default is 5 % of the RAM.
 os.environ.setdefault("GDAL_CACHEMAX", "64")
 
 try:
@@ -29,27 +29,26 @@ try:
     from rasterio.windows import Window
 except ModuleNotFoundError as error:
     raise SourceError(
-        f"An orthophoto is read with rasterio, and {error.name} is not installed: run `pip install rasterio scipy "
-        "shapely`."
+        f"Orthophotos require rasterio, and {error.name} is not installed: run `pip install rasterio scipy shapely`."
     ) from error
 
 logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # edgevpr reports each fault once, in its own words
 
 _COLOURS = (ColorInterp.blue, ColorInterp.green, ColorInterp.red)
 WGS84 = CRS.from_epsg(4326)
-HALF_WORLD_M = math.pi * 6_378_137.0  # of Web Mercator
+HALF_WORLD_M = math.pi * 6_378_137.0  # half the width of the Web Mercator map
 
 Pixel = tuple[int, int]  # column and row
 
 
 class GeoRaster:
-    """An open georeferenced picture. `crs` is its coordinate system. `transform` converts column and row (whole numbers
-    at the corners of pixels) to coordinates of `crs`. `width` and `height` are in pixels. `name` names it in messages.
+    """An open georeferenced raster. `crs` is its coordinate system. `transform` converts column and row (pixel corners
+    have integer coordinates) to coordinates of `crs`. `width` and `height` are in pixels. `name` is used in messages.
     """
 
     def __init__(self, source: str | Path, name: str) -> None:
-        """Open what GDAL opens by the text `source`. Raises SourceError for what is no picture or has no
-        georeference."""
+        """Open `source`, a file or any data set description that GDAL accepts. Raises SourceError if it is not a
+        picture or has no georeference."""
         self.name = name
         try:
             with warnings.catch_warnings():
@@ -65,7 +64,7 @@ class GeoRaster:
         self._bands = self._find_colour_bands()
 
     def _find_colour_bands(self) -> list[int]:
-        """Return the numbers (from 1) of the bands blue, green and red, or of the grey band. Raises SourceError."""
+        """Return the numbers (from 1) of the blue, green and red bands, or of the grey band. Raises SourceError."""
         kinds, dtypes = self._data.colorinterp, self._data.dtypes
         colours = [kinds.index(colour) + 1 for colour in _COLOURS if colour in kinds]
         others = [number for number, kind in enumerate(kinds, start=1) if kind != ColorInterp.alpha]
@@ -73,25 +72,25 @@ class GeoRaster:
             colours = others[2::-1] if len(others) >= 3 else others[:1]
         fault = None
         if not self.crs or self.transform.is_identity:
-            fault = "it has no geo-reference (coordinate system and position)"
+            fault = "it has no georeference (coordinate system and position)"
         elif ColorInterp.palette in kinds:
-            fault = "it holds numbers of a palette (`gdal_translate -expand rgb` makes colours of them)"
+            fault = "its colours are palette indices (convert it with `gdal_translate -expand rgb`)"
         elif not colours or any(dtypes[band - 1] != "uint8" for band in colours):
             fault = (
-                f"it holds {dtypes[0]} numbers, such as heights, and no picture of 8 bits (of a picture of 16 bits, "
-                "`gdal_translate -ot Byte -scale` makes one)"
+                f"it contains {dtypes[0]} values, such as heights, and not an 8-bit picture (convert a 16-bit picture "
+                "with `gdal_translate -ot Byte -scale`)"
             )
         if fault:
             self.close()
-            raise SourceError(f"{self.name} is no orthophoto: {fault}.")
+            raise SourceError(f"{self.name} is not a usable orthophoto: {fault}.")
         return colours
 
     def read(self, low: Pixel, high: Pixel, shrink: int) -> tuple[Image, Bools]:
-        """Read the window from (column, row) `low` to `high` (not included), reduced by the factor `shrink`: each pixel
-        of the result is the mean of `shrink` x `shrink` pixels. The window's sides must be multiples of `shrink`.
+        """Read the window from (column, row) `low` to `high` (exclusive), reduced by the factor `shrink`: each pixel of
+        the result is the mean of `shrink` x `shrink` pixels. The window's sides must be multiples of `shrink`.
 
-        Returns the picture, uint8 (H, W, 3) BGR, and bool (H, W), True where there is data. Raises ImageError for a
-        damaged window.
+        Returns the picture, uint8 (H, W, 3) BGR, and bool (H, W), True where there is data. Raises ImageError if the
+        window is damaged.
         """
         width, height = high[0] - low[0], high[1] - low[1]
         shape, window = (height // shrink, width // shrink), Window(*low, width, height)
@@ -102,8 +101,7 @@ class GeoRaster:
             valid = self._data.dataset_mask(window=window, out_shape=shape) > 127
         except RasterioError as error:
             raise ImageError(
-                f"{self.name}: the part from column {low[0]} and row {low[1]} on cannot be read ({error}): copy the "
-                "file again."
+                f"{self.name} cannot be read at column {low[0]}, row {low[1]} ({error}): copy the file again."
             ) from error
         return np.ascontiguousarray(np.broadcast_to(bands.transpose(1, 2, 0), (*shape, 3))), valid
 
@@ -112,7 +110,8 @@ class GeoRaster:
         self._data.close()
 
 
-def make_local_crs(at: Position) -> CRS:
-    """Return the coordinate system of the plane that touches the Earth at `at`: metres east and true north of that
-    point. Distances and directions from that point are exact."""
-    return CRS.from_proj4(f"+proj=aeqd +lat_0={at.lat_deg:.10f} +lon_0={at.lon_deg:.10f} +datum=WGS84 +units=m")
+def make_local_crs(origin: Position) -> CRS:
+    """Return the azimuthal equidistant projection around `origin`: metres east and true north of that point. Distances
+    and directions from that point are exact."""
+    lat_deg, lon_deg = origin.lat_deg, origin.lon_deg
+    return CRS.from_proj4(f"+proj=aeqd +lat_0={lat_deg:.10f} +lon_0={lon_deg:.10f} +datum=WGS84 +units=m")

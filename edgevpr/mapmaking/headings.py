@@ -1,8 +1,8 @@
-"""Headings of a tilted camera that nobody recorded, by the motion from image to image.
+"""Estimates headings that were not recorded, for a tilted camera, from the motion between images.
 
-The ground that a tilted camera shows lies far from the aircraft, in the direction that it looks. Neighbouring images
-are levelled by the known tilt. Then the same ground has moved by a turn and a shift. The course over ground between
-both positions, less the direction of the shift, is the heading.
+A tilted camera shows ground far from the aircraft, in its viewing direction, so a place needs the heading. Neighbouring
+images are levelled by the known tilt; the same ground then moves between them by a rotation and a shift. The heading is
+the course over ground between the two positions minus the direction of the shift.
 """
 
 import math
@@ -18,14 +18,14 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.level import MAX_TILT_DEG, MAX_TILT_UNLEVELLED_DEG, Lens, compute_level_rotation
 from edgevpr.mapmaking.tilt import FEATURES, Features, detect_features, match_features
 
-_MIN_STEP_M = 3.0  # between two positions: below it their errors turn the course
-_MAX_DIFFERENCE_DEG = 20.0  # of the headings by the motion before and after an image: with more, one of them is wrong
-_MAX_SCALE = 1.2  # by which the same ground may differ between two images: with more, tilt or height have changed
+_MIN_STEP_M = 3.0  # between two positions; over shorter steps, position errors dominate the course
+_MAX_DIFFERENCE_DEG = 20.0  # between the headings from the motion before and after an image; beyond, one is wrong
+_MAX_SCALE = 1.2  # scale change of the same ground between two images; beyond, tilt or height has changed
 
 
 def find_headings(frames: Iterable[Frame], lens: Lens) -> Iterator[Frame]:
-    """Yield frames. Those that are tilted by 20 to 60 degrees and have no heading get one, as far as the motion from
-    the frame before and to the frame after shows it."""
+    """Yield all frames. A frame that is tilted by 20 to 60 degrees and has no heading gets one, if the motion from the
+    previous frame or to the next frame shows it."""
     orb = cv2.ORB.create(FEATURES)
     last: tuple[Frame, Features | None, float | None] | None = None
     for frame in frames:
@@ -43,7 +43,7 @@ def find_headings(frames: Iterable[Frame], lens: Lens) -> Iterator[Frame]:
 
 
 def lacks_heading(frame: Frame, lens: Lens) -> bool:
-    """Tell whether a frame that is tilted by 20 to 60 degrees has no heading."""
+    """Return True if a frame is tilted by 20 to 60 degrees and has no heading."""
     tilt_deg = math.degrees(math.acos(min(1.0, float(compute_level_rotation(frame, lens)[2, 2]))))
     return frame.heading_deg is None and MAX_TILT_UNLEVELLED_DEG < tilt_deg <= MAX_TILT_DEG
 
@@ -51,35 +51,36 @@ def lacks_heading(frame: Frame, lens: Lens) -> bool:
 def _measure_heading(
     before: Frame, start: Features, after: Frame, end: Features, lens: Lens
 ) -> tuple[float, float] | None:
-    """Return the heading of the frame `after`, and the turn to it since `before`, degrees; None if the two are too near
-    to each other or share too little."""
+    """Return the heading of the frame `after`, and the rotation from `before` to `after`, in degrees; None if the two
+    were taken too close together or share too little ground."""
     if before.position is None or after.position is None:
         return None
-    here, there = ((at.lat_deg, at.lon_deg) for at in (before.position, after.position))
-    east_m, north_m = offset_m(*here, *there)
+    start_deg, end_deg = ((position.lat_deg, position.lon_deg) for position in (before.position, after.position))
+    east_m, north_m = offset_m(*start_deg, *end_deg)
     pairs = match_features(start, end) if math.hypot(east_m, north_m) >= _MIN_STEP_M else None
     if pairs is None:
         return None
-    was, now = (_project_to_ground(points, frame, lens) for points, frame in zip(pairs, (before, after), strict=True))
-    turn_scale, shift = fit_similarity(was, now)
+    old, new = (_project_to_ground(points, frame, lens) for points, frame in zip(pairs, (before, after), strict=True))
+    turn_scale, shift = fit_similarity(old, new)
     if not 1 / _MAX_SCALE < abs(turn_scale) < _MAX_SCALE:
         return None
-    # The ground moves the other way than the camera; x is to the right, y down the picture, and so back.
+    # The ground moves opposite to the camera. In the picture x points right and y down, so backwards.
     bearing_deg = math.degrees(math.atan2(-shift.real, shift.imag))
     course_deg = math.degrees(math.atan2(east_m, north_m))
     return course_deg - bearing_deg - lens.up_deg, -math.degrees(math.atan2(turn_scale.imag, turn_scale.real))
 
 
 def _project_to_ground(points: Doubles, frame: Frame, lens: Lens) -> Array:
-    """Return where points of an image (n, 2) lie on the ground, in heights right and down of the point under the
-    camera, complex (n,)."""
+    """Return where image points (n, 2) lie on the ground: complex (n,), right + i back of the point below the camera,
+    in units of the camera's height."""
     focal = 0.5 / math.tan(math.radians(lens.fov_deg) / 2)
     rays = compute_level_rotation(frame, lens) @ np.column_stack([points / focal, np.ones(len(points))]).T
     return np.asarray((rays[0] + 1j * rays[1]) / np.maximum(rays[2], 0.1))
 
 
 def _set_heading(frame: Frame, before_deg: float | None, after_deg: float | None) -> Frame:
-    """Return a frame with the mean of the headings by the motion before and after it, if they agree (None: unknown)."""
+    """Set the heading of a frame to the mean of those from the motion before and after it (None: unknown), if they
+    agree."""
     known = [heading_deg for heading_deg in (before_deg, after_deg) if heading_deg is not None]
     if not known or abs(wrap_deg(known[0] - known[-1])) > _MAX_DIFFERENCE_DEG:
         return frame

@@ -1,5 +1,5 @@
-"""Making of a complete map: places from pictures, then what `finishing` does to them. This is the work of the command
-`edgevpr map build`."""
+"""Builds a complete map: makes places from pictures, then refines and calibrates them (`finishing`). The command
+`edgevpr map build` calls it."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -39,11 +39,11 @@ _ORTHOPHOTO_TECHNIQUE = "cohog"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapOrder:
-    """The map to be made at `path` from `pictures`.
+    """The map to make at `path` from `pictures`.
 
-    `technique`: its name (None: chosen for `board`, the board that will fly). `parameters`: of the technique, by name.
-    `append`: add places to the map if it exists. `refine`, `calibrate`: also refine the map, and calibrate it, after
-    the places are made."""
+    `technique`: its name (None: choose one for `board`, the board that will fly). `parameters`: technique parameters by
+    name. `append`: add places to the map if it exists. `refine`, `calibrate`: also refine and calibrate the map once
+    its places are made."""
 
     path: str
     pictures: FlownPictures | Cuttings
@@ -58,8 +58,8 @@ class MapOrder:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MadeMap:
     """Result of `make_map`. `technique`: its name. `places`, `with_position`: number of places in the map, and of
-    those that have a position. `result`: counts of the frames read. `covered`: the ground of all places, as recorded
-    (None: too few positions). `refined`, `calibration`, `not_done`: see `FinishedMap`."""
+    places with a position. `result`: counts of the frames read. `covered`: the ground that all places cover, by their
+    recorded positions (None: too few). `refined`, `calibration`, `not_done`: see `FinishedMap`."""
 
     technique: str
     places: int
@@ -72,9 +72,9 @@ class MadeMap:
 
 
 def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], None], progress: Progress) -> MadeMap:
-    """Make the map that `order` describes, or continue it. `unusable` is called with an error for each picture that
-    cannot be used. `progress` shows progress. Raises EdgevprError."""
-    path, here, pictures = parse_map_path(order.path), load_board("this"), order.pictures
+    """Make the map that `order` describes, or continue it. `unusable` is called with the error of each picture that
+    cannot be used. `progress` reports progress. Raises EdgevprError."""
+    path, board, pictures = parse_map_path(order.path), load_board("this"), order.pictures
     flown, salience = config.source, config.salience
     is_new = not (order.append and path.exists())
     place_map = None if is_new else PlaceMap.open_for_adding(path)
@@ -113,13 +113,13 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
             encoder = make_encoder(flown, pictures, technique)
             result = build_map(
                 frames,
-                replace(encoder, gate=open_salience_gate(salience, here.threads)),
+                replace(encoder, gate=open_salience_gate(salience, board.threads)),
                 place_map,
                 PlaceSelector(salience.gap_frames, salience.gap_m),
                 unusable,
             )
         except EdgevprError:
-            if is_new and not len(place_map):  # such as a full disk: an empty file would block the next attempt
+            if is_new and not len(place_map):  # e.g. the disk is full; an empty file would block the next attempt
                 remove_map(path)
             raise
         if covered := measure_ground(place_map):
@@ -145,19 +145,19 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
 def _open_flown(
     order: MapOrder, pictures: FlownPictures, flown: SourceConfig, place_map: PlaceMap | None, mask: OverlayMask | None
 ) -> tuple[Source, Technique]:
-    """Open the pictures, and make the technique: the one asked for, else that of the map (`place_map` None: there is no
-    map yet), else the best for the board. Raises UsageError if the camera looks down, and nobody has said so, and for
-    one that is tilted by angles that are not recorded."""
+    """Open the pictures and create the technique: the requested one, else that of the map (`place_map` None: there is
+    no map yet), else the best for the board. Raises UsageError if the pictures look straight down but `--camera` is not
+    given, or if a camera that should look straight down is tilted and its angles are not recorded."""
     source, settings, camera = pictures.open(), order.parameters, flown.camera
     name = order.technique or (place_map.spec.name if place_map is not None else None)
-    asks_camera = camera is None and place_map is None and "camera" not in settings
-    if asks_camera and (not name or make_camera_setting(name, "nadir")):
+    camera_is_open = camera is None and place_map is None and "camera" not in settings
+    if camera_is_open and (not name or make_camera_setting(name, "nadir")):
         advice.require_forward_camera(pictures, mask)
     if name is None:
         with show_elapsed("choosing a technique"):
             name = pick_technique(order.board, source.total or 1, camera)
         settings = settings | make_camera_setting(name, camera)
-    elif camera:  # a technique that knows no camera refuses one that was asked for
+    elif camera:  # a technique without this setting refuses it
         settings = settings | {"camera": camera}
     technique = _make_technique(order, place_map, name, settings)
     if technique.spec.looks_down and not flown.gimbal and read_mount(flown) == STRAIGHT_DOWN:
@@ -168,17 +168,17 @@ def _open_flown(
 def _open_cuttings(
     order: MapOrder, pictures: Cuttings, camera: str | None, place_map: PlaceMap | None
 ) -> tuple["OrthophotoSource", Technique]:
-    """Open the orthophoto, and make the technique: the one asked for, else that of the map (`place_map` None: there is
-    no map yet), else `cohog`. Raises UsageError for another camera."""
+    """Open the orthophoto and create the technique: the requested one, else that of the map (`place_map` None: there is
+    no map yet), else `cohog`. Raises UsageError for a camera other than nadir."""
     if camera not in (None, "nadir"):
-        raise UsageError(f"--camera {camera}: an orthophoto shows the ground from above: give nadir, or leave it out.")
+        raise UsageError(f"--camera {camera}: an orthophoto is seen from above: give --camera nadir, or omit it.")
     name = order.technique or (place_map.spec.name if place_map is not None else _ORTHOPHOTO_TECHNIQUE)
     settings = order.parameters | make_camera_setting(name, "nadir")
     return pictures.open(), _make_technique(order, place_map, name, settings)
 
 
 def _make_technique(order: MapOrder, place_map: PlaceMap | None, name: str, settings: dict[str, str]) -> Technique:
-    here = load_board("this")
-    if place_map is not None:  # one without places is false
-        return create_technique(place_map, order.technique, settings, here)
-    return make_technique(here.threads, name, settings)
+    board = load_board("this")
+    if place_map is not None:  # a map without places is falsy
+        return create_technique(place_map, order.technique, settings, board)
+    return make_technique(board.threads, name, settings)

@@ -1,8 +1,8 @@
-"""Making places of a map from frames: every frame is encoded, and is on the disk before the next one is read.
+"""Makes the places of a map from frames: each frame is encoded and written to disk before the next one is read.
 
-With salience criteria (`FrameEncoder.gate`), only frames that reach all thresholds become places. So that no long gaps
-arise (thesis 3.4.8), the other frames are held back ("wait"). After `max_frames` frames or `max_gap_m` metres without a
-place, all thresholds are lowered in steps of 0.03 until some waiting frames pass; these become places of low quality.
+With salience criteria (`FrameEncoder.gate`), only frames that reach all thresholds become places. To avoid long gaps
+(thesis 3.4.8), the other frames wait. After `max_frames` frames or `max_gap_m` metres without a place, all thresholds
+are lowered in steps of 0.03 until some waiting frames pass; these become places of low quality.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -27,18 +27,18 @@ SelectedFrame = tuple[EncodedFrame, Salience | None]  # a frame that becomes a p
 
 
 class PlaceSelector:
-    """Selects the frames that become places, so that no long gaps arise, see the module. `max_gap_m` None: distances
-    are ignored."""
+    """Selects the frames that become places, without long gaps (see the module's docstring). `max_gap_m` None:
+    distances are ignored."""
 
     def __init__(self, max_frames: int = GAP_FRAMES, max_gap_m: float | None = None) -> None:
         self._max_frames, self._max_gap_m = max_frames, max_gap_m
         self._waiting: list[EncodedFrame] = []
-        self._last: Position | None = None  # of the last place; before there is one, of the first frame
+        self._last: Position | None = None  # of the last place, or of the first frame while there is no place
         self._has_begun = False
 
     def add_frame(self, encoded: EncodedFrame) -> Iterator[SelectedFrame]:
-        """Process the next frame. Yield those that now become places: some of those waiting, then this one if it
-        reaches all thresholds; else it waits. Each comes with its salience (None: there are no criteria)."""
+        """Process the next frame. Yield the frames that now become places, each with its salience (None: no criteria):
+        some waiting frames, then this one if it reaches all thresholds. Otherwise this one waits."""
         if encoded.salience is None:
             yield encoded, None
             return
@@ -53,18 +53,18 @@ class PlaceSelector:
             self._waiting.append(replace(encoded, frame=replace(frame, image=_NO_PIXELS)))
 
     def end(self) -> Iterator[SelectedFrame]:
-        """Yield the frames that become places at the end of a recording: the best ones, if there is no place yet."""
+        """Yield the frames that become places at the end of a recording: the best ones if there is no place yet."""
         if not self._has_begun and self._waiting:
             yield from self._take_best_waiting()
 
     def _take_best_waiting(self) -> Iterator[SelectedFrame]:
-        """Yield the best of the waiting frames, as places of low quality. Of the others, those before the last one
-        yielded are dropped, and those after it continue to wait."""
+        """Yield the best waiting frames as places of low quality. Other frames before the last yielded one are dropped;
+        those after it continue to wait."""
         waiting = [(encoded, encoded.salience) for encoded in self._waiting if encoded.salience]
-        best = np.flatnonzero(select_best([worth.shortfall for _, worth in waiting])).tolist()
+        best = np.flatnonzero(select_best([salience.shortfall for _, salience in waiting])).tolist()
         self._waiting = self._waiting[best[-1] + 1 :]
-        for encoded, worth in (waiting[at] for at in best):
-            yield self._keep(encoded), replace(worth.scores, is_low=True)
+        for encoded, salience in (waiting[index] for index in best):
+            yield self._keep(encoded), replace(salience.scores, is_low=True)
 
     def _keep(self, encoded: EncodedFrame) -> EncodedFrame:
         self._has_begun, self._last = True, encoded.frame.position or self._last
@@ -78,8 +78,8 @@ class PlaceSelector:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoveredGround:
-    """Ground covered by the places with a position, in the order mapped. `north_south_m`, `east_west_m`: its extent.
-    `lat_deg`, `lon_deg`: its middle. `track_m`: length of the way from place to place; `step_m`: median step of it."""
+    """Ground covered by the places with a position. `north_south_m`, `east_west_m`: its extent. `lat_deg`, `lon_deg`:
+    its centre. `track_m`: length of the path through the places in mapping order; `step_m`: its median step."""
 
     north_south_m: float
     east_west_m: float
@@ -89,28 +89,30 @@ class CoveredGround:
     step_m: float
 
     def describe(self, is_flown: bool) -> str:
-        """Describe the ground in one sentence, and the track if the pictures were taken in a flight."""
+        """Describe the ground in one sentence, including the track if the pictures were taken in flight."""
         lengths_m = self.north_south_m, self.east_west_m, self.track_m, self.step_m
-        high, wide, track, step = (f"{each / 1000:.1f} km" if each >= 1000 else f"{each:.0f} m" for each in lengths_m)
-        where = f"the map extends {high} north-south and {wide} east-west around {self.lat_deg:.5f}, {self.lon_deg:.5f}"
-        return f"{where}; the track is {track} long, {step} from picture to picture (median)" if is_flown else where
+        high, wide, track, step = (f"{m / 1000:.1f} km" if m >= 1000 else f"{m:.0f} m" for m in lengths_m)
+        extent = (
+            f"the map extends {high} north-south and {wide} east-west around {self.lat_deg:.5f}, {self.lon_deg:.5f}"
+        )
+        return f"{extent}; the track is {track} long, with a median of {step} between pictures" if is_flown else extent
 
 
 def measure_ground(place_map: PlaceMap) -> CoveredGround | None:
-    """Measure the ground that a map covers; None with fewer than two positions."""
+    """Measure the ground that a map covers; None if fewer than two places have a position."""
     points = np.array([(lat_deg, lon_deg) for _, lat_deg, lon_deg, _ in place_map.read_outlines()]).reshape(-1, 2)
     lat_deg, lon_deg = points[~np.isnan(points).any(axis=1)].T
     if len(lat_deg) < 2:
         return None
     east_m, north_m = project_to_metres(lat_deg, lon_deg)
     steps_m = distance_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])
-    middle_m = [float(each.max() + each.min()) / 2 for each in (east_m, north_m)]
-    middle = offset_position(float(lat_deg[0]), float(lon_deg[0]), *middle_m)
+    centre_m = [float(axis_m.max() + axis_m.min()) / 2 for axis_m in (east_m, north_m)]
+    centre = offset_position(float(lat_deg[0]), float(lon_deg[0]), *centre_m)
     return CoveredGround(
         north_south_m=float(np.ptp(north_m)),
         east_west_m=float(np.ptp(east_m)),
-        lat_deg=middle[0],
-        lon_deg=middle[1],
+        lat_deg=centre[0],
+        lon_deg=centre[1],
         track_m=float(steps_m.sum()),
         step_m=float(np.median(steps_m)),
     )
@@ -119,10 +121,10 @@ def measure_ground(place_map: PlaceMap) -> CoveredGround | None:
 @dataclass(slots=True, kw_only=True)
 class MappingResult:
     """Counts of frames. `added`: new places; of these, `without_position` have no position, and `of_low_quality` only
-    closed a gap. `already_here`: frames in the map before. `low_texture`: frames with too little information.
-    `tilted`: frames that are tilted too far to be levelled, `without_heading`: those that a heading is missing for.
-    `not_memorable`: frames left out because they failed a salience criterion. `without_data`: places left out because
-    the orthophoto has no data there. `white`: places cut from it that are white over a third or more."""
+    close a gap. `already_here`: frames that were in the map already. `low_texture`: frames with too little texture.
+    `tilted`: frames tilted too far to be levelled. `without_heading`: tilted frames that lack the heading needed to
+    level them. `not_memorable`: frames skipped because they failed a salience criterion. `without_data`: places skipped
+    because the orthophoto has no data there. `white`: places cut from it that are more than a third white."""
 
     added: int = 0
     without_position: int = 0
@@ -143,20 +145,20 @@ def build_map(
     selector: PlaceSelector | None = None,
     unusable: Callable[[ImageError], None] | None = None,
 ) -> MappingResult:
-    """Add a place for every selected frame that is not in the map yet, so that an interrupted map can be continued.
+    """Add a place for every selected frame that is not in the map yet, so that an interrupted build can be continued.
 
     Frames are encoded by the same steps as queries. A frame is in the map already if a place has the same name and
-    nearly the same descriptor; the name alone does not suffice, since cameras restart their numbering. For a frame that
-    cannot be encoded, `unusable` is called with an error; with `unusable` None, ModelError is raised. Of pictures cut
-    from an orthophoto (surveyed ones), those that hold too little to be recognised are left out.
+    nearly the same descriptor; the name alone is not enough, because cameras restart their numbering. If a frame cannot
+    be encoded, `unusable` is called with the error; with `unusable` None, ModelError is raised. Pictures cut from an
+    orthophoto (surveyed ones) are skipped if they have too little texture to be recognised.
     """
     place_map.require_technique(encoder.technique.spec)
     selector = selector or PlaceSelector()
     ids_by_image = place_map.select_ids("source_image")
     result, layers = MappingResult(), read_layers(place_map)
 
-    def keep(kept: Iterable[SelectedFrame]) -> None:
-        for encoded, salience in kept:
+    def add_places(selected: Iterable[SelectedFrame]) -> None:
+        for encoded, salience in selected:
             place, landmarks = centre_place(encoded.frame, encoded.view), encoder.pack_landmarks(encoded.picture)
             place_map.add(place, encoded.descriptor, salience, landmarks)
             result.added += 1
@@ -180,13 +182,13 @@ def build_map(
             else:
                 result.tilted += 1
             continue
-        of_name = ids_by_image.get((escape_name(frame.name),), ())
+        same_name_ids = ids_by_image.get((escape_name(frame.name),), ())
         if check_texture(encoded.descriptor, min_quality):
             result.low_texture += 1
-        elif any(place_map.has_descriptor(place_id, encoded.descriptor.coarse) for place_id in of_name):
+        elif any(place_map.has_descriptor(place_id, encoded.descriptor.coarse) for place_id in same_name_ids):
             result.already_here += 1
         else:
             result.not_memorable += bool(encoded.salience and encoded.salience.criterion)
-            keep(selector.add_frame(encoded))
-    keep(selector.end())
+            add_places(selector.add_frame(encoded))
+    add_places(selector.end())
     return result

@@ -1,5 +1,5 @@
-"""Reading of paths to be flown over, waypoint files and plans of QGroundControl, and of circles. They limit the part of
-an orthophoto from which a map is made, and of a map the part that a flight takes."""
+"""Reads the area of a flight: the path in a waypoint file or QGroundControl plan, or a circle. The area limits which
+part of an orthophoto becomes a map, and which part of a map is cut out for a flight."""
 
 import json
 import math
@@ -19,26 +19,26 @@ from edgevpr.core.geodesy import Extent, compute_extent, offset_position
 try:
     import shapely as shapely
 except ModuleNotFoundError as error:
-    raise UsageError("Areas and missions are laid out with shapely: run `pip install shapely`.") from error
+    raise UsageError("Areas and missions need shapely, which is not installed: run `pip install shapely`.") from error
 
 _MAX_FILE_BYTES = 50_000_000
 _WAYPOINT_COLUMNS = 12
-# The MAV_CMDs whose position an aircraft flies to: waypoint, loiter (unlimited, turns, time, to altitude), land, take
-# off, spline, and take off and land of a VTOL. Others, such as a region of interest, have a position to look at.
+# The MAV_CMDs that fly to their position: waypoint, loiter (unlimited, turns, time, to altitude), land, takeoff, spline
+# waypoint, VTOL takeoff and VTOL land. The position of others, such as a region of interest, is only looked at.
 _FLOWN_COMMANDS = {16, 17, 18, 19, 21, 22, 31, 82, 84, 85}
-_RELATIVE_FRAMES = {3, 6, 10, 11}  # MAV_FRAMEs whose altitude is relative to home or the terrain
+_RELATIVE_FRAMES = {3, 6, 10, 11}  # MAV_FRAMEs with altitude relative to home or the terrain
 _CIRCLE_PATTERN = re.compile(r"\s*-?[\d.]+\s*,\s*-?[\d.]+\s*,\s*-?[\d.]+\s*")  # LAT,LON,RADIUS_M
 _MAX_RADIUS_M = 200_000.0
-_QUARTER_SEGMENTS = 64  # of a buffer's round corners: exact to 0.01 % of its width
+_QUARTER_SEGMENTS = 64  # segments per quarter circle of a buffer: exact to 0.01 % of its width
 _FAR_M = 1e8
 _MALFORMED = (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError)
 
-Projection = Callable[[Doubles, Doubles], tuple[Any, Any]]  # latitudes and longitudes, to x and y in metres
+Projection = Callable[[Doubles, Doubles], tuple[Any, Any]]  # from latitudes and longitudes to x and y in metres
 
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """A point of a path in degrees, and its height in metres over home or the ground (None: the file gives none)."""
+    """A point of a path in degrees, and its height in metres above home or the terrain (None: not in the file)."""
 
     lat_deg: float
     lon_deg: float
@@ -47,23 +47,23 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """The ground around the waypoints of a mission, `path`, in the order of flight. A circle has one waypoint, in its
-    middle, and a `radius_m` (0: a mission)."""
+    """The ground of a flight: along the waypoints of a mission, `path`, in the order of flight, or inside a circle. A
+    circle has one waypoint, its centre, and a `radius_m` above 0."""
 
     path: tuple[Waypoint, ...]
     radius_m: float = 0.0
 
     @property
     def extent_deg(self) -> Extent:
-        """The bounding box of path or circle, see `compute_extent`."""
+        """The bounding box of the path or circle (see `compute_extent`)."""
         sides_m = (-self.radius_m, self.radius_m)
-        return compute_extent([offset_position(at.lat_deg, at.lon_deg, m, m) for at in self.path for m in sides_m])
+        return compute_extent([offset_position(way.lat_deg, way.lon_deg, m, m) for way in self.path for m in sides_m])
 
     def project_ground(self, project: Projection, circle_margin_m: float, path_margin_m: float) -> "shapely.Geometry":
-        """Return the ground within these margins of the circle or of the path, on a plane."""
-        way = (*self.path, self.path[-1])  # a line has two points or more
-        points: Doubles = np.column_stack(project(*np.array([(at.lat_deg, at.lon_deg) for at in way]).T))
-        # What cannot be projected is far away.
+        """Return the ground within these margins of the circle or path, projected to a plane by `project`."""
+        waypoints = (*self.path, self.path[-1])  # a LineString needs at least two points
+        points: Doubles = np.column_stack(project(*np.array([(way.lat_deg, way.lon_deg) for way in waypoints]).T))
+        # A point that cannot be projected is far away.
         line = shapely.LineString(np.nan_to_num(points, nan=_FAR_M, posinf=_FAR_M))
         margin_m = self.radius_m + circle_margin_m if self.radius_m else path_margin_m
         ground = shapely.buffer(line, margin_m, quad_segs=_QUARTER_SEGMENTS)
@@ -72,43 +72,42 @@ class Area:
 
 
 def read_area(path: str | Path) -> Area:
-    """Read a waypoint file (QGC WPL 110), a .plan of QGroundControl, or the circle that the text LAT,LON,RADIUS_M
-    describes. Raises UsageError for a file that is none of them, holds no position, or has one
-    beyond -90..90 or -180..180 degrees."""
+    """Read a waypoint file (QGC WPL 110), a QGroundControl .plan, or a circle given as the text LAT,LON,RADIUS_M.
+    Raises UsageError if the file has neither format, contains no position, or has a position outside -90..90 or
+    -180..180 degrees."""
     try:
         if _CIRCLE_PATTERN.fullmatch(str(path)):
             return _make_circle(*map(float, str(path).split(",")))
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
         is_list = text.startswith("QGC WPL")
-        way = _read_waypoints(text.splitlines()) if is_list else _read_plan(json.loads(text)["mission"]["items"])
+        waypoints = _read_waypoints(text.splitlines()) if is_list else _read_plan(json.loads(text)["mission"]["items"])
     except OSError as error:
         raise UsageError(
             f"{path} cannot be read ({error.strerror}): give a mission file, or LAT,LON,RADIUS_M."
         ) from error
     except _MALFORMED:
         raise UsageError(
-            f"{path} is no waypoint file (QGC WPL 110) and no .plan of QGroundControl that can be understood: save it "
-            "again."
+            f"{path} is not a valid waypoint file (QGC WPL 110) or QGroundControl .plan: save the mission again."
         ) from None
-    if not way:
-        raise UsageError(f"{path} holds no position to fly to: save the mission again.")
-    if any(abs(at.lat_deg) > 90 or abs(at.lon_deg) > 180 for at in way):
-        raise UsageError(f"{path} has positions beyond the globe: they must be degrees of WGS-84.")
-    return Area(tuple(way))
+    if not waypoints:
+        raise UsageError(f"{path} contains no position to fly to: save the mission again.")
+    if any(abs(way.lat_deg) > 90 or abs(way.lon_deg) > 180 for way in waypoints):
+        raise UsageError(f"{path} has invalid coordinates: positions must be WGS-84 degrees (-90..90, -180..180).")
+    return Area(tuple(waypoints))
 
 
 def _make_circle(lat_deg: float, lon_deg: float, radius_m: float) -> Area:
     if not (abs(lat_deg) < 90 and abs(lon_deg) <= 180 and 0 < radius_m <= _MAX_RADIUS_M):
         raise UsageError(
-            f"--area {lat_deg:g},{lon_deg:g},{radius_m:g}: write LAT,LON,RADIUS_M, in degrees of WGS-84 and metres (at "
-            f"most {_MAX_RADIUS_M:,.0f})."
+            f"--area {lat_deg:g},{lon_deg:g},{radius_m:g} is not a valid circle: write LAT,LON,RADIUS_M, in WGS-84 "
+            f"degrees and metres (at most {_MAX_RADIUS_M:,.0f})."
         )
     return Area((Waypoint(lat_deg, lon_deg),), radius_m)
 
 
 def _read_waypoints(lines: list[str]) -> list[Waypoint]:
-    """Read a waypoint file. The first line is a heading; the columns of the others are index, current, frame, command,
-    four parameters, lat, lon, alt, autocontinue."""
+    """Read the lines of a waypoint file. The first is a header; the columns of the others are index, current, frame,
+    command, four parameters, lat, lon, alt, autocontinue."""
     path: list[Waypoint] = []
     for values in filter(None, map(str.split, lines[1:])):
         if len(values) != _WAYPOINT_COLUMNS:
@@ -117,19 +116,19 @@ def _read_waypoints(lines: list[str]) -> list[Waypoint]:
     return path
 
 
-def _parse_waypoint(command: int, frame: int, where: Sequence[float | str | None]) -> list[Waypoint]:
-    """Return the waypoint of a mission item in a list, empty for an item that is not flown to. `command` is a MAV_CMD,
-    `frame` a MAV_FRAME, `where` latitude, longitude and altitude; (0, 0) means the aircraft's present position."""
-    lat_deg, lon_deg, alt_m = map(_parse_finite, where)
+def _parse_waypoint(command: int, frame: int, location: Sequence[float | str | None]) -> list[Waypoint]:
+    """Return a list with the waypoint of a mission item, empty if the aircraft does not fly to it. `command` is a
+    MAV_CMD, `frame` a MAV_FRAME, `location` latitude, longitude and altitude; (0, 0) is the aircraft's own position."""
+    lat_deg, lon_deg, alt_m = map(_parse_finite, location)
     if command not in _FLOWN_COMMANDS or lat_deg == lon_deg == 0:
         return []
-    # Height 0, as of home and a landing, is not that from which pictures are taken: it counts as not given.
+    # No pictures are taken from height 0, as at home and on landing, so it counts as missing.
     return [Waypoint(lat_deg, lon_deg, alt_m if frame in _RELATIVE_FRAMES and alt_m > 0 else None)]
 
 
 def _read_plan(items: list[dict[str, Any]]) -> list[Waypoint]:
-    """Read the items of a plan: simple items, and surveys and corridors, which have the waypoints computed from their
-    polygon. A plan has null for numbers that it leaves to the autopilot."""
+    """Read the items of a plan: simple items, and surveys and corridor scans, which store the waypoints computed from
+    their polygon. Numbers left to the autopilot are null."""
     path: list[Waypoint] = []
     for item in items:
         if item["type"] == "SimpleItem":

@@ -1,5 +1,5 @@
-"""Moving of a map to where GPS has it: by the offset, and the scale, that a flight has found (see
-`runtime.flight.survey`, and the lines of kind "survey" of its log). This is the work of the command `edgevpr map move`.
+"""Moves a map to match GPS, by the offset and scale that a flight measured (see `runtime.flight.survey`, which writes
+lines of kind "survey" to the flight log). The command `edgevpr map move` calls it.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -16,9 +16,9 @@ from edgevpr.runtime.flight.flightlog import select_last_flight
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapMove:
-    """The move of so many `places`: `east_m` and `north_m` are the step of the `middle` (latitude and longitude in
-    degrees), with a standard deviation of `sd_m`. The distances from it were divided by 1 + `scale` (None: the flight
-    does not tell, and they stay)."""
+    """A move of a map with `places` places. Its centre `middle` (latitude and longitude in degrees) moves by `east_m`
+    and `north_m`, with a standard deviation of `sd_m`. Distances from the centre are divided by 1 + `scale` (None: the
+    flight could not measure the scale, so they stay)."""
 
     places: int
     middle: tuple[float, float]
@@ -30,35 +30,36 @@ class MapMove:
     def apply(self, position: Position) -> Position:
         """Return the moved position."""
         away_m = offset_m(*self.middle, position.lat_deg, position.lon_deg)
-        east_m, north_m = (each / (1 + (self.scale or 0.0)) for each in map(float, away_m))
+        east_m, north_m = (distance_m / (1 + (self.scale or 0.0)) for distance_m in map(float, away_m))
         lat_deg, lon_deg = offset_position(*self.middle, east_m + self.east_m, north_m + self.north_m)
         return replace(position, lat_deg=lat_deg, lon_deg=lon_deg)
 
 
 def move_map(place_map: PlaceMap, log: str | Path) -> MapMove:
-    """Move all places of a map that is open for adding, in one transaction, by the last result in a flight log. Raises
-    UsageError if the log has none, or is not of this very map as it is now, and MapError as `PlaceMap` does."""
-    found, identity = None, None
+    """Move all places of a map that is open for adding, in one transaction, by the last survey result in a flight log.
+    Raises UsageError if the log has no result, or comes from another map or another version of this one. Raises
+    MapError as `PlaceMap` does."""
+    survey, identity = None, None
     for line in select_last_flight(log):
         if line["kind"] == "start":
             identity = line.get("map_identity")
         elif line["kind"] == "survey":
-            found = line
+            survey = line
     if identity != asdict(read_identity(place_map)):
         raise UsageError(
-            f"{log} is not of {place_map.path} as it is now: it is of another map, or this one was changed or moved "
-            "since: give the log of a flight with it."
+            f"{log} was not recorded with {place_map.path} as it is now: it comes from another map, or this map was "
+            "changed or moved since: give the log of a flight with this map."
         )
-    move = _read_move(found or {}, len(place_map))
+    move = _read_move(survey or {}, len(place_map))
     if move is None:
         raise UsageError(
-            f"{log} does not say where the map lies: that takes some minutes with good GPS and accepted matches, in "
-            "which the heading changes."
+            f"{log} contains no measured map offset: fly for some minutes with good GPS, accepted matches and changing "
+            "headings."
         )
     with place_map.transaction():
         for place in list(place_map.read_places()):
             pose = place.pose
-            if pose:  # the recorded position moves too: another refinement must not bring it back
+            if pose:  # the recorded position moves too, so that a later refinement does not undo the move
                 recorded = pose.recorded and move.apply(pose.recorded)
                 pose = replace(pose, footprint_m=pose.footprint_m / (1 + (move.scale or 0.0)), recorded=recorded)
             if place.position:
@@ -67,7 +68,7 @@ def move_map(place_map: PlaceMap, log: str | Path) -> MapMove:
 
 
 def _read_move(line: dict[str, Any], places: int) -> MapMove | None:
-    """Return the move by a line of kind "survey"; None if it does not say where the map lies."""
+    """Return the move in a line of kind "survey"; None if the line has no measured offset."""
     match line:
         case {
             "off_m": [int() | float() as east_m, int() | float() as north_m],

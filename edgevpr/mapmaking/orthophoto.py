@@ -1,5 +1,5 @@
-"""An orthophoto, from which pictures of squares of ground are cut: sides in metres on the ground, true north at the
-top. `cuttings` makes the frames of a map from them."""
+"""Cuts square pictures of the ground out of an orthophoto, with sides in metres and true north up. `cuttings` makes the
+frames of a map from them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,21 +28,21 @@ from edgevpr.mapmaking.georaster import (
 from edgevpr.mapmaking.tiles import describe_folder
 
 _EDGE_POINTS = 25  # per edge: a straight edge of the file is a curve in another coordinate system
-_MAX_HALVINGS = 8  # of the resolution: then a tile of 256 pixels is one pixel
+_MAX_HALVINGS = 8  # of the resolution: reduces a tile of 256 pixels to one
 
 Coordinate = TypeVar("Coordinate", float, Doubles)
 
 
 class Orthophoto:
-    """An open orthophoto. `name` names it in messages, and `short_name` the pictures cut from it. `extent_deg` is its
-    bounding box (south, west, north, east), `middle` its middle, and `resolution_m` the length in metres of a pixel on
-    the ground in the middle."""
+    """An open orthophoto. `name` is used in messages, and `short_name` in the names of the pictures cut from it.
+    `extent_deg` is its bounding box (south, west, north, east), `middle` the position of its centre, and `resolution_m`
+    the size of a pixel on the ground there, in metres."""
 
     def __init__(self, source: str | Path) -> None:
         """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads, or a folder of map tiles. Raises SourceError."""
         path, self._links = Path(source), TemporaryDirectory(prefix="edgevpr-tiles-")
         if not path.exists():
-            raise SourceError(f"There is no orthophoto {source}: check the name.")
+            raise SourceError(f"{source} does not exist: give the path of an orthophoto.")
         raster = describe_folder(path, Path(self._links.name)) if path.is_dir() else path
         self.name, self.short_name = str(path), path.name
         self._raster = GeoRaster(raster, self.name)
@@ -58,8 +58,8 @@ class Orthophoto:
         if not np.isfinite((lats_deg, lons_deg)).all():
             self.close()
             raise SourceError(
-                f"{self.name}: its coordinate system ({self._raster.crs.to_string()[:60]}) cannot be brought to "
-                "latitude and longitude: export it with another, such as UTM or EPSG:4326."
+                f"{self.name}: its coordinate system ({self._raster.crs.to_string()[:60]}) cannot be converted to "
+                "latitude and longitude: export the orthophoto in another one, such as UTM or EPSG:4326."
             )
         lons_deg = self.middle.lon_deg + wrap_deg(lons_deg - self.middle.lon_deg)
         self.extent_deg = (lats_deg.min(), lons_deg.min(), lats_deg.max(), lons_deg.max())
@@ -79,52 +79,52 @@ class Orthophoto:
         x, y = transform(self._raster.crs, crs, *_apply_affine(self._raster.transform, columns, rows))
         return np.array(x), np.array(y)
 
-    def _to_pixels(self, at: Position, points_m: Doubles) -> Doubles:
-        """Convert points (N, 2), in metres (east, north) of `at`, to pixels (column, row), float64 (N, 2). Whole
-        numbers are the corners of pixels."""
-        return np.column_stack(self._crs_to_pixels(*transform(make_local_crs(at), self._raster.crs, *points_m.T)))
+    def _to_pixels(self, origin: Position, points_m: Doubles) -> Doubles:
+        """Convert points (N, 2), metres (east, north) from `origin`, to pixels (column, row), float64 (N, 2). Pixel
+        corners have integer coordinates."""
+        return np.column_stack(self._crs_to_pixels(*transform(make_local_crs(origin), self._raster.crs, *points_m.T)))
 
     def _crs_to_pixels(self, x: Sequence[float], y: Sequence[float]) -> tuple[Doubles, Doubles]:
         """Convert points from the coordinate system of the file to pixels: columns and rows, float64 (N,) each."""
         raster, across = self._raster, np.array(x)
-        if self._wrap:  # a file may have longitudes from 0 to 360 degrees, or cross the date line
+        if self._wrap:  # the longitudes of a file may run from 0 to 360 degrees, or cross the date line
             middle, _ = _apply_affine(raster.transform, raster.width / 2, raster.height / 2)
             across += self._wrap * np.round((middle - across) / self._wrap)
         return _apply_affine(~raster.transform, across, np.array(y))
 
-    def cut(self, at: Position, footprint_m: float, side_px: int) -> tuple[Image, Bools]:
-        """Cut out the square of ground with its middle at `at`, true north up, and sides of `footprint_m`.
+    def cut(self, centre: Position, footprint_m: float, side_px: int) -> tuple[Image, Bools]:
+        """Cut out a square of ground around `centre`, true north up, with sides of `footprint_m`.
 
         Returns the picture, uint8 (side_px, side_px, 3) BGR, and bool (side_px, side_px), True where there is data.
-        Pixels without data have the mean colour of the others. Raises ImageError for a damaged part of the file.
+        Pixels without data get the mean colour of the others. Raises ImageError if this part of the file is damaged.
         """
         half_m = footprint_m / 2
-        corners = self._to_pixels(at, half_m * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]))
+        corners = self._to_pixels(centre, half_m * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]))
         if not np.isfinite(corners).all():
             return _make_blank(side_px)
-        across_px = np.hypot(*(corners[1] - corners[0]))
-        shrink = _compute_shrink_factor(across_px, side_px)
+        source_px = np.hypot(*(corners[1] - corners[0]))
+        shrink = _compute_shrink_factor(source_px, side_px)
         size = np.array([self._raster.width, self._raster.height])
         low = np.clip(corners.min(axis=0) - 2 * shrink, 0, size).astype(int) // shrink * shrink
         high = np.clip(corners.max(axis=0) + 3 * shrink, 0, size).astype(int) // shrink * shrink
         if (high <= low).any():
             return _make_blank(side_px)
         ground, valid = self._raster.read(tuple(low.tolist()), tuple(high.tolist()), shrink)
-        # Warped to twice the size and averaged, so that no pixel of the file is skipped.
+        # Warp to twice the size and average, so that no pixel of the file is skipped.
         large_px = 2 * side_px
-        drawn = np.array([[0, 0], [large_px, 0], [large_px, large_px], [0, large_px]])
+        target = np.array([[0, 0], [large_px, 0], [large_px, large_px], [0, large_px]])
         view = cv2.getPerspectiveTransform(
-            ((corners - low) / shrink - 0.5).astype(np.float32), (drawn - 0.5).astype(np.float32)
+            ((corners - low) / shrink - 0.5).astype(np.float32), (target - 0.5).astype(np.float32)
         )
         large = (large_px, large_px)
         warped = cv2.warpPerspective(ground, view, large, borderMode=cv2.BORDER_REPLICATE)
         picture = resize(warped, (side_px, side_px))  # type: ignore[arg-type]  # uint8
         warped = cv2.warpPerspective(255 * valid.astype(np.uint8), view, large)
-        # Only pixels that are wholly data: one at the edge is mixed with black, and would form a line around the data.
-        seen = resize(warped, (side_px, side_px)) >= 250  # type: ignore[arg-type]  # uint8
-        if seen.any():
-            picture[~seen] = picture[seen].mean(axis=0)
-        return picture, seen
+        # Only pixels that are entirely data: those at the edge are mixed with black and would outline the data.
+        has_data = resize(warped, (side_px, side_px)) >= 250  # type: ignore[arg-type]  # uint8
+        if has_data.any():
+            picture[~has_data] = picture[has_data].mean(axis=0)
+        return picture, has_data
 
     def close(self) -> None:
         """Close the file."""
@@ -132,14 +132,14 @@ class Orthophoto:
         self._links.cleanup()
 
 
-def _apply_affine(way: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
-    """Apply the affine map `way` to x and y (scalars or arrays). Its own operator differs between releases."""
-    return way.a * x + way.b * y + way.c, way.d * x + way.e * y + way.f
+def _apply_affine(affine: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
+    """Apply an affine transform to x and y (scalars or arrays). Affine's own operator differs between its releases."""
+    return affine.a * x + affine.b * y + affine.c, affine.d * x + affine.e * y + affine.f
 
 
-def _compute_shrink_factor(across_px: float, side_px: int) -> int:
-    """Return by which power of two the pixels of a file are averaged when so many become `side_px`."""
-    return 1 << min(int(np.log2(max(across_px / side_px, 1))), _MAX_HALVINGS)
+def _compute_shrink_factor(source_px: float, side_px: int) -> int:
+    """Return the power of two by which the file is reduced before `source_px` pixels become `side_px`."""
+    return 1 << min(int(np.log2(max(source_px / side_px, 1))), _MAX_HALVINGS)
 
 
 def _make_blank(side_px: int) -> tuple[Image, Bools]:

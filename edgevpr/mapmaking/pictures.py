@@ -1,4 +1,4 @@
-"""The pictures that a map is made of: those of a flight, or those cut from an orthophoto."""
+"""The pictures that a map is made from: taken in flight, or cut from an orthophoto."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlownPictures:
-    """Pictures of a flight. `source`: a folder of images or a video. `positions`: their table of positions (None: the
-    one that `open_source` finds). `rate_hz`: pictures taken per second of a video (None: every frame)."""
+    """Pictures taken in flight. `source`: a folder of images, or a video. `positions`: the table of their positions
+    (None: the one that `open_source` finds). `rate_hz`: pictures to use per second of video (None: every frame)."""
 
     source: str
     positions: Path | None = None
     rate_hz: float | None = None
 
     def open(self, only: Collection[str] | None = None) -> Source:
-        """Open the source. Only pictures whose names are in `only` are read (None: all)."""
+        """Open the source. Only pictures named in `only` are read (None: all)."""
         step_s = 1 / self.rate_hz if self.rate_hz else None
         return open_source(self.source, step_s=step_s, positions=self.positions, live=False, only=only)
 
@@ -33,12 +33,12 @@ class FlownPictures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cuttings:
-    """Pictures that are cut from an orthophoto, at the places of a grid.
+    """Pictures cut from an orthophoto at the points of a grid.
 
-    `orthophoto`: see `Orthophoto`. `footprint_m`: ground length of a picture's side, or several, each of which gives a
-    picture of every place. `spacing_m`: distance between neighbouring places. `area`: file or circle that limits the
-    places, see `missions.read_area` (None: the whole orthophoto). `attribution`: the owner's words, which a map keeps
-    (None: none are asked for)."""
+    `orthophoto`: see `Orthophoto`. `footprint_m`: length of a picture's side on the ground, or several lengths, each of
+    which gets a grid of its own. `spacing_m`: distance between neighbouring points. `area`: file or circle that limits
+    the places, see `missions.read_area` (None: the whole orthophoto). `attribution`: credit line that the owner
+    requires, stored in the map (None: not required)."""
 
     orthophoto: str
     footprint_m: float | Sequence[float]
@@ -47,8 +47,8 @@ class Cuttings:
     attribution: str | None = None
 
     def open(self, only: Collection[str] | None = None) -> "OrthophotoSource":
-        """Open the orthophoto and choose the places. Only pictures whose names are in `only` are cut (None: all).
-        Raises SourceError if it cannot be opened, and UsageError if grid and area do not fit it."""
+        """Open the orthophoto and choose the places. Only pictures named in `only` are cut (None: all).
+        Raises SourceError if it cannot be opened, and UsageError if the grid or the area does not fit it."""
         from edgevpr.mapmaking.cuttings import open_cuttings  # loads GDAL, or raises if it is missing
 
         return open_cuttings(self, only)

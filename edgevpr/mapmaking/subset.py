@@ -1,4 +1,4 @@
-"""The part of a map, or of a folder of maps, that one flight needs: what lies near its mission."""
+"""Cuts out the part of a map, or of a folder of maps, that one flight needs: the places near its mission."""
 
 import shutil
 import tempfile
@@ -17,9 +17,9 @@ from edgevpr.places.mapfile import PlaceMap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Subset:
-    """A map that was made for one flight. `maps`: number of those that it was made of. `near`: places near the mission,
-    of which the best `places` are in it. `file_bytes`: its size. `lost_calibration`: it is of several
-    maps, one of which was calibrated, and is not."""
+    """A map made for one flight. `maps`: number of maps that it was made from. `near`: number of places near the
+    mission; the best `places` of these are in the map. `file_bytes`: its size. `lost_calibration`: it was merged from
+    several maps, at least one of which was calibrated, and is not calibrated itself."""
 
     maps: int
     near: int
@@ -31,9 +31,9 @@ class Subset:
 def make_subset(
     source: Path, area: Area, margin_m: float, out: Path, max_bytes: float | None, progress: Progress
 ) -> Subset:
-    """Make the map `out` of the places of `source`, a map or a folder of maps, that are within `margin_m` metres of an
-    area: as many as fit into `max_bytes` (None: all), the best, spread over the ground. Raises UsageError if there are
-    none or none fits, and MapError for a map that cannot be read."""
+    """Make the map `out` from the places of `source`, a map or a folder of maps, within `margin_m` metres of an area.
+    If `max_bytes` (None: no limit) cannot hold all of them, the best are kept, spread over the ground. Raises
+    UsageError if there are no such places or none fits, and MapError if a map cannot be read."""
     south, west, north, east = area.extent_deg
 
     def project(lat_deg: Doubles, lon_deg: Doubles) -> tuple[Doubles, Doubles]:
@@ -44,33 +44,37 @@ def make_subset(
     for path in _list_maps(source):
         with PlaceMap.open(path) as place_map:
             place_ids, lat_deg, lon_deg = read_place_positions(place_map)
-            if there := place_ids[shapely.contains_xy(ground, *project(lat_deg, lon_deg))].tolist():
-                ids_near[path] = there
+            if near_ids := place_ids[shapely.contains_xy(ground, *project(lat_deg, lon_deg))].tolist():
+                ids_near[path] = near_ids
     paths, lost_calibration = list(ids_near), False
     with mapfiles.write_atomically(out) as unfinished, tempfile.TemporaryDirectory(dir=out.parent) as scratch:
-        whole, made = Path(scratch) / "near.gpkg", Path(scratch) / "small.gpkg"
+        all_near, best_near = Path(scratch) / "near.gpkg", Path(scratch) / "small.gpkg"
         if len(paths) == 1:
-            near = copy_places(paths[0], whole, ids_near[paths[0]])
+            near = copy_places(paths[0], all_near, ids_near[paths[0]])
         elif paths:
-            counts, lost_calibration = merge_maps(paths, whole, progress, list(ids_near.values()))
+            counts, lost_calibration = merge_maps(paths, all_near, progress, list(ids_near.values()))
             near = sum(copied for copied, _ in counts)
         if not paths or not near:
-            raise UsageError(f"No place of {source} is within {margin_m:g} m of the mission: check both or the margin.")
-        count, file_bytes = near, whole.stat().st_size
+            raise UsageError(
+                f"No place of {source} is within {margin_m:g} m of the mission: check both, or give a larger --margin-m."
+            )
+        count, file_bytes = near, all_near.stat().st_size
         if max_bytes is not None and file_bytes > max_bytes:
             count = int(near * max_bytes / file_bytes)
             if not count:
-                raise UsageError(f"A place takes {file_bytes / near / 1e6:.3f} MB, and {max_bytes / 1e6:g} hold none.")
-            shrink_map(whole, made, count, progress)
-        shutil.move(made if count < near else whole, unfinished)
+                raise UsageError(
+                    f"A place needs {file_bytes / near / 1e6:.3f} MB, so {max_bytes / 1e6:g} MB hold none: allow more."
+                )
+            shrink_map(all_near, best_near, count, progress)
+        shutil.move(best_near if count < near else all_near, unfinished)
         size = unfinished.stat().st_size
     return Subset(maps=len(paths), near=near, places=count, file_bytes=size, lost_calibration=lost_calibration)
 
 
 def _list_maps(source: Path) -> list[Path]:
-    """Return the maps to look into: one map, or those of a folder. Raises MapError if there is none."""
+    """Return the paths of the maps in `source`: one map, or a folder of maps. Raises MapError if there is none."""
     if not source.is_dir():
         return [mapfiles.require_map_file(source)]
     if not (paths := sorted(source.glob("*.gpkg"))):
-        raise MapError(f"{source} holds no map (*.gpkg): give a folder of maps, or one map.")
+        raise MapError(f"{source} contains no map (*.gpkg): give a map, or a folder of maps.")
     return paths

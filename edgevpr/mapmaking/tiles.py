@@ -1,5 +1,5 @@
-"""Map tiles (zoom/x/y: squares of the Web Mercator projection) of a folder, described for GDAL's driver WMS, which
-joins them."""
+"""Describes a folder of map tiles (zoom/x/y, squares of the Web Mercator projection) for GDAL's WMS driver, which joins
+them into one raster."""
 
 from pathlib import Path
 from typing import TypeGuard
@@ -13,15 +13,15 @@ from edgevpr.core.errors import SourceError
 from edgevpr.mapmaking.georaster import HALF_WORLD_M
 
 _TILE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
-_TMS_RESOURCE = "tilemapresource.xml"  # by OSGeo's Tile Map Service, whose y counts from the south
+_TMS_RESOURCE = "tilemapresource.xml"  # marks OSGeo's Tile Map Service, whose rows are numbered from the south
 _MAX_JOINS = 50
-_MAX_DIFFERENCE_RATIO = 0.5  # ratio of the differences along two edges; of tiles that do not join it is near 1
+_MAX_DIFFERENCE_RATIO = 0.5  # of the differences along tile edges, opposite to expected order; near 1 if neither joins
 
 
 def describe_folder(folder: Path, links: Path) -> str:
-    """Return what GDAL opens as the tiles of the highest zoom in a folder. It reads them by links in the folder
-    `links`, which are named from the north. Raises SourceError if there are none, or if their rows count otherwise than
-    is said."""
+    """Return the GDAL data set description for the tiles of the highest zoom level in `folder`. GDAL reads them through
+    symlinks in `links`, whose rows are numbered from the north (XYZ). Raises SourceError if there are no tiles, or if
+    the row numbering (XYZ or TMS) does not match what the folder declares."""
     tiles = {
         tuple(map(int, (*path.parts[-3:-1], path.stem))): path
         for path in folder.glob("*/*/*")
@@ -32,8 +32,8 @@ def describe_folder(folder: Path, links: Path) -> str:
     first = next(filter(_is_square, (cv2.imread(str(path)) for path in tiles.values())), None)
     if first is None:
         raise SourceError(
-            f"{folder} holds no map tiles (PNG, JPEG or WebP, square, of 256 or 512 pixels): give another, or the "
-            "folder above the zooms (z/x/y.png)."
+            f"{folder} contains no map tiles (square PNG, JPEG or WebP of 256 or 512 pixels): give another folder, or "
+            "the one that contains the zoom levels (z/x/y.png)."
         )
     if (folder / _TMS_RESOURCE).exists():
         tiles = {(zoom, x, 2**zoom - 1 - y): path for (_, x, y), path in tiles.items()}
@@ -43,7 +43,7 @@ def describe_folder(folder: Path, links: Path) -> str:
         (links / str(x) / str(y)).symlink_to(path.absolute())
     (_, left, top), (_, right, bottom) = (edge(list(tiles), axis=0).tolist() for edge in (np.min, np.max))
     across, down, side_px, tile_m = right + 1 - left, bottom + 1 - top, len(first), 2 * HALF_WORLD_M / 2**zoom
-    # A tile that is not there is transparent, and coarser zooms are not asked for.
+    # Missing tiles are transparent, and GDAL does not request coarser zoom levels.
     return f"""<GDAL_WMS>
 <Service name="TMS"><ServerUrl>file://{escape(str(links))}/${{x}}/${{y}}</ServerUrl></Service>
 <DataWindow>
@@ -61,23 +61,21 @@ def describe_folder(folder: Path, links: Path) -> str:
 
 
 def _require_joining_rows(folder: Path, tiles: dict[tuple[int, ...], Path]) -> None:
-    """Raise SourceError if the rows of tiles, named from the north, join clearly better the other way round."""
+    """Raise SourceError if the rows of tiles, numbered from the north, join clearly better in the opposite order."""
     pairs = [(path, tiles[zoom, x, y + 1]) for (zoom, x, y), path in tiles.items() if (zoom, x, y + 1) in tiles]
-    named, other = [0.0], [0.0]
+    expected, opposite = [0.0], [0.0]
     for paths in pairs[:: max(1, len(pairs) // _MAX_JOINS)]:
         upper, lower = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths)
         if _is_square(upper) and _is_square(lower) and upper.shape == lower.shape:
-            named.append(float(cv2.absdiff(upper[-1], lower[0]).mean()))
-            other.append(float(cv2.absdiff(lower[-1], upper[0]).mean()))
-    if sum(other) >= _MAX_DIFFERENCE_RATIO * sum(named):
+            expected.append(float(cv2.absdiff(upper[-1], lower[0]).mean()))
+            opposite.append(float(cv2.absdiff(lower[-1], upper[0]).mean()))
+    if sum(opposite) >= _MAX_DIFFERENCE_RATIO * sum(expected):
         return
     if (folder / _TMS_RESOURCE).exists():
-        advice = f"from the north, and {_TMS_RESOURCE} says from the south: remove it if the tiles were written so"
+        advice = f"north, but {_TMS_RESOURCE} declares them from the south: remove that file if it is wrong"
     else:
-        advice = (
-            f"from the south (TMS): write them with `gdal2tiles --xyz`, or put their {_TMS_RESOURCE} beside the zooms"
-        )
-    raise SourceError(f"{folder}: the rows of its tiles join only if y counts {advice}.")
+        advice = f"south (TMS): write them with `gdal2tiles --xyz`, or put {_TMS_RESOURCE} next to the zoom levels"
+    raise SourceError(f"{folder}: the tiles only join if their rows are numbered from the {advice}.")
 
 
 def _is_square(tile: object) -> TypeGuard[Image]:

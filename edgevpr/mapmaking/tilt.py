@@ -1,8 +1,8 @@
-"""The tilt of a camera that neighbouring images show by themselves, before a map is made of them.
+"""Measures the tilt of a camera from neighbouring images, before a map is made from them.
 
-Over flat ground all points of a level camera's image move alike from one image to the next, but for a rotation and a
-scale. Seen by a tilted camera the near ground moves farther than the far ground: the motion grows across the image by
-its amount times tan(tilt) over the focal length.
+Over flat ground all image points of a level camera move equally between images, apart from a rotation and a scale. With
+a tilted camera, near ground moves farther than distant ground: relative to its size, the motion changes across the
+image by tan(tilt) / focal length.
 """
 
 import math
@@ -14,39 +14,40 @@ import numpy as np
 
 from edgevpr.core.arrays import Doubles, Image
 
-MAX_UNKNOWN_TILT_DEG = 20.0  # beyond it the ground in the middle lies far from the aircraft: by a third of its height
+MAX_UNKNOWN_TILT_DEG = 20.0  # at this tilt the image centre is a third of the height away from the point below
 TYPICAL_FOV_DEG = 66.0
 MIN_PAIRS = 8
 _WIDTH_PX = 640
 FEATURES = 1500
 _REPROJECTION_PX = 3.0
 _MIN_INLIERS = 40
-_MIN_EXTENT = 0.25  # of the longest side, in both directions: points in a corner do not show how motion varies
+_MIN_EXTENT = 0.25  # of the longest side, in both directions: clustered points do not show how motion varies
 _MIN_MOTION = 0.1  # of the longest side
-_MIN_SIGMA = 3.0  # of the median: hills tilt single pairs by more than cameras are tilted
-_MEDIAN_SD = 1.86  # standard deviation of a median of n normal values over their median absolute deviation / sqrt(n)
+_MIN_SIGMA = 3.0  # of the median: in single pairs, hills look like more tilt than cameras have
+_MEDIAN_SD = 1.86  # standard deviation of the median of n normal values, in median absolute deviations / sqrt(n)
 
 
 class Tilt(NamedTuple):
-    """Tilt of a camera from straight down in degrees, as `pairs` of images show it: rather too small, by up to a third,
-    since the far ground has fewer features."""
+    """Tilt of a camera from straight down in degrees, measured from `pairs` image pairs. It is underestimated by up to
+    a third, because distant ground has fewer features."""
 
     deg: float
     pairs: int
 
 
 def measure_tilt(images: Iterable[Image], fov_deg: float | None = None) -> Tilt | None:
-    """Return the tilt that neighbours among `images` show; None if fewer than MIN_PAIRS overlap well, or show none.
+    """Return the tilt measured from neighbouring `images`; None if fewer than MIN_PAIRS pairs overlap well, or if the
+    tilt is not significant.
 
-    `images` are uint8 (H, W[, 3]), in the order of flight. `fov_deg` is the field of view of the longest side; None:
-    unknown, then TYPICAL_FOV_DEG."""
+    `images` are uint8 (H, W[, 3]), in flight order. `fov_deg` is the field of view along the longest side (None:
+    unknown, TYPICAL_FOV_DEG is assumed)."""
     orb = cv2.ORB.create(FEATURES)
     slopes: list[Doubles] = []
     reference: Features | None = None
     for features in filter(None, (detect_features(orb, image) for image in images)):
         motion = _measure_motion(reference, features) if reference else None
         if motion and motion.length < _MIN_MOTION:
-            continue  # taken in quick succession: the next one shows more
+            continue  # taken in quick succession, so wait for an image with more motion
         if motion:
             slopes.append(motion.slope)
         reference = features
@@ -61,7 +62,8 @@ def measure_tilt(images: Iterable[Image], fov_deg: float | None = None) -> Tilt 
 
 
 class Features(NamedTuple):
-    """Features of an image: `points` (n, 2), shares of its longest side from its middle, and their descriptors."""
+    """Features of an image: `points` (n, 2), as offsets from its centre in shares of its longest side, and their
+    descriptors."""
 
     points: Doubles
     descriptors: np.ndarray
@@ -71,16 +73,15 @@ def detect_features(orb: cv2.ORB, image: Image) -> Features | None:
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     scale = min(1.0, _WIDTH_PX / max(grey.shape))
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    found, descriptors = orb.detectAndCompute(small, None)
-    if not found:
+    keypoints, descriptors = orb.detectAndCompute(small, None)
+    if not keypoints:
         return None
     middle = np.array(small.shape[1::-1]) / 2
-    return Features((np.array([point.pt for point in found]) - middle) / max(small.shape), descriptors)
+    return Features((np.array([keypoint.pt for keypoint in keypoints]) - middle) / max(small.shape), descriptors)
 
 
 def match_features(before: Features, after: Features) -> tuple[Doubles, Doubles] | None:
-    """Return the points (n, 2) of the same ground in two images, both as shares of the longest side from the middle;
-    None if they are too few."""
+    """Return the matched points (n, 2) of two images, each as in `Features`; None if there are too few."""
     matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(before.descriptors, after.descriptors)
     if len(matches) < _MIN_INLIERS:
         return None
@@ -94,26 +95,25 @@ def match_features(before: Features, after: Features) -> tuple[Doubles, Doubles]
 
 
 class _Motion(NamedTuple):
-    """Motion from one image to the next: its `length` in the middle, a share of the longest side, and how it varies
-    across the image, `slope` (2,): its relative change per longest side to the right and down, which is the tangent of
-    the tilt over the focal length."""
+    """Motion between two images. `length`: motion at the centre, in shares of the longest side. `slope` (2,): relative
+    change of the motion per longest side, to the right and down, which is tan(tilt) / focal length."""
 
     length: float
     slope: Doubles
 
 
 def _measure_motion(before: Features, after: Features) -> _Motion | None:
-    """Return the motion between two images; None if they share too little."""
+    """Return the motion between two images; None if they share too little ground."""
     pairs = match_features(before, after)
     if pairs is None:
         return None
     start, end = pairs
     if np.ptp(start, axis=0).min() < _MIN_EXTENT:
         return None
-    at = np.column_stack([np.ones(len(start)), (start + end) / 2])
-    (motion, *slopes), *_ = np.linalg.lstsq(at, end - start, rcond=None)
-    # The slope of the motion is the motion times `slope`, a change of scale and a rotation.
+    locations = np.column_stack([np.ones(len(start)), (start + end) / 2])
+    (motion, *slopes), *_ = np.linalg.lstsq(locations, end - start, rcond=None)
+    # The gradient of the motion is the sum of motion times `slope`, a change of scale and a rotation.
     right, down = motion
     parts = [[right, 0, 1, 0], [0, right, 0, -1], [down, 0, 0, 1], [0, down, 1, 0]]
-    found, *_ = np.linalg.lstsq(np.array(parts), np.column_stack(slopes).ravel(), rcond=None)
-    return _Motion(float(np.hypot(*motion)), np.asarray(found[:2]))
+    solution, *_ = np.linalg.lstsq(np.array(parts), np.column_stack(slopes).ravel(), rcond=None)
+    return _Motion(float(np.hypot(*motion)), np.asarray(solution[:2]))

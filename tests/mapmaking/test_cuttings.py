@@ -104,10 +104,10 @@ def test_an_area_keeps_what_lies_near_its_path(tmp_path):
         (0, 20, "--footprint-m is 0"),
         (-5, 20, "--footprint-m is -5"),
         (float("nan"), 20, "--footprint-m is nan"),
-        (500, 20, "--footprint-m is 500, and .* is 16. m by 16. m"),
+        (500, 20, "--footprint-m is 500, but .* 16. m by 16. m"),
         (80, 0, "--spacing-m is 0"),
         (80, 1000, "--spacing-m is 1000"),
-        (80, 0.01, "give --spacing-m 1, or an --area"),
+        (80, 0.01, "give --spacing-m 1, or"),
     ],
 )
 def test_a_grid_that_makes_no_sense_is_refused(tmp_path, footprint_m, spacing_m, said):
@@ -119,7 +119,9 @@ def test_a_grid_that_makes_no_sense_is_refused(tmp_path, footprint_m, spacing_m,
 def test_an_area_elsewhere_is_refused_with_both_extents(tmp_path):
     orthophoto = Orthophoto(marked_raster(tmp_path / "o.tif"))
     for way in (Waypoint(-35.36, 149.16), waypoint(3000, 0)):
-        with pytest.raises(UsageError, match=r"does not touch .* north, .* east, the orthophoto at 49\.99.* east\.$"):
+        with pytest.raises(
+            UsageError, match=r"does not overlap .* north, .* east, the orthophoto over 49\.99.* east\.$"
+        ):
             make_lattice(orthophoto, 40.0, 10.0, Area(path=(way,)))
     for off_m in (15.5, 4.0):  # between places, and so near to a row that its box holds one of either
         with pytest.raises(UsageError, match="10 m"):

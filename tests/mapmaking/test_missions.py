@@ -81,7 +81,7 @@ def test_an_empty_area_one_beyond_the_globe_and_a_foreign_file_are_refused(tmp_p
     for empty in ("QGC WPL 110\n", {"fileType": "Plan", "mission": {"items": []}}):
         with pytest.raises(UsageError, match="no position"):
             read_area(written(tmp_path, empty))
-    with pytest.raises(UsageError, match="globe"):
+    with pytest.raises(UsageError, match="invalid coordinates"):
         read_area(written(tmp_path, "QGC WPL 110\n0 1 3 16 0 0 0 0 5542661 707819 0 1"))
     (tmp_path / "picture").write_bytes(b"\xff\xd8\xff\xe0")
     with pytest.raises(UsageError, match="save"):

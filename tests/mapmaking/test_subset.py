@@ -110,6 +110,6 @@ def test_map_subset_of_several_calibrated_maps_is_not_calibrated_and_says_so(til
 def test_what_cannot_be_taken_is_said_and_leaves_nothing(tiles, tmp_path):
     with pytest.raises(UsageError, match=r"No place of .* is within 50 m of the mission"):
         make_subset(tiles, path_over((5000, 0)), 50.0, tmp_path / "f.gpkg", None, iterate_silently)
-    with pytest.raises(MapError, match="holds no map"):
+    with pytest.raises(MapError, match="contains no map"):
         make_subset(tmp_path, path_over((0, 0)), 50.0, tmp_path / "f.gpkg", None, iterate_silently)
     assert not list(tmp_path.iterdir())

@@ -81,7 +81,7 @@ def test_a_folder_counts_its_rows_as_its_tiles_join_or_is_refused(tmp_path):
     found, _ = cut(joined(tmp_path / "tms", from_south=True, says_from_south=True))
     assert np.array_equal(found, expected)
     assert "gdal2tiles --xyz" in refused(joined(tmp_path / "silent", from_south=True))
-    assert "remove it" in refused(joined(tmp_path / "wrong", says_from_south=True))
+    assert "remove that file" in refused(joined(tmp_path / "wrong", says_from_south=True))
 
 
 def test_a_folder_may_mix_formats_and_have_gaps_and_damage_is_named(tmp_path):
