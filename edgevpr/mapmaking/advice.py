@@ -1,11 +1,11 @@
-"""Advice on the pictures of a flight before a map is made of them: where the camera looks, whether a display is drawn
-over the pictures, and what the map will lack.
+"""Checks the pictures of a flight before a map is made from them: which way the camera points, whether an on-screen
+display covers part of the pictures, and what the map will lack.
 
-Neighbouring pictures of a camera that looks ahead grow, and are neither turned nor moved up or down. Those of one that
-looks straight down move in any direction, and turn. A few pairs of neighbours are compared by their landmarks.
+From one picture of a forward camera to the next, the scene grows, but neither rotates nor moves up or down. With a
+camera that looks straight down, it moves in any direction and rotates. Landmarks of a few neighbouring pairs show this.
 
-The edges of moving ground point anywhere, so they vanish in the mean of many pictures. Those of a display, or of the
-aircraft itself, stay.
+The edges of moving ground have random directions, so they cancel in the mean of many pictures. Those of a display, or
+of the aircraft itself, remain.
 """
 
 import logging
@@ -35,40 +35,40 @@ from edgevpr.runtime.recognise.calibration import MIN_PLACES
 from edgevpr.runtime.recognise.landmarks import detect_landmarks
 
 _log = logging.getLogger(__name__)
-_RUN_COUNT = 6  # of neighbouring pictures that are compared, spread over the folder
+_RUN_COUNT = 6  # runs of neighbouring pictures to compare, spread over the folder
 _RUN_LENGTH = 3
-_TILT_RUN_LENGTH = 12  # those of a video are so close together that only every third or fourth has moved
+_TILT_RUN_LENGTH = 12  # frames of a video are so close together that only every third or fourth shows motion
 _VIDEO_PICTURES = 10  # of a video, a second apart
 _TILT_VIDEO_PICTURES = 60
 _MAX_LANDMARKS = 500
-# Limits chosen on corridor and grief_stromovka_seasons (ahead: turned by 12 degrees and moved up by 0.07 at most), and
-# on aerial_caliterra and aerial_garfield28. Turning on the spot moves pictures aside too: nearly all must be.
-_MIN_TURN_DEG = 15.0
+# Chosen on corridor and grief_stromovka_seasons (forward: at most 12 degrees and 0.07 of vertical motion), and on
+# aerial_caliterra and aerial_garfield28. Yaw moves the scene sideways too, so nearly all pairs must show such motion.
+_MIN_ROTATION_DEG = 15.0
 _MIN_UP_SHARE = 0.1
-_MIN_ASIDE_SHARE = 0.3
-_MAX_GROWTH_ASIDE = 0.03
-_MIN_CLEAR_PAIRS = 3  # pairs that are turned or moved up, and their share of all that show the same ground
-_MIN_CLEAR_SHARE = 0.2
-_MIN_PAIRS = 6  # the same, together with those moved aside
+_MIN_SIDEWAYS_SHARE = 0.3
+_MAX_SIDEWAYS_GROWTH = 0.03
+_MIN_CLEAR_PAIRS = 3  # pairs with rotation or vertical motion
+_MIN_CLEAR_SHARE = 0.2  # and their share of all pairs that show the same ground
+_MIN_PAIRS = 6  # the same, including pairs with sideways motion
 _MIN_SHARE = 0.75
 _MAX_DOWN_DEG = 25.0  # tilt of a gimbal from straight down
-_MIN_AHEAD_DEG = 45.0
-_MAX_USEFUL_HZ = 4.0  # more places a second of a video show nearly the same
-_DISPLAY_SHAPE = 240, 320  # rows and columns of the small pictures in which a display is looked for
-_DISPLAY_PICTURES = 24  # spread over all
-_MIN_DISPLAY_PICTURES = 12  # fewer say nothing
-_MIN_EDGE = 5.0  # grey levels a pixel: weaker ones are noise
-_MIN_KEPT_SHARE = 0.9  # of the strength of an edge that is left in the mean, from which on it stands still
-# Of the pixels. A display has 0.03 to 0.04, two figures and a cross alone 0.006 to 0.009. Of the sets, those from the
-# air have 0.0003 at most, and nordland_tiny, with its rails, 0.005. In corridor, whose walls run along the picture's
-# edges, 0.09 stand still.
+_MIN_FORWARD_DEG = 45.0
+_MAX_USEFUL_HZ = 4.0  # places per second of a video; more of them look nearly the same
+_DISPLAY_SHAPE = 240, 320  # rows and columns of the reduced pictures in which a display is detected
+_DISPLAY_PICTURES = 24  # spread over the whole flight
+_MIN_DISPLAY_PICTURES = 12  # fewer are not conclusive
+_MIN_EDGE = 5.0  # grey levels per pixel; weaker edges are noise
+_MIN_KEPT_SHARE = 0.9  # of the strength of an edge that remains in the mean, if the edge is static
+# Share of pixels on static edges. A display has 0.03 to 0.04; two numbers and a cross alone have 0.006 to 0.009. Aerial
+# sets have at most 0.0003, and nordland_tiny, with its rails, 0.005. In corridor, whose walls run along the picture's
+# edges, it is 0.09.
 _MIN_DISPLAY_SHARE = 0.006
-_MAX_STILL_EDGES = 0.5  # share of all edges: with more the camera itself stood still
+_MAX_STILL_EDGES = 0.5  # share of all edges; beyond, the camera itself did not move
 
 
 def warn_of_gaps(pictures: FlownPictures, total: int, places: int | None) -> None:
-    """Warn of what the map will lack. `total`: number of frames (0: unknown). `places`: number of places in the map
-    already (None: the map is not to be calibrated)."""
+    """Warn about what the map will lack. `total`: number of frames (0: unknown). `places`: number of places already in
+    the map (None: the map will not be calibrated)."""
     uri, is_placed = pictures.source, (pictures.positions or find_track(pictures.source)) is not None
     if pictures.folder:
         table = pictures.positions or find_positions(uri)
@@ -76,55 +76,55 @@ def warn_of_gaps(pictures: FlownPictures, total: int, places: int | None) -> Non
         paths = [path for run in _choose_runs(pictures.folder) for path in run]
         is_placed = any((tags.get(path.name) or read_exif(path)).position for path in paths)
     elif not pictures.rate_hz:
-        with closing(_open_video(uri)) as film:
-            lasts_s = film.total
-        if total > _MAX_USEFUL_HZ * lasts_s:
-            text = "every frame of %s becomes a place, %d in %d s: --rate-hz 1 makes %d"
-            _log.warning(text, uri, total, lasts_s, lasts_s)
+        with closing(_open_video(uri)) as video:
+            duration_s = video.total
+        if total > _MAX_USEFUL_HZ * duration_s:
+            text = "every frame of %s becomes a place, %d in %d s: give --rate-hz 1 to make only %d"
+            _log.warning(text, uri, total, duration_s, duration_s)
     if not is_placed:
         _log.warning(
-            "no position was found, and without one no fix can be sent: run edgevpr positions %s --images %s",
+            "no positions were found, and no fix can be sent without them: run edgevpr positions %s --images %s",
             next(Path(uri).parent.glob(f"{Path(uri).stem}.[sS][rR][tT]"), "LOG_OR_TRACK"),
             uri,
         )
     if total and places is not None and total + places < MIN_PLACES:
-        text = "%d places at most: a map of fewer than %d cannot be calibrated, and finds little: give more pictures"
+        text = "at most %d places: a map of fewer than %d cannot be calibrated and finds little: give more pictures"
         _log.warning(text, total + places, MIN_PLACES)
 
 
 def suggest_lens(pictures: FlownPictures, config: SourceConfig, technique: Technique) -> None:
-    """Log the field of view of the lens by the EXIF data of a picture, if it is not configured: without it pictures of
-    a camera that looks down are neither untilted nor scaled."""
+    """If no field of view is configured, log the one in a picture's EXIF data: without it, pictures of a camera that
+    looks down can be neither levelled nor scaled."""
     is_needed = technique.spec.parameters.get("camera") == "nadir" and config.fov_deg is None and config.lens is None
     if (
         is_needed
         and pictures.folder
         and (fov_deg := read_fov_deg(next(iter(list_images(pictures.folder))))) is not None
     ):
-        text = "EXIF: field of view about %.0f deg: with --fov-deg %.0f, here and in flight, positions are finer"
+        text = "EXIF: field of view about %.0f deg: give --fov-deg %.0f, here and in flight, for better positions"
         _log.info(text, fov_deg, fov_deg)
 
 
-@show_elapsed("looking where the camera looks")
+@show_elapsed("checking which way the camera points")
 def require_forward_camera(pictures: FlownPictures, mask: OverlayMask | None) -> None:
-    """Log that the camera is taken to look ahead, and why. Raises UsageError if the pictures clearly look straight
-    down: the user must say then what is meant."""
+    """Log that the camera is assumed to look ahead, and why. Raises UsageError if the pictures clearly look straight
+    down; the user must then say which is meant."""
     tilt_deg = _read_gimbal_tilt_deg(pictures.folder) if pictures.folder else None
-    if tilt_deg is not None and not _MAX_DOWN_DEG < tilt_deg < _MIN_AHEAD_DEG:
-        is_down, why = tilt_deg <= _MAX_DOWN_DEG, f"XMP data: {tilt_deg:.0f} degrees from straight down"
+    if tilt_deg is not None and not _MAX_DOWN_DEG < tilt_deg < _MIN_FORWARD_DEG:
+        is_down, why = tilt_deg <= _MAX_DOWN_DEG, f"XMP data: tilted {tilt_deg:.0f} degrees from straight down"
     else:
         is_down, why = _compare_neighbours(pictures, mask)
     if is_down:
         raise UsageError(
             f"These pictures look straight down ({why}): give --camera nadir, or --camera forward if they look ahead."
         )
-    _log.info("the camera is taken to look ahead (%s): give --camera nadir if it looks straight down", why)
+    _log.info("assuming that the camera looks ahead (%s): give --camera nadir if it looks straight down", why)
 
 
 @show_elapsed("measuring the tilt of the camera")
 def require_level_camera(pictures: FlownPictures, fov_deg: float | None) -> None:
-    """Raise UsageError if neighbouring pictures show that a camera that is to look straight down is tilted, and its
-    angles are not recorded: then nothing could level them."""
+    """Raise UsageError if neighbouring pictures show that a camera that should look straight down is tilted, and its
+    angles are not recorded, so that the pictures cannot be levelled."""
     if pictures.folder:
         paths = [path for run in _choose_runs(pictures.folder, _TILT_RUN_LENGTH) for path in run]
         table = pictures.positions or find_positions(pictures.source)
@@ -139,41 +139,41 @@ def require_level_camera(pictures: FlownPictures, fov_deg: float | None) -> None
         tilt = measure_tilt(_read_video(pictures.source, _TILT_VIDEO_PICTURES), fov_deg)
     if tilt and tilt.deg > MAX_UNKNOWN_TILT_DEG:
         raise UsageError(
-            f"The camera is tilted by {tilt.deg:.0f} degrees or more from straight down (by {tilt.pairs} pairs of "
-            "neighbouring images), and no angles are recorded: every position would be far off. Add roll_deg and "
-            "pitch_deg to the table of positions and give --fov-deg, or give --camera forward."
+            f"The camera is tilted by {tilt.deg:.0f} degrees or more from straight down (measured from {tilt.pairs} "
+            "pairs of neighbouring images), and its angles are not recorded, so every position would be far off. Add "
+            "roll_deg and pitch_deg to the table of positions and give --fov-deg, or give --camera forward."
         )
 
 
 def _compare_neighbours(pictures: FlownPictures, mask: OverlayMask | None) -> tuple[bool, str]:
-    """Compare neighbouring pictures. Returns whether they clearly look down, and what was found, as text."""
+    """Compare neighbouring pictures. Returns whether they clearly look down, and the reason as text."""
     folder = pictures.folder
     runs = map(_read_usable, _choose_runs(folder)) if folder else [_read_video(pictures.source, _VIDEO_PICTURES)]
-    pairs, clear, aside = 0, 0, 0
+    pairs, clear, sideways = 0, 0, 0
     for run in runs:
         marks = [detect_landmarks(image, mask.fit_to(image) if mask else None, _MAX_LANDMARKS) for image in run]
-        for seen in (measure_agreement(one, other) for one, other in pairwise(marks)):
+        for match in (measure_agreement(first, second) for first, second in pairwise(marks)):
             if (
-                seen.inliers < MIN_PROVEN_INLIERS
-                or seen.shift_share is None
-                or seen.rotation_deg is None
-                or seen.scale is None
+                match.inliers < MIN_PROVEN_INLIERS
+                or match.shift_share is None
+                or match.rotation_deg is None
+                or match.scale is None
             ):
                 continue
             pairs += 1
-            if abs(wrap_deg(seen.rotation_deg)) >= _MIN_TURN_DEG or abs(seen.shift_share[1]) >= _MIN_UP_SHARE:
+            if abs(wrap_deg(match.rotation_deg)) >= _MIN_ROTATION_DEG or abs(match.shift_share[1]) >= _MIN_UP_SHARE:
                 clear += 1
-            elif abs(seen.shift_share[0]) >= _MIN_ASIDE_SHARE and abs(seen.scale - 1) <= _MAX_GROWTH_ASIDE:
-                aside += 1
-    is_down = clear >= max(_MIN_CLEAR_PAIRS, _MIN_CLEAR_SHARE * pairs) or clear + aside >= max(
+            elif abs(match.shift_share[0]) >= _MIN_SIDEWAYS_SHARE and abs(match.scale - 1) <= _MAX_SIDEWAYS_GROWTH:
+                sideways += 1
+    is_down = clear >= max(_MIN_CLEAR_PAIRS, _MIN_CLEAR_SHARE * pairs) or clear + sideways >= max(
         _MIN_PAIRS, _MIN_SHARE * pairs
     )
-    return is_down, f"of {pairs} pairs of neighbours, {clear} are turned or moved up or down, and {aside} aside"
+    return is_down, f"of {pairs} pairs of neighbours, {clear} rotate or move up or down, and {sideways} move sideways"
 
 
-@show_elapsed("looking for a display")
+@show_elapsed("checking for an on-screen display")
 def warn_of_display(pictures: FlownPictures, mask: OverlayMask | None) -> None:
-    """Warn if something stands still in the pictures where `mask` shows ground (None: everywhere)."""
+    """Warn if something in the pictures does not move where `mask` shows ground (None: everywhere)."""
     if pictures.folder:
         paths = list_images(pictures.folder)
         spread = np.unique(np.linspace(0, len(paths) - 1, _DISPLAY_PICTURES, dtype=int))
@@ -183,15 +183,15 @@ def warn_of_display(pictures: FlownPictures, mask: OverlayMask | None) -> None:
     share = measure_still_share(images, mask)
     if share is not None and share >= _MIN_DISPLAY_SHARE:
         text = (
-            "%.1f %% of the picture stands still from picture to picture, as a display or a part of the aircraft does: "
-            "places are then taken for one another, or none is accepted. Black it out by --mask PNG, also in flight"
+            "%.1f %% of the picture never changes: probably a display or a part of the aircraft. It would make places "
+            "look alike, so that they are confused or none is accepted. Mask it with --mask PNG, here and in flight"
         )
         _log.warning(text, 100 * share)
 
 
 def measure_still_share(images: Iterable[Image], mask: OverlayMask | None) -> float | None:
-    """Return the share (0..1) of the pixels of `images` that lie on an edge that stands still, where `mask` shows
-    ground (None: everywhere). None if they are too few to tell, or if the camera itself stood still."""
+    """Return the share (0..1) of the pixels of `images` that lie on a static edge, where `mask` shows ground (None:
+    everywhere). None if there are too few images, or if the camera itself did not move."""
     count, allowed = 0, np.ones(_DISPLAY_SHAPE, bool)
     x, y, strength = np.zeros((3, *_DISPLAY_SHAPE), np.float32)
     for image in images:
@@ -206,7 +206,7 @@ def measure_still_share(images: Iterable[Image], mask: OverlayMask | None) -> fl
 
 
 def _compute_gradients(image: Image) -> tuple[Singles, Singles]:
-    """Return how much a small copy of a picture brightens a pixel, to the right and down: float32 (H, W) each."""
+    """Return the brightness gradients of a reduced copy of a picture, to the right and down: float32 (H, W) each."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     grey = cv2.resize(grey.astype(np.float32), _DISPLAY_SHAPE[::-1], interpolation=cv2.INTER_AREA)
     across, along = (cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0))
@@ -223,8 +223,8 @@ def _open_video(uri: str) -> Source:
 
 def _read_video(uri: str, count: int) -> Iterator[Image]:
     """Yield the first `count` usable pictures of a video, a second apart."""
-    with closing(_open_video(uri)) as film:
-        yield from (frame.image for frame in islice(filter(None, read_to_end(film, lambda error: None)), count))
+    with closing(_open_video(uri)) as video:
+        yield from (frame.image for frame in islice(filter(None, read_to_end(video, lambda error: None)), count))
 
 
 def _read_usable(paths: Iterable[Path]) -> Iterator[Image]:
@@ -234,7 +234,7 @@ def _read_usable(paths: Iterable[Path]) -> Iterator[Image]:
 
 
 def _choose_runs(folder: Path, length: int = _RUN_LENGTH) -> list[list[Path]]:
-    """Choose runs of neighbouring pictures, spread over a folder; none comes twice."""
+    """Choose runs of neighbouring pictures, spread over a folder; no picture is chosen twice."""
     paths = list_images(folder)
     if len(paths) <= _RUN_COUNT * length:
         return [paths]
@@ -243,7 +243,7 @@ def _choose_runs(folder: Path, length: int = _RUN_LENGTH) -> list[list[Path]]:
 
 
 def _read_gimbal_tilt_deg(folder: Path) -> float | None:
-    """Return how far a camera on a gimbal is from straight down, by the XMP data of some pictures; None: unknown."""
+    """Return the tilt of a gimbal camera from straight down, from the XMP data of some pictures; None: unknown."""
     tags = [read_xmp(path) for run in _choose_runs(folder) for path in run]
     tilts_deg = [max(abs(tag.roll_deg or 0.0), abs(tag.pitch_deg)) for tag in tags if tag.pitch_deg is not None]
     return float(np.median(tilts_deg)) if tilts_deg else None

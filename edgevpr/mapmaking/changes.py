@@ -1,7 +1,7 @@
-"""Artificial changes of a picture, as by another day, season, height and course. `calibrate` applies them to the map's
-own pictures to make queries.
+"""Alters pictures as if taken on another day, in another season, from another height and on another course. `calibrate`
+makes its queries from the map's own pictures this way.
 
-No single change is realistic. Together they lower the share of agreeing regions as much as real changes do, so that
+No single change is realistic. Together they reduce the share of agreeing regions as much as real changes do, so that
 right and wrong matches are as hard to tell apart as in flight. `strength` is about 0 (hardly any change) to 1.3.
 """
 
@@ -11,41 +11,41 @@ import numpy as np
 from edgevpr.core.arrays import Array, Doubles, Floats, Image, Mask, Singles
 from edgevpr.frames.images import resize
 
-_STRENGTH_RANGE = (0.3, 1.3)  # least and greatest: from a change like a cloud to one like snow
-# Of the pictures of the sets that the strengths were chosen on. Larger ones take long to change, and their noise, which
-# is that of pixels, would be averaged away.
+_STRENGTH_RANGE = (0.3, 1.3)  # from a change like a cloud to one like snow
+# Size of the pictures in the sets that the strengths were chosen on. Larger pictures take long to alter, and their
+# noise, which is per pixel, would be averaged away.
 _MAX_PX = 640
 _TONE_POINTS = 6  # points of a tone curve
-_MAX_PATCHES = 2  # most plain patches that hide a part of the picture
+_MAX_PATCHES = 2  # plain patches that hide part of the picture
 
 
 def change_picture(
-    image: Image, rng: np.random.Generator, looks_down: bool, shown: Mask | None = None
+    image: Image, rng: np.random.Generator, looks_down: bool, mask: Mask | None = None
 ) -> tuple[Image, Mask | None]:
-    """Change a picture, uint8 (H, W[, 3]), at random as if taken at another time. With `looks_down`, it is also rotated
-    by any angle. `shown`, bool (H, W), is False where it shows no ground (None: it shows ground everywhere). Returns
-    * the changed picture, uint8 grey, at most 640 pixels long, and
-    * `shown` for the changed picture."""
+    """Alter a picture, uint8 (H, W[, 3]), at random as if taken at another time. With `looks_down`, it is also rotated
+    by any angle. `mask`, bool (H, W), is False where it shows no ground (None: it shows ground everywhere). Returns
+    * the altered picture, uint8 grey, at most 640 pixels long, and
+    * the mask of the altered picture."""
     strength = rng.uniform(*_STRENGTH_RANGE)
     if (shrink := _MAX_PX / max(image.shape[:2])) < 1:
         size_px = round(shrink * image.shape[1]), round(shrink * image.shape[0])
         image = resize(image, size_px)
-        if shown is not None:
-            shown = cv2.resize(shown.view(np.uint8), size_px, interpolation=cv2.INTER_NEAREST).view(bool)
+        if mask is not None:
+            mask = cv2.resize(mask.view(np.uint8), size_px, interpolation=cv2.INTER_NEAREST).view(bool)
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
     warp = _change_viewpoint(grey.shape, rng, strength, looks_down)
-    seen = _warp_image(grey.astype(np.float32) / 255, warp, cv2.INTER_LINEAR)
-    seen = change_season(seen, rng, strength)
-    lit = _change_light(seen, rng, strength)
+    warped = _warp_image(grey.astype(np.float32) / 255, warp, cv2.INTER_LINEAR)
+    warped = change_season(warped, rng, strength)
+    lit = _change_light(warped, rng, strength)
     _cover_patches(lit, rng, strength)
-    if shown is not None:
-        shown = _warp_image(shown.view(np.uint8), warp, cv2.INTER_NEAREST).view(bool)
-    return (255 * np.clip(lit, 0, 1)).round().astype(np.uint8), shown
+    if mask is not None:
+        mask = _warp_image(mask.view(np.uint8), warp, cv2.INTER_NEAREST).view(bool)
+    return (255 * np.clip(lit, 0, 1)).round().astype(np.uint8), mask
 
 
 def _change_viewpoint(shape: tuple[int, int], rng: np.random.Generator, strength: float, looks_down: bool) -> Doubles:
-    """Return a random homography of pixels, (3, 3), that changes a picture of this `shape` as another position, height,
-    course and tilt of the camera would."""
+    """Return a random pixel homography, (3, 3), that alters a picture of this `shape` like another position, height,
+    course and tilt of the camera."""
     height, width = shape
     scale = np.exp(rng.uniform(-1, 1) * 0.15 * strength)
     turn_deg = rng.uniform(0, 360) if looks_down else rng.uniform(-3, 3) * strength
@@ -63,19 +63,19 @@ def _warp_image(image: Array, warp: Doubles, flags: int) -> Array:
 
 
 def change_season(grey: Singles, rng: np.random.Generator, strength: float) -> Singles:
-    """Map grey levels through random tone curves that differ between parts of the picture, as leaves and snow do, and
-    add a random texture. `grey` is float32 (H, W), 0..1, and so is the result, which may slightly exceed 0..1."""
+    """Map grey levels through random tone curves that differ between parts of the picture, like leaves and snow, and
+    add a random texture. `grey` is float32 (H, W), 0..1. Returns float32 (H, W), which may slightly exceed 0..1."""
     height, width = grey.shape
     tones = np.clip(255 * grey, 0, 255).astype(np.uint8)
-    one, other = (_make_tone_curve(rng, strength)[tones] for _ in range(2))
-    part = np.clip(0.5 + _make_smooth_field(rng, (height, width), 6), 0, 1)
+    first, second = (_make_tone_curve(rng, strength)[tones] for _ in range(2))
+    blend = np.clip(0.5 + _make_smooth_field(rng, (height, width), 6), 0, 1)
     texture = cv2.GaussianBlur(rng.normal(size=(height, width)).astype(np.float32), (0, 0), max(1.0, width / 200))
-    changed: Singles = part * one + (1 - part) * other + 0.36 * strength * texture
+    changed: Singles = blend * first + (1 - blend) * second + 0.36 * strength * texture
     return changed
 
 
 def _change_light(grey: Singles, rng: np.random.Generator, strength: float) -> Floats:
-    """Add soft shadows, another exposure, blur (to half of the pictures) and sensor noise to `grey`, float (H, W)."""
+    """Add soft shadows, another exposure, blur (in half of the pictures) and sensor noise to `grey`, float (H, W)."""
     lit: Floats = np.clip(grey * np.exp(0.5 * strength * _make_smooth_field(rng, grey.shape, 3)), 0, 1)
     lit = lit ** np.exp(rng.uniform(-1, 1) * 0.7 * strength)
     if rng.random() < 0.5:
@@ -89,7 +89,7 @@ def _cover_patches(grey: Floats, rng: np.random.Generator, strength: float) -> N
     height, width = grey.shape
     for _ in range(rng.integers(0, _MAX_PATCHES + 1)):
         x, y, half = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0.05, 0.2) * width * strength
-        rows, columns = (slice(max(0, int(at - half)), int(at + half)) for at in (y, x))
+        rows, columns = (slice(max(0, int(centre - half)), int(centre + half)) for centre in (y, x))
         grey[rows, columns] = rng.uniform(0, 1)
 
 

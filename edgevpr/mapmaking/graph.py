@@ -1,19 +1,18 @@
-"""The pose graph of a map: solves for the position, direction and footprint of each picture that fit best, by least
-squares, to recorded positions and to ties. A tie is the relative pose of two pictures that show the same ground.
+"""Solves the pose graph of a map by least squares: fits the position, direction and footprint of each picture to the
+recorded positions and the ties. A tie is the relative pose of two pictures that show the same ground.
 
-A place has two complex unknowns. Its position p is east + i north, in metres. Its *log* l is a complex logarithm that
-holds the footprint and the direction: exp(l) = footprint_m exp(-i up), a factor that turns an offset in the picture
-(right + i up, in shares of its longest side) into one on the ground. In a tie, `step` is the offset of the middle of
-picture `query` from the middle of picture `place`, in picture `place`, and exp(`turn`) is the rotation and scale of
-`query` against `place`:
+A place has two complex unknowns. Its position p is east + i north, in metres. Its *log* l is a complex logarithm of
+footprint and direction: exp(l) = footprint_m exp(-i up), a factor that converts an offset in the picture (right + i up,
+in shares of its longest side) to one on the ground. In a tie, `step` is the offset of the centre of picture `query`
+from the centre of picture `place`, in picture `place`, and exp(`turn`) is the rotation and scale from `place` to
+`query`:
 
     (p_query - p_place) exp(-l_place) = step        l_query - l_place = turn
 
-Both are holomorphic, so that least squares over complex numbers is exact, with half the unknowns. Steps are compared in
-the picture and not on the ground: otherwise a map shrunk to a point would fulfil all ties. Recorded positions fix
-position, scale and direction of the whole. Steps, turns and recorded positions are weighted by their standard
-deviations ("scatter"), estimated from the residuals; those that contradict the others get little weight (Geman and
-McClure 1987).
+Both are holomorphic, so complex least squares is exact and halves the number of unknowns. Steps are compared in the
+picture, not on the ground, because otherwise a map shrunk to a point would satisfy all ties. The recorded positions
+determine position, scale and direction of the whole map. Steps, turns and recorded positions are weighted by standard
+deviations that are estimated from the residuals; outliers get little weight (Geman and McClure 1987).
 """
 
 from dataclasses import dataclass
@@ -27,27 +26,27 @@ from edgevpr.core.arrays import Array, Complexes, Floats
 from edgevpr.core.geodesy import fit_similarity
 from edgevpr.core.text import show_elapsed
 
-_MAX_ROUNDS = 4  # of estimating the standard deviations
-_MIN_SD_CHANGE = 0.05  # relative; a smaller one ends the rounds
-_MAX_STEPS = 40  # of Gauss-Newton
-_MIN_MOVE = 1e-4  # as a share of a footprint; a smaller one ends the steps
+_MAX_ROUNDS = 4  # estimates of the standard deviations
+_MIN_SD_CHANGE = 0.05  # relative; a smaller change ends the rounds
+_MAX_STEPS = 40  # Gauss-Newton steps
+_MIN_MOVE = 1e-4  # as a share of a footprint; smaller moves end the steps
 _MAX_LOG_MOVE = 0.5  # largest change of a log in one Gauss-Newton step
-# Factor from the given to the real standard deviations of ties: the first estimate, and the least, since ties that
-# agree well by chance must not make the others look wrong.
+# Ratio of actual to nominal standard deviations of ties: initial estimate, and lower limit, since a few ties that agree
+# well by chance must not make the others look wrong.
 _INITIAL_TIE_FACTOR = 3.0
 _MIN_TIE_FACTOR = 0.5
 _MIN_RECORDED_SD_M = 0.5
 _INITIAL_RECORDED_SD_M = 10.0
-_MIN_AGREEMENT = 0.1  # a tie or position with a smaller weight counts as contradicting the others
+_MIN_AGREEMENT = 0.1  # a tie or position with a smaller weight contradicts the others
 _MEDIAN_LENGTH = 1.832  # median length of a vector of four standard normal numbers
-_DIAGONAL_DAMPING = 1e-6  # added to the diagonal, so that places without ties can be solved
+_DIAGONAL_DAMPING = 1e-6  # added to the diagonal, so that places without ties can be solved for
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ties:
     """T pairs of pictures of the same ground: `query` and `place`, int (T,), are the numbers of the two pictures.
-    `step` and `turn`, complex (T,), are defined in the module's docstring. `step_sd` and `turn_sd`, float (T,), are the
-    standard deviations of both along one axis, up to a factor that all share, which `solve_graph` estimates."""
+    `step` and `turn`, complex (T,), are defined in the module's docstring. `step_sd` and `turn_sd`, float (T,), are
+    their standard deviations along one axis, up to a common factor that `solve_graph` estimates."""
 
     query: np.ndarray
     place: np.ndarray
@@ -63,9 +62,9 @@ class Ties:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GraphSolution:
     """The solved graph of N places with T ties. `position`, complex (N,): east + i north in metres. `log`, complex
-    (N,): footprint and direction, see the module.
+    (N,): footprint and direction, as in the module's docstring.
     `position_var` (m^2) and `log_var`, float (N,): variances of `position` and `log`, summed over both axes.
-    `component`, int (N,): number of the group of places, connected by ties, that each place belongs to.
+    `component`, int (N,): number of each place's group; the places of a group are connected by ties.
     `recorded_sd_m`: estimated standard deviation of recorded positions along one axis.
     `recorded_agree` (N,), `ties_agree` (T,): bool, False for positions and ties that contradict the others."""
 
@@ -79,10 +78,10 @@ class GraphSolution:
     ties_agree: np.ndarray
 
 
-@show_elapsed("refining: solving where all pictures lie")
+@show_elapsed("refining: solving for all positions")
 def solve_graph(recorded: np.ndarray, ties: Ties) -> GraphSolution:
     """Solve the pose graph of N places by least squares. `recorded`, complex (N,): the recorded positions, east + i
-    north in metres. One standard deviation is estimated for all of them."""
+    north in metres; a common standard deviation is estimated for them."""
     count = len(recorded)
     _, component = connected_components(_make_tie_matrix(ties, count), directed=False)
     graph = _Graph(recorded, ties, component)
@@ -90,15 +89,15 @@ def solve_graph(recorded: np.ndarray, ties: Ties) -> GraphSolution:
     for _ in range(_MAX_ROUNDS):
         before, sd_m = factor, recorded_sd_m
         normal, agree = graph.optimise(sd_m, factor)
-        variance = 2 * _invert_diagonal(normal)  # the weights are of one axis, the variance of both
+        variance = 2 * _invert_diagonal(normal)  # the weights are per axis, the variance is the sum of both axes
         if len(ties):
-            # Unknowns absorb a part of the residuals: the estimate is corrected by the share of spare observations.
-            spare = max(2 * len(ties) - 2 * (count - len(np.unique(component))), 1) / (2 * len(ties))
+            # The unknowns absorb part of the residuals: correct the estimate by the share of redundant observations.
+            redundancy = max(2 * len(ties) - 2 * (count - len(np.unique(component))), 1) / (2 * len(ties))
             median = float(np.median(graph.compute_tie_residuals()))
-            factor = max(_MIN_TIE_FACTOR, median / _MEDIAN_LENGTH / np.sqrt(spare))
-        off_m = abs(graph.position - recorded)
-        # Residual plus the variance of the solution: with few ties, the solution follows every recorded error.
-        total_var_m2 = _estimate_sd(off_m) ** 2 + np.median(variance[:count]) / 2
+            factor = max(_MIN_TIE_FACTOR, median / _MEDIAN_LENGTH / np.sqrt(redundancy))
+        residual_m = abs(graph.position - recorded)
+        # Add the variance of the solution: with few ties, the solution follows every error of a recorded position.
+        total_var_m2 = _estimate_sd(residual_m) ** 2 + np.median(variance[:count]) / 2
         recorded_sd_m = max(_MIN_RECORDED_SD_M, float(np.sqrt(total_var_m2)))
         if abs(np.log(before / factor)) < _MIN_SD_CHANGE and abs(np.log(sd_m / recorded_sd_m)) < _MIN_SD_CHANGE:
             break
@@ -109,51 +108,51 @@ def solve_graph(recorded: np.ndarray, ties: Ties) -> GraphSolution:
         log_var=variance[count:],
         component=component,
         recorded_sd_m=recorded_sd_m,
-        recorded_agree=_weigh_residuals(off_m / sd_m) >= _MIN_AGREEMENT,
+        recorded_agree=_weigh_residuals(residual_m / sd_m) >= _MIN_AGREEMENT,
         ties_agree=agree >= _MIN_AGREEMENT,
     )
 
 
 class _Graph:
-    """The least-squares problem of `solve_graph`: N places with T ties, their recorded positions, and the solution so
-    far, `position` and `log`, complex (N,) each."""
+    """The least-squares problem of `solve_graph`: N places with T ties, their recorded positions, and the current
+    solution, `position` and `log`, complex (N,) each."""
 
     def __init__(self, recorded: np.ndarray, ties: Ties, component: np.ndarray) -> None:
-        """Make the first solution: place the pictures of each component one after the other along its most exact ties,
-        then fit the component as a whole to its recorded positions."""
+        """Compute the initial solution: chain the pictures of each component along its most accurate ties, then fit the
+        whole component to its recorded positions."""
         self._recorded, self._ties = recorded, ties
         count = len(recorded)
         position, log = np.zeros(count, complex), np.zeros(count, complex)
         tree = minimum_spanning_tree(_make_tie_matrix(ties, count))
         tie_of = {}
-        for at in np.argsort(-ties.step_sd, kind="stable").tolist():  # the most exact tie of a pair comes last
-            query, place, step, turn = int(ties.query[at]), int(ties.place[at]), ties.step[at], ties.turn[at]
+        for tie in np.argsort(-ties.step_sd, kind="stable").tolist():  # the most accurate tie of a pair comes last
+            query, place, step, turn = int(ties.query[tie]), int(ties.place[tie]), ties.step[tie], ties.turn[tie]
             tie_of[query, place], tie_of[place, query] = (step, turn), (-step * np.exp(-turn), -turn)
         for number in range(component.max(initial=-1) + 1):
             members = np.flatnonzero(component == number)
-            order, before = breadth_first_order(tree, members[0], directed=False)
-            for at in order[1:].tolist():
-                base = int(before[at])
-                step, turn = tie_of[at, base]
-                position[at], log[at] = position[base] + np.exp(log[base]) * step, log[base] + turn
+            order, predecessors = breadth_first_order(tree, members[0], directed=False)
+            for place in order[1:].tolist():
+                base = int(predecessors[place])
+                step, turn = tie_of[place, base]
+                position[place], log[place] = position[base] + np.exp(log[base]) * step, log[base] + turn
             scale, offset = _fit_robust_similarity(position[members], recorded[members])
             position[members] = scale * position[members] + offset
             log[members] += np.log(scale)
         self.position, self.log = position, log
 
     def optimise(self, sd_m: float, factor: float) -> tuple[csc_matrix, np.ndarray]:
-        """Solve for positions and logs by Gauss-Newton steps. The standard deviation of recorded positions is `sd_m`,
-        and those of the ties are multiplied by `factor`. Returns the normal matrix (2 N, 2 N), and the robust weight of
-        each tie, float (T,), 0..1."""
+        """Solve for positions and logs by Gauss-Newton steps. `sd_m` is the standard deviation of recorded positions;
+        those of the ties are multiplied by `factor`. Returns the normal matrix (2 N, 2 N) and the robust weight of each
+        tie, float (T,), 0..1."""
         count, ties = len(self.position), self._ties
         for _ in range(_MAX_STEPS):
             agree = _weigh_residuals(self.compute_tie_residuals() / factor)
-            by_step, by_turn = (agree / (factor * sd) ** 2 for sd in (ties.step_sd, ties.turn_sd))
-            by_recorded = _weigh_residuals(abs(self.position - self._recorded) / sd_m) / sd_m**2
-            jacobian, rest = self._linearise(*map(np.sqrt, (by_step, by_turn, by_recorded)))
+            step_weights, turn_weights = (agree / (factor * sd) ** 2 for sd in (ties.step_sd, ties.turn_sd))
+            recorded_weights = _weigh_residuals(abs(self.position - self._recorded) / sd_m) / sd_m**2
+            jacobian, residuals = self._linearise(*map(np.sqrt, (step_weights, turn_weights, recorded_weights)))
             normal = (jacobian.conj().T @ jacobian).tocsc()
-            move = _factorise(normal).solve(-(jacobian.conj().T @ rest))
-            # A long move is shortened: far from the solution the logs are not linear.
+            move = _factorise(normal).solve(-(jacobian.conj().T @ residuals))
+            # Shorten a long move, because the problem is not linear in the logs far from the solution.
             share = min(1.0, _MAX_LOG_MOVE / max(abs(move[count:]).max(initial=0), 1e-9))
             self.position, self.log = self.position + share * move[:count], self.log + share * move[count:]
             if (abs(move[:count]) < _MIN_MOVE * np.exp(self.log.real)).all():
@@ -161,39 +160,39 @@ class _Graph:
         return normal, agree
 
     def compute_tie_residuals(self) -> Floats:
-        """Return how far each tie differs from the solution, in standard deviations of the tie: float (T,)."""
+        """Return the difference of each tie from the solution, in standard deviations of the tie: float (T,)."""
         steps, turns = self._compute_residuals()
-        off: Floats = np.hypot(abs(steps) / self._ties.step_sd, abs(turns) / self._ties.turn_sd)
-        return off
+        residuals: Floats = np.hypot(abs(steps) / self._ties.step_sd, abs(turns) / self._ties.turn_sd)
+        return residuals
 
     def _compute_residuals(self) -> tuple[Complexes, Complexes]:
-        """Return how much the solution so far differs from the ties: in steps and in turns, complex (T,) each."""
+        """Return the differences of the current solution from the steps and turns of the ties, complex (T,) each."""
         position, log, ties = self.position, self.log, self._ties
         steps = (position[ties.query] - position[ties.place]) * np.exp(-log[ties.place]) - ties.step
         turns = log[ties.query] - log[ties.place] - ties.turn
         return steps, turns.real + 1j * ((turns.imag + np.pi) % (2 * np.pi) - np.pi)
 
     def _linearise(
-        self, by_step: np.ndarray, by_turn: np.ndarray, by_recorded: np.ndarray
+        self, step_weights: np.ndarray, turn_weights: np.ndarray, recorded_weights: np.ndarray
     ) -> tuple[csc_matrix, np.ndarray]:
-        """Return the weighted Jacobian (R, 2 N) and the weighted residuals, complex (R,). The R rows are those of the
-        steps, the turns and the recorded positions, in this order; the arguments are the weights."""
-        count, many, ties = len(self._recorded), len(self._ties), self._ties
+        """Return the weighted Jacobian (R, 2 N) and the weighted residuals, complex (R,). The R rows are the steps, the
+        turns and the recorded positions, in this order, multiplied by the given weights."""
+        count, tie_count, ties = len(self._recorded), len(self._ties), self._ties
         steps, turns = self._compute_residuals()
         unit = np.exp(-self.log[ties.place])
-        row, places = np.arange(many), np.arange(count)
+        row, places = np.arange(tie_count), np.arange(count)
         entries = (  # rows, columns and values
-            (row, ties.query, by_step * unit),
-            (row, ties.place, -by_step * unit),
-            (row, count + ties.place, -by_step * (steps + ties.step)),
-            (many + row, count + ties.query, by_turn),
-            (many + row, count + ties.place, -by_turn),
-            (2 * many + places, places, by_recorded),
+            (row, ties.query, step_weights * unit),
+            (row, ties.place, -step_weights * unit),
+            (row, count + ties.place, -step_weights * (steps + ties.step)),
+            (tie_count + row, count + ties.query, turn_weights),
+            (tie_count + row, count + ties.place, -turn_weights),
+            (2 * tie_count + places, places, recorded_weights),
         )
         rows, columns, values = map(np.concatenate, zip(*entries, strict=True))
-        jacobian = coo_matrix((values, (rows, columns)), shape=(2 * many + count, 2 * count)).tocsc()
-        from_recorded = by_recorded * (self.position - self._recorded)
-        return jacobian, np.concatenate([by_step * steps, by_turn * turns, from_recorded])
+        jacobian = coo_matrix((values, (rows, columns)), shape=(2 * tie_count + count, 2 * count)).tocsc()
+        from_recorded = recorded_weights * (self.position - self._recorded)
+        return jacobian, np.concatenate([step_weights * steps, turn_weights * turns, from_recorded])
 
 
 def _make_tie_matrix(ties: Ties, count: int) -> csc_matrix:
@@ -201,8 +200,8 @@ def _make_tie_matrix(ties: Ties, count: int) -> csc_matrix:
 
 
 def _fit_robust_similarity(shape: np.ndarray, recorded: np.ndarray) -> tuple[complex, complex]:
-    """Return two complex numbers, the factor `scale`, which also rotates, and `offset`, so that scale * `shape` +
-    offset fits `recorded`; both are points, complex (N,). Outliers get little weight. For one point, the scale is 1."""
+    """Return two complex numbers, `scale` (with rotation) and `offset`, such that scale * `shape` + offset fits
+    `recorded`; both are points, complex (N,). Outliers get little weight. For a single point the scale is 1."""
     weight = np.ones(len(shape))
     scale, offset = 1 + 0j, complex(recorded.mean() - shape.mean())
     for _ in range(20):
@@ -210,23 +209,23 @@ def _fit_robust_similarity(shape: np.ndarray, recorded: np.ndarray) -> tuple[com
         if abs(fitted) < 1e-6:
             break
         scale, offset = fitted, shift
-        off = abs(scale * shape + offset - recorded)
-        weight = _weigh_residuals(off / max(_MIN_RECORDED_SD_M, _estimate_sd(off))) + 1e-6
+        residuals = abs(scale * shape + offset - recorded)
+        weight = _weigh_residuals(residuals / max(_MIN_RECORDED_SD_M, _estimate_sd(residuals))) + 1e-6
     return scale, offset
 
 
-def _weigh_residuals(off: np.ndarray) -> np.ndarray:
-    """Return the robust weight, 0..1, of residuals `off` in standard deviations: 0.5 for a residual of three."""
-    return 1 / (1 + (off / 4.66) ** 2) ** 2
+def _weigh_residuals(residuals: np.ndarray) -> np.ndarray:
+    """Return the robust weights, 0..1, of residuals in standard deviations: 0.5 for a residual of three."""
+    return 1 / (1 + (residuals / 4.66) ** 2) ** 2
 
 
 def _estimate_sd(residuals: np.ndarray) -> float:
-    """Estimate the standard deviation along one axis of complex residuals from their median, so ignoring outliers."""
+    """Estimate the standard deviation of complex residuals along one axis from their median, which ignores outliers."""
     return float(np.median(abs(residuals))) / 1.1774 if len(residuals) else 0.0
 
 
 def _factorise(normal: csc_matrix) -> SuperLU:
-    """Factor a Hermitian positive definite matrix (M, M) as L D L^H, its rows and columns in an order that keeps L
+    """Factorise a Hermitian positive definite matrix (M, M) as L D L^H, with its rows and columns reordered to keep L
     sparse. The factor `U` is D L^H."""
     filled = normal + _DIAGONAL_DAMPING * identity(normal.shape[0])
     return splu(filled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
@@ -235,19 +234,19 @@ def _factorise(normal: csc_matrix) -> SuperLU:
 def _invert_diagonal(normal: csc_matrix) -> Floats:
     """Return the diagonal of the inverse of a Hermitian positive definite matrix (M, M), float (M,).
 
-    Only entries of the inverse where L has entries are computed, from the last column to the first (Takahashi, Fagan
-    and Chen 1973). A column needs the block of the inverse over its rows. That is a part of the block of the column's
-    parent, which is the column with the number of its first row.
+    The inverse is computed only where L has entries, from the last column to the first (Takahashi, Fagan and Chen
+    1973). A column needs the block of the inverse at its rows, which is part of the block of its parent: the column
+    with the number of its first row.
     """
     factored = _factorise(normal)
     lower, pivots = factored.L.tocsc(), factored.U.diagonal().real
     lower.sort_indices()
     below = _find_rows_below(lower)
-    waiting = np.bincount([rows[0] for rows in below if len(rows)], minlength=len(below))  # children of a column
+    waiting = np.bincount([rows[0] for rows in below if len(rows)], minlength=len(below))  # children left per column
     blocks: dict[int, Complexes] = {}
-    found = np.empty(len(below))
+    diagonal = np.empty(len(below))
     for column in reversed(range(len(below))):
-        rows, given = below[column], slice(lower.indptr[column] + 1, lower.indptr[column + 1])
+        rows, stored = below[column], slice(lower.indptr[column] + 1, lower.indptr[column + 1])
         block = np.empty((len(rows) + 1, len(rows) + 1), complex)
         block[0, 0] = 1 / pivots[column]
         if len(rows):
@@ -255,7 +254,7 @@ def _invert_diagonal(normal: csc_matrix) -> Floats:
             inside = np.searchsorted(np.append(parent, below[parent]), rows)
             block[1:, 1:] = blocks[parent][np.ix_(inside, inside)]
             factors = np.zeros(len(rows), complex)
-            factors[np.searchsorted(rows, lower.indices[given])] = lower.data[given]
+            factors[np.searchsorted(rows, lower.indices[stored])] = lower.data[stored]
             block[1:, 0] = -block[1:, 1:] @ factors
             block[0, 1:] = block[1:, 0].conj()
             block[0, 0] -= np.vdot(factors, block[1:, 0])
@@ -264,14 +263,14 @@ def _invert_diagonal(normal: csc_matrix) -> Floats:
                 del blocks[parent]
         if waiting[column]:
             blocks[column] = block
-        found[column] = block[0, 0].real
-    in_order: Floats = found[factored.perm_c]
-    return in_order
+        diagonal[column] = block[0, 0].real
+    original_order: Floats = diagonal[factored.perm_c]
+    return original_order
 
 
 def _find_rows_below(lower: csc_matrix) -> list[Array]:
-    """Return the numbers of the rows below the diagonal where a column of the factor L (M, M) may have entries: M
-    arrays, int (R,), ascending. An entry that is zero by chance, and so not stored, counts."""
+    """Return, for each column of the factor L (M, M), the numbers of the rows below the diagonal that may have entries:
+    M arrays, int (R,), ascending. Entries that are zero by chance, and therefore not stored, count."""
     starts, ends = lower.indptr[:-1] + 1, lower.indptr[1:]
     below = [lower.indices[start:end] for start, end in zip(starts, ends, strict=True)]
     for rows in below:

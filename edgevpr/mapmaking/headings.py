@@ -79,8 +79,7 @@ def _project_to_ground(points: Doubles, frame: Frame, lens: Lens) -> Array:
 
 
 def _set_heading(frame: Frame, before_deg: float | None, after_deg: float | None) -> Frame:
-    """Set the heading of a frame to the mean of those from the motion before and after it (None: unknown), if they
-    agree."""
+    """Set a frame's heading to the mean of those from the motion before and after it (None: unknown) if they agree."""
     known = [heading_deg for heading_deg in (before_deg, after_deg) if heading_deg is not None]
     if not known or abs(wrap_deg(known[0] - known[-1])) > _MAX_DIFFERENCE_DEG:
         return frame
