@@ -1,11 +1,11 @@
-"""A data set: a folder of queries, a folder of references (the images to map), and a ground truth, which names the
-right references of each query; a query without any is off the map. `open_folder` recognises the layouts in which data
+"""Reads a data set: a folder of queries, a folder of references (the images to map), and a ground truth that lists the
+correct references of each query; a query without any is off the map. `open_folder` recognises the layouts in which data
 sets are published by their files:
 
-* query/, ref/ and ground_truth.csv: edgevpr's own.
-* database/ and queries/, or images/test/ with both: file names like @EASTING@NORTHING@...jpg, metres of UTM (Pitts30k,
-  GSV-Cities and others in that form). References near the query are right.
-* query/ and ref/ with positions (positions.csv or EXIF): references near the query are right.
+* query/, ref/ and ground_truth.csv: edgevpr's own layout.
+* database/ and queries/, or images/test/ with both: file names like @EASTING@NORTHING@...jpg, in UTM metres (Pitts30k,
+  GSV-Cities and others in that form). References near the query are correct.
+* query/ and ref/ with positions (positions.csv or EXIF): references near the query are correct.
 """
 
 import csv
@@ -27,15 +27,15 @@ from edgevpr.frames.source import read_tags
 _MAX_FILE_BYTES = 100_000_000  # a million queries
 _LAYOUTS = "query/, ref/ and ground_truth.csv or positions.csv; or database/ and queries/"
 _SCORED_STATUSES = ("ok", "novel")  # statuses of a query; novel: its place is not in the map
-# By the file name of each query, in the order of the file: the file names of the references that are right (none: the
-# query is off the map), and of those ignored, where a match counts as neither right nor wrong. None: it is not scored.
+# Maps the file name of each query, in file order, to the file names of its correct references (none: the query is off
+# the map) and of the ignored ones, where a match counts as neither correct nor wrong. None: the query is not scored.
 GroundTruth = dict[str, tuple[frozenset[str], frozenset[str]] | None]
 
 
 @dataclass(frozen=True, slots=True)
 class ScoredQuery:
-    """A query that is scored: the `path` of its image, and the file names of the references that are `right` (none: its
-    place is not in the map) and of those `ignored`, where a match counts as neither right nor wrong."""
+    """A query that is scored: the `path` of its image, and the file names of the correct references, `right` (none: its
+    place is not in the map), and of those `ignored`, where a match counts as neither correct nor wrong."""
 
     path: Path
     right: frozenset[str]
@@ -45,7 +45,7 @@ class ScoredQuery:
 @dataclass(frozen=True, slots=True)
 class Dataset:
     """A data set: its scored `queries`, and the folder `ref_dir` of its references. `references` are the file names of
-    all images there, in the order of mapping. `unscored`: how many images of queries have no truth to score them by."""
+    all images in that folder, in mapping order. `unscored`: number of query images without ground truth."""
 
     queries: tuple[ScoredQuery, ...]
     ref_dir: Path
@@ -54,76 +54,76 @@ class Dataset:
 
 
 def load_dataset(query_dir: str | Path, ref_dir: str | Path, ground_truth: str | Path) -> Dataset:
-    """Read a data set and check it against its folders. Images of queries that `ground_truth` lacks are not scored.
+    """Read a data set and check it against its folders. Query images missing from `ground_truth` are not scored.
 
-    Raises UsageError with file, name and what to do, and SourceError for a folder without images.
+    Raises UsageError with file, name and remedy, and SourceError for a folder without images.
     """
     return make_dataset(query_dir, ref_dir, read_truth(ground_truth), ground_truth)
 
 
 def make_dataset(query_dir: str | Path, ref_dir: str | Path, truth: GroundTruth, origin: str | Path) -> Dataset:
-    """Make a data set of two folders of images and the ground truth that was read from `origin`. Raises UsageError for
-    a name that is not in its folder, and where no query is scored."""
+    """Make a data set from two folders of images and the ground truth read from `origin`. Raises UsageError if a name
+    is not in its folder, or if no query is scored."""
     paths = {decode_name(path.name): path for path in list_images(query_dir)}
     references = list_names(ref_dir)
     for name, answers in truth.items():
         if name not in paths:
-            raise UsageError(f"{origin}: the query `{name}` is not in {query_dir}: correct its name, or drop the row.")
+            raise UsageError(f"{origin}: query `{name}` is not in {query_dir}: correct its name, or remove the row.")
         if answers and (unknown := sorted(frozenset.union(*answers).difference(references))):
-            raise UsageError(f"{origin}: the reference `{unknown[0]}` is not in {ref_dir}: correct its name.")
+            raise UsageError(f"{origin}: reference `{unknown[0]}` is not in {ref_dir}: correct its name.")
     queries = tuple(ScoredQuery(paths[name], *answers) for name, answers in truth.items() if answers)
     if not queries:
-        raise UsageError(f"{origin} scores no query: it needs a row with the status `ok` or `novel`.")
+        raise UsageError(f"{origin} has no query to score: add a row with the status `ok` or `novel`.")
     return Dataset(queries, Path(ref_dir), references, len(paths) - len(queries))
 
 
 def list_names(folder: str | Path) -> tuple[str, ...]:
-    """Return the names of all images in a folder, in counting order (2.png before 10.png)."""
+    """Return the names of all images in a folder, in natural order (2.png before 10.png)."""
     return tuple(decode_name(path.name) for path in list_images(folder))
 
 
 def read_truth(path: str | Path) -> GroundTruth:
-    """Read a CSV with the columns query_file and ref_files (file names separated by spaces; none: the query is off the
-    map). Optional columns are ref_files_loose (references to ignore, unless they are in ref_files too) and status
-    (`ok`, or `novel` for a query off the map; with any other it is not scored). Raises UsageError with file, line,
-    value and what to do."""
+    """Read a CSV file with the columns query_file and ref_files (file names separated by spaces; none: the query is off
+    the map). Optional columns are ref_files_loose (references to ignore, unless they are in ref_files too) and status
+    (`ok`, or `novel` for a query off the map; queries with any other status are not scored). Raises UsageError with
+    file, line, value and remedy."""
     truth: GroundTruth = {}
     for where, row in _read_rows(Path(path)):
         name = row["query_file"]
         if name in truth:
-            raise UsageError(f"{where}: the query `{name}` has a row already: keep one, with all its ref_files.")
+            raise UsageError(f"{where}: query `{name}` already has a row: keep one row with all its ref_files.")
         right, loose = (frozenset(row.get(key, "").split()) for key in ("ref_files", "ref_files_loose"))
         status = row.get("status", "ok")
         if right and status == "novel":
-            raise UsageError(f"{where}: the query `{name}` is `novel` and has ref_files: drop them, or write `ok`.")
+            raise UsageError(f"{where}: query `{name}` is `novel` but has ref_files: remove them, or write `ok`.")
         truth[name] = (right, loose - right) if status in _SCORED_STATUSES else None
     return truth
 
 
 def _read_rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield for each row its file and line, for messages, and its values by column, without outer spaces."""
+    """For each row, yield its file and line, for messages, and its values by column, stripped of surrounding spaces."""
     try:
         reader = csv.DictReader(io.StringIO(read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig"), newline=""))
         if missing := [name for name in ("query_file", "ref_files") if name not in (reader.fieldnames or ())]:
-            raise UsageError(f"{path}: the column `{missing[0]}` is missing from its first line: add it.")
+            raise UsageError(f"{path}: the first line lacks the column `{missing[0]}`: add it.")
         for row in reader:
             where = f"{path}, line {reader.line_num}"
             if None in row or None in row.values():
                 raise UsageError(
-                    f"{where}: the row has another number of fields than the first line: separate columns by commas, "
-                    "and file names inside a column by spaces."
+                    f"{where}: this row and the first line have different numbers of fields: separate columns with "
+                    "commas, and file names inside a column with spaces."
                 )
             yield where, {column: value.strip() for column, value in row.items()}
     except OSError as error:
         raise UsageError(f"{path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise UsageError(f"{path} is not a CSV file in UTF-8 ({error}): save it as one.") from error
+        raise UsageError(f"{path} is not a UTF-8 CSV file ({error}): save it as one.") from error
 
 
 def open_folder(folder: str | Path, within_m: float) -> Dataset:
-    """Read the data set in `folder`, in any layout above. Without a ground truth references within `within_m` metres of
-    a query are right. Raises UsageError for an unknown layout or parts that do not fit together, and SourceError for a
-    folder without images."""
+    """Read the data set in `folder`, in any of the layouts above. Without a ground truth, references within `within_m`
+    metres of a query are correct. Raises UsageError for an unknown layout or parts that do not match, and SourceError
+    for a folder without images."""
     folder = Path(folder)
     query, ref = folder / "query", folder / "ref"
     if (truth := folder / "ground_truth.csv").is_file():
@@ -133,18 +133,18 @@ def open_folder(folder: str | Path, within_m: float) -> Dataset:
             return _read_utm_names(outer / "queries", outer / "database", within_m)
     if query.is_dir() and ref.is_dir():
         return match_positions(query, ref, within_m)
-    raise UsageError(f"{folder} has no known layout of a data set: it needs {_LAYOUTS}.")
+    raise UsageError(f"{folder} does not have the layout of a data set: it needs {_LAYOUTS}.")
 
 
 def match_positions(query_dir: Path, ref_dir: Path, within_m: float) -> Dataset:
-    """Make a data set of two folders of images with positions; queries without one are not scored. Raises UsageError
-    where there are no positions, or none are near."""
+    """Make a data set from two folders of images with positions; queries without a position are not scored. Raises
+    UsageError if there are no positions, or if no reference is near a query."""
     queries, references = (
         {path: tag.position for path, tag in read_tags(folder).items() if tag.position}
         for folder in (query_dir, ref_dir)
     )
     if not queries or not references:
-        raise UsageError("No positions, and no ground truth: give --ground-truth, or positions.csv.")
+        raise UsageError("No positions and no ground truth found: give --ground-truth, or add a positions.csv.")
     query_deg, reference_deg = (
         np.array([(position.lat_deg, position.lon_deg) for position in positions.values()])
         for positions in (queries, references)
@@ -168,19 +168,18 @@ def _parse_utm_m(path: Path) -> tuple[float, float]:
         _, east, north, *_ = path.name.split("@")
         return float(east), float(north)
     except ValueError:
-        raise UsageError(f"{path}: its name lacks @EASTING@NORTHING@ in metres: rename it, or leave it out.") from None
+        raise UsageError(f"{path}: its name lacks @EASTING@NORTHING@ in metres: rename or remove the file.") from None
 
 
 def _find_near(
     queries: Sequence[Path], query_m: Doubles, references: Sequence[Path], reference_m: Doubles, within_m: float
 ) -> GroundTruth:
-    """Return the ground truth of queries: the references within `within_m` metres are right. `query_m` and
-    `reference_m`, (N, 2), are metres east and north of a common origin. Raises UsageError if no query has a right
-    reference."""
+    """Return the ground truth of queries: references within `within_m` metres are correct. `query_m` and `reference_m`,
+    (N, 2), are metres east and north of a common origin. Raises UsageError if no query has a correct reference."""
     names, truth = [decode_name(path.name) for path in references], GroundTruth()
     for path, position_m in zip(queries, query_m, strict=True):
         near = np.flatnonzero(np.hypot(*(reference_m - position_m).T) <= within_m)
         truth[decode_name(path.name)] = frozenset(names[index] for index in near), frozenset()
     if not any(answers and answers[0] for answers in truth.values()):
-        raise UsageError(f"No query was taken within {within_m:g} m of a reference: allow more with --within-m.")
+        raise UsageError(f"No query was taken within {within_m:g} m of a reference: give a larger --within-m.")
     return truth

@@ -1,8 +1,8 @@
-"""Measurement of one technique on a data set: map the references, ask every query as in a flight, judge each answer by
-ground truth, and sum up quality and costs.
+"""Measures one technique on a data set: maps the references, runs every query as in flight, judges each answer by the
+ground truth, and summarises quality and cost.
 
-Numbers in parentheses are sections and equations of the thesis (Mubariz
-Zaffar, *Visual Place Recognition for Autonomous Robots*).
+Numbers in parentheses are sections and equations of the thesis (Mubariz Zaffar, *Visual Place Recognition for
+Autonomous Robots*).
 """
 
 import math
@@ -53,11 +53,11 @@ _NO_TAG = GeoTag()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchOptions:
-    """Options of matching. `candidates`: how many places are compared in full (None: the technique's own number, as in
-    flight); with `exact` all are, without a scan. `sequence`: how many successive queries, in the order of their names,
-    are matched together (None: the technique's own number). `follow`: the filter follows them as one flight's frames.
-    `known`: what is known of each besides its image, like "heading,height" (None: nothing, `hints.RecordedPrior`).
-    """
+    """Options of matching. `candidates`: number of places to compare in full (None: the technique's own number, as in
+    flight). `exact`: compare all places in full, without a scan. `sequence`: number of successive queries, in the order
+    of their names, to match together (None: the technique's own number). `follow`: track the queries with the place
+    filter, as frames of one flight. `known`: what is known about each query besides its image, such as "heading,height"
+    (see `hints.RecordedPrior`; None: nothing)."""
 
     candidates: int | None = bounded_key(1, 1_000_000, default=None)
     sequence: int | None = bounded_key(1, 100, default=None)
@@ -69,13 +69,13 @@ class MatchOptions:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryAnswer:
     """The judged answer to one query. `has_match`: its place is in the map. `found` is the name of the best reference
-    that is not ignored (None: there is none) and `score` its score (-inf); `first_right` is the rank of the first
-    right reference, from 0 (infinite: none).
+    that is not ignored (None: none), and `score` its score (-inf: none). `first_right` is the rank, from 0, of the
+    first correct reference (infinite: none).
 
-    `accepted`: a flight would have accepted the match; `accepted_wrong`: and it is wrong; `accepted_off_map`: and the
-    query has no place in the map; `accepted_elsewhere`: it is wrong, and no neighbour of a right or ignored reference
-    (`outside_neighbourhood`). `discarded`: the salience gate dropped the query as not memorable. `encoding` and
-    `matching` are the costs of the two stages.
+    `accepted`: a flight would have accepted the match. `accepted_wrong`: accepted, and wrong. `accepted_off_map`:
+    accepted, and the query's place is not in the map. `accepted_elsewhere`: accepted, wrong, and not a neighbour of a
+    correct or ignored reference (`outside_neighbourhood`). `discarded`: the salience gate discarded the query as not
+    memorable. `encoding` and `matching` are the costs of the two stages.
     """
 
     query: str
@@ -95,11 +95,11 @@ class QueryAnswer:
 def answer_queries(
     technique: Technique, dataset: Dataset, options: MatchOptions, progress: Progress, gate: SalienceGate | None = None
 ) -> tuple[list[QueryAnswer], tuple[str, ...]]:
-    """Map the references of `dataset` in a temporary file, and ask every query. Return one judged answer for each that
-    is scored, and what could not be done to the map (see `open_temporary_map`). `gate` discards queries that are not
-    memorable (None: none are); the map has all references, as in the thesis (3.3). Raises UsageError where no query
-    has what `options.known` asks for, ImageError and ModelError for an image, a network or a query that fails, and
-    MapError if the map cannot be written."""
+    """Map the references of `dataset` in a temporary file and run every query. Return the judged answers to the scored
+    queries, and the steps that failed for the map (see `open_temporary_map`). `gate` discards queries that are not
+    memorable (None: keep all); the map has all references, as in the thesis (3.3). Raises UsageError if no query has
+    what `options.known` requires, ImageError and ModelError if an image, network or query fails, and MapError if the
+    map cannot be written."""
     spec = technique.spec
     prior, tags = read_prior(options.known, dataset, spec, options.sequence)
     sequence = options.sequence or spec.sequence
@@ -123,11 +123,11 @@ def answer_queries(
 
         scored = {query.path.name: query for query in dataset.queries}
         paths = [query.path for query in dataset.queries]
-        # One query is not counted: the first pays for lazy imports and a cold disk.
+        # Run one query without counting it, because the first one pays for lazy imports and a cold disk.
         _recognise(open_recogniser(1, False), paths[0], _NO_TAG)
         if gate:
             gate.reset()
-        if sequence > 1 or follows:  # queries that are not scored are part of a sequence too
+        if sequence > 1 or follows:  # a sequence includes the queries that are not scored
             paths = list_images(paths[0].parent)
         recogniser, answers = open_recogniser(sequence, follows), []
         for path in progress(paths, len(paths), f"{spec.name}: queries"):
@@ -144,11 +144,11 @@ def open_temporary_map(
     images: Path | None = None,
     progress: Progress = iterate_silently,
 ) -> Iterator[tuple[PlaceMap, PlaceIndex, tuple[str, ...]]]:
-    """Context manager: map `frames` in a temporary file, then refine and calibrate the map as `map build` does; gives
-    the map, open to read, an index with all its places, and sentences on what could not be done to it. `images` is the
-    folder that the frames come from (None: the map is not calibrated)."""
+    """Context manager: map `frames` in a temporary file, then refine and calibrate the map like `map build`. Yields the
+    map, open for reading, an index of all its places, and a sentence for each step that failed. `images` is the folder
+    that the frames come from (None: the map is not calibrated)."""
 
-    def show(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
+    def show_progress(items: Iterable[Any], total: int, label: str) -> Iterable[Any]:
         return progress(items, total, f"{technique.spec.name}: {label}")
 
     with tempfile.TemporaryDirectory(prefix="edgevpr-eval-") as folder:
@@ -157,10 +157,10 @@ def open_temporary_map(
             build_map(frames, FrameEncoder(technique=technique), place_map)
             pictures = FlownPictures(source=str(images)) if images else None
             encoder = make_encoder(SourceConfig(), pictures, technique)
-            finished = finish_map(place_map, encoder, MatchConfig(), pictures, show)
+            finished = finish_map(place_map, encoder, MatchConfig(), pictures, show_progress)
         with PlaceMap.open(path) as place_map:
             index = load_index(place_map, technique, len(place_map) * compute_place_bytes(technique.spec))
-            # The folder is gone when the sentences are read, and another one in the next run.
+            # Drop the name of the temporary folder, which is deleted afterwards and differs in every run.
             yield place_map, index, tuple(sentence.replace(f"{folder}/", "") for sentence in finished.not_done)
 
 
@@ -171,8 +171,8 @@ def summarise(
     options: MatchOptions,
     not_done: tuple[str, ...] = (),
 ) -> metrics.TechniqueResult:
-    """Return the result of `technique`, without the PCU, from its answers to all queries, which were asked by
-    `options` on a map to which something could not be done."""
+    """Return the result of `technique`, without the PCU, from its answers to all queries. `options` are those of the
+    queries, and `not_done` lists the steps that failed for the map."""
     queries, references = len(answers), len(dataset.references)
     sequence = options.sequence or technique.spec.sequence
     battery, board = BatteryConfig(), load_board("this")
@@ -216,9 +216,9 @@ def summarise(
 def read_prior(
     text: str | None, dataset: Dataset, spec: TechniqueSpec, sequence: int | None
 ) -> tuple[RecordedPrior | None, dict[Path, GeoTag]]:
-    """Return what narrows each query of a data set, where `text` says what is known ("heading,height"; None: nothing),
-    and the tags of the queries by path. The height of the map is the median of those of its pictures. `sequence` is
-    that of `MatchOptions`. Raises UsageError if no query has what is asked for, and for a text that cannot be read."""
+    """Return the prior that narrows the search for each query of a data set, and the tags of the queries by path.
+    `text` lists what is known ("heading,height"; None: nothing). The height of the map is the median over its pictures.
+    `sequence`: see `MatchOptions`. Raises UsageError if `text` is invalid, or if no query has what it lists."""
     if not (parts := parse_known_fields(text)):
         return None, {}
     queries, places = read_tags(dataset.queries[0].path.parent), read_tags(dataset.ref_dir)
@@ -233,13 +233,13 @@ def read_prior(
 
 
 def _recognise(recogniser: Recogniser, path: Path, tag: GeoTag) -> Recognition:
-    """Recognise the image `path`, of which `tag` is known. Raises ModelError if that fails: figures without some
+    """Recognise the image at `path`, given its `tag`. Raises ModelError if recognition fails, because figures that omit
     queries would mislead."""
     event = recogniser.step(
         Frame(
             image=read_image(path),
             name=path.name,
-            t_mono_s=0.0,  # without gaps in time
+            t_mono_s=0.0,  # constant, so that there are no time gaps
             position=tag.position,
             heading_deg=tag.heading_deg,
             height_m=tag.height_m,
@@ -251,25 +251,25 @@ def _recognise(recogniser: Recogniser, path: Path, tag: GeoTag) -> Recognition:
 
 
 def _judge(event: Recognition, query: ScoredQuery, references: Sequence[str], index: PlaceIndex) -> QueryAnswer:
-    """Judge the recognition of `query`. `references` are the names of all places, in the order of mapping, which is
-    that of the slots of the index."""
+    """Judge the recognition of `query`. `references` are the names of all places, in mapping order, which is also the
+    order of the slots of the index."""
     discarded = event.salience is not None and event.salience.reason is not None
     ranking = None if discarded else event.ranking
     slots = ranking.slots if ranking else np.empty(0, np.intp)
     right, ignored = (np.array([name in names for name in references]) for names in (query.right, query.ignored))
     scored = np.flatnonzero(~ignored[slots])
     wrong = event.accepted and not (right | ignored)[slots[0]]
-    away = wrong and outside_neighbourhood(index, slots[0], np.flatnonzero(right | ignored), 0.0).all()
+    is_elsewhere = wrong and outside_neighbourhood(index, slots[0], np.flatnonzero(right | ignored), 0.0).all()
     return QueryAnswer(
         query=query.path.name,
         has_match=bool(query.right),
         found=references[slots[scored[0]]] if len(scored) else None,
         score=float(ranking.scores[scored[0]]) if ranking and len(scored) else -math.inf,
-        first_right=metrics.rank_first_right(slots[scored], right),
+        first_right=metrics.rank_of_first_correct(slots[scored], right),
         accepted=event.accepted,
         accepted_wrong=bool(wrong),
         accepted_off_map=bool(wrong and not query.right),
-        accepted_elsewhere=bool(away),
+        accepted_elsewhere=bool(is_elsewhere),
         discarded=discarded,
         encoding=event.steps.encoding,
         matching=event.steps.match,
@@ -277,7 +277,7 @@ def _judge(event: Recognition, query: ScoredQuery, references: Sequence[str], in
 
 
 def read_frames(source: Source) -> Iterator[Frame]:
-    """Yield all frames of a source. Raises ImageError for the first that cannot be used: figures without some
+    """Yield all frames of a source. Raises ImageError for the first that cannot be used, because figures that omit
     images would mislead."""
     while not source.ended:
         if frame := source.read(timeout_s=1.0):

@@ -1,11 +1,11 @@
 """Results of an evaluation, and their quality figures (thesis 2.7 and 6.3.1), as pure functions of the best match of
 every query.
 
-`scores` is float (N,): the score of each query's best match, -inf for a query that found none. `ranks` is float (N,):
-the rank, from 0, of its first right reference, infinite if there is none. `has_match` is bool (N,): whether its place
-is in the map. A match is accepted when its score is at least the threshold. So each threshold gives a precision, the
-share of right ones among the accepted matches, and a recall, the share of accepted ones among the right matches, and
-these are the curve. Numbers like (2.1) are equations of the thesis.
+`scores`, float (N,), is the score of each query's best match, -inf if it has none. `ranks`, float (N,), is the rank,
+from 0, of its first correct reference, infinite if there is none. `has_match`, bool (N,), is True if its place is in
+the map. A match is accepted if its score reaches the threshold. Each threshold gives one point of the precision-recall
+curve: precision is the share of accepted matches that are correct, and recall the share of correct matches that are
+accepted. Numbers like (2.1) are equations of the thesis.
 """
 
 import math
@@ -16,18 +16,18 @@ from typing import Any
 import numpy as np
 
 Interval = tuple[float, float]  # lower end, upper end
-_SIGMAS_95 = 1.959964  # of a normal distribution, within which 95 % lie
+_SIGMAS_95 = 1.959964  # 95 % of a normal distribution lie within this many standard deviations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figures:
-    """Figures of quality of `queries`; all shares are 0..1, and each recall has its 95 % confidence interval.
+    """Quality figures of `queries` queries; all shares are 0..1, and each recall has its 95 % confidence interval.
 
-    `auc_from_zero` is the area under the curve with a first point at recall 0, as scikit-learn and VPR-Bench compute
-    it, `auc_2_3` that by equation 2.3, `ep` the extended precision (2.4). R@100P is the recall at 100 % precision: of
-    the right best matches (VPR-Bench), and of the queries whose place is in the map (VPR_Tutorial). `roc_auc` is None
-    if all best matches are right, or none is. `precision_recall` are the points (precision, recall) of the curve, from
-    the highest threshold down."""
+    `auc_from_zero` is the area under the curve with an extra first point at recall 0, as in scikit-learn and VPR-Bench;
+    `auc_2_3` is the area by equation 2.3; `ep` is the extended precision (2.4). Recall at 100 % precision is relative
+    to the correct best matches (VPR-Bench), or to the queries whose place is in the map (VPR_Tutorial). `roc_auc` is
+    None if all best matches are correct, or none is. `precision_recall` lists the points (precision, recall) of the
+    curve, from the highest threshold down."""
 
     queries: int
     recall_at_1: float
@@ -48,10 +48,10 @@ class Figures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quality(Figures):
-    """Quality of a technique on a data set: the figures of all queries that are scored.
+    """Quality of a technique on a data set: the figures of all scored queries.
 
-    `queries_off_map` of them have no place in the map, where every match is wrong. `with_match` are the figures of the
-    others alone (None: they are all queries, or there are none). `unscored` queries have no truth to score them by."""
+    `queries_off_map` of them have no place in the map, so every match of theirs is wrong. `with_match` are the figures
+    of the others alone (None: these are all queries, or there are none). `unscored` queries have no ground truth."""
 
     technique: str
     references: int
@@ -67,11 +67,11 @@ class TechniqueResult(Quality):
     `accepted`, `accepted_wrong`, `accepted_off_map`, `accepted_elsewhere` and `discarded` count queries by the fields
     of `evaluate.QueryAnswer`; a discarded query counts as missed. Times are means over the queries: `t_match_s` is for
     all references, `t_match_per_ref_s` for one. `u_encode` and `u_match` are the shares of all cores that were busy,
-    0..1 (5.1). `descriptor_bytes` and `fine_bytes` are the RAM and the disk of a place, as in `profile`. Charges are
-    for all queries, in Ah (5.7), from the battery pack; `ah_assumes` names board, pack and efficiency. `sequence`: how
-    many queries were matched together. `known`: that of `evaluate.MatchOptions`. `weights`: origin of the network's
-    weights (None: no network). `not_done`: sentences on what `map build` does to a map and could not be done to this
-    one. `pcu`: filled in by `add_pcu`, since it depends on all techniques compared.
+    0..1 (5.1). `descriptor_bytes` and `fine_bytes` are the RAM and disk space per place, as in `profile`. `ah_total` is
+    the charge drawn from the battery pack for all queries, in Ah (5.7); `ah_assumes` states board, pack and efficiency.
+    `sequence`: number of queries matched together. `known`: see `evaluate.MatchOptions`. `weights`: origin of the
+    network's weights (None: no network). `not_done`: sentences on steps of `map build` that failed for this map.
+    `pcu`: set by `add_pcu`, because it depends on all techniques compared.
     """
 
     parameters: dict[str, int | float | str]
@@ -96,16 +96,16 @@ class TechniqueResult(Quality):
     pcu: float | None = None
 
 
-def rank_first_right(ranked: np.ndarray, right: np.ndarray) -> float:
-    """Return the rank, from 0, of the first right reference; infinite if there is none. `ranked` are numbers of
-    references, best first. `right`, bool (references,), is True for those that are right."""
+def rank_of_first_correct(ranked: np.ndarray, right: np.ndarray) -> float:
+    """Return the rank, from 0, of the first correct reference; infinite if there is none. `ranked` are the numbers of
+    references, best first. `right`, bool (references,), is True for correct references."""
     hits = np.flatnonzero(right[ranked])
     return float(hits[0]) if len(hits) else math.inf
 
 
 def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the curve with the threshold at every distinct score, from the highest down: precision (2.1) and recall
-    (2.2), float (points,). `correct`, bool (N,), tells right matches. If none is right, recall is taken to be 0."""
+    """Compute the curve with a threshold at each distinct score, from the highest down: precision (2.1) and recall
+    (2.2), float (points,). `correct`, bool (N,), is True for correct matches. If none is correct, recall is 0."""
     scores, correct = np.asarray(scores, float), np.asarray(correct, bool)
     order = np.argsort(-scores, kind="stable")[: np.count_nonzero(scores > -math.inf)]
     if not len(order):
@@ -118,31 +118,31 @@ def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarra
 
 
 def auc_2_3(precision: np.ndarray, recall: np.ndarray) -> float:
-    """Compute the area under the precision-recall curve by equation 2.3: only the points that occur, no extra one at
-    recall 0. So it is at most (N-1)/N, and 0 if all scores are the same, even of a faultless technique."""
+    """Compute the area under the precision-recall curve by equation 2.3, without an extra point at recall 0. Even for a
+    perfect technique it is therefore at most (N-1)/N, and 0 if all scores are equal."""
     return float(np.trapezoid(precision, recall))
 
 
 def auc_from_zero(precision: np.ndarray, recall: np.ndarray) -> float:
     """Compute the area under the precision-recall curve with an extra first point at recall 0 and precision 1, as
-    scikit-learn's `auc(*precision_recall_curve(...))` and most papers do. It is 1 for a faultless technique, whatever
-    the ties."""
+    scikit-learn's `auc(*precision_recall_curve(...))` and most papers do. It is 1 for a perfect technique, whether or
+    not scores are tied."""
     return float((1 + precision[0]) / 2 * recall[0]) + auc_2_3(precision, recall)
 
 
 def recall_at_100_precision(precision: np.ndarray, recall: np.ndarray) -> float:
-    """Return the largest recall at which every accepted match is right; 0 if the best-scoring match is wrong."""
+    """Return the largest recall at which every accepted match is correct; 0 if the best-scoring match is wrong."""
     return float(recall[precision == 1].max(initial=0))
 
 
 def precision_at_100_recall(precision: np.ndarray, recall: np.ndarray) -> float:
-    """Return the precision with the threshold at the lowest-scoring right match: never below recall@1."""
+    """Return the precision with the threshold at the lowest-scoring correct match: never below recall@1."""
     return float(precision[np.argmax(recall)])
 
 
 def roc_auc(scores: np.ndarray, correct: np.ndarray) -> float | None:
-    """Compute the area under the ROC curve: the chance that a right match scores higher than a wrong one. Ties count
-    half. None if all matches are right, or none is."""
+    """Compute the area under the ROC curve: the probability that a correct match scores higher than a wrong one, with
+    ties counting half. None if all matches are correct, or none is."""
     scores, correct = np.asarray(scores), np.asarray(correct, bool)
     right, wrong = scores[correct], np.sort(scores[~correct])
     if not len(right) or not len(wrong):
@@ -166,7 +166,7 @@ def wilson_interval(hits: np.ndarray) -> Interval:
 
 
 def compute_figures(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray) -> Figures:
-    """Compute the figures of one query or more."""
+    """Compute the figures of at least one query."""
     correct = ranks == 0
     precision, recall = precision_recall(scores, correct)
     recall_at_100 = recall_at_100_precision(precision, recall)
@@ -187,8 +187,8 @@ def compute_figures(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray
 
 
 def compute_quality(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray) -> dict[str, Any]:
-    """Return the fields of a `Quality`, by name, that follow from the answers: the figures of all queries, and of those
-    whose place is in the map."""
+    """Return the fields of a `Quality`, by name, that are computed from the answers: the figures of all queries, and of
+    those whose place is in the map."""
     figures = compute_figures(scores, ranks, has_match)
     is_mixed = has_match.any() and not has_match.all()
     return {
@@ -199,7 +199,7 @@ def compute_quality(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray
 
 
 def add_pcu(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
-    """Return the results with the PCU (see `pcu`) filled in. It depends on the slowest encoder among them."""
+    """Return the results with the PCU (see `pcu`) added. It depends on the slowest encoder among them."""
     results = list(results)
     slowest_s = max((result.t_encode_s for result in results), default=0.0)
     return [
@@ -208,6 +208,6 @@ def add_pcu(results: Iterable[TechniqueResult]) -> list[TechniqueResult]:
 
 
 def read_result(row: dict[str, Any]) -> TechniqueResult:
-    """Return the result whose fields are in `row`, as read from JSON. Other keys of `row` are left out."""
+    """Return the result whose fields are in `row`, as read from JSON. Other keys of `row` are ignored."""
     values = {field.name: row[field.name] for field in fields(TechniqueResult) if field.name in row}
     return TechniqueResult(**{**values, "with_match": values.get("with_match") and Figures(**values["with_match"])})

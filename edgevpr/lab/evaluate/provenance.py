@@ -1,4 +1,4 @@
-"""Provenance of a measurement, stored with every result: date, machine and versions."""
+"""Describes the provenance of a measurement (date, machine and versions), which is stored with every result."""
 
 import os
 import platform
@@ -20,7 +20,7 @@ def format_date() -> str:
 
 @cache
 def read_versions() -> dict[str, str | None]:
-    """Return the versions of edgevpr, Python and the libraries that decide a figure; None for one that is missing."""
+    """Return the versions of edgevpr, Python and the libraries that affect results; None if one is missing."""
     versions: dict[str, str | None] = {"edgevpr": edgevpr.__version__, "python": platform.python_version()}
     for name, package in _PACKAGES.items():
         try:
@@ -31,14 +31,14 @@ def read_versions() -> dict[str, str | None]:
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return the machine: its processor, the cores this process may use, and the threads of NumPy's BLAS library."""
+    """Return the processor, the number of cores this process may use, and the threads of NumPy's BLAS library."""
     threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
     return {"cpu": read_cpu_model(), "cores": len(os.sched_getaffinity(0)), "blas_threads": threads}
 
 
 @cache
 def read_cpu_model() -> str:
-    """Return the name of the processor, or its architecture (such as aarch64) if the system gives no name."""
+    """Return the name of the processor, or its architecture (such as aarch64) if the system reports no name."""
     for line in Path("/proc/cpuinfo").read_text().splitlines():
         if line.startswith(("model name", "Model")):
             return line.partition(":")[2].strip()
@@ -46,5 +46,5 @@ def read_cpu_model() -> str:
 
 
 def describe_origin() -> dict[str, Any]:
-    """Return the date, the machine and the versions, which are stored with a result."""
+    """Return the date, machine and versions to store with a result."""
     return {"date": format_date(), "machine": describe_machine(), "versions": read_versions()}

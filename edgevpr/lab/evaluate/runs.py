@@ -1,4 +1,4 @@
-"""Measures rows (a technique with its settings) on data sets: `edgevpr eval`."""
+"""Measures rows, each a technique with its settings, on data sets for `edgevpr eval`."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,8 +18,8 @@ from edgevpr.techniques import create
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What is measured: the data `sets`, by name, and on each of them the `rows`: (technique, its settings), by the
-    label of the row. `options` and `salience` say how all of them are asked."""
+    """A plan of measurements: every row on every set. `sets`: data sets by name. `rows`: (technique, its settings) by
+    the label of the row. `options` and `salience` apply to all of them."""
 
     sets: Mapping[str, Dataset]
     rows: Mapping[str, tuple[str, dict[str, Any]]]
@@ -29,8 +29,8 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """Outcome of a run: the results of the rows `measured`, by set, the `answers` to their queries and why others
-    `failed`, both by set and label."""
+    """Outcome of a run. `measured`: results of the rows, by set. `answers`: judged answers to their queries, by set and
+    label. `failed`: errors of rows that could not be measured, by set and label."""
 
     measured: dict[str, list[TechniqueResult]]
     answers: dict[tuple[str, str], Sequence[QueryAnswer]]
@@ -55,14 +55,14 @@ class Measurements:
 
 
 def _serialise_answer(answer: QueryAnswer) -> dict[str, Any]:
-    """Return the fields of an answer; null instead of the infinite ones of a query that found nothing right."""
+    """Return the fields of an answer for JSON, with null in place of infinite values."""
     fields = asdict(answer)
     return fields | {name: None for name in ("score", "first_right") if not math.isfinite(fields[name])}
 
 
 def measure(plan: Plan, progress: Progress) -> Measurements:
-    """Measure every row on every set. Raises UsageError for an unknown technique or parameter. A network or picture
-    that cannot be used only makes its row fail."""
+    """Measure every row on every set. Raises UsageError for an unknown technique or parameter. If a network or picture
+    cannot be used, only its row fails."""
     outcome = Measurements({}, {}, {})
     for name, dataset in plan.sets.items():
         results = []
@@ -70,7 +70,7 @@ def measure(plan: Plan, progress: Progress) -> Measurements:
             technique, gate = create(technique_name, settings), open_salience_gate(plan.salience)
             try:
                 answers, not_done = answer_queries(technique, dataset, plan.options, progress, gate)
-            except (ModelError, ImageError) as error:  # it stops no other row
+            except (ModelError, ImageError) as error:  # the other rows continue
                 outcome.failed[name, label] = error
             else:
                 result = summarise(technique, dataset, answers, plan.options, not_done)

@@ -1,6 +1,6 @@
-"""Measures stored similarities, the scores that a technique gave every reference for every query, without any image.
+"""Measures stored similarities (a technique's scores of all references for each query) without the images.
 
-`edgevpr eval --similarity` uses it. A file is a .npy, float (queries, references); higher is more alike.
+`edgevpr eval --similarity` uses it. A file is a .npy array, float (queries, references); higher is more similar.
 """
 
 import math
@@ -13,41 +13,41 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.images import make_sort_key
 from edgevpr.lab.evaluate.dataset import GroundTruth
-from edgevpr.lab.evaluate.metrics import Quality, compute_quality, rank_first_right
+from edgevpr.lab.evaluate.metrics import Quality, compute_quality, rank_of_first_correct
 
 
 def read_similarities(path: str | Path) -> Doubles:
-    """Read a file of similarities, float64 (queries, references). Raises UsageError for a file that holds none."""
+    """Read a file of similarities, float64 (queries, references). Raises UsageError if the file contains none."""
     try:
         scores = np.load(path, allow_pickle=False)
     except OSError as error:
         raise UsageError(f"{path} cannot be read ({error.strerror or error}): give a .npy file.") from error
     except (ValueError, EOFError) as error:
-        raise UsageError(f"{path} holds no similarities ({error}): give a .npy file of them.") from error
+        raise UsageError(f"{path} contains no similarities ({error}): give a .npy file.") from error
     is_matrix = isinstance(scores, np.ndarray) and scores.ndim == 2 and scores.dtype.kind in "biuf"
     if not is_matrix or np.isnan(scores).any():
-        raise UsageError(f"{path} needs a row of numbers for each query, with one for each reference, and no NaN.")
+        raise UsageError(f"{path} must be a matrix of numbers, no NaN: one row per query, one column per reference.")
     return np.asarray(scores, np.float64)
 
 
 def add_unscored(truth: GroundTruth, queries: Sequence[str]) -> GroundTruth:
-    """Return `truth` with an entry for each of `queries`, the names of all images, in their order. Raises UsageError if
-    it names others."""
+    """Return `truth` with an entry for each of `queries`, the names of all query images, in that order. Raises
+    UsageError if `truth` contains other names."""
     if missing := sorted(truth.keys() - set(queries)):
-        raise UsageError(f"The ground truth names the query `{missing[0]}`, which is not in --query.")
+        raise UsageError(f"The ground truth contains the query `{missing[0]}`, which is not in the --query folder.")
     return {name: truth.get(name) for name in queries}
 
 
 def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequence[str] | None = None) -> Quality:
-    """Compute the quality of `scores`, float (queries, references), which `label` names in messages. Rows are the
-    queries of `truth`, in its order, and columns `references` (None: all that `truth` names, in counting order). Raises
-    UsageError where the counts do not fit."""
+    """Compute the quality of `scores`, float (queries, references); `label` is their name in messages. Rows are the
+    queries of `truth`, in its order, and columns are `references` (None: all names in `truth`, in natural order).
+    Raises UsageError if the numbers do not match."""
     named = frozenset[str]().union(*(names for answers in truth.values() for names in answers or ()))
     names = list(references or sorted(named, key=make_sort_key))
     if scores.shape != (len(truth), len(names)) or not named <= set(names):
         raise UsageError(
-            f"{label} has scores of {scores.shape[0]} queries and {scores.shape[1]} references, and the ground truth "
-            f"has {len(truth)} and {len(names)}: give the matching one, or all images with --query and --ref."
+            f"{label} has scores for {scores.shape[0]} queries and {scores.shape[1]} references, but the ground truth "
+            f"has {len(truth)} and {len(names)}: give the matching file, or all images with --query and --ref."
         )
     best = []
     for row, answers in zip(scores, truth.values(), strict=True):
@@ -56,8 +56,8 @@ def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequenc
             ranked = np.argsort(-row, kind="stable")
             ranked = ranked[~ignored[ranked]]
             score = row[ranked[0]] if len(ranked) else -math.inf
-            best.append((score, rank_first_right(ranked, right), bool(right.any())))
+            best.append((score, rank_of_first_correct(ranked, right), bool(right.any())))
     if not best:
-        raise UsageError(f"{label}: the ground truth scores none of its queries: give the matching one.")
+        raise UsageError(f"{label}: the ground truth scores none of its queries: give the matching ground truth.")
     columns = map(np.array, zip(*best, strict=True))
     return Quality(technique=label, references=len(names), unscored=len(truth) - len(best), **compute_quality(*columns))

@@ -1,4 +1,4 @@
-"""Formats results of evaluations as text tables for a terminal, and as rows for tables of pages."""
+"""Formats results of evaluations as text tables for the terminal, and as rows for tables on pages."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -7,19 +7,19 @@ from edgevpr.core.text import align_table
 from edgevpr.lab.evaluate.metrics import Figures, Interval, Quality, TechniqueResult
 from edgevpr.lab.evaluate.provenance import read_versions
 
-Column = tuple[str, Callable[[Any], str]]  # a heading, and the text of a result's cell
+Column = tuple[str, Callable[[Any], str]]  # the heading, and a function that formats the cell of a result
 
 ABOUT_FIGURES = (
-    "95 %: interval by Wilson's score.",
-    "AUC: area under the precision-recall curve from recall 0 (scikit-learn, VPR-Bench); AUC 2.3: that of equation 2.3 "
-    "of the thesis, from the first point on.",
-    "R@100%P, right: share of the right best matches (VPR-Bench); R@100%P, in map: of the queries whose place is in "
-    "the map (VPR_Tutorial).",
+    "95 %: Wilson score interval.",
+    "AUC: area under the precision-recall curve from recall 0 (scikit-learn, VPR-Bench); AUC 2.3: by equation 2.3 of "
+    "the thesis, from the first point of the curve.",
+    "R@100%P, right: share of the correct best matches (VPR-Bench); R@100%P, in map: share of the queries whose place "
+    "is in the map (VPR_Tutorial).",
 )
 
 
 def format_share(share: float | Interval | None) -> str:
-    """Return a share (0..1) or an interval as text; "-" for None, which is unknown."""
+    """Return a share (0..1) or an interval as text; "-" for None (unknown)."""
     if isinstance(share, Sequence):  # JSON has no tuples
         return f"{share[0]:.2f}-{share[1]:.2f}"
     return "-" if share is None else f"{share:.3f}"
@@ -75,8 +75,8 @@ COSTS: tuple[Column, ...] = (
 
 
 def make_rows(result: Quality, columns: Sequence[Column], both: bool = True) -> Iterator[list[str]]:
-    """Yield the row of a result, and with `both` a second one of the queries whose place is in the map, if these are
-    not all."""
+    """Yield the row of a result. With `both`, also yield a row for the queries whose place is in the map, if there are
+    others."""
     yield [result.technique, *(format_cell(result) for _, format_cell in columns)]
     if both and result.with_match:
         yield [f"{result.technique}, in map", *(format_cell(result.with_match) for _, format_cell in columns)]
@@ -88,8 +88,8 @@ def list_headings(columns: Sequence[Column]) -> list[str]:
 
 
 def format_results(results: Sequence[Quality]) -> str:
-    """Return the text that `edgevpr eval` prints for a data set: tables, then the notes on them. Results of techniques
-    come from `metrics.compare`; those of stored similarities have no costs."""
+    """Return the text that `edgevpr eval` prints for a data set: tables, then notes on them. Results for stored
+    similarities have no costs."""
     has_costs = isinstance(results[0], TechniqueResult)
     texts = []
     for columns in (RECALLS, (*CURVE, *DECISIONS), COSTS) if has_costs else (RECALLS, CURVE):
@@ -102,14 +102,15 @@ def list_notes(results: Sequence[Quality]) -> Iterator[str]:
     """Yield the sentences below the tables of a data set."""
     first = results[0]
     yield f"{first.queries} queries scored against {first.references} references."
-    yield f"{first.queries_off_map} of them have no place in the map: every match of theirs is wrong (off the map)."
+    yield f"{first.queries_off_map} of them are off the map: their place is not in it, so every match is wrong."
     if first.unscored:
-        yield f"{first.unscored} more queries have no truth, and are not scored."
+        yield f"{first.unscored} more queries have no ground truth and are not scored."
     yield from ABOUT_FIGURES
     techniques = [result for result in results if isinstance(result, TechniqueResult)]
     if techniques:
         yield from _list_notes_on_techniques(techniques)
-    yield "By " + ", ".join(f"{name} {version or '(not installed)'}" for name, version in read_versions().items()) + "."
+    versions = (f"{name} {version or '(not installed)'}" for name, version in read_versions().items())
+    yield f"Computed with {', '.join(versions)}."
 
 
 def _list_notes_on_techniques(results: Sequence[TechniqueResult]) -> Iterator[str]:
@@ -117,11 +118,11 @@ def _list_notes_on_techniques(results: Sequence[TechniqueResult]) -> Iterator[st
         if result.sequence > 1:
             yield f"{result.technique} matched sequences of {result.sequence} queries."
         if result.known:
-            yield f"Known of each query of {result.technique}: {result.known}."
+            yield f"{result.technique} was given for each query: {result.known}."
         if result.discarded:
-            yield f"{result.technique}: {result.discarded} queries were not memorable, and count as missed."
+            yield f"{result.technique}: {result.discarded} queries were discarded as not memorable and count as missed."
         yield from (f"{result.technique}: {sentence}" for sentence in result.not_done)
-    yield "Times: means over the queries. accepted: would have moved the aircraft, by the technique's own rule."
+    yield "Times: means over the queries. accepted: a flight would accept the match, by the technique's own rule."
     slowest_ms = 1000 * max(result.t_encode_s for result in results)
     yield f"PCU: P@100%R x log10(t_e,max / t_e + 9) with t_e,max = {slowest_ms:.1f} ms."
     yield f"mAh: {results[0].ah_assumes}."

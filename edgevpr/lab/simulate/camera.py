@@ -1,4 +1,4 @@
-"""Pictures of a scene by a camera under a drone: light on the ground, a pinhole camera, and the faults of its sensor.
+"""Renders pictures of a scene by a camera under a drone: lighting, a pinhole camera and its sensor's imperfections.
 `generated` and `overflight` take their pictures with it."""
 
 from dataclasses import dataclass
@@ -15,9 +15,9 @@ _STRIP_ROWS = 256  # rows lit at a time: the working memory stays small
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Light:
-    """Light of the hour and the weather. `warmth` shifts sunlight from blue (-1) to orange (+1). `cloud_frac` of the
-    ground lies in the shadow of clouds, and `haze_frac` (0..1) of the picture is grey haze. `exposure` is a factor of
-    brightness, `gamma` an exponent."""
+    """Lighting by time of day and weather. `warmth` shifts sunlight from blue (-1) to orange (+1). `cloud_frac` is the
+    share (0..1) of the ground in cloud shadow, and `haze_frac` the share of grey haze in the picture. `exposure` is a
+    brightness factor, `gamma` an exponent."""
 
     sun_azimuth_deg: float
     sun_elevation_deg: float
@@ -30,8 +30,8 @@ class Light:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Camera:
-    """A pinhole camera that looks straight down, the top of its picture towards the nose of the aircraft, and its
-    faults: `noise_sigma` in grey levels, and `blur_px` along the direction of flight."""
+    """A pinhole camera that looks straight down, with the top of its picture towards the nose of the aircraft.
+    `noise_sigma`: sensor noise in grey levels. `blur_px`: motion blur along the direction of flight."""
 
     width: int = 640
     height: int = 480
@@ -43,8 +43,8 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraPose:
-    """Position and attitude of the camera. Positions are metres from the scene's south-west corner and over its ground.
-    Angles are degrees of the airframe: heading clockwise from north, roll right wing down, pitch nose up."""
+    """Position and attitude of the camera. Positions are metres from the scene's south-west corner and above ground.
+    Angles are those of the airframe in degrees: heading clockwise from north, roll right wing down, pitch nose up."""
 
     east_m: float = 0.0
     north_m: float = 0.0
@@ -71,7 +71,7 @@ def ground_to_pixel(pose: CameraPose, camera: Camera) -> Doubles:
 
 
 def light_scene(scene: Scene, light: Light, seed: int) -> Image:
-    """Light the scene: uint8 (H, W, 3) BGR with shaded slopes, cast shadows, and shadows of clouds made from `seed`."""
+    """Light the scene: returns uint8 (H, W, 3) BGR with shaded slopes, cast shadows, and cloud shadows from `seed`."""
     azimuth, elevation = np.radians((light.sun_azimuth_deg, light.sun_elevation_deg))
     towards_sun = float(np.sin(azimuth)), float(-np.cos(azimuth))  # in columns and rows
     shadow = _cast_shadows(scene, towards_sun, float(np.tan(elevation)))
@@ -81,8 +81,8 @@ def light_scene(scene: Scene, light: Light, seed: int) -> Image:
     ground = np.empty_like(scene.albedo)
     for top in range(0, len(ground), _STRIP_ROWS):
         rows = slice(top, top + _STRIP_ROWS)
-        around_cm = scene.height_cm[max(0, top - 1) : top + _STRIP_ROWS + 1].astype(np.float32)
-        down, right = (np.gradient(around_cm, 100 * scene.metres_per_pixel, axis=axis) for axis in (0, 1))
+        padded_cm = scene.height_cm[max(0, top - 1) : top + _STRIP_ROWS + 1].astype(np.float32)
+        down, right = (np.gradient(padded_cm, 100 * scene.metres_per_pixel, axis=axis) for axis in (0, 1))
         inner = slice(top - max(0, top - 1), None)
         down, right = down[inner][:_STRIP_ROWS], right[inner][:_STRIP_ROWS]
         slope = np.sin(elevation) - np.cos(elevation) * (right * towards_sun[0] + down * towards_sun[1])
@@ -93,10 +93,10 @@ def light_scene(scene: Scene, light: Light, seed: int) -> Image:
 
 
 def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: float) -> Array:
-    """Compute the shadows, uint8 (H, W), 255 where something stands between the ground and the sun. `towards_sun`
-    (column, row) is the step of one pixel towards the sun, and `steepness` the tangent of its elevation."""
-    # The sunlight of (x, y) is blocked if, for any k, the height k pixels towards the sun less k * drop exceeds that of
-    # (x, y). The maximum over 2k pixels comes from those over the first and the next k: eight passes look 256 far.
+    """Compute the shadow mask, uint8 (H, W), 255 where something blocks the sun. `towards_sun` (column, row) is a step
+    of one pixel towards the sun, and `steepness` the tangent of its elevation."""
+    # Sunlight at (x, y) is blocked if, for any k, the height k pixels towards the sun minus k * drop exceeds the height
+    # at (x, y). The maximum over 2k pixels combines those over the first and the next k: eight passes reach 256 pixels.
     drop_cm = 100 * scene.metres_per_pixel * steepness
     blocking, steps = scene.height_cm, 1
     while steps * scene.metres_per_pixel < _MAX_SHADOW_M:
@@ -111,7 +111,7 @@ def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: flo
 
 
 def _make_clouds(scene: Scene, cloud_frac: float, seed: int) -> Array:
-    """Return the share of sunlight that clouds hold back, uint8 (H, W); 255 is all of it."""
+    """Return the share of sunlight that clouds block, uint8 (H, W); 255 is all of it."""
     coarse = make_noise(np.random.default_rng(seed), (64, 64), 16, 3)
     edge = float(np.quantile(coarse, 1 - cloud_frac)) + (0.25 if cloud_frac == 0 else 0)
     cover = (150 * smooth_step(coarse, edge - 0.25, edge + 0.25)).astype(np.uint8)
@@ -119,10 +119,10 @@ def _make_clouds(scene: Scene, cloud_frac: float, seed: int) -> Array:
 
 
 def view_on_ground(pose: CameraPose, camera: Camera) -> Doubles | None:
-    """Return the corners of the picture on the ground, (4, 2) metres east and north. None: it shows the horizon."""
+    """Return the corners of the picture on the ground, (4, 2) metres east and north; None if it shows the horizon."""
     corners = [(0, 0, 1), (camera.width - 1, 0, 1), (camera.width - 1, camera.height - 1, 1), (0, camera.height - 1, 1)]
     ground = np.linalg.solve(ground_to_pixel(pose, camera), np.array(corners, float).T).T
-    return ground[:, :2] / ground[:, 2:] if (ground[:, 2] > 0).all() else None  # one over the distance ahead
+    return ground[:, :2] / ground[:, 2:] if (ground[:, 2] > 0).all() else None  # inverse depth
 
 
 def photograph(
@@ -134,15 +134,15 @@ def photograph(
     rng: np.random.Generator,
     border: int = cv2.BORDER_REFLECT,
 ) -> np.ndarray:
-    """Take one frame, uint8 (camera.height, camera.width, 3) BGR, of a `light_scene` ground; `rng` makes the sensor's
-    noise. `border` is what OpenCV shows beyond the ground: its mirror image, or nothing (BORDER_CONSTANT)."""
-    # The centre of the north-west pixel is half a pixel inside of the scene.
+    """Take one frame, uint8 (camera.height, camera.width, 3) BGR, of ground from `light_scene`; `rng` generates the
+    sensor noise. `border` is OpenCV's border mode beyond the ground: its mirror image, or black (BORDER_CONSTANT)."""
+    # The centre of the north-west pixel lies half a pixel inside the scene.
     half, depth_m = metres_per_pixel / 2, len(ground) * metres_per_pixel
     metres_from_pixel = np.array([[metres_per_pixel, 0, half], [0, -metres_per_pixel, depth_m - half], [0, 0, 1]])
     view = ground_to_pixel(pose, camera) @ metres_from_pixel
     frame = cv2.warpPerspective(ground, view, (camera.width, camera.height), borderMode=border)
     if camera.blur_px >= 1:
-        frame = cv2.blur(frame, (1, round(camera.blur_px) + 1))  # the ground runs down the picture
+        frame = cv2.blur(frame, (1, round(camera.blur_px) + 1))  # the ground moves down the picture
     tone = np.linspace(0, 1, 256, dtype=np.float32) ** light.gamma * light.exposure
     tone = tone * (1 - light.haze_frac) + 0.62 * light.haze_frac
     frame_levels: Array = cv2.LUT(frame, (255 * tone).astype(np.float32))

@@ -1,4 +1,4 @@
-"""The demonstration `edgevpr demo`: two generated flights, and the real commands between them, each as a process."""
+"""Runs `edgevpr demo`: generates two flights and runs the real commands on them, each in a process of its own."""
 
 import subprocess
 import sys
@@ -30,12 +30,12 @@ from edgevpr.lab.simulate.landscape import make_scene
 from edgevpr.review.logged import LoggedQuery, read_flight
 
 _SEED = 1
-_INTERVAL_S = 0.2  # of the later flight, which is flown by the times of its pictures
-_CAMERA = ("--camera", "nadir", "--fov-deg", 66)  # that of the generated flights
-# A place is the right one where the two pictures share 30 % of their ground, which is 78 m long from a height of 80 m.
+_INTERVAL_S = 0.2  # between pictures of the later flight, which is replayed at the times of its pictures
+_CAMERA = ("--camera", "nadir", "--fov-deg", 66)  # of the generated flights
+# A place is correct if the two pictures share 30 % of their ground. From a height of 80 m a picture is 78 m long.
 MAX_RIGHT_M = 55.0
 _PICTURE_PX = (1600, 1050)
-# Colours (blue, green, red) of the places, of the later flight, and of the matches by their outcome.
+# Colours (blue, green, red) of the places, of the later flight, and of matches by outcome.
 _MAPPED = (255, 255, 255)
 _LATER = (10, 214, 255)
 _RIGHT = (91, 191, 47)
@@ -51,11 +51,11 @@ _LEGEND = {
 
 
 def run_demo(folder: str | Path) -> str:
-    """Generate both flights, map the first one, fly the second one without a flight controller; return the results, as
-    text.
+    """Generate both flights, map the first one, fly the second one without a flight controller, and return the results
+    as text.
 
-    Leaves in `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and demo.png.
-    Raises EdgevprError where a part of it fails.
+    Writes to `folder`: flight-1/ and flight-2/ (images, positions.csv), map.gpkg, flight.jsonl and demo.png.
+    Raises EdgevprError if a command fails.
     """
     folder = Path(folder)
     map_path, log_path, picture_path = (folder / name for name in ("map.gpkg", "flight.jsonl", "demo.png"))
@@ -78,16 +78,16 @@ page              edgevpr report {log_path} --out {folder / "report.html"}"""
 
 
 def run_command(*words: object) -> None:
-    """Run a command of edgevpr to its end. Raises EdgevprError if it fails."""
+    """Run an edgevpr command and wait for it. Raises EdgevprError if it fails."""
     command = list(map(str, words))
     code = subprocess.run([sys.executable, "-m", "edgevpr", *command], stdout=subprocess.DEVNULL).returncode
     if code:
-        raise EdgevprError(f"`edgevpr {' '.join(command)}` ended with exit code {code}: see its message above.")
+        raise EdgevprError(f"`edgevpr {' '.join(command)}` failed with exit code {code}: see its message above.")
 
 
 def read_queries(log_path: Path, mapped: Path, flown: Path) -> tuple[list[LoggedQuery], list[LatLon]]:
-    """Read the queries of a flight log, judged by the positions.csv in the folder of its flight, and the positions of
-    the places, from that of the mapping flight."""
+    """Read the queries of a flight log, with true positions from the positions.csv in `flown`, and the positions of the
+    places from the one in `mapped`."""
     true_positions, places = (
         {name: (tag.position.lat_deg, tag.position.lon_deg) for name, tag in tags.items() if tag.position}
         for tags in (read_positions(folder / "positions.csv") for folder in (flown, mapped))
@@ -101,7 +101,7 @@ def read_queries(log_path: Path, mapped: Path, flown: Path) -> tuple[list[Logged
 
 
 def is_right(query: LoggedQuery) -> bool:
-    """Return True if the place that was found is near enough to where the picture was taken."""
+    """Return True if the matched place is near enough to the true position of the query."""
     return _are_near(query.true_position, query.place_position)
 
 
@@ -118,12 +118,12 @@ def summarise(queries: Sequence[LoggedQuery], places: Sequence[LatLon]) -> str:
     off_map_rejected = off_map - sum(query not in on_map for query in accepted)
     recall = sum(map(is_right, on_map)) / max(len(on_map), 1)
     return f"""
-queries           {len(queries)}: {len(on_map)} over the map, {off_map} beyond it
-recall@1          {recall:.2f} of those over the map (best place within {MAX_RIGHT_M:g} m)
+queries           {len(queries)}: {len(on_map)} over the map, {off_map} outside it
+recall@1          {recall:.2f} of the queries over the map (best place within {MAX_RIGHT_M:g} m)
 accepted          {len(accepted)}, {sum(not is_right(query) for query in accepted)} of them wrong
-rejected          {len(queries) - len(accepted)}, among them {off_map_rejected} of the {off_map} beyond the map
+rejected          {len(queries) - len(accepted)}, including {off_map_rejected} of the {off_map} outside the map
 position error    median {np.median(errors_m):.1f} m, 90 % within {np.quantile(errors_m, 0.9):.1f} m, \
-largest {max(errors_m):.1f} m (of the accepted; places are 21 m apart)"""
+largest {max(errors_m):.1f} m (accepted queries; places are 21 m apart)"""
 
 
 def _choose_colour(query: LoggedQuery) -> tuple[int, int, int]:
@@ -133,8 +133,8 @@ def _choose_colour(query: LoggedQuery) -> tuple[int, int, int]:
 
 
 def _draw(path: Path, ground: Image, mapping: GeneratedFlight, queries: Sequence[LoggedQuery]) -> None:
-    """Draw both tracks on the lit landscape `ground`, uint8 (H, W, 3) BGR, and write the picture to `path`. Land
-    outside of the map is darkened, and a line joins each query to the place that was recognised."""
+    """Draw both tracks on the lit landscape `ground`, uint8 (H, W, 3) BGR, and write the picture to `path`. Unmapped
+    land is darkened, and a line connects each query to its matched place."""
     scale = _PICTURE_PX[0] / SCENE_WIDTH_M
 
     def pixels(points_m: ArrayLike) -> list[tuple[int, int]]:
@@ -146,15 +146,15 @@ def _draw(path: Path, ground: Image, mapping: GeneratedFlight, queries: Sequence
             cv2.fillConvexPoly(covered, np.array(pixels(corners_m)), 1)
     picture = cv2.resize(ground, _PICTURE_PX, interpolation=cv2.INTER_AREA)
     picture = np.where(covered[..., None] > 0, picture, picture // 3 + 20).astype(np.uint8)
-    places = pixels([(pose.east_m, pose.north_m) for pose in mapping.poses])
+    mapped_px = pixels([(pose.east_m, pose.north_m) for pose in mapping.poses])
     matches = [query for query in queries if query.true_position and query.place_position]
-    taken = pixels([to_metres(*query.true_position) for query in matches if query.true_position])
-    matched = pixels([to_metres(*query.place_position) for query in matches if query.place_position])
-    for track, colour in ((places, _MAPPED), (taken, _LATER)):
+    query_px = pixels([to_metres(*query.true_position) for query in matches if query.true_position])
+    place_px = pixels([to_metres(*query.place_position) for query in matches if query.place_position])
+    for track, colour in ((mapped_px, _MAPPED), (query_px, _LATER)):
         cv2.polylines(picture, [np.array(track)], False, colour, 2, cv2.LINE_AA)
-    for place in places:
+    for place in mapped_px:
         cv2.circle(picture, place, 4, _MAPPED, -1, cv2.LINE_AA)
-    for query, start, end in zip(matches, taken, matched, strict=True):
+    for query, start, end in zip(matches, query_px, place_px, strict=True):
         cv2.line(picture, start, end, _choose_colour(query), 3 if query.accepted else 1, cv2.LINE_AA)
         cv2.circle(picture, start, 7, _choose_colour(query), -1, cv2.LINE_AA)
     for row, (text, colour) in enumerate(_LEGEND.items()):
@@ -163,15 +163,15 @@ def _draw(path: Path, ground: Image, mapping: GeneratedFlight, queries: Sequence
 
 
 def _draw_pairs(folder: Path, queries: Sequence[LoggedQuery]) -> Image:
-    """Draw ten queries, evenly spread over the flight, each with the picture of its place: uint8 (H, W, 3) BGR."""
+    """Draw ten queries, evenly spread over the flight, each next to its matched place: uint8 (H, W, 3) BGR."""
     pairs: list[Image] = []
     for index in np.linspace(0, len(queries) - 1, 10).astype(int):
         query = queries[index]
         files = (folder / "flight-2/images" / query.name, folder / f"flight-1/images/{query.reference_image}")
         pictures = [cv2.resize(read_image(file), (240, 180), interpolation=cv2.INTER_AREA) for file in files]
         pair = cv2.copyMakeBorder(np.hstack(pictures), 25, 5, 5, 5, cv2.BORDER_CONSTANT, value=_choose_colour(query))
-        outcome = "rejected" if query.off_m is None else f"{query.off_m:.1f} m off"
-        text = f"query, and its place: {outcome}, score {query.line['score']:.2f}"
+        outcome = "rejected" if query.off_m is None else f"error {query.off_m:.1f} m"
+        text = f"query and matched place: {outcome}, score {query.line['score']:.2f}"
         cv2.putText(pair, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
         pairs.append(pair.astype(np.uint8))
     return np.hstack([np.vstack(pairs[:5]), np.vstack(pairs[5:])])

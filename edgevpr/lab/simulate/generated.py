@@ -1,5 +1,5 @@
-"""Two flights over one generated landscape: the first makes a map; the second comes back hours later and also leaves
-the mapped land. `edgevpr simulate flight` writes them, and `demo` flies them."""
+"""Generates two flights over one generated landscape. The first is for making a map; the second returns hours later and
+also leaves the mapped land. `edgevpr simulate flight` writes them, and `demo` flies them."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -17,22 +17,22 @@ from edgevpr.lab.simulate.brush import Scene
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, light_scene, photograph
 from edgevpr.lab.simulate.landscape import make_scene
 
-# The south-west corner of every scene: the home of ArduPilot's simulator (its Tools/autotest/locations.txt, CMAC).
+# The south-west corner of every scene: home of ArduPilot's simulator (CMAC in its Tools/autotest/locations.txt).
 _ORIGIN_ALT_M = 584.0
 ORIGIN = Position(-35.363261, 149.165230, _ORIGIN_ALT_M)
-SCENE_WIDTH_M = 640.0  # as the flights below need
+SCENE_WIDTH_M = 640.0  # large enough for the flights below
 SCENE_DEPTH_M = 420.0
 
 _LEG_START_M = 65.0  # east
-_LEG_END_M = 345.0  # the land east of it is in no map
+_LEG_END_M = 345.0  # the land east of this is not mapped
 _LEGS_NORTH_M = (70.0, 140.0, 210.0, 280.0, 350.0)
 _HEIGHT_M = 80.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GeneratedFlight:
-    """A flight with one picture at each pose, every `interval_s` from `start_utc` on; `seed` makes its clouds and the
-    noise of its sensor."""
+    """A flight with one picture per pose, every `interval_s` seconds from `start_utc`. `seed` generates the clouds and
+    the sensor noise."""
 
     poses: tuple[CameraPose, ...]
     light: Light
@@ -43,16 +43,17 @@ class GeneratedFlight:
 
 
 def plan_mapping_flight(seed: int) -> GeneratedFlight:
-    """Plan 70 pictures on five parallel legs, flown to and fro on a clear morning with the nose ahead."""
+    """Plan 70 pictures on five parallel legs, flown back and forth on a clear morning, nose forward."""
     rng = np.random.default_rng((seed, 1))
     poses = []
     for leg, north_m in enumerate(_LEGS_NORTH_M):
         eastwards = leg % 2 == 0
         for east in np.linspace(_LEG_START_M, _LEG_END_M, 14)[:: 1 if eastwards else -1].tolist():
-            off_m, off_deg = rng.normal(0, 0.7, 3).tolist(), rng.normal(0, 0.8, 3).tolist()
-            position = {"east_m": east + off_m[0], "north_m": north_m + off_m[1], "height_m": _HEIGHT_M + off_m[2]}
-            heading_deg = (90 if eastwards else 270) + off_deg[0]
-            poses.append(CameraPose(**position, heading_deg=heading_deg, roll_deg=off_deg[1], pitch_deg=off_deg[2]))
+            dx_m, dy_m, dz_m = rng.normal(0, 0.7, 3).tolist()
+            yaw_deg, roll_deg, pitch_deg = rng.normal(0, 0.8, 3).tolist()
+            position = {"east_m": east + dx_m, "north_m": north_m + dy_m, "height_m": _HEIGHT_M + dz_m}
+            heading_deg = (90 if eastwards else 270) + yaw_deg
+            poses.append(CameraPose(**position, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg))
     return GeneratedFlight(
         poses=tuple(poses),
         light=Light(sun_azimuth_deg=48, sun_elevation_deg=52, exposure=1.12),
@@ -63,8 +64,8 @@ def plan_mapping_flight(seed: int) -> GeneratedFlight:
 
 
 def plan_later_flight(seed: int) -> GeneratedFlight:
-    """Plan 40 pictures on an afternoon with clouds and haze: back along the fourth leg, out along the third one and on
-    over land that is in no map, with drifts in place, height, heading and tilt."""
+    """Plan 40 pictures on a cloudy, hazy afternoon: back along the fourth leg, out along the third one, and on over
+    land that is not mapped, with slow deviations in position, height, heading and tilt."""
     rng = np.random.default_rng((seed, 2))
     back_m = np.arange(_LEG_END_M - 6, _LEG_START_M, -21.0)
     out_m = np.arange(_LEG_START_M + 8, SCENE_WIDTH_M - 62, 19.0)
@@ -90,7 +91,7 @@ def plan_later_flight(seed: int) -> GeneratedFlight:
 
 
 def write_flight(folder: str | Path, scene: Scene, flight: GeneratedFlight) -> Iterator[str]:
-    """Write the pictures of a flight over a scene with `write_shots`."""
+    """Write the pictures of a flight over a scene (see `write_shots`)."""
     ground = light_scene(scene, flight.light, flight.seed)
     rng = np.random.default_rng((flight.seed, 3))
 
@@ -110,10 +111,10 @@ def write_flight(folder: str | Path, scene: Scene, flight: GeneratedFlight) -> I
 
 
 def write_shots(folder: Path, shots: Iterable[tuple[GeoTag, Image | None]], quality: int) -> Iterator[str]:
-    """Write `folder`/images/*.jpg, and in the end `folder`/positions.csv with the true position and attitude of each.
-    A shot is its tag and its picture, uint8 (H, W, 3) BGR; without a picture it is left out.
+    """Write `folder`/images/*.jpg, and finally `folder`/positions.csv with the true position and attitude of each
+    image. A shot is a tag and a picture, uint8 (H, W, 3) BGR; shots without a picture are skipped.
 
-    Yields the name of every image once it is written. Raises OSError where the folder cannot be written.
+    Yields the name of each image once it is written. Raises OSError if the folder cannot be written.
     """
     (folder / "images").mkdir(parents=True, exist_ok=True)
     written: dict[str, GeoTag] = {}
@@ -128,20 +129,20 @@ def write_shots(folder: Path, shots: Iterable[tuple[GeoTag, Image | None]], qual
 
 
 def write_generated_flight(folder: Path, which: str, seed: int) -> str:
-    """Write the flight `which`, "map" or "query", over the landscape of a seed; return a sentence about it."""
+    """Write the flight `which` ("map" or "query") over the landscape from `seed`; return a sentence about it."""
     flight = plan_mapping_flight(seed) if which == "map" else plan_later_flight(seed)
     written = list(write_flight(folder, make_scene(seed, SCENE_WIDTH_M, SCENE_DEPTH_M), flight))
-    return f"{folder}: {len(written)} images in images/, where they were taken in positions.csv"
+    return f"{folder}: {len(written)} images in images/, their positions in positions.csv"
 
 
 def to_position(pose: CameraPose) -> Position:
-    """Return the geographic position of a pose in the scene, a plane that touches the globe at ORIGIN."""
+    """Return the geographic position of a pose in the scene, a plane tangent to the Earth at ORIGIN."""
     lat_deg, lon_deg = offset_position(ORIGIN.lat_deg, ORIGIN.lon_deg, pose.east_m, pose.north_m)
     return Position(lat_deg, lon_deg, _ORIGIN_ALT_M + pose.height_m)
 
 
 def to_metres(lat_deg: float, lon_deg: float) -> tuple[float, float]:
-    """Return east and north, in metres, of a position in the scene: the inverse of `to_position`."""
+    """Return the east and north coordinates of a position in the scene, in metres: the inverse of `to_position`."""
     east_m, north_m = offset_m(ORIGIN.lat_deg, ORIGIN.lon_deg, lat_deg, lon_deg)
     return float(east_m), float(north_m)
 

@@ -1,7 +1,7 @@
-"""A piece of farmland seen from above, generated from a seed, in place of a real site; `camera` photographs it.
+"""Generates farmland seen from above, from a seed, as a substitute for a real site; `camera` photographs it.
 
-Land is cut into fields along bent lines (points are (N, 2): east, north in metres). Each field is painted as one kind,
-such as meadow. A river, a road, farms and trees, (N, 4) metres: east, north, radius, top, are painted over them.
+The land is divided into fields along bent lines (points are (N, 2): east, north in metres). Each field is painted as
+one kind, such as meadow; then a river, a road, farms and trees, (N, 4) metres: east, north, radius, top.
 """
 
 from collections.abc import Callable, Iterable
@@ -33,7 +33,7 @@ _ASPHALT = (120, 122, 122)
 _WATER = (50, 56, 46)
 _STONE = (150, 154, 156)
 _ROOFS = ((62, 78, 142), (58, 68, 104), (112, 104, 98), (190, 186, 180), (150, 148, 132), (88, 104, 150))
-# Along and beside the road from the middle of the yard, length, width (metres), quarter turns of the ridge.
+# Offset from the yard's centre along and across the road, length, width (metres), ridge direction in quarter turns.
 _BUILDINGS = ((-9, 8, 17, 8.5, 0), (8, 9, 12, 7, 0), (10, -6, 18, 8, 1), (-8, -8, 11, 7.5, 0), (-16, -1, 5, 4, 0))
 _LEAVES = np.array([(42, 84, 62), (36, 72, 50), (50, 100, 84), (60, 106, 98), (46, 76, 68)], float)
 _GRASS = (60, 118, 106)
@@ -64,7 +64,7 @@ def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: floa
 
 
 def _paint_border(rng: np.random.Generator, canvas: Scene, line_m: Doubles, level: int) -> Doubles:
-    """Paint the border of two fields, of which great cuts are lanes (see `cut_parcels`); return its trees."""
+    """Paint the border between two fields and return its trees. Cuts of level 0 and 1 (see `cut_parcels`) are lanes."""
     box = canvas.box(line_m, 5.0)
     if canvas.height_cm[box].size == 0:
         return np.empty((0, 4))
@@ -90,7 +90,7 @@ def _paint_border(rng: np.random.Generator, canvas: Scene, line_m: Doubles, leve
 
 
 def _make_trees(rng: np.random.Generator, line_m: Doubles, step_m: float, spread_m: float, radius_m: float) -> Doubles:
-    """Return trees about every `step_m` along a line, about `spread_m` off it, with radii of about `radius_m`."""
+    """Return trees with radii of about `radius_m`, about every `step_m` along a line and about `spread_m` from it."""
     run_m = np.concatenate(([0], np.cumsum(np.hypot(*np.diff(line_m, axis=0).T))))
     at_m = np.arange(rng.uniform(0, step_m), run_m[-1], step_m)
     at_m += rng.normal(0, step_m * 0.25, len(at_m))
@@ -131,23 +131,23 @@ def _paint_road(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> Non
 
 
 def _paint_farms(rng: np.random.Generator, canvas: Scene, road_m: Doubles, river_m: Doubles) -> Doubles:
-    """Paint farms beside the road, away from the river; return the middles of their yards, (N, 2) metres."""
+    """Paint farms beside the road, away from the river; return the centres of their yards, (N, 2) metres."""
     yards = []
-    for at in range(18, len(road_m) - 18, 13):
-        ahead = road_m[at + 1] - road_m[at]
+    for index in range(18, len(road_m) - 18, 13):
+        ahead = road_m[index + 1] - road_m[index]
         turn_rad = float(np.arctan2(ahead[1], ahead[0])) + rng.normal(0, 0.12)
         along, beside = rotate_axes(turn_rad)
-        middle = road_m[at] + beside * rng.choice([-1, 1]) * 24 + along * rng.normal(0, 4)
-        if np.hypot(*(river_m - middle).T).min() > 42 and rng.random() < 0.7:
-            _farm(rng, canvas, middle, turn_rad)
-            yards.append(middle)
+        centre = road_m[index] + beside * rng.choice([-1, 1]) * 24 + along * rng.normal(0, 4)
+        if np.hypot(*(river_m - centre).T).min() > 42 and rng.random() < 0.7:
+            _paint_farm(rng, canvas, centre, turn_rad)
+            yards.append(centre)
     return np.array(yards).reshape(-1, 2)
 
 
-def _farm(rng: np.random.Generator, canvas: Scene, middle: Doubles, turn_rad: float) -> None:
+def _paint_farm(rng: np.random.Generator, canvas: Scene, yard_centre: Doubles, turn_rad: float) -> None:
     """Paint a yard with ragged edges, buildings around it and vehicles on it."""
     along, beside = rotate_axes(turn_rad)
-    yard = np.array([middle + a * along * 19 + b * beside * 17 for a, b in CORNERS])
+    yard = np.array([yard_centre + a * along * 19 + b * beside * 17 for a, b in CORNERS])
     box = canvas.box(yard, 4.0)
     cover = canvas.polygon(box, yard)
     ragged = smooth_step(cv2.GaussianBlur(cover, (0, 0), 8) + 0.16 * make_noise(rng, cover.shape, 30), 0.42, 0.58)
@@ -155,20 +155,20 @@ def _farm(rng: np.random.Generator, canvas: Scene, middle: Doubles, turn_rad: fl
     canvas.height_cm[box] = np.where(ragged > 0.3, BASE_CM, canvas.height_cm[box])
     for u_m, v_m, length_m, width_m, quarter_turns in _BUILDINGS:
         if rng.random() < 0.8:
-            centre = middle + (u_m + rng.normal(0, 1)) * along + (v_m + rng.normal(0, 1)) * beside
+            centre = yard_centre + (u_m + rng.normal(0, 1)) * along + (v_m + rng.normal(0, 1)) * beside
             length_m, width_m = (np.array((length_m, width_m)) * rng.uniform(0.8, 1.25, 2)).tolist()
             colour = np.array(_ROOFS[rng.integers(len(_ROOFS))]) * rng.uniform(0.85, 1.1)
             ridge_rad = turn_rad + quarter_turns * np.pi / 2
             paint_building(canvas, centre, length_m, width_m, ridge_rad, rng.uniform(2.6, 5), colour)
     for _ in range(rng.integers(2, 7)):
-        centre = middle + rng.uniform(-14, 14) * along + rng.uniform(-2, 3) * beside
+        centre = yard_centre + rng.uniform(-14, 14) * along + rng.uniform(-2, 3) * beside
         colour = rng.uniform(60, 225) * rng.uniform(0.6, 1.2, 3)
         ridge_rad = turn_rad + rng.integers(2) * np.pi / 2 + rng.normal(0, 0.2)
         paint_building(canvas, centre, 4.3, 1.9, ridge_rad, 1.4, colour)
 
 
 def _vary_brightness(rng: np.random.Generator, canvas: Scene) -> None:
-    """Vary the brightness of the ground in bumps of 60 m, of 5 m and of 1 m: real ground is never of one colour."""
+    """Vary the brightness of the ground in patches of 60 m, 5 m and 1 m, because real ground is never uniform."""
     for share, bump_m in ((0.06, 60.0), (0.07, 5.0), (0.08, 1.0)):
         bump_px = max(bump_m / canvas.metres_per_pixel, 2.0)
         coarse = max(2, int(bump_px / 8))
@@ -182,7 +182,7 @@ def _vary_brightness(rng: np.random.Generator, canvas: Scene) -> None:
 def _paint_trees(
     rng: np.random.Generator, canvas: Scene, trees: Doubles, keep_off_m: Iterable[tuple[Doubles, float]]
 ) -> None:
-    """Paint the trees that keep the distances in metres from the points (N, 2) of `keep_off_m`."""
+    """Paint the trees that are further from each line of points in `keep_off_m` than its clearance in metres."""
     for line_m, clear_m in keep_off_m:
         gap_m = np.hypot(*(trees[:, None, :2] - line_m[None]).T).T
         trees = trees[(gap_m > clear_m).all(axis=1)]
@@ -195,8 +195,8 @@ def _paint_trees(
         paint_tree(canvas, domes[radius_px][rng.integers(4)], (east_m, north_m), top_m, colour)
 
 
-# The looks of fields. `patches` and `tufts`, float32 (H, W), are noise with bumps of 22 m and of 2.4 m; `across_m` is
-# the distance in metres across the rows of the field.
+# Textures of fields. `patches` and `tufts`, float32 (H, W), are noise with bumps of 22 m and 2.4 m; `across_m` is the
+# distance in metres across the rows of the field.
 FieldTexture = tuple[Array, Array]  # colour (H, W, 3) BGR, relief (H, W) cm
 
 
@@ -230,7 +230,7 @@ def _texture_pasture(patches: Singles, tufts: Singles, across_m: Array) -> Field
     worn = smooth_step(patches + 0.4 * tufts, 0.4, 2.4)
     wet = smooth_step(-patches, 0.3, 1.7)
     rushes = smooth_step(tufts + 0.9 * patches, 1.4, 2.8)
-    # Cattle walk one behind the other: narrow paths wind along the lines of equal noise.
+    # Cattle walk in single file, so narrow paths wind along the contour lines of the noise.
     path = smooth_step(np.abs(patches + 0.02 * across_m % 2 - 0.9), 0.05, 0.02)
     colour = mix_colours(_GRASS, _DRY, 0.35 + 0.3 * worn - 0.3 * wet + 0.2 * tufts + 0.45 * path)
     return colour * (1 - 0.3 * rushes[..., None]), 2 * tufts + 10 * rushes
@@ -240,7 +240,7 @@ def _texture_forest_floor(patches: Singles, tufts: Singles, across_m: Array) -> 
     return 0.75 * mix_colours(_LUSH, _SOIL, 0.35 + 0.2 * tufts), 10 * tufts
 
 
-# Kinds of fields: how frequent, how they look, and their trees (spacing, scatter and radius in metres; None: no trees).
+# Kinds of fields: relative frequency, texture, and trees (spacing, scatter and radius in metres; None: no trees).
 _FIELD_KINDS: tuple[
     tuple[float, Callable[[Singles, Singles, Array], FieldTexture], tuple[float, float, float] | None], ...
 ] = (
@@ -255,9 +255,9 @@ _FIELD_KINDS: tuple[
 
 
 def _paint_field(rng: np.random.Generator, canvas: Scene, outline_m: Doubles) -> Doubles:
-    """Paint a field of a random kind within its outline (N, 2); return its trees."""
+    """Paint a field of a random kind inside its outline (N, 2); return its trees."""
     weights = np.array([weight for weight, _, _ in _FIELD_KINDS])
-    _, look, trees_m = _FIELD_KINDS[rng.choice(len(_FIELD_KINDS), p=weights / weights.sum())]
+    _, make_texture, trees_m = _FIELD_KINDS[rng.choice(len(_FIELD_KINDS), p=weights / weights.sum())]
     side = find_longest_side(outline_m[:: max(1, len(outline_m) // 10)])
     turn_rad = np.arctan2(side[1], side[0]) + rng.normal(0, 0.06)
     along, _ = rotate_axes(turn_rad)
@@ -268,7 +268,7 @@ def _paint_field(rng: np.random.Generator, canvas: Scene, outline_m: Doubles) ->
         patches = make_noise(rng, cover.shape, 22 / canvas.metres_per_pixel)
         tufts = make_noise(rng, cover.shape, 2.4 / canvas.metres_per_pixel)
         across_m = -along[1] * east_m + along[0] * north_m + 0.4 * patches
-        colour, relief_cm = look(patches, tufts, across_m)
+        colour, relief_cm = make_texture(patches, tufts, across_m)
         canvas.paint(box, cover, colour * rng.uniform(0.85, 1.12) * rng.normal(1, 0.025, 3))
         canvas.height_cm[box] = np.where(cover > 0.5, np.clip(BASE_CM + relief_cm, 0, None), canvas.height_cm[box])
     return _make_tree_rows(rng, outline_m, turn_rad, *trees_m) if trees_m else np.empty((0, 4))
@@ -277,7 +277,7 @@ def _paint_field(rng: np.random.Generator, canvas: Scene, outline_m: Doubles) ->
 def _make_tree_rows(
     rng: np.random.Generator, outline_m: Doubles, turn_rad: float, spacing_m: float, scatter_m: float, radius_m: float
 ) -> Doubles:
-    """Return trees in rows along `turn_rad`, `spacing_m` apart, moved at random by about `scatter_m`."""
+    """Return trees in rows along `turn_rad`, `spacing_m` apart, displaced at random by about `scatter_m`."""
     along, across = rotate_axes(turn_rad)
     reach_m = np.arange(-110, 110, spacing_m)
     u, v = (axis.reshape(-1, 1) for axis in np.meshgrid(reach_m, reach_m))

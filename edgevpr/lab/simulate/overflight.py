@@ -1,5 +1,5 @@
-"""A flight over an orthophoto: pictures, and where they were taken. The track is read from a positions.csv, or follows
-the waypoints of a mission. `edgevpr simulate flight` writes it."""
+"""Simulates a flight over an orthophoto: its pictures and their positions. The track is read from a positions.csv, or
+follows the waypoints of a mission. `edgevpr simulate flight` writes it."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,37 +20,37 @@ from edgevpr.mapmaking.missions import read_area
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 SPEED_M_S = 10.0
-_SWAY_DEG = 2.0  # largest roll, pitch and yaw error on a track without attitude
+_SWAY_DEG = 2.0  # largest roll, pitch and yaw deviation on a track without attitude
 _START_UTC_S = 1_771_029_000.0
-_LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)  # the shadows stay those of the orthophoto
-_MAX_CORNER_HEIGHTS = 3.0  # heights from below the camera to a corner of its picture: beyond is nearly the horizon
+_LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)  # adds no shadows to those of the orthophoto
+_MAX_CORNER_HEIGHTS = 3.0  # largest distance of a picture corner on the ground, in heights; the horizon is beyond
 
 
 def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list[GeoTag]:
-    """Read a track as the pictures to take along it. A positions.csv gives a picture for each line with a position, a
-    mission file one every `every_m` metres along its waypoints. Each picture gets a height above the ground (`height_m`
-    if it is not None, else that of the track), a heading and a time. Raises UsageError for a track that cannot be read,
-    or has no height or no picture."""
+    """Read a track and return the pictures to take along it: one for each row of a positions.csv with a position, or
+    one every `every_m` metres along the waypoints of a mission file. Each picture gets a height above ground
+    (`height_m`, or that of the track if it is None), a heading and a time. Raises UsageError if the track cannot be
+    read, or has no height or no picture."""
     if Path(path).suffix.lower() == ".csv":
         shots = [tag for tag in read_positions(path).values() if tag.position]
     else:
         shots = _plan_mission_shots(path, every_m)
     if not shots:
-        raise UsageError(f"{path} has no path: a track needs waypoints, or lines with lat and lon.")
+        raise UsageError(f"{path} contains no track: it needs waypoints, or rows with lat and lon.")
     places = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
     timed, t_s, course_deg = [], _START_UTC_S, 0.0
     for number, shot in enumerate(shots):
-        over_m = height_m or shot.height_m
-        if not (over_m and over_m > 0):
+        shot_height_m = height_m or shot.height_m
+        if not (shot_height_m and shot_height_m > 0):
             raise UsageError(f"{path} lacks heights above ground (height_m > 0): give --height-m.")
-        # The first picture looks along the way to the second one.
+        # The first picture has the course from its own position to the second one.
         start, end = places[max(0, number - 1)], places[number or min(1, len(places) - 1)]
-        if (way_m := float(distance_m(*start, *end))) > 0:
+        if (step_m := float(distance_m(*start, *end))) > 0:
             east_m, north_m = offset_m(*start, *end)
             course_deg = float(np.degrees(np.arctan2(east_m, north_m)) % 360)
-        t_s += way_m / SPEED_M_S if number else 0.0
+        t_s += step_m / SPEED_M_S if number else 0.0
         heading_deg = course_deg if shot.heading_deg is None else shot.heading_deg
-        timed.append(replace(shot, height_m=over_m, heading_deg=heading_deg, t_utc_s=t_s))
+        timed.append(replace(shot, height_m=shot_height_m, heading_deg=heading_deg, t_utc_s=t_s))
     return timed
 
 
@@ -59,18 +59,18 @@ def _plan_mission_shots(path: str | Path, every_m: float) -> list[GeoTag]:
     if len(waypoints) < 2:
         return []
     lat_deg, lon_deg = (np.array([getattr(way, name) for way in waypoints]) for name in ("lat_deg", "lon_deg"))
-    way_m = np.append(0, np.cumsum(distance_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])))
-    at_m = np.arange(0, way_m[-1] + 1e-6, every_m)
-    heights_m = np.array([way.height_m for way in waypoints], float)  # NaN: home and landings have none
-    is_known = np.isfinite(heights_m)
-    over_m = np.interp(at_m, way_m[is_known], heights_m[is_known]).tolist() if is_known.any() else [None] * len(at_m)
-    places = zip(np.interp(at_m, way_m, lat_deg).tolist(), np.interp(at_m, way_m, lon_deg).tolist(), strict=True)
-    return [GeoTag(position=Position(*place), height_m=height) for place, height in zip(places, over_m, strict=True)]
+    track_m = np.append(0, np.cumsum(distance_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])))
+    shot_m = np.arange(0, track_m[-1] + 1e-6, every_m)  # along the track
+    waypoint_m = np.array([way.height_m for way in waypoints], float)  # heights; NaN for home and landings
+    known = np.isfinite(waypoint_m)
+    heights_m = np.interp(shot_m, track_m[known], waypoint_m[known]).tolist() if known.any() else [None] * len(shot_m)
+    places = zip(*(np.interp(shot_m, track_m, degrees).tolist() for degrees in (lat_deg, lon_deg)), strict=True)
+    return [GeoTag(position=Position(*place), height_m=height) for place, height in zip(places, heights_m, strict=True)]
 
 
 def make_poses(shots: list[GeoTag], seed: int) -> list[CameraPose]:
-    """Return the pose of the camera for each picture, placed at 0 m east and north. Where the track has neither roll
-    nor pitch, both vary slowly by up to 2 degrees, and so does the heading."""
+    """Return the camera pose of each picture, at 0 m east and north. If the track has neither roll nor pitch, both vary
+    slowly by up to 2 degrees, and so does the heading."""
     rng = np.random.default_rng((seed, 4))
     sways = _SWAY_DEG * np.stack([make_oscillation(rng, len(shots)) for _ in range(3)])
     poses = []
@@ -78,39 +78,39 @@ def make_poses(shots: list[GeoTag], seed: int) -> list[CameraPose]:
         has_attitude = shot.roll_deg is not None or shot.pitch_deg is not None
         roll_deg, pitch_deg, yaw_deg = (shot.roll_deg or 0.0, shot.pitch_deg or 0.0, 0.0) if has_attitude else sway
         heading_deg = ((shot.heading_deg or 0.0) + yaw_deg) % 360
-        over_m = shot.height_m or 0.0
-        poses.append(CameraPose(height_m=over_m, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg))
+        height_m = shot.height_m or 0.0
+        poses.append(CameraPose(height_m=height_m, heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg))
     return poses
 
 
 def photograph_ground(
     orthophoto: Orthophoto, position: Position, pose: CameraPose, camera: Camera, light: Light, rng: np.random.Generator
 ) -> Image | None:
-    """Take one picture over `position`, uint8 (camera.height, camera.width, 3) BGR; None if the orthophoto lacks a
-    tenth or more of the ground in the picture. Raises UsageError if the picture shows the horizon."""
+    """Take one picture above `position`, uint8 (camera.height, camera.width, 3) BGR; None if the orthophoto lacks more
+    than a tenth of the ground in the picture. Raises UsageError if the picture shows the horizon."""
     corners_m = view_on_ground(pose, camera)
     if corners_m is None or (reach_m := float(np.abs(corners_m).max())) > _MAX_CORNER_HEIGHTS * pose.height_m:
         raise UsageError(
-            f"At roll {pose.roll_deg:.0f} and pitch {pose.pitch_deg:.0f} degrees the picture shows the horizon, and "
-            "an orthophoto has none: give smaller angles, or a narrower --fov-deg."
+            f"At roll {pose.roll_deg:.0f} and pitch {pose.pitch_deg:.0f} degrees the picture shows the horizon, which "
+            "an orthophoto does not contain: use smaller angles, or give a smaller --fov-deg."
         )
     side_px = int(np.ceil(2 * reach_m * camera.focal_px / pose.height_m)) + 4
     metres_per_pixel = pose.height_m / camera.focal_px
     half_m = side_px * metres_per_pixel / 2
     ground, valid = orthophoto.cut(position, 2 * half_m, side_px)
     view = np.zeros(valid.shape, np.uint8)
-    in_pixels = (corners_m * (1, -1) + half_m) / metres_per_pixel - 0.5
-    cv2.fillConvexPoly(view, in_pixels.round().astype(np.int32), 1)
+    corners_px = (corners_m * (1, -1) + half_m) / metres_per_pixel - 0.5
+    cv2.fillConvexPoly(view, corners_px.round().astype(np.int32), 1)
     if valid[view > 0].mean() < 1 - MAX_WITHOUT_DATA:
         return None
-    over_patch = replace(pose, east_m=half_m, north_m=half_m)
-    return photograph(ground, metres_per_pixel, over_patch, camera, light, rng)
+    centred_pose = replace(pose, east_m=half_m, north_m=half_m)
+    return photograph(ground, metres_per_pixel, centred_pose, camera, light, rng)
 
 
 def write_overflight(
     folder: Path, orthophoto: Orthophoto, shots: list[GeoTag], fov_deg: float, seed: int
 ) -> Iterator[str]:
-    """Write the pictures with `write_shots`; those that would show ground beyond the orthophoto are left out."""
+    """Write the pictures with `write_shots`, skipping those that would show ground beyond the orthophoto."""
     camera = Camera()
     camera = replace(camera, focal_px=float(camera.width / 2 / np.tan(np.radians(fov_deg / 2))))
     rng = np.random.default_rng((seed, 3))

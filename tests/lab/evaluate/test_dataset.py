@@ -56,15 +56,15 @@ HEAD = "query_file,ref_files,status\n"
 @pytest.mark.parametrize(
     ("truth", "said"),
     [
-        ("query_file,refs\na.png,a.png\n", ["truth.csv", "`ref_files` is missing"]),
-        ("", ["truth.csv", "`query_file` is missing"]),
+        ("query_file,refs\na.png,a.png\n", ["truth.csv", "lacks the column `ref_files`"]),
+        ("", ["truth.csv", "lacks the column `query_file`"]),
         (HEAD + "a.png,a.png,ok\nz.png,a.png,ok\n", ["truth.csv", "`z.png`", "correct its name"]),
         (HEAD + "a.png,a.png y.png,ok\n", ["truth.csv", "`y.png`", "correct its name"]),
-        (HEAD + "a.png,a.png,novel\n", ["truth.csv, line 2", "`a.png`", "`novel` and has ref_files"]),
+        (HEAD + "a.png,a.png,novel\n", ["truth.csv, line 2", "`a.png`", "`novel` but has ref_files"]),
         (HEAD + "a.png,a.png,ok\na.png,b.png,ok\n", ["truth.csv, line 3", "`a.png`", "keep one"]),
         (HEAD + "a.png,a.png\n", ["truth.csv, line 2", "fields"]),
-        (HEAD + "a.png,a.png,uncertain\n", ["truth.csv", "scores no query"]),
-        (b"\xff\xd8\xff\xe0 a JPEG", ["truth.csv", "not a CSV file"]),
+        (HEAD + "a.png,a.png,uncertain\n", ["truth.csv", "no query to score"]),
+        (b"\xff\xd8\xff\xe0 a JPEG", ["truth.csv", "not a UTF-8 CSV file"]),
     ],
 )
 def test_load_dataset_names_line_and_value_of_a_wrong_file(folder, truth, said):

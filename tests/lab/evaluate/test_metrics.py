@@ -67,7 +67,7 @@ def test_precision_recall_accepts_no_query_that_found_nothing():
 
 def test_first_right_is_the_rank_of_the_first_right_reference():
     right = np.array([False, True, False, True])
-    assert [metrics.rank_first_right(np.array(order), right) for order in ([1, 0], [0, 2, 3, 1], [2, 0])] == [
+    assert [metrics.rank_of_first_correct(np.array(order), right) for order in ([1, 0], [0, 2, 3, 1], [2, 0])] == [
         0,
         2,
         NEVER,

@@ -43,11 +43,11 @@ def test_measure_gives_the_published_figures_of_eight_matrices(capsys):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (np.zeros((2, 3)), "scores of 2 queries and 3 references, and the ground truth has 3 and 3"),
-        (np.zeros(3), "a row of numbers for each query"),
+        (np.zeros((2, 3)), "scores for 2 queries and 3 references, but the ground truth has 3 and 3"),
+        (np.zeros(3), "one row per query"),
         (np.full((3, 3), np.nan), "no NaN"),
-        (np.array([[None]]), "holds no similarities"),
-        (b"rubbish", "holds no similarities"),
+        (np.array([[None]]), "contains no similarities"),
+        (b"rubbish", "contains no similarities"),
     ],
 )
 def test_measure_refuses_what_does_not_fit_in_one_sentence(tmp_path, truth, capsys, content, said):
