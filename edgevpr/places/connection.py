@@ -1,5 +1,5 @@
 """The connection to an open map file, the lock of the one program that may add places, and the check that the file has
-not been replaced. `mapfile.PlaceMap` builds on it and knows what the rows mean."""
+not been replaced. `mapfile.PlaceMap` extends it with the meaning of the rows."""
 
 import os
 import sqlite3
@@ -96,8 +96,8 @@ class MapConnection:
         self.close()
 
     def close(self) -> None:
-        """Close the file. If it was open for adding, first merge SQLite's log into it: one file, also readable from a
-        read-only medium, is left."""
+        """Close the file. If it was open for adding, first merge SQLite's log into it: the single file that remains is
+        readable even on a read-only medium."""
         if self._lock is not None:
             mapfiles.merge_write_ahead_log(self.db)
         self.db.close()
@@ -107,7 +107,7 @@ class MapConnection:
 
     def require_unchanged(self) -> None:
         """Raise MapError if the file is gone, cannot be read, or has been replaced by another map since it was opened.
-        Only when another program has touched the file is it opened again, and its map_id and technique compared: the
+        If another program has touched the file, it is reopened, and its map_id and technique are compared, because the
         old connection may have cached pages of a replaced file."""
         with translate_errors(self.path):
             state = self._read_file_state()
@@ -140,7 +140,7 @@ class MapConnection:
                 yield
                 self.db.execute("COMMIT")
             except BaseException:
-                if self.db.in_transaction:  # SQLite has already rolled back where the disk is full
+                if self.db.in_transaction:  # SQLite has already rolled back if the disk is full
                     self.db.execute("ROLLBACK")
                 raise
 
@@ -159,15 +159,15 @@ class MapConnection:
             except sqlite3.Error as error:
                 if not is_row_error(error):
                     raise
-                raise PlaceError(self.path, place_id, f"SQLite says: {error}") from error
+                raise PlaceError(self.path, place_id, f"SQLite reports: {error}") from error
         if not row:
-            raise PlaceError(self.path, place_id, "its row is gone")
+            raise PlaceError(self.path, place_id, "its row is missing")
         return rows.read_columns(columns, row)
 
     def __len__(self) -> int:
         """Return the number of places; in a damaged file, count only the readable ones. Raises MapError."""
         with translate_errors(self.path):
-            try:  # total(1) and not count(*), which no progress handler ends in a table that refers to itself
+            try:  # not count(*): no progress handler can end it in a table that refers to itself
                 return int(self.db.execute("SELECT total(1) FROM places").fetchone()[0])
             except sqlite3.Error as error:
                 if not is_row_error(error):

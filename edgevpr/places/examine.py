@@ -25,7 +25,7 @@ _LOW_QUALITY_FACTOR = 0.5  # on the value of a place that was added only to clos
 
 
 class PlaceCheck(NamedTuple):
-    """The result of checking one place. `problem` says in a few words what is damaged (None: nothing). `content` has
+    """The result of checking one place. `problem` describes the damage in a few words (None: no damage). `content` has
     the values of its row by column name, without damaged landmarks (empty: unreadable). `is_usable`: nothing but its
     landmarks is damaged."""
 
@@ -44,8 +44,8 @@ def read_place_positions(place_map: PlaceMap) -> tuple[Ints, Doubles, Doubles]:
 @dataclass(frozen=True, slots=True)
 class MapCheck:
     """The result of checking a map. `places` is the number of readable places, of `total`. `damaged` has (place id,
-    problem in few words) of each place with damage; one of which only the landmarks are damaged can still be read.
-    `faults` are SQLite's messages about the file as a whole."""
+    problem in few words) of each damaged place; a place with damaged landmarks only can still be read. `faults` are
+    SQLite's messages about the file as a whole."""
 
     path: str
     places: int
@@ -66,7 +66,7 @@ def check_places(place_map: PlaceMap, only: Collection[int] | None = None) -> It
         if row is not None:
             problem, content = None, rows.read_columns(rows.ALL_COLUMNS, row)
         else:
-            content = _read_but_landmarks(place_map, place_id)
+            content = _read_without_landmarks(place_map, place_id)
             problem = "SQLite cannot read its landmarks" if content else "SQLite cannot read its row"
         is_usable = False
         try:
@@ -83,8 +83,8 @@ def check_places(place_map: PlaceMap, only: Collection[int] | None = None) -> It
         yield PlaceCheck(place_id, problem, content, is_usable)
 
 
-def _read_but_landmarks(place_map: PlaceMap, place_id: int) -> Content:
-    """Return a row without its end, the landmarks, which cannot be read; empty if the rest cannot be read either."""
+def _read_without_landmarks(place_map: PlaceMap, place_id: int) -> Content:
+    """Return a row without its landmarks, which cannot be read; empty if the rest cannot be read either."""
     with suppress(PlaceError):
         return {**place_map.read_row(place_id, rows.COLUMNS_WITHOUT_LANDMARKS), **_NO_LANDMARKS}
     return {}
@@ -104,12 +104,12 @@ def merge_maps(
     progress: Progress = iterate_silently,
     only: Sequence[Collection[int] | None] | None = None,
 ) -> tuple[list[tuple[int, int]], bool]:
-    """Merge the places of several maps, or those with the ids `only`, a collection for each map, into the new map
-    `out`; if that fails, leave no file. Returns for each map the numbers (places copied, duplicate places), and True if
-    one was calibrated: `out` is not.
+    """Merge the places of several maps into the new map `out`; if that fails, leave no file. `only`: for each map, the
+    ids of the places to merge (None: all). Returns (places copied, duplicates) for each map, and True if any map was
+    calibrated; `out` is not.
 
     A place is a duplicate if image name and time are equal and the coarse parts nearly so (`PlaceMap.has_descriptor`).
-    Mask hash and lens are copied if all maps have the same; attributions are all copied. Raises MapError if the
+    Mask hash and lens are copied if they are the same in all maps; all attributions are copied. Raises MapError if the
     techniques differ or a file cannot be read or written, and PlaceError if a place is damaged."""
     with ExitStack() as stack:
         unfinished = stack.enter_context(mapfiles.write_atomically(out))
@@ -134,8 +134,8 @@ def merge_maps(
 def _add_places(
     place_map: PlaceMap, source: PlaceMap, progress: Progress, only: Collection[int] | None
 ) -> tuple[int, int]:
-    """Copy the places of `source`, or those with the ids `only`, that are new into `place_map`; return the numbers
-    (copied, duplicates)."""
+    """Copy the places of `source`, or those with the ids `only`, into `place_map`, except duplicates; return the
+    numbers (copied, duplicates)."""
     copied = duplicates = 0
     with place_map.transaction():
         ids_by_picture = place_map.select_ids("source_image, time")
@@ -177,16 +177,16 @@ def repair_map(path: str | Path, progress: Progress = iterate_silently) -> Path:
     if original.exists():
         raise MapError(f"{original} exists already, from an earlier repair: move it away first.")
     copy = path.with_name(f".{path.name}.{os.getpid()}")
-    lock = mapfiles.lock_map(path)  # meanwhile no program can add places, which the copy would lack
+    lock = mapfiles.lock_map(path)  # until the end, no program can add places that the copy would lack
     try:
         with PlaceMap.open(path) as damaged:
             if not _copy_usable(damaged, copy, progress(check_places(damaged), len(damaged), "copying")):
                 raise MapError(f"{path}: none of its places can be read: restore a copy, or build it again.")
-        for left, kept in zip(mapfiles.list_sqlite_files(path), mapfiles.list_sqlite_files(original), strict=True):
-            if left.exists():  # else SQLite would apply the log of the damaged map to the copy
-                left.rename(kept)
+        for file, kept in zip(mapfiles.list_sqlite_files(path), mapfiles.list_sqlite_files(original), strict=True):
+            if file.exists():  # otherwise SQLite would apply the log of the damaged map to the copy
+                file.rename(kept)
         try:
-            os.link(path, original)  # a link first, so that there is a map at `path` at every moment
+            os.link(path, original)  # a link first, so that there is a map at `path` at all times
         except OSError:
             path.rename(original)  # a FAT file system has no links
         copy.replace(path)
@@ -198,16 +198,16 @@ def repair_map(path: str | Path, progress: Progress = iterate_silently) -> Path:
 
 
 def copy_places(path: str | Path, out: Path, place_ids: Collection[int]) -> int:
-    """Copy places of a map to the new file `out`, as `shrink_map` does; return how many there are."""
+    """Copy places of a map to the new file `out`, as `shrink_map` does; return their number."""
     with mapfiles.write_atomically(out) as unfinished, PlaceMap.open(path) as place_map:
         return _copy_usable(place_map, unfinished, check_places(place_map, place_ids))
 
 
 def shrink_map(path: str | Path, out: Path, count: int, progress: Progress = iterate_silently) -> tuple[int, int]:
     """Copy the `count` best readable places of a map to the new file `out`: those of high quality that leave small gaps
-    (see `choose_places`). They keep their ids, to which the calibration, copied like the mask hash, refers. Returns
-    (number of places copied, number of readable places). Raises MapError if the map cannot be read, or if `out` exists
-    or cannot be written; no part of a file is then left."""
+    (see `choose_places`). They keep their ids, since the calibration, which is copied like the mask hash, refers to
+    them. Returns (number of places copied, number of readable places). Raises MapError if the map cannot be read, or if
+    `out` exists or cannot be written; no part of a file is then left."""
     with mapfiles.write_atomically(out) as unfinished, PlaceMap.open(path) as place_map:
         checks = progress(check_places(place_map), len(place_map), "reading")
         places = [rows.parse_place(check.place_id, check.content) for check in checks if check.is_usable]
@@ -220,7 +220,7 @@ def shrink_map(path: str | Path, out: Path, count: int, progress: Progress = ite
 
 
 def _rate_place(place: Place) -> float:
-    """Return the value of keeping a place, 0..1: quality, times memorability and staticity as far as known."""
+    """Return the value of keeping a place, 0..1: quality, times memorability and staticity if known."""
     salience = place.salience
     if salience is None:
         return place.quality
@@ -229,8 +229,8 @@ def _rate_place(place: Place) -> float:
 
 
 def _copy_usable(place_map: PlaceMap, out: Path, places: Iterable[PlaceCheck]) -> int:
-    """Make the map `out` of the usable ones of `places`, with the same ids, mask hash, lens, attribution and
-    calibration; return the number of its places."""
+    """Create the map `out` from the usable `places`, with the same ids, mask hash, lens, attribution and calibration;
+    return the number of its places."""
     copied = 0
     with PlaceMap.create(out, place_map.spec) as copy:
         copy.record_mask(place_map.mask_sha256)

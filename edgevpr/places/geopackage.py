@@ -16,7 +16,7 @@ _WGS84_WKT = (
 
 # The checksums (CRC-32 of zlib) stand before the BLOBs: SQLite reads all of a large BLOB to find what comes after it. A
 # program that moves a place (QGIS) does not know the checksums. So a trigger deletes those of position and pose, and
-# the recorded position (see `core.types.Pose`), from which the place must not be refined again after it was moved.
+# the recorded position (see `core.types.Pose`): a place that was moved must not be refined from it again.
 SCHEMA = f"""
 CREATE TABLE gpkg_spatial_ref_sys (
     srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
@@ -99,7 +99,7 @@ def decode_point_or_none(geom: object) -> tuple[float, float] | None:
 
 
 def format_utc(t_utc_s: float | None) -> str | None:
-    """Format seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds; None for None and for an impossible
+    """Format seconds since 1970 as a GeoPackage DATETIME, UTC with milliseconds; None for None or an impossible
     time."""
     if t_utc_s is None:
         return None

@@ -21,7 +21,7 @@ from edgevpr.places.mapfile import PlaceMap
 _log = logging.getLogger(__name__)
 _METADATA_BYTES = 8 + 8 + 8 + 2  # id, latitude, longitude, heading
 _PACK_BATCH = 32  # places
-_BLOCK_PLACES = 256  # the least value in each block is stored, to find the least of all quickly
+_BLOCK_PLACES = 256  # the minimum of each block is stored, to find the overall minimum quickly
 _OUTLINE_DTYPE = np.dtype([("id", np.int64), ("lat_deg", float), ("lon_deg", float), ("quality", float)])
 
 CoarsePart = tuple[int, LatLon | None, float | None, Array]  # one item of `PlaceMap.read_coarse_parts`
@@ -34,7 +34,7 @@ class PlaceIndex:
 
     `place_ids` is int64 (N,). `lat_deg` and `lon_deg` are float64 (N,), NaN for a place without a position.
     `heading_deg` is float16 (N,), accurate to a quarter of a degree, NaN if unknown. `rows` (N, *row shape) has the
-    coarse parts, packed if the technique packs them, with the `mean` coarse part (else None)."""
+    coarse parts. If the technique packs them, `mean` is the mean coarse part of the map; otherwise None."""
 
     place_ids: Ints
     lat_deg: Doubles
@@ -79,16 +79,16 @@ class PlaceIndex:
 
 
 def compute_place_bytes(spec: TechniqueSpec) -> int:
-    """Return how many bytes of RAM one place of the index takes."""
+    """Return how many bytes of RAM one place of the index needs."""
     return spec.row.nbytes + _METADATA_BYTES
 
 
 def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int, extra_bytes: int = 0) -> PlaceIndex:
     """Load the coarse parts of a map, packed by the technique. Return the index of the places that were loaded.
 
-    If `budget_bytes` is too small for all, only the places of `choose_places` are loaded. `extra_bytes` of
-    the budget stay free for other arrays that grow with the index (see `sequence`). Places that cannot be read are
-    entered in `PlaceMap.left_out`. Raises MapError if no place can be read, or if the budget is too small for one."""
+    If `budget_bytes` is too small for all, only the places of `choose_places` are loaded. `extra_bytes` per place are
+    reserved for other arrays that grow with the index (see `sequence`). Places that cannot be read are recorded in
+    `PlaceMap.left_out`. Raises MapError if no place can be read, or if the budget is too small for one."""
     spec = technique.spec
     places, place_bytes = len(place_map), compute_place_bytes(spec) + extra_bytes
     if not places:
@@ -100,11 +100,11 @@ def load_index(place_map: PlaceMap, technique: Technique, budget_bytes: int, ext
         )
     capacity = min(places, budget_bytes // place_bytes)
     index = allocate_index(spec, capacity, place_map.compute_mean_coarse() if spec.packed else None)
-    # Another program may have added places since they were counted: those are left out until the next load.
+    # Another program may have added places since they were counted: they are ignored until the next load.
     parts: Iterator[CoarsePart] = islice(place_map.read_coarse_parts(), places)
     if capacity < places:
         _log.warning(
-            f"{place_map.path}: its {places} places need {places * place_bytes / 1e6:.1f} MB of RAM, and the budget is "
+            f"{place_map.path}: its {places} places need {places * place_bytes / 1e6:.1f} MB of RAM, but the budget is "
             f"{budget_bytes / 1e6:g} MB: only the {capacity} best are loaded; raise --budget-mb to "
             f"{np.ceil(places * place_bytes / 1e5) / 10:g} for all."
         )
@@ -167,9 +167,9 @@ def choose_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: i
     """Choose `capacity` of N places, given in the order they were mapped; return their indices, int, ascending.
     `lat_deg`, `lon_deg` (NaN: unknown) and `quality` (0..1) are float (N,).
 
-    Places are dropped one at a time, always the one of the least value: its quality times the distance to the nearer of
-    its two remaining neighbours along the track. So gaps stay small, and places of high quality stay. The first and the
-    last are kept."""
+    Places are dropped one at a time, always the one with the lowest value: its quality times the distance to the nearer
+    of its two remaining neighbours along the track. So gaps stay small, and good places stay. The first and the last
+    are kept."""
     count = len(quality)
     if count <= capacity:
         return np.arange(count)
@@ -179,13 +179,13 @@ def choose_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: i
     median_m = (float(np.nanmedian(steps_m)) if np.isfinite(steps_m).any() else 0.0) or 1.0
 
     def measure_distance_m(a: int, b: int) -> float:
-        away_m = math.hypot(east_m[b] - east_m[a], north_m[b] - north_m[a])
-        return median_m * (b - a) if math.isnan(away_m) else away_m
+        gap_m = math.hypot(east_m[b] - east_m[a], north_m[b] - north_m[a])
+        return median_m * (b - a) if math.isnan(gap_m) else gap_m
 
     def rate_place(before: int, place: int, after: int) -> float:
         if before < 0 or after >= count:
             return math.inf
-        # A tiny share of the distance between its neighbours decides among places at the same position.
+        # A tiny share of the distance between its neighbours breaks ties among places at the same position.
         nearer_m = min(measure_distance_m(before, place), measure_distance_m(place, after))
         return (nearer_m + 1e-6 * measure_distance_m(before, after)) * max(float(quality[place]), 1e-3)
 
@@ -195,10 +195,10 @@ def choose_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: i
     for place in range(count):
         values[place] = rate_place(place - 1, place, place + 1)
     blocks = values.reshape(-1, _BLOCK_PLACES)
-    least = blocks.min(axis=1)
+    block_minima = blocks.min(axis=1)
     kept = np.ones(count, bool)
     for _ in range(count - max(capacity, 2)):
-        block = int(least.argmin())
+        block = int(block_minima.argmin())
         place = block * _BLOCK_PLACES + int(blocks[block].argmin())
         kept[place], values[place] = False, np.inf
         ends = int(before[place]), int(after[place])
@@ -206,5 +206,5 @@ def choose_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: i
         for end in ends:
             values[end] = rate_place(int(before[end]), end, int(after[end]))
         for changed in {block, *(end // _BLOCK_PLACES for end in ends)}:
-            least[changed] = blocks[changed].min()
+            block_minima[changed] = blocks[changed].min()
     return np.flatnonzero(kept)[:capacity]

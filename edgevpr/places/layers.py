@@ -1,7 +1,7 @@
-"""Layers of a map: its places by the footprint at which they were cut from an orthophoto. Most maps have one.
+"""Layers of a map: places grouped by the footprint at which they were cut from an orthophoto. Most maps have one.
 
-A picture is found best among places that show a little less ground than it does, in finer detail. So a flight at a
-height that its map was not cut for finds more in a map of several footprints.
+A picture matches best among places that show slightly less ground, in finer detail. So if a flight is higher or lower
+than planned, a map with several footprints finds more of its pictures.
 """
 
 from collections.abc import Sequence
@@ -14,16 +14,16 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import Expectation
 
-# Footprint of the places that match a picture best, as a share of its own, by benchmarks/results/from_space.md
+# Footprint of the places that match a picture best, as a share of the picture's (benchmarks/results/from_space.md)
 _BEST_FOOTPRINT_RATIO = 0.92
-_MAX_LAYER_RATIO = 1.2  # ratio of two footprints below which they are one layer
+_MAX_LAYER_RATIO = 1.2  # footprints whose ratio is smaller belong to one layer
 
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """The `footprints_m` of a map, ascending: those at which its places were cut or, of a map of one layer, `median_m`,
-    the median of all places (None: unknown, and there are none). Of a map of several layers, `place_ids` int64 (M,),
-    ascending, are the places that were cut, and `layer` int (M,) the number of the footprint of each."""
+    """The `footprints_m` of a map, ascending: those at which its places were cut or, in a map with one layer,
+    `median_m`, the median of all places (None: unknown, and `footprints_m` is empty). With several layers, `place_ids`
+    int64 (M,), ascending, are the places that were cut, and `layer` int (M,) the number of each one's footprint."""
 
     median_m: float | None
     footprints_m: tuple[float, ...]
@@ -38,7 +38,7 @@ class Layers:
 
     def narrow_search(self, expected: Expectation, index: PlaceIndex, footprint_m: float | None) -> Expectation:
         """Narrow a search to the places of the index that were cut at about `footprint_m` (None: search all layers), if
-        any of them is in reach. Places that were not cut stay."""
+        any of them is in reach. Places that were not cut are kept."""
         if footprint_m is None or len(self.footprints_m) < 2:
             return expected
         rows = np.minimum(np.searchsorted(self.place_ids, index.place_ids), len(self.place_ids) - 1)
@@ -63,7 +63,7 @@ def read_layers(place_map: PlaceMap) -> Layers:
     return Layers(median_m, tuple(footprints_m), place_ids[is_cut][order], layer)
 
 
-def _find_nearest(footprints_m: Sequence[float], to_m: float | Doubles) -> Ints:
-    """Return the number of the footprint that is nearest by ratio to the length, or to each of the lengths, `to_m`."""
-    off = np.subtract.outer(np.log(to_m), np.log(footprints_m))
-    return np.asarray(np.abs(off).argmin(axis=-1))
+def _find_nearest(footprints_m: Sequence[float], length_m: float | Doubles) -> Ints:
+    """Return the number of the footprint that is nearest, by ratio, to `length_m` or to each of its lengths."""
+    log_ratios = np.subtract.outer(np.log(length_m), np.log(footprints_m))
+    return np.asarray(np.abs(log_ratios).argmin(axis=-1))

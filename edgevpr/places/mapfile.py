@@ -26,13 +26,13 @@ from edgevpr.places.rows import Content, RowError, Values
 
 _COARSE_COLUMNS = f"{rows.VALUES}, geom_crc32, coarse, coarse_crc32"
 _OWNER_SEPARATOR = "; "
-_MAX_DIFFERENT_SHARE = 0.05  # of the numbers of two coarse parts of one picture
-_MAX_RELATIVE_DIFFERENCE = 0.01  # norm of their difference: far above rounding, far below another picture's
+_MAX_DIFFERENT_SHARE = 0.05  # of the values of two coarse parts of the same picture
+_MAX_RELATIVE_DIFFERENCE = 0.01  # norm of their difference: far above rounding, far below that of two pictures
 
 
 class Footprints(NamedTuple):
-    """The places of a map that have a footprint: `place_ids` int64 (M,), `length_m` float64 (M,) of the ground that a
-    picture's longest side shows, and `is_cut` bool (M,): it was cut from an orthophoto."""
+    """The places of a map that have a footprint: `place_ids` int64 (M,), `length_m` float64 (M,) of the ground along a
+    picture's longest side, and `is_cut` bool (M,), True if it was cut from an orthophoto."""
 
     place_ids: Ints
     length_m: Doubles
@@ -61,10 +61,10 @@ class _StoredText:
 
 class PlaceMap(MapConnection):
     """An open map. `left_out` maps the id of each place that could not be read so far to the reason in a few words, in
-    the order in which they were found.
+    the order of discovery.
 
-    `mask_sha256`: hash of the overlay mask that was used to make the places. `lens`: name of the calibration by which
-    their pictures were straightened. `attribution`: owners of the orthophotos that places were cut from, in their own
+    `mask_sha256`: hash of the overlay mask that was used to make the places. `lens`: name of the camera calibration
+    used to undistort their pictures. `attribution`: owners of the orthophotos from which places were cut, in their own
     words. `calibration`: the calibration of confidences (see `mapmaking.calibrate`). None: there is none, or it is
     unknown."""
 
@@ -74,7 +74,7 @@ class PlaceMap(MapConnection):
     calibration = _StoredText(mapspec.CALIBRATION)
 
     def require_technique(self, spec: TechniqueSpec) -> None:
-        """Raise MapError, naming what differs, unless the map's descriptors were made by exactly `spec`."""
+        """Raise MapError, listing the differences, unless the map's descriptors were made by exactly `spec`."""
         if differences := mapspec.list_differences(self.spec, spec):
             raise MapError(
                 f"{self.path} was made differently ({'; '.join(differences)}): use it with its own technique and "
@@ -120,13 +120,13 @@ class PlaceMap(MapConnection):
         self._record_text(mapspec.MASK, sha256)
 
     def record_lens(self, path: str | None) -> None:
-        """Store the name of the calibration by which the pictures of the places are straightened. None: they are not,
-        and nothing is stored. Raises MapError."""
+        """Store the name of the camera calibration used to undistort the pictures of the places. None: store nothing.
+        Raises MapError."""
         if path is not None:
             self._record_text(mapspec.LENS, Path(path).name)
 
     def add_attribution(self, text: str | None) -> None:
-        """Store an owner's words with those that are there (None: nothing is stored). Raises MapError."""
+        """Add an owner's words to the stored attribution (None: store nothing). Raises MapError."""
         if text:
             owners = [*(self.attribution or text).split(_OWNER_SEPARATOR), *text.split(_OWNER_SEPARATOR)]
             self._record_text(mapspec.ATTRIBUTION, _OWNER_SEPARATOR.join(dict.fromkeys(owners)))
@@ -139,15 +139,15 @@ class PlaceMap(MapConnection):
         """Yield the places with `place_ids` in the order given (None: all places, in the order they were added). Raises
         PlaceError for a place that is missing or damaged."""
         for place_id in [place_id for place_id, _ in self.scan_rows("1")] if place_ids is None else map(int, place_ids):
-            with self._name_unreadable(place_id):
+            with self._convert_row_errors(place_id):
                 place = rows.parse_place(place_id, self.read_row(place_id, rows.PLACE_COLUMNS))
             yield place
 
     def read_coarse_parts(self) -> Iterator[tuple[int, LatLon | None, float | None, Array]]:
         """Yield (place_id, (lat_deg, lon_deg) or None, heading_deg or None, coarse part as array of `spec.coarse`) of
-        every readable place, in the order they were added. Note the other places in `left_out`."""
+        every readable place, in the order they were added. Record the other places in `left_out`."""
         for place_id, row in self.scan_rows(_COARSE_COLUMNS):
-            with self._leave_out_unreadable(place_id):
+            with self._skip_unreadable(place_id):
                 content = rows.read_columns(_COARSE_COLUMNS, row)
                 point, heading_deg = rows.parse_position(content)
                 part = rows.decode_part(content, "coarse", self.spec.coarse)
@@ -166,7 +166,7 @@ class PlaceMap(MapConnection):
     def read_fine_part(self, place_id: int) -> tuple[Array, LatLon | None]:
         """Read one place from the file: return its fine part, a read-only array of `spec.fine`, and its (lat_deg,
         lon_deg), None if it has no position. Raises PlaceError for a place that is missing or damaged."""
-        with self._name_unreadable(place_id):
+        with self._convert_row_errors(place_id):
             if self.spec.fine is None:
                 raise RowError("it has no fine part")
             content = self.read_row(int(place_id), "geom, geom_crc32, fine, fine_crc32")
@@ -176,7 +176,7 @@ class PlaceMap(MapConnection):
     def read_landmarks(self, place_id: int) -> bytes | None:
         """Read the encoded landmarks of one place from the file; None if it has none. Raises PlaceError if the place
         is missing or damaged."""
-        with self._name_unreadable(place_id):
+        with self._convert_row_errors(place_id):
             return rows.read_landmarks(self.read_row(int(place_id), "landmarks, landmarks_crc32"))
 
     def read_footprints(self) -> Footprints:
@@ -203,16 +203,16 @@ class PlaceMap(MapConnection):
             stored = rows.decode_part(self.read_row(place_id, "coarse"), "coarse", self.spec.coarse).astype(np.float32)
         except (RowError, PlaceError):
             return False
-        given = np.asarray(coarse, np.float32).reshape(stored.shape)
-        is_near = np.linalg.norm(stored - given) <= _MAX_RELATIVE_DIFFERENCE * np.linalg.norm(stored)
-        return bool(is_near or np.mean(stored != given) <= _MAX_DIFFERENT_SHARE)
+        candidate = np.asarray(coarse, np.float32).reshape(stored.shape)
+        is_near = np.linalg.norm(stored - candidate) <= _MAX_RELATIVE_DIFFERENCE * np.linalg.norm(stored)
+        return bool(is_near or np.mean(stored != candidate) <= _MAX_DIFFERENT_SHARE)
 
     def read_outlines(self) -> Iterator[tuple[int, float, float, float]]:
-        """Yield (place_id, lat_deg, lon_deg, quality 0..1) of every readable place, NaN for an unknown position. Note
+        """Yield (place_id, lat_deg, lon_deg, quality 0..1) of every readable place, NaN for an unknown position. Record
         the other places in `left_out`."""
         columns = "geom, quality, geom_crc32"
         for place_id, row in self.scan_rows(columns):
-            with self._leave_out_unreadable(place_id):
+            with self._skip_unreadable(place_id):
                 content = rows.read_columns(columns, row)
                 lat_deg, lon_deg = rows.parse_point(content) or (math.nan, math.nan)
                 yield place_id, lat_deg, lon_deg, rows.parse_quality(content)
@@ -225,7 +225,7 @@ class PlaceMap(MapConnection):
             self.db.execute("INSERT OR REPLACE INTO edgevpr_map (key, value) VALUES (?, ?)", (key, json.dumps(text)))
 
     @contextmanager
-    def _name_unreadable(self, place_id: int) -> Iterator[None]:
+    def _convert_row_errors(self, place_id: int) -> Iterator[None]:
         """Turn the exception `RowError`, raised in the body of `with`, into a PlaceError with the place's id."""
         try:
             yield
@@ -233,8 +233,8 @@ class PlaceMap(MapConnection):
             raise PlaceError(self.path, place_id, str(error)) from error
 
     @contextmanager
-    def _leave_out_unreadable(self, place_id: int) -> Iterator[None]:
-        """If the body of `with` raises `RowError`, enter the place and the reason in `left_out`, and go on."""
+    def _skip_unreadable(self, place_id: int) -> Iterator[None]:
+        """If the body of `with` raises `RowError`, record the place and the reason in `left_out`, and continue."""
         try:
             yield
         except RowError as error:

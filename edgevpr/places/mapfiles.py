@@ -13,15 +13,15 @@ from edgevpr.places.geopackage import decode_point_or_none
 
 _SQLITE_SUFFIXES = ("-wal", "-shm", "-journal")
 MAX_WAIT_S = 5.0  # longest wait for another program that is writing
-# Instructions of SQLite after which a statement is interrupted. A table of a million places takes a tenth of this; a
-# view, or a damaged table that refers to itself, may never end.
+# SQLite instructions after which a statement is interrupted. A table of a million places takes a tenth of this; a view,
+# or a damaged table that refers to itself, may never end.
 _MAX_SQLITE_STEPS = 500_000_000
 
-# Words of SQLite's messages, and advice to the user.
+# Words in SQLite's messages, and the advice to the user.
 _ADVICE = {
-    "full": "the disk is full: make room; every place confirmed so far is kept",
+    "full": "the disk is full: free some space; all places confirmed so far are kept",
     "not a database": "this is not a place map: give a .gpkg file made by `edgevpr map build`",
-    "readonly": "it may not be written: check its permissions and those of its folder",
+    "readonly": "it is not writable: check its permissions and those of its folder",
     "unable to open": "it cannot be opened: check the path, and the permissions of the file and its folder",
     "": "the file or its disk is damaged, or it is not a place map ({message}): restore a copy or build it again",
 }
@@ -57,7 +57,7 @@ def require_regular(path: Path) -> None:
     from which a program would read for ever."""
     if path.is_dir():
         raise MapError(
-            f"{path} is a folder, and a map is one file: cut the map of a mission out of a folder of maps with "
+            f"{path} is a folder, but a map is one file: extract the map of a mission from a folder of maps with "
             f"`edgevpr map subset {path} --mission FILE --out flight.gpkg`."
         )
     for file in (path, *list_sqlite_files(path)):
@@ -66,7 +66,7 @@ def require_regular(path: Path) -> None:
 
 
 def lock_map(path: Path, make: bool = False) -> int:
-    """Lock a map for the one program that may add places; return a file descriptor, whose closing ends the lock.
+    """Lock a map for the one program that may add places. Returns a file descriptor; closing it releases the lock.
 
     Readers need no lock. SQLite's own lock is not enough, since it lasts for one transaction only: two programs that
     map the same pictures would add every place twice. `make` creates a missing file. Raises MapBusyError if another
@@ -82,7 +82,7 @@ def lock_map(path: Path, make: bool = False) -> int:
             f"{path}: another program is adding places to this map: wait until it has finished, or stop it."
         ) from None
     except OSError:
-        pass  # a file system without locks: go on
+        pass  # a file system without locks: continue
     return descriptor
 
 
@@ -135,14 +135,15 @@ def enable_write_ahead_log(db: sqlite3.Connection) -> None:
 
 
 def merge_write_ahead_log(db: sqlite3.Connection) -> None:
-    """Merge SQLite's log into the map file and remove it. It stays, harmless, while another program uses the map."""
+    """Merge SQLite's log into the map file and remove it. The log stays, and does no harm, while another program uses
+    the map."""
     with suppress(sqlite3.Error):
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         db.execute("PRAGMA journal_mode = DELETE")
 
 
 def merge_leftover_log(path: Path) -> None:
-    """Merge the log that a killed program left into the map file; do nothing if that may not be written."""
+    """Merge the log that a killed program left behind into the map file; do nothing if it is not writable."""
     if list_sqlite_files(path)[0].exists():
         with suppress(sqlite3.Error), closing(connect(path, "rw")) as db:
             merge_write_ahead_log(db)
@@ -164,7 +165,7 @@ def translate_errors(path: Path) -> Iterator[None]:
     except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter if SQLite's message quotes a damaged schema
         message = str(error)
         if "locked" in message:
-            raise MapBusyError(f"{path}: another program writes to it: close that program and try again.") from error
+            raise MapBusyError(f"{path}: another program is writing to it: close that program and retry.") from error
         advice = next(advice for words, advice in _ADVICE.items() if words in message)
         raise MapError(f"{path}: {advice.format(message=message)}.") from error
 

@@ -30,12 +30,12 @@ _EXTENT = "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapInfo:
     """Summary of a map. `extent` is (lat_min, lon_min, lat_max, lon_max) in degrees. Any field is None if no place has
-    the value, or if another program wrote it in another form. `with_position` and `with_pose` are numbers of places.
-    `of_low_quality` is the number added only because there would have been too wide a gap. Of the places with a pose,
+    the value, or if another program wrote it in a different form. `with_position` and `with_pose` are numbers of
+    places. `of_low_quality` is the number added only to avoid too wide a gap. For the places with a pose,
     `footprints_m` are the lengths on the ground of a picture's longest side (see `Layers`), and `position_sd_m` is the
-    standard deviation of the positions along one axis, as root mean square. `attribution` names the owners of
-    orthophotos. `one_way_deg` is the course of a map that looks down and was flown in one direction: a camera that
-    triggers late shifts such a map along it, and nothing in the map shows that."""
+    standard deviation of the positions along one axis, as root mean square. `attribution` lists the owners of
+    orthophotos. `one_way_deg` is the course of a nadir map that was flown in one direction: a camera that triggers late
+    shifts such a map along its course, and nothing in the map reveals it."""
 
     path: str
     spec: TechniqueSpec
@@ -54,10 +54,10 @@ class MapInfo:
 
     @property
     def one_way_warning(self) -> str:
-        """A warning of the error that a map flown in one direction cannot show, in a sentence."""
+        """A one-sentence warning about the error that a map flown in one direction cannot reveal."""
         return (
             f"all places were flown on a course of about {self.one_way_deg:.0f} degrees: if the camera triggers late, "
-            "all positions are shifted by its delay times the speed, which only lines flown the other way would show"
+            "all positions are shifted by its delay times the speed, which only lines flown the other way would reveal"
         )
 
 
@@ -107,7 +107,7 @@ def _find_one_way_deg(place_map: PlaceMap) -> float | None:
     """Return the course over ground, degrees, if all places were flown over in about one direction; None if not, or if
     their times are unknown."""
     tags: list[tuple[float, float, float]] = []
-    with suppress(PlaceError):  # those before a damaged place say enough
+    with suppress(PlaceError):  # the places before a damaged one are enough
         for place in place_map.read_places():
             if place.t_utc_s is not None and place.position:
                 tags.append((place.t_utc_s, place.position.lat_deg, place.position.lon_deg))

@@ -55,7 +55,7 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
     if application_id != geopackage.APPLICATION_ID or not {"edgevpr_map", "places"} <= tables:
         raise MapError(f"{path}: this is not a place map: give a .gpkg file made by `edgevpr map build`.")
     try:
-        # The others are read only when they are needed: a map can be used without them.
+        # The optional keys are read only when they are needed: a map can be used without them.
         rows = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?, ?)", OPTIONAL_KEYS)
         stored = {key: json.loads(value) for key, value in rows.fetchmany(_MAX_STORED)}
         version = stored["format_version"]
@@ -65,7 +65,7 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
         raise _make_damage_error(path, error) from error
     if version not in (FORMAT_VERSION, _PRERELEASE_VERSION):
         raise MapError(
-            f"{path} has map format {version}, and this version of edgevpr reads {FORMAT_VERSION}: update edgevpr, or "
+            f"{path} has map format {version}, but this version of edgevpr reads {FORMAT_VERSION}: update edgevpr, or "
             "build the map again."
         )
     _require_columns(path, db)
@@ -78,7 +78,7 @@ def read_spec(path: Path, stored: Stored) -> TechniqueSpec:
         name, parameters, model = stored["technique"], dict(stored["parameters"]), stored["model_sha256"]
         coarse, fine, packed = (_parse_part_spec(stored[part]) for part in _PARTS)
         if coarse is None or not isinstance(name, str) or not isinstance(model, str | None):
-            raise ValueError("no coarse part, or names that are no text")
+            raise ValueError("no coarse part, or a name that is not text")
         if not all(isinstance(value, int | str) or math.isfinite(value) for value in parameters.values()):
             raise ValueError(f"the parameters {parameters!r}")
     except (ValueError, KeyError, TypeError, OverflowError) as error:
@@ -99,14 +99,14 @@ def list_differences(theirs: TechniqueSpec, ours: TechniqueSpec) -> list[str]:
 
 def _require_columns(path: Path, db: sqlite3.Connection) -> None:
     """Raise MapError unless the table of places has the columns that every map has."""
-    # Generated columns are not in this list: they are computed when read, so their size has no limit.
+    # This list omits generated columns: they are computed when read, so their size has no limit.
     columns = {name: (kind, key) for _, name, kind, _, _, key in db.execute("PRAGMA table_info(places)")}
     missing = [name for name in rows.ALL_COLUMNS.split(", ") if name not in columns]
     if columns.get("place_id") != ("INTEGER", 1):
         missing.append("place_id")
     if missing:
         raise MapError(
-            f"{path}: its table of places lacks columns of a map ({', '.join(missing)}): restore a copy or build the "
+            f"{path}: its table of places lacks required columns ({', '.join(missing)}): restore a copy or build the "
             "map again."
         )
 

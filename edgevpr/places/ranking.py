@@ -1,4 +1,4 @@
-"""Rankings of places for a query: how two are merged, and by how much the best place leads those elsewhere."""
+"""Rankings of places for a query: merging of two, and the margin of the best place over places elsewhere."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
@@ -10,17 +10,17 @@ from edgevpr.core.contract import FineMatch
 from edgevpr.core.geodesy import distance_m
 from edgevpr.places.index import PlaceIndex
 
-MAX_NEIGHBOUR_SLOTS = 2  # places before and after one without a position that are its neighbours
+MAX_NEIGHBOUR_SLOTS = 2  # the neighbours of a place without a position, on each side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ranking:
     """The places that a query may show, best first: their `slots` in the index, int (K,), and their `scores`, float32
-    (K,). `compared` maps the slot of each place that was compared in full to the match found, which has this score;
-    those only scored quickly (see `Technique.score_quickly`) come last. `unread` int (U,): slots of places that cannot
-    be read from the file, but that the query may show as well, because the scan scored their row (see `Scan`) at least
-    as high as the best place's, or among the three best. `tried`: share (0..1) of the rotations under which the query
-    could match that were not ruled out."""
+    (K,). `compared` maps the slot of each place that was compared in full to its match, which has this score; places
+    that were only scored quickly (see `Technique.score_quickly`) come last. `unread` int (U,): slots of places that
+    cannot be read from the file, but that the query may show, because their scan score (see `Scan`) is at least that of
+    the best place or among the three best. `tried`: share (0..1) of the possible rotations of the query that were not
+    ruled out."""
 
     slots: Ints
     scores: Singles
@@ -39,15 +39,15 @@ class Ranking:
         return replace(self, slots=self.slots[order], scores=self.scores[order])
 
 
-def merge_rankings(one: Ranking, other: Ranking) -> Ranking:
+def merge_rankings(first: Ranking, second: Ranking) -> Ranking:
     """Merge two rankings of the same query, made with different expectations. If both compared a place in full, the
     better match counts."""
-    compared = dict(one.compared)
-    for slot, match in other.compared.items():
+    compared = dict(first.compared)
+    for slot, match in second.compared.items():
         if slot not in compared or match.score > compared[slot].score:
             compared[slot] = match
     rest = dict[int, float]()
-    for ranking in (one, other):
+    for ranking in (first, second):
         for slot, score in zip(ranking.slots.tolist(), ranking.scores.tolist(), strict=True):
             if slot not in compared:
                 rest[slot] = max(score, rest.get(slot, score))
@@ -58,8 +58,8 @@ def merge_rankings(one: Ranking, other: Ranking) -> Ranking:
         slots=np.array(list(scores), np.intp),
         scores=np.array(list(scores.values()), np.float32),
         compared=compared,
-        unread=np.union1d(one.unread, other.unread).astype(np.intp),
-        tried=min(1.0, one.tried + other.tried),
+        unread=np.union1d(first.unread, second.unread).astype(np.intp),
+        tried=min(1.0, first.tried + second.tried),
     )
 
 
@@ -71,7 +71,7 @@ def outside_neighbourhood(
     same: Collection[int] = (),
     max_slots: int = MAX_NEIGHBOUR_SLOTS,
 ) -> Bools:
-    """Return bool (K,), True for each of `slots` (K,) that is no neighbour of the slot `best`: it is more than
+    """Return bool (K,), True for each of `slots` (K,) that is not a neighbour of the slot `best`: it is more than
     `neighbour_m` metres or, without a position, `max_slots` slots away, and its id is not in `same`."""
     away_m = distance_m(index.lat_deg[best], index.lon_deg[best], index.lat_deg[slots], index.lon_deg[slots])
     away = np.where(np.isnan(away_m), abs(slots - best) > max_slots, away_m > neighbour_m)
@@ -79,8 +79,8 @@ def outside_neighbourhood(
 
 
 def margin(ranking: Ranking, index: PlaceIndex, neighbour_m: float, same: Collection[int] = ()) -> float | None:
-    """Return the best score minus the best score of a place elsewhere (see `outside_neighbourhood`); None if none is
-    ranked."""
+    """Return the best score minus the best score of a place elsewhere (see `outside_neighbourhood`); None if no such
+    place is ranked."""
     is_rival = outside_neighbourhood(index, int(ranking.slots[0]), ranking.slots[1:], neighbour_m, same)
     runners_up = ranking.scores[1:][is_rival]
     return float(ranking.scores[0] - runners_up[0]) if len(runners_up) else None

@@ -1,11 +1,11 @@
-"""Retrieval of the places that a query may show: a scan of the whole index, then full comparisons of the best places.
+"""Retrieval of the places that a query may show: scan the whole index, then compare the best places in full.
 
-A *hypothesis* is a rotation and a camera height under which query and place may match; each has a number.
-A place that cannot be read is left out from then on. Its loss must never make a wrong match be accepted:
+A *hypothesis* is a rotation and a camera height under which query and place may match; each has a number. A place that
+cannot be read is left out from then on. Its loss must never cause a wrong match to be accepted:
 
-* The query in which a place turns out to be unreadable is refused.
+* The query that reveals an unreadable place is refused.
 * A place that was left out keeps its row. A query that may show it (see `Ranking.unread`) is refused.
-* Without a fine part the row is all: a place that was left out keeps its rank, and is refused if it is the best.
+* Without a fine part the row is enough: a place that was left out keeps its rank, and is refused if it is the best.
 * If most of the places compared with one query cannot be read, the file is at fault: no place is left out.
 """
 
@@ -26,27 +26,27 @@ from edgevpr.places.ranking import Ranking, outside_neighbourhood
 
 Choice = tuple[int, list[int] | None]  # a slot, and the hypotheses to try (None: all)
 QuickScore = tuple[float, Choice]  # approximate score, and the slot with its best hypothesis
-# Scan scores of each place, float32 (N,), and each hypothesis, float32 (N, H), -inf if ruled out (None: there is none).
+# Scan scores of each place, float32 (N,), and each hypothesis, float32 (N, H), -inf if ruled out (None: no hypotheses).
 Scan = tuple[Singles, Singles | None]
 
 _ELSEWHERE_PLACES = 5
 _MAX_HYPOTHESES = 3  # per place
 _MAX_UNMOVED_PLACES = 9
-# Factor on the candidates in a map of so many places without a known heading: on the sets from the air it finds 0.832
-# of the queries over 10,000 places (without: 0.802). Twice as many find fewer of 1,000 places.
+# Factor on the candidates in a map of at least this many places, without a known heading: on the aerial sets it finds
+# 0.832 of the queries among 10,000 places (0.802 without it). Twice as many find fewer among 1,000 places.
 _LARGE_MAP_PLACES = 2000
 _LARGE_MAP_FACTOR = 1.6
-_MIN_UNREADABLE = 3  # in one query: with so many the file may be at fault
-# In the data set corridor (tune), if the right places were left out and a wrong one had enough margin to be accepted,
-# one of the right ones always had at least the scan score of the wrong one, or one of the two best scan scores.
+_MIN_UNREADABLE = 3  # in one query: from this many on, the file may be at fault
+# In the data set corridor (tune), if the correct places were left out and a wrong one had enough margin to be accepted,
+# one of the correct ones always had at least the scan score of the wrong one, or one of the two best.
 _LIKELY_PLACES = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Knowledge about the place of a query before the search (None: unknown). `in_reach` bool (N,), at least one True:
-    the places where the aircraft can be. `turned_deg` float (N,): rotation of the camera, in degrees, since each place
-    was mapped. `height_ratio`: the camera's height above the ground, divided by that when mapping."""
+    """What is known about the place of a query before the search (None: unknown). `in_reach` bool (N,), at least one
+    True: the places where the aircraft can be. `turned_deg` float (N,): rotation of the camera, in degrees, since each
+    place was mapped. `height_ratio`: the camera's height above the ground, divided by the height when mapping."""
 
     in_reach: Bools | None = None
     turned_deg: Doubles | None = None
@@ -79,11 +79,11 @@ def scan_index(query: Query) -> Scan:
 def compare_places(query: Query, scanned: Scan, candidates: int | None, apart_m: float) -> Ranking:
     """Compare the `candidates` places that have the best scan scores with the query, and rank them.
 
-    Of more than the technique's `in_full`, only those with the best quick scores are compared in full. Among
-    2,000 places and more, looking down with no heading known, 1.6 times as many are compared. If `candidates` is None,
-    or at least the number of places and more than the technique's own number, all places are compared. If all
-    candidates are within `apart_m` metres of the best one, the best-scanned places elsewhere are compared as well, for
-    the margin; if `expected.in_reach` is known, also five out of reach, and at least five elsewhere.
+    If there are more candidates than the technique's `in_full`, only those with the best quick scores are compared in
+    full. With a nadir camera, no heading and at least 2,000 places, there are 1.6 times as many. All places are
+    compared if `candidates` is None, or at least the number of places and more than the technique's own number. If all
+    candidates are within `apart_m` metres of the best one, those elsewhere with the best scan scores are compared too,
+    for the margin. If `expected.in_reach` is known, so are five out of reach and at least five elsewhere.
 
     Without a fine part the scan scores rank the places. With `TechniqueSpec.scan_counts`, the score is that of the
     comparison times the mean of the scan score and 1. Raises PlaceError if a place cannot be read; it is then left out.
@@ -114,14 +114,14 @@ def compare_places(query: Query, scanned: Scan, candidates: int | None, apart_m:
 
 
 def compute_candidate_factor(tries_rotations: bool, places: int) -> float:
-    """Return the factor on the number of candidates in a map of so many places, if no heading is known."""
+    """Return the factor on the number of candidates in a map of `places` places, if no heading is known."""
     return _LARGE_MAP_FACTOR if tries_rotations and places >= _LARGE_MAP_PLACES else 1
 
 
 class _Comparison:
     """The comparisons of one query with places of its map: by slot, the `scores` and `matches` of the places compared
-    in full (without a fine part: scan scores, and no matches), and those passed over after a comparison in part.
-    `readable` bool (N,) is False for places left out (all True without a fine part)."""
+    in full (without a fine part: scan scores, and no matches), and those skipped after a quick score. `readable` bool
+    (N,) is False for places left out (all True without a fine part)."""
 
     def __init__(self, query: Query, scanned: Scan, candidates: int | None) -> None:
         technique, index, expected = query.technique, query.index, query.expected
@@ -135,11 +135,11 @@ class _Comparison:
             self.readable = ~np.isin(index.place_ids, list(query.place_map.left_out))
         self.scores: dict[int, float] = {}
         self.matches: dict[int, FineMatch] = {}
-        self._passed_over: list[QuickScore] = []
+        self._skipped: list[QuickScore] = []
 
     def choose_candidates(self, among: Bools, count: int, in_full: int | None) -> list[Choice]:
-        """Choose up to `count` places where `among` bool (N,) is True, by scan score. If they have together more than
-        `in_full` hypotheses to try, keep only the `in_full` places with the best glance (None: keep all)."""
+        """Choose up to `count` places where `among` bool (N,) is True, by scan score. If together they have more than
+        `in_full` hypotheses to try, keep only the `in_full` places with the best quick scores (None: keep all)."""
         if self._tries_all and self._by_hypothesis is not None:
             count = self._by_hypothesis.size
         chosen = choose_best(self._scanned, self._by_hypothesis, among, count)
@@ -150,17 +150,17 @@ class _Comparison:
             score, likely = self._query.technique.score_quickly(self._query.descriptor, fine, hypotheses)
             quick_scores.append((self._weigh_by_scan(slot, score), (slot, likely)))
         quick_scores.sort(key=lambda quick_score: -quick_score[0])
-        self._passed_over += quick_scores[in_full:]
+        self._skipped += quick_scores[in_full:]
         return [choice for _, choice in quick_scores[:in_full]]
 
     def choose_more(self, among: Bools, count: int) -> list[Choice]:
-        """Choose up to `count` more places where `among` is True: those passed over, or if none of them is, those
-        of the best scan scores."""
-        more = [choice for _, choice in self._passed_over if among[choice[0]]][:count]
+        """Choose up to `count` more places where `among` is True: skipped ones or, if there are none, those with the
+        best scan scores."""
+        more = [choice for _, choice in self._skipped if among[choice[0]]][:count]
         return more or choose_best(self._scanned, self._by_hypothesis, among, count)
 
     def compare_places(self, chosen: list[Choice]) -> None:
-        """Compare the chosen places in full. Raises as `_read_fine_parts`."""
+        """Compare the chosen places in full. Raises the errors of `_read_fine_parts`."""
         if self._has_one_stage:
             self.scores.update((slot, float(self._scanned[slot])) for slot, _ in chosen)
             return
@@ -174,7 +174,7 @@ class _Comparison:
         slots, scores = np.array(list(self.scores), np.intp), np.array(list(self.scores.values()), np.float32)
         order = np.argsort(-scores, kind="stable")
         slots, scores = slots[order], scores[order]
-        rest = [(score, slot) for score, (slot, _) in self._passed_over if slot not in self.scores]
+        rest = [(score, slot) for score, (slot, _) in self._skipped if slot not in self.scores]
         rest.sort(key=lambda scored: -scored[0])
         unread: Ints = np.flatnonzero(~self.readable)
         if len(unread):
@@ -216,7 +216,7 @@ def _read_fine_parts(query: Query, chosen: list[Choice]) -> Iterator[tuple[int, 
     if len(unreadable) >= _MIN_UNREADABLE and 2 * len(unreadable) > len(chosen):
         raise MapError(
             f"{place_map.path}: {len(unreadable)} of the {len(chosen)} places compared cannot be read (place "
-            f"{first.place_id}: {first.problem}): the file is damaged or another map; restore a copy."
+            f"{first.place_id}: {first.problem}): the file is damaged or is another map: restore a copy."
         )
     for failure in unreadable:
         place_map.left_out.setdefault(failure.place_id, failure.problem)
@@ -224,8 +224,8 @@ def _read_fine_parts(query: Query, chosen: list[Choice]) -> Iterator[tuple[int, 
 
 
 def match_unmoved_places(query: Query, best: int, apart_m: float) -> list[FineMatch]:
-    """Compare a query, looking down, with a few places elsewhere than the slot `best`, all over the map, as if it had
-    been taken from their height and not turned (see `Technique.match_at_rest`). Raises as `compare_places` does."""
+    """Compare a nadir query with a few places all over the map, but not near the slot `best`, as if it had been taken
+    at their height and heading (see `Technique.match_at_rest`). Raises the errors of `compare_places`."""
     index, left_out = query.index, list(query.place_map.left_out)
     slots = np.flatnonzero(
         outside_neighbourhood(index, best, np.arange(len(index)), apart_m) & ~np.isin(index.place_ids, left_out)
@@ -258,9 +258,9 @@ def load_candidates(
 
 def choose_best(scores: Singles, by_hypothesis: Singles | None, among: Bools, count: int) -> list[Choice]:
     """Choose the `count` slots with the best `scores` where `among` bool (N,) is True, each with the hypotheses to try
-    (None: all), in the order of the map file, in which a memory card reads them fastest. With `by_hypothesis` float32
-    (N, H) (see `Scan`), the `count` best pairs of a place and a hypothesis are chosen instead, three of a place at
-    most, or more if there are too few places."""
+    (None: all), in the order of the map file, which an SD card reads fastest. With `by_hypothesis` float32 (N, H) (see
+    `Scan`), the `count` best pairs of a place and a hypothesis are chosen instead, at most three per place, or more if
+    there are too few places."""
     slots = np.flatnonzero(among)
     if by_hypothesis is None or not len(slots):
         return [(slot, None) for slot in slots[np.sort(_find_largest(scores[slots], count))].tolist()]

@@ -1,8 +1,8 @@
 """The rows of the table of places: their columns, the check of their values, and a scan that survives damaged pages.
 
 A row is used only if each value has the right type and range, and each BLOB the right size and checksum. A missing
-checksum (NULL) is accepted, since a program that moves a place on purpose removes it. An exception is the time, which
-other programs write in many forms: a value that is not a time counts as unknown.
+checksum (NULL) is accepted, since a program that moves a place on purpose removes it. The exception is the time, which
+other programs write in many formats: a value that is not a time is treated as unknown.
 """
 
 import math
@@ -21,7 +21,7 @@ from edgevpr.core.types import Frame, Place, Pose, Position, Salience
 from edgevpr.places import geopackage
 from edgevpr.places.mapfiles import is_row_error
 
-# Lists of columns, as SQL queries name them.
+# Lists of columns, for SQL queries.
 VALUES = "geom, time, alt_m, heading_deg, source_image, quality"
 SALIENCE = "memorability, staticity, entropy, is_low_quality"
 POSE = (
@@ -37,7 +37,7 @@ MAX_LANDMARK_BYTES = 10_000  # per place
 _POSE = tuple(POSE.split(", "))
 _ALTITUDES_M = (-1000, 100_000)  # above sea level, as in positions.csv
 _VARIANCES_M2 = (1e-12, 1e10)
-_RANGES: dict[str, tuple[float, float]] = {  # least and greatest number of a column
+_RANGES: dict[str, tuple[float, float]] = {  # smallest and largest number of a column
     "alt_m": _ALTITUDES_M,
     "quality": (0, 1),
     "footprint_m": (1e-6, 1e5),
@@ -46,7 +46,7 @@ _RANGES: dict[str, tuple[float, float]] = {  # least and greatest number of a co
     "recorded_lat_deg": (-90, 90),
     "recorded_lon_deg": (-180, 180),
 }
-_MAX_UNREADABLE = 100_000  # successive ids without a readable place that end a scan
+_MAX_UNREADABLE = 100_000  # a scan ends after this many successive ids without a readable place
 
 # Values of some columns of a row as SQLite returns them; their types are not checked yet.
 Values = tuple[Any, ...]
@@ -60,7 +60,7 @@ class RowError(ValueError):
 def read_columns(columns: str, row: Values | None) -> Content:
     """Return the values of a row by the names in `columns`, of the form "a, b". Raises RowError if it is None."""
     if row is None:
-        raise RowError("its row is gone")
+        raise RowError("its row is missing")
     return dict(zip(columns.split(", "), row, strict=True))
 
 
@@ -68,7 +68,7 @@ def parse_point(content: Content) -> LatLon | None:
     """Decode `geom` as (lat_deg, lon_deg); None for a place without a position. Raises RowError."""
     if content["geom"] is None:
         if content["geom_crc32"] is not None:
-            raise RowError("its position is gone")
+            raise RowError("its position is missing")
         return None
     try:
         point = geopackage.decode_point(content["geom"])
@@ -83,7 +83,7 @@ def decode_part(content: Content, name: str, spec: PartSpec) -> Array:
     if it is in `content`. Raises RowError."""
     blob = content[name]
     if not isinstance(blob, bytes) or len(blob) != spec.nbytes:
-        raise RowError(f"its {name} part has a wrong size")
+        raise RowError(f"its {name} part has the wrong size")
     _require_checksum(content, name, f"{name} part")
     part: Array = np.frombuffer(blob, spec.dtype).reshape(spec.shape)
     if part.dtype.kind == "f" and not np.isfinite(part).all():
@@ -97,7 +97,7 @@ def read_landmarks(content: Content) -> bytes | None:
     if blob is None:
         return None
     if not isinstance(blob, bytes) or len(blob) > MAX_LANDMARK_BYTES:
-        raise RowError("its landmarks have a wrong size")
+        raise RowError("its landmarks have the wrong size")
     _require_checksum(content, "landmarks", "set of landmarks")
     return blob
 
@@ -106,7 +106,7 @@ def parse_quality(content: Content) -> float:
     """Return the quality of a place, 0 to 1. Raises RowError."""
     quality = _parse_number(content, "quality")
     if quality is None:
-        raise RowError("its quality is gone")
+        raise RowError("its quality is missing")
     return quality
 
 
@@ -138,7 +138,7 @@ def parse_place(place_id: int, content: Content) -> Place:
 def make_content(
     frame: Frame, descriptor: Descriptor, spec: TechniqueSpec, salience: Salience | None, landmarks: bytes | None
 ) -> Content:
-    """Return the row of a new place, by columns, without checksums. An impossible time or altitude becomes NULL."""
+    """Return the row of a new place, by column, without checksums. An impossible time or altitude becomes NULL."""
     position, scores = frame.position, salience.scores if salience else {}
     altitude = position.alt_m if position else None
     return {
@@ -185,8 +185,8 @@ def escape_name(name: str) -> str:
 
 
 def scan_rows(db: sqlite3.Connection, columns: str) -> Iterator[tuple[int, Values | None]]:
-    """Yield (place id, values of `columns`) of every place in the order added; None for values SQLite cannot read. From
-    a damaged page on, each place is read by its id. Raises sqlite3.Error if nothing can be read."""
+    """Yield (place id, values of `columns`) of every place in the order added; None for values SQLite cannot read.
+    After a damaged page, each place is read by its id. Raises sqlite3.Error if nothing can be read."""
     last = -(2**63)
     try:
         for place_id, *row in db.execute(f"SELECT place_id, {columns} FROM places ORDER BY place_id"):
@@ -235,7 +235,7 @@ def _make_salience(values: Sequence[Any]) -> Salience | None:
 
 
 def _make_pose(content: Content) -> Pose | None:
-    """Make a Pose from the columns `POSE`; None if they are unknown. Raises RowError: a wrong pose misleads fixes."""
+    """Make a Pose from the columns `POSE`; None if unknown. Raises RowError: a wrong pose would shift fixes."""
     values, checksum = [_parse_number(content, name) for name in _POSE], content["pose_crc32"]
     if checksum is not None and checksum != compute_pose_crc32(values):
         raise RowError("its pose does not match its checksum")
@@ -266,10 +266,10 @@ def compute_crc32(blob: bytes | None) -> int | None:
     return None if blob is None else zlib.crc32(blob)
 
 
-def _require_checksum(content: Content, name: str, called: str) -> None:
+def _require_checksum(content: Content, name: str, label: str) -> None:
     checksum = content.get(f"{name}_crc32")
     if checksum is not None and checksum != zlib.crc32(content[name]):
-        raise RowError(f"its {called} does not match its checksum")
+        raise RowError(f"its {label} does not match its checksum")
 
 
 def _parse_number(content: Content, name: str) -> float | None:

@@ -4,7 +4,7 @@ This is the trajectory search of Milford and Wyeth 2012 (SeqSLAM, equations 4 to
 technique. A trajectory assigns a slot of the index to each of the last queries, at a constant speed of 0.8 to 1.2
 places per query: places must be mapped in the order of the flight. At another speed, or backwards, the search finds
 places that lag behind. So trajectories at other speeds (-2.5 to 3) are scored as well, and a place is accepted only if
-it scores higher than these *rivals* of all places elsewhere."""
+it scores higher than these *rivals* at all places elsewhere."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from edgevpr.places.ranking import Ranking
 FOLLOWED_SPEEDS = np.linspace(0.8, 1.2, 5)  # places per query, as in the paper
 _SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places per query; ten queries can tell steps of 0.25 apart
 _OTHER_SPEEDS = _SPEEDS[(FOLLOWED_SPEEDS[0] > _SPEEDS) | (FOLLOWED_SPEEDS[-1] < _SPEEDS)]
-# After 5 s at 10 m/s the vehicle has left the neighbourhood of 50 m, and no trajectory spans the places between.
+# After 5 s at 10 m/s the vehicle has left the 50 m neighbourhood, and no trajectory covers the places in between.
 _MAX_PAUSE_S = 5.0
 _MAX_PAUSE_INTERVALS = 3  # a slow board may take longer for each query, e.g. 6 s
 _MIN_QUERIES_TOGETHER = 3
@@ -42,8 +42,8 @@ class SequenceSearch:
     """The scores of all places for the last `length` queries, and the search for trajectories in them.
 
     Call `add_query` for each query. No place may be accepted before `frames`, the number of queries, is `length`.
-    `rivals` float32 (N,) is for each place the best mean score of a trajectory that ends there at a speed outside 0.8
-    to 1.2. A pause of more than five seconds, and more than three times the interval before it, begins a new
+    `rivals` float32 (N,) has, for each place, the best mean score of a trajectory that ends there at a speed outside
+    0.8 to 1.2. A pause of more than five seconds, and more than three times the previous interval, starts a new
     sequence."""
 
     def __init__(self, length: int) -> None:
@@ -52,7 +52,7 @@ class SequenceSearch:
         self._other_trajectories = make_trajectories(length, _OTHER_SPEEDS)
         self.rivals: Singles = np.empty(0, np.float32)
         self._rows: deque[Singles] = deque(maxlen=length)  # newest first
-        self._usual: deque[float] = deque(maxlen=_MIN_QUERIES_ALONE)  # score of the places not compared, by query
+        self._default_scores: deque[float] = deque(maxlen=_MIN_QUERIES_ALONE)  # score of places not compared, per query
         self._t_last_s: float | None = None
         self._interval_s = 0.0
 
@@ -69,10 +69,10 @@ class SequenceSearch:
         if self._is_broken(t_mono_s):
             self._rows.clear()
         if self.frames == self.length:
-            self._rows.pop()  # before there is one more
-        usual = float(np.median(ranking.scores)) if len(ranking.slots) < len(index) else 0.0
-        self._usual.appendleft(usual)
-        row = np.full(len(index), usual, np.float32)
+            self._rows.pop()  # before the next one is added
+        default_score = float(np.median(ranking.scores)) if len(ranking.slots) < len(index) else 0.0
+        self._default_scores.appendleft(default_score)
+        row = np.full(len(index), default_score, np.float32)
         row[ranking.slots] = ranking.scores
         self._rows.appendleft(row)
         means = find_best_means(self._rows, self._trajectories)
@@ -95,28 +95,27 @@ class SequenceSearch:
         together = find_best_means(newest, [trajectory[:_MIN_QUERIES_TOGETHER] for trajectory in self._trajectories])
         if not near[together.argmax()]:
             return False
-        for row, usual in zip(newest[:_MIN_QUERIES_ALONE], self._usual, strict=False):
+        for row, default_score in zip(newest[:_MIN_QUERIES_ALONE], self._default_scores, strict=False):
             best = float(row[near].max(initial=0))
-            # The usual score, which places have that were not compared, would reach a `min_score` of 0.
+            # The default score, that of places not compared, would reach a `min_score` of 0.
             better = np.count_nonzero(row > best)
-            if best <= usual or best < min_score or better * near.sum() > _MAX_BETTER_SHARE * len(row):
+            if best <= default_score or best < min_score or better * near.sum() > _MAX_BETTER_SHARE * len(row):
                 return False
         return True
 
     def _is_broken(self, t_mono_s: float) -> bool:
         """Return True if this query cannot continue the sequence, because of a long pause."""
-        before_s, usual_s = self._t_last_s, self._interval_s
+        last_s, last_interval_s = self._t_last_s, self._interval_s
         self._t_last_s = t_mono_s
-        if before_s is None:
+        if last_s is None:
             return False
-        self._interval_s = t_mono_s - before_s
-        return self._interval_s > max(_MAX_PAUSE_S, _MAX_PAUSE_INTERVALS * usual_s)
+        self._interval_s = t_mono_s - last_s
+        return self._interval_s > max(_MAX_PAUSE_S, _MAX_PAUSE_INTERVALS * last_interval_s)
 
 
 def make_trajectories(length: int, velocities: Floats) -> list[list[int]]:
     """Return the trajectories of `length` queries at `velocities` (V,), in places per query, without duplicates: for
-    each query, the newest first, how many slots before the newest one's it was, such as [0, 1, 2, ...] at a velocity of
-    1."""
+    each query, newest first, its distance in slots from the newest query, such as [0, 1, 2, ...] at a velocity of 1."""
     # Round halves up, even if the product has a rounding error in its last bit.
     back = np.floor(velocities[:, None] * np.arange(length) + 0.5 + 1e-9).astype(int)
     unique: list[list[int]] = np.unique(back, axis=0).tolist()

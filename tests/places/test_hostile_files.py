@@ -64,11 +64,11 @@ TAMPERED = {
     ),
     "DROP TABLE places; CREATE VIRTUAL TABLE places USING rtree(id, a, b)": "not a place map",
     "DROP TABLE places": "not a place map",
-    "ALTER TABLE places RENAME COLUMN fine TO fein": "lacks columns of a map .fine.",
+    "ALTER TABLE places RENAME COLUMN fine TO fein": "lacks required columns .fine.",
     "ALTER TABLE places DROP COLUMN fine; ALTER TABLE places ADD COLUMN fine AS (zeroblob(1000000000))": (
-        "lacks columns of a map .fine."
+        "lacks required columns .fine."
     ),
-    "ALTER TABLE places RENAME COLUMN geom_crc32 TO other": "lacks columns of a map .geom_crc32.",
+    "ALTER TABLE places RENAME COLUMN geom_crc32 TO other": "lacks required columns .geom_crc32.",
     "DELETE FROM edgevpr_map": "edgevpr_map is damaged",
     "UPDATE edgevpr_map SET value = CAST(x'ff' AS TEXT) WHERE key = 'fine'": "edgevpr_map is damaged",
 }

@@ -62,17 +62,17 @@ def damage(place_map, change, *numbers):
 
 
 DAMAGE = {
-    "fine = x'00'": "its fine part has a wrong size",
+    "fine = x'00'": "its fine part has the wrong size",
     "fine = zeroblob(8)": "its fine part does not match its checksum",
     "fine_crc32 = 1": "its fine part does not match its checksum",
     "fine_crc32 = 'x'": "its fine part does not match its checksum",
-    "fine = NULL": "its fine part has a wrong size",
-    "fine = 7": "its fine part has a wrong size",
+    "fine = NULL": "its fine part has the wrong size",
+    "fine = 7": "its fine part has the wrong size",
     "fine = x'000000000000f07f', fine_crc32 = NULL": "its fine part is not finite",
     f"geom = x'{encode_point(1.0, 1.0).hex()}'": "its position has changed",
     "geom = NULL": "its position has changed",
     "geom = 'text'": "its geometry is not a point",
-    "place_id = 1000": "its row is gone",
+    "place_id = 1000": "its row is missing",
 }
 
 

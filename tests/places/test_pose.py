@@ -51,7 +51,7 @@ def test_pose_and_landmarks_come_back_and_a_place_may_have_none(posed, tmp_path)
         ("cov_east_north_m2 = 99, pose_crc32 = NULL", "pose has an impossible covariance"),
         ("recorded_lat_deg = 91, pose_crc32 = NULL", "its recorded_lat_deg is 91"),
         ("landmarks = x'00'", "set of landmarks does not match its checksum"),
-        ("landmarks = zeroblob(20000)", "its landmarks have a wrong size"),
+        ("landmarks = zeroblob(20000)", "its landmarks have the wrong size"),
     ],
 )
 def test_a_pose_that_cannot_be_true_is_not_believed(posed, change, says):

@@ -42,7 +42,7 @@ def test_a_damaged_fine_part_of_any_place_costs_one_query_and_then_only_where_it
     assert sum(line["accepted"] for line in queries[2:]) >= 4, "the flight goes on with the rest"
     assert flight.end["unusable"] == 1
     assert [(line["place"], line["problem"]) for line in of_kind(lines, "left out")] == [
-        (place, "its fine part has a wrong size")
+        (place, "its fine part has the wrong size")
     ]
     assert flight.link.texts() == [(4, "edgevpr: map damaged, 1 place left out")]
     assert flight.end["left_out"] == queries[-1]["totals"]["left_out"] == 1
