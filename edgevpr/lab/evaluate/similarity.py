@@ -34,7 +34,7 @@ def add_unscored(truth: GroundTruth, queries: Sequence[str]) -> GroundTruth:
     """Return `truth` with an entry for each of `queries`, the names of all query images, in that order. Raises
     UsageError if `truth` contains other names."""
     if missing := sorted(truth.keys() - set(queries)):
-        raise UsageError(f"The ground truth contains the query `{missing[0]}`, which is not in the --query folder.")
+        raise UsageError(f"The ground truth contains the query `{missing[0]}`, which is not in --query.")
     return {name: truth.get(name) for name in queries}
 
 
