@@ -11,7 +11,7 @@ __version__ = "0.1.0"
 os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] = "102100000"
 
 # Loaded when they are asked for: `import edgevpr` and the commands stay light.
-_INTERFACE = ("Cuttings", "FlownPictures", "Map", "Match", "build")
+_INTERFACE = ("FlightPictures", "Map", "Match", "OrthophotoGrid", "build")
 
 
 def __getattr__(name: str) -> object:

@@ -28,8 +28,8 @@ from edgevpr.core.config import load_config
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.reasons import Reason
 from edgevpr.core.types import Frame, Place, Position
-from edgevpr.mapmaking.making import MadeMap, MapOrder, make_map
-from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
+from edgevpr.mapmaking.making import BuiltMap, MapPlan, make_map
+from edgevpr.mapmaking.pictures import FlightPictures, OrthophotoGrid
 from edgevpr.power.boards import load_board, resolve_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -195,7 +195,7 @@ def _to_match(event: Recognition) -> Match:
 
 def build(
     path: str | Path,
-    images: str | Path | FlownPictures | Cuttings,
+    images: str | Path | FlightPictures | OrthophotoGrid,
     *,
     camera: str | None = None,
     technique: str | None = None,
@@ -203,22 +203,22 @@ def build(
     refine: bool = True,
     calibrate: bool = True,
     progress: Progress | None = None,
-) -> MadeMap:
+) -> BuiltMap:
     """Make a map as `edgevpr map build` does. `progress` is called after each picture (None: it is shown on stderr).
 
-    `images`: a folder of pictures or a video; `FlownPictures` say more of them, and `Cuttings` take an orthophoto.
+    `images`: a folder of pictures or a video; `FlightPictures` has more options, `OrthophotoGrid` uses an orthophoto.
     `camera`: "nadir" or "forward". `technique`: None chooses it. `config`: a configuration of the flight (None: the
     shipped one). Pictures that cannot be used are left out with a warning, and one says what could not be done to the
     map. Raises EdgevprError.
     """
-    pictures = images if isinstance(images, FlownPictures | Cuttings) else FlownPictures(source=_to_path(images))
-    order = MapOrder(
-        path=_to_path(path), pictures=pictures, technique=technique, parameters={}, refine=refine, calibrate=calibrate
+    source = images if isinstance(images, FlightPictures | OrthophotoGrid) else FlightPictures(source=_to_path(images))
+    plan = MapPlan(
+        path=_to_path(path), pictures=source, technique=technique, parameters={}, refine=refine, calibrate=calibrate
     )
     settings = load_config(config, {"source.camera": camera})
     show = text.progress if progress is None else _wrap_progress(progress)
     with ThreadpoolController().limit(limits=1, user_api="blas"):
-        made = make_map(order, settings, lambda error: _log.warning("%s", error), show)
+        made = make_map(plan, settings, lambda error: _log.warning("%s", error), show)
     for sentence in made.not_done:
         _log.warning("%s", sentence)
     return made
@@ -249,4 +249,4 @@ def _check_image(image: object) -> None:
         raise ImageError(f"The picture is {image.dtype} of shape {image.shape}: {hint}.")
 
 
-__all__ = ("Cuttings", "FlownPictures", "Map", "Match", "build")
+__all__ = ("FlightPictures", "Map", "Match", "OrthophotoGrid", "build")

@@ -109,7 +109,7 @@ def test_interface_raises_errors_of_edgevpr(flight, valley, tmp_path):
         ground.match(seen(1))
     with pytest.raises(SourceError, match="nothing"):
         edgevpr.build(
-            tmp_path / "m.gpkg", edgevpr.Cuttings(orthophoto="nothing.tif", footprint_m=100.0, spacing_m=25.0)
+            tmp_path / "m.gpkg", edgevpr.OrthophotoGrid(orthophoto="nothing.tif", footprint_m=100.0, spacing_m=25.0)
         )
     with pytest.raises(AttributeError):
         edgevpr.Mop  # noqa: B018

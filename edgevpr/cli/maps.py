@@ -32,7 +32,7 @@ from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import progress
 
 if TYPE_CHECKING:
-    from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
+    from edgevpr.mapmaking.pictures import FlightPictures, OrthophotoGrid
 
 _ORTHOPHOTO_FLAGS = ("footprint_m", "spacing_m", "area", "attribution")
 _RECORDING_FLAGS = ("positions", "rate_hz")
@@ -126,9 +126,9 @@ def _parse_lengths(text: str) -> tuple[float, ...]:
         raise ArgumentTypeError(f"`{text}` is no length in metres, nor several with commas between them") from None
 
 
-def _parse_pictures(args: Namespace) -> "FlownPictures | Cuttings":
+def _parse_pictures(args: Namespace) -> "FlightPictures | OrthophotoGrid":
     """Return the pictures that the flags name: those of a recording or of an orthophoto. Raises UsageError."""
-    from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
+    from edgevpr.mapmaking.pictures import FlightPictures, OrthophotoGrid
 
     if (args.source is None) == (args.orthophoto is None):
         raise UsageError("Give either --images (pictures of a flight) or --orthophoto: a map is made of one of them.")
@@ -138,19 +138,19 @@ def _parse_pictures(args: Namespace) -> "FlownPictures | Cuttings":
         raise UsageError(f"--{given[0].replace('_', '-')} goes with {source}: leave it out.")
     if args.source is not None:
         rate_hz = getattr(args, "rate_hz", None)
-        return FlownPictures(source=args.source, positions=to_path(args.positions), rate_hz=rate_hz)
+        return FlightPictures(source=args.source, positions=to_path(args.positions), rate_hz=rate_hz)
     if args.footprint_m is None or args.spacing_m is None:
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
     about: dict[str, Any] = {name: getattr(args, name, None) for name in _ORTHOPHOTO_FLAGS}
-    return Cuttings(orthophoto=args.orthophoto, **about)
+    return OrthophotoGrid(orthophoto=args.orthophoto, **about)
 
 
 def run_map_build(args: Namespace) -> int:
     """Run `map build`: make a map from a recording or an orthophoto, or add to one."""
-    from edgevpr.mapmaking.making import MapOrder, make_map
+    from edgevpr.mapmaking.making import MapPlan, make_map
 
     config = make_config(args, args.config)
-    order = MapOrder(
+    order = MapPlan(
         path=args.map,
         pictures=_parse_pictures(args),
         technique=args.technique,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from edgevpr.core.text import format_offset, sanitize
 
 if TYPE_CHECKING:
-    from edgevpr.mapmaking.making import MadeMap
+    from edgevpr.mapmaking.making import BuiltMap
     from edgevpr.mapmaking.moving import MapMove
     from edgevpr.mapmaking.refine import Refinement
     from edgevpr.places.examine import MapCheck
@@ -29,7 +29,7 @@ _OTHER_SEASON_NOTE = (
 _MAX_DIFFERENCES = 20  # differences of a replay at most
 
 
-def format_build(path: str, made: "MadeMap", is_cut: bool) -> Iterator[str]:
+def format_build(path: str, made: "BuiltMap", is_cut: bool) -> Iterator[str]:
     """Yield what `map build` has made, and what to expect of the map. `is_cut`: of an orthophoto."""
     result = made.result
     yield f"{path}: {result.added} places added ({result.without_position} without a position), {made.places} in all"

@@ -28,7 +28,7 @@ from edgevpr.frames.images import list_images, read_image
 from edgevpr.frames.mask import OverlayMask
 from edgevpr.frames.positions import find_positions, find_track, read_positions, read_track
 from edgevpr.frames.source import Source, open_source, read_to_end
-from edgevpr.mapmaking.pictures import FlownPictures
+from edgevpr.mapmaking.pictures import FlightPictures
 from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, measure_tilt
 from edgevpr.runtime.recognise.agreement import MIN_PROVEN_INLIERS, measure_agreement
 from edgevpr.runtime.recognise.calibration import MIN_PLACES
@@ -66,7 +66,7 @@ _MIN_DISPLAY_SHARE = 0.006
 _MAX_STILL_EDGES = 0.5  # share of all edges; beyond, the camera itself did not move
 
 
-def warn_of_gaps(pictures: FlownPictures, total: int, places: int | None) -> None:
+def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> None:
     """Warn about what the map will lack. `total`: number of frames (0: unknown). `places`: number of places already in
     the map (None: the map will not be calibrated)."""
     uri, is_placed = pictures.source, (pictures.positions or find_track(pictures.source)) is not None
@@ -92,7 +92,7 @@ def warn_of_gaps(pictures: FlownPictures, total: int, places: int | None) -> Non
         _log.warning(text, total + places, MIN_PLACES)
 
 
-def suggest_lens(pictures: FlownPictures, config: SourceConfig, technique: Technique) -> None:
+def suggest_lens(pictures: FlightPictures, config: SourceConfig, technique: Technique) -> None:
     """If no field of view is configured, log the one in a picture's EXIF data: without it, pictures of a camera that
     looks down can be neither levelled nor scaled."""
     is_needed = technique.spec.parameters.get("camera") == "nadir" and config.fov_deg is None and config.lens is None
@@ -106,7 +106,7 @@ def suggest_lens(pictures: FlownPictures, config: SourceConfig, technique: Techn
 
 
 @show_elapsed("checking which way the camera points")
-def require_forward_camera(pictures: FlownPictures, mask: OverlayMask | None) -> None:
+def require_forward_camera(pictures: FlightPictures, mask: OverlayMask | None) -> None:
     """Log that the camera is assumed to look ahead, and why. Raises UsageError if the pictures clearly look straight
     down; the user must then say which is meant."""
     tilt_deg = _read_gimbal_tilt_deg(pictures.folder) if pictures.folder else None
@@ -122,7 +122,7 @@ def require_forward_camera(pictures: FlownPictures, mask: OverlayMask | None) ->
 
 
 @show_elapsed("measuring the tilt of the camera")
-def require_level_camera(pictures: FlownPictures, fov_deg: float | None) -> None:
+def require_level_camera(pictures: FlightPictures, fov_deg: float | None) -> None:
     """Raise UsageError if neighbouring pictures show that a camera that should look straight down is tilted, and its
     angles are not recorded, so that the pictures cannot be levelled."""
     if pictures.folder:
@@ -145,7 +145,7 @@ def require_level_camera(pictures: FlownPictures, fov_deg: float | None) -> None
         )
 
 
-def _compare_neighbours(pictures: FlownPictures, mask: OverlayMask | None) -> tuple[bool, str]:
+def _compare_neighbours(pictures: FlightPictures, mask: OverlayMask | None) -> tuple[bool, str]:
     """Compare neighbouring pictures. Returns whether they clearly look down, and the reason as text."""
     folder = pictures.folder
     runs = map(_read_usable, _choose_runs(folder)) if folder else [_read_video(pictures.source, _VIDEO_PICTURES)]
@@ -172,7 +172,7 @@ def _compare_neighbours(pictures: FlownPictures, mask: OverlayMask | None) -> tu
 
 
 @show_elapsed("checking for an on-screen display")
-def warn_of_display(pictures: FlownPictures, mask: OverlayMask | None) -> None:
+def warn_of_display(pictures: FlightPictures, mask: OverlayMask | None) -> None:
     """Warn if something in the pictures does not move where `mask` shows ground (None: everywhere)."""
     if pictures.folder:
         paths = list_images(pictures.folder)
@@ -180,7 +180,7 @@ def warn_of_display(pictures: FlownPictures, mask: OverlayMask | None) -> None:
         images = _read_usable(paths[at] for at in spread)
     else:
         images = _read_video(pictures.source, _DISPLAY_PICTURES)
-    share = measure_still_share(images, mask)
+    share = measure_static_share(images, mask)
     if share is not None and share >= _MIN_DISPLAY_SHARE:
         text = (
             "%.1f %% of the picture never changes: probably a display or a part of the aircraft. It would make places "
@@ -189,7 +189,7 @@ def warn_of_display(pictures: FlownPictures, mask: OverlayMask | None) -> None:
         _log.warning(text, 100 * share)
 
 
-def measure_still_share(images: Iterable[Image], mask: OverlayMask | None) -> float | None:
+def measure_static_share(images: Iterable[Image], mask: OverlayMask | None) -> float | None:
     """Return the share (0..1) of the pixels of `images` that lie on a static edge, where `mask` shows ground (None:
     everywhere). None if there are too few images, or if the camera itself did not move."""
     count, allowed = 0, np.ones(_DISPLAY_SHAPE, bool)

@@ -16,7 +16,7 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.mask import load_mask
 from edgevpr.frames.source import read_to_end
 from edgevpr.mapmaking.headings import find_headings, lacks_heading
-from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
+from edgevpr.mapmaking.pictures import FlightPictures, OrthophotoGrid
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
@@ -45,7 +45,7 @@ def finish_map(
     place_map: PlaceMap,
     encoder: FrameEncoder,
     match: MatchConfig,
-    pictures: FlownPictures | Cuttings | None,
+    pictures: FlightPictures | OrthophotoGrid | None,
     progress: Progress,
     refine: bool = True,
     calibrate: bool = True,
@@ -53,7 +53,7 @@ def finish_map(
     """Refine and calibrate an open map, as far as its technique allows. `pictures` None: not available, so the map is
     not calibrated. The result lists what failed and nothing is raised, because a map is usable without these steps."""
     technique, refined, calibration, not_done = encoder.technique, None, None, []
-    if refine and technique.spec.looks_down and not isinstance(pictures, Cuttings):
+    if refine and technique.spec.looks_down and not isinstance(pictures, OrthophotoGrid):
         try:
             refined = refine_map(place_map, technique, pictures.folder if pictures else None, progress)
         except EdgevprError as error:
@@ -92,7 +92,7 @@ def calibrate_map(
     place_map: PlaceMap,
     encoder: FrameEncoder,
     match: MatchConfig,
-    pictures: FlownPictures | Cuttings,
+    pictures: FlightPictures | OrthophotoGrid,
     progress: Progress,
 ) -> MapCalibration:
     """Calibrate the confidence of an open map with the pictures that it was made from, skipping those that cannot be
@@ -116,9 +116,11 @@ def calibrate_map(
     return calibrate(encoder, place_map, match, QueryMeter(load_board("this")), frames, progress)
 
 
-def make_encoder(source: SourceConfig, pictures: FlownPictures | Cuttings | None, technique: Technique) -> FrameEncoder:
+def make_encoder(
+    source: SourceConfig, pictures: FlightPictures | OrthophotoGrid | None, technique: Technique
+) -> FrameEncoder:
     """Return the encoder for places: with mask and levelling, which pictures cut from an orthophoto do not need."""
-    if isinstance(pictures, Cuttings):
+    if isinstance(pictures, OrthophotoGrid):
         return FrameEncoder(technique=technique)
     levelling = make_levelling(source, technique, below=True)
     return FrameEncoder(technique=technique, mask=load_mask(source.mask), levelling=levelling)

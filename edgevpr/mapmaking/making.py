@@ -18,7 +18,7 @@ from edgevpr.mapmaking import advice
 from edgevpr.mapmaking.finishing import finish_map, make_encoder
 from edgevpr.mapmaking.headings import find_headings
 from edgevpr.mapmaking.mapping import CoveredGround, MappingResult, PlaceSelector, build_map, measure_ground
-from edgevpr.mapmaking.pictures import Cuttings, FlownPictures
+from edgevpr.mapmaking.pictures import FlightPictures, OrthophotoGrid
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.mapfiles import parse_map_path, remove_map
 from edgevpr.places.mapinfo import describe_map
@@ -30,7 +30,7 @@ from edgevpr.runtime.recognise.levelling import read_camera_lens, read_mount
 from edgevpr.runtime.recognise.opening import create_technique, make_technique, open_salience_gate, warn_of_mismatch
 
 if TYPE_CHECKING:
-    from edgevpr.mapmaking.cuttings import OrthophotoSource
+    from edgevpr.mapmaking.orthophoto_source import OrthophotoSource
     from edgevpr.mapmaking.refine import Refinement
 
 _log = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ _ORTHOPHOTO_TECHNIQUE = "cohog"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MapOrder:
+class MapPlan:
     """The map to make at `path` from `pictures`.
 
     `technique`: its name (None: choose one for `board`, the board that will fly). `parameters`: technique parameters by
@@ -46,7 +46,7 @@ class MapOrder:
     its places are made."""
 
     path: str
-    pictures: FlownPictures | Cuttings
+    pictures: FlightPictures | OrthophotoGrid
     technique: str | None = None
     parameters: dict[str, str]
     board: str = "this"
@@ -56,7 +56,7 @@ class MapOrder:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MadeMap:
+class BuiltMap:
     """Result of `make_map`. `technique`: its name. `places`, `with_position`: number of places in the map, and of
     places with a position. `result`: counts of the frames read. `covered`: the ground that all places cover, by their
     recorded positions (None: too few). `refined`, `calibration`, `not_done`: see `FinishedMap`."""
@@ -71,23 +71,23 @@ class MadeMap:
     not_done: tuple[str, ...] = ()
 
 
-def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], None], progress: Progress) -> MadeMap:
-    """Make the map that `order` describes, or continue it. `unusable` is called with the error of each picture that
+def make_map(plan: MapPlan, config: Config, unusable: Callable[[ImageError], None], progress: Progress) -> BuiltMap:
+    """Make the map that `plan` describes, or continue it. `unusable` is called with the error of each picture that
     cannot be used. `progress` reports progress. Raises EdgevprError."""
-    path, board, pictures = parse_map_path(order.path), load_board("this"), order.pictures
-    flown, salience = config.source, config.salience
-    is_new = not (order.append and path.exists())
+    path, board, pictures = parse_map_path(plan.path), load_board("this"), plan.pictures
+    source_config, salience = config.source, config.salience
+    is_new = not (plan.append and path.exists())
     place_map = None if is_new else PlaceMap.open_for_adding(path)
     source: Source
     counts: dict[str, int] = {}
-    if isinstance(pictures, FlownPictures):
-        mask, lens = load_mask(flown.mask), flown.lens
-        source, technique = _open_flown(order, pictures, flown, place_map, mask)
+    if isinstance(pictures, FlightPictures):
+        mask, lens = load_mask(source_config.mask), source_config.lens
+        source, technique = _open_flight(plan, pictures, source_config, place_map, mask)
     else:
         mask, lens = None, None
-        source, technique = cuttings, _ = _open_cuttings(order, pictures, flown.camera, place_map)
-        cuttings.announce_size(pictures.spacing_m, technique)
-        counts = cuttings.counts
+        source, technique = orthophoto_source, _ = _open_orthophoto(plan, pictures, source_config.camera, place_map)
+        orthophoto_source.announce_size(pictures.spacing_m, technique)
+        counts = orthophoto_source.counts
     if place_map is None:
         place_map = PlaceMap.create(path, technique.spec)
         place_map.record_mask(mask.sha256 if mask else None)
@@ -96,21 +96,21 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
         warn_of_mismatch(place_map, mask, lens)
     with place_map:
         try:
-            if isinstance(pictures, FlownPictures):
-                is_calibrated = order.calibrate and list_evidence_kinds(technique.spec)
+            if isinstance(pictures, FlightPictures):
+                is_calibrated = plan.calibrate and list_evidence_kinds(technique.spec)
                 advice.warn_of_gaps(pictures, source.total, len(place_map) if is_calibrated else None)
-                advice.suggest_lens(pictures, flown, technique)
+                advice.suggest_lens(pictures, source_config, technique)
                 advice.warn_of_display(pictures, mask)
             else:
                 place_map.add_attribution(pictures.attribution)
             frames: Iterator[Frame] = filter(None, progress(read_to_end(source, unusable), source.total, "mapping"))
             if (
                 technique.spec.looks_down
-                and isinstance(pictures, FlownPictures)
-                and (camera := read_camera_lens(flown))
+                and isinstance(pictures, FlightPictures)
+                and (camera := read_camera_lens(source_config))
             ):
                 frames = find_headings(frames, camera)
-            encoder = make_encoder(flown, pictures, technique)
+            encoder = make_encoder(source_config, pictures, technique)
             result = build_map(
                 frames,
                 replace(encoder, gate=open_salience_gate(salience, board.threads)),
@@ -123,14 +123,14 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
                 remove_map(path)
             raise
         if covered := measure_ground(place_map):
-            _log.info("%s", covered.describe(is_flown=isinstance(pictures, FlownPictures)))
+            _log.info("%s", covered.describe(is_flown=isinstance(pictures, FlightPictures)))
         finished = finish_map(
-            place_map, encoder, config.match, pictures, progress, refine=order.refine, calibrate=order.calibrate
+            place_map, encoder, config.match, pictures, progress, refine=plan.refine, calibrate=plan.calibrate
         )
         info = describe_map(place_map)
         if info.one_way_deg is not None:
             _log.warning("%s", info.one_way_warning)
-        return MadeMap(
+        return BuiltMap(
             technique=technique.spec.name,
             places=len(place_map),
             with_position=info.with_position,
@@ -142,43 +142,43 @@ def make_map(order: MapOrder, config: Config, unusable: Callable[[ImageError], N
         )
 
 
-def _open_flown(
-    order: MapOrder, pictures: FlownPictures, flown: SourceConfig, place_map: PlaceMap | None, mask: OverlayMask | None
+def _open_flight(
+    plan: MapPlan, pictures: FlightPictures, config: SourceConfig, place_map: PlaceMap | None, mask: OverlayMask | None
 ) -> tuple[Source, Technique]:
     """Open the pictures and create the technique: the requested one, else that of the map (`place_map` None: there is
     no map yet), else the best for the board. Raises UsageError if the pictures look straight down but `--camera` is not
     given, or if a camera that should look straight down is tilted and its angles are not recorded."""
-    source, settings, camera = pictures.open(), order.parameters, flown.camera
-    name = order.technique or (place_map.spec.name if place_map is not None else None)
-    camera_is_open = camera is None and place_map is None and "camera" not in settings
-    if camera_is_open and (not name or make_camera_setting(name, "nadir")):
+    source, settings, camera = pictures.open(), plan.parameters, config.camera
+    name = plan.technique or (place_map.spec.name if place_map is not None else None)
+    needs_camera_check = camera is None and place_map is None and "camera" not in settings
+    if needs_camera_check and (not name or make_camera_setting(name, "nadir")):
         advice.require_forward_camera(pictures, mask)
     if name is None:
         with show_elapsed("choosing a technique"):
-            name = pick_technique(order.board, source.total or 1, camera)
+            name = pick_technique(plan.board, source.total or 1, camera)
         settings = settings | make_camera_setting(name, camera)
     elif camera:  # a technique without this setting refuses it
         settings = settings | {"camera": camera}
-    technique = _make_technique(order, place_map, name, settings)
-    if technique.spec.looks_down and not flown.gimbal and read_mount(flown) == STRAIGHT_DOWN:
-        advice.require_level_camera(pictures, flown.fov_deg)
+    technique = _make_technique(plan, place_map, name, settings)
+    if technique.spec.looks_down and not config.gimbal and read_mount(config) == STRAIGHT_DOWN:
+        advice.require_level_camera(pictures, config.fov_deg)
     return source, technique
 
 
-def _open_cuttings(
-    order: MapOrder, pictures: Cuttings, camera: str | None, place_map: PlaceMap | None
+def _open_orthophoto(
+    plan: MapPlan, pictures: OrthophotoGrid, camera: str | None, place_map: PlaceMap | None
 ) -> tuple["OrthophotoSource", Technique]:
     """Open the orthophoto and create the technique: the requested one, else that of the map (`place_map` None: there is
     no map yet), else `cohog`. Raises UsageError for a camera other than nadir."""
     if camera not in (None, "nadir"):
         raise UsageError(f"--camera {camera}: an orthophoto is seen from above: give --camera nadir, or omit it.")
-    name = order.technique or (place_map.spec.name if place_map is not None else _ORTHOPHOTO_TECHNIQUE)
-    settings = order.parameters | make_camera_setting(name, "nadir")
-    return pictures.open(), _make_technique(order, place_map, name, settings)
+    name = plan.technique or (place_map.spec.name if place_map is not None else _ORTHOPHOTO_TECHNIQUE)
+    settings = plan.parameters | make_camera_setting(name, "nadir")
+    return pictures.open(), _make_technique(plan, place_map, name, settings)
 
 
-def _make_technique(order: MapOrder, place_map: PlaceMap | None, name: str, settings: dict[str, str]) -> Technique:
+def _make_technique(plan: MapPlan, place_map: PlaceMap | None, name: str, settings: dict[str, str]) -> Technique:
     board = load_board("this")
     if place_map is not None:  # a map without places is falsy
-        return create_technique(place_map, order.technique, settings, board)
+        return create_technique(place_map, plan.technique, settings, board)
     return make_technique(board.threads, name, settings)

@@ -92,10 +92,8 @@ class CoveredGround:
         """Describe the ground in one sentence, including the track if the pictures were taken in flight."""
         lengths_m = self.north_south_m, self.east_west_m, self.track_m, self.step_m
         high, wide, track, step = (f"{m / 1000:.1f} km" if m >= 1000 else f"{m:.0f} m" for m in lengths_m)
-        extent = (
-            f"the map extends {high} north-south and {wide} east-west around {self.lat_deg:.5f}, {self.lon_deg:.5f}"
-        )
-        return f"{extent}; the track is {track} long, with a median of {step} between pictures" if is_flown else extent
+        text = f"the map extends {high} north-south and {wide} east-west around {self.lat_deg:.5f}, {self.lon_deg:.5f}"
+        return f"{text}; the track is {track} long, with a median of {step} between pictures" if is_flown else text
 
 
 def measure_ground(place_map: PlaceMap) -> CoveredGround | None:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 from edgevpr.frames.source import Source, open_source
 
 if TYPE_CHECKING:
-    from edgevpr.mapmaking.cuttings import OrthophotoSource
+    from edgevpr.mapmaking.orthophoto_source import OrthophotoSource
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlownPictures:
+class FlightPictures:
     """Pictures taken in flight. `source`: a folder of images, or a video. `positions`: the table of their positions
     (None: the one that `open_source` finds). `rate_hz`: pictures to use per second of video (None: every frame)."""
 
@@ -32,8 +32,8 @@ class FlownPictures:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Cuttings:
-    """Pictures cut from an orthophoto at the points of a grid.
+class OrthophotoGrid:
+    """A grid of pictures cut from an orthophoto.
 
     `orthophoto`: see `Orthophoto`. `footprint_m`: length of a picture's side on the ground, or several lengths, each of
     which gets a grid of its own. `spacing_m`: distance between neighbouring points. `area`: file or circle that limits
@@ -49,6 +49,6 @@ class Cuttings:
     def open(self, only: Collection[str] | None = None) -> "OrthophotoSource":
         """Open the orthophoto and choose the places. Only pictures named in `only` are cut (None: all).
         Raises SourceError if it cannot be opened, and UsageError if the grid or the area does not fit it."""
-        from edgevpr.mapmaking.cuttings import open_cuttings  # loads GDAL, or raises if it is missing
+        from edgevpr.mapmaking.orthophoto_source import open_orthophoto  # loads GDAL, or raises if it is missing
 
-        return open_cuttings(self, only)
+        return open_orthophoto(self, only)

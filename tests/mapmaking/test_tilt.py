@@ -7,7 +7,7 @@ import pytest
 from edgevpr.core.errors import UsageError
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph
 from edgevpr.mapmaking.advice import require_level_camera
-from edgevpr.mapmaking.pictures import FlownPictures
+from edgevpr.mapmaking.pictures import FlightPictures
 from edgevpr.mapmaking.tilt import MAX_UNKNOWN_TILT_DEG, MIN_PAIRS, measure_tilt
 
 CAMERA = Camera(width=320, height=240, focal_px=246.5, noise_sigma=0)
@@ -51,7 +51,7 @@ def test_measure_tilt_finds_none_of_a_camera_that_looks_straight_down(ground):
 def test_require_level_refuses_a_tilted_camera_whose_angles_are_not_recorded(ground, tmp_path):
     for number, image in enumerate(fly(ground, 45)):
         cv2.imwrite(str(tmp_path / f"{number:02}.png"), image)
-    pictures = FlownPictures(source=str(tmp_path))
+    pictures = FlightPictures(source=str(tmp_path))
     with pytest.raises(UsageError, match="degrees or more from straight down"):
         require_level_camera(pictures, None)
     (tmp_path / "positions.csv").write_text("file,lat,lon,roll_deg,pitch_deg\n00.png,50,8,0,45\n")

@@ -27,7 +27,7 @@ from edgevpr.lab.evaluate import metrics
 from edgevpr.lab.evaluate.dataset import Dataset, ScoredQuery
 from edgevpr.mapmaking.finishing import finish_map, make_encoder
 from edgevpr.mapmaking.mapping import build_map
-from edgevpr.mapmaking.pictures import FlownPictures
+from edgevpr.mapmaking.pictures import FlightPictures
 from edgevpr.places.index import PlaceIndex, compute_place_bytes, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.ranking import outside_neighbourhood
@@ -155,7 +155,7 @@ def open_temporary_map(
         path = Path(folder) / "references.gpkg"
         with PlaceMap.create(path, technique.spec) as place_map:
             build_map(frames, FrameEncoder(technique=technique), place_map)
-            pictures = FlownPictures(source=str(images)) if images else None
+            pictures = FlightPictures(source=str(images)) if images else None
             encoder = make_encoder(SourceConfig(), pictures, technique)
             finished = finish_map(place_map, encoder, MatchConfig(), pictures, show_progress)
         with PlaceMap.open(path) as place_map:

@@ -118,7 +118,7 @@ def _make_clouds(scene: Scene, cloud_frac: float, seed: int) -> Array:
     return cv2.resize(cover, scene.height_cm.shape[::-1], interpolation=cv2.INTER_CUBIC)
 
 
-def view_on_ground(pose: CameraPose, camera: Camera) -> Doubles | None:
+def project_view(pose: CameraPose, camera: Camera) -> Doubles | None:
     """Return the corners of the picture on the ground, (4, 2) metres east and north; None if it shows the horizon."""
     corners = [(0, 0, 1), (camera.width - 1, 0, 1), (camera.width - 1, camera.height - 1, 1), (0, camera.height - 1, 1)]
     ground = np.linalg.solve(ground_to_pixel(pose, camera), np.array(corners, float).T).T

@@ -16,7 +16,7 @@ from edgevpr.core.geodesy import distance_m
 from edgevpr.core.text import progress
 from edgevpr.frames.images import read_image
 from edgevpr.frames.positions import read_positions
-from edgevpr.lab.simulate.camera import light_scene, view_on_ground
+from edgevpr.lab.simulate.camera import light_scene, project_view
 from edgevpr.lab.simulate.generated import (
     SCENE_DEPTH_M,
     SCENE_WIDTH_M,
@@ -142,7 +142,7 @@ def _draw(path: Path, ground: Image, mapping: GeneratedFlight, queries: Sequence
 
     covered = np.zeros(_PICTURE_PX[::-1], np.uint8)
     for pose in mapping.poses:
-        if (corners_m := view_on_ground(pose, mapping.camera)) is not None:
+        if (corners_m := project_view(pose, mapping.camera)) is not None:
             cv2.fillConvexPoly(covered, np.array(pixels(corners_m)), 1)
     picture = cv2.resize(ground, _PICTURE_PX, interpolation=cv2.INTER_AREA)
     picture = np.where(covered[..., None] > 0, picture, picture // 3 + 20).astype(np.uint8)

@@ -13,11 +13,11 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import distance_m, offset_m
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, read_positions
-from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph, view_on_ground
+from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, photograph, project_view
 from edgevpr.lab.simulate.generated import make_oscillation, write_shots
-from edgevpr.mapmaking.cuttings import MAX_WITHOUT_DATA
 from edgevpr.mapmaking.missions import read_area
 from edgevpr.mapmaking.orthophoto import Orthophoto
+from edgevpr.mapmaking.orthophoto_source import MAX_WITHOUT_DATA
 
 SPEED_M_S = 10.0
 _SWAY_DEG = 2.0  # largest roll, pitch and yaw deviation on a track without attitude
@@ -88,7 +88,7 @@ def photograph_ground(
 ) -> Image | None:
     """Take one picture above `position`, uint8 (camera.height, camera.width, 3) BGR; None if the orthophoto lacks more
     than a tenth of the ground in the picture. Raises UsageError if the picture shows the horizon."""
-    corners_m = view_on_ground(pose, camera)
+    corners_m = project_view(pose, camera)
     if corners_m is None or (reach_m := float(np.abs(corners_m).max())) > _MAX_CORNER_HEIGHTS * pose.height_m:
         raise UsageError(
             f"At roll {pose.roll_deg:.0f} and pitch {pose.pitch_deg:.0f} degrees the picture shows the horizon, which "

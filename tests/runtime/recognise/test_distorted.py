@@ -12,8 +12,8 @@ from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.positions import GeoTag, write_positions
-from edgevpr.mapmaking.making import MapOrder, make_map
-from edgevpr.mapmaking.pictures import FlownPictures
+from edgevpr.mapmaking.making import MapPlan, make_map
+from edgevpr.mapmaking.pictures import FlightPictures
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 
@@ -55,9 +55,9 @@ def maps(ground, lenses, tmp_path_factory):
             tags[f"{number}.png"] = GeoTag(position=Position(*offset_position(*ORIGIN, 250.0, north_m)), **STRAIGHT)
         write_positions(folder / "positions.csv", tags)
         made[name] = str(folder / "map.gpkg")
-        order = MapOrder(
+        order = MapPlan(
             path=made[name],
-            pictures=FlownPictures(source=str(folder)),
+            pictures=FlightPictures(source=str(folder)),
             technique="cohog",
             parameters={"camera": "nadir"},
             refine=False,

@@ -12,10 +12,10 @@ from rasters import HOME, grid, ground_m, marked_raster, textured_raster, write_
 
 from edgevpr.core.errors import UsageError
 from edgevpr.core.geodesy import offset_position
-from edgevpr.mapmaking.cuttings import SIDE_PX, OrthophotoSource, make_lattice
 from edgevpr.mapmaking.missions import Area, Waypoint
 from edgevpr.mapmaking.orthophoto import Orthophoto
-from edgevpr.mapmaking.pictures import Cuttings
+from edgevpr.mapmaking.orthophoto_source import SIDE_PX, OrthophotoSource, make_lattice
+from edgevpr.mapmaking.pictures import OrthophotoGrid
 
 pytestmark = pytest.mark.slow
 
@@ -151,13 +151,15 @@ def test_places_under_cloud_are_counted(tmp_path):
 
 def test_one_order_cuts_every_place_at_several_footprints(tmp_path):
     path = textured_raster(tmp_path / "o.tif", pixel_m=0.5)
-    source = Cuttings(orthophoto=str(path), footprint_m=(150.0, 100.0), spacing_m=50.0).open()
+    source = OrthophotoGrid(orthophoto=str(path), footprint_m=(150.0, 100.0), spacing_m=50.0).open()
     frames = frames_of(source)
     assert len({frame.name for frame in frames}) == len(frames) == source.total
     assert {frame.pose.footprint_m for frame in frames if "_150m_" in frame.name} == {150.0}
     assert {frame.pose.footprint_m for frame in frames if "_100m_" in frame.name} == {100.0}
-    again = Cuttings(orthophoto=str(path), footprint_m=(100.0, 150.0), spacing_m=50.0).open(only=[frames[-1].name])
+    again = OrthophotoGrid(orthophoto=str(path), footprint_m=(100.0, 150.0), spacing_m=50.0).open(
+        only=[frames[-1].name]
+    )
     (one,) = frames_of(again)
     assert np.array_equal(one.image, frames[-1].image)
     with pytest.raises(UsageError, match="--footprint-m is 5000"):
-        Cuttings(orthophoto=str(path), footprint_m=(100.0, 5000.0), spacing_m=50.0).open()
+        OrthophotoGrid(orthophoto=str(path), footprint_m=(100.0, 5000.0), spacing_m=50.0).open()

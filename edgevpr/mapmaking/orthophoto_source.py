@@ -24,7 +24,7 @@ from edgevpr.mapmaking.missions import Area, read_area, shapely
 from edgevpr.mapmaking.orthophoto import Orthophoto
 
 if TYPE_CHECKING:
-    from edgevpr.mapmaking.pictures import Cuttings
+    from edgevpr.mapmaking.pictures import OrthophotoGrid
 
 _log = logging.getLogger(__name__)
 
@@ -144,12 +144,12 @@ def _compute_white_share(image: Image) -> float:
     return float(((low > _MIN_WHITE) & (high - low < _MAX_COLOUR_DIFFERENCE)).mean())
 
 
-def open_cuttings(cuttings: "Cuttings", only: Collection[str] | None) -> OrthophotoSource:
-    """Open an orthophoto and choose the places (see `Cuttings.open`)."""
-    footprints_m = [float(footprint_m) for footprint_m in np.unique(cuttings.footprint_m)]
-    area = read_area(cuttings.area) if cuttings.area else None
-    orthophoto = Orthophoto(cuttings.orthophoto)
-    lattices = [make_lattice(orthophoto, footprint_m, cuttings.spacing_m, area) for footprint_m in footprints_m]
+def open_orthophoto(grid: "OrthophotoGrid", only: Collection[str] | None) -> OrthophotoSource:
+    """Open an orthophoto and choose the places (see `OrthophotoGrid.open`)."""
+    footprints_m = [float(footprint_m) for footprint_m in np.unique(grid.footprint_m)]
+    area = read_area(grid.area) if grid.area else None
+    orthophoto = Orthophoto(grid.orthophoto)
+    lattices = [make_lattice(orthophoto, footprint_m, grid.spacing_m, area) for footprint_m in footprints_m]
     if (side_px := footprints_m[0] / orthophoto.resolution_m) < _MIN_WIDTH_PX:
         raise UsageError(
             f"{orthophoto.name} is too coarse: a picture of {footprints_m[0]:g} m is {side_px:.0f} pixels wide, and "
