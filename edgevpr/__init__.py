@@ -5,12 +5,12 @@ from importlib import import_module
 
 __version__ = "0.1.0"
 
-# The largest survey cameras that are flown have 100 megapixels (11664 x 8750); decoded that is 300 MB. Without a limit
-# a picture of 1 MB, which compresses well, takes gigabytes. OpenCV reads this once, when the first module imports it,
-# and then compares it with the header of a picture before any pixel is decoded.
+# The largest survey cameras on aircraft have 100 megapixels (11664 x 8750), 300 MB decoded. Without a limit a highly
+# compressed picture of 1 MB can need gigabytes. OpenCV reads this once, when it is first imported, and compares it with
+# the header of a picture before any pixel is decoded.
 os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] = "102100000"
 
-# Loaded when they are asked for: `import edgevpr` and the commands stay light.
+# Imported on first use, so that `import edgevpr` and the commands stay fast.
 _INTERFACE = ("FlightPictures", "Map", "Match", "OrthophotoGrid", "build")
 
 

@@ -1,5 +1,5 @@
-"""The Python interface: `edgevpr.build` makes a map, `edgevpr.Map` finds pictures in it. Everything else in the package
-may change from version to version; this may not.
+"""The Python interface: `edgevpr.build` builds a map, `edgevpr.Map` matches pictures with it. This interface is stable;
+everything else in the package may change from version to version.
 
     import cv2, edgevpr
 
@@ -34,7 +34,7 @@ from edgevpr.power.boards import load_board, resolve_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
-Progress = Callable[[int, int, str], None]  # called with the number done, of how many, and of which work
+Progress = Callable[[int, int, str], None]  # called with the number done, the total, and the name of the work
 T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
@@ -42,14 +42,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Match:
-    """Answer to one picture. None: unknown, or nothing was found.
+    """Result of matching one picture. None: unknown, or no place was found.
 
-    `accepted`: the picture shows `place`, and `reason` says why, or why not: by a code with parameters, and as text,
-    `str(reason)`, in a sentence. `confidence`: probability that it does. `position`: where the aircraft was, if it is
-    accepted. `accuracy_m`: its standard deviation, metres. `covariance_m2`: (variance east, covariance, variance
-    north). `of_place`: `position` is that of the place, since nothing is known of the way from there. `heading_deg`:
-    compass direction of the top of the picture. `turned_deg`: rotation of the picture against that of the place,
-    clockwise. `t_query_s`: seconds that it took.
+    `accepted`: the match with `place` was accepted. `reason`: why it was or was not, as a code with parameters;
+    `str(reason)` is a sentence. `confidence`: probability that the picture shows the place. `position`: position of the
+    aircraft, if accepted. `accuracy_m`: its standard deviation in metres. `covariance_m2`: (variance east, covariance,
+    variance north). `of_place`: `position` is simply that of the place, because the offset from it is unknown.
+    `heading_deg`: compass direction of the top of the picture. `turned_deg`: rotation of the picture relative to the
+    place's picture, clockwise. `t_query_s`: processing time in seconds.
     """
 
     accepted: bool
@@ -66,7 +66,7 @@ class Match:
     t_query_s: float
 
     def geojson(self) -> dict[str, Any]:
-        """Return the position as a GeoJSON feature; its geometry is None without a position."""
+        """Return the position as a GeoJSON feature; its geometry is None if there is no position."""
         properties = {
             "accepted": self.accepted,
             "reason": self.reason.code.name,
@@ -80,12 +80,12 @@ class Match:
 
 
 class Map:
-    """A map file, opened to find pictures in.
+    """A map file, opened for matching.
 
-    `config`: a configuration of a flight (None: the shipped one). `fov_deg`: field of view across the longest side of
-    the pictures; with it they are untilted and scaled by attitude and height. `accept_precision`: probability that a
-    match must have. `follow`: the pictures are those of one flight, in order. Raises EdgevprError for a map that cannot
-    be used. Not safe to use from several threads at once.
+    `config`: flight configuration file (None: the defaults). `fov_deg`: field of view across the longest side of the
+    pictures; if given, they are levelled and scaled by attitude and height. `accept_precision`: confidence that a match
+    must reach. `follow`: the pictures are those of one flight, in order. Raises EdgevprError for a map that cannot be
+    used. Not thread-safe.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Map:
         self._recogniser.place_map.close()
 
     def places(self) -> Iterator[Place]:
-        """Yield the places as they are read from the file: number, picture, position, heading and pose of each."""
+        """Yield the places while reading the file: number, picture, position, heading and pose of each."""
         yield from self._recogniser.place_map.read_places()
 
     def match(
@@ -140,11 +140,11 @@ class Map:
     ) -> Match:
         """Find the place of a picture, uint8 (H, W) grey or (H, W, 3) blue, green, red.
 
-        `heading_deg`: compass direction of the nose. `height_m`: above the ground; it counts, and is needed, only with
-        `fov_deg` or a `lens` in the configuration. `roll_deg`, `pitch_deg`: as in `Frame`. `near`: places within 300 m
-        of it are searched, and a few others in case that is wrong. `t_s`: when it was taken, seconds of any clock
-        (None: now); it counts with `follow`. Raises ImageError for a picture that cannot be used, UsageError for a
-        missing height or a value that is none.
+        `heading_deg`: compass direction of the nose. `height_m`: above ground; used, and then required, only with
+        `fov_deg` or a `lens` in the configuration. `roll_deg`, `pitch_deg`: as in `Frame`. `near`: assumed position;
+        places within 300 m are searched, and a few others in case it is wrong. `t_s`: capture time, seconds on any
+        clock (None: now); used only with `follow`. Raises ImageError for a picture that cannot be used, UsageError for
+        a missing height or an invalid value.
         """
         if not self._is_open:
             raise UsageError("The map is closed: match within its `with` block, or before close().")
@@ -156,7 +156,7 @@ class Map:
         if near is not None and not isinstance(near, Position):
             raise UsageError(f"near is {near!r}: give edgevpr.core.types.Position(lat_deg, lon_deg).")
         if self._needs_height and height_m is None:
-            raise UsageError("The map was opened with a field of view: give the height_m of each picture too.")
+            raise UsageError("The map was opened with a lens or field of view: give the height_m of each picture.")
         frame = Frame(
             image=image,
             name="",
@@ -167,7 +167,7 @@ class Map:
             pitch_deg=pitch_deg,
             height_m=height_m,
         )
-        # Products of small matrices gain nothing from more threads, which spin: they took eight times the processor.
+        # Products of small matrices gain nothing from more threads, which spin: measured, eight times the CPU time.
         with self._threads.limit(limits=1, user_api="blas"):
             event = self._recogniser.step(frame)
         if event.failed:
@@ -204,12 +204,12 @@ def build(
     calibrate: bool = True,
     progress: Progress | None = None,
 ) -> BuiltMap:
-    """Make a map as `edgevpr map build` does. `progress` is called after each picture (None: it is shown on stderr).
+    """Build a map as `edgevpr map build` does. `progress` is called after each picture (None: it is shown on stderr).
 
-    `images`: a folder of pictures or a video; `FlightPictures` has more options, `OrthophotoGrid` uses an orthophoto.
-    `camera`: "nadir" or "forward". `technique`: None chooses it. `config`: a configuration of the flight (None: the
-    shipped one). Pictures that cannot be used are left out with a warning, and one says what could not be done to the
-    map. Raises EdgevprError.
+    `images`: a folder of pictures or a video, `FlightPictures` to specify more, or `OrthophotoGrid` for an orthophoto.
+    `camera`: "nadir" or "forward". `technique`: name (None: chosen automatically). `config`: flight configuration file
+    (None: the defaults). Pictures that cannot be used are left out with a warning; a refinement or calibration that is
+    not possible causes a warning too. Raises EdgevprError.
     """
     source = images if isinstance(images, FlightPictures | OrthophotoGrid) else FlightPictures(source=_to_path(images))
     plan = MapPlan(
@@ -240,13 +240,13 @@ def _to_path(path: object) -> str:
 
 
 def _check_image(image: object) -> None:
-    """Raise ImageError for anything but a picture."""
+    """Raise ImageError for anything that is not a picture."""
     hint = "give a NumPy array of uint8, (H, W) grey or (H, W, 3) blue, green, red, as cv2.imread returns"
     if not isinstance(image, np.ndarray):
-        cause = " (None: the file could not be read)" if image is None else ""
-        raise ImageError(f"The picture is of type {type(image).__name__}: {hint}{cause}.")
+        cause = " (cv2.imread returns None for an unreadable file)" if image is None else ""
+        raise ImageError(f"The picture has the type {type(image).__name__}: {hint}{cause}.")
     if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.ndim < 2 or 0 in image.shape:
-        raise ImageError(f"The picture is {image.dtype} of shape {image.shape}: {hint}.")
+        raise ImageError(f"The picture is {image.dtype} with shape {image.shape}: {hint}.")
 
 
 __all__ = ("FlightPictures", "Map", "Match", "OrthophotoGrid", "build")

@@ -1,6 +1,6 @@
 """`edgevpr eval`: measure techniques, or stored similarities, on data sets with ground truth.
 
-Here a set is a data set, and a row is a technique with its settings, which has one row in the printed tables.
+In this module a set is a data set, and a row is a technique with its settings: one row of the printed tables.
 """
 
 from argparse import Namespace
@@ -32,27 +32,29 @@ if TYPE_CHECKING:
 def add(commands: Any) -> None:
     """Add the command and its flags."""
     parser = add_command(commands, "eval", run_eval, "evaluate techniques on data sets with ground truth")
-    parser.add_argument("--data", nargs="+", default=[], metavar="FOLDER", help="data sets in any known layout")
+    parser.add_argument("--data", nargs="+", default=[], metavar="FOLDER", help="data sets in any supported layout")
     parser.add_argument("--query", metavar="FOLDER", help="folder of query images")
     parser.add_argument("--ref", metavar="FOLDER", help="folder of reference images")
-    parser.add_argument("--ground-truth", metavar="FILE", help="CSV: query_file,ref_files (else: what is near)")
-    parser.add_argument(
-        "--within-m", type=parse_positive, default=25.0, metavar="M", help="metres that count as near (default: 25)"
-    )
+    parser.add_argument("--ground-truth", metavar="FILE", help="CSV: query_file,ref_files (default: see --within-m)")
+    text = "references this near to a query, in metres, are correct (default: 25)"
+    parser.add_argument("--within-m", type=parse_positive, default=25.0, metavar="M", help=text)
     parser.add_argument("--similarity", nargs="+", metavar="FILE", help="evaluate stored similarity matrices (.npy)")
-    parser.add_argument("--form", default="float", metavar="A,B", help=f"of vectors: {', '.join(FORMS)} (float)")
+    text = f"vector formats to evaluate: {', '.join(FORMS)} (default: float)"
+    parser.add_argument("--form", default="float", metavar="A,B", help=text)
     parser.add_argument("--exact", action="store_true", help="compare all places in full; too slow for a flight")
     parser.add_argument("--follow", action="store_true", help="treat the queries as one flight, in order (cohog only)")
     add_known(parser)
-    parser.add_argument("--config", metavar="FILE", help="configuration file: sections `salience` and `match`")
+    text = "configuration file; its sections `salience` and `match` are used"
+    parser.add_argument("--config", metavar="FILE", help=text)
     add_keys(parser, "source.camera", "match.candidates", "match.sequence", "salience.use")
-    parser.add_argument("--techniques", default="hog,cohog", metavar="A,B", help="techniques (default: hog,cohog)")
-    add_parameters(parser, "a parameter of a technique", "TECHNIQUE.KEY=VALUE")
+    text = "techniques to evaluate (default: hog,cohog)"
+    parser.add_argument("--techniques", default="hog,cohog", metavar="A,B", help=text)
+    add_parameters(parser, "set a parameter of a technique", "TECHNIQUE.KEY=VALUE")
     add_json(parser)
 
 
 def run_eval(args: Namespace) -> int:
-    """Run `eval`: measure stored similarities, or rows on data sets, and print the results."""
+    """Run `eval`: measure stored similarities, or techniques on data sets, and print the results."""
     if args.similarity:
         return _measure_similarities(args)
     from edgevpr.lab.evaluate.evaluate import MatchOptions
@@ -78,7 +80,7 @@ def run_eval(args: Namespace) -> int:
         f"{sanitize(name)}\n\n{format_results(results)}\n" for name, results in outcome.measured.items() if results
     ]
     print_result(content, args.json, "\n".join(tables))
-    print_notes(*(f"{name}, {row} was not measured: {error}" for (name, row), error in outcome.failed.items()))
+    print_notes(*(f"{row} was not measured on {name}: {error}" for (name, row), error in outcome.failed.items()))
     return 1 if outcome.failed else 0
 
 
@@ -89,7 +91,7 @@ def _measure_similarities(args: Namespace) -> int:
     from edgevpr.lab.evaluate.tables import format_results
 
     if not args.ground_truth:
-        raise UsageError("Name the ground truth of the stored similarities with --ground-truth.")
+        raise UsageError("Give the ground truth of the stored similarities with --ground-truth.")
     truth = read_truth(args.ground_truth)
     if args.query:
         truth = add_unscored(truth, list_names(args.query))
@@ -101,13 +103,13 @@ def _measure_similarities(args: Namespace) -> int:
 
 
 def _open_sets(args: Namespace) -> "dict[str, Dataset]":
-    """Read the data sets that the flags name."""
+    """Open the data sets given by the flags."""
     from edgevpr.lab.evaluate.dataset import load_dataset, match_positions, open_folder
 
     if not (args.data or (args.query and args.ref)):
-        raise UsageError("Name the data sets with --data or --query and --ref; or stored similarities: --similarity.")
+        raise UsageError("Give data sets with --data, or with --query and --ref, or similarities with --similarity.")
     if args.data and args.ground_truth:
-        raise UsageError("--ground-truth goes with --query and --ref: a folder of --data has its own.")
+        raise UsageError("--ground-truth applies only to --query and --ref: a folder of --data has its own.")
     sets = {}
     if args.query and args.ref:
         query, ref = (Path(side).resolve() for side in (args.query, args.ref))
@@ -121,22 +123,22 @@ def _open_sets(args: Namespace) -> "dict[str, Dataset]":
 
 
 def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
-    """Return the rows that the flags ask for, as `runs.Plan` has them: each technique in each form. Raises UsageError
-    for an unknown form, or a --param of a technique that is not in --techniques."""
+    """Return the rows requested by the flags, as in `runs.Plan`: each technique in each form. Raises UsageError for an
+    unknown form, and for a --param of a technique that is not in --techniques."""
     from edgevpr import techniques
     from edgevpr.runtime.preflight.pick import make_camera_setting
 
     names = [name.strip() for name in args.techniques.split(",") if name.strip()]
     if not names:
-        raise UsageError(f"--techniques names none: use some of {', '.join(techniques.list_techniques())}.")
+        raise UsageError(f"--techniques is empty: choose from {', '.join(techniques.list_techniques())}.")
     forms = [form.strip() for form in args.form.split(",")]
     if unknown := [form for form in forms if form not in FORMS]:
-        raise UsageError(f"--form names `{unknown[0]}`: use some of {', '.join(FORMS)}.")
+        raise UsageError(f"--form has an unknown format `{unknown[0]}`: choose from {', '.join(FORMS)}.")
     settings = {name: make_camera_setting(name, parse_value(args, "source.camera")) for name in names}
     for key, value in parse_parameters(args.param).items():
         name, _, parameter = key.partition(".")
         if name not in settings or not parameter:
-            raise UsageError(f"--param {key}: write TECHNIQUE.KEY=VALUE with a technique of --techniques.")
+            raise UsageError(f"--param {key}: write TECHNIQUE.KEY=VALUE with a technique from --techniques.")
         settings[name][parameter] = value
     if any("camera" in techniques.read_parameters(name) and "camera" not in settings[name] for name in names):
         print_notes("camera assumed to look ahead: if it looks straight down, give `--camera nadir`")

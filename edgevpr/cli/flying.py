@@ -1,4 +1,4 @@
-"""Commands of a flight: `edgevpr match`, `run`, `check`, `service` and `doctor`."""
+"""Flight commands: `edgevpr match`, `run`, `check`, `service` and `doctor`."""
 
 import os
 from argparse import Namespace
@@ -70,7 +70,7 @@ def add(commands: Any) -> None:
 
 
 def run_match(args: Namespace) -> int:
-    """Run `match`: find the places of a recording's images in a map, and print a line for each image."""
+    """Run `match`: look up a recording's images in a map, and print a line for each image."""
     from edgevpr.cli.matched import format_match, format_matches
     from edgevpr.frames.source import open_source, read_to_end
     from edgevpr.power.boards import load_board, resolve_board
@@ -103,7 +103,7 @@ def run_match(args: Namespace) -> int:
     if not is_calibrated and list_evidence_kinds(place_map.spec):
         lines.append(f"The map is {explain_not_calibrated(len(place_map))}.")
     if known:
-        lines.append(f"Known of each query: {','.join(known)}.")
+        lines.append(f"Known for each query: {','.join(known)}.")
     if weights := describe_weights(recogniser.technique.spec):
         lines.append(f"Weights of {weights}.")
     print_result(matches, args.json, "\n".join(lines))
@@ -111,7 +111,7 @@ def run_match(args: Namespace) -> int:
 
 
 def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recogniser") -> None:
-    """Raise UsageError if no query of `match`, or no place of the map, has what is to be known of it."""
+    """Raise UsageError if no query, or no place of the map, has the data that --known lists."""
     from edgevpr.frames.positions import find_track, read_track
     from edgevpr.frames.source import read_tags
     from edgevpr.runtime.recognise.hints import explain_useless
@@ -122,12 +122,12 @@ def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recognise
     else:
         table = positions or find_track(source)
         queries = list(read_track(table).tags) if table else []
-    if why := explain_useless(known, queries, list(recogniser.place_map.read_places()), recogniser.sequence):
-        raise UsageError(why)
+    if problem := explain_useless(known, queries, list(recogniser.place_map.read_places()), recogniser.sequence):
+        raise UsageError(problem)
 
 
 def run_flight(args: Namespace) -> int:
-    """Run `run`: fly with a configuration, until the flight ends."""
+    """Run `run`: run a flight with a configuration until it ends."""
     from edgevpr.runtime.flight.flight import fly
 
     config = make_config(args, args.config)
@@ -136,27 +136,27 @@ def run_flight(args: Namespace) -> int:
 
 
 def run_check(args: Namespace) -> int:
-    """Run `check`: check whether a flight can start with a configuration, and print the findings."""
+    """Run `check`: check whether a flight with a configuration can start, and print the findings."""
     from edgevpr.runtime.service.check import check_configuration
 
     return _show_findings(check_configuration(args.config, offline=args.offline), args.json)
 
 
 def run_doctor(args: Namespace) -> int:
-    """Run `doctor`: check autopilot and board, and print what is fine, what is wrong, and what to change."""
+    """Run `doctor`: check the autopilot and this computer, and print what is fine, what is wrong and what to change."""
     from edgevpr.mavlink.address import parse_link
     from edgevpr.runtime.service.doctor import check_setup
 
     config = make_config(args, args.config)
     if config.mavlink.link is None:
-        raise UsageError("No link to the autopilot is configured: name one with --link, or in --config.")
+        raise UsageError("No link to the autopilot is configured: give one with --link, or in --config.")
     address = parse_link(config.mavlink.link)
     findings, reading = check_setup(config, address)
     return _show_findings(findings, args.json, link=str(address), reading=reading and asdict(reading))
 
 
 def _show_findings(findings: "Sequence[Finding]", as_json: bool, **others: Any) -> int:
-    """Print findings, in JSON with the fields `others`, and return the exit code."""
+    """Print the findings (in JSON together with the fields `others`) and return the exit code."""
     from edgevpr.runtime.service.finding import format_findings
 
     is_ok, fields = all(finding.ok for finding in findings), [finding.fields() for finding in findings]

@@ -1,5 +1,5 @@
-"""Entry point of the command line `edgevpr`. Each module of `_GROUPS` adds a group of commands with their flags. A
-command imports what it needs only when it runs, so that help and short commands are fast."""
+"""Entry point of the `edgevpr` command line. Each module in `_GROUPS` adds a group of commands with their flags. A
+command imports what it needs only when it runs, so help and short commands are fast."""
 
 import argparse
 import logging
@@ -18,23 +18,23 @@ from edgevpr.core.text import sanitize, suggest
 EXIT_CODES = {
     0: "Done, and nothing is wrong.",
     1: "A problem was found (by `check`, `doctor`, `map check`, `replay`), something was left out (an image, a "
-    "technique), or a map, images, a link or a disk cannot be used. It may work later.",
-    2: "The request is wrong: the command line, the configuration, or a table or a log that it names. Nothing was "
-    "started, and trying again does not help: systemd does not restart the service. `check` exits as `run` would.",
-    130: "Stopped by Ctrl-C. `run` and `top`, which are meant to be stopped so, exit with 0 or 1.",
+    "technique), or a map, images, a link or a disk cannot be used. A retry may succeed.",
+    2: "The request is wrong: the command line, the configuration, or a table or log that it names. Nothing was "
+    "started. A retry would fail too, so systemd does not restart the service. `check` exits as `run` would.",
+    130: "Stopped by Ctrl-C. `run` and `top`, which are meant to be stopped this way, exit with 0 or 1.",
 }
 _GROUPS = (positions, maps, flying, top, review, profile, evaluation, simulation)
 
 
 def program() -> None:
-    """Run the command in `sys.argv`, and end the process with its exit code."""
-    if "_ARGCOMPLETE" in os.environ:  # the shell asks for completions
+    """Run the command in `sys.argv` and exit the process with its exit code."""
+    if "_ARGCOMPLETE" in os.environ:  # the shell requests completions
         import argcomplete
 
         argcomplete.autocomplete(make_parser())
     code = main()
     if threading.active_count() > 1:
-        # A capture thread hangs in a stream that does not answer: in a normal exit FFmpeg would abort Python.
+        # A capture thread is blocked on a stream that does not answer: on a normal exit FFmpeg would abort Python.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
@@ -42,7 +42,7 @@ def program() -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command `argv` (None: that of `sys.argv`) and return its exit code, one of `EXIT_CODES`."""
+    """Run the command `argv` (None: `sys.argv`) and return its exit code, one of `EXIT_CODES`."""
     with guard_output():
         return _run(sys.argv[1:] if argv is None else argv)
 
@@ -52,7 +52,7 @@ def _run(argv: list[str]) -> int:
     if unknown:
         hint = suggest(unknown[0].partition("=")[0], args.parser._option_string_actions, "")
         args.parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint and '; '}{hint}")
-    # Set before NumPy is imported: matrix products are small here, and more threads only make them slower.
+    # Set before NumPy is imported: the matrix products are small, and more threads would only slow them down.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LineFormatter("edgevpr: %(message)s"))
@@ -63,7 +63,7 @@ def _run(argv: list[str]) -> int:
         return code
     except EdgevprError as error:
         return _report_failure(args, error, str(error), error.exit_code)
-    except BrokenPipeError:  # the reader of the output has gone (`edgevpr ... | head`)
+    except BrokenPipeError:  # the reader of the output has exited (`edgevpr ... | head`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
@@ -72,9 +72,9 @@ def _run(argv: list[str]) -> int:
             args, error, f"{what}{error.strerror or error}: check the path, its permissions and the disk.", 1
         )
     except ImportError as error:
-        return _report_failure(args, error, f"{error}: package missing or broken; reinstall edgevpr (64-bit OS).", 1)
+        return _report_failure(args, error, f"{error}: package missing or broken: reinstall edgevpr (64-bit OS).", 1)
     except KeyboardInterrupt:
-        print("edgevpr: stopped; everything confirmed so far is kept.", file=sys.stderr)
+        print("edgevpr: stopped; everything confirmed so far has been kept.", file=sys.stderr)
         return 130
 
 
@@ -85,7 +85,7 @@ def _report_failure(args: argparse.Namespace, error: Exception, sentence: str, e
     return exit_code
 
 
-@cache  # making it takes two thirds of the time of a short command, and one process may run many
+@cache  # building it takes two thirds of the time of a short command, and one process may run many
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     parser = Parser(prog="edgevpr", description="Visual place recognition for the companion computer of a small drone.")

@@ -1,5 +1,5 @@
-"""`edgevpr map`: make, correct, move, calibrate, look into, check, repair and merge place maps; and `edgevpr
-salience`: print how memorable, static and full of information a picture is."""
+"""`edgevpr map`: build, refine, move, calibrate, inspect, check, repair and merge place maps; and `edgevpr salience`:
+print how memorable, static and rich in information an image is."""
 
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable, Mapping
@@ -60,10 +60,10 @@ def add(commands: Any) -> None:
     calibrate.add_argument("--config", metavar="FILE", help="configuration of the flight (camera, mask, precision)")
     add_keys(calibrate, "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
     add_json(calibrate)
-    info = add_to_map("info", run_map_info, "print what a map contains, or make a page of it")
+    info = add_to_map("info", run_map_info, "print what a map contains, or write it as an HTML page")
     info.add_argument("--page", metavar="FILE", help="write an HTML page that opens offline")
     add_map_images(info)
-    info.add_argument("--config", metavar="FILE", help="configuration of the mapping flight (its lens)")
+    info.add_argument("--config", metavar="FILE", help="configuration of the mapping flight (lens)")
     add_keys(info, "source.lens", "source.fov_deg", "source.up_deg")
     add_json(info)
     add_json(add_to_map("check", run_map_check, "read the whole map and report what is damaged"))
@@ -95,7 +95,7 @@ def _add_build(build: ArgumentParser) -> None:
 
 
 def _add_pictures(parser: ArgumentParser) -> None:
-    """Add the flags for the pictures to make a map of: those of a recording, and those of an orthophoto."""
+    """Add the flags for the pictures of a map: those for a recording and those for an orthophoto."""
     add_recording(parser, required=False)
     flags = parser.add_argument_group("from an orthophoto, instead of --images")
     flags.add_argument("--orthophoto", metavar="FILE", help="GeoTIFF, VRT, MBTiles, or a folder of tiles (z/x/y.png)")
@@ -114,39 +114,39 @@ def _add_pictures(parser: ArgumentParser) -> None:
     flags.add_argument(
         "--area",
         metavar="AREA",
-        help="area to map: a mission (its path counts with a footprint on either side), or LAT,LON,RADIUS_M",
+        help="area to map: a mission (its path, with a footprint on either side), or LAT,LON,RADIUS_M",
     )
 
 
 def _parse_lengths(text: str) -> tuple[float, ...]:
-    """Read "75,105,150", as the `type` of a flag. Raises ArgumentTypeError for another text."""
+    """Parse "75,105,150"; the `type` of a flag. Raises ArgumentTypeError for any other text."""
     try:
         return tuple(map(float, text.split(",")))
     except ValueError:
-        raise ArgumentTypeError(f"`{text}` is no length in metres, nor several with commas between them") from None
+        raise ArgumentTypeError(f"`{text}` is not a length in metres or a comma-separated list of lengths") from None
 
 
 def _parse_pictures(args: Namespace) -> "FlightPictures | OrthophotoGrid":
-    """Return the pictures that the flags name: those of a recording or of an orthophoto. Raises UsageError."""
+    """Return the pictures given by the flags: those of a recording or of an orthophoto. Raises UsageError."""
     from edgevpr.mapmaking.pictures import FlightPictures, OrthophotoGrid
 
     if (args.source is None) == (args.orthophoto is None):
-        raise UsageError("Give either --images (pictures of a flight) or --orthophoto: a map is made of one of them.")
+        raise UsageError("Give either --images (pictures of a flight) or --orthophoto: a map is built from one.")
     others = _ORTHOPHOTO_FLAGS if args.orthophoto is None else _RECORDING_FLAGS
-    if given := [name for name in others if getattr(args, name, None) is not None]:
+    if misplaced := [name for name in others if getattr(args, name, None) is not None]:
         source = "--orthophoto" if args.orthophoto is None else "--images"
-        raise UsageError(f"--{given[0].replace('_', '-')} goes with {source}: leave it out.")
+        raise UsageError(f"--{misplaced[0].replace('_', '-')} applies only to {source}: leave it out.")
     if args.source is not None:
         rate_hz = getattr(args, "rate_hz", None)
         return FlightPictures(source=args.source, positions=to_path(args.positions), rate_hz=rate_hz)
     if args.footprint_m is None or args.spacing_m is None:
         raise UsageError("--orthophoto needs --footprint-m (ground along a picture's longest side) and --spacing-m.")
-    about: dict[str, Any] = {name: getattr(args, name, None) for name in _ORTHOPHOTO_FLAGS}
-    return OrthophotoGrid(orthophoto=args.orthophoto, **about)
+    options: dict[str, Any] = {name: getattr(args, name, None) for name in _ORTHOPHOTO_FLAGS}
+    return OrthophotoGrid(orthophoto=args.orthophoto, **options)
 
 
 def run_map_build(args: Namespace) -> int:
-    """Run `map build`: make a map from a recording or an orthophoto, or add to one."""
+    """Run `map build`: build a map from a recording or an orthophoto, or add to an existing map."""
     from edgevpr.mapmaking.making import MapPlan, make_map
 
     config = make_config(args, args.config)
@@ -175,7 +175,7 @@ def run_map_build(args: Namespace) -> int:
 
 
 def run_map_refine(args: Namespace) -> int:
-    """Run `map refine`: correct the positions of a map's pictures by comparing them, and print the result."""
+    """Run `map refine`: correct the positions of a map's places by matching their pictures, and print the result."""
     from edgevpr.mapmaking.finishing import refine_map
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.runtime.recognise.opening import create_technique
@@ -187,7 +187,7 @@ def run_map_refine(args: Namespace) -> int:
 
 
 def run_map_move(args: Namespace) -> int:
-    """Run `map move`: move the places of a map by the offset from GPS that a flight has found, and print the move."""
+    """Run `map move`: move the places of a map by the offset from GPS that a flight measured, and print the move."""
     from edgevpr.mapmaking.moving import move_map
     from edgevpr.places.mapfile import PlaceMap
 
@@ -198,7 +198,7 @@ def run_map_move(args: Namespace) -> int:
 
 
 def run_map_calibrate(args: Namespace) -> int:
-    """Run `map calibrate`: calibrate the confidence of matches in a map, and print what to expect of the map."""
+    """Run `map calibrate`: calibrate the confidence of matches in a map, and print what to expect from the map."""
     from edgevpr.mapmaking.finishing import calibrate_map, make_encoder
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.runtime.recognise.opening import create_technique
@@ -213,7 +213,7 @@ def run_map_calibrate(args: Namespace) -> int:
 
 
 def run_map_info(args: Namespace) -> int:
-    """Run `map info`: print what a map holds, and what it takes on disk and in RAM; with --page, make a page of it."""
+    """Run `map info`: print what a map contains and its size on disk and in RAM; with --page, write its page."""
     from edgevpr.places.index import compute_place_bytes
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.places.mapinfo import describe_map
@@ -239,7 +239,7 @@ def run_map_info(args: Namespace) -> int:
 
 
 def _write_page(args: Namespace, lines: list[str], recognisable: Mapping[int, float]) -> None:
-    """Write the page of a map. `lines` are those of `map info`."""
+    """Write the page of a map. `lines`: the output of `map info`."""
     from edgevpr.mapmaking.look_alikes import find_look_alikes
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.review.album import make_map_album
@@ -265,7 +265,7 @@ def _write_page(args: Namespace, lines: list[str], recognisable: Mapping[int, fl
 
 
 def run_map_check(args: Namespace) -> int:
-    """Run `map check`: read everything in a map and print what is damaged. The exit code is 1 if anything is."""
+    """Run `map check`: read the whole map and print what is damaged. The exit code is 1 if anything is damaged."""
     from edgevpr.places.examine import check_map
 
     result = check_map(args.map, progress)
@@ -274,21 +274,21 @@ def run_map_check(args: Namespace) -> int:
 
 
 def run_map_repair(args: Namespace) -> int:
-    """Run `map repair`: drop what is damaged in a map, and keep the original file."""
+    """Run `map repair`: remove the damaged places of a map, and keep the original file."""
     from edgevpr.places.examine import check_map, repair_map
 
     result = check_map(args.map, progress)
     original = None if result.is_whole else repair_map(args.map, progress)
     dropped = result.total - result.places
     fields = {"path": args.map, "kept": result.places, "dropped": dropped, "original": original and str(original)}
-    repaired = f"{args.map}: repaired, {result.places} places kept, {dropped} dropped; the original is {original}"
+    repaired = f"{args.map}: repaired, {result.places} places kept, {dropped} removed; the original is now {original}"
     text = "no damage: the map is unchanged" if original is None else repaired
     print_result(fields, args.json, [*format_check(result), text])
     return 0
 
 
 def run_map_merge(args: Namespace) -> int:
-    """Run `map merge`: make one map of several."""
+    """Run `map merge`: merge several maps into one."""
     from edgevpr.places.examine import merge_maps
     from edgevpr.places.mapfiles import parse_map_path
 
@@ -313,7 +313,7 @@ def run_salience(args: Namespace) -> int:
 
     gate = open_salience_gate(make_config(args, args.config, **{"salience.use": True}).salience)
     assert gate is not None  # salience.use is set
-    memorability = judge_scores(gate.scores(read_image(Path(args.image))), gate.config)
-    outcome = {"kept": memorability.reason is None, "reason": memorability.reason and memorability.reason.fields()}
-    print_result({"image": args.image, **asdict(memorability.scores), **outcome}, args.json)
+    judgement = judge_scores(gate.scores(read_image(Path(args.image))), gate.config)
+    outcome = {"kept": judgement.reason is None, "reason": judgement.reason and judgement.reason.fields()}
+    print_result({"image": args.image, **asdict(judgement.scores), **outcome}, args.json)
     return 0

@@ -1,4 +1,4 @@
-"""Result of `edgevpr match`: the value of a query, for JSON, and the table with its summary, for people."""
+"""Output of `edgevpr match`: the JSON object of a query, and the table and summary for people."""
 
 import textwrap
 from collections import Counter
@@ -12,16 +12,16 @@ from edgevpr.core.text import align_table, format_probability, sanitize
 if TYPE_CHECKING:
     from edgevpr.runtime.recognise.recognition import Recognition
 
-_NAME_COLUMNS = 17  # with them a row has about 120 columns
+_NAME_COLUMNS = 17  # keeps a row at about 120 columns
 _REASON_COLUMNS = 48
 _FIX_HEADINGS = ("lat", "lon", "± m", "m from its GPS tag")
 
 
 def format_match(event: "Recognition") -> dict[str, Any]:
-    """Return a query for `match --json`: the fields of its event, but `position` is the fix (null: none), and the best
-    place is one object (null: none was found). `of_place`: the fix is the position of the place itself, as the offset
-    from it is unknown. `from_gps_tag_m`: distance of the fix from the query's own tag, null without both.
-    """
+    """Return a query for `match --json`: the fields of its event, except that `position` is the fix (null: none) and
+    the best place is one object (null: none was found). `of_place`: the fix is the position of the place itself,
+    because the offset from it is unknown. `from_gps_tag_m`: distance from the fix to the query's own GPS tag; null if
+    either is missing."""
     from edgevpr.core.geodesy import distance_m
     from edgevpr.runtime.recognise.recognition import to_fields
 
@@ -46,7 +46,7 @@ def format_match(event: "Recognition") -> dict[str, Any]:
 
 
 def format_matches(matches: Sequence[dict[str, Any]]) -> Iterator[str]:
-    """Yield the table of the queries `matches` (see `format_match`), and its summary."""
+    """Yield the table of the queries `matches` (see `format_match`) and its summary."""
     measure = "confidence" if any("confidence" in match for match in matches) else "score"
     rows = align_table(
         [("query", "accepted", measure, "place, picture"), *(_format_place(match, measure) for match in matches)],
@@ -63,7 +63,7 @@ def format_matches(matches: Sequence[dict[str, Any]]) -> Iterator[str]:
 
 
 def _format_place(match: dict[str, Any], measure: str) -> tuple[str, ...]:
-    """Return the left part of a row: the query, and the place that was found."""
+    """Return the left part of a row: the query and the place found."""
     place, value = match["place"], match.get(measure)
     certainty = "-" if value is None else format_probability(value) if measure == "confidence" else f"{value:.3f}"
     label = f"{place['number']} {_shorten_name(place['image'])}" if place else "-"
@@ -71,7 +71,7 @@ def _format_place(match: dict[str, Any], measure: str) -> tuple[str, ...]:
 
 
 def _format_fix(match: dict[str, Any]) -> tuple[str, ...]:
-    """Return the right part of a row with a fix; a star marks one that is the place's own position."""
+    """Return the right part of a row with a fix; a star marks a fix that is the position of the place itself."""
     fix, away_m = match["position"], match["from_gps_tag_m"]
     accuracy = f"{fix['accuracy_m']:.1f}{'*' if fix['of_place'] else ' '}"
     return f"{fix['lat_deg']:.6f}", f"{fix['lon_deg']:.6f}", accuracy, "-" if away_m is None else f"{away_m:.1f}"
@@ -84,7 +84,7 @@ def _format_refusal(match: dict[str, Any]) -> str:
 
 
 def _shorten_name(name: str) -> str:
-    """Return the name of a picture for the table; of a long one only the end, which tells it from others."""
+    """Return the name of a picture for the table; only the end of a long name, where names differ."""
     name = sanitize(name)
     return name if len(name) <= _NAME_COLUMNS else f"...{name[3 - _NAME_COLUMNS :]}"
 
@@ -97,9 +97,9 @@ def _summarise(matches: Sequence[dict[str, Any]], fixes: Sequence[dict[str, Any]
     if not fixes:
         return
     in_world_m, on_map_m = (median(match["position"][key] for match in fixes) for key in ("accuracy_m", "on_map_m"))
-    text = f"± m: 1 sigma of the fix in the world, {in_world_m:.1f} m in the median; on the map {on_map_m:.1f} m"
+    text = f"± m: 1 sigma of the fix in the world, median {in_world_m:.1f} m; on the map {on_map_m:.1f} m"
     if away_m := [match["from_gps_tag_m"] for match in fixes if match["from_gps_tag_m"] is not None]:
         text += f"; {median(away_m):.1f} m from the GPS tags, which have errors of their own"
     yield text
     if of_place := sum(match["position"]["of_place"] for match in fixes):
-        yield f"*: {of_place} positions are those of the places: how far the query was from its place is not known"
+        yield f"*: {of_place} positions are simply those of the matched places: the offset from the place is unknown"

@@ -1,4 +1,4 @@
-"""`edgevpr positions`: where pictures were taken, from a log, a track, subtitles or a table."""
+"""`edgevpr positions`: geotag pictures from a log, a track, subtitles or a table."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -22,14 +22,15 @@ def add(commands: Any) -> None:
         "--offset-s",
         type=float,
         metavar="S",
-        help="seconds to add to the camera's clock (default: the time zone that fits), or to the time of subtitles",
+        help="seconds to add to the camera's clock (default: the time zone that fits) or to the times of subtitles",
     )
-    parser.add_argument("--out", metavar="CSV", help="file to write (default: positions.csv there, or VIDEO.csv)")
+    text = "file to write (default: positions.csv in the folder, or VIDEO.csv)"
+    parser.add_argument("--out", metavar="CSV", help=text)
     add_json(parser)
 
 
 def run_positions(args: Namespace) -> int:
-    """Run `run_positions`: write the table that all other commands find beside the pictures."""
+    """Run `positions`: write the table of positions that all other commands find next to the pictures."""
     from edgevpr.core.errors import UsageError
     from edgevpr.core.text import show_elapsed
     from edgevpr.frames.positions import write_positions, write_track
@@ -38,10 +39,10 @@ def run_positions(args: Namespace) -> int:
 
     source, is_folder = Path(args.images), Path(args.images).is_dir()
     if not source.exists():
-        raise UsageError(f"{source} does not exist: give the folder of the images, or the video.")
+        raise UsageError(f"{source} does not exist: give the folder of the images or the video file.")
     out = Path(args.out) if args.out else source / "positions.csv" if is_folder else source.with_suffix(".csv")
     if out.exists():
-        raise UsageError(f"{out} exists already: move it away, or name another with --out.")
+        raise UsageError(f"{out} already exists: move it away, or give another file with --out.")
     with show_elapsed(f"reading {args.record}"):
         record = read_record(Path(args.record))
     placed = (place_pictures if is_folder else place_video)(record, source, args.offset_s)
@@ -51,7 +52,7 @@ def run_positions(args: Namespace) -> int:
         else:
             write_positions(out, placed.tags)
     except OSError as error:
-        raise UsageError(f"{out} cannot be written ({error.strerror}): name another file with --out.") from error
+        raise UsageError(f"{out} cannot be written ({error.strerror}): give another file with --out.") from error
     fields = {
         "record": record.kind,
         "how": placed.how,

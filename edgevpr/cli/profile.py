@@ -1,4 +1,4 @@
-"""`edgevpr profile`: what each technique costs a board in RAM and battery, estimated before take-off."""
+"""`edgevpr profile`: estimate, before take-off, how much RAM and battery each technique needs on a board."""
 
 from argparse import Namespace
 from typing import TYPE_CHECKING, Any
@@ -29,7 +29,7 @@ def add(commands: Any) -> None:
 
 
 def run_profile(args: Namespace) -> int:
-    """Run `profile`: estimate what techniques cost in a flight, or list the boards that have a profile."""
+    """Run `profile`: estimate the cost of techniques in a flight, or list the boards that have a profile."""
     from edgevpr.power.boards import list_boards, load_board, resolve_board
     from edgevpr.runtime.preflight.choose import list_preferred
     from edgevpr.runtime.preflight.estimate import estimate_flight
@@ -43,7 +43,7 @@ def run_profile(args: Namespace) -> int:
         return 0
     config = make_config(args)
     board = resolve_board(load_board(args.board), config.source, config.memory)
-    list_preferred(board)  # raises if the profile names a technique that is not there
+    list_preferred(board)  # raises if the profile names a technique that does not exist
     plan, trials = _make_plan(args, config, board)
     results = progress(run_trials(trials, board.threads), len(trials), "trying techniques")
     estimate = estimate_flight(board, compare_speed(board), results, plan)
@@ -52,7 +52,7 @@ def run_profile(args: Namespace) -> int:
 
 
 def _make_plan(args: Namespace, config: Config, board: "Board") -> "tuple[FlightPlan, tuple[Trial, ...]]":
-    """Return the plan of the flight, and the techniques to try in all their forms: that of --map, else every one."""
+    """Return the plan of the flight, and the techniques to try in all their forms: that of --map, or all of them."""
     from edgevpr import techniques
     from edgevpr.places.mapfile import PlaceMap
     from edgevpr.power.equations import parse_pack

@@ -1,5 +1,5 @@
-"""Commands for after a flight: `edgevpr report`, a page of its log, and `edgevpr replay`, which flies a recorded flight
-again on the ground."""
+"""Commands for use after a flight: `edgevpr report` makes a page of its log, `edgevpr replay` replays a recorded flight
+on the ground."""
 
 from argparse import Namespace
 from dataclasses import asdict
@@ -18,18 +18,18 @@ def add(commands: Any) -> None:
     report = add_command(commands, "report", run_report, "make an HTML page of a flight from its log")
     report.add_argument("log", metavar="LOG")
     report.add_argument("--out", required=True, metavar="FILE", help="page to write (.html)")
-    report.add_argument("--map", metavar="MAP", help="map to draw on (default: the map of the flight)")
+    report.add_argument("--map", metavar="MAP", help="map to draw (default: the map of the flight)")
     report.add_argument(
         "--images",
         action="append",
         default=[],
         metavar="DIR",
-        help="folder of frames of this flight (repeatable), or its video; not needed with a recording",
+        help="folder of this flight's frames (repeatable), or its video; not needed if the flight was recorded",
     )
     add_map_images(report)
-    replay = add_command(commands, "replay", run_replay, "replay a recorded flight, and compare every line and packet")
+    replay = add_command(commands, "replay", run_replay, "replay a recorded flight and compare lines and packets")
     replay.add_argument("log", metavar="LOG", help="flight log; its last flight is replayed")
-    replay.add_argument("--map", metavar="MAP", help="map of the flight (default: at its recorded path)")
+    replay.add_argument("--map", metavar="MAP", help="map of the flight (default: its recorded path)")
     add_json(replay)
 
 
@@ -52,7 +52,7 @@ def run_report(args: Namespace) -> int:
         except EdgevprError as error:
             if args.map:
                 raise
-            no_ground = f"The map of the flight is not drawn: {error} Its place can be given with --map."
+            no_ground = f"The map of the flight is not drawn: {error} If the map has moved, give its path with --map."
     references = make_map_album(args.map_images, ground)
     page = make_flight_page(flight, ground, frames, references, no_ground)
     write_output(args.out, args.log, lambda out: out.write(page))
@@ -61,15 +61,15 @@ def run_report(args: Namespace) -> int:
 
 
 def run_replay(args: Namespace) -> int:
-    """Run `replay`: fly a recorded flight again, and print the comparison. The exit code is 1 if anything differs."""
+    """Run `replay`: replay a recorded flight, and print the comparison. The exit code is 1 if anything differs."""
     from edgevpr.review.compare import compare_lines
     from edgevpr.review.replay import replay
 
-    again = replay(args.log, args.map)
-    end = {"guessed": again.guessed, "why_ended": again.why_ended}
-    lines, packets = compare_lines(again.flown, again.lines), again.packets
-    has_all = not lines.after or again.why_ended is not None
+    result = replay(args.log, args.map)
+    end = {"guessed": result.guessed, "why_ended": result.why_ended}
+    lines, packets = compare_lines(result.flown, result.lines), result.packets
+    has_all = not lines.after or result.why_ended is not None
     is_same = has_all and not (lines.others or packets.others)
     value = {"lines": asdict(lines), "packets": asdict(packets), **end, "is_same": is_same}
-    print_result(value, args.json, format_replay(again, lines, packets))
+    print_result(value, args.json, format_replay(result, lines, packets))
     return 0 if is_same else 1

@@ -1,4 +1,4 @@
-"""Guards the output of all commands: removes control characters that a terminal would act on, and passwords."""
+"""Guards the output of all commands: removes passwords, and control characters that a terminal would interpret."""
 
 import io
 import logging
@@ -9,25 +9,25 @@ from typing import TextIO
 
 from edgevpr.core.text import sanitize
 
-_LAYOUT_CHARACTERS = "\n\r\t"  # control characters that pass: tables and progress lines need them
+_LAYOUT_CHARACTERS = "\n\r\t"  # control characters that are kept: tables and progress lines need them
 
 
 @contextmanager
 def guard_output() -> Iterator[None]:
-    """Context manager: all that is written to stdout and stderr inside it passes through `core.text.sanitize`."""
+    """Context manager that passes everything written to stdout and stderr through `core.text.sanitize`."""
     with redirect_stdout(_GuardedStream(sys.stdout)), redirect_stderr(_GuardedStream(sys.stderr)):
         yield
 
 
 class LineFormatter(logging.Formatter):
-    """Formats each log message as one line, so that a file name with a line break cannot fake a second message."""
+    """Formats each log message as one line, so a file name with a line break cannot fake a second message."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         return sanitize(super().formatMessage(record))
 
 
 class _GuardedStream(io.TextIOBase):
-    """Text stream that passes what is written through `sanitize`, then to `stream`, for `print` and progress lines."""
+    """Text stream for `print` and progress lines that passes all text through `sanitize` to `stream`."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream

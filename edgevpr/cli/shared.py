@@ -1,4 +1,4 @@
-"""Parts that the commands share: flags, the configuration made from them, and the printing of results and errors."""
+"""Code that the commands share: flags, the configuration made from them, and the printing of results and errors."""
 
 import json
 import re
@@ -16,7 +16,7 @@ from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.core.text import sanitize, suggest
 
 T = TypeVar("T")
-_PREFIX = "key "  # prefix of the attribute names of `Namespace` that hold keys of the configuration
+_PREFIX = "key "  # prefix of `Namespace` attributes that hold configuration keys
 _HELP_COLUMNS = 78
 _UNITS = {
     "s": " s", "ms": " ms", "m": " m", "mb": " MB", "bytes": " bytes", "c": " °C", "deg": "°", "mah": " mAh", "w": " W"
@@ -24,8 +24,8 @@ _UNITS = {
 
 
 class Parser(ArgumentParser):
-    """Parser of a command. The error of a wrong choice names the one that may be meant. What begins as a negative
-    number, as in `--area -35.36,149.16,500`, is a value and no flag."""
+    """Parser of a command. The error for an invalid choice suggests a similar one. Arguments that begin as a negative
+    number, as in `--area -35.36,149.16,500`, are values, not flags."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -38,8 +38,8 @@ class Parser(ArgumentParser):
 
 
 def add_command(commands: Any, name: str, run: Callable[[Namespace], int], text: str) -> ArgumentParser:
-    """Add a command that calls `run` with the parsed arguments, and return its parser. `text` is its help; `run`
-    returns the exit code."""
+    """Add a command and return its parser. `run` is called with the parsed arguments and returns the exit code; `text`
+    is the command's help."""
     parser = _add_parser(commands, name, text)
     parser.set_defaults(run=run, parser=parser)
     parser.epilog = format_examples(parser.prog.partition(" ")[2])
@@ -48,14 +48,14 @@ def add_command(commands: Any, name: str, run: Callable[[Namespace], int], text:
 
 
 def add_group(commands: Any, name: str, text: str) -> Any:
-    """Add a command that has subcommands, such as `map`, and return the object that those are added to."""
+    """Add a command that has subcommands, such as `map`, and return the object to add them to."""
     return _add_parser(commands, name, text).add_subparsers(title="commands", required=True, metavar="COMMAND")
 
 
 def _add_parser(commands: Any, name: str, text: str) -> ArgumentParser:
     description = "\n".join(wrap(text[0].upper() + text[1:] + ".", _HELP_COLUMNS))
     parser: ArgumentParser = commands.add_parser(name, help=text, description=description)
-    # Accepted after the command too, where users type it.
+    # Accepted after the command too, where users type them.
     parser.add_argument("-v", "--debug", action="store_true", default=SUPPRESS, help=SUPPRESS)
     parser.add_argument("-q", "--quiet", action="store_true", default=SUPPRESS, help=SUPPRESS)
     return parser
@@ -67,24 +67,24 @@ def add_json(parser: ArgumentParser) -> None:
 
 
 def add_recording(parser: ArgumentParser, required: bool = True) -> None:
-    """Add the flags for the images or the video that frames come from, and for their positions."""
+    """Add the flags for the folder of images or the video, and for its positions."""
     text = "folder of images, or video file"
     parser.add_argument("--images", "--source", dest="source", required=required, metavar="SOURCE", help=text)
     add_positions(parser)
 
 
 def add_positions(parser: ArgumentParser) -> None:
-    """Add the flag for the positions that go with a folder of images or a video."""
+    """Add the flag for the positions of a folder of images or a video."""
     parser.add_argument(
         "--positions",
         metavar="CSV",
-        help="file,lat,lon[,alt,yaw_deg,roll_deg,pitch_deg,height_m,time] (default: beside the images); of a video "
-        "time,lat,lon[,...], in seconds from its first frame; `edgevpr positions` makes both",
+        help="file,lat,lon[,alt,yaw_deg,roll_deg,pitch_deg,height_m,time] (default: positions.csv next to the images); "
+        "for a video: time,lat,lon[,...], with time in seconds from its first frame; see `edgevpr positions`",
     )
 
 
 def add_map_images(parser: ArgumentParser) -> None:
-    """Add the flag for the pictures that a map was made of, which a page shows."""
+    """Add the flag for the pictures that a map was built from, for pages that show them."""
     parser.add_argument(
         "--map-images",
         action="append",
@@ -95,22 +95,22 @@ def add_map_images(parser: ArgumentParser) -> None:
 
 
 def add_known(parser: ArgumentParser) -> None:
-    """Add the flag for what is known of recorded queries, which `hints.parse_known_fields` reads."""
+    """Add the flag for what is known for recorded queries; `hints.parse_known_fields` parses its value."""
     parser.add_argument(
         "--known",
         metavar="A,B",
-        help="what is known of each query, as in flight: heading (yaw_deg of positions.csv), height (height_m of "
-        "queries and places, or that of the map), reach (a position within 300 m)",
+        help="what is known for each query, as in flight: heading (yaw_deg in positions.csv), height (height_m of "
+        "queries and places, or the map's height), reach (a position within 300 m)",
     )
 
 
 def add_parameters(parser: ArgumentParser, text: str, form: str = "KEY=VALUE") -> None:
-    """Add --param, for parameters of a technique. It may be repeated. `text` is its help."""
+    """Add the repeatable flag --param for parameters of a technique. `text` is its help."""
     parser.add_argument("--param", action="append", default=[], metavar=form, help=text)
 
 
 def add_keys(parser: ArgumentParser, *names: str) -> None:
-    """Add the flags of the configuration keys `names`, such as "source.mask"; without names, those of all keys."""
+    """Add the flags of the configuration keys `names`, such as "source.mask" (no names: the flags of all keys)."""
     for key in list_keys():
         if not key.flags or (names and key.name not in names):
             continue
@@ -121,46 +121,46 @@ def add_keys(parser: ArgumentParser, *names: str) -> None:
 
 
 def parse_value(args: Namespace, name: str) -> Any:
-    """Return the value that the flags give for the configuration key `name`; None if they give none."""
+    """Return the value that the flags set for the configuration key `name`; None if they set none."""
     return getattr(args, _PREFIX + name)
 
 
 def make_config(args: Namespace, path: str | None = None, **others: Any) -> Config:
-    """Make the configuration from the file `path` (None: the defaults). Flags override the file, and the values
-    `others`, by configuration key, override both."""
+    """Make the configuration from the file `path` (None: the defaults). Flags override the file, and `others` (values
+    by configuration key) override both."""
     flags = {name.removeprefix(_PREFIX): value for name, value in vars(args).items() if name.startswith(_PREFIX)}
     return load_config(path, flags | others)
 
 
 def parse_parameters(pairs: list[str]) -> dict[str, str]:
-    """Read ["gt=0.4"] as {"gt": "0.4"}. Raises UsageError for another form."""
+    """Parse ["gt=0.4"] into {"gt": "0.4"}. Raises UsageError for any other format."""
     for pair in pairs:
         if "=" not in pair:
-            raise UsageError(f"--param {pair}: write KEY=VALUE, e.g. gt=0.4.")
+            raise UsageError(f"--param {pair}: write KEY=VALUE, for example gt=0.4.")
     return dict(pair.split("=", 1) for pair in pairs)
 
 
 def to_path(text: str | None) -> Path | None:
-    """Return `text`, the value of an optional flag, as a path; None if it is None or empty."""
+    """Return the value of an optional flag as a path; None if it is None or empty."""
     return Path(text) if text else None
 
 
 def skip_image(error: ImageError, unusable: list[ImageError]) -> None:
-    """Report that an image cannot be used, and add the error to the list `unusable`; the command goes on without it."""
+    """Report an image that cannot be used and append the error to `unusable`; the command continues without it."""
     print_notes(str(error))
     unusable.append(error)
 
 
 def report_unusable(unusable: list[ImageError]) -> int:
-    """Return the exit code: 1 if any image could not be used, and then print how many; else 0."""
+    """Return the exit code 1, and print how many images could not be used, if there are any; else return 0."""
     if unusable:
         print_notes(f"{sum(error.count for error in unusable)} images could not be used (named above).")
     return 1 if unusable else 0
 
 
 def print_result(value: Any, as_json: bool, text: str | Iterable[str] | None = None) -> None:
-    """Print a result, a dataclass or a dictionary: as JSON for programs, or for people as `text`, whole or in lines of
-    which control characters are escaped (None: a line for each field)."""
+    """Print a result, a dataclass or a dictionary: as JSON for programs, or as `text` for people. Lines of `text` are
+    sanitized; a single string is printed as it is. `text` None: print a line for each field."""
     fields = asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
     if as_json:
         print(json.dumps(fields, indent=2, default=str))
@@ -170,19 +170,19 @@ def print_result(value: Any, as_json: bool, text: str | Iterable[str] | None = N
 
 
 def describe_lost_calibration(path: str, is_lost: bool) -> list[str]:
-    """Return what to do with a map made of several calibrated maps, in a line; none if nothing `is_lost`."""
-    why = "not calibrated: the confidence of its parts does not apply, and the shipped one is used"
-    return [f"  {why}; run edgevpr map calibrate {path}"] if is_lost else []
+    """Return a line on what to do with a map whose calibration `is_lost` by merging or cutting; else no lines."""
+    problem = "not calibrated: the calibrations of its parts do not apply to it, so the shipped one is used"
+    return [f"  {problem}; run edgevpr map calibrate {path}"] if is_lost else []
 
 
 def format_fields(fields: dict[str, Any], indent: str = "") -> Iterator[str]:
-    """Yield a line of text for each field that is known: its name, and its value with the unit that ends the name. The
-    lines of a field that has fields itself are indented; a list of rows or sentences has one line for each."""
+    """Yield a line of text for each known field: its name, and its value with the unit from the end of the name. The
+    lines of nested fields are indented; a list of rows or sentences gets one line for each."""
     for name, value in fields.items():
         words, _, ending = name.rpartition("_")
         unit = _UNITS.get(ending, "") if words else ""
         label = (words if unit else name).replace("_", " ")
-        # The texts of dictionaries and of rows have spaces too.
+        # The text of a dictionary or a row contains spaces too.
         is_list = isinstance(value, list | tuple) and any(" " in str(item) for item in value)
         for item in value if is_list else [value]:
             if isinstance(item, dict) and item:
@@ -203,13 +203,13 @@ def _format_value(value: Any) -> str:
 
 
 def print_notes(*sentences: str) -> None:
-    """Print sentences to stderr, each after the name of the program."""
+    """Print sentences to stderr, each prefixed with the name of the program."""
     for sentence in sentences:
         print(f"edgevpr: {sanitize(sentence)}", file=sys.stderr)
 
 
 def parse_positive(text: str) -> float:
-    """Read a finite number above zero, as the `type` of a flag. Raises ValueError for other texts."""
+    """Parse a finite number above zero; the `type` of a flag. Raises ValueError for any other text."""
     value = float(text)
     if not 0 < value < float("inf"):
         raise ValueError
@@ -217,7 +217,7 @@ def parse_positive(text: str) -> float:
 
 
 def parse_count(text: str) -> int:
-    """Read a whole number above zero, as the `type` of a flag. Raises ValueError for other texts."""
+    """Parse a whole number above zero; the `type` of a flag. Raises ValueError for any other text."""
     value = int(text)
     if value < 1:
         raise ValueError
@@ -225,20 +225,20 @@ def parse_count(text: str) -> int:
 
 
 def check_output(target: str, source: str) -> Path:
-    """Return the path of the file `target`, to be written. Raises UsageError if it is the file `source`, which is read,
-    or if its folder does not exist."""
+    """Return the path of the output file `target`. Raises UsageError if it is the input file `source`, or if its folder
+    does not exist."""
     from edgevpr.core.files import require_folder
 
     path = Path(target)
     if path.exists() and Path(source).exists() and path.samefile(source):
-        raise UsageError(f"{target} is the input: give another name.")
+        raise UsageError(f"{target} is the input file: give another output file.")
     require_folder(path)
     return path
 
 
 def write_output(target: str, source: str, write: Callable[[TextIO], T]) -> T:
-    """Write the file `target`, whole or not at all: call `write` with the open text file, and return its result. Raises
-    as `check_output` does."""
+    """Write the file `target` completely or not at all: call `write` with the open text file and return its result.
+    Raises UsageError as `check_output` does."""
     from edgevpr.core.files import write_atomically
 
     path = check_output(target, source)

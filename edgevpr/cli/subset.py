@@ -1,4 +1,4 @@
-"""`edgevpr map subset`: the part of a map, or of a folder of maps, that one flight needs."""
+"""`edgevpr map subset`: cut out the part of a map, or of a folder of maps, that one flight needs."""
 
 from argparse import Namespace
 from collections.abc import Callable
@@ -13,7 +13,7 @@ _MARGIN_M = 500.0
 
 
 def add(add_to_map: Callable[..., Any]) -> None:
-    """Add the command and its flags. `add_to_map` adds a command that begins with a map."""
+    """Add the command and its flags. `add_to_map` adds a `map` command whose first argument is a map."""
     parser = add_to_map("subset", run_map_subset, "cut out the part that a mission needs", "map, or folder of maps")
     parser.add_argument(
         "--mission",
@@ -34,7 +34,7 @@ def add(add_to_map: Callable[..., Any]) -> None:
 
 
 def run_map_subset(args: Namespace) -> int:
-    """Run `map subset`: make the map of a mission, and print what is left out."""
+    """Run `map subset`: cut out the map of a mission, and print what is left out."""
     from edgevpr.mapmaking.missions import read_area
     from edgevpr.mapmaking.subset import make_subset
     from edgevpr.places.mapfiles import parse_map_path

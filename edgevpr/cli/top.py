@@ -1,4 +1,4 @@
-"""`edgevpr top`: show the status of the flight on this computer, once a second, from the file that it writes."""
+"""`edgevpr top`: show once a second the status file of the flight on this computer."""
 
 import shutil
 import sys
@@ -14,9 +14,9 @@ from edgevpr.core.text import escape_unprintable, format_probability
 
 _STATUS_FILE = "/run/edgevpr/status.json"
 _REFRESH_S = 1.0  # the flight writes its status once a second
-_LATE_STATUS_S = 2.5  # from this age on a warning is shown; a slow frame may delay a status
-_STALE_STATUS_S = 10.0  # from this age on --once takes it for the last of a flight that was killed
-_COARSE_AGE_S = 3.0  # age of a picture from which on seconds are enough
+_LATE_STATUS_S = 2.5  # older: a warning is shown; a slow frame may delay a status
+_STALE_STATUS_S = 10.0  # older: --once assumes that the flight was killed
+_COARSE_AGE_S = 3.0  # older pictures: the age is shown in whole seconds
 _CLEAR = "\x1b[H\x1b[J"
 _CHANNELS = {"COMMAND": "command 43003", "SENSOR": "message 296"}  # other channels are shown by their own names
 
@@ -31,24 +31,24 @@ def add(commands: Any) -> None:
 
 
 def run_top(args: Namespace) -> int:
-    """Run `top`: show the status of a flight until Ctrl-C; once with --once, or if stdout is no terminal."""
+    """Run `top`: show the status of a flight until Ctrl-C; once with --once or if stdout is not a terminal."""
     from edgevpr.runtime.flight.status import read_status
 
     if args.once or args.json or not sys.stdout.isatty():
-        found = read_status(args.file)
-        if found is None or found[1] > _STALE_STATUS_S:
+        status = read_status(args.file)
+        if status is None or status[1] > _STALE_STATUS_S:
             raise EdgevprError(" ".join(_explain_no_flight(args.file)))
-        print_result(found[0], args.json, format_status(found[0]))
+        print_result(status[0], args.json, format_status(status[0]))
         return 0
     try:
         while True:
-            found = read_status(args.file)
-            lines = format_status(found[0]) if found else list(_explain_no_flight(args.file))
-            if found and found[1] > _LATE_STATUS_S:
-                lines.insert(0, f"no status from the flight for {found[1]:.0f} s")
+            status = read_status(args.file)
+            lines = format_status(status[0]) if status else list(_explain_no_flight(args.file))
+            if status and status[1] > _LATE_STATUS_S:
+                lines.insert(0, f"no status from the flight for {status[1]:.0f} s")
             columns, height = shutil.get_terminal_size()
-            sys.__stdout__.write(_CLEAR)  # type: ignore[union-attr]  # past the guard, which lets no escapes through
-            rows = lines if found else [row for line in lines for row in textwrap.wrap(line, columns - 1)]
+            sys.__stdout__.write(_CLEAR)  # type: ignore[union-attr]  # bypasses the guard, which removes escapes
+            rows = lines if status else [row for line in lines for row in textwrap.wrap(line, columns - 1)]
             print("\n".join(row[: columns - 1] for row in rows[: height - 1]), flush=True)
             time.sleep(_REFRESH_S)
     except KeyboardInterrupt:
@@ -56,24 +56,24 @@ def run_top(args: Namespace) -> int:
 
 
 def _explain_no_flight(file: str) -> tuple[str, str]:
-    """Return two lines for the user where no flight writes its status to `file`."""
+    """Return two lines for the user if no flight writes its status to `file`."""
     return (
         f"No running flight writes its status to {file}:",
-        "start one (edgevpr run) with `status: {file: PATH}` in its configuration, and name that PATH with --file.",
+        "start one (edgevpr run) with `status: {file: PATH}` in its configuration, and give that PATH with --file.",
     )
 
 
 def format_status(status: dict[str, Any]) -> list[str]:
-    """Return the status of a flight (see `runtime.flight.vitals`) for people, as lines of a label and a text."""
+    """Return the status of a flight (see `runtime.flight.vitals`) as lines for people: a label and a text each."""
     age_s, heat = status["latency_s"], _format_optional("{:.0f} °C", status["temperature_c"])
-    form = ", {:.2f} s old" if (age_s or 0) < _COARSE_AGE_S else ", newest image {:.0f} s old"
-    latency = _format_optional(form, age_s)
+    template = ", {:.2f} s old" if (age_s or 0) < _COARSE_AGE_S else ", newest image {:.0f} s old"
+    latency = _format_optional(template, age_s)
     hot, throttled = ", hot" * bool(status["hot"]), ", throttled" * bool(status["throttled"])
     ram = f"{status['machine_ram_mb']:.0f} of {status['machine_ram_total_mb']:.0f} MB by all programs"
     rows = [
         ("edgevpr", f"{status['version']}, {status['elapsed_s']:.0f} s of flight, {status['health'].lower()}"),
         ("frames", f"{status['source']}{latency}{', paused' if status['paused'] else ''}"),
-        ("rate", f"{status['asked_rate_hz']:g} queries a second"),
+        ("rate", f"{status['asked_rate_hz']:g} queries per second"),
         ("queries", f"{status['queries']}, {status['accepted']} accepted, {status['failed']} failed"),
         ("CPU", f"{status['machine_cpu_share']:.0%} by all programs"),
         ("RAM", f"{status['rss_mb']:.0f} MB, {ram}"),
@@ -88,8 +88,8 @@ def format_status(status: dict[str, Any]) -> list[str]:
     return [f"{label:<11} {escape_unprintable(text)}" for label, text in rows]
 
 
-def _format_optional(form: str, value: float | None) -> str:
-    return "" if value is None else form.format(value)
+def _format_optional(template: str, value: float | None) -> str:
+    return "" if value is None else template.format(value)
 
 
 def _format_query(query: dict[str, Any] | None, now_s: float) -> str:
@@ -106,7 +106,7 @@ def _format_query(query: dict[str, Any] | None, now_s: float) -> str:
 
 def _format_link(link: dict[str, Any]) -> list[tuple[str, str]]:
     channel = _CHANNELS.get(link["channel"], link["channel"])
-    autopilot = _format_optional(f"autopilot {{:.0f}}, positions by {channel}", link["autopilot"])
+    autopilot = _format_optional(f"autopilot {{:.0f}}, positions via {channel}", link["autopilot"])
     return [
         ("link", f"{link['trouble'] or 'open'}, {autopilot or 'no telemetry from an autopilot'}"),
         ("fixes", link["fixes"]),

@@ -1,5 +1,5 @@
-"""Texts of the results that people read most: of making and checking maps, and of replays. Each
-function returns the lines of one result; JSON has the same values by their names (see `show`)."""
+"""Texts of the results that people read most: of building and checking maps, and of replays. Each function yields the
+lines of one result; JSON has the same values by name (see `print_result`)."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -16,37 +16,37 @@ if TYPE_CHECKING:
     from edgevpr.review.replay import ReplayResult
 
 NO_POSITIONS_NOTE = (
-    "no place has a position, and a map without positions sends no fixes: it only says which place is recognised. Give "
-    "pictures with GPS in their EXIF data, or a positions.csv beside them (file,lat,lon[,alt,...], --positions); of a "
-    "video, give --positions with time,lat,lon, in seconds from its first frame"
+    "no place has a position, so flights with this map send no fixes and only report which place was recognised. Give "
+    "pictures with GPS in their EXIF data, or a positions.csv next to them (file,lat,lon[,alt,...], --positions); for "
+    "a video, give --positions with time,lat,lon, the time in seconds from its first frame"
 )
-# By benchmarks/results/from_space.md, a raster of half a metre a pixel.
+# Figures from benchmarks/results/from_space.md, with a raster of half a metre per pixel.
 _OTHER_SEASON_NOTE = (
-    "fewer of another day: months and an earthquake later 48 % of images were accepted alone with heading and height "
-    "known (3 to 8 of twelve in a line), 23 % without (0 to 6); to measure this ground, `match` images that `simulate "
-    "flight` takes of another orthophoto"
+    "fewer on another day: months and an earthquake later 48 % of single images were accepted with heading and height "
+    "known (3 to 8 of twelve in a row), 23 % without (0 to 6); to measure this ground, `match` images that `simulate "
+    "flight` generates from another orthophoto"
 )
-_MAX_DIFFERENCES = 20  # differences of a replay at most
+_MAX_DIFFERENCES = 20  # maximum number of replay differences printed
 
 
 def format_build(path: str, made: "BuiltMap", is_cut: bool) -> Iterator[str]:
-    """Yield what `map build` has made, and what to expect of the map. `is_cut`: of an orthophoto."""
+    """Yield what `map build` has made, and what to expect from the map. `is_cut`: it was cut from an orthophoto."""
     result = made.result
-    yield f"{path}: {result.added} places added ({result.without_position} without a position), {made.places} in all"
+    yield f"{path}: {result.added} places added ({result.without_position} without a position), {made.places} in total"
     if result.already_here:
-        yield f"  {result.already_here} images were in the map already"
+        yield f"  {result.already_here} images were already in the map"
     if result.tilted:
         yield f"  left out: {result.tilted} tilted by more than 63 degrees (without --fov-deg or --lens: 20)"
     if result.without_heading:
         yield f"  left out: {result.without_heading} tilted by more than 20 degrees, heading unknown (add yaw_deg)"
     if result.not_memorable:
-        yield f"  left out: {result.not_memorable} that are not memorable"
+        yield f"  left out: {result.not_memorable} not memorable"
     if result.without_data or result.low_texture:
         yield f"  left out: {result.without_data} without data, {result.low_texture} with too little texture"
     if result.white:
-        yield f"  {result.white} of the places are white over a third or more: clouds and snow do not stay"
+        yield f"  {result.white} of the places are at least a third white: clouds and snow do not last"
     if result.of_low_quality:
-        yield f"  {result.of_low_quality} of the places are of low quality, kept to bound the gaps"
+        yield f"  {result.of_low_quality} of the places are of low quality, kept to limit the gaps"
     if made.refined:
         yield from format_refinement(path, made.refined)
     if made.calibration:
@@ -59,27 +59,27 @@ def format_build(path: str, made: "BuiltMap", is_cut: bool) -> Iterator[str]:
 
 
 def format_refinement(path: str, refined: "Refinement") -> Iterator[str]:
-    """Yield the result of refining a map: how many pictures were moved to where they really lie, by how much, and which
-    were recorded far from there."""
+    """Yield the result of refining a map: how many places were moved to the true position of their picture, by how
+    much, and which were recorded far from it."""
     if refined.without_position == refined.places:
         yield "  not refined: no place has a position"
         return
-    yield f"{path}: {refined.refined} of {refined.places} places refined, by {refined.ties} links between images"
+    yield f"{path}: {refined.refined} of {refined.places} places refined, using {refined.ties} links between images"
     if refined.footprint_m:
-        moved = f"corrected by {refined.moved_m:.1f} m, accurate to {refined.position_sd_m:.1f} m (medians)"
+        moved = f"corrected by {refined.moved_m:.1f} m, now accurate to {refined.position_sd_m:.1f} m (medians)"
         yield f"  position    {moved}; the GPS tags scatter by {refined.recorded_sd_m:.1f} m"
         yield f"  footprint   an image shows {refined.footprint_m:.0f} m of ground along its longest side (median)"
     if refined.surveyed:
         yield f"  surveyed    {refined.surveyed} cut from an orthophoto keep their position"
     if not_tied := refined.places - refined.without_position - refined.surveyed - refined.refined:
-        yield f"  not linked  {not_tied} keep their recorded position: a fix there is as accurate as the spacing"
+        yield f"  not linked  {not_tied} keep their recorded position: a fix there is only as accurate as the spacing"
     for place_id, image, off_m in refined.contradictory:
         yield f"  GPS tag     place {place_id} ({sanitize(image)}): recorded {off_m:.0f} m from where its image lies"
 
 
 def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[str]:
-    """Yield what a map holds. `confidence` is a sentence on how sure its matches can be (None: they are judged by fixed
-    limits), `ram_mb` the memory that the map takes in a flight."""
+    """Yield what a map contains. `confidence`: a sentence on the confidence of its matches (None: they are judged by
+    fixed limits). `ram_mb`: memory that the map needs in flight."""
     spec = info.spec
     settings = ", ".join(f"{key} {value}" for key, value in spec.parameters.items())
     yield f"{info.path}: {info.places} places, {info.with_position} with a position"
@@ -92,9 +92,9 @@ def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Itera
     if info.with_pose:
         lengths = " or ".join(f"{footprint_m:.0f}" for footprint_m in info.footprints_m)
         footprint = f"an image shows {lengths} m of ground along its longest side"
-        yield f"  pose        of {info.with_pose} places, accurate to {info.position_sd_m:.1f} m; {footprint}"
+        yield f"  pose        {info.with_pose} places, accurate to {info.position_sd_m:.1f} m; {footprint}"
     if info.of_low_quality:
-        yield f"  salience    {info.of_low_quality} of low quality, kept to bound the gaps"
+        yield f"  salience    {info.of_low_quality} of low quality, kept to limit the gaps"
     if info.one_way_deg is not None:
         yield f"  one way     {info.one_way_warning}"
     if info.attribution:
@@ -105,32 +105,32 @@ def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Itera
 
 
 def format_move(path: str, move: "MapMove") -> Iterator[str]:
-    """Yield how `map move` has moved a map."""
+    """Yield how `map move` moved a map."""
     yield f"{path}: {move.places} places moved {format_offset(move.east_m, move.north_m)}, +-{move.sd_m:.1f} m"
     if move.scale is not None:
-        yield f"  scale       divided by {1 + move.scale:.4f}, around {move.middle[0]:.6f}, {move.middle[1]:.6f}"
+        yield f"  scale       divided by {1 + move.scale:.4f}, about {move.middle[0]:.6f}, {move.middle[1]:.6f}"
 
 
 def format_check(result: "MapCheck") -> Iterator[str]:
-    """Yield the result of `map check`: the places that can be read, and what is damaged."""
+    """Yield the result of `map check`: how many places can be read, and what is damaged."""
     yield f"{result.path}: {result.places} of {result.total} places can be read"
     yield from (f"  damaged     place {place_id}: {problem}" for place_id, problem in result.damaged)
-    yield from (f"  SQLite      {fault}" for fault in result.faults or ("the file is sound",))
+    yield from (f"  SQLite      {fault}" for fault in result.faults or ("the file is intact",))
 
 
-def format_replay(again: "ReplayResult", lines: "LineComparison", packets: "PacketComparison") -> Iterator[str]:
-    """Yield how a replay differs from its flight: in the `lines` of the log, in the `packets` sent, and in its end."""
+def format_replay(replay: "ReplayResult", lines: "LineComparison", packets: "PacketComparison") -> Iterator[str]:
+    """Yield how a replay differs from its flight: in `lines` of the log, in `packets` sent, and in how it ends."""
     yield from _limit_differences([*map(_format_difference, lines.others), *packets.others])
     yield from (f"The program differs: {name} was {then}, is {now}" for name, (then, now) in lines.program.items())
-    yield f"{sum(line.get('kind') == 'query' for line in again.lines)} queries replayed"
+    yield f"{sum(line.get('kind') == 'query' for line in replay.lines)} queries replayed"
     yield f"log      {lines.alike} lines are equal, {len(lines.others)} differ"
     yield f"MAVLink  {packets.alike} packets are equal, {len(packets.others)} differ"
-    if again.guessed:
-        yield f"{again.guessed} inputs are not on the tape where this program reads them: its costs differ."
-    if again.why_ended:
-        yield f"The replay ends before the flight: {again.why_ended}; {lines.after} lines come after it."
+    if replay.guessed:
+        yield f"{replay.guessed} inputs were not recorded where this version reads them, so values were guessed."
+    if replay.why_ended:
+        yield f"The replay ended before the flight: {replay.why_ended}; the flight has {lines.after} more lines."
     elif lines.after:
-        yield f"{lines.after} lines of the flight are missing in the replay."
+        yield f"{lines.after} lines of the flight are missing from the replay."
 
 
 def _limit_differences(texts: list[str]) -> list[str]:

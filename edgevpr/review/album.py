@@ -1,4 +1,4 @@
-"""The pictures of a page: found by the names that a log or a map gives them, and made small enough for one file."""
+"""The pictures of a page: found by their names in a log or a map, and scaled down to fit into one file."""
 
 import re
 from base64 import b64encode
@@ -20,43 +20,43 @@ from edgevpr.frames.positions import GeoTag
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
-_SIDES_PX = (480, 320, 240, 160, 112)  # of a small picture: the largest with which it fits is taken
-_MIN_BYTES = 2500  # of a picture of the smallest side, as an address
-_MAX_HEADING_ERROR_DEG = 45.0  # between the tops of a picture and of a place: more is a contradiction
-_CUT_PX = 512  # of a picture from an orthophoto, as the map was made of
+_SIDES_PX = (480, 320, 240, 160, 112)  # longest sides of a small picture: the largest that fits is used
+_MIN_BYTES = 2500  # size of the data: address of a picture with the smallest side
+_MAX_HEADING_ERROR_DEG = 45.0  # between the tops of a picture and its place: more is a contradiction
+_CUT_PX = 512  # side of a picture cut from an orthophoto, as in the map build
 
-_FRAME_NAME = re.compile(r"frame \d{6} t=(\d+\.\d+) s")  # as `VideoSource` names them
+_FRAME_NAME = re.compile(r"frame \d{6} t=(\d+\.\d+) s")  # the names that `VideoSource` gives
 
 Key = tuple[str, str]  # which album, and the name of a picture in it
 
 
 @dataclass(frozen=True, slots=True)
 class AlbumPicture:
-    """A picture, uint8 (H, W[, 3]), its mask, bool (H, W), False where it shows no ground (None: nowhere), and a
-    function that reads its position and attitude (None: unknown)."""
+    """A picture, uint8 (H, W[, 3]). `mask`: bool (H, W), False where it shows no ground (None: it shows ground
+    everywhere). `tag`: function that reads its position and attitude (None: unknown)."""
 
     image: Image
     mask: Mask | None = None
     tag: Callable[[], GeoTag | None] | None = None
 
 
-Finder = Callable[[str], AlbumPicture | None]  # returns the picture of a name; None if there is none that can be read
+Finder = Callable[[str], AlbumPicture | None]  # returns the picture with a name; None if no such picture can be read
 
 
 class Album:
-    """Finds pictures by the names that a log or a map gives them, with the first of `finders` that has one. The flight
-    and the map have an album each, since their pictures often have equal names."""
+    """Finds pictures by their names in a log or a map, trying `finders` in order. The flight and the map each have an
+    album, because their pictures often have the same names."""
 
     def __init__(self, *finders: Finder) -> None:
         self._finders = finders
         self._kept: dict[str, bytes] = {}
 
     def __bool__(self) -> bool:
-        """Return True if there is anywhere to look for pictures."""
+        """Return True if the album has any finder."""
         return bool(self._finders)
 
     def find_image(self, name: str) -> Image | None:
-        """Return the picture `name`, uint8 (H, W[, 3]); None if there is none that can be read."""
+        """Return the picture `name`, uint8 (H, W[, 3]); None if no such picture can be read."""
         if name in self._kept:
             from edgevpr.frames.images import decode_jpeg
 
@@ -65,13 +65,13 @@ class Album:
         return picture.image if picture else None
 
     def level_picture(self, place: Place, lens: "Lens | None") -> AlbumPicture | None:
-        """Return the picture of a place, levelled if the `lens` is known; None if there is none."""
+        """Return the picture of a place, levelled if the `lens` is known; None if the picture is not found."""
         picture = self._find(place.source_image)
         if picture is None:
             return None
         from edgevpr.frames.images import encode_small_jpeg
 
-        # Photographs are slow to decode: a small copy is kept, and no file is read for it any more.
+        # Photographs are slow to decode: keep a small copy, so that the file is not read again.
         self._kept[place.source_image] = encode_small_jpeg(picture.image, _SIDES_PX[0])
         tag = picture.tag() if lens and picture.tag else None
         if lens is None or tag is None:
@@ -83,8 +83,8 @@ class Album:
         return AlbumPicture(level.image, level.mask)
 
     def align_picture(self, place: Place, lens: "Lens | None") -> AlbumPicture | None:
-        """Return the picture of a place whose top points where its pose says: levelled, as in a map made with the
-        `lens`, whose tops point north, or as it is. None if there is none, or its heading contradicts both."""
+        """Return the picture of a place in the orientation of its pose: levelled, with its top to the north, as in a
+        map built with the `lens`, or unchanged. None if it is not found or its heading contradicts both."""
         picture = self._find(place.source_image)
         tag = picture.tag() if picture and picture.tag else None
         if not tag or tag.heading_deg is None or not place.pose:
@@ -102,16 +102,16 @@ class Album:
 
 
 def _read_picture(path: Path, tag: Callable[[], GeoTag | None] | None = None) -> AlbumPicture | None:
-    from edgevpr.frames.images import read_image  # a page without pictures needs no OpenCV
+    from edgevpr.frames.images import read_image  # imported here: a page without pictures needs no OpenCV
 
-    with suppress(ImageError, OSError, ValueError):  # no picture, or a name that no file can have
+    with suppress(ImageError, OSError, ValueError):  # not a picture, or an invalid file name
         if path.is_file():
             return AlbumPicture(read_image(path), tag=tag)
     return None
 
 
 def _find_in_folder(folder: Path, name: str) -> AlbumPicture | None:
-    # A log from somebody else may name any file of this machine: show only files in the folder.
+    # A log from somebody else may name any file on this machine: show only files in the folder.
     path = folder / Path(name).name
     return _read_picture(path, lambda: _read_folder_tags(folder).get(path))
 
@@ -126,8 +126,8 @@ def _read_folder_tags(folder: Path) -> Mapping[Path, GeoTag]:
 
 
 class _VideoFinder:
-    """Finds the pictures of a video by the names of its frames. Raises EdgevprError for a file that is no video or has
-    an unusable table of positions beside it."""
+    """Finds the pictures of a video by the names of its frames. Raises EdgevprError for a file that is not a video or
+    has an unusable table of positions next to it."""
 
     def __init__(self, video: Path) -> None:
         from edgevpr.frames.positions import find_track, read_track
@@ -144,7 +144,7 @@ class _VideoFinder:
         match = _FRAME_NAME.fullmatch(name)
         if not match:
             return None
-        if name <= self._passed:  # names are in the order of the video, which is read forwards
+        if name <= self._passed:  # names sort in the order of the video, which can only be read forwards
             self._source.close()
             self._source, self._passed = self._open(), ""
         for frame in filter(None, read_to_end(self._source, lambda error: None)):
@@ -156,15 +156,15 @@ class _VideoFinder:
 
 
 def _open_orthophoto(source: str | Path, places: Sequence[Place]) -> Finder:
-    """Return a finder of the pictures of places that were cut from an orthophoto: they are cut again. Raises
-    EdgevprError if it cannot be opened."""
+    """Return a finder that cuts the pictures of places out of an orthophoto again. Raises EdgevprError if the
+    orthophoto cannot be opened."""
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
 
-    cut = {place.source_image: (place.position, place.pose) for place in places if place.position and place.pose}
+    cuts = {place.source_image: (place.position, place.pose) for place in places if place.position and place.pose}
     orthophoto = Orthophoto(source)
 
     def find(name: str) -> AlbumPicture | None:
-        position, pose = cut.get(name, (None, None))
+        position, pose = cuts.get(name, (None, None))
         with suppress(ImageError):
             return AlbumPicture(*orthophoto.cut(position, pose.footprint_m, _CUT_PX)) if position and pose else None
         return None
@@ -173,8 +173,8 @@ def _open_orthophoto(source: str | Path, places: Sequence[Place]) -> Finder:
 
 
 def make_album(sources: Sequence[str | Path], recorded: Mapping[str, Path] = MappingProxyType({})) -> Album:
-    """Return the album of the pictures in `sources`: folders, or one video; and first those of a recording, `recorded`,
-    by the names of its frames. Raises EdgevprError for a source that cannot be used."""
+    """Return the album of the pictures in `sources`, folders or one video. `recorded`: files of a recording by frame
+    name, which are searched first. Raises EdgevprError for a source that cannot be used."""
     finders: list[Finder] = []
     if recorded:
         finders.append(lambda name: _read_picture(recorded[name]) if name in recorded else None)
@@ -182,29 +182,29 @@ def make_album(sources: Sequence[str | Path], recorded: Mapping[str, Path] = Map
         return Album(*finders, _VideoFinder(Path(sources[0])))
     for folder in map(Path, sources):
         if not folder.is_dir():
-            raise UsageError(f"{folder}: there is no such folder: give a folder of images, or a video.")
+            raise UsageError(f"{folder} does not exist: give a folder of images, or a video.")
         finders.append(partial(_find_in_folder, folder.resolve()))
     return Album(*finders)
 
 
 def make_map_album(sources: Sequence[str | Path], places: Sequence[Place]) -> Album:
-    """Return the album of a map's pictures. `sources` are folders of pictures, or a video, or the orthophoto that the
-    map was cut from. Raises EdgevprError for one that cannot be used."""
+    """Return the album of a map's pictures. `sources`: folders of pictures, a video, or the orthophoto from which the
+    map was cut. Raises EdgevprError for a source that cannot be used."""
     if sources and any(place.position and place.pose and place.pose.is_surveyed for place in places):
         return Album(_open_orthophoto(sources[0], places))
     return make_album(sources)
 
 
 def embed_pictures(
-    steps: Sequence[Sequence[Key]], albums: Mapping[str, Album], room_bytes: float
+    steps: Sequence[Sequence[Key]], albums: Mapping[str, Album], budget_bytes: float
 ) -> tuple[dict[Key, str], str]:
-    """Load the pictures of all steps as data: addresses, in `room_bytes` together: each as large as its share of them
-    allows, and if that is too little, those of every second, third, ... step. Returns them by their keys, and a
-    sentence on what is left out ("": nothing)."""
+    """Load the pictures of all steps as data: addresses of at most `budget_bytes` together. Each is as large as its
+    share of the budget allows; if that is too little, only every second, third, ... step has pictures. Returns the
+    addresses by key, and a sentence on what is left out ("": nothing)."""
     from edgevpr.frames.images import encode_small_webp
 
     keys = list(dict.fromkeys(key for step in steps for key in step if albums[key[0]]))
-    every = max(1, -(-len(keys) * _MIN_BYTES // max(1, int(room_bytes))))
+    every = max(1, -(-len(keys) * _MIN_BYTES // max(1, int(budget_bytes))))
     keys = list(dict.fromkeys(key for step in steps[::every] for key in step if albums[key[0]]))
     pictures: dict[Key, str] = {}
     some_left_out = every > 1
@@ -214,11 +214,11 @@ def embed_pictures(
             continue
         for side_px in _SIDES_PX:
             address = f"data:image/webp;base64,{b64encode(encode_small_webp(image, side_px)).decode()}"
-            if len(address) <= room_bytes / (len(keys) - number):
+            if len(address) <= budget_bytes / (len(keys) - number):
                 break
-        if len(address) <= room_bytes:
+        if len(address) <= budget_bytes:
             pictures[album, name] = address
-            room_bytes -= len(address)
+            budget_bytes -= len(address)
         else:
             some_left_out = True
     return pictures, "Only some steps have pictures: the page would be too large with more." * some_left_out

@@ -1,5 +1,5 @@
-"""Compares a flight with its replay, for `edgevpr replay`: the lines of both logs, and the packets sent on the
-link, byte by byte. In names here, "then" is the flight and "now" its replay."""
+"""Compares a flight with its replay, for `edgevpr replay`: the lines of both logs, and byte by byte the packets sent on
+the link. In the names of this module, "then" is the flight and "now" its replay."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -12,17 +12,17 @@ Changes = dict[str, tuple[Any, Any]]  # by name: (value in the flight, value in 
 
 _SIGNATURE_BYTES = 13
 
-# Fields of a log's first line that describe the program that flew, not the flight.
+# Fields of a log's first line that describe the program, not the flight.
 _PROGRAM_FIELDS = ("version", "machine", "python", "libraries")
 
 
 @dataclass(slots=True)
 class LineComparison:
-    """Comparison of the logs of flight and replay: the number of lines that are `alike`, the `others`, which differ,
-    and the number of lines of the flight that come `after` the end of the replay. `program` has those fields of the
-    first line that describe the program and differ. Each of the `others` has the `kind` of the line, its time
-    `t_mono_s`, its `query`, and either `fields`, those that differ, by dotted name (like "fix.sent"), or `only_in`:
-    "replay" if the flight has no such line."""
+    """Comparison of the logs of a flight and its replay. `alike`: number of equal lines. `others`: the lines that
+    differ. `after`: number of lines of the flight after the end of the replay. `program`: differing fields of the first
+    line that describe the program. Each of the `others` has the `kind` of the line, its time `t_mono_s`, its `query`,
+    and either `fields`, the differing fields by dotted name (such as "fix.sent"), or `only_in`: "replay" if the flight
+    has no such line."""
 
     alike: int = 0
     others: list[Line] = field(default_factory=list)
@@ -31,18 +31,18 @@ class LineComparison:
 
 
 def compare_lines(then: Iterable[Line], now: Iterable[Line]) -> LineComparison:
-    """Compare the lines of a flight's log with those of its replay, one after the other."""
-    then, now, found = list(then), list(now), LineComparison(after=max(0, len(then) - len(now)))
+    """Compare a flight's log with that of its replay, line by line."""
+    then, now, result = list(then), list(now), LineComparison(after=max(0, len(then) - len(now)))
     for before, after in zip(then, now, strict=False):
         fields = dict(_compare_values(before, after))
         if before.get("kind") == "start":
-            found.program = {name: fields.pop(name) for name in [*fields] if name.partition(".")[0] in _PROGRAM_FIELDS}
+            result.program = {name: fields.pop(name) for name in [*fields] if name.partition(".")[0] in _PROGRAM_FIELDS}
         if fields:
-            found.others.append({**_identify_line(before), "fields": fields})
+            result.others.append({**_identify_line(before), "fields": fields})
         else:
-            found.alike += 1
-    found.others += [{**_identify_line(line), "only_in": "replay"} for line in now[len(then) :]]
-    return found
+            result.alike += 1
+    result.others += [{**_identify_line(line), "only_in": "replay"} for line in now[len(then) :]]
+    return result
 
 
 def _identify_line(line: Line) -> Line:
@@ -59,14 +59,14 @@ def _compare_values(then: Any, now: Any, name: str = "") -> Iterator[tuple[str, 
 
 @dataclass(slots=True)
 class PacketComparison:
-    """Comparison of the packets that the flight sent with those that its replay sends: how many are `alike`, and the
-    `others`, each in a sentence."""
+    """Comparison of the packets sent by a flight and by its replay. `alike`: number of equal packets. `others`: a
+    sentence on each difference."""
 
     alike: int = 0
     others: list[str] = field(default_factory=list)
 
     def compare(self, t_s: float, then: bytes | None, now: bytes | None) -> None:
-        """Compare two packets (None: none was sent) at the time `t_s` of the flight's clock."""
+        """Compare two packets (None: none was sent) at the time `t_s` on the flight's clock."""
         if then and now and _strip_sequence(then) == _strip_sequence(now):
             self.alike += 1
         elif then or now:
@@ -78,8 +78,8 @@ def _describe_packet(packet: bytes | None) -> str:
 
 
 def _strip_sequence(packet: bytes) -> bytes:
-    """Return a packet without its sequence number, which counts the packets before it, its checksum, which depends on
-    that number, and its signature, for which no recording holds the key."""
+    """Return a packet without its sequence number, which depends on the packets before it, its checksum, which depends
+    on that number, and its signature, whose key is not in the recording."""
     if packet[0] != mavlink.PROTOCOL_MARKER_V2:
         return packet[:2] + packet[3:-2]
     signature_bytes = _SIGNATURE_BYTES if packet[2] & mavlink.MAVLINK_IFLAG_SIGNED else 0

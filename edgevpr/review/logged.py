@@ -1,4 +1,4 @@
-"""Reads a flight log into checked values, for the report. A field that is missing, damaged or of another type becomes
+"""Reads a flight log into checked values for the report. A field that is missing, damaged or of the wrong type becomes
 None."""
 
 import logging
@@ -14,17 +14,17 @@ from edgevpr.runtime.flight.flightlog import select_last_flight
 _log = logging.getLogger(__name__)
 
 Point = tuple[float, float]  # latitude and longitude, degrees
-_MAX_REPORT_AGE_S = 1.0  # a report of the autopilot that is further in time from a frame is not used for it
-_REASON_FIELDS = ("note", "why")  # fields with a reason: the first that a line has is shown
-_TEXT_FIELDS = ("said", "state", "problem")  # fields with a text for people, else
-_MAX_NUMBER = 1e15  # larger numbers are damage; the comparison also excludes NaN, and integers that no float can hold
+_MAX_REPORT_AGE_S = 1.0  # an autopilot report is used only for frames at most this far away in time
+_REASON_FIELDS = ("note", "why")  # fields that hold a reason: the first present is shown
+_TEXT_FIELDS = ("said", "state", "problem")  # fields that hold a text for people: shown if there is no reason
+_MAX_NUMBER = 1e15  # larger numbers are damage; the comparison also excludes NaN and integers too large for a float
 
 
 class FixOutcome(Enum):
-    """Outcome of a fix, in the words of the report. CONTINUOUS: the fix became part of the position that is sent many
-    times a second, and is not answered. NOT_SENT: it was not sent, see its `why`."""
+    """Outcome of a fix, in the words of the report. CONTINUOUS: the fix was included in the position that is sent many
+    times a second, which the autopilot does not answer. NOT_SENT: it was not sent, see `why`."""
 
-    TAKEN = "fix taken"
+    TAKEN = "fix accepted"
     REFUSED = "fix refused"
     UNANSWERED = "fix not answered"
     CONTINUOUS = "in continuous position"
@@ -36,8 +36,8 @@ SENT_OUTCOMES = (FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.UNANSWERED)
 
 @dataclass(slots=True, kw_only=True)
 class LoggedFix:
-    """The fix of a query: its outcome, `why` it was not sent or not taken (None: unknown), and its `position`
-    (None: there was nothing to send)."""
+    """The fix of a query. `why`: reason why it was not sent or not accepted (None: unknown). `position`: None if there
+    was nothing to send."""
 
     outcome: FixOutcome
     why: Reason | None
@@ -47,12 +47,12 @@ class LoggedFix:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoggedQuery:
-    """One query, whose frame was taken `t_s` seconds after the start of the flight. None in any field: unknown.
+    """One query. None in any field: unknown. `t_s`: time of its frame, seconds since the start of the flight.
 
-    `line` is its line of the log. `position` is that of an accepted match, `place_position` that of the place found.
-    `autopilot_position` and `gps_position` are those of the aircraft at that time by autopilot and GPS receiver.
-    `true_position`, by which a match is judged, is the autopilot's if it has GPS, else that of the receiver.
-    `has_link`: a report of the autopilot arrived within a second."""
+    `line`: its line in the log. `position`: position by the match, if accepted. `place_position`: position of the place
+    found. `autopilot_position`, `gps_position`: positions of the aircraft at that time by autopilot and GPS receiver.
+    `true_position`, against which a match is judged, is the autopilot's if it has GPS, else the receiver's.
+    `has_link`: a report from the autopilot arrived within a second."""
 
     line: dict[str, Any]
     name: str
@@ -73,15 +73,15 @@ class LoggedQuery:
 
     @property
     def off_m(self) -> float | None:
-        """Distance from the match to `true_position`."""
+        """Distance in metres from the match to `true_position`."""
         return float(distance_m(*self.true_position, *self.position)) if self.true_position and self.position else None
 
 
 @dataclass(slots=True, kw_only=True)
 class LoggedFlight:
-    """One flight. `path` is its log, `start` and `end` are its first and last line ({}: missing). `remarks` are the
-    lines with a text for people: time, kind and text. `unusable` is the number of frames that never became queries,
-    `between` the lines of fixes sent between matches. Times are seconds after its start; it is `span_s` long."""
+    """One flight. `path`: its log. `start`, `end`: its first and last line ({}: missing). `remarks`: time, kind and
+    text of the lines with a text for people. `unusable`: number of frames that never became queries. `between`: lines
+    of fixes sent between matches. Times are seconds since its start; `span_s` is its duration."""
 
     path: Path
     start: dict[str, Any] = field(default_factory=dict)
@@ -94,8 +94,8 @@ class LoggedFlight:
 
 
 def read_flight(path: str | Path) -> LoggedFlight:
-    """Read the last flight of the log `path`, and warn if files of it are missing. The first time in it counts as its
-    start. Raises UsageError if there is no such file, and EdgevprError if it has no line of a flight (see
+    """Read the last flight in the log `path`, and warn if any of its files are missing. Its first timestamp is taken as
+    its start. Raises UsageError if the file does not exist, and EdgevprError if it has no line of a flight (see
     `flightlog.select_last_flight`)."""
     lines = select_last_flight(path)
     flight, queries, start_s = LoggedFlight(path=Path(path)), dict[str, LoggedQuery](), None
@@ -138,7 +138,7 @@ def _read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
     gps_position = _locate_gps(line, t_frame_s)
     has_link = _is_fresh(get_number(line, "vehicle", "t_received_s"), t_frame_s)
     autopilot_position = get_point(line, "vehicle") if has_link else None
-    # The confidence by which a match was judged: its own, or that of the flight so far where it is higher.
+    # The confidence by which a match was judged: its own or, if higher, that of the flight so far.
     confidences = get_number(line, "confidence"), get_number(line, "followed", "confidence")
     place, fix = get_number(line, "place"), get_value(line, "fix")
     has_gps = get_value(line, "vehicle", "has_gps") is True
@@ -156,7 +156,7 @@ def _read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
         place_position=get_point(line, "position"),
         autopilot_position=autopilot_position,
         gps_position=gps_position,
-        # An autopilot that has GPS knows by how much its receiver lags: at 20 m/s that is metres.
+        # An autopilot with GPS compensates for the lag of its receiver, which is metres at 20 m/s.
         true_position=autopilot_position if gps_position and has_gps else gps_position,
         fix=_read_fix(fix) if isinstance(fix, dict) else None,
         has_link=has_link if "vehicle" in line else None,
@@ -182,8 +182,8 @@ def _is_fresh(t_s: float | None, t_frame_s: float | None) -> bool:
 
 
 def _locate_gps(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
-    """Return where the GPS receiver was when the frame was taken: its newest position, moved on by the velocity. None
-    if it is unknown or its time is further than `_MAX_REPORT_AGE_S` from the frame's."""
+    """Return the position of the GPS receiver at the time of the frame: its newest position, extrapolated with the
+    velocity. None if it is unknown or more than `_MAX_REPORT_AGE_S` away from the frame in time."""
     position, t_s = get_point(line, "vehicle", "gps"), get_number(line, "vehicle", "gps", "t_s")
     if position is None or t_s is None or t_frame_s is None or not _is_fresh(t_s, t_frame_s):
         return None
@@ -197,7 +197,7 @@ def _read_text(line: dict[str, Any]) -> str:
     reasons = [str(reason) for key in _REASON_FIELDS if (reason := read_reason(line.get(key)))]
     words = next(iter([*reasons, *(text for key in _TEXT_FIELDS if (text := get_text(line, key)))]), None)
     match line:
-        case {"from": dict() as before, "to": dict() as after}:  # of the governor
+        case {"from": dict() as before, "to": dict() as after}:  # a change by the governor
             changed = [f"{key} {before.get(key)} to {now}" for key, now in after.items() if before.get(key) != now]
             return f"{', '.join(changed)}: {words}"
     others = {"kind", "time", "t_mono_s"}
@@ -205,21 +205,21 @@ def _read_text(line: dict[str, Any]) -> str:
 
 
 def get_value(record: Any, *keys: str) -> Any:
-    """Return the value at `keys` in the nested dictionaries of `record`; None if any of them is missing."""
+    """Return the value at `keys` in the nested dictionaries of `record`; None if any key is missing."""
     for key in keys:
         record = record.get(key) if isinstance(record, dict) else None
     return record
 
 
 def get_number(record: Any, *keys: str) -> float | None:
-    """Return the number at `keys`, as `get_value` does; None if it is missing or no plausible number."""
+    """Return the number at `keys` (see `get_value`); None if it is missing or not a plausible number."""
     value = get_value(record, *keys)
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return float(value) if is_number and -_MAX_NUMBER < value < _MAX_NUMBER else None
 
 
 def get_text(record: Any, *keys: str) -> str | None:
-    """Return the text at `keys`, as `get_value` does; None if it is missing, empty or no text."""
+    """Return the text at `keys` (see `get_value`); None if it is missing, empty or not text."""
     value = get_value(record, *keys)
     return value if isinstance(value, str) and value else None
 

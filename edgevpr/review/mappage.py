@@ -1,5 +1,5 @@
-"""The page of a map (`edgevpr map info --page`): its places by quality over the ground that they show, the gaps between
-them, GPS tags that do not fit, and places that look alike."""
+"""The page of a map (`edgevpr map info --page`): its places by quality over the ground they show, the gaps between
+them, inconsistent GPS tags, and places that look alike."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -17,25 +17,25 @@ from edgevpr.review.webpage import UNKNOWN, Layer, Section, Step, format_number,
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
-MAX_QUERIES = 100  # images of a map that are searched among the places elsewhere; each takes half a second
-_QUALITY_CLASSES = {"low": 0.4, "fair": 0.6, "good": 0.8, "best": 1.01}  # below which value it is called so
-_MAX_HARD_CONFIDENCE = 0.5  # mean confidence of a place that is hard to recognise
-_MAX_TAG_SIGMA = 4.0  # times the usual distance of a tag from where its picture lies, as in refinement
-_MEDIAN_PER_SIGMA = 1.1774  # median length of a normally distributed vector over the standard deviation of an axis
-_MIN_TAG_OFF_M = 5.0  # less is the receiver's error
-_CELLS_PER_FOOTPRINT = 24  # of a footprint
-_MAX_CELLS = 4_000_000  # of the whole ground
-_COVERED_SHARE = 0.75  # of a footprint: the short side of a picture of 4:3
-_MIN_GAP_FOOTPRINTS = 0.15  # footprints: less is no gap
-_MAX_GAP_FOOTPRINTS = 1.0  # footprints: what is wider and open to one side is outside the map
+MAX_QUERIES = 100  # images of a map that are matched against the places elsewhere; each takes half a second
+_QUALITY_CLASSES = {"low": 0.4, "fair": 0.6, "good": 0.8, "best": 1.01}  # upper limits of the classes
+_MAX_HARD_CONFIDENCE = 0.5  # maximum mean confidence of a place that is hard to recognise
+_MAX_TAG_SIGMA = 4.0  # times the usual distance of a tag from the true position of its picture, as in refinement
+_MEDIAN_PER_SIGMA = 1.1774  # median length of a normally distributed 2D vector over the standard deviation per axis
+_MIN_TAG_OFF_M = 5.0  # smaller distances are receiver error
+_CELLS_PER_FOOTPRINT = 24  # resolution of the coverage grid
+_MAX_CELLS = 4_000_000  # of the coverage grid
+_COVERED_SHARE = 0.75  # of a footprint: the short side of a 4:3 picture
+_MIN_GAP_FOOTPRINTS = 0.15  # narrower gaps are ignored
+_MAX_GAP_FOOTPRINTS = 1.0  # wider gaps that are open to one side are outside the map
 _NOTES = (
-    "Coverage gaps lie between pictures that do not meet: each picture is assumed to show at least a square of three "
+    "Coverage gaps are between pictures that do not touch: each picture is assumed to show at least a square of three "
     "quarters of its long side.",
     "A GPS tag is inconsistent if it is four times farther from its picture than is usual in this map.",
 )
 _NO_PICTURES = (
-    "Look-alikes are searched with --map-images, in a map of `cohog`, if its places were made from these images with "
-    "the lens of --config."
+    "Look-alikes are searched only with --map-images, in a `cohog` map whose places were built from these images with "
+    "the lens given by --config."
 )
 
 
@@ -48,13 +48,13 @@ def make_map_page(
     pictures: Album,
     lens: "Lens | None",
 ) -> str:
-    """Return the whole page of the map `name`. `lines` are those of `map info`. `recognisable` is the mean confidence
-    of the right matches of a place that calibration asked for, by its number; `look_alikes` are what looks like each of
-    the places whose picture was looked for (None: nothing does). `pictures` finds those of the map, `lens` is that of
+    """Return the whole page of the map `name`. `lines`: the output of `map info`. `recognisable`: mean confidence of
+    the correct matches of each place that calibration queried, by place number. `look_alikes`: for each place whose
+    picture was searched, the place that looks alike (None: none does). `pictures`: the map's album. `lens`: lens of
     its camera (None: unknown)."""
     ground = [place for place in places if place.position]
     points = {place.place_id: to_point(place) for place in ground}
-    tags_off_m, twins = find_inconsistent_tags(ground), {alike.place_id: alike for alike in look_alikes if alike}
+    tags_off_m, twins = find_inconsistent_tags(ground), {twin.place_id: twin for twin in look_alikes if twin}
     hard = {place_id for place_id, confidence in recognisable.items() if confidence < _MAX_HARD_CONFIDENCE}
     gaps, covered_m2, gaps_m2 = find_gaps(ground)
     steps = list(_make_steps(places, recognisable, tags_off_m, twins, points))
@@ -62,7 +62,7 @@ def make_map_page(
     tags = [(read_recorded_position(place), to_point(place)) for place in ground if place.place_id in tags_off_m]
     layers = [
         Layer("coverage gaps", "hole", gaps, "area"),
-        Layer("look alike", "alike", [(one, other) for one, other in pairs if one and other], "line"),
+        Layer("look alike", "alike", [(point, other) for point, other in pairs if point and other], "line"),
         Layer("inconsistent GPS tags", "amiss", tags, "line"),
         make_layer(steps, "hard to recognise", "weak"),
         *(make_layer(steps, f"{quality} quality", quality) for quality in _QUALITY_CLASSES),
@@ -110,7 +110,7 @@ def _make_steps(
             "inconsistent GPS tag": place_id in tags_off_m,
             "hard to recognise": is_hard,
             "not aligned with its neighbours": position and not pose,
-            "kept to bound a gap": place.salience and place.salience.is_low,
+            "kept to limit a gap": place.salience and place.salience.is_low,
             "without a position": not position,
         }
         sd_m = float(np.sqrt(sum(pose.covariance_m2[::2]) / 2)) if pose else None
@@ -120,7 +120,7 @@ def _make_steps(
             if pose
             else []
         )
-        texts += [f"its GPS tag lies {tags_off_m[place_id]:.0f} m from its image"] if place_id in tags_off_m else []
+        texts += [f"its GPS tag is {tags_off_m[place_id]:.0f} m from its image"] if place_id in tags_off_m else []
         if confidence is not None:
             texts.append(f"mean confidence of altered copies of its image: {format_probability(confidence)}")
         pictures = [("place", place.source_image, f"place {place_id}: {place.source_image}")]
@@ -132,7 +132,7 @@ def _make_steps(
         yield Step(
             title=f"Place {place_id}: {place.source_image}",
             texts=texts,
-            groups={name: "places" for name, is_so in groups.items() if is_so},
+            groups={name: "places" for name, is_member in groups.items() if is_member},
             points={name: point for name, point in {**marks, _classify_quality(place): position}.items() if point},
             circle_m=sd_m,
             place=place,
@@ -141,14 +141,14 @@ def _make_steps(
 
 
 def read_recorded_position(place: Place) -> Point:
-    """Return where a place was recorded before refinement moved it."""
+    """Return the recorded position of a place, before refinement moved it."""
     recorded = place.pose and place.pose.recorded
     return (recorded.lat_deg, recorded.lon_deg) if recorded else to_point(place)
 
 
 def find_inconsistent_tags(ground: Sequence[Place]) -> dict[int, float]:
-    """Return the places whose recorded position lies far from where their pictures lie, and how far: metres by the
-    place's number. Far is more than four standard deviations of an axis, taken from the median of all."""
+    """Return the distance in metres, by place number, from the recorded position of a place to its refined one, for
+    places where it is more than four standard deviations per axis, estimated from the median of all."""
     moved_m = {
         place.place_id: float(distance_m(*read_recorded_position(place), *to_point(place)))
         for place in ground
@@ -159,8 +159,8 @@ def find_inconsistent_tags(ground: Sequence[Place]) -> dict[int, float]:
 
 
 def find_gaps(ground: Sequence[Place]) -> tuple[list[list[Point]], float, float]:
-    """Find ground between pictures that none of them shows. Returns its outlines, the area that is shown and that of
-    the gaps, m2; nothing if no place has a pose."""
+    """Find the gaps between pictures: ground that none of them shows. Return their outlines, the area shown and the
+    area of the gaps, in m2; no outlines and zeros if no place has a pose."""
     posed = [(place, place.pose) for place in ground if place.pose]
     if not posed:
         return [], 0.0, 0.0
@@ -182,7 +182,7 @@ def find_gaps(ground: Sequence[Place]) -> tuple[list[list[Point]], float, float]
     )
     closed = cv2.morphologyEx(shown, cv2.MORPH_CLOSE, wide)
     around, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(closed, around, -1, (1,), cv2.FILLED)  # what is surrounded, however wide
+    cv2.drawContours(closed, around, -1, (1,), cv2.FILLED)  # enclosed gaps count however wide they are
     between = cv2.morphologyEx(closed & (1 - shown), cv2.MORPH_OPEN, thin)
     outlines, _ = cv2.findContours(between, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     gaps = [[offset_position(*origin, *(low + cell_m * point)) for point in outline[:, 0]] for outline in outlines]

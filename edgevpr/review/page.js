@@ -1,4 +1,4 @@
-// Draws the page and moves it. Its content is in the data block "page", by `webpage.py`. Texts become text
+// Draws the page and makes it interactive. `webpage.py` writes its content to the data block "page". Texts become text
 // nodes, never HTML.
 "use strict";
 (() => {

@@ -1,7 +1,4 @@
-"""The report of a flight (`edgevpr report`): one HTML page with its pictures inside, without network.
-
-Functions that return a str return HTML.
-"""
+"""The report of a flight (`edgevpr report`): one HTML page that contains its pictures and needs no network."""
 
 import json
 from collections import Counter
@@ -41,7 +38,7 @@ if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
 _MAX_REMARKS = 200
-_MAX_GPS_ERROR_M = 15.0  # less is the error of a receiver, and no danger
+_MAX_GPS_ERROR_M = 15.0  # smaller distances are receiver error and not dangerous
 _FIX_COLOURS = {
     FixOutcome.TAKEN: "taken",
     FixOutcome.UNANSWERED: "unanswered",
@@ -55,8 +52,8 @@ _HEAD_FIELDS = (("map", "map"), ("technique", "technique"), ("board", "board"), 
 def make_flight_page(
     flight: LoggedFlight, ground: Sequence[Place], frames: Album, references: Album, no_ground: str = ""
 ) -> str:
-    """Return the whole page. `frames` finds the pictures of the flight, `references` those that the map was made of.
-    `no_ground` is a sentence on why there is no `ground`."""
+    """Return the whole page. `ground`: the map's places. `frames`: album of the flight's pictures; `references`: album
+    of the map's. `no_ground`: a sentence on why there is no `ground`."""
     queries = flight.queries
     time = get_text(flight.start, "time") or next((get_text(query.line, "time") for query in queries), None)
     start = [f"{name} {value}" for name, key in _HEAD_FIELDS if (value := get_text(flight.start, key))]
@@ -81,7 +78,7 @@ def make_flight_page(
 
 
 def _make_layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
-    """Return the layers of the drawing, from the bottom to the top."""
+    """Return the layers of the drawing, bottom layer first."""
     return [
         Layer("places of the map", "places", [[to_point(place) for place in ground]]),
         make_layer(steps, "places found", "found"),
@@ -90,21 +87,21 @@ def _make_layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[
         make_layer(steps, "autopilot", "autopilot", "line"),
         make_layer(steps, "refused there", "missed"),
         make_layer(steps, "matches", "accepted"),
-        make_layer(steps, "fixes taken", "taken"),
+        make_layer(steps, "fixes accepted", "taken"),
         make_layer(steps, "fixes not answered", "unanswered"),
         make_layer(steps, "fixes refused", "refused"),
     ]
 
 
 def _make_steps(ground: Sequence[Place], flight: LoggedFlight) -> list[Step]:
-    """Return a step for each query of a flight over the places of `ground`."""
+    """Return a step for each query of a flight over the places `ground`."""
     places = {place.place_id: place for place in ground}
     has_link = any(query.has_link for query in flight.queries)
     return [_make_step(query, places.get(query.place or 0), flight.span_s > 0, has_link) for query in flight.queries]
 
 
 def _make_step(query: LoggedQuery, place: Place | None, has_times: bool, has_link: bool) -> Step:
-    """Return the step of a query. `has_times`: its flight lasted. `has_link`: the flight had a link to an autopilot."""
+    """Return the step of a query. `has_times`: the flight has times. `has_link`: it had a link to an autopilot."""
     fix, verdict = query.fix, "accepted" if query.accepted else "refused"
     points = {
         "found": query.place_position,
@@ -140,7 +137,7 @@ def _make_step(query: LoggedQuery, place: Place | None, has_times: bool, has_lin
 
 def _format_place(query: LoggedQuery) -> str:
     if query.place is None:
-        return "no place was found"
+        return "no place found"
     score = format_number(get_number(query.line, "score"))
     confidence = "" if query.confidence is None else f", confidence {format_probability(query.confidence)}"
     return f"place {query.place} ({query.reference_image or 'without a name'}), score {score}{confidence}"
@@ -150,23 +147,23 @@ def _format_position(query: LoggedQuery) -> str:
     if not query.position:
         return ""
     accuracy = "" if query.accuracy_m is None else f", accurate to {format_number(query.accuracy_m, 'm')}"
-    off = "" if query.off_m is None else f", {format_number(query.off_m, 'm')} from GPS"
-    return f"position {query.position[0]:.6f}, {query.position[1]:.6f}{accuracy}{off}"
+    distance = "" if query.off_m is None else f", {format_number(query.off_m, 'm')} from GPS"
+    return f"position {query.position[0]:.6f}, {query.position[1]:.6f}{accuracy}{distance}"
 
 
 def _read_lens(start: Mapping[str, Any]) -> "Lens | None":
-    """Return the lens of the flight's camera by the first line of its log; None if it is unknown."""
+    """Return the lens of the flight's camera from the first line of its log; None if it is unknown."""
     names = ("fov_deg", "up_deg", "mount_ahead_deg", "mount_right_deg")
     fov_deg, up_deg, ahead_deg, right_deg = (get_number(start, "config", "source", name) for name in names)
     if fov_deg is None or not 0 < fov_deg < 180:
         return None
-    from edgevpr.frames.level import Lens, Mount  # with OpenCV
+    from edgevpr.frames.level import Lens, Mount  # loads OpenCV
 
     return Lens(fov_deg, up_deg or 0.0, mount=Mount(ahead_deg or 0.0, right_deg or 0.0))
 
 
 def _compute_figures(flight: LoggedFlight) -> dict[str, str]:
-    """Return the figures of a flight, by their names."""
+    """Return the figures of a flight by name."""
     queries, accepted = flight.queries, [query for query in flight.queries if query.accepted]
     share = f" ({len(accepted) / len(queries):.0%})" if queries else ""
     off_m = [query.off_m for query in accepted if query.off_m is not None]
@@ -179,14 +176,14 @@ def _compute_figures(flight: LoggedFlight) -> dict[str, str]:
         "accepted": f"{len(accepted)}{share}",
         "accuracy, median": format_number(median(accuracies_m) if accuracies_m else None, "m"),
         "from GPS, median": format_number(median(off_m) if off_m else None, "m"),
-        "from GPS, most": format_number(max(off_m, default=None), "m"),
+        "from GPS, maximum": format_number(max(off_m, default=None), "m"),
         "frames not usable": str(flight.unusable) if flight.unusable else UNKNOWN,
         "longest without a match": format_number(max(after_s - t_s for t_s, after_s in pairwise(ends_s)), "s"),
         "fixes sent": f"{sum(outcomes[outcome] for outcome in SENT_OUTCOMES)}{between}",
-        "fixes taken": str(outcomes[FixOutcome.TAKEN]),
+        "fixes accepted": str(outcomes[FixOutcome.TAKEN]),
         "charge": format_number(_find_highest(flight, "totals", "used_mah"), "mAh"),
-        "RAM, most": format_number(_find_highest(flight, "costs", "rss_mb"), "MB"),
-        "hottest": format_number(_find_highest(flight, "board", "temperature_c"), "°C"),
+        "RAM, maximum": format_number(_find_highest(flight, "costs", "rss_mb"), "MB"),
+        "temperature, maximum": format_number(_find_highest(flight, "board", "temperature_c"), "°C"),
     }
 
 
@@ -201,11 +198,11 @@ def _list_warnings(flight: LoggedFlight, has_ground: bool, no_ground: str) -> li
     warnings = [
         (flight.start, "The log lacks the first line of this flight: its configuration is unknown."),
         (flight.end, "The log has no last line: it was cut off (power, full disk), or the flight is still running."),
-        (queries, "This flight had no query."),
-        (not queries or has_places, "No place has a position: there is no drawing, and no fix was sent."),
+        (queries, "This flight had no queries."),
+        (not queries or has_places, "No place has a position, so there is no drawing and no fix was sent."),
         (
             not queries or any(query.has_link for query in queries),
-            "The log has no report of the autopilot's position: its track and the distance from GPS are unknown.",
+            "The log has no autopilot position reports, so its track and the distance from GPS are unknown.",
         ),
         (not no_ground, no_ground),
     ]
@@ -233,7 +230,7 @@ def _make_charts(flight: LoggedFlight) -> list[Chart]:
             dots("from GPS", "gps", [query.off_m for query in queries]),
             dots("accuracy, 1 sigma", "accepted", [query.accuracy_m for query in queries]),
         ]),
-        Chart("A query", "ms", [
+        Chart("Time per query", "ms", [
             line("encode", "gps", 1e3, "costs", "t_encode_s"),
             line("match", "accepted", 1e3, "costs", "t_match_s"),
             line("CPU", "taken", 1e3, "costs", "cpu_s"),
@@ -246,7 +243,7 @@ def _make_charts(flight: LoggedFlight) -> list[Chart]:
 
 
 def _make_remarks(flight: LoggedFlight) -> list[Section]:
-    """Return the section of what was reported in flight, as far as there is any."""
+    """Return the section of messages reported in flight; none if there were no messages."""
     rows = [(format_duration(t_s), kind, sentence) for t_s, kind, sentence in flight.remarks[:_MAX_REMARKS]]
     left_out = len(flight.remarks) - len(rows)
     lines = [f"{left_out} more lines are in the log."] if left_out else []
@@ -254,7 +251,7 @@ def _make_remarks(flight: LoggedFlight) -> list[Section]:
 
 
 def _make_settings(flight: LoggedFlight) -> list[Section]:
-    """Return the section of the configuration, if the log has it."""
+    """Return the section with the configuration; none if the log has no configuration."""
     reason, config = get_text(flight.start, "decided", "reason"), get_value(flight.start, "config")
     if not isinstance(config, dict):
         return []

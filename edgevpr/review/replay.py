@@ -1,5 +1,5 @@
-"""Flies a recorded flight again, for `edgevpr replay`: the code of a flight, with clocks, frames and messages from the
-recording in place of the real ones."""
+"""Replays a recorded flight, for `edgevpr replay`: runs the flight code with clocks, frames and messages from the
+recording instead of the real ones."""
 
 import logging
 from collections.abc import Iterator
@@ -32,9 +32,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayResult:
-    """Result of a replay: the lines of the log of the flight, `flown`, and those of its replay, `lines`; the comparison
-    of the `packets` of both; `why_ended`, the reason why the replay ended before the flight did (None: it did not); and
-    `guessed`, the number of answers that were not on the tape where they were asked for (see `Playback`)."""
+    """Result of a replay. `flown`: lines of the flight's log. `lines`: lines of the replay's log. `packets`: comparison
+    of the packets of both. `why_ended`: why the replay ended before the flight (None: it did not). `guessed`: number of
+    inputs that were not on the tape where the code read them (see `Playback`)."""
 
     flown: list[Line]
     lines: list[Line]
@@ -44,34 +44,34 @@ class ReplayResult:
 
 
 def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
-    """Fly the last flight of `log` again. Its recording is in the folder that the log names, or in one of that name
-    beside the log. `place_map` is the path of its map (None: the path that it had). Raises UsageError if there is no
-    recording, and EdgevprError if it or the map cannot be opened."""
+    """Replay the last flight in `log`. Its recording is in the folder that the log names, or in a folder of the same
+    name next to the log. `place_map`: path of its map (None: its recorded path). Raises UsageError if there is no
+    recording, and EdgevprError if the recording or the map cannot be opened."""
     flown, folder = read_recorded(log)
     notes = read_tape(folder / TAPE)
     note = next(notes, None)
     if not (note and note[0] == "flight" and isinstance(note[1], dict)):
-        raise EdgevprError(f"{folder / TAPE} is no tape of a flight, or was cut in its first line: nothing to replay.")
+        raise EdgevprError(f"{folder / TAPE} is not a tape of a flight, or is truncated in its first line.")
     header = note[1]
     if header["config"].get("mavlink", {}).get("ground"):
         raise UsageError(
-            f"{folder} is of a flight with a second link (`mavlink.ground`), which this edgevpr does not have: "
-            f"replay it with edgevpr {header['version']}."
+            f"{folder} is from a flight with a second link (`mavlink.ground`), which this version of edgevpr does not "
+            f"have: replay it with edgevpr {header['version']}."
         )
     config = build(Config, _drop_unknown_settings(header["config"]), str(folder))
     place_map = place_map or config.map
     if place_map and not Path(place_map).exists():
-        raise UsageError(f"{place_map}, the map of the flight, is not there: give it with --map.")
+        raise UsageError(f"{place_map}, the map of the flight, does not exist: give its path with --map.")
     playback = Playback(notes)
     recorded = build(Board, header["board"], "the board of the flight")
     board = resolve_board(recorded, config.source, config.memory)
     why_ended = None
     with TemporaryDirectory(prefix="edgevpr-replay-") as temporary:
-        again_log = f"{temporary}/flight.jsonl" if config.log.path else None
+        replay_log = f"{temporary}/flight.jsonl" if config.log.path else None
         io = FlightIO(
             board=board,
             place_map=place_map,
-            log=replace(config.log, path=again_log, max_mb=None),
+            log=replace(config.log, path=replay_log, max_mb=None),
             clock=tape_clock(Clock(sleep=playback.sleep), playback),
             machine=tape_machine(Machine(board), playback),
             open_source=lambda step_s: ReplayedSource(playback, partial(_read_frame, folder)),
@@ -83,14 +83,14 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
             recording=header["recording"],
         )
         try:
-            with _silence_log(), closing(Flight.open(config, io)) as again:
-                again.run()
+            with _silence_log(), closing(Flight.open(config, io)) as flight:
+                flight.run()
         except TapeEnded as end:
             why_ended = str(end) or "the recording ends there"
         show_wait("")
         return ReplayResult(
             flown=flown,
-            lines=list(read_log(again_log)) if again_log else [],
+            lines=list(read_log(replay_log)) if replay_log else [],
             packets=playback.packets,
             why_ended=why_ended,
             guessed=playback.guessed,
@@ -99,8 +99,8 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
 
 @contextmanager
 def _silence_log() -> Iterator[None]:
-    """Context manager: of the messages of the replayed flight, which has printed them once, let errors through only;
-    all with --debug."""
+    """Context manager that suppresses the messages of the replayed flight, which were printed in the flight, except
+    errors; with --debug it suppresses none."""
     logging.disable(logging.NOTSET if _log.isEnabledFor(logging.DEBUG) else logging.WARNING)
     try:
         yield
@@ -109,7 +109,7 @@ def _silence_log() -> Iterator[None]:
 
 
 def _read_frame(folder: Path, number: int) -> Image:
-    """Read a recorded frame. Raises TapeEnded for one that cannot be read, for instance after a power cut."""
+    """Read a recorded frame. Raises TapeEnded if it cannot be read, for example after a power cut."""
     show_wait(f"replaying  {number}")
     try:
         return read_image(frame_path(folder, number))
@@ -118,7 +118,7 @@ def _read_frame(folder: Path, number: int) -> Image:
 
 
 def _drop_unknown_settings(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the settings of a recorded flight without those that this edgevpr no longer has, with a warning."""
+    """Return the settings of a recorded flight without those that this version no longer has, with a warning."""
     kept, known = {}, {key.name for key in list_keys()}
     for name, value in config.items():
         dotted = f"{prefix}{name}"
@@ -127,5 +127,5 @@ def _drop_unknown_settings(config: dict[str, Any], prefix: str = "") -> dict[str
         elif isinstance(value, dict):
             kept |= {name: section} if (section := _drop_unknown_settings(value, f"{dotted}.")) else {}
         elif value not in (None, False):
-            _log.warning("the flight had the setting `%s`, which this edgevpr does not know", dotted)
+            _log.warning("the flight had the setting `%s`, which this version of edgevpr does not recognise", dotted)
     return kept

@@ -1,7 +1,7 @@
-"""Plays back the tape of a recorded flight: the code's questions to the outside world (clock, frame, temperature) get
-the answers that they got in the flight, and its link receives what it received then. `replay` uses it.
+"""Plays back the tape of a recorded flight, for `replay`: the code's reads of the outside world (clock, frame,
+temperature) return the values that they returned in the flight, and its link receives what it received then.
 
-`runtime.flight.boundary` says what is on the tape."""
+`runtime.flight.boundary` defines what is on the tape."""
 
 import json
 import logging
@@ -29,25 +29,25 @@ from edgevpr.review.compare import PacketComparison
 from edgevpr.runtime.flight.boundary import LINK, SOURCE_STATE_DEFAULTS, Tape
 from edgevpr.runtime.flight.stop import StopNow
 
-Note = list[Any]  # a line of the tape: a kind, and its values
+Note = list[Any]  # a line of the tape: a kind and its values
 _CLOCKS = ("mono_s", "wall_s", "utc_s", "process_cpu_s", "thread_cpu_s")
 
 _log = logging.getLogger(__name__)
 
 
 class TapeEnded(BaseException):
-    """Raised where the tape has no more notes: the flight was killed, or its recording ended before it did."""
+    """Raised at the end of the tape: the flight was killed there, or its recording ended before the flight."""
 
 
 class ReplayedDriver:
-    """A driver without a port and a thread: the turns of the link come from the tape, a `Playback`."""
+    """A driver without a port or a thread: the turns of the link come from the tape, a `Playback`."""
 
     def __init__(self, playback: "Playback", _: LinkAddress, conversation: Conversation, turns: Turns) -> None:
         self._playback, self._conversation, self._turns = playback, conversation, turns
         self._leaving: deque[FixTransmission] = deque()
 
     def start(self) -> None:
-        """Let the playback perform the link's turns from now on."""
+        """From now on let the playback perform the link's turns."""
         self._playback.perform_turn = self._perform
 
     def state(self) -> PortState:
@@ -56,10 +56,10 @@ class ReplayedDriver:
         return connected, trouble, reopened
 
     def wake(self) -> None:
-        """Do nothing: what is sent when is on the tape."""
+        """Do nothing: the tape determines when packets are sent."""
 
     def close(self) -> None:
-        """Do nothing: all that closing does is on the tape."""
+        """Do nothing: everything that closing does is on the tape."""
 
     def _perform(self, t_s: float, steps: list[Note]) -> None:
         """Repeat the `steps` of a turn at the time `t_s`."""
@@ -79,29 +79,29 @@ class ReplayedDriver:
                     conversation.settings.signing.verdicts = verdicts
                 try:
                     conversation.handle(b64decode(data), now_s, tuple(sender) if sender else None)
-                except Exception:  # as in the flight, which then lost the link
+                except Exception:  # as in the flight, where the link was lost
                     _log.debug("the link failed", exc_info=True)
             case ["said", then]:
-                packet, sending = conversation.next_packet() or (None, None)
-                self._leaving += [sending] if sending else []
+                packet, transmission = conversation.next_packet() or (None, None)
+                self._leaving += [transmission] if transmission else []
                 self._playback.packets.compare(now_s, b64decode(then) if then else None, packet)
             case ["departed", count]:
                 departed = [self._leaving.popleft() for _ in range(min(count, len(self._leaving)))]
-                for sending in departed:
-                    sending.settle(True)
+                for transmission in departed:
+                    transmission.settle(True)
                 conversation.count_sent_fixes(departed)
-            case ["lost" | "closed" as what, *count]:
-                for sending in self._leaving:
-                    sending.settle(False, LOST)
+            case ["lost" | "closed" as event, *count]:
+                for transmission in self._leaving:
+                    transmission.settle(False, LOST)
                 self._leaving.clear()
-                conversation.break_off(*count) if what == "lost" else conversation.end()
+                conversation.break_off(*count) if event == "lost" else conversation.end()
             case _:
-                raise EdgevprError(f"The tape has a step of the link that this edgevpr does not know: {step}")
+                raise EdgevprError(f"The recording has a link event that this version of edgevpr does not know: {step}")
 
 
 class ReplayedSigning(Signing):
-    """Signing without the key: signs nothing, and admits the messages that the flight admitted. `verdicts` has, for
-    each of the next messages, why the flight refused it (None: it did not)."""
+    """Signing without the key: signs nothing, and accepts the messages that the flight accepted. `verdicts`: for each
+    of the next messages, why the flight refused it (None: it accepted it)."""
 
     def admits(self, message: Message) -> bool:
         """Return True if the flight accepted this message's signature."""
@@ -112,8 +112,8 @@ class ReplayedSigning(Signing):
 
 
 class ReplayedSource(Source):
-    """The source of a recorded flight: frames and attributes (see `Source`) come from its tape. `picture` returns the
-    picture stored under a number, uint8 (H, W, 3) BGR or (H, W) grey."""
+    """The source of a recorded flight: its frames and attributes (see `Source`) come from the tape. `picture` returns
+    the picture stored under a number, uint8 (H, W, 3) BGR or (H, W) grey."""
 
     def __init__(self, tape: Tape, picture: Callable[[int], Image]) -> None:
         self.is_live, self.total = tape.read("is_live", lambda: False), 0
@@ -126,42 +126,42 @@ class ReplayedSource(Source):
         return Condition[value] if name == "condition" else value
 
     def read(self, timeout_s: float) -> Frame | None:
-        known: Any = self._tape.read("frame", lambda: None)
-        if known is None:
+        fields: Any = self._tape.read("frame", lambda: None)
+        if fields is None:
             return None
-        self.step_s = known.pop("step_s", None)
-        if problem := known.get("problem"):
+        self.step_s = fields.pop("step_s", None)
+        if problem := fields.get("problem"):
             raise ImageError(problem)
-        number, position = known.pop("number"), known.pop("position")
-        return Frame(image=self._picture(number), position=position and Position(**position), **known)
+        number, position = fields.pop("number"), fields.pop("position")
+        return Frame(image=self._picture(number), position=position and Position(**position), **fields)
 
 
 class Playback(Tape):
-    """A tape that is played back. `perform_turn` performs a turn of the link, given its time and steps (None: the link
-    has not started); turns are performed in the order of the tape. `packets` compares the packets sent with those of
-    the flight.
+    """Plays back a tape. `perform_turn` performs a turn of the link, given its time and steps (None: the link has not
+    started); turns are performed in the order of the tape. `packets` compares the packets sent with those of the
+    flight.
 
-    Code that has changed since the flight may ask more, less, or in another order. A question without an answer before
-    the tape's next frame then gets the newest answer of its kind, so code and tape stay together. `guessed` counts the
-    questions out of order; if it is 0, the replay has asked exactly what the flight asked.
+    Code that has changed since the flight may read more, less, or in another order. A read that has no value on the
+    tape before the next frame returns the newest value of its kind, which keeps code and tape synchronised. `guessed`
+    counts the reads out of order; if it is 0, the replay read exactly what the flight read.
     """
 
     def __init__(self, notes: Iterable[Note]) -> None:
         self.perform_turn: Callable[[float, list[Note]], None] | None = None
         self.packets = PacketComparison()
         self.guessed = 0
-        self.t_s = 0.0  # of the newest turn or look at the clock
+        self.t_s = 0.0  # time of the newest turn or clock reading
         self._notes, self._at = list(notes), 0
         self._known: dict[str, Any] = {}
         self._is_stopping = False
 
     def read(self, kind: str, look: Callable[[], Any]) -> Any:
-        """Return the flight's answer to a question of `kind`. `look` asks the real machine: it is called only if the
-        tape has no answer. Raises StopNow where the flight was stopped, and TapeEnded."""
+        """Return the value of `kind` that the flight read here. `look` reads the real machine; it is called only if the
+        tape has no value. Raises StopNow where the flight was stopped, and TapeEnded."""
         if self._peek_kind() == "stopped":
             self._at += 1
             self._is_stopping = True
-        # A flight that was stopped may have asked more while it cleaned up: such a question is answered first.
+        # A flight that was stopped may have read more values while cleaning up: these are returned first.
         if self._is_stopping and self._peek_kind() != kind:
             self._is_stopping = False
             raise StopNow
@@ -175,16 +175,16 @@ class Playback(Tape):
         self._at += 1
         if head == "stopped":
             raise StopNow
-        found = self._known[kind] = values[0]
+        value = self._known[kind] = values[0]
         if _is_time(kind):
-            self.t_s = max(self.t_s, found)
-        return found
+            self.t_s = max(self.t_s, value)
+        return value
 
     def sleep(self, seconds: float) -> None:
-        """Return at once: the time comes from the tape."""
+        """Return immediately: the time comes from the tape."""
 
     def _peek_kind(self) -> str:
-        """Perform the link's turns that come next on the tape, and return the kind of the answer after them. Raises
+        """Perform the link's turns that are next on the tape, and return the kind of the note after them. Raises
         TapeEnded."""
         while note := self._peek_note():
             if note[0] != LINK or self.perform_turn is None:
@@ -198,8 +198,8 @@ class Playback(Tape):
         return self._notes[self._at] if self._at < len(self._notes) else None
 
     def _has_answer(self, kind: str) -> bool:
-        """Return True if an answer of `kind`, or the end of the flight, comes before the next frame. For a clock return
-        False, since no answers are skipped to read one."""
+        """Return True if a value of `kind`, or the end of the flight, comes before the next frame. Return False for a
+        clock, because no notes are skipped to read one."""
         until = (kind, "stopped", "frame")
         first = next((note[0] for note in islice(self._notes, self._at, None) if note[0] in until), None)
         return first in (kind, "stopped") and kind not in _CLOCKS
@@ -215,12 +215,12 @@ class Playback(Tape):
 
 
 def _is_time(kind: str) -> bool:
-    """Tell whether answers of `kind` are times on the flight's monotonic clock."""
+    """Return True if values of `kind` are times on the flight's monotonic clock."""
     return kind == "mono_s" or kind.startswith("turn: ")
 
 
 def read_tape(path: Path) -> Iterator[Note]:
-    """Yield the notes of a tape file, up to a line that was cut off. Raises OSError if it cannot be read."""
+    """Yield the notes of a tape file, up to a truncated line. Raises OSError if the file cannot be read."""
     with open(path, "rb") as file:
         for line in file:
             try:

@@ -1,5 +1,5 @@
-"""Makes a page of a flight, of matches or of a map: one HTML file that needs no network. Python gives the content as
-data; `page.js` draws and moves it. All texts reach the page as text, never as HTML."""
+"""Makes the page of a flight or a map: one HTML file that needs no network. Python supplies the content as data;
+`page.js` draws it and makes it interactive. All texts reach the page as text, never as HTML."""
 
 import base64
 import hashlib
@@ -27,33 +27,33 @@ Form = Literal["dots", "line", "area"]
 
 UNKNOWN = "–"
 MAX_PAGE_BYTES = 15_000_000
-_MAX_TEXT_BYTES = 3_000_000  # of the texts of all steps
-_SPARE_BYTES = 400_000  # for style, script and the frame of the page
-_MAX_PLACES = 6000  # drawn; of more, every second, third, ... is drawn
-_MARGIN_M = 30.0  # around what is drawn, where no place knows how much ground its picture shows
+_MAX_TEXT_BYTES = 3_000_000  # texts of all steps together
+_SPARE_BYTES = 400_000  # for style, script and the HTML around them
+_MAX_PLACES = 6000  # of more places, every second, third, ... is drawn
+_MARGIN_M = 30.0  # margin around the drawing if no footprint is known
 
 _NO_PICTURE = (
-    "No image of --map-images is drawn on the ground: none is of this map, or their headings contradict it. Give the "
-    "images that the map was built from, with their positions.csv, and the lens of the build."
+    "No image from --map-images is drawn on the ground: none belongs to this map, or their headings contradict it. "
+    "Give the images that the map was built from, with their positions.csv, and the lens used in the build."
 )
 _NO_IMAGES = "With --map-images the page shows the map's own pictures under the drawing."
 
-# Content security policy: the browser loads nothing from anywhere and runs no script but the page's own, even if a file
+# Content security policy: the browser loads nothing from anywhere and runs only the page's own script, even if a file
 # name in the page contains HTML.
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src 'sha256-{}'"
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">
 <meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="light dark">
 <link rel="icon" href="data:,"><title>edgevpr</title><style>{style}</style></head>
-<body><noscript>This page is drawn by its own script: allow scripts.</noscript>
+<body><noscript>This page is drawn by its own script: allow scripts to see it.</noscript>
 <script type="application/json" id="page">{data}</script><script>{script}</script></body></html>
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """Layer of the drawing, which the reader can hide: its name, the CSS class that colours it, and its `ways`, each a
-    sequence of positions, drawn in a `form`: dots, a line, or an area."""
+    """A layer of the drawing, which the reader can hide. `colour`: CSS class that sets its colour. `ways`: sequences of
+    positions, each drawn in a `form`: dots, a line or an area."""
 
     name: str
     colour: str
@@ -63,10 +63,10 @@ class Layer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
-    """One step, a query of a flight or a place of a map: its `title`, sentences about it (`texts`), and the reasons and
-    outcomes (`groups`) by which the reader chooses steps, with the colour of each. `points`: positions by the colour
-    of their layer. `circle_m`: radius around the last of them. `place`: the place whose ground is outlined. `pictures`:
-    (which album, name, caption) of each. `t_s`: its time (None: it has none)."""
+    """One step: a query of a flight or a place of a map. `texts`: sentences about it. `groups`: the reasons and
+    outcomes by which the reader can filter steps, with the colour of each. `points`: positions by the colour of their
+    layer. `circle_m`: radius of a circle around the last point. `place`: the place whose ground is outlined.
+    `pictures`: album, name and caption of each picture. `t_s`: its time (None: it has none)."""
 
     title: str
     texts: Sequence[str]
@@ -80,8 +80,8 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """A chart over time of values in `unit` ("": shares, up to 1). Each of `series` is the name in its legend, the
-    colour, and the points (t_s, value); those of a form "dots" are not joined."""
+    """A chart over time of values in `unit` ("": shares, up to 1). `series`: for each, the name in the legend, the
+    colour, the form ("dots" are not joined) and the points (t_s, value)."""
 
     title: str
     unit: str
@@ -90,7 +90,7 @@ class Chart:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A section of texts: `lines`, a table of `rows`, and a long text, `folded` away ("": none)."""
+    """A section of text: `lines`, a table of `rows`, and a long text, `folded` by default ("": none)."""
 
     title: str
     lines: Sequence[str] = ()
@@ -99,8 +99,8 @@ class Section:
 
 
 def read_ground(path: str | Path) -> list[Place]:
-    """Read the places of the map file `path` that have a position. Raises EdgevprError for a map that cannot be read,
-    or is damaged."""
+    """Read the places with a position from the map file `path`. Raises EdgevprError for a map that is unreadable or
+    damaged."""
     with PlaceMap.open(path) as place_map:
         return [place for place in place_map.read_places() if place.position]
 
@@ -112,7 +112,7 @@ def to_point(place: Place) -> Point:
 
 
 def make_layer(steps: Sequence[Step], name: str, colour: str, form: Form = "dots") -> Layer:
-    """Return the layer of the positions that steps have under `colour`: a line ends where a step has none."""
+    """Return the layer of the steps' points of this `colour`; a line is interrupted at a step that has none."""
     runs = groupby((step.points.get(colour) for step in steps), bool)
     return Layer(name, colour, [[point for point in run if point] for is_known, run in runs if is_known], form)
 
@@ -129,10 +129,10 @@ def make_page(
     charts: Sequence[Chart] = (),
     sections: Sequence[Section] = (),
 ) -> str:
-    """Return a whole page of at most `MAX_PAGE_BYTES`. `head` has its title, texts below it (`known`), `figures` by
-    name, `warnings` and `span_s`, the length of the time axis (None: steps have no times). `ground` are the places
-    drawn below the `layers`. `albums` are those of the pictures, by the names that steps give them; "place" is that of
-    the map, `lens` that of its camera (None: unknown). `notes` are sentences below the ground."""
+    """Return a whole page of at most `MAX_PAGE_BYTES`. `head`: its title, texts below it (`known`), `figures` by name,
+    `warnings`, and the length of the time axis `span_s` (None: steps have no times). `ground`: places drawn below the
+    `layers`. `albums`: albums by the names that steps use; "place" is the map's. `lens`: lens of the map's camera
+    (None: unknown). `notes`: sentences below the drawing."""
     notes, rest = list(notes), {**head, "charts": list(map(asdict, charts)), "sections": list(map(asdict, sections))}
     rest["figures"] = [(name, text) for name, text in head["figures"].items() if text != UNKNOWN]
     drawing = _Drawing(ground, layers, steps)
@@ -148,8 +148,8 @@ def make_page(
     keys = [[picture[:2] for picture in step.pictures] for step in steps]
     keys += [[("ground", place.source_image)] for place in shown if place.pose]
     levelled = _make_ground_album(albums["place"], shown, lens)
-    room_bytes = MAX_PAGE_BYTES - _SPARE_BYTES - len(_dump([rest, rows, drawing.layers]))
-    pictures, left_out = embed_pictures(keys, {**albums, "ground": levelled}, room_bytes)
+    budget_bytes = MAX_PAGE_BYTES - _SPARE_BYTES - len(_dump([rest, rows, drawing.layers]))
+    pictures, left_out = embed_pictures(keys, {**albums, "ground": levelled}, budget_bytes)
     notes += [left_out] if left_out else []
     if any(place.pose for place in shown) and not any(album == "ground" for album, _ in pictures):
         notes.append(_NO_PICTURE if albums["place"] else _NO_IMAGES)
@@ -171,8 +171,8 @@ def make_page(
 
 
 class _Drawing:
-    """Converts positions into points of the drawing: metres to the right of and below the first one, with north up.
-    `box` is (left, top, width, height) of all that is drawn; None: nothing has a position."""
+    """Converts positions to points of the drawing: metres right of and below the first position, with north up. `box`:
+    bounding box (left, top, width, height) of the drawing; None: nothing has a position."""
 
     def __init__(self, ground: Sequence[Place], layers: Sequence[Layer], steps: Sequence[Step]) -> None:
         layers = [layer for layer in layers if any(layer.ways)]
@@ -196,15 +196,15 @@ class _Drawing:
         return round(float(east_m), 2), round(-float(north_m), 2)
 
     def square(self, place: Place) -> tuple[float, ...] | None:
-        """Return middle (x, y), side and direction of the square of ground in which a place's picture lies, whose
-        longest side is that of the square; None if that is unknown."""
+        """Return the centre (x, y), side and direction of the smallest square of ground that contains a place's
+        picture; None if they are unknown."""
         if not (place.pose and place.position):
             return None
         return *self.convert(to_point(place)), round(place.pose.footprint_m, 2), round(place.pose.up_deg, 1)
 
 
 def _serialise_step(step: Step, drawing: _Drawing, numbers: Mapping[str, int]) -> dict[str, Any]:
-    """Return a step as the script reads it, without its pictures. `numbers` are those of the groups."""
+    """Return a step as the script reads it, without its pictures. `numbers`: numbers of the groups by name."""
     return {
         "title": step.title,
         "texts": [sentence for sentence in step.texts if sentence],
@@ -217,7 +217,7 @@ def _serialise_step(step: Step, drawing: _Drawing, numbers: Mapping[str, int]) -
 
 
 def _make_ground_album(album: Album, places: Sequence[Place], lens: "Lens | None") -> Album:
-    """Return the album of the map's pictures as its poses lay them on the ground, transparent where they show none."""
+    """Return the album of the map's pictures aligned with its poses, transparent where they show no ground."""
     by_name = {place.source_image: place for place in places if place.pose}
 
     def find(name: str) -> AlbumPicture | None:
@@ -231,7 +231,7 @@ def _make_ground_album(album: Album, places: Sequence[Place], lens: "Lens | None
 
 
 def _dump(value: Any) -> str:
-    """Return `value` as JSON that no text in it can end, without passwords and control characters."""
+    """Return `value` as JSON without passwords and control characters; no text in it can close the script element."""
     return json.dumps(_clean(value), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
@@ -244,15 +244,15 @@ def _clean(value: Any) -> Any:
 
 
 def _render(data: Mapping[str, Any]) -> str:
-    here = Path(__file__)
-    script = here.with_name("page.js").read_text("utf-8")
+    module = Path(__file__)
+    script = module.with_name("page.js").read_text("utf-8")
     sha256 = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    style = here.with_name("page.css").read_text("utf-8")
+    style = module.with_name("page.css").read_text("utf-8")
     return _PAGE.format(policy=_POLICY.format(sha256), style=style, data=_dump(data), script=script)
 
 
 def format_number(value: float | None, unit: str = "") -> str:
-    """Return a number, with three significant digits, and its unit as text; a dash for None."""
+    """Format a number with three significant digits and its unit; a dash for None."""
     if value is None:
         return UNKNOWN
     digits = f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
@@ -260,7 +260,7 @@ def format_number(value: float | None, unit: str = "") -> str:
 
 
 def format_duration(t_s: float) -> str:
-    """Return a time in seconds as text: minutes and seconds (2:03), from an hour on with the hours (1:02:03)."""
+    """Format a time in seconds as minutes and seconds (2:03), from one hour with hours (1:02:03)."""
     minutes, seconds = divmod(round(t_s), 60)
     hours = f"{minutes // 60}:{minutes % 60:02d}" if minutes >= 60 else str(minutes)
     return f"{hours}:{seconds:02d}"

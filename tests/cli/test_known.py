@@ -64,8 +64,8 @@ def test_match_reports_what_has_narrowed_each_query(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("known", "places_known", "more", "said"),
     [
-        ("heading", True, (), "`heading` needs yaw_deg, which no query has"),
-        ("height,reach", False, (), "`reach` needs lat and lon, which no place has"),
+        ("heading", True, (), "`heading` needs yaw_deg, but no query has it"),
+        ("height,reach", False, (), "`reach` needs lat and lon, but no place has it"),
         ("height,speed", True, (), "`known` names `speed`: use some of heading, height, reach"),
         ("height", True, ("--sequence", "2"), "2 queries are matched together"),
     ],

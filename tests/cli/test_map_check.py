@@ -48,7 +48,7 @@ def test_map_repair_leaves_a_whole_map_alone(valley, capsys):
     before = valley.read_bytes()
     assert main(["map", "check", str(valley)]) == 0
     said = capsys.readouterr()
-    assert said.out.splitlines()[1:] == ["  SQLite      the file is sound"]
+    assert said.out.splitlines()[1:] == ["  SQLite      the file is intact"]
     assert "checking  6/6  100 %" in said.err
     assert main(["map", "repair", str(valley)]) == 0
     assert "no damage" in capsys.readouterr().out
@@ -70,7 +70,7 @@ def test_map_repair_drops_what_is_damaged_and_keeps_the_original(valley, capsys)
     assert main(["map", "repair", str(valley)]) == 0
     original = valley.with_name("valley.gpkg.damaged")
     said = capsys.readouterr()
-    assert f"2 dropped; the original is {original}" in said.out
+    assert f"2 removed; the original is now {original}" in said.out
     assert "copying  6/6  100 %" in said.err
     assert original.read_bytes() == before
     with PlaceMap.open(original) as damaged, PlaceMap.open(valley) as repaired:

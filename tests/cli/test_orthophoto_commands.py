@@ -62,7 +62,7 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
     ("flags", "code", "said"),
     [
         ([], 2, "Give either --images (pictures of a flight) or --orthophoto"),
-        (["--images", "x", "--footprint-m", "80"], 2, "--footprint-m goes with --orthophoto: leave it out."),
+        (["--images", "x", "--footprint-m", "80"], 2, "--footprint-m applies only to --orthophoto: leave it out."),
         (["--orthophoto", "GROUND"], 2, "needs --footprint-m"),
         (
             ["--orthophoto", "GROUND", "--footprint-m", "80", "--spacing-m", "20", "--camera", "forward"],
@@ -81,10 +81,10 @@ def test_map_build_refuses_a_wrong_request(tmp_path, ground, capsys, flags, code
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--track", "t"], "--track goes with --orthophoto"),
-        (["--orthophoto", "GROUND"], "needs its --track"),
+        (["--track", "t"], "--track applies only to --orthophoto"),
+        (["--orthophoto", "GROUND"], "needs --track"),
         (["--orthophoto", "GROUND", "--track", "TRACK"], "give --height-m"),
-        (["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "900"], "none was taken"),
+        (["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "900"], "none was written"),
     ],
 )
 def test_simulate_flight_refuses_a_wrong_request(tmp_path, ground, track, capsys, flags, said):

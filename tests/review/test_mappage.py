@@ -69,7 +69,7 @@ def test_map_page_shows_places_and_their_problems(browser, mapped):
 @pytest.mark.slow
 def test_map_page_is_never_written_over_the_map(mapped, capsys):
     before = (mapped / "valley.gpkg").read_bytes()
-    assert "another name" in refused(capsys, "map", "info", mapped / "valley.gpkg", "--page", mapped / "valley.gpkg")
+    assert "another output" in refused(capsys, "map", "info", mapped / "valley.gpkg", "--page", mapped / "valley.gpkg")
     assert (mapped / "valley.gpkg").read_bytes() == before
 
 

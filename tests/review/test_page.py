@@ -39,7 +39,7 @@ def test_make_flight_page_of_a_real_flight_has_all_parts(made):
     assert "longest without a match" in dict(data["figures"])
     assert {"places", "accepted", "taken", "autopilot", "gps"} <= {each["colour"] for each in data["ground"]["layers"]}
     drawn = [chart["title"] for chart in data["charts"] if any(points for *_, points in chart["series"])]
-    assert drawn[:5] == ["Confidence", "Position", "A query", "RAM", "Charge"]
+    assert drawn[:5] == ["Confidence", "Position", "Time per query", "RAM", "Charge"]
     assert [count for name, _, count in data["groups"] if name == "match over 15 m from GPS"] == [8]
     assert data["warnings"] == [], "nothing is missing"
 
@@ -100,11 +100,11 @@ def test_report_makes_a_page_without_the_map(flown, tmp_path):
 @pytest.mark.parametrize(
     ("argv", "code", "said"),
     [
-        (["LOG", "--out", "LOG"], 2, "give another name"),
+        (["LOG", "--out", "LOG"], 2, "give another output file"),
         (["LOG", "--out", "no/such/out.html"], 2, "its folder does not exist: create it first"),
         (["gone", "--out", "out.html"], 2, "there is no such flight log"),
         (["LOG", "--out", "out.html", "--map", "gone.gpkg"], 1, "There is no map"),
-        (["LOG", "--out", "out.html", "--images", "gone"], 2, "there is no such folder"),
+        (["LOG", "--out", "out.html", "--images", "gone"], 2, "does not exist: give a folder"),
         (["empty", "--out", "out.html"], 1, "holds no line of a flight log"),
     ],
 )

@@ -48,7 +48,7 @@ def test_positions_places_pictures_by_their_names(capsys, folder, tmp_path):
     tags = read_positions(folder / "positions.csv")
     assert tags["IMG_3.JPG"].position.lat_deg == pytest.approx(50.4)
     assert tags["IMG_3.JPG"].t_utc_s == START_S + 7, "what the table does not say is taken from the picture"
-    assert "exists already" in refused(capsys, "positions", tmp_path / "table.csv", "--images", folder)
+    assert "already exists" in refused(capsys, "positions", tmp_path / "table.csv", "--images", folder)
 
 
 def test_positions_places_triggered_pictures_in_order(capsys, folder, tmp_path):

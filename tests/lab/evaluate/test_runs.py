@@ -33,7 +33,7 @@ def test_eval_fails_only_the_rows_of_a_set_with_a_broken_picture(tmp_path, capsy
     (broken / "ref" / "r1.png").write_bytes(b"")
     assert run("eval", "--data", broken, make_set(tmp_path / "meadow"), *HOG, "--json") == 1
     said = capsys.readouterr()
-    assert "broken, hog" in said.err
+    assert "hog was not measured on broken" in said.err
     content = json.loads(said.out)
     assert [row["set"] for row in content["results"]] == ["meadow"]
     assert [row["set"] for row in content["failed"]] == ["broken"]
@@ -44,11 +44,11 @@ def test_eval_fails_only_the_rows_of_a_set_with_a_broken_picture(tmp_path, capsy
     ("argv", "said"),
     [
         ([], "--data"),
-        (["--data", "SET", "--ground-truth", "truth.csv"], "--ground-truth goes with"),
+        (["--data", "SET", "--ground-truth", "truth.csv"], "--ground-truth applies only to"),
         (["--data", "gone"], "gone"),
         (["--data", "SET", "--techniques", "cohogg"], "cohogg"),
         (["--data", "SET", "--form", "2bit"], "2bit"),
-        (["--data", "SET", "--param", "calc.model=x"], "with a technique of --techniques"),
+        (["--data", "SET", "--param", "calc.model=x"], "with a technique from --techniques"),
     ],
 )
 def test_eval_refuses_a_wrong_request_in_one_sentence(tmp_path, monkeypatch, capsys, argv, said):
