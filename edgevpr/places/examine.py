@@ -170,8 +170,8 @@ def check_map(path: str | Path, progress: Progress = iterate_silently) -> MapChe
 def repair_map(path: str | Path, progress: Progress = iterate_silently) -> Path:
     """Replace the map by a copy of its usable places, which keep their ids and get checksums; keep the original as
     `*.damaged` and return its path. Mask hash and calibration are copied if they can be read. Raises MapError, and
-    leaves the map as it is, if no place can be read, if the original of an earlier repair exists, or if the copy cannot
-    be written."""
+    leaves the map unchanged, if no place can be read, if the original of an earlier repair exists, or if the copy
+    cannot be written."""
     path = mapfiles.require_map_file(path)
     original = path.with_name(path.name + ".damaged")
     if original.exists():

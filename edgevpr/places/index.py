@@ -56,7 +56,7 @@ class PlaceIndex:
         return sum(array.nbytes for array in self.arrays.values())
 
     @property
-    def knows_headings(self) -> bool:
+    def has_headings(self) -> bool:
         """True if at least one place has a heading."""
         return not np.isnan(self.heading_deg).all()
 
@@ -158,8 +158,8 @@ def _fill_index(index: PlaceIndex, parts: Iterator[CoarsePart], technique: Techn
 def _filter_parts(parts: Iterator[CoarsePart], ascending: Ints) -> Iterator[CoarsePart]:
     """Yield the parts of the places whose ids are in `ascending`."""
     for part in parts:
-        number = int(np.searchsorted(ascending, part[0]))
-        if number < len(ascending) and ascending[number] == part[0]:
+        nearest = int(np.searchsorted(ascending, part[0]))
+        if nearest < len(ascending) and ascending[nearest] == part[0]:
             yield part
 
 
@@ -201,10 +201,10 @@ def choose_places(lat_deg: Floats, lon_deg: Floats, quality: Floats, capacity: i
         block = int(block_minima.argmin())
         place = block * _BLOCK_PLACES + int(blocks[block].argmin())
         kept[place], values[place] = False, np.inf
-        ends = int(before[place]), int(after[place])
-        after[ends[0]], before[ends[1]] = ends[1], ends[0]
-        for end in ends:
-            values[end] = rate_place(int(before[end]), end, int(after[end]))
-        for changed in {block, *(end // _BLOCK_PLACES for end in ends)}:
+        neighbours = int(before[place]), int(after[place])
+        after[neighbours[0]], before[neighbours[1]] = neighbours[1], neighbours[0]
+        for neighbour in neighbours:
+            values[neighbour] = rate_place(int(before[neighbour]), neighbour, int(after[neighbour]))
+        for changed in {block, *(neighbour // _BLOCK_PLACES for neighbour in neighbours)}:
             block_minima[changed] = blocks[changed].min()
     return np.flatnonzero(kept)[:capacity]

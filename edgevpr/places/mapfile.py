@@ -136,7 +136,7 @@ class PlaceMap(MapConnection):
         self._record_text(mapspec.CALIBRATION, text)
 
     def read_places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
-        """Yield the places with `place_ids` in the order given (None: all places, in the order they were added). Raises
+        """Yield the places with `place_ids` in this order (None: all places, in the order they were added). Raises
         PlaceError for a place that is missing or damaged."""
         for place_id in [place_id for place_id, _ in self.scan_rows("1")] if place_ids is None else map(int, place_ids):
             with self._convert_row_errors(place_id):

@@ -1,5 +1,5 @@
-"""Paths of map files and of the files that SQLite keeps beside them; the lock of the program that adds places; opening
-and closing with SQLite, and the translation of its errors into sentences for the user."""
+"""Paths of map files and of SQLite's files next to them; the lock of the program that adds places; opening and closing
+with SQLite, and the translation of its errors into messages for the user."""
 
 import fcntl
 import os
@@ -28,7 +28,7 @@ _ADVICE = {
 
 
 def list_sqlite_files(path: Path) -> list[Path]:
-    """Return the paths of the files that SQLite may keep beside a map file, whether they exist or not."""
+    """Return the paths of the files that SQLite may keep next to a map file, whether they exist or not."""
     return [path.with_name(path.name + end) for end in _SQLITE_SUFFIXES]
 
 
@@ -53,7 +53,7 @@ def require_map_file(name: str | Path) -> Path:
 
 
 def require_regular(path: Path) -> None:
-    """Raise MapError if the map, or a file of SQLite beside it, exists but is not a regular file: a folder, or a pipe,
+    """Raise MapError if the map, or a file of SQLite next to it, exists but is not a regular file: a folder, or a pipe,
     from which a program would read for ever."""
     if path.is_dir():
         raise MapError(
@@ -102,7 +102,7 @@ def write_atomically(out: Path) -> Iterator[Path]:
 
 
 def remove_map(path: Path) -> None:
-    """Delete a map file, if it exists, and the files that SQLite keeps beside it."""
+    """Delete a map file, if it exists, and the files that SQLite keeps next to it."""
     for file in (path, *list_sqlite_files(path)):
         file.unlink(missing_ok=True)
 

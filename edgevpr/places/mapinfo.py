@@ -1,4 +1,4 @@
-"""Queries about a whole map that read no descriptors: its summary and its identity."""
+"""Summary and identity of a map, from queries that read no descriptors."""
 
 import hashlib
 import math
@@ -127,8 +127,8 @@ def _find_one_way_deg(place_map: PlaceMap) -> float | None:
 def read_identity(place_map: PlaceMap) -> MapIdentity:
     """Return the identity of an open map as it is now. Raises MapError if it cannot be read.
 
-    Hashing the whole file at every start would take seconds on a small board. The checksums of the descriptors stand
-    before them in the file, so they are read quickly, and change whenever a descriptor changes.
+    Hashing the whole file at every start would take seconds on a small board. The checksums of the descriptors precede
+    them in the file, so they are read quickly, and change whenever a descriptor changes.
     """
     digest, places = hashlib.sha256(), 0
     with translate_errors(place_map.path):

@@ -42,8 +42,8 @@ def write_spec(db: sqlite3.Connection, spec: TechniqueSpec) -> None:
         "model_sha256": spec.model_sha256,
         **{part: getattr(spec, part) and asdict(getattr(spec, part)) for part in _PARTS},
     }
-    rows = [(key, json.dumps(value)) for key, value in values.items()]
-    db.executemany("INSERT INTO edgevpr_map (key, value) VALUES (?, ?)", rows)
+    entries = [(key, json.dumps(value)) for key, value in values.items()]
+    db.executemany("INSERT INTO edgevpr_map (key, value) VALUES (?, ?)", entries)
 
 
 def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
@@ -56,8 +56,8 @@ def read_stored(path: Path, db: sqlite3.Connection) -> Stored:
         raise MapError(f"{path}: this is not a place map: give a .gpkg file made by `edgevpr map build`.")
     try:
         # The optional keys are read only when they are needed: a map can be used without them.
-        rows = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?, ?)", OPTIONAL_KEYS)
-        stored = {key: json.loads(value) for key, value in rows.fetchmany(_MAX_STORED)}
+        entries = db.execute("SELECT key, value FROM edgevpr_map WHERE key NOT IN (?, ?, ?, ?)", OPTIONAL_KEYS)
+        stored = {key: json.loads(value) for key, value in entries.fetchmany(_MAX_STORED)}
         version = stored["format_version"]
         if not isinstance(version, int) or version < 1:
             raise ValueError(f"format version {version}")
@@ -86,13 +86,13 @@ def read_spec(path: Path, stored: Stored) -> TechniqueSpec:
     return TechniqueSpec(name=name, parameters=parameters, coarse=coarse, fine=fine, model_sha256=model, packed=packed)
 
 
-def list_differences(theirs: TechniqueSpec, ours: TechniqueSpec) -> list[str]:
-    """Return one phrase for each difference between the technique of a map and ours; empty if they are equal."""
-    if theirs.name != ours.name:
-        return [f"technique is {theirs.name}, not {ours.name}"]
+def list_differences(stored: TechniqueSpec, current: TechniqueSpec) -> list[str]:
+    """Return one phrase for each difference between the `stored` and the `current` technique; empty if equal."""
+    if stored.name != current.name:
+        return [f"technique is {stored.name}, not {current.name}"]
     old, new = (
         {**spec.parameters, "model sha256": spec.model_sha256, "coarse part": spec.coarse, "fine part": spec.fine}
-        for spec in (theirs, ours)
+        for spec in (stored, current)
     )
     return [f"{name} is {old.get(name)}, not {new.get(name)}" for name in old | new if old.get(name) != new.get(name)]
 

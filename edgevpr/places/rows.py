@@ -54,7 +54,7 @@ Content = Mapping[str, Any]  # such values by column name
 
 
 class RowError(ValueError):
-    """Raised if a value of a row is missing or invalid; the message says which, in a few words."""
+    """Raised if a value of a row is missing or invalid; the message describes the problem in a few words."""
 
 
 def read_columns(columns: str, row: Values | None) -> Content:

@@ -17,11 +17,11 @@ from edgevpr.places.index import PlaceIndex
 from edgevpr.places.ranking import Ranking
 
 FOLLOWED_SPEEDS = np.linspace(0.8, 1.2, 5)  # places per query, as in the paper
-_SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places per query; ten queries can tell steps of 0.25 apart
+_SPEEDS = np.arange(-2.5, 3.01, 0.25)  # places per query; ten queries can distinguish steps of 0.25
 _OTHER_SPEEDS = _SPEEDS[(FOLLOWED_SPEEDS[0] > _SPEEDS) | (FOLLOWED_SPEEDS[-1] < _SPEEDS)]
 # After 5 s at 10 m/s the vehicle has left the 50 m neighbourhood, and no trajectory covers the places in between.
 _MAX_PAUSE_S = 5.0
-_MAX_PAUSE_INTERVALS = 3  # a slow board may take longer for each query, e.g. 6 s
+_MAX_PAUSE_INTERVALS = 3  # a slow board may need longer for each query, such as 6 s
 _MIN_QUERIES_TOGETHER = 3
 _MIN_QUERIES_ALONE = 2
 _MAX_BETTER_SHARE = 0.1
@@ -104,7 +104,7 @@ class SequenceSearch:
         return True
 
     def _is_broken(self, t_mono_s: float) -> bool:
-        """Return True if this query cannot continue the sequence, because of a long pause."""
+        """Return True if this query cannot continue the sequence because the pause was too long."""
         last_s, last_interval_s = self._t_last_s, self._interval_s
         self._t_last_s = t_mono_s
         if last_s is None:

@@ -32,7 +32,7 @@ _FACTORIES = {
 # and weights that the user has chosen. Nor is `seqslam`: a sequence needs a flight along the mapped route.
 DEFAULT_TECHNIQUES = ("cohog", "hog")
 CONFIDENCE_TECHNIQUE = "cohog"  # the only technique whose matches have a confidence
-_TYPE_NAMES = {int: "a whole number", float: "a number", str: "a word"}
+_TYPE_NAMES = {int: "an integer", float: "a number", str: "text"}
 
 
 def list_techniques() -> tuple[str, ...]:

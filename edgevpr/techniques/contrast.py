@@ -2,7 +2,7 @@
 
 Dim ground has as little entropy as a blank wall. Such a picture is smoothed, since stretching amplifies sensor noise,
 and then *stretched* to more grey levels. A picture with enough contrast, or almost none, is left unchanged: noise must
-not look like ground. Results are rounded equally on every processor (see `gradients`): means of whole grey levels are
+not look like ground. Results are rounded equally on every processor (see `gradients`): means of integer grey levels are
 exact, and products and sums are computed one by one."""
 
 import math
@@ -65,18 +65,18 @@ def _find_range(grey: Singles, allowed: Mask | None) -> tuple[float, float]:
         means = means[_average_blocks(allowed.view(np.uint8)) > 0.999]
     if not means.size:
         return 0.0, 0.0
-    outside = int(_CLIPPED_SHARE * means.size)
+    clipped = int(_CLIPPED_SHARE * means.size)
     ordered = np.sort(means, axis=None)
-    return float(ordered[outside]), float(ordered[-1 - outside])
+    return float(ordered[clipped]), float(ordered[-1 - clipped])
 
 
-def _average_blocks(whole: Array) -> Array:
-    """Average whole numbers, uint8 (side, side), over square blocks: float32 (n, n). Sums of whole numbers are exact in
-    any order."""
-    block_px = max(1, len(whole) // _BLOCKS_PER_SIDE)
-    n = len(whole) // block_px
-    part = whole[: n * block_px, : n * block_px].astype(np.float32)
-    return cv2.resize(part, (n, n), interpolation=cv2.INTER_AREA)
+def _average_blocks(levels: Array) -> Array:
+    """Average integers, uint8 (side, side), over square blocks: float32 (n, n). Sums of integers are exact in any
+    order."""
+    block_px = max(1, len(levels) // _BLOCKS_PER_SIDE)
+    n = len(levels) // block_px
+    cropped = levels[: n * block_px, : n * block_px].astype(np.float32)
+    return cv2.resize(cropped, (n, n), interpolation=cv2.INTER_AREA)
 
 
 def _smooth_rows(grey: Array, sigma_pixels: float, pixel_px: int) -> None:

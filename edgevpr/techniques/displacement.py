@@ -40,7 +40,7 @@ def find_displacement(numbers: Ints, nearest: Ints, sides: tuple[int, int], weig
     if not len(numbers):
         return FineMatch(0.0, shift_cells=(0.0, 0.0), covariance_cells2=(0.0, 0.0, 0.0), coverage=0.0)
     border = len(weights) - 1
-    step, votes, vote_sums = _count_votes(numbers, nearest, sides, weights)
+    shifts, votes, vote_sums = _count_votes(numbers, nearest, sides, weights)
     width = len(votes)
     peak_weights = _make_peak_weights(weights)
     peak_y, peak_x = divmod(int(vote_sums.argmax()), vote_sums.shape[1])
@@ -60,7 +60,7 @@ def find_displacement(numbers: Ints, nearest: Ints, sides: tuple[int, int], weig
     near = np.zeros((width, width), bool)
     near[peak_y : peak_y + size, peak_x : peak_x + size] = True
     is_matched = np.zeros(sides[1] ** 2, bool)
-    is_matched[nearest[near.ravel().take(step)]] = True
+    is_matched[nearest[near.ravel().take(shifts)]] = True
     return FineMatch(
         count / len(numbers),
         shift_cells=(peak_x - zero_index + mean_x, peak_y - zero_index + mean_y),
@@ -146,11 +146,11 @@ def _count_votes(
     border = len(weights) - 1
     query_side, reference_side = sides
     width = query_side + reference_side - 1 + 2 * border
-    first = (query_side - 1 + border) * (width + 1)
-    step = _number_regions(reference_side, width)[nearest] - _number_regions(query_side, width)[numbers] + first
-    votes = np.bincount(step, minlength=width * width).reshape(width, width).astype(np.float32)
+    offset = (query_side - 1 + border) * (width + 1)
+    shifts = _number_regions(reference_side, width)[nearest] - _number_regions(query_side, width)[numbers] + offset
+    votes = np.bincount(shifts, minlength=width * width).reshape(width, width).astype(np.float32)
     vote_sums = cv2.filter2D(votes, -1, _make_peak_weights(weights), borderType=cv2.BORDER_CONSTANT)
-    return step, votes, vote_sums[border : width - border, border : width - border]
+    return shifts, votes, vote_sums[border : width - border, border : width - border]
 
 
 @lru_cache

@@ -51,14 +51,14 @@ def average_blocks(per_pixel: Array, cell_px: int) -> Array:
     return means
 
 
-def find_good_blocks(grey: Bytes, which: str, cell_px: int, threshold: float, among: Bools | bool = True) -> Bools:
-    """Find the good blocks (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). `which` is the
+def find_good_blocks(grey: Bytes, kind: str, cell_px: int, threshold: float, among: Bools | bool = True) -> Bools:
+    """Find the good blocks (thesis 6.2.1): those whose mean entropy is at least `threshold` (0..1). `kind` is the
     entropy: "filled_bins" or "shannon". `grey` is uint8 (H, W) with sides that are multiples of `cell_px`. Returns bool
     (H/cell_px - 1, W/cell_px - 1), False where `among`, bool of this shape, is False (True: consider all).
 
     Cheap bounds of the Shannon entropy decide nearly every block. The entropy is computed only at the pixels of the
-    other blocks; the result is the same as with the whole map."""
-    if which == "filled_bins":
+    other blocks; the result is the same as with the full entropy map."""
+    if kind == "filled_bins":
         return (average_blocks(compute_filled_bins(grey), cell_px) >= threshold) & among
     small = _make_shannon_copy(grey)
     # The entropy of the lower four bits is a lower bound. Among 16 k values the upper bits add at most log2 k.
@@ -104,8 +104,8 @@ def _compute_range(grey: Bytes) -> Array:
 
 def _count_distinct(padded: Array) -> Array:
     """Count the distinct intensities in each disc by unions of 256-bit sets; for shapes see `_combine_over_disc`."""
-    bit, word_of = np.left_shift(np.uint64(1), padded & 63, dtype=np.uint64), padded >> 6
-    unions = (_combine_over_disc(bit * (word_of == word), np.bitwise_or) for word in range(4))
+    bit, word_index = np.left_shift(np.uint64(1), padded & 63, dtype=np.uint64), padded >> 6
+    unions = (_combine_over_disc(bit * (word_index == word), np.bitwise_or) for word in range(4))
     sizes: Array = reduce(np.add, (np.bitwise_count(union).astype(np.int16) for union in unions))
     return sizes
 

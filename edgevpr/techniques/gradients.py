@@ -103,17 +103,17 @@ def _sum_angles(dx: Array, dy: Array, cell_px: int, bins: int, signed: bool) -> 
     """Sum the gradients `dx` and `dy`, float32 (H, W), by cell and orientation: float (H/cell_px, W/cell_px, bins)."""
     magnitude, _ = _compute_magnitude(dx, dy)
     angle = np.arctan2(dy, dx)
-    angle *= np.float32(bins / (2 * np.pi if signed else np.pi))  # in bins; whole numbers are centres of orientations
+    angle *= np.float32(bins / (2 * np.pi if signed else np.pi))  # in bins; integers are bin centres
     low = np.floor(angle)
-    to_high = angle - low
+    high_share = angle - low
     low = low.astype(np.intp) % bins
     high = (low + 1) % bins
 
     rows, cols = dx.shape[0] // cell_px, dx.shape[1] // cell_px
     cell = np.add.outer(np.arange(dx.shape[0]) // cell_px * cols, np.arange(dx.shape[1]) // cell_px) * bins
     size = rows * cols * bins
-    votes = np.bincount((cell + low).ravel(), (magnitude * (1 - to_high)).ravel(), size)
-    votes += np.bincount((cell + high).ravel(), (magnitude * to_high).ravel(), size)
+    votes = np.bincount((cell + low).ravel(), (magnitude * (1 - high_share)).ravel(), size)
+    votes += np.bincount((cell + high).ravel(), (magnitude * high_share).ravel(), size)
     return votes.reshape(rows, cols, bins)
 
 
@@ -121,7 +121,7 @@ def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
     """Compute the same sums as `_sum_angles` for 8 orientations over 360 degrees, without angles, branches or
     scattered sums.
 
-    A gradient of magnitude m lies in a quadrant, at phi = -45..45 degrees from its diagonal, whose orientation gets m -
+    A gradient of magnitude m is in a quadrant, at phi = -45..45 degrees from its diagonal, whose orientation gets m -
     |g|, where g = m phi / 45 degrees. The rest goes to the y axis if g > 0, to the x axis if g < 0. With v = sqrt(2) m
     sin(phi) and u = sqrt(2) m cos(phi), g = v (_P m + _R u) / (_Q m + u) to 2e-6 m. Each plane is summed over the cells
     once unchanged, and once with its signs flipped by those of dx, dy or both. The orientations are sums and
@@ -168,8 +168,8 @@ def _sum_octants(dx: Array, dy: Array, cell_px: int, *_: object) -> Singles:
 
 
 def _compute_magnitude(dx: Array, dy: Array, out: Array | None = None) -> tuple[Array, Array]:
-    """Return the length of each gradient, written to `out` if given, and an array of its shape that the caller may
-    overwrite."""
+    """Return the magnitude of each gradient, written to `out` if given, and an array of the same shape as scratch
+    space."""
     squares, scratch = np.multiply(dx, dx, out=out), dy * dy
     squares += scratch
     return cv2.sqrt(squares, squares), scratch

@@ -64,11 +64,11 @@ def make_field(grid: Grid, patterns: Array, numbers: Ints, sides: tuple[int, int
     centre. Returns the field (C, m, m) of C channels; m is `grid.side` or, for a picture of more ground, an even number
     larger."""
     side, place_side = sides
-    whole = np.zeros((side * side, len(grid.channels) + 1), patterns.dtype)
-    whole[numbers, :-1] = patterns[:, grid.channels]
-    whole[numbers, -1] = 1
+    padded = np.zeros((side * side, len(grid.channels) + 1), patterns.dtype)
+    padded[numbers, :-1] = patterns[:, grid.channels]
+    padded[numbers, -1] = 1
     pooling = _make_pooling(side, place_side, grid.side)
-    pooled = _apply_weights(pooling, whole.reshape(side, side, -1).transpose(2, 0, 1))
+    pooled = _apply_weights(pooling, padded.reshape(side, side, -1).transpose(2, 0, 1))
     values, weight = pooled[:-1], pooled[-1]
     values = values - weight * (values.sum(axis=(1, 2)) / max(float(weight.sum()), _TINY))[:, None, None]
     near = _make_distance_weights(len(weight), _SURROUND_SD * grid.side)

@@ -126,11 +126,11 @@ def make_square_regions(height: int, width: int) -> list[Square]:
     regions = []
     for scale in range(1, _RMAC_SCALES + 1):
         side = 2 * short // (scale + 1)
-        down, across = (scale, scale + m - 1) if height <= width else (scale + m - 1, scale)
+        rows, columns = (scale, scale + m - 1) if height <= width else (scale + m - 1, scale)
         regions += [
             (top, left, side)
-            for top in _space_evenly(height, side, down)
-            for left in _space_evenly(width, side, across)
+            for top in _space_evenly(height, side, rows)
+            for left in _space_evenly(width, side, columns)
         ]
     return regions
 
@@ -156,12 +156,12 @@ def find_regions(features: Singles, count: int) -> Ints:
     np.maximum(features, 0, out=tall[:, :height])
     tall = tall.reshape(-1, width)
     label_count, labels, stats, _ = cv2.connectedComponentsWithStats((tall > 0).view(np.uint8), connectivity=8)
-    left, top, wide, high, area = stats[1:].T
+    left, top, box_width, box_height, area = stats[1:].T
     sums = np.bincount(labels.ravel(), weights=tall.ravel(), minlength=label_count)[1:]
     energy = (sums / area).astype(np.float32)
     channel, row = np.divmod(top, height + 1)
     best = np.lexsort((left, row, channel, -energy))[:count]
-    return np.stack([row, left, row + high, left + wide], axis=1)[best]
+    return np.stack([row, left, row + box_height, left + box_width], axis=1)[best]
 
 
 def describe_regions(features: Singles, boxes: Ints) -> Singles:

@@ -92,13 +92,13 @@ def enhance_contrast(differences: Array) -> Doubles:
     """Enhance the local contrast of the query's differences from the places along the map: int32 (N,) to float64 (N,).
     The mean of the differences up to five places away is subtracted from each, and the result is divided by their
     (sample) standard deviation; 0 where they are all equal. Integer sums stay exact on a long map."""
-    whole = differences.astype(np.int64)
-    first = np.maximum(np.arange(len(whole)) - _WINDOW_PLACES // 2, 0)
-    last = np.minimum(np.arange(len(whole)) + _WINDOW_PLACES // 2 + 1, len(whole))
+    integers = differences.astype(np.int64)
+    first = np.maximum(np.arange(len(integers)) - _WINDOW_PLACES // 2, 0)
+    last = np.minimum(np.arange(len(integers)) + _WINDOW_PLACES // 2 + 1, len(integers))
     count = last - first
-    sums, squares = (np.concatenate(([0], np.cumsum(values))) for values in (whole, whole**2))
+    sums, squares = (np.concatenate(([0], np.cumsum(values))) for values in (integers, integers**2))
     total = sums[last] - sums[first]
     variance = (count * (squares[last] - squares[first]) - total**2).astype(np.float64)  # times count * (count - 1)
     scale = np.sqrt((count - 1) / count / np.maximum(variance, 1))  # a variance of 0 leaves nothing to scale
-    deviations: Doubles = (count * whole - total) * scale
+    deviations: Doubles = (count * integers - total) * scale
     return deviations

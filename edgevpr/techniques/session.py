@@ -16,7 +16,7 @@ from edgevpr.techniques.card import Card, InputRule, load_card
 
 _OUTPUT_SHAPES = {"descriptor": (2, "(1, D)"), "features": (4, "(1, C, H, W)")}
 _NOISE_SEED = 7
-MAX_FILE_BYTES = 2**31  # protobuf, in which ONNX files are written, allows no more
+MAX_FILE_BYTES = 2**31  # limit of protobuf, the format of ONNX files
 _MAX_THREADS = 256
 _MAX_VALUE = 1e12  # the norm of a vector of much larger values overflows float32, and its unit vector is zero
 _INTERPOLATIONS = {"area": cv2.INTER_AREA, "linear": cv2.INTER_LINEAR_EXACT, "cubic": cv2.INTER_CUBIC}
@@ -168,8 +168,8 @@ def prepare_input(image: Array, rule: InputRule) -> Singles:
         image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     elif rule.colour == "rgb":
         image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    across, down = compute_fill_shares(image, rule)
-    width, height = round(across * rule.width), round(down * rule.height)
+    width_share, height_share = compute_fill_shares(image, rule)
+    width, height = round(width_share * rule.width), round(height_share * rule.height)
     image = cv2.resize(image, (width, height), interpolation=_INTERPOLATIONS[rule.resize])
     if rule.pad is not None:
         border = (0, rule.height - height, 0, rule.width - width)

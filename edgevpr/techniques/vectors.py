@@ -21,8 +21,8 @@ _SHIPPED_MODEL = "calc"
 _TINY = 1e-6
 _BLOCK_BYTES = 4 << 20  # of places converted to float32 together
 _MIN_BLOCK_PLACES = 16
-_SUFFIX_BYTES = 8  # at the end of a row in 8 bits: its step and its length, both float32
-_WORD_BITS = 64  # a row in 1 bit is padded to whole words, whose bits are counted at once
+_SUFFIX_BYTES = 8  # at the end of an `8bit` row: its step and its length, both float32
+_WORD_BITS = 64  # a `1bit` row is padded to words of this size, whose bits are counted at once
 _CODE_BLOCK_BYTES = 1 << 20  # of binary vectors compared together: about the size of an L2 cache
 
 
@@ -105,9 +105,9 @@ class VectorTechnique:
                 rows[block, : -(-self._length // 8)] = np.packbits(deviations > 0, axis=1)
                 continue
             step = np.maximum(np.abs(deviations).max(axis=1), np.finfo(np.float32).tiny) / 127
-            whole = np.rint(np.divide(deviations, step[:, None], out=deviations), out=deviations)
-            length = step * np.sqrt(np.einsum("nd,nd->n", whole, whole))
-            rows[block, : self._length] = whole
+            levels = np.rint(np.divide(deviations, step[:, None], out=deviations), out=deviations)
+            length = step * np.sqrt(np.einsum("nd,nd->n", levels, levels))
+            rows[block, : self._length] = levels
             rows[block, self._length :] = np.stack([step, length], axis=1).astype("<f4").view(np.int8)
         return rows
 
@@ -136,7 +136,7 @@ class VectorTechnique:
         code[: -(-self._length // 8)] = np.packbits(vector > 0)
         query, places = code.view(np.uint64), np.ascontiguousarray(rows).view(np.uint64)
         differing_bits: Ints = np.empty(len(rows), np.uint16 if 8 * len(code) < 1 << 16 else np.uint32)
-        ones = np.ones(len(query), np.float32)  # a product is the fastest sum, and exact for whole numbers below 2^24
+        ones = np.ones(len(query), np.float32)  # a product is the fastest sum, and exact for integers below 2^24
         block_places = max(1, _CODE_BLOCK_BYTES // len(code))
         for start in range(0, len(rows), block_places):
             block = slice(start, start + block_places)

@@ -53,7 +53,7 @@ def count_cells(cells: int, ratio: float) -> int:
 
 
 def compute_scale(cells: int, ratio: float) -> float:
-    """Return the exact height ratio of a view: its number of cells along one side, which is whole, over the number
+    """Return the exact height ratio of a view: its number of cells along one side, an integer, divided by the number
     `cells` of a place."""
     return count_cells(cells, ratio) / cells
 
@@ -62,12 +62,12 @@ class QueryViews:
     """The views of one query, each made on first use. `square` is the unchanged view: its blocks float32 (n, n, 4
     bins), and bool (n, n), True for good blocks. `encode` makes such a pair for another view, with cells of `cell_px`
     pixels. Views rotated by quarter turns reuse the same cells, rotated. `seen` bool (n, n) is True for blocks of the
-    unchanged view that lie on allowed pixels only."""
+    unchanged view that have only allowed pixels."""
 
-    def __init__(self, picture: Picture, square: tuple[Singles, Bools], cell_px: int, encode: Encode) -> None:
+    def __init__(self, picture: Picture, unchanged: tuple[Singles, Bools], cell_px: int, encode: Encode) -> None:
         self._picture, self._cell_px, self._encode, self.seen = picture, cell_px, encode, picture.seen
-        self._side, self._good = len(square[1]), max(int(square[1].sum()), 1)
-        self._encoded = {(1.0, 0): square}
+        self._side, self._good = len(unchanged[1]), max(int(unchanged[1].sum()), 1)
+        self._encoded = {(1.0, 0): unchanged}
         self._scaled: dict[float, tuple[Array, Array]] = {}
         self.structure: Singles | None = None  # of the unchanged view (see `overlay`)
         self._regions: dict[tuple[int, Describe], ViewRegions] = {}
@@ -83,10 +83,10 @@ class QueryViews:
     def make_blocks(self, ratio: float, turn: int) -> tuple[Singles, Bools]:
         """Return the view of the height ratio `ratio` and the rotation `turn`, in steps of 15 degrees: its blocks,
         float32 (n, n, 4 bins), and bool (n, n), True for good blocks."""
-        quarters, within = divmod(turn, STEPS_PER_QUARTER)
-        if (ratio, within) not in self._encoded:
-            self._encoded[ratio, within] = self._encode(*self._warp_picture(ratio, within))
-        blocks, good = self._encoded[ratio, within]
+        quarters, steps = divmod(turn, STEPS_PER_QUARTER)
+        if (ratio, steps) not in self._encoded:
+            self._encoded[ratio, steps] = self._encode(*self._warp_picture(ratio, steps))
+        blocks, good = self._encoded[ratio, steps]
         return rotate_blocks(blocks, -quarters), np.rot90(good, -quarters)
 
     def make_regions(self, number: int, describe: Describe) -> ViewRegions:
@@ -127,17 +127,17 @@ class QueryViews:
         grey = cv2.resize(grey, (side, side), interpolation=cv2.INTER_AREA)
         return grey, cv2.resize(allowed, (side, side), interpolation=cv2.INTER_NEAREST)
 
-    def _warp_picture(self, ratio: float, within: int) -> tuple[Array, Array, int]:
-        """Return the picture of the view of the height ratio `ratio`, rotated by `within` steps of 15 degrees: grey
+    def _warp_picture(self, ratio: float, steps: int) -> tuple[Array, Array, int]:
+        """Return the picture of the view of the height ratio `ratio`, rotated by `steps` steps of 15 degrees: grey
         float32 (side, side); bool (side, side), True for allowed pixels; and the side of a cell in pixels."""
         cell_px = self._cell_px if ratio <= 1 else max(2, self._cell_px // 2)
         side = count_cells(self._side + 1, ratio) * cell_px
         if ratio not in self._scaled:
             self._scaled[ratio] = self._resize_picture(side)
         grey, allowed = self._scaled[ratio]
-        if within:
+        if steps:
             middle = (side - 1) / 2
-            matrix = cv2.getRotationMatrix2D((middle, middle), -360 * within / ROTATIONS, 1)
+            matrix = cv2.getRotationMatrix2D((middle, middle), -360 * steps / ROTATIONS, 1)
             grey = cv2.warpAffine(grey, matrix, (side, side), borderMode=cv2.BORDER_REPLICATE)
             allowed = cv2.warpAffine(allowed, matrix, (side, side), flags=cv2.INTER_NEAREST)
         return grey, allowed.astype(bool), cell_px

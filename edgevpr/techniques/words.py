@@ -58,7 +58,7 @@ def make_local_descriptors(features: Singles) -> Singles:
 def compute_vlad(local: Singles, words: Singles, sharpness: float | None = None) -> Singles:
     """Compute VLAD of the descriptors `local` (N, D) with `words` (K, D): float32 (K * D,). The part of word k is the
     sum over descriptors x of a_k(x) (x - c_k) (Arandjelović et al. 2016, equation 1), scaled to length 1 (Arandjelović
-    and Zisserman 2013), as is the whole. The weight a_k is 1 for the word nearest to x and 0 for the others
+    and Zisserman 2013), as is the result. The weight a_k is 1 for the word nearest to x and 0 for the others
     (`sharpness` None), or that of `compute_soft_weights`."""
     if sharpness is None:
         weights = np.zeros((len(local), len(words)), np.float32)

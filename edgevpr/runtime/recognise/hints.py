@@ -276,7 +276,7 @@ def _drop_useless(reach: Reach | None, heading_deg: float | None, index: PlaceIn
     """Return the hints that narrow a search of the index; None: none does. An area of all places or none does not."""
     if reach and not 0 < index.find_within(reach.position, reach.radius_m).sum() < len(index):
         reach = None
-    if not index.knows_headings:
+    if not index.has_headings:
         heading_deg = None
     return Hints(reach, heading_deg).select(*_TRUST_ALL)
 
