@@ -1,4 +1,4 @@
-"""Addresses of MAVLink links, parsed from the text in which the user writes them (`mavlink.link`)."""
+"""Addresses of MAVLink links, parsed from the setting `mavlink.link`."""
 
 from dataclasses import dataclass
 
@@ -13,8 +13,8 @@ Sender = tuple[str, int]  # host and port
 
 @dataclass(frozen=True, slots=True)
 class LinkAddress:
-    """The parsed address of a link. `where` is a host (of udpin: the own address at which it listens) or the path of a
-    serial device; `number` is a UDP or TCP port, or the baud rate of the serial device."""
+    """The parsed address of a link. `where`: a host (for udpin: the local address to listen on) or the path of a serial
+    device. `number`: a UDP or TCP port, or the baud rate of the serial device."""
 
     kind: str  # "udpout", "udpin", "tcp" or "serial"
     where: str
@@ -25,14 +25,14 @@ class LinkAddress:
 
 
 def parse_link(url: str) -> LinkAddress:
-    """Parse the text of a link, such as `udpout:127.0.0.1:14550`. Raises LinkAddressError for none of the FORMS."""
+    """Parse an address, such as `udpout:127.0.0.1:14550`. Raises LinkAddressError if it has none of the FORMS."""
     kind, _, rest = url.partition(":")
-    where, _, number = rest.rpartition(":")  # from the right: names in /dev/serial/by-path hold colons
+    where, _, number = rest.rpartition(":")  # from the right: names in /dev/serial/by-path contain colons
     if kind not in ("udpout", "udpin", "tcp", "serial") or not where.strip() or not number:
-        raise LinkAddressError(f"{url!r} is not a MAVLink link: write {FORMS}.")
+        raise LinkAddressError(f"{url!r} is not a MAVLink address: use {FORMS}.")
     if kind != "serial" and ":" in where:
-        raise LinkAddressError(f"{url}: {where!r} is not a host: give a name or an IPv4 address.")
-    low, high, what = _BAUD if kind == "serial" else _PORT
+        raise LinkAddressError(f"{url}: {where!r} is not a host: give a host name or an IPv4 address.")
+    low, high, rule = _BAUD if kind == "serial" else _PORT
     if not (number.isascii() and number.isdigit() and len(number) < 10 and low <= int(number) <= high):
-        raise LinkAddressError(f"{url}: {what}, not {number!r}.")
+        raise LinkAddressError(f"{url}: {rule}, not {number!r}.")
     return LinkAddress(kind, where, int(number))

@@ -1,5 +1,6 @@
-"""ArduPilot's channel and the table of its parameters (see `parameters`). By GPS_INPUT edgevpr is one of its GPS
-receivers: a real one with a fix must always come first. Each row names the file of ArduPilot 4.7-dev that decides."""
+"""ArduPilot's channel and the table of its parameters (see `parameters`). With GPS_INPUT edgevpr acts as one of the GPS
+receivers, and a real receiver with a fix must always take precedence. Each rule names the file of ArduPilot 4.7-dev
+that it is based on."""
 
 from collections.abc import Iterator
 
@@ -20,13 +21,13 @@ from edgevpr.mavlink.parameters import (
     require,
 )
 
-MAVLINK_GPS = 14  # value of GPSn_TYPE: the receiver's positions come as GPS_INPUT
-ADVISED_RECEIVER = 1  # index of the receiver that we advise the user to give to us
+MAVLINK_GPS = 14  # value of GPSn_TYPE: the receiver is simulated by GPS_INPUT
+ADVISED_RECEIVER = 1  # index of the receiver that users are advised to assign to edgevpr
 RECEIVERS = ("GPS1_TYPE", "GPS2_TYPE")
 DELAYS = ("GPS1_DELAY_MS", "GPS2_DELAY_MS")
 VISION = "VISO_TYPE"
 _MAVLINK_VISION = 1
-# AP_GPS assumes this age for the positions of a receiver whose delay is not configured (GPS_Backend::get_lag).
+# Age that AP_GPS assumes for the positions of a receiver without a configured delay (GPS_Backend::get_lag).
 _GPS_LAG_S = 0.2
 
 _ALL_CHANNELS = (Channel.COMMAND, Channel.GPS_INPUT, Channel.ODOMETRY)
@@ -53,25 +54,25 @@ _SOURCE_VISION = 6
 _SOURCE_GSF = 8
 _SOURCE_BARO = 1
 _SOURCE_COMPASS = 1
-# What an ODOMETRY repeats of the autopilot's own: name of the source, its wrong value, and a right one.
+# Fields of ODOMETRY that repeat the autopilot's own estimate: name of the source, its wrong value, and a right one.
 _OWN_SOURCES = (
     ("POSZ", _SOURCE_VISION, _SOURCE_BARO),
     ("VELZ", _SOURCE_VISION, 0),
     ("YAW", _SOURCE_VISION, _SOURCE_COMPASS),
 )
-_MAX_GPS_DELAY_MS = 250  # EK3's buffer is never longer: AP_NavEKF3_core.cpp, setup_core
+_MAX_GPS_DELAY_MS = 250  # the maximum length of EKF3's buffer: AP_NavEKF3_core.cpp, setup_core
 _MAX_GLITCH_RADIUS_M = 100
 _MAX_VISION_SD_M = 10
-# Set 2 for ODOMETRY: position by us, height and heading by the autopilot's own sensors.
+# Source set 2 for ODOMETRY: position from edgevpr, height and heading from the autopilot's own sensors.
 _VISION_SET_CHANGES = ("EK3_SRC2_POSXY=6", "EK3_SRC2_VELXY=0", "EK3_SRC2_POSZ=1", "EK3_SRC2_YAW=1")
 
 
 def choose_ardupilot_channel(kind: VehicleKind, parameters: Parameters) -> ChannelChoice:
     """Choose the channel for an ArduPilot: GPS_INPUT or ODOMETRY if its parameters are set for it, else command 43003.
-    `parameters` has values by name, without those that the autopilot does not have.
+    `parameters`: the values by name, without parameters that the autopilot does not have.
 
     A plane dead-reckons without GPS for as long as it flies, and accepts a fix at any time (`NavEKF3_core::setLatLng`).
-    Without GPS and optical flow a copter lands after some seconds and a rover stops, even if it gets single fixes.
+    Without GPS and optical flow, a copter lands within seconds and a rover stops, even if they receive single fixes.
     """
     for number in range(len(RECEIVERS)):
         name = resolve_name(parameters, RECEIVERS[number])
@@ -102,7 +103,7 @@ def _is_primary(parameters: Parameters, choice: ChannelChoice) -> bool:
 
 
 def _check_primary(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
-    """AP_GPS.cpp, update_primary: the primary receiver, while it has a 3D fix, or for ever."""
+    """Yield the changes that make the real receiver the primary one (AP_GPS.cpp, update_primary)."""
     switch = parameters.get("GPS_AUTO_SWITCH", _SWITCH_BEST)
     is_ours = _is_primary(parameters, choice) and _has_other_receiver(parameters, choice)
     if switch in (_SWITCH_PRIMARY, _SWITCH_PRIMARY_IF_3D) and is_ours:
@@ -112,7 +113,7 @@ def _check_primary(parameters: Parameters, choice: ChannelChoice) -> Iterator[st
 
 
 def _check_switch(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
-    """AP_GPS.cpp, update_primary: with 0 no other receiver is ever used; 2 uses all of them."""
+    """Yield the change that lets ArduPilot switch to our receiver, without blending it (AP_GPS.cpp, update_primary)."""
     switch = parameters.get("GPS_AUTO_SWITCH", _SWITCH_BEST)
     if switch in (_SWITCH_BEST, _SWITCH_PRIMARY_IF_3D) or (
         switch == _SWITCH_PRIMARY and _is_primary(parameters, choice)
@@ -125,8 +126,9 @@ def _check_switch(parameters: Parameters, choice: ChannelChoice) -> Iterator[str
 
 
 def _check_blend(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
-    """AP_GPS_Blended.cpp, _calc_weights: the mean of one weight for each bit of the mask. By horizontal accuracy ours
-    is about 0.01, by speed 0.1. By height it is a third to a half, since our height is the autopilot's own."""
+    """Yield the change needed if blending gives our receiver a large weight: the mean of one weight per bit of the mask
+    (AP_GPS_Blended.cpp, _calc_weights). Our weight is about 0.01 for horizontal accuracy and 0.1 for speed, but a third
+    to a half for height, because our height is the autopilot's own."""
     mask = parameters.get("GPS_BLEND_MASK", 5)
     is_safe = has_bit(mask, _BLEND_POSITION_BIT) and not has_bit(mask, _BLEND_HEIGHT_BIT)
     is_blended = parameters.get("GPS_AUTO_SWITCH") == _SWITCH_BLEND and _has_other_receiver(parameters, choice)
@@ -135,25 +137,25 @@ def _check_blend(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]
 
 
 def _check_lanes(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
-    """AP_NavEKF3_Measurements.cpp, update_gps_selection: lane n flies by receiver n while that has a 3D fix."""
+    """Yield the change that frees EKF lane n from receiver n (AP_NavEKF3_Measurements.cpp, update_gps_selection)."""
     affinity = parameters.get("EK3_AFFINITY", 0)
     if has_bit(affinity, _AFFINITY_GPS_BIT) and _has_other_receiver(parameters, choice):
         yield f"EK3_AFFINITY={int(affinity) & ~_AFFINITY_GPS_BIT}"
 
 
 def _check_own_receiver(*checks: Check) -> Check:
-    """Join the checks of the two receivers into one, which applies that of our own receiver."""
+    """Combine the checks of the two receivers into one that applies the check of our own receiver."""
     names = tuple(name for check in checks for name in check.names)
     return Check(names, lambda parameters, choice: checks[choice.receiver].find_changes(parameters, choice))
 
 
-def _name_sources(what: str) -> tuple[str, ...]:
-    return tuple(f"EK3_SRC{number}_{what}" for number in (1, 2, 3))
+def _name_sources(quantity: str) -> tuple[str, ...]:
+    return tuple(f"EK3_SRC{number}_{quantity}" for number in (1, 2, 3))
 
 
-def _refuse_source(what: str, wrong: int, right: int) -> Check:
-    """Demand that no source set has the source `wrong` for `what`."""
-    return expect(right, *_name_sources(what), allows=lambda source: source != wrong)
+def _refuse_source(quantity: str, wrong: int, right: int) -> Check:
+    """Return a check that no source set uses the source `wrong` for `quantity`."""
+    return expect(right, *_name_sources(quantity), allows=lambda source: source != wrong)
 
 
 def _has_source(parameters: Parameters, source: int) -> bool:
@@ -162,7 +164,7 @@ def _has_source(parameters: Parameters, source: int) -> bool:
 
 
 def _check_source_set(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
-    """AP_NavEKF_Source.cpp: a source that no set has is never used."""
+    """Yield the changes that add our source to a source set: else it is never used (AP_NavEKF_Source.cpp)."""
     if choice.channel is Channel.GPS_INPUT and not _has_source(parameters, _SOURCE_GPS):
         yield f"EK3_SRC1_POSXY={_SOURCE_GPS}"
     if choice.channel is Channel.ODOMETRY and not _has_source(parameters, _SOURCE_VISION):
@@ -170,7 +172,7 @@ def _check_source_set(parameters: Parameters, choice: ChannelChoice) -> Iterator
 
 
 def _check_set_per_lane(parameters: Parameters, _choice: ChannelChoice) -> Iterator[str]:
-    """AP_NavEKF_Source.h, getActiveSourceSet: lane n uses set n, whatever the pilot selects."""
+    """Yield the change that frees EKF lane n from source set n (AP_NavEKF_Source.h, getActiveSourceSet)."""
     options = parameters.get("EK3_SRC_OPTIONS", 0)
     is_mixed = _has_source(parameters, _SOURCE_GPS) and _has_source(parameters, _SOURCE_VISION)
     if has_bit(options, _SET_PER_LANE_BIT) and is_mixed:
@@ -178,7 +180,7 @@ def _check_set_per_lane(parameters: Parameters, _choice: ChannelChoice) -> Itera
 
 
 def _check_arming(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:
-    """AP_Arming.cpp, check_enabled."""
+    """Yield the changes that enable the arming checks of our channel (AP_Arming.cpp, check_enabled)."""
     bit = _GPS_CHECK_BIT if choice.channel is Channel.GPS_INPUT else _VISION_CHECK_BIT
     if not has_bit(parameters.get("ARMING_CHECK", _ALL_CHECKS_BIT), _ALL_CHECKS_BIT | bit):
         yield f"ARMING_CHECK={_ALL_CHECKS_BIT}"
@@ -190,31 +192,31 @@ def _check_arming(parameters: Parameters, choice: ChannelChoice) -> Iterator[str
 _RULES = (
     require(_GPS_INPUT, "the index of the real receiver: 0 if GPS2_TYPE is 14, 1 if GPS1_TYPE is",
         Check(("GPS_PRIMARY", "GPS_AUTO_SWITCH", *RECEIVERS), _check_primary),
-        "With GPS_AUTO_SWITCH 0 or 4 it uses our positions, of the primary receiver, while GPS is good."),
+        "With GPS_AUTO_SWITCH 0 or 4 it uses the primary receiver, which is ours, even while GPS is good."),
     recommend(_GPS_INPUT, "1; 4 is as good",
         Check(("GPS_AUTO_SWITCH", "GPS_PRIMARY", "GPS_BLEND_MASK", *RECEIVERS), _check_switch),
-        "With 0 our receiver is never used; with 2 each position is partly ours while GPS is good."),
-    require(_GPS_INPUT, "1 or 5, where GPS_AUTO_SWITCH is 2",
+        "With 0 our receiver is never used; with 2 it contributes to each position while GPS is good."),
+    require(_GPS_INPUT, "1 or 5 if GPS_AUTO_SWITCH is 2",
         Check(("GPS_BLEND_MASK", "GPS_AUTO_SWITCH", *RECEIVERS), _check_blend),
-        "Without bit 1, or with bit 2, a large part of each position is ours while GPS is good."),
-    require(_GPS_INPUT, "0, or any value without the bit 1 (GPS); then EK3_PRIMARY may be any",
+        "Without bit 1, or with bit 2, our receiver has a large weight in each position while GPS is good."),
+    require(_GPS_INPUT, "0, or any value without bit 1 (GPS); EK3_PRIMARY may then have any value",
         Check(("EK3_AFFINITY", "EK3_PRIMARY", *RECEIVERS), _check_lanes),
-        "With bit 1 a lane of the filter uses our positions while GPS is good."),
-    # AP_GPS.cpp, get_lag: any delay is accepted, but the filter's buffer ends (NavEKF3_core::setup_core).
+        "With bit 1 a lane of the filter uses our positions even while GPS is good."),
+    # AP_GPS.cpp, get_lag: any delay is accepted, but the filter's buffer is limited (NavEKF3_core::setup_core).
     require(_GPS_INPUT,
-        f"0 to {_MAX_GPS_DELAY_MS}: edgevpr reads it, and sends the position of that time (0: 0.2 s)",
+        f"0 to {_MAX_GPS_DELAY_MS}: edgevpr reads it, and sends the position at that age (0: 0.2 s)",
         _check_own_receiver(*(expect(0, name, allows=make_limit(_MAX_GPS_DELAY_MS)) for name in DELAYS)),
         "The filter's buffer is shorter, so it would treat our position as a newer one.", "GPSn_DELAY_MS"),
-    # AP_NavEKF3_Measurements.cpp, CorrectGPSForAntennaOffset: it is subtracted from our position.
+    # AP_NavEKF3_Measurements.cpp, CorrectGPSForAntennaOffset: the offset is subtracted from our position.
     require(_GPS_INPUT, f"within {MAX_OFFSET_M:g} m of 0 for our receiver",
         _check_own_receiver(*(expect(0, *list_axes(f"GPS{n}_POS"), allows=is_small_offset) for n in (1, 2))),
         "We send the position of the vehicle itself, which an antenna offset would shift.", "GPSn_POS_*"),
     require(_GPS_INPUT, "1",  # AP_AHRS_DCM.cpp and AP_AHRS.cpp, get_relative_position_D_home
         expect(1, "AHRS_GPS_USE", allows=lambda value: value in (0, 1)),
-        "With 2 the height may come from our receiver, which repeats the autopilot's own height."),
+        "With 2 the height may come from our receiver, which only repeats the autopilot's own height."),
     recommend(_ALL_CHANNELS, "AHRS_EKF_TYPE 3, EK3_ENABLE 1",  # AP_AHRS.cpp, handle_external_position_estimate
         join_checks(expect(1, "EK3_ENABLE"), expect(3, "AHRS_EKF_TYPE")),
-        "Only EKF3 accepts our positions: enable it, and reboot.", "AHRS_EKF_TYPE"),
+        "Only EKF3 accepts our positions: enable EKF3, and reboot the autopilot.", "AHRS_EKF_TYPE"),
     recommend(_CONTINUOUS, "3 in one set for GPS_INPUT; 6 in one set for ODOMETRY",
         Check(_name_sources("POSXY"), _check_source_set),
         "No source set of the filter uses our position.", "EK3_SRCn_POSXY"),
@@ -227,25 +229,25 @@ _RULES = (
         "EK3_SRCn_YAW"),
     recommend(_CONTINUOUS, f"above 0, up to {_MAX_GLITCH_RADIUS_M}",  # SelectVelPosFusion
         expect(25, "EK3_GLITCH_RAD", allows=lambda radius_m: 0 < radius_m <= _MAX_GLITCH_RADIUS_M),
-        "With 0 the filter refuses no position, not even a wrong one; with a larger value it recovers late."),
+        "With 0 the filter accepts every position, even a wrong one; with a larger value it recovers late."),
     recommend(_CONTINUOUS,
-        "1, or with the bits 8 (GPS) and 262144 (vision); ARMING_SKIPCHK in newer firmware: without them",
+        "1, or with bits 8 (GPS) and 262144 (vision); newer firmware: ARMING_SKIPCHK without these bits",
         Check(("ARMING_CHECK",), _check_arming), "It arms even if our positions are missing or contradict GPS."),
-    # AP_VisualOdom_MAV.cpp: VISO_VEL_M_NSE is the accuracy, whatever we send.
+    # AP_VisualOdom_MAV.cpp: VISO_VEL_M_NSE is used as the accuracy, whatever we send.
     require(_ODOMETRY, "not 6", _refuse_source("VELXY", _SOURCE_VISION, right=0),
-        "Our velocity comes from the same matches as the position; the filter would trust it more than its gyros.",
+        "Our velocity comes from the same matches as our position; the filter would trust it more than its gyros.",
         "EK3_SRCn_VELXY"),
     require(_ODOMETRY, "POSZ, VELZ and YAW not 6",
         join_checks(*(_refuse_source(*source) for source in _OWN_SOURCES)),
         "Height, climb and heading in our ODOMETRY are the autopilot's own: it would confirm itself.", "EK3_SRCn_*"),
-    require(_ODOMETRY, "without the bit 8, where one set has GPS and one has us",
+    require(_ODOMETRY, "without bit 8, if one source set uses GPS and one uses our positions",
         Check(("EK3_SRC_OPTIONS", *_name_sources("POSXY")), _check_set_per_lane),
-        "Each lane of the filter has its own source set, so one uses our positions while GPS is good."),
+        "Each lane of the filter has its own source set, so one lane uses our positions while GPS is good."),
     require(_ODOMETRY, "1", expect(1, "VISO_SCALE"),  # AP_VisualOdom_MAV, handle_pose_estimate
-        "It scales our distance from the origin."),
-    # AP_VisualOdom_Backend.cpp rotates VISION_POSITION_DELTA only; AP_VisualOdom_IntelT265.cpp rotates all.
+        "It scales the distance of our position from the origin."),
+    # AP_VisualOdom_Backend.cpp rotates VISION_POSITION_DELTA only; AP_VisualOdom_IntelT265.cpp rotates all messages.
     recommend(_ODOMETRY, "0", expect(0, "VISO_ORIENT"),
-        "Our positions must not be rotated; 4.7 does not rotate those of ODOMETRY, but that may change."),
+        "Our positions must not be rotated; 4.7 does not rotate positions of ODOMETRY, but that may change."),
     require(_ODOMETRY, f"within {MAX_OFFSET_M:g} m of 0",  # CorrectExtNavForSensorOffset
         expect(0, *list_axes("VISO_POS"), allows=is_small_offset),
         "We send the position of the vehicle itself, which a camera offset would shift.", "VISO_POS_*"),
@@ -254,10 +256,10 @@ _RULES = (
         "We send the current position, which would be treated as an old one."),
     require(_ODOMETRY, "0 to 100",  # AP_VisualOdom_MAV.cpp, handle_pose_estimate
         expect(0, "VISO_QUAL_MIN", allows=lambda quality: quality >= 0),
-        "With -1 even a position that we call bad is used."),
-    recommend(_ODOMETRY, f"up to {_MAX_VISION_SD_M}",  # handle_pose_estimate: the least deviation
+        "With -1 even a position that we mark as bad is used."),
+    recommend(_ODOMETRY, f"up to {_MAX_VISION_SD_M}",  # handle_pose_estimate: the minimum standard deviation
         expect(0.2, "VISO_POS_M_NSE", allows=make_limit(_MAX_VISION_SD_M)),
-        "With more, a good position has no more weight than a poor one."),
+        "With a larger value, an accurate position has no more weight than an inaccurate one."),
 )
 # fmt: on
 ARDUPILOT_TABLE = ParameterTable("ArduPilot", (*RECEIVERS, VISION), _RULES, choose_ardupilot_channel)

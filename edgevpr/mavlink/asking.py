@@ -1,4 +1,4 @@
-"""Questions to an autopilot before the flight, for `edgevpr check` and `doctor`. No setting of it is changed."""
+"""Requests to an autopilot before the flight, for `edgevpr check` and `doctor`. They change none of its settings."""
 
 import select
 import statistics
@@ -19,11 +19,11 @@ from edgevpr.mavlink.signing import NOT_SIGNING, Signing
 from edgevpr.mavlink.wire import Message, PacketReader, mavlink, read_parameter_value
 
 HEARTBEAT_INTERVAL_S = 1.0
-HEARTBEAT_TIMEOUT_S = 5.0  # an autopilot sends one each second
+HEARTBEAT_TIMEOUT_S = 5.0  # autopilots send one per second
 MAX_TRIES = 3
 ANSWER_TIMEOUT_S = 1.0
-MAX_PARALLEL_REQUESTS = 10  # parameters asked for at once; ArduPilot drops what comes on top of 20
-LISTEN_S = 4.0  # for other autopilots, damaged bytes and signatures
+MAX_PARALLEL_REQUESTS = 10  # parameters requested at once; ArduPilot drops requests beyond 20
+LISTEN_S = 4.0  # time to detect other autopilots, corrupt bytes and signatures
 
 _STREAM_TIMEOUT_S = 1.2
 _REFUSALS = (mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED)
@@ -32,51 +32,52 @@ _RELEASES = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}  # FIRM
 
 
 class RequestLink(AbstractContextManager["RequestLink"]):
-    """A link to one autopilot, for a caller that waits for each answer. It sends a heartbeat once a second, as some
-    ports of autopilots do not answer without. It is a context manager, which raises LinkError when the link is lost.
+    """A link to one autopilot whose methods wait for each answer. It sends a heartbeat once a second, because some
+    autopilot ports only answer a sender of heartbeats. As a context manager it raises LinkError if the link is lost.
 
-    - `system_id`: that of the autopilot; None until its first heartbeat, if none was given.
-    - `received`: number of messages from the autopilot, by name; `signed`: how many of them carry a signature.
-    - `says_version_1`: its last message was MAVLink 1; `round_trips_s`: seconds from each request to its answer.
+    - `system_id`: system id of the autopilot; None until its first heartbeat, unless one was given.
+    - `received`: number of messages from the autopilot, by name; `signed`: number of signed messages among them.
+    - `uses_mavlink_1`: its last message was MAVLink 1; `round_trips_s`: seconds from each request to its answer.
     - `others`: system ids of other autopilots on the link; `reader` counts bytes that belong to no message."""
 
     def __init__(
         self, address: LinkAddress, own_id: int = 197, system_id: int | None = None, signing: Signing = NOT_SIGNING
     ) -> None:
-        """Open the link. `own_id` is our component id, `system_id` that of the autopilot (None: from a heartbeat).
-        Raises LinkError."""
+        """Open the link. `own_id`: our component id. `system_id`: system id of the autopilot (None: use that of the
+        first heartbeat). Raises LinkError."""
         self.system_id = system_id
         self.received: Counter[str] = Counter()
         self.signed = 0
         self.others: set[int] = set()
-        self.says_version_1 = False
+        self.uses_mavlink_1 = False
         self.round_trips_s: list[float] = []
         self.signing, self.reader = signing, PacketReader(signing.admits)
         self._address = address
         self._packer = mavlink.MAVLink(None, srcSystem=system_id or 1, srcComponent=own_id)
-        self._arrived: deque[Message] = deque()  # from the autopilot, not yet returned to the caller
+        self._unread: deque[Message] = deque()  # messages from the autopilot, not yet returned to the caller
         self._heartbeat_due_s = 0.0
         try:
             self._port = open_port(address)
         except OSError as error:
             why = error.strerror or error
-            raise LinkError(f"{address} cannot be opened ({why}): connect or start it, or correct the link.") from error
+            advice = "connect the device or start the other end, or correct the link address"
+            raise LinkError(f"{address} cannot be opened ({why}): {advice}.") from error
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self._port.close()
         if isinstance(error, OSError):
-            raise LinkError(f"{self._address} was lost ({error.strerror or error}): check the cable.") from error
+            raise LinkError(f"{self._address}: link lost ({error.strerror or error}): check the cable.") from error
 
-    def heartbeat(self, wait_s: float = HEARTBEAT_TIMEOUT_S) -> Message | None:
-        """Wait for the heartbeat of an autopilot (None: none came); from then on all others are ignored."""
+    def wait_for_heartbeat(self, wait_s: float = HEARTBEAT_TIMEOUT_S) -> Message | None:
+        """Wait for the heartbeat of an autopilot (None: none arrived). Other autopilots are ignored from then on."""
         return self._wait_for(wait_s, lambda message: bool(message.get_type() == "HEARTBEAT"))
 
     def listen(self, wait_s: float) -> None:
-        """Receive messages for `wait_s` seconds without asking for any; they are only counted."""
+        """Receive messages for `wait_s` seconds and count them, without requesting any."""
         self._wait_for(wait_s, lambda message: False)
 
-    def message(self, message_id: int) -> Message | None:
-        """Request one message (MAV_CMD_REQUEST_MESSAGE) and return it; None: it was refused, or not answered."""
+    def request_message(self, message_id: int) -> Message | None:
+        """Request one message (MAV_CMD_REQUEST_MESSAGE) and return it; None if it was refused or not answered."""
         name = mavlink.mavlink_map[message_id].msgname
         for _ in range(MAX_TRIES):
             sent_s = time.monotonic()
@@ -86,22 +87,22 @@ class RequestLink(AbstractContextManager["RequestLink"]):
                 continue
             self.round_trips_s.append(time.monotonic() - sent_s)
             if answer.get_type() != name and answer.result == mavlink.MAV_RESULT_DENIED:
-                # PX4 refuses a message that has not changed since it last streamed it: wait for the stream.
+                # PX4 refuses to send a message that has not changed since it was last streamed: wait for the stream.
                 answer = self._wait_for(_STREAM_TIMEOUT_S, lambda message: message.get_type() == name)
             return answer if answer and answer.get_type() == name else None
         return None
 
-    def parameters(self, names: Iterable[str], bytewise: bool) -> dict[str, float | int]:
-        """Read parameters by name (PARAM_REQUEST_READ) and return their values by name. Parameters that the autopilot
-        does not have, and values that are not finite, are left out. For `bytewise` see `read_parameter_value`."""
+    def request_parameters(self, names: Iterable[str], bytewise: bool) -> dict[str, float | int]:
+        """Request parameters by name (PARAM_REQUEST_READ) and return their values by name, without those that the
+        autopilot does not have or whose value is not finite. For `bytewise` see `read_parameter_value`."""
         values: dict[str, float | int] = {}
         missing = list(dict.fromkeys(names))
         for _ in range(MAX_TRIES):
             for start in range(0, len(missing), MAX_PARALLEL_REQUESTS):
-                asked = missing[start : start + MAX_PARALLEL_REQUESTS]
-                for name in asked:
+                batch = missing[start : start + MAX_PARALLEL_REQUESTS]
+                for name in batch:
                     self._send(messages.make_parameter_request(self.system_id or 0, name))
-                waiting = set(asked)
+                waiting = set(batch)
                 while waiting and (answer := self._wait_for(ANSWER_TIMEOUT_S, _match_parameters(waiting))):
                     waiting.remove(answer.param_id)
                     if (
@@ -113,11 +114,11 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         return values
 
     def _wait_for(self, wait_s: float, is_wanted: Callable[[Message], bool]) -> Message | None:
-        """Return the first wanted message of those received already, and those that arrive within `wait_s` seconds."""
+        """Return the first wanted message among the unread ones and those that arrive within `wait_s` seconds."""
         end_s = time.monotonic() + wait_s
         while True:
-            while self._arrived:
-                if is_wanted(message := self._arrived.popleft()):
+            while self._unread:
+                if is_wanted(message := self._unread.popleft()):
                     return message
             now_s = time.monotonic()
             if now_s >= end_s:
@@ -128,14 +129,15 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         """Send a heartbeat if one is due, then receive for up to `wait_s` seconds."""
         if self._port.connected and now_s >= self._heartbeat_due_s:
             self._heartbeat_due_s = now_s + HEARTBEAT_INTERVAL_S
-            # Of no kind: PX4 warns of a lost companion when one that has only asked falls silent.
+            # Generic type, not onboard controller: otherwise PX4 would report a lost companion after this exchange.
             self._send(messages.make_heartbeat(Health.BOOT, mavlink.MAV_TYPE_GENERIC))
         readable, _, _ = select.select([self._port], [], [], wait_s)
-        # A serial port without a byte would look lost; a refused datagram makes its port readable again and again.
+        # Reading a serial port without data would look like a disconnect, so select first. A refused datagram makes a
+        # UDP port readable again and again, so pause.
         data = self._port.read() if readable else b""
         if readable and not data:
             time.sleep(0.01)
-        self._arrived.extend(filter(self._admit, self.reader.feed(data, self._port.sender)))
+        self._unread.extend(filter(self._admit, self.reader.feed(data, self._port.sender)))
 
     def _admit(self, message: Message) -> bool:
         beats = message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
@@ -152,11 +154,11 @@ class RequestLink(AbstractContextManager["RequestLink"]):
             return False
         self.received[message.get_type()] += 1
         self.signed += bool(message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
-        self.says_version_1 = message.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V1
+        self.uses_mavlink_1 = message.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V1
         return True
 
     def _send(self, message: Message) -> None:
-        """Send a message; bytes that a full port does not accept are lost, so every request is repeated."""
+        """Send a message. Bytes that a full port does not accept are lost, which is why requests are repeated."""
         self.signing.stamp(self._packer)
         self._port.write(message.pack(self._packer))
         self._packer.seq = (self._packer.seq + 1) % 256
@@ -164,7 +166,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutopilotReading:
-    """All that an autopilot reports about itself; None or empty: not answered."""
+    """Everything that an autopilot reports about itself; None or empty if it did not answer."""
 
     system_id: int
     firmware: str  # "ardupilot", "px4" or "other"
@@ -178,12 +180,12 @@ class AutopilotReading:
     filter_flags: int | None  # of EKF_STATUS_REPORT or ESTIMATOR_STATUS
     origin: tuple[float, float] | None  # of its local frame: latitude, longitude in degrees
     signs: bool  # its messages are signed
-    is_signed_to: bool  # ours to it are
-    answers: bool  # it has answered a question
-    says_version_1: bool  # of MAVLink
+    is_signed_to: bool  # our messages to it are signed
+    answers: bool  # it has answered a request
+    uses_mavlink_1: bool
     other_systems: tuple[int, ...]  # system ids of other autopilots on the link
-    bad_bytes: int  # that belong to no valid message
-    round_trip_s: float | None  # median time of an answer
+    bad_bytes: int  # bytes that belong to no valid message
+    round_trip_s: float | None  # median round trip of requests
     clock_ahead_s: float | None  # its UTC minus that of this machine
 
     @property
@@ -191,18 +193,18 @@ class AutopilotReading:
         return VehicleKind(self.vehicle)
 
 
-def read_autopilot(asking: RequestLink, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
-    """Read all that an autopilot reports about itself, in ten seconds; return None if no heartbeat comes. `wanted` maps
-    a firmware to the names of the parameters to read; parameters with another name in other releases are found too."""
-    beat = asking.heartbeat()
-    if beat is None:
+def read_autopilot(link: RequestLink, wanted: Mapping[str, Iterable[str]]) -> AutopilotReading | None:
+    """Read, within ten seconds, everything that an autopilot reports about itself; return None if no heartbeat arrives.
+    `wanted`: names of the parameters to read, by firmware. Their names in other releases are also tried."""
+    heartbeat = link.wait_for_heartbeat()
+    if heartbeat is None:
         return None
-    firmware = _FIRMWARES.get(beat.autopilot, "other")
-    asking.listen(LISTEN_S)
-    version_message = asking.message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-    answers = bool(version_message or asking.received["COMMAND_ACK"])
+    firmware = _FIRMWARES.get(heartbeat.autopilot, "other")
+    link.listen(LISTEN_S)
+    version_message = link.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+    answers = bool(version_message or link.received["COMMAND_ACK"])
     is_px4 = firmware == "px4"
-    numbers = (
+    message_ids = (
         mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS if is_px4 else mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
         mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
         mavlink.MAVLINK_MSG_ID_GPS2_RAW,
@@ -212,32 +214,34 @@ def read_autopilot(asking: RequestLink, wanted: Mapping[str, Iterable[str]]) -> 
         mavlink.MAVLINK_MSG_ID_ATTITUDE,
     )
     names = tuple(wanted.get(firmware, ())) if answers else ()
-    # Without an answer each request would take three seconds. Of the last two only the arrival matters.
-    filter_state, first, second, origin, clock, *_ = (asking.message(each) if answers else None for each in numbers)
-    parameters = asking.parameters(names, is_px4)
-    others = (ALTERNATIVES.get(name) for name in names if name not in parameters)
-    parameters |= asking.parameters(filter(None, others), is_px4)
+    # If the autopilot does not answer, each request would take three seconds. The last two messages are only counted.
+    filter_state, first, second, origin, clock, *_ = (
+        link.request_message(number) if answers else None for number in message_ids
+    )
+    parameters = link.request_parameters(names, is_px4)
+    other_names = (ALTERNATIVES.get(name) for name in names if name not in parameters)
+    parameters |= link.request_parameters(filter(None, other_names), is_px4)
     packed = version_message.flight_sw_version if version_message else 0
     version = packed >> 24, packed >> 16 & 255, packed >> 8 & 255
     return AutopilotReading(
-        system_id=beat.get_srcSystem(),
+        system_id=heartbeat.get_srcSystem(),
         firmware=firmware,
-        vehicle=classify_vehicle(beat.type).value,
-        is_armed=bool(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
+        vehicle=classify_vehicle(heartbeat.type).value,
+        is_armed=bool(heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
         version=version if version_message else None,
         version_text=".".join(map(str, version)) + _RELEASES.get(packed & 255, "") if version_message else None,
         parameters=parameters,
-        received=tuple(sorted(asking.received)),
+        received=tuple(sorted(link.received)),
         gps_fix=(first and first.fix_type, second and second.fix_type),
         filter_flags=filter_state and filter_state.flags,
         origin=(origin.latitude / 1e7, origin.longitude / 1e7) if origin else None,
-        signs=asking.signed > 0,
-        is_signed_to=asking.signing is not NOT_SIGNING,
+        signs=link.signed > 0,
+        is_signed_to=link.signing is not NOT_SIGNING,
         answers=answers,
-        says_version_1=asking.says_version_1,
-        other_systems=tuple(sorted(asking.others)),
-        bad_bytes=asking.reader.bad_bytes,
-        round_trip_s=statistics.median(asking.round_trips_s) if asking.round_trips_s else None,
+        uses_mavlink_1=link.uses_mavlink_1,
+        other_systems=tuple(sorted(link.others)),
+        bad_bytes=link.reader.bad_bytes,
+        round_trip_s=statistics.median(link.round_trips_s) if link.round_trips_s else None,
         clock_ahead_s=clock.time_unix_usec / 1e6 - time.time() if clock and clock.time_unix_usec else None,
     )
 
@@ -248,5 +252,5 @@ def _is_refusal(message: Message) -> bool:
 
 
 def _match_parameters(names: set[str]) -> Callable[[Message], bool]:
-    kinds = ("PARAM_VALUE", "PARAM_ERROR")  # the value, or that the parameter is unknown
+    kinds = ("PARAM_VALUE", "PARAM_ERROR")  # PARAM_ERROR: the parameter is unknown
     return lambda message: message.get_type() in kinds and message.param_id in names

@@ -1,4 +1,4 @@
-"""Channels: the messages by which positions are sent to an autopilot, chosen by its parameters: see
+"""Channels: the messages that carry positions to an autopilot. Its parameters decide which one is used: see
 `ardupilot_parameters` and `px4_parameters`."""
 
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from edgevpr.core.reasons import Reason
 
 Parameters: TypeAlias = Mapping[str, float]
 
-# ArduPilot's names of before 4.6, by those since (AP_GPS.cpp, convert_parameters).
+# ArduPilot's parameter names before 4.6, by the current name (AP_GPS.cpp, convert_parameters).
 OLD_NAMES = {
     "GPS1_TYPE": "GPS_TYPE",
     "GPS2_TYPE": "GPS_TYPE2",
@@ -21,15 +21,15 @@ OLD_NAMES = {
 
 
 class Channel(Enum):
-    """A message by which positions are sent. COMMAND carries single fixes, which may be rare and late; the others are
-    continuous: they carry the estimate, ten times a second without a gap."""
+    """A message that carries positions. COMMAND carries single fixes, which may be rare and late. The others are
+    continuous: they carry the estimated position ten times a second without gaps."""
 
-    NONE = auto()  # nothing is sent: a parameter is dangerous, or not answered yet
+    NONE = auto()  # nothing is sent: a parameter is dangerous, or not yet received
     COMMAND = auto()  # 43003, EXTERNAL_POSITION_ESTIMATE
     SENSOR = auto()  # message 296, GLOBAL_POSITION_SENSOR (PX4)
     GPS_INPUT = auto()  # message 232, as a GPS receiver (ArduPilot)
     ODOMETRY = auto()  # message 331 (ArduPilot)
-    VISION = auto()  # message 331, as a position only (PX4)
+    VISION = auto()  # message 331, with a position only (PX4)
 
     @property
     def is_continuous(self) -> bool:
@@ -37,12 +37,12 @@ class Channel(Enum):
 
     @property
     def is_beside_gps(self) -> bool:
-        """True if positions are sent while the autopilot has GPS too."""
+        """True if positions are also sent while the autopilot has GPS."""
         return self in (Channel.GPS_INPUT, Channel.ODOMETRY)
 
 
 class VehicleKind(Enum):
-    """A kind of vehicle; it decides what the autopilot can do without GPS."""
+    """A kind of vehicle, which determines what the autopilot can do without GPS."""
 
     PLANE = "plane"
     COPTER = "copter"
@@ -59,8 +59,8 @@ _MAV_TYPES = {
 
 @dataclass(frozen=True, slots=True)
 class ChannelChoice:
-    """The channel chosen for an autopilot, and the `reason` for it. For GPS_INPUT, `receiver` is the index of the GPS
-    receiver that we replace (0: the first), and `lag_s` the age that the autopilot assumes our positions to have."""
+    """The channel chosen for an autopilot, and the `reason`. For GPS_INPUT, `receiver` is the index of the GPS receiver
+    that we replace (0: the first), and `lag_s` the age that the autopilot assumes for our positions."""
 
     channel: Channel
     reason: Reason
@@ -69,18 +69,18 @@ class ChannelChoice:
 
     @property
     def silence_reason(self) -> Reason | None:
-        """The reason why nothing is sent; None if something is."""
+        """The reason why no positions are sent; None if they are sent."""
         return self.reason if self.channel is Channel.NONE else None
 
 
 def classify_vehicle(mav_type: int) -> VehicleKind:
     """Return the kind of vehicle for the `type` field of its HEARTBEAT (a MAV_TYPE). A VTOL aircraft counts as a plane:
-    in forward flight it dead-reckons as one, and its type does not tell whether it hovers."""
+    it dead-reckons like one in forward flight, and its type does not show whether it hovers."""
     return next((kind for kind, types in _MAV_TYPES.items() if mav_type in types), VehicleKind.OTHER)
 
 
 def resolve_name(parameters: Parameters, name: str) -> str:
-    """Return the name that this autopilot has for a parameter: its old one if only that was read, else `name`."""
+    """Return this autopilot's name for a parameter: the old name if only that was read, otherwise `name`."""
     old = OLD_NAMES.get(name, name)
     return old if old in parameters and name not in parameters else name
 

@@ -1,6 +1,6 @@
-"""The autopilot's clock, the seconds since its boot, as a function of our monotonic clock. It is learnt by TIMESYNC
-(ArduPilot `GCS_MAVLINK::handle_timesync`, PX4 `MavlinkTimesync::handle_message`), and shows when the autopilot has
-restarted."""
+"""The autopilot's clock (seconds since its boot) as a function of our monotonic clock. It is synchronised by TIMESYNC
+(ArduPilot `GCS_MAVLINK::handle_timesync`, PX4 `MavlinkTimesync::handle_message`), and also detects restarts of the
+autopilot."""
 
 import logging
 import math
@@ -11,27 +11,27 @@ from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.wire import Message, mavlink
 
-HEARTBEAT_TIMEOUT_S = 5.0  # heartbeats come once a second, and this many may be lost
+HEARTBEAT_TIMEOUT_S = 5.0  # five heartbeats, which are sent once a second
 TIMESYNC_TIMEOUT_S = 5.0  # without an answer
 _REQUEST_INTERVAL_S = 1.0
 _URGENT_REQUEST_INTERVAL_S = 0.25
-_MAX_ANSWER_AGE_S = 10.0  # of answers; two quartz clocks drift apart by 1 ms at most in this time
+_MAX_ANSWER_AGE_S = 10.0  # two quartz clocks drift apart by at most 1 ms in this time
 _MAX_CLOCK_DRIFT_S = 1e-3
-_MAX_REQUESTS = 64  # whose answers are still awaited: those of a link that is very late
-_MIN_STEP_BACK_S = 1.0  # a boot time that goes back by more is that of another boot
-_RESTART_CHECK_S = 3.0  # after a gap of heartbeats; an autopilot that shows no boot time meanwhile counts as restarted
-_UTC_ROUNDING_S = 5e-3  # its boot time comes in whole milliseconds
+_MAX_REQUESTS = 64  # requests with pending answers; only a very slow link has as many
+_MIN_STEP_BACK_S = 1.0  # a boot time that goes back by more than this belongs to another boot
+_RESTART_CHECK_S = 3.0  # after a gap in heartbeats; an autopilot that sends no boot time in it counts as restarted
+_UTC_ROUNDING_S = 5e-3  # boot times are sent in whole milliseconds
 _MAX_STAMP_ERROR_S = 1.0
 JITTER_LAG_S = 0.5  # `max_lag_ms` of ArduPilot's JitterCorrection
-_JITTER_SAMPLES = 200  # of our stamps, after the last foreign one: twice `convergence_loops`, which start anywhere
-# Only messages whose time is that of sending: others report the time of a measurement, which may be an old one.
+_JITTER_SAMPLES = 200  # our stamps affected by a foreign one: two rounds of `convergence_loops`, the first partial
+# Only messages stamped when they are sent: others carry the time of a measurement, which may be old.
 _BOOT_TIME_MESSAGES = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU", "SYSTEM_TIME")
 _WRAP_MS = 2**32
 _WRAP_MARGIN_MS = 60_000
-MAX_REPORT_DELAY_S = 0.5  # a report that comes later is not used: at 20 m/s it is 10 m old
+MAX_REPORT_DELAY_S = 0.5  # reports with a longer delay are not used: at 20 m/s they are off by 10 m
 _MIN_PUNCTUAL_S = 10.0  # without a late report
-# The messages that share ArduPilot's one correction of time stamps per link, with the name of the stamp: all callers of
-# `GCS_MAVLINK::correct_offboard_timestamp_usec_to_ms` but command 43003.
+# The messages that share ArduPilot's single timestamp correction per link, with the name of their timestamp field: all
+# callers of `GCS_MAVLINK::correct_offboard_timestamp_usec_to_ms` except command 43003.
 _STAMP_FIELDS = {
     "ATT_POS_MOCAP": "time_usec",
     "GLOBAL_VISION_POSITION_ESTIMATE": "usec",
@@ -46,7 +46,7 @@ log = logging.getLogger(__name__)
 
 
 class _Answer(NamedTuple):
-    """The bounds that an answer to TIMESYNC sets to the offset, boot time less monotonic time; received at `t_s`."""
+    """Bounds on the clock offset (boot time minus monotonic time) from an answer to TIMESYNC received at `t_s`."""
 
     t_s: float
     low_s: float
@@ -61,30 +61,30 @@ class _Answer(NamedTuple):
 
 
 class AutopilotClock:
-    """Converts our monotonic time to the autopilot's time since boot, and to its UTC. The offset is that of the answer
-    with the shortest round trip of the last ten seconds. Where TIMESYNC is not answered within five seconds, time
-    stamps are those of our own clock until the autopilot restarts."""
+    """Converts our monotonic time to the autopilot's time since boot, and to its UTC. The offset is taken from the
+    answer with the shortest round trip within the last ten seconds. If TIMESYNC is not answered within five seconds,
+    timestamps are taken from our own clock until the autopilot restarts."""
 
     def __init__(self) -> None:
         self._requests_ns: deque[int] = deque(maxlen=_MAX_REQUESTS)
-        self._first_request_s = self._due_s = -math.inf  # first asked; when to ask next
+        self._first_request_s = self._due_s = -math.inf  # times of the first request and of the next one
         self._answers: list[_Answer] = []
         self._best: _Answer | None = None
         self._uses_own_clock = False
-        self._heartbeat_s = math.inf  # of the last heartbeat
-        self._boot_ms: dict[str, int] = {}  # the last of each kind of message
-        self._gap_end_s: float | None = None  # when a heartbeat came after a gap; None: it is the same boot
+        self._heartbeat_s = math.inf  # time of the last heartbeat
+        self._boot_ms: dict[str, int] = {}  # last boot time by kind of message
+        self._gap_end_s: float | None = None  # when heartbeats resumed after a gap; None: no restart suspected
         self._is_same_boot = False  # boot times have continued since the gap
-        self._utc_ahead_s: float | None = None  # UTC less boot time
-        self._utc_ahead_of_ours_s: float | None = None  # UTC less our time, where the boot time is not known
+        self._utc_ahead_s: float | None = None  # UTC minus boot time
+        self._utc_ahead_of_ours_s: float | None = None  # UTC minus our time, used if the boot time is unknown
 
     def make_request(self, now_s: float) -> Message | None:
-        """Return the TIMESYNC to be sent at `now_s`; None if none is due."""
+        """Return the TIMESYNC to send at `now_s`; None if none is due."""
         if not self._requests_ns:
             self._first_request_s = now_s
         if self._best is None and not self._uses_own_clock and now_s - self._first_request_s > TIMESYNC_TIMEOUT_S:
             self._uses_own_clock = True
-            log.warning("the autopilot does not answer TIMESYNC: time stamps are those of our own clock")
+            log.warning("the autopilot does not answer TIMESYNC: using our own clock for timestamps")
         if now_s < self._due_s:
             return None
         is_urgent = self._gap_end_s is not None or (self._best is None and not self._uses_own_clock)
@@ -93,8 +93,8 @@ class AutopilotClock:
         return mavlink.MAVLink_timesync_message(tc1=0, ts1=self._requests_ns[-1])
 
     def handle(self, message: Message, now_s: float) -> bool:
-        """Process a message of the autopilot. Returns True if it shows that the autopilot has restarted: its boot time
-        goes back or, after a gap of heartbeats, does not continue."""
+        """Process a message from the autopilot. Returns True if it shows that the autopilot has restarted: its boot
+        time goes back or, after a gap in heartbeats, does not continue."""
         kind = message.get_type()
         if kind == "TIMESYNC" and message.tc1 > 0 and message.ts1 in self._requests_ns:
             if self._handle_answer(message.tc1 / 1e9, message.ts1 / 1e9, now_s):
@@ -114,48 +114,48 @@ class AutopilotClock:
         return False
 
     def boot_time_s(self, t_mono_s: float) -> float | None:
-        """Return the autopilot's time since boot at `t_mono_s`; None: not known (yet)."""
+        """Return the autopilot's time since boot at `t_mono_s`; None if it is unknown."""
         return t_mono_s + (self._best.low_s + self._best.high_s) / 2 if self._best else None
 
     def stamp_s(self, t_mono_s: float) -> float | None:
-        """Return `t_mono_s` as a time stamp for the autopilot; None: not known yet, or perhaps that of a past boot."""
+        """Return `t_mono_s` as a timestamp for the autopilot; None if its clock is unknown or may have restarted."""
         if self._gap_end_s is not None:
             return None
         return t_mono_s if self._uses_own_clock else self.boot_time_s(t_mono_s)
 
     def utc_s(self, t_mono_s: float) -> float | None:
-        """Return the autopilot's UTC at `t_mono_s`, seconds since 1970; None: unknown."""
+        """Return the autopilot's UTC at `t_mono_s` in seconds since 1970; None if it is unknown."""
         boot_s = self.boot_time_s(t_mono_s)
         if boot_s is not None and self._utc_ahead_s is not None:
             return boot_s + self._utc_ahead_s
         return None if self._utc_ahead_of_ours_s is None else t_mono_s + self._utc_ahead_of_ours_s
 
     def delay_s(self, boot_ms: int, now_s: float) -> float:
-        """Return the transport delay in seconds of a report with the boot time `boot_ms`; 0.0 if the boot time is not
-        known. It is at least half the last round trip: if the report is not late, then our messages are."""
+        """Return the transport delay in seconds of a report stamped `boot_ms`; 0.0 if the autopilot's clock is unknown.
+        The delay is at least half the last round trip: if the report is not late, then our messages are."""
         boot_s = self.boot_time_s(now_s)
         if boot_s is None:
             return 0.0
         return max(math.remainder(boot_s - boot_ms / 1e3, _WRAP_MS / 1e3), self._answers[-1].round_trip_s / 2)
 
     def _handle_answer(self, boot_s: float, sent_s: float, now_s: float) -> bool:
-        """Process the answer to the request sent at `sent_s`. Returns True if it is from another boot."""
-        answer, before = _Answer(now_s, boot_s - now_s, boot_s - sent_s), self._best
+        """Process the answer to the request sent at `sent_s`. Returns True if it belongs to another boot."""
+        answer, old_best = _Answer(now_s, boot_s - now_s, boot_s - sent_s), self._best
         last = self._answers[-1] if self._answers else None
         if last and boot_s < last.t_s + last.low_s - _MIN_STEP_BACK_S:
             return True
-        if self._gap_end_s is not None and before and answer.round_trip_s < _MIN_STEP_BACK_S:
-            if answer.high_s < before.low_s - _MIN_STEP_BACK_S:
+        if self._gap_end_s is not None and old_best and answer.round_trip_s < _MIN_STEP_BACK_S:
+            if answer.high_s < old_best.low_s - _MIN_STEP_BACK_S:
                 return True
             self._gap_end_s = None
-        # One that contradicts the newest is from before a pause of either clock.
+        # Answers that contradict the newest one date from before one of the clocks paused.
         kept = (old for old in self._answers if now_s - old.t_s <= _MAX_ANSWER_AGE_S and not old.contradicts(answer))
         self._answers = [*kept, answer]
-        self._best = min(self._answers, key=lambda kept: kept.round_trip_s)
+        self._best = min(self._answers, key=lambda answer: answer.round_trip_s)
         return False
 
     def _handle_boot_time(self, kind: str, boot_ms: int) -> bool:
-        """Process the boot time in a message of `kind`. Returns True if it goes back."""
+        """Process the boot time in a message of `kind`. Returns True if the boot time has gone back."""
         last_ms = self._boot_ms.get(kind)
         self._boot_ms[kind] = boot_ms
         if last_ms is None:
@@ -166,8 +166,8 @@ class AutopilotClock:
         return is_back
 
     def _handle_utc(self, message: Message, now_s: float) -> None:
-        """Process a SYSTEM_TIME: UTC and boot time of one instant, by one clock. Their difference is constant but for
-        the rounding of the boot time, and keeps its first value until it is corrected by more."""
+        """Process a SYSTEM_TIME: UTC and boot time of one instant, from one clock. Their difference is constant except
+        for the rounding of the boot time, so its first value is kept until it changes by more than that."""
         utc_s, boot_s = message.time_unix_usec / 1e6, message.time_boot_ms / 1e3
         self._utc_ahead_of_ours_s = utc_s - now_s
         expected_s = self.boot_time_s(now_s)
@@ -179,13 +179,13 @@ class AutopilotClock:
 
 
 class ReportDelay:
-    """Decides by their delay whether the autopilot's reports are used, and announces it when that changes. `is_late`:
-    the newest came more than MAX_REPORT_DELAY_S after it was sent, as on a full link, or after we were stopped."""
+    """Decides from their delay whether the autopilot's reports are used, and announces changes. `is_late`: the newest
+    report arrived more than MAX_REPORT_DELAY_S after it was sent, because the link is full or our process paused."""
 
     def __init__(self, announce: Announce) -> None:
         self.is_late = False
         self._announce = announce
-        self._late_s: float | None = None  # when one last came too late; None: all come in time
+        self._late_s: float | None = None  # when a report last arrived too late; None: reports arrive on time
 
     def update(self, delay_s: float, now_s: float) -> None:
         """Process the delay of a report received at `now_s`."""
@@ -193,34 +193,35 @@ class ReportDelay:
         if self.is_late:
             if self._late_s is None:
                 log.warning(
-                    "the autopilot's reports come %.1f s late and are not used: the link is full; raise its baud rate, "
-                    "or let the other programs on it ask for fewer messages", delay_s,
+                    "the autopilot's reports arrive %.1f s late and are not used: the link is full; raise its baud "
+                    "rate, or have the other programs on the link request fewer messages", delay_s,
                 )  # fmt: skip
                 self._announce(Severity.WARNING, f"link full: reports {delay_s:.1f} s late", "delay")
             self._late_s = now_s
         elif self._late_s is not None and now_s - self._late_s > _MIN_PUNCTUAL_S:
             self._late_s = None
-            self._announce(Severity.INFO, "reports come in time again", "delay")
+            self._announce(Severity.INFO, "reports on time again", "delay")
 
 
 class ForeignStamps:
-    """Finds time stamps of other programs that are not in the autopilot's time. ArduPilot has one correction for all
-    senders of a link (`JitterCorrection`): after a stamp that is ahead, ours counts as sent 0.5 s before it arrives."""
+    """Finds timestamps of other programs that are not in the autopilot's time. ArduPilot has one timestamp correction
+    for all senders of a link (`JitterCorrection`). After a stamp that is ahead of its time, it treats our messages as
+    sent 0.5 s before they arrive."""
 
     def __init__(self) -> None:
         self._reported: set[tuple[str, str]] = set()
-        self._spoilt_stamps = 0  # stamps of ours that still count as too old
+        self._spoilt_stamps = 0  # number of our next stamps that ArduPilot will read as too old
 
     def take_lag_s(self) -> float:
-        """Return by how many seconds the stamp that we send now will count as too old."""
+        """Return by how many seconds ArduPilot will read the stamp that we send now as too old."""
         if self._spoilt_stamps == 0:
             return 0.0
         self._spoilt_stamps -= 1
         return JITTER_LAG_S
 
     def find(self, message: Message, boot_s: float | None) -> str | None:
-        """Return sender and name of a message whose stamp is off by more than a second, the first time (None: it is
-        not). `boot_s` is the autopilot's time since boot."""
+        """Return sender and name of a message if its timestamp is wrong by more than a second and this was not reported
+        before, else None. `boot_s`: the autopilot's time since boot."""
         kind = message.get_type()
         if kind in _STAMP_FIELDS:
             stamp_s = getattr(message, _STAMP_FIELDS[kind]) / 1e6
@@ -236,8 +237,8 @@ class ForeignStamps:
         if (sender, kind) in self._reported:
             return None
         self._reported.add((sender, kind))
-        why = "ArduPilot has one time correction for all senders of a link: ODOMETRY counts as up to 0.5 s older"
-        advice = "let it take its time from TIMESYNC, or give it a port of its own"
-        text = f"{sender} stamps its {kind} {stamp_s - boot_s:.1f} s off the autopilot's time since boot"
-        log.warning("%s: %s; %s", text, why, advice)
+        why = "ArduPilot has one timestamp correction for all senders of a link, so it dates ODOMETRY up to 0.5 s back"
+        advice = "have that program use TIMESYNC, or connect it to another port"
+        fault = f"the timestamps of {kind} from {sender} differ from the autopilot's time by {stamp_s - boot_s:.1f} s"
+        log.warning("%s: %s; %s", fault, why, advice)
         return f"{sender} {kind}"

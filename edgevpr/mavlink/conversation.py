@@ -1,4 +1,4 @@
-"""The conversation with the autopilot, without port and thread, used inside turns only (see `turns`)."""
+"""The conversation with the autopilot, independent of port and thread. Used inside turns only (see `turns`)."""
 
 import logging
 import math
@@ -23,20 +23,20 @@ from edgevpr.mavlink.wire import Message, PacketReader, mavlink
 
 MAX_MESSAGES = 64
 HEARTBEAT_INTERVAL_S = 1.0
-STATE_INTERVAL_S = 0.1  # ArduPilot calls a receiver unhealthy whose positions come more than 215 ms apart
+STATE_INTERVAL_S = 0.1  # ArduPilot treats a GPS receiver as unhealthy if its positions are more than 215 ms apart
 HEALTH_TIMEOUT_S = 10.0  # a hung main loop must not look healthy because the link's thread still runs
-INTERIM_FIX_INTERVAL_S = 0.5  # between single fixes without a match
+INTERIM_FIX_INTERVAL_S = 0.5  # between fixes sent without a new match
 REQUEST_INTERVAL_S = 5.0
-ORIGIN_TIMEOUT_S = 5.0  # an autopilot that has an origin sends it once a second when asked to
+ORIGIN_TIMEOUT_S = 5.0  # an autopilot that has an origin sends it once a second on request
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSettings:
-    """The settings of a link. `system_id`: that of the autopilot (None: of the first one). A fix that has waited
-    for `max_fix_age_s` is never sent. `clock`: the monotonic clock of all stamps. `origin` is sent to an autopilot that
-    takes ODOMETRY and has none (None: never)."""
+    """The settings of a link. `system_id`: system id of the autopilot (None: accept the first one). A fix that has
+    waited for `max_fix_age_s` is never sent. `clock`: the monotonic clock of all timestamps. `origin`: the origin to
+    set on an autopilot that accepts ODOMETRY and has no origin (None: never set one)."""
 
     component_id: int = 197
     system_id: int | None = None
@@ -48,7 +48,7 @@ class LinkSettings:
 
 
 class Conversation:
-    """Makes the packets to send, one after another, and processes those received. `sent` counts messages by name."""
+    """Makes the packets to send, one at a time, and processes received bytes. `sent` counts messages by name."""
 
     def __init__(self, settings: LinkSettings, clock: Callable[[], float]) -> None:
         self.settings = settings
@@ -67,9 +67,9 @@ class Conversation:
         self._health, self._health_set_s = Health.BOOT, clock()
         self._packer = mavlink.MAVLink(None, srcSystem=settings.system_id or 1, srcComponent=settings.component_id)
         self._heartbeat_due_s = self._state_due_s = self._interim_fix_due_s = clock()
-        self._next_request_s: float | None = None  # for its reports; None: not needed
+        self._next_request_s: float | None = None  # when to request reports next; None: they are not needed
         self._restarts, self._restart_reported_s = 0, -math.inf
-        self._reported_channel: Channel | None = self.channel  # the channel that the listener knows
+        self._reported_channel: Channel | None = self.channel  # as last reported to the listener
         self._has_requested_continuous: bool | None = None
         self._origin_missing_since_s, self._has_set_origin = math.inf, False
         self._has_requested_pressure = False
@@ -77,22 +77,22 @@ class Conversation:
 
     @property
     def channel(self) -> Channel:
-        """The channel by which positions are sent."""
+        """The channel used to send positions."""
         return self.autopilot.interview.choice.channel
 
     @property
     def has_pending(self) -> bool:
-        """True if a message or a text waits to be sent, or a fix for its answer."""
+        """True if a message or text is queued, or a fix awaits its answer."""
         return bool(self._messages or self.texts or self.fixes)
 
     def send(self, *outgoing: Message) -> None:
-        """Queue messages to be sent. If the queue is full, the oldest messages are dropped and counted."""
+        """Queue messages. If the queue is full, the oldest messages are dropped and counted."""
         for message in outgoing:
             self.dropped_queue_full += len(self._messages) == MAX_MESSAGES
             self._messages.append(message)
 
     def send_fix(self, fix: Fix) -> FixTransmission:
-        """Queue a position fix. It is sent within `max_fix_age_s` seconds, while the autopilot is alive, or never."""
+        """Queue a position fix. It is sent within `max_fix_age_s` seconds if the autopilot is alive, or never."""
         now_s = self._clock()
         self._interim_fix_due_s = now_s + INTERIM_FIX_INTERVAL_S
         return self.fixes.put(fix, now_s)
@@ -103,63 +103,63 @@ class Conversation:
         return taken
 
     def announce(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        """Queue a status text; one is sent every five seconds. `topic`: its subject (see `Texts`)."""
+        """Queue a status text; at most one is sent every five seconds. `topic`: see `Texts`."""
         self.texts.put(severity, text, topic)
 
     def set_health(self, health: Health) -> None:
-        """Set the health to send in heartbeats. It is valid for ten seconds; without a new call it becomes CRITICAL."""
+        """Set the health to send in heartbeats. Unless it is set again within ten seconds, it becomes CRITICAL."""
         self._health, self._health_set_s = health, self._clock()
 
     def request_position(self) -> None:
-        """From now on request the autopilot's reports, and again whenever they stop or become rare."""
+        """Start to request the autopilot's reports, and request them again whenever they stop or become rare."""
         self._next_request_s = self._clock()
 
     def predict_vehicle(self, t_mono_s: float) -> Vehicle | None:
-        """Return the last report of the vehicle, moved to `t_mono_s`, the time of a frame, as far as velocity and
-        attitude (within 0.3 s) are known; None without a position. On a continuous channel, `t_fix_s` is now."""
+        """Return the last report of the vehicle, extrapolated to `t_mono_s`, the time of a frame, as far as velocity
+        and attitude (within 0.3 s) are known; None without a position. On a continuous channel, `t_fix_s` is now."""
         vehicle = self.autopilot.predict_vehicle(t_mono_s)
         t_fix_s = self._clock() if self.channel.is_continuous else self.fixes.t_fix_s
         return vehicle and replace(vehicle, t_fix_s=t_fix_s)
 
     def wait_s(self, longest_s: float) -> float:
-        """Return for how many seconds, `longest_s` at most, the link may sleep before something is due to be sent."""
+        """Return how many seconds, at most `longest_s`, the link may sleep until the next message is due."""
         due_in_s = self._state_due_s - self._clock() if self.channel.is_continuous else longest_s
         return min(longest_s, max(0.0, due_in_s))
 
     def next_packet(self) -> tuple[bytes, FixTransmission | None] | None:
-        """Choose and pack the next message. Returns its packet and the fix in it, if any; None: nothing is due."""
-        while (chosen := self._next_message(self._clock())) is not None:
-            message, sending = chosen
+        """Choose and pack the next message. Returns its packet and the fix in it, if any; None if nothing is due."""
+        while (outgoing := self._next_message(self._clock())) is not None:
+            message, transmission = outgoing
             self.settings.signing.stamp(self._packer)
             try:
                 packet: bytes = message.pack(self._packer)
-            except (struct.error, OverflowError) as error:  # a value out of its field's range must not end the link
+            except (struct.error, OverflowError) as error:  # an out-of-range value must not break the link
                 log.error("%s not sent: %s", message, error)
-                if sending:
-                    sending.settle(False, Reason(ReasonCode.NOT_ENCODABLE, {"problem": str(error)}))
+                if transmission:
+                    transmission.settle(False, Reason(ReasonCode.NOT_ENCODABLE, {"problem": str(error)}))
                 continue
             self._packer.seq = (self._packer.seq + 1) % 256
-            if sending:
-                self.fixes.record_sent(sending, self._clock())
+            if transmission:
+                self.fixes.record_sent(transmission, self._clock())
             else:
                 self.sent[message.get_type()] += 1
-            return packet, sending
+            return packet, transmission
         return None
 
     def count_sent_fixes(self, fixes: list[FixTransmission]) -> None:
-        """Count the fixes that have left the port. Call it before `handle` processes the answer to one of them."""
+        """Count the fixes that have left the port. Call this before `handle` processes an answer to one of them."""
         self.sent["COMMAND_INT"] += len(fixes)
 
     def handle(self, data: bytes, now_s: float, sender: Sender | None) -> bool:
         """Process bytes received from `sender` at `now_s`. Returns True if they contain the autopilot's heartbeat."""
-        beats = False
+        has_heartbeat = False
         for message in self.reader.feed(data, sender):
             if self.autopilot.handle(message, now_s, sender):
-                beats = True
+                has_heartbeat = True
                 self._packer.srcSystem = self.autopilot.system_id
                 if self.autopilot.identity.has_moved:
                     self._reset(ReasonCode.AUTOPILOT_REPLACED)
-                    self.announce(Severity.WARNING, "autopilot has another address", "autopilot")
+                    self.announce(Severity.WARNING, "autopilot address has changed", "autopilot")
             if self.autopilot.has_restarted:
                 self._reset(ReasonCode.AUTOPILOT_RESTARTED)
                 self._announce_restart(now_s)
@@ -168,10 +168,10 @@ class Conversation:
             if not self.autopilot.identity.is_foreign(sender):
                 self._handle_request(message, now_s)
                 self._handle_stamp(message, now_s)
-        return beats
+        return has_heartbeat
 
     def announce_changes(self) -> None:
-        """Announce what has changed with the autopilot and its answers since the last call."""
+        """Announce changes in the autopilot's heartbeats and answers since the last call."""
         now_s = self._clock()
         is_alive = self.autopilot.is_alive(now_s)
         if is_alive and self._was_alive is False:
@@ -186,17 +186,17 @@ class Conversation:
             self.announce(*self._reports.pop(0))
 
     def break_off(self, lost_fixes: int) -> None:
-        """Reset the state of a lost port. `lost_fixes` is the number of fixes discarded with it."""
+        """Reset the state after the port was lost. `lost_fixes`: number of fixes discarded with it."""
         self.fixes.record_lost(lost_fixes)
         self.autopilot.heartbeat_s = -math.inf  # the reopened port may lead to another autopilot
-        self.reader.parsers.clear()  # with incomplete messages
+        self.reader.parsers.clear()  # discards incomplete messages
 
     def drop_stale(self) -> None:
-        """Give up the fixes that have waited too long."""
+        """Drop the fixes that have waited too long."""
         self.fixes.drop_stale(self._clock())
 
     def end(self) -> None:
-        """Give up all fixes, awaited and queued."""
+        """Give up all fixes: queued ones, and those that await an answer."""
         self.fixes.cancel_awaited(Reason(ReasonCode.ENDED_BEFORE_ANSWER))
         self.fixes.drop_stale(math.inf)
 
@@ -214,14 +214,14 @@ class Conversation:
             if self.channel.is_continuous and (state := self._make_state(system_id, now_s)):
                 return state, None
             pause = Reason(ReasonCode.PAUSED) if self.requests.is_paused else None
-            if why := pause or self.autopilot.interview.choice.silence_reason or self.fixes.find_objection(now_s):
-                self.fixes.withhold(why)
+            if objection := pause or self.autopilot.interview.choice.silence_reason or self.fixes.find_objection(now_s):
+                self.fixes.withhold(objection)
             elif (stamp_s := self.autopilot.stamp_s(now_s)) is None:
                 self.fixes.drop_stale(now_s, ReasonCode.CLOCK_UNKNOWN)
-            elif sending := self.fixes.next(now_s) or self._next_interim_fix(now_s):
+            elif transmission := self.fixes.next(now_s) or self._next_interim_fix(now_s):
                 lag_s = self.autopilot.foreign_stamps.take_lag_s()
-                fix = compensate_lag(sending.fix, now_s, lag_s, self.autopilot.vehicle)
-                return messages.make_position_fix(fix, now_s, system_id, stamp_s), sending
+                fix = compensate_lag(transmission.fix, now_s, lag_s, self.autopilot.vehicle)
+                return messages.make_position_fix(fix, now_s, system_id, stamp_s), transmission
         else:
             self.fixes.drop_stale(now_s)
         if text := self.texts.next(now_s):
@@ -229,8 +229,8 @@ class Conversation:
         return (self._messages.popleft(), None) if self._messages else None
 
     def _next_interim_fix(self, now_s: float) -> FixTransmission | None:
-        """Return a fix between two matches, if one is due and helps. ArduPilot corrects its position by it; PX4 may
-        correct its velocity, too, which would feed its own error back."""
+        """Return a fix between two matches, if one is due and useful. ArduPilot corrects only its position with it. PX4
+        may also correct its velocity, which would feed back its own error."""
         is_due = now_s >= self._interim_fix_due_s and self.autopilot.firmware == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
         if not is_due or not (fix := self.settings.listener.make_interim_fix(now_s)):
             return None
@@ -254,31 +254,31 @@ class Conversation:
             return messages.make_gps_input(state, choice.receiver, stamp_s, autopilot.clock.utc_s(t_s))
         origin = self.settings.origin
         if autopilot.origin is None and origin and now_s - self._origin_missing_since_s > ORIGIN_TIMEOUT_S:
-            self._origin_missing_since_s = now_s  # again later: a filter that has not started ignores it
+            self._origin_missing_since_s = now_s  # send it again later: a filter that has not started ignores it
             return self._make_origin(origin, system_id)
         if state and state.attitude and autopilot.origin:
             return messages.make_odometry(state, state.attitude, autopilot.origin, stamp_s)
         return None
 
     def _make_origin(self, origin: Position, system_id: int) -> Message:
-        """Make the message that sets the origin, or requests the air pressure for an altitude that the map lacks."""
+        """Make the message that sets the origin; if the map lacks its altitude, request the air pressure first."""
         alt_m = self.autopilot.pressure_alt_m if origin.alt_m is None else origin.alt_m
         if alt_m is None:
             if self._has_requested_pressure:
                 self.announce(Severity.WARNING, "origin altitude unknown: set EKF origin", "origin")
             self._has_requested_pressure = True
             return messages.make_message_request(system_id, mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE)
-        self._has_requested_pressure = False  # an autopilot that restarts is asked again
+        self._has_requested_pressure = False  # request it again after a restart of the autopilot
         if not self._has_set_origin:
-            altitude = "by air pressure, up to 150 m off" if origin.alt_m is None else "of the map"
-            log.warning("the autopilot has no origin: set to the first place of the map, altitude %s", altitude)
+            altitude = "from air pressure (error up to 150 m)" if origin.alt_m is None else "from the map"
+            log.warning("the autopilot has no origin: setting it to the first place of the map, altitude %s", altitude)
             self._has_set_origin = True
         if origin.alt_m is None:
             self.announce(Severity.WARNING, f"origin altitude unknown: about {alt_m:.0f} m", "origin")
         return messages.make_origin(system_id, origin.lat_deg, origin.lon_deg, alt_m)
 
     def _request_reports(self, system_id: int, now_s: float) -> None:
-        """Request the parameters that are due, and reports that have stopped or come at less than half the rate."""
+        """Request the parameters that are due, and reports that have stopped or arrive at less than half the rate."""
         if self._next_request_s is None:
             return
         self.send(*self.autopilot.interview.questions(now_s, system_id))
@@ -299,7 +299,7 @@ class Conversation:
             self.send(*messages.make_report_requests(system_id, self.autopilot.firmware, is_continuous))
 
     def _reset(self, why: ReasonCode) -> None:
-        """Restart with an autopilot that has lost its state. `why` is reported for the awaited fixes."""
+        """Start over with an autopilot that has lost its state. `why`: reason reported for the awaited fixes."""
         self.fixes.cancel_awaited(Reason(why))
         self._has_requested_continuous = self._reported_channel = None
         self._origin_missing_since_s, self._has_set_origin = math.inf, False
@@ -315,21 +315,21 @@ class Conversation:
         self._restart_reported_s = now_s
 
     def _handle_stamp(self, message: Message, now_s: float) -> None:
-        """Announce a wrong time stamp of another program, by which ArduPilot misreads ours, too."""
+        """Announce a wrong timestamp of another program, which also makes ArduPilot misread ours."""
         own_id = self._packer.srcSystem, self._packer.srcComponent
         sender, autopilot = (message.get_srcSystem(), message.get_srcComponent()), self.autopilot
         if sender in (own_id, (own_id[0], AUTOPILOT)) or autopilot.firmware != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
             return
         if wrong_stamp := autopilot.foreign_stamps.find(message, autopilot.clock.boot_time_s(now_s)):
-            self.announce(Severity.WARNING, f"wrong stamps: {wrong_stamp}", "stamps")
+            self.announce(Severity.WARNING, f"bad timestamps: {wrong_stamp}", "stamps")
 
     def _handle_request(self, message: Message, now_s: float) -> None:
         self.send(*self.requests.handle(message, (self._packer.srcSystem, self._packer.srcComponent), now_s))
 
     def _handle_answer(self, answer: str, now_s: float) -> None:
-        sending = self.fixes.handle(answer, self.autopilot.assess_readiness(now_s).explain(answer), now_s)
-        if sending and answer == "ACCEPTED":
-            self.autopilot.accuracy.record_accuracy(sending.fix.accuracy_m, now_s)
+        transmission = self.fixes.handle(answer, self.autopilot.assess_readiness(now_s).explain(answer), now_s)
+        if transmission and answer == "ACCEPTED":
+            self.autopilot.accuracy.record_accuracy(transmission.fix.accuracy_m, now_s)
         if answer == "FAILED" and self.autopilot.is_origin_request_due(now_s):
             origin = mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
             self.send(messages.make_message_request(self.autopilot.system_id or 0, origin))

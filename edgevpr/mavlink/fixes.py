@@ -1,9 +1,9 @@
-"""Position fixes in transit to the autopilot: those that wait to be sent, and those that wait for an answer. Used by
-`conversation` inside turns only.
+"""Position fixes in transit to the autopilot: queued ones, and those that await an answer. Used by `conversation`
+inside turns only.
 
-A fix is never sent late, and after five unanswered ones almost none is sent. COMMAND_ACK does not say which fix it
-answers, so it is matched to the oldest fix sent less than a second ago: with one fix a second, and an answer within
-some tens of milliseconds, there is only one such fix. An answer that matches no fix is only counted.
+A fix is never sent late, and after five unanswered fixes in a row only occasional ones are sent. COMMAND_ACK does not
+identify the fix that it answers, so it is matched to the oldest fix sent less than a second ago. With one fix a second,
+and answers within some tens of milliseconds, there is only one such fix. An answer without a fix is only counted.
 """
 
 import logging
@@ -19,20 +19,20 @@ from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.messages import Fix, Severity
 
 MAX_QUEUED_FIXES = 8
-# The longest that a fix may wait, from `put` on and in all buffers together. types.MAX_FIX_AGE_S limits the age of its
-# frame, which is sent with the fix.
+# Longest time from `put` until a fix is sent, in all buffers together. types.MAX_FIX_AGE_S limits the age of its frame,
+# which is sent with the fix.
 MAX_FIX_WAIT_S = 1.0
-MAX_UNANSWERED = 5  # this number of unanswered fixes in a row stops the sending, until one is answered
-RETRY_INTERVAL_S = 10.0  # while the sending is stopped, one fix is sent at this interval
-ANSWER_TIMEOUT_S = 1.0  # an answer takes some tens of milliseconds, over a radio up to half a second
+MAX_UNANSWERED = 5  # after as many unanswered fixes in a row, sending stops until one is answered
+RETRY_INTERVAL_S = 10.0  # interval of the fixes sent while sending is stopped
+ANSWER_TIMEOUT_S = 1.0  # answers take some tens of milliseconds, over a radio up to half a second
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class FixAnswer:
-    """The autopilot's answer to a fix: `result` is the name of a MAV_RESULT (None: none came in time), `why` the reason
-    (None: accepted), `latency_s` the time from sending to answer."""
+    """The autopilot's answer to a fix. `result`: name of a MAV_RESULT (None: no answer in time). `why`: reason (None:
+    accepted). `latency_s`: time from sending to answer."""
 
     result: str | None
     why: Reason | None
@@ -40,8 +40,8 @@ class FixAnswer:
 
 
 class FixTransmission:
-    """A fix to be sent by `due_s`. `sent` is None while it waits, then True, or False with the reason in `why`.
-    `t_sent_s` is when it was handed to the port, `outcome` the answer of the autopilot."""
+    """A fix to send by `due_s`. `sent`: None while it is queued, then True, or False with the reason in `why`.
+    `t_sent_s`: when it was handed to the port. `outcome`: the autopilot's answer."""
 
     def __init__(self, fix: Fix, due_s: float) -> None:
         self.fix, self.due_s = fix, due_s
@@ -53,23 +53,23 @@ class FixTransmission:
 
     @property
     def answer(self) -> str | None:
-        """The name of a MAV_RESULT; None if there is no answer (yet)."""
+        """The name of a MAV_RESULT; None if there is no answer."""
         return self.outcome.result if self.outcome else None
 
     def settle(self, sent: bool, why: Reason | None = None) -> None:
-        """Set the outcome: sent, or not sent and `why`. This wakes the threads in `wait`."""
+        """Record whether the fix was sent and, if not, `why`. Wakes the threads in `wait`."""
         self.sent, self.why = sent, why
         self._settled.set()
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until the fix is sent or given up, `timeout_s` seconds at most."""
+        """Wait up to `timeout_s` seconds until the fix is sent or given up."""
         self._settled.wait(timeout_s)
 
 
 class Fixes:
-    """The fixes of one link: those that wait to be sent, and those that wait for their answer. Counts those `dropped`
-    (too old or too many), `withheld` (by `find_objection` or a pause), and `unanswered`. `refusal` is the reason of the
-    last refusal by the autopilot (None: there was none)."""
+    """The fixes of one link: queued ones, and those that await an answer. Counts fixes `dropped` (too old or too many),
+    `withheld` (by `find_objection` or a pause) and `unanswered`. `refusal`: reason of the autopilot's last refusal
+    (None: it has refused none)."""
 
     def __init__(self, max_wait_s: float = MAX_FIX_WAIT_S, announce: Announce = lambda *_: None) -> None:
         self._announce = announce
@@ -78,78 +78,78 @@ class Fixes:
         self._max_wait_s = max_wait_s
         self._waiting: deque[FixTransmission] = deque()
         self._awaited: deque[tuple[float, FixTransmission]] = deque()  # sent, with the time of sending
-        self._accepted_s = -math.inf  # time of the newest fix that was accepted, or perhaps was
+        self._accepted_s = -math.inf  # time of the newest fix that was, or may have been, accepted
         self._last_answer: tuple[str, Reason] | None = None
         self._sent_s = -math.inf
-        self._unanswered_row = 0  # fixes without an answer, in a row
+        self._unanswered_row = 0  # consecutive fixes without an answer
         self._is_stopped = False  # as last announced
         self._resumes_s = -math.inf
 
     def __len__(self) -> int:
-        """Return the number of fixes that wait for their answers."""
+        """Return the number of fixes that await an answer."""
         return len(self._awaited)
 
     @property
     def t_fix_s(self) -> float:
-        """The time of the newest fix that the autopilot may be using: any that it has not refused (-inf: none)."""
+        """Time of the newest fix that the autopilot may be using: one that it has not refused (-inf: none)."""
         return max(self._accepted_s, self._awaited[-1][0] if self._awaited else -math.inf)
 
     def put(self, fix: Fix, now_s: float) -> FixTransmission:
         """Queue a fix. It is sent within `max_wait_s` seconds and before its frame is 5 s old, or not at all."""
-        sending = FixTransmission(fix, min(now_s + self._max_wait_s, fix.t_frame_s + MAX_FIX_AGE_S))
+        transmission = FixTransmission(fix, min(now_s + self._max_wait_s, fix.t_frame_s + MAX_FIX_AGE_S))
         age_s = now_s - fix.t_frame_s
         if age_s > MAX_FIX_AGE_S:
-            self._drop(sending, Reason(ReasonCode.FRAME_TOO_OLD, {"age_s": age_s, "limit_s": MAX_FIX_AGE_S}))
-            return sending
+            self._drop(transmission, Reason(ReasonCode.FRAME_TOO_OLD, {"age_s": age_s, "limit_s": MAX_FIX_AGE_S}))
+            return transmission
         if len(self._waiting) == MAX_QUEUED_FIXES:
             self._drop(self._waiting.popleft(), Reason(ReasonCode.SUPERSEDED))
-        self._waiting.append(sending)
-        return sending
+        self._waiting.append(transmission)
+        return transmission
 
     def next(self, now_s: float) -> FixTransmission | None:
-        """Drop the fixes that have waited too long; return the oldest of the others, None without any."""
+        """Drop the fixes that have waited too long; return the oldest remaining one (None: none is queued)."""
         self.drop_stale(now_s)
         return self._waiting.popleft() if self._waiting else None
 
     def drop_stale(self, now_s: float, lack: ReasonCode = ReasonCode.NO_AUTOPILOT) -> None:
-        """Give up the fixes that have waited too long, for a `lack`."""
-        for sending in self._waiting:
-            if now_s > sending.due_s:
-                self._drop(sending, Reason(lack, {"limit_s": self._max_wait_s}))
-        self._waiting = deque(sending for sending in self._waiting if sending.sent is None)
+        """Drop the fixes that have waited too long, with the reason `lack`."""
+        for transmission in self._waiting:
+            if now_s > transmission.due_s:
+                self._drop(transmission, Reason(lack, {"limit_s": self._max_wait_s}))
+        self._waiting = deque(transmission for transmission in self._waiting if transmission.sent is None)
 
     def withhold(self, why: Reason) -> None:
-        """Give up all fixes that wait to be sent, for the reason `why`."""
+        """Give up all queued fixes, with the reason `why`."""
         self.withheld += len(self._waiting)
-        for sending in self._waiting:
-            sending.settle(False, why)
+        for transmission in self._waiting:
+            transmission.settle(False, why)
         self._waiting.clear()
 
     def find_objection(self, now_s: float) -> Reason | None:
-        """Return the reason why no fix may be sent now (None: it may)."""
+        """Return the reason why no fix may be sent now; None if fixes may be sent."""
         if self._unanswered_row >= MAX_UNANSWERED and now_s - self._sent_s < RETRY_INTERVAL_S:
             return Reason(ReasonCode.FIXES_UNANSWERED)
         if now_s < self._resumes_s:
             return Reason(ReasonCode.ANSWERS_BEGIN_AGAIN)
         return None
 
-    def record_sent(self, sending: FixTransmission, now_s: float) -> None:
+    def record_sent(self, transmission: FixTransmission, now_s: float) -> None:
         """Record that a fix was handed to the port."""
-        sending.t_sent_s = self._sent_s = now_s
+        transmission.t_sent_s = self._sent_s = now_s
         self._unanswered_row += 1
-        self._awaited.append((now_s, sending))
+        self._awaited.append((now_s, transmission))
 
     def record_lost(self, count: int) -> None:
-        """Record that `count` fixes were lost with the port: they do not count as unanswered, unless sending is stopped
-        already, which only an answer ends."""
+        """Record that `count` fixes were lost with the port. They do not count as unanswered, except while sending is
+        stopped, which only an answer ends."""
         if not self._is_stopped:
             self._unanswered_row -= count
         self.cancel_awaited(Reason(ReasonCode.LINK_LOST_BEFORE_ANSWER))
 
     def handle(self, result: str, reason: Reason, now_s: float) -> FixTransmission | None:
-        """Process an answer: `result` is the name of a MAV_RESULT, `reason` explains it. Returns its fix, if any."""
+        """Process an answer. `result`: name of a MAV_RESULT. `reason`: explains it. Returns its fix, if any."""
         if self._is_stopped:
-            # The answers to all those fixes may arrive now, and must not be matched to a new fix.
+            # Answers to the unanswered fixes may arrive now, and must not be matched to a new fix.
             self._resumes_s = now_s + ANSWER_TIMEOUT_S
         self._unanswered_row = 0
         self.time_out(now_s)
@@ -168,9 +168,9 @@ class Fixes:
             self.refusal = reason
         if not self._awaited:
             return None
-        sent_s, sending = self._awaited.popleft()
-        sending.outcome = FixAnswer(result, None if is_accepted else reason, now_s - sent_s)
-        return sending
+        sent_s, transmission = self._awaited.popleft()
+        transmission.outcome = FixAnswer(result, None if is_accepted else reason, now_s - sent_s)
+        return transmission
 
     def time_out(self, now_s: float) -> None:
         """Count the fixes sent more than a second ago as unanswered."""
@@ -178,45 +178,46 @@ class Fixes:
             self._give_up(Reason(ReasonCode.NO_ANSWER, {"limit_s": ANSWER_TIMEOUT_S}))
 
     def cancel_awaited(self, reason: Reason) -> None:
-        """Stop waiting for the answers to all fixes sent, for `reason`."""
+        """Stop waiting for answers to the fixes sent, with the reason `reason`."""
         while self._awaited:
             self._give_up(reason)
 
     def report_silence(self, why_silent: Reason, now_s: float) -> None:
-        """Report if fixes are no longer answered (for the likely reason `why_silent`), or are answered again."""
+        """Report when fixes are no longer answered (with the likely reason `why_silent`), or are answered again."""
         self.time_out(now_s)
         is_stopped = self._unanswered_row >= MAX_UNANSWERED
         if is_stopped == self._is_stopped or (is_stopped and now_s - self._sent_s < ANSWER_TIMEOUT_S):
             return
         self._is_stopped = is_stopped
         if is_stopped:
-            often = f"one every {RETRY_INTERVAL_S:g} s is sent until one is answered"
-            log.warning("five fixes in a row had no answer, so %s: %s", often, why_silent)
+            log.warning(
+                "no answer to five fixes in a row (%s): now sending one every %g s", why_silent, RETRY_INTERVAL_S
+            )
             self._announce(Severity.WARNING, f"fixes unanswered: {why_silent.code.summary}", "answers")
         else:
-            log.warning("position fixes are answered again: they are sent again")
+            log.warning("position fixes are answered again: resuming to send them")
             self._announce(Severity.INFO, "fixes are answered again", "answers")
 
-    def _drop(self, sending: FixTransmission, why: Reason) -> None:
+    def _drop(self, transmission: FixTransmission, why: Reason) -> None:
         self.dropped += 1
-        sending.settle(False, why)
+        transmission.settle(False, why)
 
     def _give_up(self, reason: Reason) -> None:
-        """Give up the oldest fix sent; the autopilot may use it all the same."""
-        sent_s, sending = self._awaited.popleft()
+        """Stop waiting for the answer to the oldest fix sent; the autopilot may still use that fix."""
+        sent_s, transmission = self._awaited.popleft()
         self._accepted_s = max(self._accepted_s, sent_s)
-        if sending.sent:
+        if transmission.sent:
             self.unanswered += 1
-            sending.outcome = FixAnswer(None, reason, None)
+            transmission.outcome = FixAnswer(None, reason, None)
 
 
 def compensate_lag(fix: Fix, now_s: float, lag_s: float, vehicle: Vehicle | None) -> Fix:
-    """Return a fix for an autopilot that treats a message received at `now_s` as sent `lag_s` earlier: a fix that is so
-    much younger or, if its age is less than that, the position of the vehicle so long ago."""
-    younger_s = min(lag_s, max(0.0, now_s - fix.t_frame_s))
-    fix = replace(fix, t_frame_s=fix.t_frame_s + younger_s)
-    if younger_s == lag_s or vehicle is None or vehicle.velocity_m_s is None:
+    """Adapt a fix for an autopilot that treats a message received at `now_s` as sent `lag_s` earlier: reduce its age by
+    `lag_s` or, for the part that exceeds its age, move its position back by the vehicle's velocity."""
+    age_reduction_s = min(lag_s, max(0.0, now_s - fix.t_frame_s))
+    fix = replace(fix, t_frame_s=fix.t_frame_s + age_reduction_s)
+    if age_reduction_s == lag_s or vehicle is None or vehicle.velocity_m_s is None:
         return fix
-    east_m, north_m = (-(lag_s - younger_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
+    east_m, north_m = (-(lag_s - age_reduction_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
     lat_deg, lon_deg = offset_position(fix.lat_deg, fix.lon_deg, east_m, north_m)
     return replace(fix, lat_deg=lat_deg, lon_deg=lon_deg)

@@ -1,5 +1,5 @@
-"""Requests that arrive over the link, and texts for the ground station. A command is a request that only the flight
-itself can carry out, such as a pause. Used by `conversation` and the flight."""
+"""Requests received over the link, and texts for the ground station. A command is a request that only the flight itself
+can carry out, such as a pause. Used by `conversation` and the flight."""
 
 import math
 from collections import Counter
@@ -10,10 +10,10 @@ from typing import NamedTuple
 from edgevpr.mavlink.messages import Severity, make_status_text
 from edgevpr.mavlink.wire import Message, mavlink
 
-MAX_ANSWERS_PER_S = 50  # requests a second; the answers to a flood of them must not displace our own messages
+MAX_ANSWERS_PER_S = 50  # answers to a flood of requests must not crowd out our own messages
 TEXT_INTERVAL_S = 5.0
 
-Announce = Callable[[Severity, str, str], None]  # reports to the ground station: severity, text and topic
+Announce = Callable[[Severity, str, str], None]  # sends a text to the ground station: severity, text and topic
 
 
 class UserCommand(IntEnum):
@@ -24,16 +24,17 @@ class UserCommand(IntEnum):
 
 
 class CommandRequest(NamedTuple):
-    """A command, and the sender who made it, as the text "system id/component id"."""
+    """A command and its sender, as "SYSTEM_ID/COMPONENT_ID"."""
 
     command: UserCommand
     sender: str
 
 
 class Requests:
-    """Answers the requests of the link, and keeps the newest command until the flight's main loop takes it. Commands
-    are rejected until the flight `is_flying`. `results` counts commands by the name of their result, `ignored` the
-    other messages to us, of an unknown kind or too many a second. While it `is_paused`, no fix may be sent."""
+    """Answers requests received over the link, and keeps the newest command until the flight's main loop takes it.
+    Commands are rejected until `is_flying` is set. `results` counts commands by the name of their result. `ignored`
+    counts other messages addressed to us: of an unknown kind, or above the rate limit. While `is_paused`, no fix may be
+    sent."""
 
     def __init__(self) -> None:
         self.is_flying = False
@@ -44,12 +45,12 @@ class Requests:
         self._second_s, self._answered = 0.0, 0
 
     def take(self) -> CommandRequest | None:
-        """Return the newest command that has arrived since the last call (None: none has)."""
+        """Return the newest command received since the last call (None: none)."""
         waiting, self._waiting = self._waiting, None
         return waiting
 
     def handle(self, message: Message, us: tuple[int, int], now_s: float) -> tuple[Message, ...]:
-        """Process a message and return the replies. `us` is our (system id, component id), `now_s` our clock."""
+        """Process a message and return the replies. `us`: our (system id, component id). `now_s`: time by our clock."""
         sender = message.get_srcSystem(), message.get_srcComponent()
         if sender[0] == 0 or sender == us or not _needs_answer(message, us):
             return ()
@@ -66,7 +67,7 @@ class Requests:
         return (mavlink.MAVLink_command_ack_message(message.command, result, **to),)
 
     def _keep_command(self, code: float, sender: tuple[int, int]) -> int:
-        """Keep a command, in place of a waiting one. Returns a MAV_RESULT."""
+        """Keep a command; it replaces one that is still waiting. Returns a MAV_RESULT."""
         if code not in tuple(UserCommand):  # a whole float equals its integer, and NaN equals none
             return int(mavlink.MAV_RESULT_DENIED)
         if not self.is_flying:
@@ -84,13 +85,13 @@ class Requests:
 
 
 class Texts:
-    """The texts that wait to be sent, one in five seconds, warnings before notes (texts of severity INFO). Of one
-    `topic` the newest counts: it replaces a waiting one, and is dropped if it equals the last one sent. But a note does
-    not replace a waiting warning: it is sent after it."""
+    """The queue of status texts. One is sent every five seconds, warnings before notes (texts of severity INFO). A new
+    text replaces a waiting one of the same `topic`, and is dropped if it equals the last one sent. However, a note does
+    not replace a waiting warning: it is sent after the warning."""
 
     def __init__(self) -> None:
-        self._waiting: dict[tuple[str, Severity], str] = {}  # the oldest first
-        self._last: dict[str, str] = {}  # the last text sent of each topic
+        self._waiting: dict[tuple[str, Severity], str] = {}  # oldest first
+        self._last: dict[str, str] = {}  # last text sent, by topic
         self._spacing_s = TEXT_INTERVAL_S
         self._sent_s = -math.inf
 
@@ -98,7 +99,7 @@ class Texts:
         return len(self._waiting)
 
     def put(self, severity: Severity, text: str, topic: str | None = None) -> None:
-        """Queue a text. A text without a `topic` is a topic of its own."""
+        """Queue a text. Without a `topic`, the text itself is its topic."""
         topic = topic or text
         if severity is Severity.WARNING:
             self._waiting.pop((topic, Severity.INFO), None)
@@ -108,21 +109,21 @@ class Texts:
             del self._waiting[topic, severity]
 
     def next(self, now_s: float) -> Message | None:
-        """Return the STATUSTEXT that is to be sent now; None if no text waits, or the last one was too recent."""
+        """Return the STATUSTEXT to send now; None if no text waits, or the last one was sent too recently."""
         if not self._waiting or now_s - self._sent_s < self._spacing_s:
             return None
-        topic, severity = chosen = min(self._waiting, key=lambda key: key[1])  # the oldest warning, else note
+        topic, severity = chosen = min(self._waiting, key=lambda key: key[1])  # the oldest warning or, if none, note
         self._sent_s, self._last[topic] = now_s, self._waiting.pop(chosen)
         return make_status_text(severity, f"edgevpr: {self._last[topic]}")
 
     def remove_pauses(self) -> None:
-        """Send the remaining texts without pauses: the link is about to be closed."""
+        """Send the remaining texts without pauses, because the link is about to be closed."""
         self._spacing_s = 0.0
 
 
 def _needs_answer(message: Message, us: tuple[int, int]) -> bool:
-    """Return True if a message asks something of us: a TIMESYNC without `tc1`, or a message addressed to exactly us. A
-    command to all is not for us, since every component would acknowledge it."""
+    """Return True if a message requests an answer from us: a TIMESYNC without `tc1`, or a message addressed to us
+    alone. A broadcast command is not answered, because every component would acknowledge it."""
     if message.get_type() == "TIMESYNC":
         return bool(message.tc1 == 0)
     target = getattr(message, "target_system", None), getattr(message, "target_component", None)

@@ -41,7 +41,7 @@ def test_all_that_an_autopilot_says_is_read(address):
     assert said.filter_flags & mavlink.EKF_POS_HORIZ_ABS
     assert abs(said.clock_ahead_s) < 60
     assert said.round_trip_s > 0
-    assert (said.answers, said.signs, said.says_version_1, said.other_systems) == (True, False, False, ())
+    assert (said.answers, said.signs, said.uses_mavlink_1, said.other_systems) == (True, False, False, ())
     assert {"GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT"} <= set(said.received)
     assert peer.names() == READ_ONLY, "nothing is ever set"
     assert {message.command for message in peer.heard if message.get_type() == "COMMAND_LONG"} == {512}
@@ -52,9 +52,9 @@ def test_questions_that_are_lost_are_asked_again(address):
     names = [f"P{number}" for number in range(12)]
     answers = {"messages": healthy_messages(), "parameters": dict.fromkeys(names, 3)}
     with AnsweringAutopilot(address.number, loses=1, **answers), RequestLink(address) as asking:
-        assert asking.heartbeat(60)
-        assert asking.message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-        assert asking.parameters(names, bytewise=False) == dict.fromkeys(names, 3)
+        assert asking.wait_for_heartbeat(60)
+        assert asking.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+        assert asking.request_parameters(names, bytewise=False) == dict.fromkeys(names, 3)
 
 
 def test_a_message_that_is_denied_since_it_was_just_streamed_is_taken_from_the_stream(address):
@@ -62,9 +62,9 @@ def test_a_message_that_is_denied_since_it_was_just_streamed_is_taken_from_the_s
     fix = mavlink.MAVLink_gps_raw_int_message(0, 3, 500_000_000, 140_000_000, 0, 80, 120, 0, 0, 14)
     streamed = fix.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
     with AnsweringAutopilot(address.number, noise=streamed), RequestLink(address) as asking:
-        assert asking.heartbeat(60)
-        assert asking.message(mavlink.MAVLINK_MSG_ID_GPS_RAW_INT).fix_type == 3
-        assert asking.message(mavlink.MAVLINK_MSG_ID_GPS2_RAW) is None
+        assert asking.wait_for_heartbeat(60)
+        assert asking.request_message(mavlink.MAVLINK_MSG_ID_GPS_RAW_INT).fix_type == 3
+        assert asking.request_message(mavlink.MAVLINK_MSG_ID_GPS2_RAW) is None
 
 
 def test_a_parameter_that_older_firmware_is_silent_about_is_left_out(address, monkeypatch):
@@ -83,14 +83,14 @@ def test_an_autopilot_that_is_heard_and_answers_nothing_is_told_from_one_that_si
 
 def test_mavlink_1_and_damaged_bytes_are_seen(address):
     said, _ = read(address, messages=healthy_messages(), version_1=True, noise=bytes(50))
-    assert said.says_version_1
+    assert said.uses_mavlink_1
     assert said.bad_bytes >= 50
 
 
 def test_a_second_autopilot_is_named_and_not_listened_to(address):
     with AnsweringAutopilot(address.number, system_id=3), AnsweringAutopilot(address.number, system_id=4) as other:
         with RequestLink(address, system_id=4) as asking:
-            assert asking.heartbeat(60).get_srcSystem() == 4
+            assert asking.wait_for_heartbeat(60).get_srcSystem() == 4
             asking.listen(0.3)
         assert asking.others == {3}
         assert asking.received.keys() == {"HEARTBEAT"}

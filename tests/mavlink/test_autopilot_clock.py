@@ -152,7 +152,7 @@ def test_stamps_of_others_that_are_not_in_the_autopilots_time_are_reported_once(
     for _ in range(3):
         autopilot.say(foreign(kind, 1.7e9), component_id=191)
     texts = [text for _, text in autopilot.texts()]
-    assert texts == [make_status_text(Severity.WARNING, f"edgevpr: wrong stamps: 7/191 {kind}").text]
+    assert texts == [make_status_text(Severity.WARNING, f"edgevpr: bad timestamps: 7/191 {kind}").text]
     assert caplog.text.count("off the autopilot's time since boot") == 1
     px4 = Autopilot(PX4)
     px4.say(foreign(kind, 1.7e9), component_id=191)

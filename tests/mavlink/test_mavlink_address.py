@@ -30,11 +30,11 @@ def test_a_link_is_read_and_written_alike(url, address):
 @pytest.mark.parametrize(
     ("url", "says"),
     [
-        ("", "write udpout:HOST:PORT"),
-        ("udp:127.0.0.1:14550", "write udpout:HOST:PORT"),
-        ("udpout:127.0.0.1", "write udpout:HOST:PORT"),
-        ("udpin::14550", "write udpout:HOST:PORT"),
-        ("/dev/ttyACM0", "write udpout:HOST:PORT"),
+        ("", "use udpout:HOST:PORT"),
+        ("udp:127.0.0.1:14550", "use udpout:HOST:PORT"),
+        ("udpout:127.0.0.1", "use udpout:HOST:PORT"),
+        ("udpin::14550", "use udpout:HOST:PORT"),
+        ("/dev/ttyACM0", "use udpout:HOST:PORT"),
         ("udpout:127.0.0.1:port", "'port'"),
         ("udpout:127.0.0.1:0", "from 1 to 65535"),
         ("udpout:127.0.0.1:65536", "from 1 to 65535"),

@@ -68,7 +68,7 @@ def test_track_starts_with_a_flight_and_not_with_questions(monkeypatch):
     try:
         with RequestLink(parse_link(f"udpout:{link}")) as asking:
             assert read_autopilot(asking, {"px4": ("EKF2_AGP0_CTRL",)}).parameters == {"EKF2_AGP0_CTRL": 1}
-            there = asking.message(mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
+            there = asking.request_message(mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
         assert there.lat / 1e7 == 50.0
         with link_to(f"udpout:{link}") as flight:
             wait_until(lambda: flight.stats().autopilot_heard)
@@ -98,8 +98,8 @@ def test_script_sets_parameters_and_prints_its_summary():
     try:
         assert "a simulated arducopter that has lost GPS" in process.stderr.readline()
         with RequestLink(parse_link(f"udpout:127.0.0.1:{number}")) as asking:
-            assert asking.heartbeat().type == mavlink.MAV_TYPE_QUADROTOR
-            assert asking.parameters(["GPS2_TYPE"], bytewise=False) == {"GPS2_TYPE": 14}
+            assert asking.wait_for_heartbeat().type == mavlink.MAV_TYPE_QUADROTOR
+            assert asking.request_parameters(["GPS2_TYPE"], bytewise=False) == {"GPS2_TYPE": 14}
         process.terminate()
         printed, more = process.communicate(timeout=60)
     finally:

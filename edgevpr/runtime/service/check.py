@@ -87,9 +87,9 @@ def _check_link(what: str, settings: MavlinkConfig, offline: bool) -> Finding:
         return report_ok(what, ReasonCode.NO_LINK)
     address = parse_link(settings.link)
     signing = open_signing(settings, is_read_only=True)
-    with RequestLink(address, settings.component_id, settings.system_id, signing) as inquiry:
-        if not offline and inquiry.heartbeat() is None:
-            return explain_silence(address, inquiry)
+    with RequestLink(address, settings.component_id, settings.system_id, signing) as link:
+        if not offline and link.wait_for_heartbeat() is None:
+            return explain_silence(address, link)
     code = FindingCode.LINK_OPENED if settings.send_fixes else FindingCode.LINK_OPENED_DRY
-    system = None if offline else inquiry.system_id
+    system = None if offline else link.system_id
     return report_ok(what, code, address=str(address), system=system, key=settings.signing_key)

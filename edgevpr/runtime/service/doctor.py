@@ -40,36 +40,36 @@ def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], Au
     show_wait(f"asking the autopilot at {address}")
     reading = None
     try:
-        with RequestLink(address, settings.component_id, settings.system_id, signing) as inquiry:
-            reading = read_autopilot(inquiry, {name: rules.parameters for name, rules in RULES.items()})
+        with RequestLink(address, settings.component_id, settings.system_id, signing) as link:
+            reading = read_autopilot(link, {name: rules.parameters for name, rules in RULES.items()})
             if reading:
                 autopilot_findings = list(check_autopilot(reading, address, settings.send_fixes))
             else:
-                autopilot_findings = [explain_silence(address, inquiry)]
+                autopilot_findings = [explain_silence(address, link)]
     except LinkError as error:
         reading, autopilot_findings = None, [report_error("link", error)]
     show_wait("")
     return autopilot_findings + machine_findings, reading
 
 
-def explain_silence(address: LinkAddress, inquiry: RequestLink) -> Finding:
+def explain_silence(address: LinkAddress, link: RequestLink) -> Finding:
     """Return the finding that explains, from what was received instead, why no autopilot heartbeat was received."""
-    link = str(address)
-    if refused := inquiry.signing.refused:
+    where = str(address)
+    if refused := link.signing.refused:
         cause = max(refused, key=lambda reason: refused[reason])
         return report_fault(
-            "link", FindingCode.MESSAGES_REFUSED, address=link, cause=cause, meaning=REFUSAL_MEANINGS[cause]
+            "link", FindingCode.MESSAGES_REFUSED, address=where, cause=cause, meaning=REFUSAL_MEANINGS[cause]
         )
-    if inquiry.others:
-        change = f"mavlink: {{system_id: {min(inquiry.others)}}}"
+    if link.others:
+        change = f"mavlink: {{system_id: {min(link.others)}}}"
         return report_fault(
-            "link", FindingCode.OTHER_SYSTEM, change, address=link, systems=_join_numbers(sorted(inquiry.others))
+            "link", FindingCode.OTHER_SYSTEM, change, address=where, systems=_join_numbers(sorted(link.others))
         )
     if address.kind != "serial":
-        return report_fault("link", FindingCode.NO_HEARTBEAT, address=link, waited_s=HEARTBEAT_TIMEOUT_S)
-    code = FindingCode.SERIAL_NOT_MAVLINK if inquiry.reader.bad_bytes else FindingCode.SERIAL_SILENT
+        return report_fault("link", FindingCode.NO_HEARTBEAT, address=where, waited_s=HEARTBEAT_TIMEOUT_S)
+    code = FindingCode.SERIAL_NOT_MAVLINK if link.reader.bad_bytes else FindingCode.SERIAL_SILENT
     changes = (f"{rules.name}: {', '.join(rules.port_changes(address.number))}" for rules in RULES.values())
-    return report_fault("link", code, *changes, address=link, waited_s=HEARTBEAT_TIMEOUT_S)
+    return report_fault("link", code, *changes, address=where, waited_s=HEARTBEAT_TIMEOUT_S)
 
 
 def check_autopilot(reading: AutopilotReading, address: LinkAddress, sends_fixes: bool) -> Iterator[Finding]:
