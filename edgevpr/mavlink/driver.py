@@ -1,5 +1,4 @@
-"""Drives a conversation: moves packets between it and a port, in a thread of its own, which alone touches the socket or
-serial port."""
+"""Drives a conversation: moves packets between it and a port. Only the driver's own thread accesses the port."""
 
 import logging
 import select
@@ -17,39 +16,39 @@ from edgevpr.mavlink.ports import PacketWriter, Port, open_port
 from edgevpr.mavlink.signing import OLD
 from edgevpr.mavlink.turns import Turns
 
-MAX_SLEEP_S = 0.25  # of the thread, when nothing wakes it
+MAX_SLEEP_S = 0.25  # longest sleep of the thread, if nothing wakes it
 FIRST_RETRY_S = 0.2
 MAX_RETRY_S = 2.0
-DEPARTURE_CHECK_S = 0.01  # between two checks whether a fix has left the operating system
+DEPARTURE_CHECK_S = 0.01  # interval of checks whether a fix has left the operating system
 FLUSH_TIMEOUT_S = 0.5
 
-PortState = tuple[bool, str | None, int]  # is it connected; why not, or None; how often it was opened again
+PortState = tuple[bool, str | None, int]  # connected?, why not (or None), number of times it was reopened
 
 log = logging.getLogger(__name__)
 
 
 class Driver(Protocol):
-    """What a link needs of its driver. None of the methods waits for the other end."""
+    """The interface of a link to its driver. No method waits for the other end."""
 
     def start(self) -> None:
-        """Begin to send and receive. Raises LinkError for a fault that only the user can correct."""
+        """Start to send and receive. Raises LinkError for a fault that only the user can correct."""
 
     def wake(self) -> None:
-        """Wake the sender: a message is waiting."""
+        """Wake the driver: a message is queued."""
 
     def state(self) -> PortState:
         """Return the state of the port."""
 
     def close(self) -> None:
-        """Send what is queued, wait for the answers to fixes, both for half a second at most, and close the port."""
+        """Send queued messages and wait for answers to fixes, for at most half a second each, then close the port."""
 
 
 DriverMaker = Callable[[LinkAddress, Conversation, Turns], Driver]
 
 
 class PortDriver:
-    """The driver of a real port, which it reopens whenever the connection is lost. A missing device or server is no
-    error: the thread tries to open it again and again, and `state` gives the reason."""
+    """The driver of a real port, which it reopens whenever the connection is lost. A missing device or server is not an
+    error: the thread keeps trying to open it, and `state` gives the reason."""
 
     def __init__(self, address: LinkAddress, conversation: Conversation, turns: Turns) -> None:
         self._address, self._conversation, self._turns = address, conversation, turns
@@ -74,12 +73,12 @@ class PortDriver:
         self._thread.start()
 
     def wake(self) -> None:
-        with suppress(OSError):  # it rings already, or the link is closed
+        with suppress(OSError):  # a wake-up is already pending, or the link is closed
             self._wake_sender.send(b"!")
 
     def state(self) -> PortState:
-        line = self._writer
-        return line is not None and line.port.connected, self._trouble, self._reopened
+        writer = self._writer
+        return writer is not None and writer.port.connected, self._trouble, self._reopened
 
     def close(self) -> None:
         self._closing.set()
@@ -103,7 +102,7 @@ class PortDriver:
                     self._work(self._writer, timeout_s=MAX_SLEEP_S)
             except (OSError, LinkError) as error:
                 self._handle_loss(error)
-            except Exception as error:  # a reopened link is better than none
+            except Exception as error:  # reopening the link is better than losing it
                 log.exception("the link failed")
                 self._handle_loss(error)
         self._flush()
@@ -118,54 +117,54 @@ class PortDriver:
         self._writer = self._open()
         self._reopened += 1
 
-    def _work(self, line: PacketWriter, timeout_s: float) -> None:
-        """Write as much as the port accepts, wait until there is something to do or `timeout_s` is over, and read."""
+    def _work(self, writer: PacketWriter, timeout_s: float) -> None:
+        """Write as much as the port accepts, wait up to `timeout_s` for something to do, then read."""
         with self._turns.take_link_turn():
-            if line.port.connected:
-                self._transmit(line)
+            if writer.port.connected:
+                self._transmit(writer)
             self._conversation.announce_changes()
-        reading: list[Port | socket.socket] = [line.port, self._wake_receiver]
-        writing = [line.port] if line.unsent else []
-        timeout_s = min(timeout_s, DEPARTURE_CHECK_S) if line.pending_fixes else self._conversation.wait_s(timeout_s)
+        reading: list[Port | socket.socket] = [writer.port, self._wake_receiver]
+        writing = [writer.port] if writer.unsent else []
+        timeout_s = min(timeout_s, DEPARTURE_CHECK_S) if writer.pending_fixes else self._conversation.wait_s(timeout_s)
         readable, _, _ = select.select(reading, writing, [], timeout_s)
         if self._wake_receiver in readable:
             self._wake_receiver.recv(4096)
-        if line.port in readable:
-            self._receive(line)
+        if writer.port in readable:
+            self._receive(writer)
 
-    def _receive(self, line: PacketWriter) -> None:
-        data = line.port.read()
+    def _receive(self, writer: PacketWriter) -> None:
+        data = writer.port.read()
         if data:
             self._retry_s = FIRST_RETRY_S
             if self._trouble is not None:
                 log.info("%s is back", self._address)
                 self._trouble = None
         with self._turns.take_link_turn():
-            self._count_sent_fixes(line)  # before its answer is read
+            self._count_sent_fixes(writer)  # before answers to them are read
             self._settings.signing.verdicts.clear()
-            beats = self._conversation.handle(data, self._turns.now_s(), line.port.sender)
-            # An autopilot whose clock is old, which has the key, learns the time from what we send it.
+            beats = self._conversation.handle(data, self._turns.now_s(), writer.port.sender)
+            # An autopilot that has the key but an old clock learns the time from our signed messages.
             has_old_clock = OLD in self._settings.signing.verdicts
             is_behind = has_old_clock and not self._conversation.autopilot.is_alive(self._turns.now_s())
         if beats or is_behind:
-            line.port.answer_sender()
+            writer.port.answer_sender()
 
-    def _transmit(self, line: PacketWriter) -> None:
+    def _transmit(self, writer: PacketWriter) -> None:
         while True:
-            # Before writing: what has waited too long must not be written on.
-            self._count_sent_fixes(line)
-            if not line.unsent:
-                next_one = self._conversation.next_packet()
-                if next_one is None:
+            # Check before writing: the rest of a fix that has waited too long must not be written.
+            self._count_sent_fixes(writer)
+            if not writer.unsent:
+                outgoing = self._conversation.next_packet()
+                if outgoing is None:
                     return
-                line.put(*next_one)
-            line.write()
-            if line.unsent:
+                writer.put(*outgoing)
+            writer.write()
+            if writer.unsent:
                 return
 
-    def _count_sent_fixes(self, line: PacketWriter) -> None:
-        if departed := line.take_sent_fixes():
-            self._conversation.count_sent_fixes(departed)
+    def _count_sent_fixes(self, writer: PacketWriter) -> None:
+        if sent_fixes := writer.take_sent_fixes():
+            self._conversation.count_sent_fixes(sent_fixes)
 
     def _handle_loss(self, error: Exception) -> None:
         with self._turns.take_link_turn():
@@ -173,20 +172,20 @@ class PortDriver:
         self._record_trouble(error)
 
     def _close_writer(self) -> int:
-        """Close the port, and return the number of fixes thrown away with it."""
-        line, self._writer = self._writer, None
-        return line.close() if line else 0
+        """Close the port, and return the number of fixes discarded with it."""
+        writer, self._writer = self._writer, None
+        return writer.close() if writer else 0
 
     def _record_trouble(self, error: Exception) -> None:
         reason = getattr(error, "strerror", None) or str(error)
         if reason != self._trouble:
             self._trouble = reason
-            log.warning("%s is not connected (%s); trying again", self._address, reason)
+            log.warning("%s is not connected (%s): retrying", self._address, reason)
 
     def _flush(self) -> None:
-        give_up_s = time.monotonic() + FLUSH_TIMEOUT_S
+        deadline_s = time.monotonic() + FLUSH_TIMEOUT_S
         with suppress(OSError):
-            while self._writer and self._writer.port.connected and time.monotonic() < give_up_s:
+            while self._writer and self._writer.port.connected and time.monotonic() < deadline_s:
                 self._work(self._writer, timeout_s=0.01)
                 if not self._conversation.has_pending and self._writer.is_idle:
                     break

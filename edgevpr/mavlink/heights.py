@@ -1,7 +1,7 @@
 """Height above the ground: from a range finder or terrain data while these are recent, otherwise above the take-off
-point. An autopilot's relative altitude follows its home, and its altitude above sea level follows the origin of its
-filter: both may be set in flight (ArduPilot `AP_AHRS::get_relative_position_D_home`, PX4 `GLOBAL_POSITION_INT.hpp`).
-`Heights` therefore adds up changes of whichever of the two agrees with the reported climb."""
+point. An autopilot's relative altitude depends on its home, and its altitude above sea level on the origin of its
+filter. Both can be set in flight (ArduPilot `AP_AHRS::get_relative_position_D_home`, PX4 `GLOBAL_POSITION_INT.hpp`), so
+`Heights` sums the changes of whichever altitude agrees with the reported climb rate."""
 
 import logging
 import math
@@ -14,12 +14,12 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 RANGE_MAX_AGE_S = 1.0
 TERRAIN_MAX_AGE_S = 2.5
-BAD_SIGNAL_QUALITY = 1  # of DISTANCE_SENSOR; 0 is unknown, 100 the best
-# A disarmed vehicle stands on the ground unless it moves: it may glide, or be carried by another one.
+BAD_SIGNAL_QUALITY = 1  # DISTANCE_SENSOR: 0 is unknown, 100 the best
+# A disarmed vehicle is assumed to be on the ground unless it moves: it may glide, or be carried by another vehicle.
 MAX_STANDING_SPEED_M_S = 3.0
 MAX_STANDING_CLIMB_M_S = 1.0
-# A change of altitude between two reports that differs by more from the reported climb is a jump, unless the reports
-# are so far apart that the climb between them is not known.
+# A change in altitude between two reports that differs from the reported climb by more than this is a jump, unless the
+# reports are so far apart that the climb between them is unknown.
 MIN_JUMP_M = 2.0
 JUMP_M_PER_S = 5.0
 MAX_STEP_S = 5.0
@@ -31,8 +31,8 @@ _log = logging.getLogger(__name__)
 
 
 class Altitudes(NamedTuple):
-    """Altitudes of one report at time `t_s`: metres above sea level (None: the autopilot has no position) and above
-    home, and the climb rate."""
+    """Altitudes reported at time `t_s` in metres, above sea level (None: the autopilot has no position) and above home,
+    and the climb rate."""
 
     t_s: float
     above_sea_m: float | None
@@ -41,12 +41,12 @@ class Altitudes(NamedTuple):
 
 
 class Heights:
-    """Follows the height above the ground through new homes and origins. The height is 0 while the vehicle stands on
-    the ground, disarmed; if its first report comes in flight, its height above home is used once.
+    """Tracks the height above the ground across changes of home and origin. The height is 0 while the vehicle stands on
+    the ground, disarmed. If the first report arrives in flight, tracking starts from its height above home.
 
-    `takeoff_m`: height above the take-off point (None: no report yet). `jumped_m`: sum of jumps of the altitude since
-    take-off that neither a new home nor a new origin explains; the height leaves them out. `contradiction_m`: the
-    difference by which a range finder has disagreed for seconds (None: it agrees)."""
+    `takeoff_m`: height above the take-off point (None: no report yet). `jumped_m`: sum of altitude jumps since take-off
+    that neither a new home nor a new origin explains; they are not included in the height. `contradiction_m`:
+    difference from the range finder, if it has persisted for seconds (None: they agree)."""
 
     def __init__(self, announce: Announce) -> None:
         self._announce = announce
@@ -57,11 +57,11 @@ class Heights:
         self._is_standing = self._has_home = self._is_guess = self._has_jumped = False
         self._range: tuple[float, float] | None = None  # metres, time
         self._terrain: tuple[float, float] | None = None  # altitude of the ground below in metres, time
-        self._takeoff_terrain_m: float | None = None  # altitude of the take-off point by the same terrain data
-        self._changing_since_s: float | None = None  # since when the range finder differs from `contradiction_m`
+        self._takeoff_terrain_m: float | None = None  # altitude of the take-off point in the same terrain data
+        self._changing_since_s: float | None = None  # when the range finder began to disagree with `contradiction_m`
 
     def handle(self, message: Message, now_s: float, attitude: Attitude | None) -> None:
-        """Process a TERRAIN_REPORT or a DISTANCE_SENSOR, slanted by the `attitude` (None: unknown)."""
+        """Process a TERRAIN_REPORT or a DISTANCE_SENSOR. Its slant distance is corrected for `attitude` (None: unknown)."""
         if message.get_type() == "TERRAIN_REPORT":
             self._handle_terrain(message, now_s)
         elif message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270:
@@ -72,8 +72,8 @@ class Heights:
             self._range = (message.current_distance / 100 * max(0.0, slant), now_s) if is_good else None
 
     def handle_altitudes(self, altitudes: Altitudes, is_armed: bool, speed_m_s: float) -> None:
-        """Process the altitudes of a GLOBAL_POSITION_INT; `speed_m_s` is its speed over the ground."""
-        # PX4 without a home reports the altitude above sea level as that above home.
+        """Process the altitudes of a GLOBAL_POSITION_INT; `speed_m_s` is its ground speed."""
+        # PX4 without a home reports the altitude above sea level as the altitude above home.
         was_without_home = not self._has_home
         self._has_home |= altitudes.above_sea_m != altitudes.above_home_m
         is_still = speed_m_s <= MAX_STANDING_SPEED_M_S and abs(altitudes.climb_m_s) <= MAX_STANDING_CLIMB_M_S
@@ -91,18 +91,18 @@ class Heights:
         self._check_range(altitudes.t_s)
 
     def now(self, now_s: float) -> float:
-        """Return the height above the ground in metres, by the best recent source."""
+        """Return the height above the ground in metres from the best recent source."""
         measured_m = self._get_recent(self._range, now_s, RANGE_MAX_AGE_S)
         return self._compute_autopilot_height_m(now_s) if measured_m is None else measured_m
 
     @property
     def doubt_m(self) -> float:
-        """Possible error of the height, metres: by its jumps, and by a contradiction."""
+        """Possible error of the height in metres, from its jumps or its contradiction."""
         return max(abs(self.jumped_m), self.contradiction_m or 0.0)
 
     def _compute_change_m(self, last: Altitudes, altitudes: Altitudes) -> float:
-        """Return the change of height since the `last` report: that of the altitude above sea level or, if it has
-        jumped, of that above home, or, if both have, the reported climb."""
+        """Return the change in height since the `last` report, from the altitude above sea level; if that jumped, from
+        the altitude above home; if both jumped, from the reported climb rate."""
         step_s = abs(altitudes.t_s - last.t_s)
         climbed_m = step_s * (last.climb_m_s + altitudes.climb_m_s) / 2
         steps_m = [altitudes.above_home_m - last.above_home_m] if self._has_home else []
@@ -117,24 +117,22 @@ class Heights:
                 return step_m
         nearest_m = min(steps_m, key=lambda step_m: abs(step_m - climbed_m))
         self._has_jumped = True
-        if step_s > MAX_STEP_S or jumped_before:  # two jumps in a row: it is the climb that is wrong
+        if step_s > MAX_STEP_S or jumped_before:  # two jumps in a row: the climb rate is wrong, not the altitude
             return nearest_m
         jump_m = nearest_m - climbed_m
         self.jumped_m += jump_m
-        self._report(f"altitude jumped {jump_m:+.0f} m", "the height leaves it out", "altitude")
+        self._report(f"altitude jumped {jump_m:+.0f} m", "jump ignored", "altitude")
         return climbed_m
 
     def _check_range(self, now_s: float) -> None:
-        """Compare the range finder with the other heights; it must differ, or agree, for some seconds."""
-        by_range_m, by_autopilot_m = (
-            self._get_recent(self._range, now_s, RANGE_MAX_AGE_S),
-            self._compute_autopilot_height_m(now_s),
-        )
-        if by_range_m is None:
+        """Compare the range finder with the autopilot's height. A change counts once it has lasted some seconds."""
+        range_m = self._get_recent(self._range, now_s, RANGE_MAX_AGE_S)
+        autopilot_m = self._compute_autopilot_height_m(now_s)
+        if range_m is None:
             self._changing_since_s = None
             return
-        difference_m = abs(by_range_m - by_autopilot_m)
-        differs = difference_m > max(MIN_CONTRADICTION_M, CONTRADICTION_SHARE * abs(by_autopilot_m))
+        difference_m = abs(range_m - autopilot_m)
+        differs = difference_m > max(MIN_CONTRADICTION_M, CONTRADICTION_SHARE * abs(autopilot_m))
         if differs == (self.contradiction_m is not None):
             self._changing_since_s = None
             self.contradiction_m = difference_m if differs else None
@@ -145,8 +143,8 @@ class Heights:
             return
         self.contradiction_m, self._changing_since_s = difference_m if differs else None, None
         if differs:
-            text = f"height {by_autopilot_m:.0f} m, by range finder {by_range_m:.0f} m"
-            self._report(text, "they contradict each other", "range finder")
+            text = f"height {autopilot_m:.0f} m, by range finder {range_m:.0f} m"
+            self._report(text, "the two contradict each other", "range finder")
         else:
             self._announce(Severity.INFO, "height and range finder agree again", "range finder")
 
@@ -155,11 +153,11 @@ class Heights:
         self._announce(Severity.WARNING, text, topic)
 
     def _handle_terrain(self, report: Message, now_s: float) -> None:
-        # A spacing of 0 means that the autopilot has no terrain data here.
+        # A spacing of 0 means that the autopilot has no terrain data at this position.
         is_known = report.spacing and math.isfinite(report.terrain_height + report.current_height)
         self._terrain = (report.terrain_height, now_s) if is_known else None
         if is_known and self._takeoff_terrain_m is None and self.takeoff_m is not None and not self._is_standing:
-            # Before version 4.7, ArduPilot's own height follows home, so it is used only once.
+            # Before version 4.7, ArduPilot's `current_height` depends on home, so it is used only once.
             self._takeoff_terrain_m = report.terrain_height + report.current_height - self.takeoff_m
 
     def _compute_autopilot_height_m(self, now_s: float) -> float:

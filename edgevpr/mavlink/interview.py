@@ -1,4 +1,4 @@
-"""The interview: requests an autopilot's version and parameters during the flight, and chooses the channel by them."""
+"""The interview: requests an autopilot's version and parameters in flight, and chooses the channel from them."""
 
 import logging
 import math
@@ -17,12 +17,12 @@ from edgevpr.mavlink.wire import Message, mavlink, read_parameter_value
 
 MAX_PARALLEL_REQUESTS = 10  # ArduPilot drops requests beyond 20 (GCS_Param.cpp, param_requests)
 ROUND_INTERVAL_S = 1.0
-MIN_ROUND_INTERVAL_S = 0.1  # after a round in which all was answered
-MAX_SILENT_ROUNDS = 4  # rounds without any answer, after which the pauses grow
+MIN_ROUND_INTERVAL_S = 0.1  # after a round in which every request was answered
+MAX_SILENT_ROUNDS = 4  # after as many rounds without any answer, the pauses grow
 MAX_PAUSE_S = 30.0
-REFRESH_INTERVAL_S = 2.0  # one known parameter is requested again, to notice a change in flight
+REFRESH_INTERVAL_S = 2.0  # between repeated requests of known parameters, to detect changes in flight
 MIN_ROUNDS_TO_ABSENT = 4
-MAX_LOSS_PROBABILITY = 1e-4  # that all answers for one parameter were lost
+MAX_LOSS_PROBABILITY = 1e-4  # probability that all answers for one parameter were lost
 MISSING_REPORT_DELAY_S = 10.0
 MAX_VERSION_REQUESTS = 4
 TOPIC = "parameters"
@@ -34,15 +34,15 @@ log = logging.getLogger(__name__)
 
 
 class Interview:
-    """Asks an autopilot for its version and for the parameters of its table, and chooses the channel.
+    """Requests an autopilot's version and the parameters of its table, and chooses the channel.
 
-    Unanswered requests are repeated, a second later or, while nothing at all is answered, after growing pauses. Known
-    parameters are requested again, one every two seconds, and values that arrive unrequested are used too; after a
-    change the channel is chosen again. Old firmware does not answer for a parameter that it does not have: this counts
-    as absent after four rounds in which others were answered, or more on a link that loses messages.
+    Unanswered requests are repeated after a second or, while nothing at all is answered, after growing pauses. Known
+    parameters are requested again, one every two seconds, and values that arrive unrequested are also used. After a
+    change the channel is chosen again. Old firmware does not answer requests for a parameter that it does not have. Such a
+    parameter counts as absent after four rounds in which others were answered, or more on a link that loses messages.
 
-    `choice` is the channel. Before the first requests it is command 43003, for programs that send fixes by themselves
-    and need no reports; then `Channel.NONE` until all parameters that it depends on are known."""
+    `choice`: the channel. Before the first requests it is command 43003, for programs that send fixes by themselves and
+    need no reports. Then it is `Channel.NONE` until all parameters that it depends on are known."""
 
     def __init__(self, announce: Announce) -> None:
         self._announce = announce
@@ -54,12 +54,12 @@ class Interview:
         self._version_requests = 0
         self._absent: set[str] = set()
         self._requests: Counter[str] = Counter()
-        self._unanswered: Counter[str] = Counter()  # rounds without an answer for this name, but with one for another
-        self._waiting: set[str] = set()  # asked for in the last round, and not answered
+        self._unanswered: Counter[str] = Counter()  # rounds in which another name was answered, but not this one
+        self._waiting: set[str] = set()  # names requested in the last round, and not yet answered
         self._answers = 0
         self._silent_rounds = self._refresh_index = 0
         self._asked_s = self._due_s = -math.inf
-        self._has_begun = self._is_asking = False  # since the first questions; as long as an answer is missing
+        self._has_begun = self._is_asking = False  # the first requests were made; answers are still missing
         self._missing_since_s: float | None = None
         self._has_reported_missing = False
 
@@ -68,7 +68,7 @@ class Interview:
         return self._decision.choice
 
     def handle(self, message: Message) -> None:
-        """Process a message from the autopilot; most kinds are ignored."""
+        """Process a message from the autopilot; irrelevant kinds are ignored."""
         match message.get_type():
             case "HEARTBEAT":
                 before = self._autopilot, self._kind
@@ -124,7 +124,7 @@ class Interview:
             self._decide()
 
     def _record_answer(self, name: str) -> None:
-        """Record an answer for one parameter: the autopilot receives our requests, and may not have the others."""
+        """Record an answer for one parameter: it shows that the autopilot receives our requests."""
         self._version_requests *= bool(self._values)
         self._silent_rounds = 0
         self._answers += name in self._waiting
@@ -134,8 +134,8 @@ class Interview:
             self._due_s = min(self._due_s, self._asked_s + interval_s)
 
     def _mark_absent(self) -> None:
-        """Mark parameters as absent that were requested so often that a loss of all answers is next to impossible, by
-        the share of answers that arrive. For others that may be absent too, one answer counts as lost."""
+        """Mark parameters as absent if, given the share of answers that arrive, it is almost impossible that all their
+        answers were lost. Each other parameter that may be absent counts as one lost answer."""
         unknown = {name for name in self._unanswered.keys() - self._values.keys() if not self._is_known(name)}
         lost = sum(self._unanswered[name] for name in self._values) + len(unknown - self._absent)
         arrives = (self._answers + 1) / (self._answers + lost + 2)
@@ -157,8 +157,8 @@ class Interview:
         return not names.isdisjoint(self._values) or names <= self._absent
 
     def _find_missing(self) -> list[str]:
-        """Return the names to ask for: first those that decide the channel, then those that it needs, then the rest; of
-        these first those that were asked for least. An alternative name is asked for once the first had no answer."""
+        """Return the names to request: those that decide the channel, then those that the channel needs, then the rest,
+        each group with the least requested names first. An alternative name is requested if the first has no answer."""
         if not (table := self._table):
             return []
         needed = table.list_needed(table.choose(self._kind, self._values))
@@ -166,14 +166,14 @@ class Interview:
         missing: list[tuple[int, int, str]] = []
         for name in table.names:
             if not self._is_known(name):
-                other = ALTERNATIVES.get(name)
-                names = (name, other) if other and self._requests[name] else (name,)
+                alternative = ALTERNATIVES.get(name)
+                names = (name, alternative) if alternative and self._requests[name] else (name,)
                 missing += [(rank.get(name, 2), self._requests[key], key) for key in names if key not in self._absent]
         return [name for *_, name in sorted(missing)]
 
     def _choose_refresh(self, is_alone: bool) -> list[str]:
-        """Return the name to be asked for again, if any: a known one or, if it `is_alone`, an absent one, since all its
-        answers may have been lost."""
+        """Return the name to request again, if any: a known one or, if the request `is_alone`, also an absent one, as
+        all its answers may have been lost."""
         names = list(self._values)
         if is_alone:
             names += [name for name in self._absent if ALTERNATIVES.get(name) not in self._values]
@@ -181,7 +181,7 @@ class Interview:
         return [sorted(names)[self._refresh_index % len(names)]] if names else []
 
     def _decide(self) -> None:
-        """Choose the channel again, and report it if anything about it has changed."""
+        """Choose the channel again, and report it if the decision has changed."""
         if not self._has_begun:
             return
         table = self._table
@@ -193,17 +193,17 @@ class Interview:
 
     def _report(self, decision: Decision, firmware: str) -> None:
         version = f" {self._version[0]}.{self._version[1]}" if self._version else ""
-        who, choice = f"{firmware}{version} on a {self._kind.value}", decision.choice
+        vehicle, choice = f"{firmware}{version} on a {self._kind.value}", decision.choice
         faults = list(decision.faults)
         if choice.channel is Channel.NONE:
-            log.warning("%s: %s", who, choice.reason)
+            log.warning("%s: %s", vehicle, choice.reason)
             self._announce(Severity.WARNING, f"nothing sent: {faults.pop(0).brief}", TOPIC)
         else:
-            log.info("%s: sending positions by %s", who, choice.reason)
+            log.info("%s: sending positions via %s", vehicle, choice.reason)
             if faults:
                 self._announce(Severity.WARNING, f"{faults[0].brief}: see the log", TOPIC)
             elif self._reported or self._has_reported_missing:
-                self._announce(Severity.INFO, f"positions sent by {choice.channel.name}", TOPIC)
+                self._announce(Severity.INFO, f"positions sent via {choice.channel.name}", TOPIC)
         for fault in faults:
             log.warning("%s", fault.reason)
 

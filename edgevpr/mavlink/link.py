@@ -1,4 +1,4 @@
-"""The link to the flight controller: any thread may call it, and its driver alone touches the port."""
+"""The link to the flight controller. Any thread may call it; only its driver accesses the port."""
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -18,12 +18,12 @@ from edgevpr.mavlink.wire import Message
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStats:
-    """Counts and state of a link since its start; messages are counted by name, answers (`acks`) by name of the result.
+    """Counts and state of a link since its start. Messages are counted by name, answers (`acks`) by name of the result.
 
-    `trouble` is why the port could not be opened or was lost; None once data arrives again. `foreign_messages` came
-    from another autopilot or address. `withheld_fixes` were not sent because of unanswered ones or a pause;
-    `refused_why` is about the last refused one. `commands` and `ignored_requests` count the requests.
-    `bad_bytes` belong to no message. `answered_s`: when a command of ours was last answered, by its number."""
+    `trouble`: why the port could not be opened or was lost; None once data arrives again. `foreign_messages`: messages
+    from another autopilot or address. `withheld_fixes`: fixes not sent because of unanswered ones or a pause.
+    `refused_why`: reason of the last refused fix. `commands`, `ignored_requests`: counts of requests received.
+    `bad_bytes`: bytes that belong to no message. `answered_s`: time of the last answer to our commands, by number."""
 
     connected: bool
     trouble: str | None
@@ -52,16 +52,16 @@ class LinkStats:
 
     @property
     def positions_sent(self) -> int:
-        """The number of positions sent by message 296 or ODOMETRY."""
+        """Number of positions sent as message 296 or ODOMETRY."""
         return self.sent.get("GLOBAL_POSITION_SENSOR", 0) + self.sent.get("ODOMETRY", 0)
 
 
 class Link:
-    """The link to one flight controller. Its `conversation` decides what is sent, and processes what is received; it is
-    used inside `turns` only. `drive` makes what moves its packets through the port.
+    """The link to one flight controller. Its `conversation` makes the messages to send and processes received ones; it
+    is used inside `turns` only. `drive` makes the driver, which moves packets through the port.
 
-    All methods but `start` and `close` may be called from any thread; none waits for the other end, and none raises.
-    Those that are not explained here are those of `Conversation`.
+    All methods except `start` and `close` may be called from any thread; they never wait for the other end, and never
+    raise. Methods without a docstring are those of `Conversation`.
     """
 
     def __init__(
@@ -77,12 +77,12 @@ class Link:
         self._driver = drive(address, self.conversation, self.turns)
 
     def start(self) -> None:
-        """Open the port and start to send and receive. Raises LinkError for a fault that only the user can correct; a
-        missing device or server is none, and `stats` gives the reason."""
+        """Open the port and start to send and receive. Raises LinkError for a fault that only the user can correct. A
+        missing device or server is not such a fault: `stats` gives the reason."""
         self._driver.start()
 
     def turn(self, what: str) -> AbstractContextManager[None]:
-        """Take a turn: a context manager in which the link does nothing, and its time stands still (see `Turns`)."""
+        """Take a turn: a context manager during which the link is idle and its clock stands still (see `Turns`)."""
         return self.turns.take_turn(what)
 
     def send(self, *outgoing: Message) -> None:
@@ -98,7 +98,7 @@ class Link:
             self.conversation.announce(severity, text, topic)
 
     def accept_commands(self) -> None:
-        with self.turn("offer"):  # so called on the tapes of recorded flights, as the turn of `take_command`
+        with self.turn("offer"):  # recordings of earlier flights use this name, and that of `take_command`
             self.conversation.requests.is_flying = True
 
     def take_interim_fixes(self) -> list[FixTransmission]:
@@ -118,7 +118,7 @@ class Link:
             self.conversation.request_position()
 
     def vehicle(self) -> Vehicle | None:
-        """Return the autopilot's last report of its vehicle; None before the first, and if the last had no position."""
+        """Return the last report of the vehicle; None before the first one, or if the last one had no position."""
         with self.turn("vehicle"):
             return self.conversation.autopilot.vehicle
 
@@ -131,7 +131,7 @@ class Link:
         return self.conversation.channel
 
     def is_alive(self) -> bool:
-        """Return True if a fix can be sent now: the port is connected and the autopilot has sent a heartbeat lately."""
+        """Return True if a fix can be sent now: the port is connected and the autopilot's heartbeat is recent."""
         with self.turn("listens"):
             return self._driver.state()[0] and self.conversation.autopilot.is_alive(self.turns.now_s())
 
@@ -163,7 +163,7 @@ class Link:
             )
 
     def close(self) -> None:
-        """Send what is queued, wait for the answers to fixes, both for half a second at most, and close the port."""
+        """Send queued messages and wait for answers to fixes, for at most half a second each, then close the port."""
         with self.turn("close"):
             self.conversation.texts.remove_pauses()
         self._driver.close()
@@ -177,7 +177,7 @@ class Link:
 
     @contextmanager
     def _sending(self, what: str) -> Iterator[None]:
-        """Context manager: take a turn, and wake the thread after it."""
+        """Context manager: take a turn, then wake the driver's thread."""
         with self.turn(what):
             yield
         self._driver.wake()

@@ -121,7 +121,7 @@ def test_missing_answers_are_reported_once_and_withhold_fixes():
     autopilot.link = {}
     autopilot.answer_for(60, Channel.GPS_INPUT)
     autopilot.answer_for(10)
-    assert (Severity.INFO, "edgevpr: positions sent by GPS_INPUT") in autopilot.sentences()
+    assert (Severity.INFO, "edgevpr: positions sent via GPS_INPUT") in autopilot.sentences()
 
 
 def test_a_dangerous_change_in_flight_stops_the_channel_at_once_and_its_end_starts_it():
