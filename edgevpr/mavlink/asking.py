@@ -140,15 +140,15 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         self._unread.extend(filter(self._admit, self.reader.feed(data, self._port.sender)))
 
     def _admit(self, message: Message) -> bool:
-        beats = message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
+        is_heartbeat = message.get_type() == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
         if message.get_srcComponent() != AUTOPILOT or message.get_srcSystem() == 0:
             return False
-        if beats and self.system_id is None:
+        if is_heartbeat and self.system_id is None:
             self.system_id = self._packer.srcSystem = message.get_srcSystem()
         if message.get_srcSystem() != self.system_id:
-            self.others |= {message.get_srcSystem()} if beats else set()
+            self.others |= {message.get_srcSystem()} if is_heartbeat else set()
             return False
-        if beats:
+        if is_heartbeat:
             self._port.answer_sender()
         elif not self.received:
             return False

@@ -142,11 +142,11 @@ class PortDriver:
         with self._turns.take_link_turn():
             self._count_sent_fixes(writer)  # before answers to them are read
             self._settings.signing.verdicts.clear()
-            beats = self._conversation.handle(data, self._turns.now_s(), writer.port.sender)
+            has_heartbeat = self._conversation.handle(data, self._turns.now_s(), writer.port.sender)
             # An autopilot that has the key but an old clock learns the time from our signed messages.
             has_old_clock = OLD in self._settings.signing.verdicts
             is_behind = has_old_clock and not self._conversation.autopilot.is_alive(self._turns.now_s())
-        if beats or is_behind:
+        if has_heartbeat or is_behind:
             writer.port.answer_sender()
 
     def _transmit(self, writer: PacketWriter) -> None:

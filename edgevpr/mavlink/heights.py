@@ -61,7 +61,7 @@ class Heights:
         self._changing_since_s: float | None = None  # when the range finder began to disagree with `contradiction_m`
 
     def handle(self, message: Message, now_s: float, attitude: Attitude | None) -> None:
-        """Process a TERRAIN_REPORT or a DISTANCE_SENSOR. Its slant distance is corrected for `attitude` (None: unknown)."""
+        """Process a TERRAIN_REPORT or a DISTANCE_SENSOR; `attitude` (None: unknown) corrects its slant."""
         if message.get_type() == "TERRAIN_REPORT":
             self._handle_terrain(message, now_s)
         elif message.orientation == mavlink.MAV_SENSOR_ROTATION_PITCH_270:

@@ -38,7 +38,7 @@ class Interview:
 
     Unanswered requests are repeated after a second or, while nothing at all is answered, after growing pauses. Known
     parameters are requested again, one every two seconds, and values that arrive unrequested are also used. After a
-    change the channel is chosen again. Old firmware does not answer requests for a parameter that it does not have. Such a
+    change the channel is chosen again. Old firmware does not answer requests for a parameter that it does not have. The
     parameter counts as absent after four rounds in which others were answered, or more on a link that loses messages.
 
     `choice`: the channel. Before the first requests it is command 43003, for programs that send fixes by themselves and

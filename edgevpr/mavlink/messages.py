@@ -1,7 +1,7 @@
 """Functions that make the messages we send, one for each kind: values in, a pymavlink message out; no I/O and no clock.
 
-`t_mono_s` is a time of the system's monotonic clock in seconds. `stamp_s` is such a time by the clock of the receiver:
-an ArduPilot keeps a single time correction for all messages of a link, which every restart of our clock would spoil.
+`t_mono_s` is a time of the system's monotonic clock in seconds. `stamp_s` is such a time by the receiver's clock:
+ArduPilot keeps a single timestamp correction for all messages of a link, which a restart of our clock would corrupt.
 """
 
 import math
@@ -17,26 +17,26 @@ POSITION_FIX = mavlink.MAV_CMD_EXTERNAL_POSITION_ESTIMATE  # 43003
 SET_SOURCE_SET = mavlink.MAV_CMD_SET_EKF_SOURCE_SET  # 42007
 AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 MAX_TEXT_BYTES = 50
-SENSOR_ID = 1  # the `id` in our messages 296, equal to EKF2_AGP0_ID, whose value 0 would switch the slot off
+SENSOR_ID = 1  # `id` in message 296; must equal EKF2_AGP0_ID, whose value 0 would disable the slot
 _YAW_SD_RAD = math.radians(5.0)
-# A reserve must never outbid a real receiver that has a 3D fix, which takes four satellites. At the same fix type
-# ArduPilot changes to the one with more satellites, and blends by accuracies (AP_GPS::update_primary, AP_GPS_Blended).
+# A reserve must never outrank a real receiver with a 3D fix, which needs four satellites. At equal fix type ArduPilot
+# switches to the receiver with more satellites, and blends by accuracy (AP_GPS::update_primary, AP_GPS_Blended).
 _RESERVE_SATELLITES = 2
 _RESERVE_SD_M = 100.0
 _RESERVE_SD_M_S = 10.0
-_NORMAL_SATELLITES = 6  # the smallest number with which a filter starts
+_NORMAL_SATELLITES = 6  # the minimum for a filter to start
 _GPS_EPOCH_S = 315_964_800  # 1980-01-06
-_LEAP_S = 18  # since then, as of 2017
+_LEAP_S = 18  # leap seconds since the GPS epoch, as of 2017
 _WEEK_S = 604_800
 
 
 class Health(IntEnum):
-    """The state of this companion computer that its heartbeat reports (MAV_STATE)."""
+    """State of this companion computer, reported in its heartbeat (MAV_STATE)."""
 
     BOOT = mavlink.MAV_STATE_BOOT
-    STANDBY = mavlink.MAV_STATE_STANDBY  # paused by the ground
+    STANDBY = mavlink.MAV_STATE_STANDBY  # paused from the ground
     ACTIVE = mavlink.MAV_STATE_ACTIVE
-    CRITICAL = mavlink.MAV_STATE_CRITICAL  # it runs, but does not work: no frames come, or its main loop hangs
+    CRITICAL = mavlink.MAV_STATE_CRITICAL  # running but not working: no frames arrive, or the main loop hangs
 
 
 class Severity(IntEnum):
@@ -49,8 +49,8 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A fix: the vehicle's position at `t_frame_s`, when the frame was taken (monotonic clock), and `accuracy_m`, the
-    standard deviation of one axis. Raises ValueError for an invalid position, accuracy or time."""
+    """A fix: the vehicle's position at `t_frame_s`, when a frame was taken (monotonic clock). `accuracy_m`: standard
+    deviation of one axis. Raises ValueError for an invalid position, accuracy or time."""
 
     lat_deg: float
     lon_deg: float
@@ -58,19 +58,19 @@ class Fix:
     t_frame_s: float
 
     def __post_init__(self) -> None:
-        if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # in this form NaN is refused too
-            raise ValueError(f"latitude {self.lat_deg}, longitude {self.lon_deg} is no place on the Earth")
+        if not (abs(self.lat_deg) <= 90 and abs(self.lon_deg) <= 180):  # this form also rejects NaN
+            raise ValueError(f"latitude {self.lat_deg}, longitude {self.lon_deg} is not a position on Earth")
         if not 0 < self.accuracy_m < math.inf:
             raise ValueError(f"an accuracy of {self.accuracy_m} m is invalid: it must be finite and above zero")
         if not math.isfinite(self.t_frame_s):
-            raise ValueError(f"the age of a frame taken at {self.t_frame_s} s cannot be computed")
+            raise ValueError(f"a frame time of {self.t_frame_s} s is invalid: it must be finite")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionState:
     """Position and motion of the vehicle at `t_mono_s`: altitude above sea level, velocity (east, north, down), and
     standard deviations (`accuracy_m` and `speed_accuracy_m_s` of one axis, `alt_accuracy_m` of the altitude).
-    `attitude` is (roll, pitch, yaw) in radians, None if unknown. `is_reserve`: a real GPS receiver is good."""
+    `attitude`: (roll, pitch, yaw) in radians, None if unknown. `is_reserve`: a real GPS receiver has a good fix."""
 
     t_mono_s: float
     lat_deg: float
@@ -92,8 +92,8 @@ def make_heartbeat(health: Health, kind: int = mavlink.MAV_TYPE_ONBOARD_CONTROLL
 
 def make_position_fix(fix: Fix, t_sent_s: float, target_system: int, stamp_s: float | None = None) -> Message:
     """Make a COMMAND_INT (75) with command 43003, in the form that ArduPilot accepts: global frame, no altitude (NaN).
-    The age of the fix is sent as processing time, `stamp_s` (None: `t_sent_s`) as that of sending: a float32, good to
-    8 ms after one day."""
+    The processing time is the age of the fix, and the transmission time is `stamp_s` (None: `t_sent_s`), a float32
+    with a resolution of 8 ms after one day."""
     return mavlink.MAVLink_command_int_message(
         target_system=target_system,
         target_component=AUTOPILOT,
@@ -112,7 +112,7 @@ def make_position_fix(fix: Fix, t_sent_s: float, target_system: int, stamp_s: fl
 
 
 def make_position_sensor(state: MotionState) -> Message:
-    """Make a GLOBAL_POSITION_SENSOR (296): a position without altitude. PX4 goes by the time of its arrival."""
+    """Make a GLOBAL_POSITION_SENSOR (296): a position without altitude. PX4 uses its time of arrival."""
     return mavlink.MAVLink_global_position_sensor_message(
         target_system=0,
         target_component=0,
@@ -131,9 +131,8 @@ def make_position_sensor(state: MotionState) -> Message:
 
 
 def make_gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_unix_s: float | None) -> Message:
-    """Make a GPS_INPUT (232) as GPS receiver number `receiver` (0: the first). A `state` of None is sent as "no fix", a
-    reserve as a poor fix. `stamp_s` is the time of the state, `t_unix_s` the same time in UTC, seconds since 1970
-    (None: unknown)."""
+    """Make a GPS_INPUT (232) for GPS receiver `receiver` (0: the first). A `state` of None is sent as "no fix", a
+    reserve as a poor fix. `stamp_s`: time of the state. `t_unix_s`: the same in seconds since 1970 (None: unknown)."""
     week, rest_s = (0, 0) if t_unix_s is None else divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, _WEEK_S)
     east, north, down = state.velocity_m_s if state else (0, 0, 0)
     satellites, sd_m, sd_m_s = 0, 0.0, 0.0
@@ -166,16 +165,16 @@ def make_gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_u
 def make_odometry(
     state: MotionState, attitude: tuple[float, float, float], origin: tuple[float, float, float], stamp_s: float
 ) -> Message:
-    """Make an ODOMETRY (331) in the only frames that ArduPilot accepts: position north, east, down of `make_origin`
-    (latitude, longitude in degrees, altitude in metres above sea level), velocity along the axes of the airframe.
-    `attitude` is (roll, pitch, yaw) in radians. ArduPilot computes a standard deviation as the cube root of the sum of
-    the squared variances (`GCS_MAVLINK::handle_odometry`); the variances sent are those from which it gets the right
-    one. That of the height, which we do not measure, is zero."""
+    """Make an ODOMETRY (331) in the only frames that ArduPilot accepts: position north, east, down relative to `origin`
+    (latitude, longitude in degrees, altitude in metres above sea level), velocity in the body frame. `attitude`:
+    (roll, pitch, yaw) in radians. ArduPilot computes a standard deviation as the cube root of the sum of the squared
+    variances (`GCS_MAVLINK::handle_odometry`), so we send variances that give the correct one. The variance of the
+    height, which we do not measure, is zero."""
     east, north, down = state.velocity_m_s
     to_earth = rotmat.Matrix3()
     to_earth.from_euler(*attitude)
     velocity = to_earth.transposed() * rotmat.Vector3(north, east, down)  # along nose, right, down
-    # The upper triangle of 6 x 6, row by row: only its diagonal is known.
+    # Upper triangle of the 6 x 6 covariance, row by row: only the diagonal is known.
     pose_variances, velocity_variances = [0.0] * 21, [0.0] * 21
     pose_variances[0] = pose_variances[6] = math.sqrt(state.accuracy_m**3 / 2)
     pose_variances[20] = math.sqrt(_YAW_SD_RAD**3)
@@ -185,7 +184,7 @@ def make_odometry(
         origin,
         time_usec=round(stamp_s * 1e6),
         frame_id=mavlink.MAV_FRAME_LOCAL_FRD,
-        q=list(quaternion.QuaternionBase(list(attitude)).q),  # from the airframe to north, east, down; w, x, y, z
+        q=list(quaternion.QuaternionBase(list(attitude)).q),  # from the body frame to north, east, down; w, x, y, z
         vx=velocity.x,
         vy=velocity.y,
         vz=velocity.z,
@@ -195,9 +194,9 @@ def make_odometry(
 
 
 def make_vision_position(state: MotionState, origin: tuple[float, float, float]) -> Message:
-    """Make an ODOMETRY (331) with a position, north, east, down of `make_origin` (latitude, longitude in degrees,
-    altitude in metres above sea level), and nothing else. PX4 knows our clock by our answers to its TIMESYNC."""
-    variances = [math.nan] * 21  # the upper triangle of 6 x 6, row by row
+    """Make an ODOMETRY (331) with only a position, north, east, down relative to `origin` (latitude, longitude in
+    degrees, altitude in metres above sea level). PX4 learns our clock from our answers to its TIMESYNC."""
+    variances = [math.nan] * 21  # upper triangle of the 6 x 6 covariance, row by row
     variances[0] = variances[6] = state.accuracy_m**2
     variances[11] = state.alt_accuracy_m**2
     return _complete_odometry(
@@ -215,7 +214,7 @@ def make_vision_position(state: MotionState, origin: tuple[float, float, float])
 
 
 def _complete_odometry(state: MotionState, origin: tuple[float, float, float], **fields: Any) -> Message:
-    """Make an ODOMETRY with the position of a state relative to the origin, and with `fields`, those of the channel."""
+    """Make an ODOMETRY from the position of a state relative to `origin`, and the channel's own `fields`."""
     east_m, north_m = offset_m(origin[0], origin[1], state.lat_deg, state.lon_deg)
     return mavlink.MAVLink_odometry_message(
         child_frame_id=mavlink.MAV_FRAME_BODY_FRD,
@@ -234,7 +233,7 @@ def _complete_odometry(state: MotionState, origin: tuple[float, float, float], *
 
 def make_report_requests(target_system: int, firmware: int, is_continuous: bool = False) -> tuple[Message, ...]:
     """Make the requests for all reports that the flight needs, each a COMMAND_LONG (76) with SET_MESSAGE_INTERVAL
-    (511). `firmware` is a MAV_AUTOPILOT; a continuous channel (`is_continuous`) needs more, at higher rates."""
+    (511). `firmware`: a MAV_AUTOPILOT. A continuous channel (`is_continuous`) needs more reports, at higher rates."""
     rates_hz = _rates_hz(is_continuous)
     if firmware in _FILTER_REPORTS:
         rates_hz[_FILTER_REPORTS[firmware]] = 2
@@ -243,12 +242,12 @@ def make_report_requests(target_system: int, firmware: int, is_continuous: bool 
 
 
 def attitude_hz(is_continuous: bool) -> int:
-    """Return how many attitudes a second `make_report_requests` asks for."""
+    """Return the rate in Hz at which `make_report_requests` requests attitudes."""
     return _rates_hz(is_continuous)[mavlink.MAVLINK_MSG_ID_ATTITUDE]
 
 
 def make_message_request(target_system: int, message_id: int) -> Message:
-    """Make a COMMAND_LONG (76) with REQUEST_MESSAGE (512): the autopilot shall send message `message_id` once."""
+    """Make a COMMAND_LONG (76) with REQUEST_MESSAGE (512): request message `message_id` once."""
     return _make_command(target_system, mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
 
 
@@ -265,8 +264,8 @@ def make_origin(target_system: int, lat_deg: float, lon_deg: float, alt_m: float
 
 
 def make_named_values(t_mono_s: float, **values: float | None) -> tuple[Message, ...]:
-    """Make a NAMED_VALUE_INT (252) for each whole number and a NAMED_VALUE_FLOAT (251) for each other number; a value
-    of None is unknown and gets no message. docs/reference/ground-station.md lists the names, of 10 letters at most."""
+    """Make a NAMED_VALUE_INT (252) for each integer and a NAMED_VALUE_FLOAT (251) for each other number; unknown values
+    (None) are omitted. docs/reference/ground-station.md lists the names, which have at most 10 letters."""
     boot_ms = _boot_ms(t_mono_s)
     return tuple(
         mavlink.MAVLink_named_value_int_message(boot_ms, name.encode(), value)
@@ -278,15 +277,15 @@ def make_named_values(t_mono_s: float, **values: float | None) -> tuple[Message,
 
 
 def make_source_set(number: int, target_system: int) -> Message:
-    """Make a COMMAND_LONG (76) with SET_EKF_SOURCE_SET (42007): ArduPilot shall use source set `number` (1..3)."""
+    """Make a COMMAND_LONG (76) with SET_EKF_SOURCE_SET (42007): make ArduPilot use source set `number` (1..3)."""
     return _make_command(target_system, SET_SOURCE_SET, number)
 
 
 def make_computer_status(
     t_mono_s: float, loads: Sequence[float], ram_used_bytes: int, ram_total_bytes: int, temperature_c: float | None
 ) -> Message:
-    """Make an ONBOARD_COMPUTER_STATUS (390): the load of each core (0..1; the first eight are sent), used and total RAM
-    (sent in MiB), and the temperature in degrees Celsius (None: unknown)."""
+    """Make an ONBOARD_COMPUTER_STATUS (390) from the load of each core (0..1; the first eight are sent), used and total
+    RAM (sent in MiB), and the temperature in degrees Celsius (None: unknown)."""
     percents = [min(100, max(0, round(100 * share))) for share in loads[:8]]
     temperature = 127 if temperature_c is None else min(126, max(-128, round(temperature_c)))
     return mavlink.MAVLink_onboard_computer_status_message(
@@ -297,7 +296,7 @@ def make_computer_status(
         ram_total=ram_total_bytes >> 20,
         cpu_cores=percents + [255] * (8 - len(percents)),
         temperature_core=[temperature] + [127] * 7,
-        # The other fields are not measured; MAVLink marks that by the largest value of their type.
+        # The other fields are not measured. MAVLink marks them by the largest value of their type.
         cpu_combined=[255] * 10,
         gpu_cores=[255] * 4,
         gpu_combined=[255] * 10,
@@ -309,7 +308,7 @@ def make_computer_status(
 
 
 def make_status_text(severity: Severity, text: str) -> Message:
-    """Make a STATUSTEXT (253), cut to 50 bytes: not every ground station can read a text in chunks."""
+    """Make a STATUSTEXT (253), cut to 50 bytes: not every ground station supports text in chunks."""
     data = text.encode()
     if len(data) > MAX_TEXT_BYTES:
         data = data[: MAX_TEXT_BYTES - 3].decode(errors="ignore").encode() + b"..."
@@ -323,7 +322,7 @@ _REPORTS_HZ = {
     mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: 2,
     mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT: 2,
 }
-# An ArduPilot plane, whose loop runs fifty times a second, denies more than forty messages a second.
+# An ArduPilot plane, whose loop runs at 50 Hz, denies rates above 40 Hz.
 _CONTINUOUS_HZ = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 25,
     mavlink.MAVLINK_MSG_ID_SCALED_IMU: 25,
@@ -331,7 +330,7 @@ _CONTINUOUS_HZ = {
     mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: 1,
 }
 _UNKNOWN_UINT32 = 2**32 - 1
-# Only the right one: ArduPilot sends the pilot a text for each request of a message that it does not know.
+# Request only the firmware's own report: ArduPilot sends the pilot a text for each request of an unknown message.
 _FILTER_REPORTS = {
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
     mavlink.MAV_AUTOPILOT_PX4: mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,

@@ -1,4 +1,4 @@
-"""The autopilot at the other end of the link: which sender it is, and its state by its messages."""
+"""The autopilot at the other end of the link: its identity among the senders, and its state from its messages."""
 
 import logging
 import math
@@ -21,23 +21,23 @@ from edgevpr.mavlink.vehicle import MAX_FILTER_REPORT_AGE_S, Attitude, Attitudes
 from edgevpr.mavlink.wire import Message, mavlink
 
 MAX_GPS_DISAGREEMENT_M = 50.0  # at 25 m/s, with one or two seconds between the two reports
-MAX_SPEED_M_S = 150.0  # over ground: a small aircraft is never faster, so such a report is wrong
-_MIN_HPA = 300.0  # of the air at any height of flight
+MAX_SPEED_M_S = 150.0  # ground speed; small aircraft are never faster, so such a report is wrong
+_MIN_HPA = 300.0  # air pressure at any flight altitude
 _MAX_HPA = 1100.0
 _MILLI_G_M_S2 = 9.80665e-3
 
-# Reports of where the vehicle is, and how it moves; the first three carry the boot time.
+# Reports of the vehicle's position and motion; the first three carry the boot time.
 _TIMED_REPORTS = ("ATTITUDE", "GLOBAL_POSITION_INT", "SCALED_IMU")
 _MOTION_REPORTS = (*_TIMED_REPORTS, *GPS_REPORTS)
-_ORIGIN_TIMEOUT_S = 2.0  # of the request: an autopilot that has not answered by then has no origin
+_ORIGIN_TIMEOUT_S = 2.0  # an autopilot that has not answered the request by then has no origin
 _ORIGIN_REQUEST_INTERVAL_S = 10.0
-REPLACEMENT_SILENCE_S = 30.0  # a restarting flight controller is back within 20 s; a sender before that is another
+REPLACEMENT_SILENCE_S = 30.0  # a flight controller restarts within 20 s
 
 log = logging.getLogger(__name__)
 
 
 class Endpoint(NamedTuple):
-    """The sender of an autopilot's messages; its address is None if the link has one sender only."""
+    """The sender of an autopilot's messages; its address is None if the link has only one sender."""
 
     system_id: int
     address: Sender | None
@@ -48,9 +48,9 @@ class Endpoint(NamedTuple):
 
 
 class Identity:
-    """Decides which sender is our autopilot, `kept`: the first or, with `system_id` set, the first with that system id.
-    A sender with another system id never replaces it; one with the same at another address does so once our autopilot
-    has been silent for 30 s: then it `has_moved`. `foreign_messages` counts the messages of others."""
+    """Decides which sender is our autopilot, `kept`: the first one or, if `system_id` is set, the first with that id.
+    A sender with another system id never replaces it. A sender with the same system id at another address replaces it
+    once it has been silent for 30 s; then it `has_moved`. `foreign_messages` counts the messages of other senders."""
 
     def __init__(self, system_id: int | None = None) -> None:
         self.kept: Endpoint | None = None
@@ -60,30 +60,30 @@ class Identity:
         self._has_warned = False
         self.has_moved = False
 
-    def admits(self, endpoint: Endpoint, beats: bool, now_s: float) -> bool:
-        """Return True if this endpoint is our autopilot, which it may become by a message that `beats`: a heartbeat."""
+    def admits(self, endpoint: Endpoint, is_heartbeat: bool, now_s: float) -> bool:
+        """Return True if this endpoint is our autopilot. It may become ours if its message `is_heartbeat`."""
         self.has_moved = False
-        if beats and endpoint != self.kept and self._may_replace(endpoint, now_s):
+        if is_heartbeat and endpoint != self.kept and self._may_replace(endpoint, now_s):
             if self.kept is None:
                 log.info("connected to autopilot (%s)", endpoint)
             else:
                 silent_s = now_s - self._received_s
-                log.warning("the autopilot is %s now: %s has been silent for %.0f s", endpoint, self.kept, silent_s)
+                log.warning("the autopilot is now %s: %s has been silent for %.0f s", endpoint, self.kept, silent_s)
                 self.has_moved = True
             self.kept, self._has_warned = endpoint, False
         if endpoint != self.kept:
-            # Not counted where any sender may still become our autopilot.
+            # Do not count while any sender may still become our autopilot.
             self.foreign_messages += self.kept is not None or self._configured is not None
             return False
         self._received_s = now_s
         return True
 
     def is_foreign(self, address: Sender | None) -> bool:
-        """Return True if bytes from this address cannot come from our autopilot, whose address is another one."""
+        """Return True if bytes from this address cannot come from our autopilot, which has another address."""
         return self.kept is not None and address != self.kept.address
 
     def _may_replace(self, endpoint: Endpoint, now_s: float) -> bool:
-        """Return True if a endpoint that is not our autopilot becomes ours by its heartbeat."""
+        """Return True if the heartbeat of another endpoint makes that endpoint our autopilot."""
         kept = self.kept
         if kept is None and self._configured in (None, endpoint.system_id):
             return True
@@ -91,62 +91,62 @@ class Identity:
             self._has_warned = True
             ours = kept or f"system {self._configured}"
             advice = "give each vehicle a link of its own, or set mavlink.system_id and restart edgevpr"
-            log.warning("another autopilot, %s, is on this link: fixes go to %s only; %s", endpoint, ours, advice)
+            log.warning("another autopilot, %s, is on this link: fixes are sent to %s only; %s", endpoint, ours, advice)
         is_same = kept is not None and endpoint.system_id == kept.system_id
         return is_same and now_s - self._received_s >= REPLACEMENT_SILENCE_S
 
 
 class Listener:
-    """Base class of an object that navigates by the autopilot's reports and estimates the positions to send; this one
-    does nothing. The link's thread calls the methods, which never block and never raise."""
+    """Base class for objects that navigate by the autopilot's reports and estimate the positions to send; it does
+    nothing. The link's thread calls the methods, which must never block or raise."""
 
     def handle_autopilot(self, t_s: float) -> None:
-        """Process the appearance of an autopilot at `t_s`: the first, a restarted one, or another one."""
+        """Handle a new autopilot at `t_s`: the first, a restarted or a different one."""
 
     def handle_channel(self, channel: Channel) -> None:
-        """Process the channel by which positions are sent, when it is first chosen and when it changes."""
+        """Handle the channel for positions when it is first chosen, and when it changes."""
 
     def handle_vehicle(self, vehicle: Vehicle) -> None:
-        """Process a report of the vehicle's position and velocity."""
+        """Handle a report of the vehicle's position and velocity."""
 
     def handle_force(self, t_s: float, force_m_s2: tuple[float, float, float], attitude: Attitude) -> None:
-        """Process the specific force at `t_s` (m/s^2 along nose, right and down), and the attitude then."""
+        """Handle the specific force at `t_s` (m/s^2 along nose, right and down), and the attitude at that time."""
 
     def trusts_gps(self) -> bool:
         """Return False while matches prove the GPS receiver wrong."""
         return True
 
     def estimate_state(self, t_s: float) -> MotionState | None:
-        """Return the vehicle's position and motion at `t_s`, for a continuous channel; None: not known well enough."""
+        """Return the vehicle's position and motion at `t_s` for a continuous channel; None if it is too uncertain."""
         return None
 
     def make_interim_fix(self, now_s: float) -> Fix | None:
-        """Return a fix to send between two matches, if fixes are single; None: it would not help."""
+        """Return a fix to send between two matches, for a channel of single fixes; None if it would not help."""
         return None
 
 
 class Autopilot:
-    """The state of the autopilot and its vehicle, by the messages received; `identity` selects those of our autopilot.
-    `component_id` is our component id, `system_id` that of the autopilot (None: that of the first one)."""
+    """The state of the autopilot and its vehicle, from the messages of our autopilot, which `identity` selects.
+    `component_id`: our component id. `system_id`: system id of the autopilot (None: accept the first one)."""
 
     def __init__(self, component_id: int, system_id: int | None, listener: Listener, announce: Announce) -> None:
         self.identity = Identity(system_id)
         self.acks: Counter[str] = Counter()  # answers to our fixes, by name of the result
-        self.answered_s: dict[int, float] = {}  # when it last answered a command of ours, by the command's number
-        self.firmware: int = mavlink.MAV_AUTOPILOT_GENERIC  # MAV_AUTOPILOT; this until its heartbeat
+        self.answered_s: dict[int, float] = {}  # time of its last answer to each of our commands, by number
+        self.firmware: int = mavlink.MAV_AUTOPILOT_GENERIC  # a MAV_AUTOPILOT; generic until its first heartbeat
         self._listener, self._component_id, self._announce = listener, component_id, announce
-        self.heartbeat_s = -math.inf  # the time of its last heartbeat through the port now open
-        self.answer: str | None = None  # name of a MAV_RESULT, if the last message answers a fix
-        self.has_restarted = False  # as the last message shows
+        self.heartbeat_s = -math.inf  # time of its last heartbeat through the currently open port
+        self.answer: str | None = None  # name of a MAV_RESULT, if the last message answered a fix
+        self.has_restarted = False  # shown by the last message
         self._reset()
 
     def _reset(self) -> None:
         self.interview = Interview(self._announce)
         self.is_armed: bool | None = None  # None: no heartbeat yet
         self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
-        self._origin_s = self._asked_origin_s = self._gps_s = self._flags_s = -math.inf  # times of the last ones
+        self._origin_s = self._asked_origin_s = self._gps_s = self._flags_s = -math.inf  # times of the last messages
         self._lacked_origin, self._flags = False, 0
-        self.pressure_alt_m: float | None = None  # metres in the standard atmosphere, by its barometer
+        self.pressure_alt_m: float | None = None  # barometric altitude in the standard atmosphere
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
         self.attitudes, self.heights, self.accuracy = Attitudes(), Heights(self._announce), PositionAccuracy()
         self.clock, self.imu_s = AutopilotClock(), -math.inf  # when accelerations were last received
@@ -160,22 +160,22 @@ class Autopilot:
         return self.identity.kept.system_id if self.identity.kept else None
 
     def stamp_s(self, t_mono_s: float) -> float | None:
-        """Return `t_mono_s` as a time stamp for it; None: not known yet. A PX4 converts stamps of our clock itself."""
+        """Return `t_mono_s` as a timestamp for it; None if its clock is unknown. PX4 converts our timestamps itself."""
         return t_mono_s if self.firmware == mavlink.MAV_AUTOPILOT_PX4 else self.clock.stamp_s(t_mono_s)
 
     def is_alive(self, now_s: float) -> bool:
-        """Return True if the autopilot's heartbeat came in the last five seconds, through the port now open."""
+        """Return True if a heartbeat of the autopilot arrived through the current port in the last five seconds."""
         return now_s - self.heartbeat_s <= HEARTBEAT_TIMEOUT_S
 
     def is_origin_request_due(self, now_s: float) -> bool:
-        """Return True, and note the time, if the origin is to be requested now: a restart may have lost it."""
+        """Return True, and record the time, if the origin should be requested now: a restart may have lost it."""
         if now_s - self._gps_s <= GPS_TIMEOUT_S or now_s - self._asked_origin_s < _ORIGIN_REQUEST_INTERVAL_S:
             return False
         self._lacked_origin, self._asked_origin_s = self._lacks_origin(now_s), now_s
         return True
 
     def assess_readiness(self, now_s: float) -> Readiness:
-        """Return what is known of its readiness to accept a fix."""
+        """Return its readiness to accept a fix, as far as it is known."""
         return Readiness(
             is_px4=self.firmware == mavlink.MAV_AUTOPILOT_PX4,
             is_armed=self.is_armed,
@@ -186,12 +186,12 @@ class Autopilot:
         )
 
     def _lacks_origin(self, now_s: float) -> bool:
-        """Return True if it did not answer the last request for its origin, or that before as long as it may answer."""
+        """Return True if its origin was requested and not received in time; during a request, the previous result."""
         is_late = self._lacked_origin or now_s - self._asked_origin_s > _ORIGIN_TIMEOUT_S
         return self._origin_s < self._asked_origin_s and is_late
 
     def predict_vehicle(self, t_mono_s: float) -> Vehicle | None:
-        """Return the last report, moved to `t_mono_s`: see `Conversation.predict_vehicle`."""
+        """Return the last report, extrapolated to `t_mono_s`: see `Conversation.predict_vehicle`."""
         vehicle, attitude = self.vehicle, self.attitudes.at(t_mono_s)
         if vehicle and vehicle.velocity_m_s and vehicle.is_fresh(t_mono_s):
             east_m, north_m = ((t_mono_s - vehicle.t_received_s) * speed_m_s for speed_m_s in vehicle.velocity_m_s)
@@ -212,34 +212,34 @@ class Autopilot:
             self.identity.foreign_messages += self.identity.is_foreign(address)
             return False
         kind = message.get_type()
-        beats = bool(kind == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID)
-        before = self.identity.kept
-        if not self.identity.admits(Endpoint(message.get_srcSystem(), address), beats, now_s):
+        is_heartbeat = bool(kind == "HEARTBEAT" and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID)
+        previous = self.identity.kept
+        if not self.identity.admits(Endpoint(message.get_srcSystem(), address), is_heartbeat, now_s):
             return False
-        is_other = self.identity.kept != before
+        is_other = self.identity.kept != previous
         self.has_restarted = not is_other and self.clock.handle(message, now_s)
         if is_other or self.has_restarted:
             self._reset()
             self.clock.handle(message, now_s)
             self._listener.handle_autopilot(now_s)
         self.interview.handle(message)
-        if kind == "COMMAND_ACK" and message.target_component not in (0, self._component_id):  # 0: to all
+        if kind == "COMMAND_ACK" and message.target_component not in (0, self._component_id):  # 0: broadcast
             return False
         if kind == "COMMAND_ACK":
             self.answered_s[message.command] = now_s
-        if beats:
+        if is_heartbeat:
             self.heartbeat_s, self.firmware = now_s, message.autopilot
             self.is_armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         else:
             self._handle_report(message, now_s)
-        return beats
+        return is_heartbeat
 
     def _handle_report(self, message: Message, now_s: float) -> None:
         kind = message.get_type()
         if kind in _TIMED_REPORTS:
             self.report_delay.update(self.clock.delay_s(message.time_boot_ms, now_s), now_s)
         if kind in _MOTION_REPORTS and self.report_delay.is_late:
-            return  # an outdated report, as on a link that is full, or after our process was paused
+            return  # an outdated report: the link is full, or our process was paused
         match kind:
             case "COMMAND_ACK" if message.command == POSITION_FIX and message.result != mavlink.MAV_RESULT_IN_PROGRESS:
                 entry = mavlink.enums["MAV_RESULT"].get(message.result)
@@ -271,10 +271,10 @@ class Autopilot:
                 self._origin_s = now_s
 
     def _handle_position(self, message: Message, now_s: float) -> None:
-        """Process a GLOBAL_POSITION_INT. One off the Earth, or at 0, 0, is no position: `vehicle` is then None."""
+        """Process a GLOBAL_POSITION_INT. If its position is invalid, or 0, 0, `vehicle` becomes None."""
         gps, lat_deg, lon_deg = self._receiver(now_s), message.lat / 1e7, message.lon / 1e7
         is_near = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= MAX_GPS_DISAGREEMENT_M)
-        # With a continuous channel the estimate may come from our own positions: it proves nothing about the receiver.
+        # On a continuous channel the estimate may derive from our own positions, so it proves nothing about GPS.
         has_gps = bool(gps) and (is_near or self.interview.choice.channel.is_continuous) and self.px4.uses_gps
         if gps and has_gps:
             self.accuracy.record_accuracy(gps.sd_m, now_s)

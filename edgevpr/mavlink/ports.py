@@ -1,6 +1,6 @@
-"""Ports of four kinds: UDP out, UDP in, TCP and serial. None of them blocks once it is open, and all handle every
-fault in the same way: pymavlink's own connections may spin, hang or raise. A `PacketWriter` writes packets to an open
-port: no position fix leaves late from a buffer, be it ours or that of the operating system."""
+"""Ports of four kinds: UDP out, UDP in, TCP and serial. Unlike pymavlink's own connections, which may spin, hang or
+raise, none of them blocks once it is open, and all handle faults in the same way. A `PacketWriter` writes packets to an
+open port, and ensures that no position fix leaves late from a buffer, whether ours or the operating system's."""
 
 import errno
 import fcntl
@@ -19,16 +19,16 @@ from edgevpr.mavlink.address import LinkAddress, Sender
 from edgevpr.mavlink.fixes import FixTransmission
 
 CONNECT_TIMEOUT_S = 1.0
-TCP_TIMEOUT_MS = 1000  # if the other end has not confirmed bytes by then, the connection is closed and they are lost
-TCP_BUFFER_BYTES = 8192  # doubled by the system: some 30 messages; its default is megabytes
+TCP_TIMEOUT_MS = 1000  # if bytes are not acknowledged by then, the connection is closed and they are lost
+TCP_BUFFER_BYTES = 8192  # doubled by the system, about 30 messages; the default is megabytes
 READ_BYTES = 65_536
 LOST = Reason(ReasonCode.LINK_LOST)
-WRITE_TIMEOUT_S = 0.5  # a port that has accepted no byte for this time is reopened: waiting bytes would leave late
+WRITE_TIMEOUT_S = 0.5  # a port that accepts no bytes for this long is reopened: the waiting bytes would leave late
 
 
 class Port:
-    """The base of all ports. After an error the owner closes the port and opens a new one. `connected`: there is a
-    receiver to send to. `sender`: the address from which the last bytes came; None if there can be only one."""
+    """Base class of all ports. After an error the owner closes the port and opens a new one. `connected`: there is a
+    receiver to send to. `sender`: source address of the last bytes; None if there can be only one."""
 
     connected = True
     sender: Sender | None = None
@@ -43,7 +43,7 @@ class Port:
         return self._sock.fileno()
 
     def read(self) -> bytes:
-        """Return the bytes that have arrived (b"": none), without waiting. Raises OSError if the connection is lost."""
+        """Return the bytes received (b"": none), without waiting. Raises OSError if the connection is lost."""
         with suppress(BlockingIOError):
             data = os.read(self.fileno(), READ_BYTES)
             if not data:
@@ -52,27 +52,27 @@ class Port:
         return b""
 
     def write(self, data: bytes) -> int:
-        """Write the bytes that fit without waiting; return their number. Raises OSError if the connection is lost."""
+        """Write as many bytes as fit without waiting; return their number. Raises OSError if the connection is lost."""
         with suppress(BlockingIOError):
             return os.write(self.fileno(), data)
         return 0
 
     def answer_sender(self) -> None:
-        """From now on send to the sender of the last bytes read. No effect if there can be only one sender."""
+        """Send to the sender of the last bytes read from now on. No effect if there can be only one sender."""
 
     def unsent(self) -> int:
-        """Return the number of bytes written that have not left the system, or (TCP) are not confirmed."""
+        """Return the number of written bytes that have not left the system or, over TCP, are not acknowledged."""
         return 0
 
     def discard_on_close(self) -> None:
-        """Make `close` discard the bytes that have not left, instead of letting them leave later."""
+        """Make `close` discard unsent bytes instead of sending them later."""
 
     def close(self) -> None:
         self._sock.close()
 
 
 def _open_udp(attach: Callable[[socket.socket, tuple[str, int]], None], host: str, port: int) -> socket.socket:
-    """Return a UDP socket, attached to an address by `bind` or `connect`; one that cannot be is closed."""
+    """Return a UDP socket attached to an address by `attach`: `bind` or `connect`. Closes the socket if that fails."""
     with ExitStack() as closes:
         sock = closes.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         attach(sock, (host, port))
@@ -81,12 +81,12 @@ def _open_udp(attach: Callable[[socket.socket, tuple[str, int]], None], host: st
 
 
 class UdpOutPort(Port):
-    """A UDP socket that is connected to one address: the operating system drops packets from any other."""
+    """A UDP socket connected to one address: the operating system drops packets from any other."""
 
     def __init__(self, host: str, port: int) -> None:
         super().__init__(_open_udp(socket.socket.connect, host, port))
 
-    # A datagram that no program received makes the next call fail, once; so `write` tries twice.
+    # A datagram that no program received makes the next call fail once, so `write` tries twice.
 
     def read(self) -> bytes:
         with suppress(BlockingIOError, ConnectionRefusedError):
@@ -101,10 +101,10 @@ class UdpOutPort(Port):
 
 
 class UdpInPort(Port):
-    """A UDP socket that listens. It sends to the first sender, until `answer_sender` selects another."""
+    """A listening UDP socket. It sends to the first sender until `answer_sender` selects another one."""
 
     def __init__(self, host: str, port: int) -> None:
-        # No SO_REUSEADDR: with it, a second program on the port would silently take the first one's datagrams.
+        # No SO_REUSEADDR: with it, a second program on the port would silently receive the first one's datagrams.
         super().__init__(_open_udp(socket.socket.bind, host, port))
         self._peer: Sender | None = None
         self.connected = False
@@ -136,7 +136,7 @@ class TcpPort(Port):
         self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, TCP_BUFFER_BYTES)
 
     def unsent(self) -> int:
-        # SIOCOUTQ, which has the number of TIOCOUTQ.
+        # SIOCOUTQ, which has the same value as TIOCOUTQ.
         return int.from_bytes(fcntl.ioctl(self._sock, termios.TIOCOUTQ, bytes(4)), "little")
 
     def discard_on_close(self) -> None:
@@ -144,7 +144,7 @@ class TcpPort(Port):
 
 
 class SerialPort(Port):
-    """A serial line, written by its file descriptor: pyserial's own write spins when the buffer is full."""
+    """A serial port, written through its file descriptor: pyserial's own write spins when the buffer is full."""
 
     _loss = "the device is gone"
 
@@ -152,14 +152,14 @@ class SerialPort(Port):
         import serial  # not at the top: no other kind of link needs it
 
         if not stat.S_ISCHR(os.stat(device).st_mode):
-            raise ValueError("it is no serial device")
+            raise ValueError("it is not a serial device")
         try:
             self._port = serial.Serial(device, baud, timeout=0, exclusive=True)
         except termios.error as error:  # not a subclass of OSError
             raise OSError(*error.args) from error
         except serial.SerialException as error:
             if isinstance(error.__context__, termios.error) and error.__context__.args[0] == errno.ENOTTY:
-                raise ValueError("it is no serial device") from error
+                raise ValueError("it is not a serial device") from error
             raise
 
     def fileno(self) -> int:
@@ -171,7 +171,7 @@ class SerialPort(Port):
     def close(self) -> None:
         with suppress(OSError, termios.error):
             if self.unsent():
-                # Bytes still in the buffer must neither leave later nor delay the close (for up to 30 s).
+                # Bytes still in the buffer must neither leave later nor delay closing the port (by up to 30 s).
                 self._port.reset_output_buffer()
         self._port.close()
 
@@ -182,27 +182,27 @@ _PORT_TYPES: dict[str, Callable[[str, int], Port]] = {
     "tcp": TcpPort,
     "serial": SerialPort,
 }
-_ADVICE = {  # by error, and whether the link is a serial one
-    (errno.EADDRINUSE, False): "the port is in use by another program: stop that one, or take another port",
-    (errno.EWOULDBLOCK, True): "the device is in use by another program: stop that one",
-    (errno.EACCES, True): "this user may not open it: `edgevpr doctor` says what to change (mostly group `dialout`)",
-    (errno.EACCES, False): "the system does not permit it: take a port above 1023 and the address of one host",
+_ADVICE = {  # by error, and whether the link is serial
+    (errno.EADDRINUSE, False): "the port is in use by another program: stop that program, or use another port",
+    (errno.EWOULDBLOCK, True): "the device is in use by another program: stop that program",
+    (errno.EACCES, True): "this user has no access: run `edgevpr doctor` to see what to change (often group `dialout`)",
+    (errno.EACCES, False): "permission denied: use a port above 1023 and the address of a single host",
 }
 
 
 def open_port(address: LinkAddress) -> Port:
-    """Open the port of a link. Raises LinkAddressError for an address that is wrong, LinkError for another fault that
-    the user must correct (a port in use, no permission), and OSError for one that may end by itself (no device)."""
+    """Open the port of a link. Raises LinkAddressError for a wrong address, LinkError for another fault that the user
+    must correct (a port in use, no permission), and OSError for a fault that may disappear by itself (no device)."""
     is_serial = address.kind == "serial"
     try:
         return _PORT_TYPES[address.kind](address.where, address.number)
     except (socket.gaierror, UnicodeError) as error:
-        # The host may be found later: no name server has answered, or a .local host announces itself.
-        is_unasked = isinstance(error, socket.gaierror) and error.errno != socket.EAI_NONAME
-        kind = LinkError if is_unasked or address.where.endswith(".local") else LinkAddressError
-        raise kind(f"{address}: there is no host {address.where!r}: correct it, or give an IP address.") from error
+        # The host may be found later: no name server has answered, or a .local host has yet to announce itself.
+        is_unresolved = isinstance(error, socket.gaierror) and error.errno != socket.EAI_NONAME
+        kind = LinkError if is_unresolved or address.where.endswith(".local") else LinkAddressError
+        raise kind(f"{address}: host {address.where!r} not found: correct it, or give an IP address.") from error
     except ValueError as error:
-        raise LinkAddressError(f"{address} cannot be opened ({error}): correct the device or the baud rate.") from error
+        raise LinkAddressError(f"{address} cannot be opened ({error}): correct the device or baud rate.") from error
     except OSError as error:
         if not (advice := _ADVICE.get((error.errno or 0, is_serial))):
             raise
@@ -211,16 +211,16 @@ def open_port(address: LinkAddress) -> Port:
 
 
 class PacketWriter:
-    """Writes packets to a port, one after another. A fix counts as sent when all its bytes have left the operating
-    system (over TCP: when they are confirmed). If that has not happened by its `due_s`, `take_sent_fixes` raises
-    ConnectionError; closing the port then throws the bytes away. `unsent` are the bytes of the last packet that the
-    port has not accepted yet."""
+    """Writes packets to a port, one at a time. A fix counts as sent when all its bytes have left the operating system
+    (over TCP: when they are acknowledged). If that has not happened by its `due_s`, `take_sent_fixes` raises
+    ConnectionError, and closing the port then discards the bytes. `unsent`: the bytes of the last packet that the port
+    has not yet accepted."""
 
     def __init__(self, port: Port, clock: Callable[[], float]) -> None:
         self.port, self._clock = port, clock
         self.unsent = b""
         self._accepted_bytes = 0
-        self.pending_fixes: deque[tuple[int, FixTransmission]] = deque()  # `_accepted_bytes` at their last byte
+        self.pending_fixes: deque[tuple[int, FixTransmission]] = deque()  # with `_accepted_bytes` at their last byte
         self._blocked_since_s: float | None = None
 
     @property
@@ -228,20 +228,20 @@ class PacketWriter:
         """True if every byte has left the operating system."""
         return not self.unsent and self.port.unsent() == 0
 
-    def put(self, packet: bytes, sending: FixTransmission | None) -> None:
-        """Set the next packet and the fix in it, if any, once the port has accepted the previous packet in full."""
+    def put(self, packet: bytes, transmission: FixTransmission | None) -> None:
+        """Set the next packet, and the fix in it, if any. The port must have accepted the previous packet in full."""
         self.unsent = packet
-        if sending:
-            self.pending_fixes.append((self._accepted_bytes + len(packet), sending))
+        if transmission:
+            self.pending_fixes.append((self._accepted_bytes + len(packet), transmission))
 
     def write(self) -> None:
-        """Write what the port accepts without blocking. Raises OSError if it is lost, or took nothing for 0.5 s."""
+        """Write what the port accepts without blocking. Raises OSError if it is lost, or accepts nothing for 0.5 s."""
         if not self.unsent:
             return
-        taken = self.port.write(self.unsent)
-        self.unsent = self.unsent[taken:]
-        self._accepted_bytes += taken
-        if taken:
+        count = self.port.write(self.unsent)
+        self.unsent = self.unsent[count:]
+        self._accepted_bytes += count
+        if count:
             self._blocked_since_s = None
         elif self._blocked_since_s is None:
             self._blocked_since_s = self._clock()
@@ -249,24 +249,24 @@ class PacketWriter:
             raise ConnectionError("the port accepts no more bytes")
 
     def take_sent_fixes(self) -> list[FixTransmission]:
-        """Return the fixes that have left since the last call, now sent. Raises ConnectionError if one is too late."""
-        departed = []
-        # Read before the bytes are asked for: a clock that jumps meanwhile must not condemn what has just left.
+        """Return the fixes sent since the last call. Raises ConnectionError if the next one is overdue."""
+        sent_fixes = []
+        # Read the clock before the port: if the clock jumps in between, a fix that has just left must not be rejected.
         now_s = self._clock()
-        left = self._accepted_bytes - self.port.unsent() if self.pending_fixes else 0
-        while self.pending_fixes and self.pending_fixes[0][0] <= left:
-            departed.append(self.pending_fixes.popleft()[1])
-            departed[-1].settle(True)
-        if not departed and self.pending_fixes and now_s > self.pending_fixes[0][1].due_s:
-            raise ConnectionError("a position fix has waited too long in it")
-        return departed
+        sent_bytes = self._accepted_bytes - self.port.unsent() if self.pending_fixes else 0
+        while self.pending_fixes and self.pending_fixes[0][0] <= sent_bytes:
+            sent_fixes.append(self.pending_fixes.popleft()[1])
+            sent_fixes[-1].settle(True)
+        if not sent_fixes and self.pending_fixes and now_s > self.pending_fixes[0][1].due_s:
+            raise ConnectionError("a position fix has waited too long in its buffer")
+        return sent_fixes
 
     def close(self) -> int:
-        """Close the port, throw away all bytes that have not left, and return the number of fixes in them."""
+        """Close the port, discard all unsent bytes, and return the number of fixes in them."""
         with suppress(OSError):
             if not self.is_idle:
                 self.port.discard_on_close()
         self.port.close()
-        for _, sending in self.pending_fixes:
-            sending.settle(False, LOST)
+        for _, transmission in self.pending_fixes:
+            transmission.settle(False, LOST)
         return len(self.pending_fixes)

@@ -1,10 +1,10 @@
-"""Whether a PX4 uses GPS and our positions, by its filter's report (ESTIMATOR_STATUS).
+"""Whether PX4 uses GPS and our positions, from its filter's report (ESTIMATOR_STATUS).
 
-PX4 does not reset its position to a GPS that comes back while it uses our positions, however far off these are (EKF2,
-`isGnssPosResetAllowed`). So ours have to stop before it can use GPS again, and they stop only when PX4 shows that it
-would: it fuses the velocity of its receiver, for which our positions do not matter, as soon as its checks of the
-receiver pass. Read in the sources of 1.18 (`Ekf::get_ekf_soln_status`, `getHorizontalVelocityInnovationTestRatio`), and
-compared with a real 1.17.0 and 1.18-beta1."""
+While PX4 uses our positions, it does not reset its position to a GPS that has recovered, however far off ours are
+(EKF2, `isGnssPosResetAllowed`). We must therefore stop sending before it can use GPS again, but only once PX4 shows
+that it would: as soon as its checks of the receiver pass, it fuses the receiver's velocity, whatever our positions are.
+Based on the sources of 1.18 (`Ekf::get_ekf_soln_status`, `getHorizontalVelocityInnovationTestRatio`), and compared with
+the real 1.17.0 and 1.18-beta1."""
 
 import math
 
@@ -15,40 +15,40 @@ from edgevpr.mavlink.wire import Message, mavlink
 
 _FUSES_ABSOLUTE = mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
 _FUSES_ANY = mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
-_SENSOR_TIMEOUT_S = 6.0  # so long after our last message 296 its flag may still mean ours: PX4 waits for 5 s
-_VISION_TIMEOUT_S = 1.0  # ODOMETRY has a flag of its own, so only its end must be noticed
-_MIN_UNUSED_S = 2.0  # of a receiver with a fix, which may have got or lost it a moment ago
+_SENSOR_TIMEOUT_S = 6.0  # after our last message 296, whose flag PX4 keeps set for 5 s
+_VISION_TIMEOUT_S = 1.0  # ODOMETRY has a flag of its own, so only the end of our messages must be detected
+_MIN_UNUSED_S = 2.0  # PX4 must not use a receiver with a fix for this long, as the fix may be new or just lost
 _SENDING_TIMEOUT_S = 1.0
-# A receiver that has come back has to be steady for so long before it is left to PX4: less would follow a flapping one.
+# A recovered receiver must be steady for this long before we stop sending; less would follow an intermittent receiver.
 _MIN_STEADY_S = 1.5
-_FIRST_PAUSE_S = 30.0  # after an attempt that PX4 did not use; twice as long each time
+_FIRST_PAUSE_S = 30.0  # after an attempt in which PX4 did not use GPS; doubled each time
 _MAX_PAUSE_S = 240.0
 
 
 class Px4Fusion:
-    """Infers whether PX4 `uses_gps` while a receiver has a fix: with EKF2_GPS_CTRL=0, or when it rejects GPS, it does
-    not. `used` and `unused` count its reports while our positions are sent, by whether it fuses them."""
+    """Infers whether PX4 `uses_gps` while a receiver has a fix: it does not if EKF2_GPS_CTRL=0, or if it rejects GPS.
+    `used` and `unused` count its reports while our positions are sent, by whether it fuses them."""
 
     def __init__(self) -> None:
         self.uses_gps = True
         self.used = self.unused = 0
         self._sent_s, self._is_vision = -math.inf, False
         self._unused_since_s: float | None = None
-        self._reports_fusion = False  # before 1.16 the flag is that of a position, of whatever source
+        self._reports_fusion = False  # before 1.16 the flag means a position from any source
         self._takes_velocity = False
         self._next_try_s, self._pause_s = -math.inf, _FIRST_PAUSE_S
 
     @property
     def used_share(self) -> float | None:
-        """Share of the reports by which our positions are used; None without a report."""
+        """Share of reports in which our positions are used; None without reports."""
         count = self.used + self.unused
         return self.used / count if count else None
 
     def make_state_message(
         self, state: MotionState | None, is_vision: bool, origin: tuple[float, float, float] | None, now_s: float
     ) -> Message | None:
-        """Make the message that sends PX4 a state (None: unknown), by message 296 or, if it `is_vision`, by ODOMETRY,
-        which needs the `make_origin` of its local frame: latitude, longitude in degrees, altitude in metres."""
+        """Make the message that sends a state (None: unknown) to PX4: message 296 or, if `is_vision`, ODOMETRY, which
+        needs the `origin` of PX4's local frame: latitude, longitude in degrees, altitude in metres."""
         if state is None or (is_vision and origin is None):
             return None
         self._sent_s, self._is_vision = now_s, is_vision
@@ -59,13 +59,13 @@ class Px4Fusion:
         )
 
     def handle(self, report: Message, now_s: float, receiver: Receiver | None, is_trusted: bool = True) -> None:
-        """Process an ESTIMATOR_STATUS. `receiver` is the best GPS receiver that has a fix (None: none has), which
-        `is_trusted` unless matches prove it wrong."""
+        """Process an ESTIMATOR_STATUS. `receiver`: the best GPS receiver with a fix (None: none has a fix).
+        `is_trusted`: False while matches prove that receiver wrong."""
         is_fusing = bool(report.flags & _FUSES_ABSOLUTE)
         self._reports_fusion |= is_fusing
         silent_s = now_s - self._sent_s
         if silent_s < _SENDING_TIMEOUT_S:
-            # A ratio above 1 is beyond the filter's gate.
+            # A test ratio above 1 is outside the filter's gate.
             ours = _FUSES_ANY if self._is_vision else _FUSES_ABSOLUTE
             is_used = bool(report.flags & ours) and not report.pos_horiz_ratio > 1
             self.used, self.unused = self.used + is_used, self.unused + (not is_used)
@@ -86,10 +86,10 @@ class Px4Fusion:
             is_due = now_s >= self._next_try_s and receiver.steady_for_s >= _MIN_STEADY_S
             self._unused_since_s, self.uses_gps = None, takes_velocity and is_due and is_trusted
         elif not takes_velocity:
-            self._infer_gps_use(False, now_s)  # it does not use the GPS that we have stopped for
+            self._infer_gps_use(False, now_s)  # PX4 does not use the GPS that we stopped sending for
 
     def _infer_gps_use(self, is_fusing: bool, now_s: float) -> None:
-        """Infer whether PX4 uses GPS while it uses none of our positions: whether it fuses a position."""
+        """Infer whether PX4 uses GPS while it uses none of our positions: it does if it fuses a position."""
         if is_fusing:
             self._unused_since_s, self.uses_gps, self._pause_s = None, True, _FIRST_PAUSE_S
         elif self._unused_since_s is None:

@@ -1,5 +1,5 @@
-"""PX4's channel and the table of its parameters (see `parameters`). Each row names the file of PX4 1.18.0-beta1 that
-decides, or says that it was flown in its own simulator."""
+"""PX4's channel and the table of its parameters (see `parameters`). Each rule names the file of PX4 1.18.0-beta1 that
+it is based on, or is marked `flown`: tested in PX4's own simulator."""
 
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.channel import Channel, ChannelChoice, Parameters, VehicleKind
@@ -19,7 +19,7 @@ from edgevpr.mavlink.parameters import (
 
 POSITION_BIT = 1  # bit of EKF2_AGPn_CTRL
 AGP_CONTROL = "EKF2_AGP0_CTRL"  # since 1.18, as is message 296: 1.17.0 has neither
-VISION_CONTROL = "EKF2_EV_CTRL"  # with more bits it may be that of another system; before 1.16 the default is 15
+VISION_CONTROL = "EKF2_EV_CTRL"  # more bits may belong to another system; before 1.16 the default is 15
 
 _ALL_CHANNELS = (Channel.COMMAND, Channel.SENSOR, Channel.VISION)
 _CONTINUOUS = (Channel.SENSOR, Channel.VISION)
@@ -28,13 +28,13 @@ _ODOMETRY = (Channel.VISION,)
 
 _GPS_POSITION_BIT = 1  # bit of EKF2_GPS_CTRL
 _HEIGHT_FROM_VISION = 3  # value of EKF2_HGT_REF
-_MAX_SD_M = 10  # the least error that the filter assumes of a position
+_MAX_SD_M = 10  # limit of the minimum error that the filter assumes for a position
 _MAX_GATE_SD = 10
 _DELAY_CONSEQUENCE = "We send the current position, which would be treated as an old one."
 
 
 def choose_px4_channel(_kind: VehicleKind, parameters: Parameters) -> ChannelChoice:
-    """Choose the channel for a PX4: message 296 or ODOMETRY if AGP_CONTROL or VISION_CONTROL allow them, else command
+    """Choose the channel for PX4: message 296 or ODOMETRY if AGP_CONTROL or VISION_CONTROL enables it, else command
     43003."""
     fuses_ours = has_bit(parameters.get(AGP_CONTROL, 0), POSITION_BIT)
     if parameters.get(VISION_CONTROL) == POSITION_BIT and not fuses_ours:
@@ -49,26 +49,26 @@ def choose_px4_channel(_kind: VehicleKind, parameters: Parameters) -> ChannelCho
 
 # fmt: off
 _RULES = (
-    recommend(_ALL_CHANNELS, "7, the default: with the bit 1",  # gps_control.cpp, controlGnssPosFusion
+    recommend(_ALL_CHANNELS, "7, the default; any value with bit 1",  # gps_control.cpp, controlGnssPosFusion
         expect(7, "EKF2_GPS_CTRL", allows=lambda value: has_bit(value, _GPS_POSITION_BIT)),
-        "GPS is not used for the position, only ours: this is for an aircraft without GPS."),
+        "Only our positions are used, not GPS: this is for an aircraft without GPS."),
     require(_ALL_CHANNELS, "0", expect(0, "EKF2_GPS_MODE"),  # gps_control.cpp, isGnssPosResetAllowed
-        "GPS that comes back far from our position is refused as long as airspeed or optical flow is used."),
+        "GPS that recovers far from our position is rejected as long as airspeed or optical flow is used."),
     recommend(_CONTINUOUS, "0 or 1", expect(1, "EKF2_HGT_REF", allows=lambda value: value != _HEIGHT_FROM_VISION),
-        "We send no height: with 3 (vision) it never gets ready to arm."),  # flown
+        "We send no height: with 3 (vision) it never becomes ready to arm."),  # flown
     recommend(_ALL_CHANNELS, "1", expect(1, "SYS_HAS_GPS"),
-        "With 0 it arms without GPS, so the start may be unknown: this is for an aircraft without GPS."),
-    # aux_global_position.cpp: a slot whose number is 0 at the start does not exist.
+        "With 0 it arms without GPS, so the start position may be unknown: this is for an aircraft without GPS."),
+    # aux_global_position.cpp: a slot whose ID is 0 at startup does not exist.
     recommend(_MESSAGE_296, f"{SENSOR_ID}", expect(SENSOR_ID, "EKF2_AGP0_ID"),
-        "Our positions carry this number; with another they are not used."),
+        "Our positions carry this ID; with any other value they are not used."),
     require(_MESSAGE_296, f"1, the default; up to {_MAX_SD_M}",  # flown
         expect(1, "EKF2_AGP0_NOISE", allows=make_limit(_MAX_SD_M)),
-        "It hardly follows our positions, and accepts ones that are far off: with 50 it was 20 m off, unnoticed."),
+        "It hardly follows our positions, and accepts ones that are far off: with 50 it was 20 m off, undetected."),
     require(_MESSAGE_296, f"3, the default; up to {_MAX_GATE_SD}",
         expect(3, "EKF2_AGP0_GATE", allows=make_limit(_MAX_GATE_SD)),  # fuseHorizontalPosition
-        "The filter refuses no position, not even a wrong one."),
+        "The filter accepts every position, even a wrong one."),
     recommend(_MESSAGE_296, "0", expect(0, "EKF2_AGP0_MODE"),  # aux_global_position_control.cpp, isResetAllowed
-        "With airspeed or optical flow it never returns to our positions after it has left the gate."),
+        "With airspeed or optical flow it never returns to our positions once they are outside the gate."),
     require(_MESSAGE_296, f"0; up to {MAX_DELAY_MS:g}",  # aux_global_position_control.cpp, bufferData
         expect(0, "EKF2_AGP0_DELAY", allows=make_limit(MAX_DELAY_MS)), _DELAY_CONSEQUENCE),
     require(_ODOMETRY, "0", expect(0, "EKF2_EV_NOISE_MD"),  # params_external_vision.yaml
@@ -78,7 +78,7 @@ _RULES = (
         "It hardly follows our positions, and accepts ones that are far off: with 20 it was 35 m off, and landed."),
     require(_ODOMETRY, f"5, the default; up to {_MAX_GATE_SD}",
         expect(5, "EKF2_EVP_GATE", allows=make_limit(_MAX_GATE_SD)),  # ev_pos_control.cpp, controlEvPosFusion
-        "The filter refuses no position, not even a wrong one."),
+        "The filter accepts every position, even a wrong one."),
     require(_ODOMETRY, f"within {MAX_OFFSET_M:g} m of 0",  # ev_pos_control.cpp, pos_offset_body
         expect(0, *list_axes("EKF2_EV_POS"), allows=is_small_offset),
         "We send the position of the vehicle itself, which a camera offset would shift.", "EKF2_EV_POS_*"),

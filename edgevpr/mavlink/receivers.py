@@ -1,7 +1,7 @@
-"""The GPS receivers of an autopilot, by their own messages: GPS_RAW_INT and GPS2_RAW.
+"""The GPS receivers of an autopilot, from their own messages: GPS_RAW_INT and GPS2_RAW.
 
-Our own positions cannot be in them, except in those of the receiver that edgevpr simulates (GPS_INPUT), which is left
-out. The autopilot's estimate, in contrast, may be derived from our positions.
+These messages cannot contain our own positions, except those of the receiver that edgevpr simulates (GPS_INPUT), which
+is excluded. The autopilot's estimate, in contrast, may be derived from our positions.
 """
 
 import math
@@ -12,21 +12,21 @@ from edgevpr.core.types import Receiver
 from edgevpr.mavlink.wire import Message, mavlink
 
 GPS_REPORTS = ("GPS_RAW_INT", "GPS2_RAW")
-GPS_TIMEOUT_S = 2.5  # reports come at least once a second, and one may be lost
+GPS_TIMEOUT_S = 2.5  # reports arrive at least once a second, and one may be lost
 DEFAULT_GPS_SD_M = 5.0  # of a receiver that does not report its accuracy
-MAX_PLAUSIBLE_SD_M = 15.0  # a receiver with a larger one does not replace our positions
-# From the measurement of a receiver to the arrival of its report: next to nothing in PX4's simulator, 0.1 s and
-# up to 0.2 s until the next report in ArduPilot's.
+MAX_PLAUSIBLE_SD_M = 15.0  # a receiver with a larger standard deviation does not replace our positions
+# Time from a receiver's measurement to the arrival of its report: almost zero in PX4's simulator; in ArduPilot's, 0.1 s
+# plus up to 0.2 s until the next report.
 RECEIVER_LAG_S = 0.1
-_ACCURACY_UNKNOWN = (0, 2**32 - 1)  # of h_acc: not sent, and not known
+_ACCURACY_UNKNOWN = (0, 2**32 - 1)  # values of h_acc: not sent, and unknown
 _SPEED_UNKNOWN = 2**16 - 1
-_MAX_STEP_M = 8.0  # from one report to the next, beyond the motion by its own velocity: more is a jump
-_MAX_GAP_S = 1.5  # a receiver that was silent for longer is no longer steady
+_MAX_STEP_M = 8.0  # between two reports, beyond the motion from the receiver's velocity: more is a jump
+_MAX_GAP_S = 1.5  # a receiver that is silent for longer is no longer steady
 
 
 @dataclass(frozen=True, slots=True)
 class _TrackedReceiver:
-    """A receiver with a 3D fix: its newest report, the autopilot's time stamp of it, and since when it is steady."""
+    """A receiver with a 3D fix: its newest report, the autopilot's timestamp of it, and since when it is steady."""
 
     report: Receiver
     time_usec: int
@@ -34,30 +34,31 @@ class _TrackedReceiver:
 
 
 class Receivers:
-    """The receivers that have a 3D fix. A receiver is steady while its fixes follow each other without a gap or jump,
-    by its own velocity, with a plausible accuracy."""
+    """The receivers that have a 3D fix. A receiver is steady while its fixes have a plausible accuracy and follow each
+    other without a gap, or a jump relative to its own velocity."""
 
     def __init__(self) -> None:
         self._tracked: dict[str, _TrackedReceiver] = {}
 
     def handle(self, message: Message, now_s: float) -> None:
-        """Process a GPS_RAW_INT or GPS2_RAW of the autopilot that arrived at `now_s`."""
+        """Process a GPS_RAW_INT or GPS2_RAW received from the autopilot at `now_s`."""
         name = message.get_type()
         if message.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
             self._tracked.pop(name, None)
             return
-        before = self._tracked.get(name)
-        # After a receiver is lost, its last position is reported for some seconds more, with an unchanged time stamp.
-        if before and message.time_usec and message.time_usec == before.time_usec:
+        previous = self._tracked.get(name)
+        # After a receiver is lost, its last position is still reported for some seconds, with an unchanged timestamp.
+        if previous and message.time_usec and message.time_usec == previous.time_usec:
             return
         report = _to_receiver(message, now_s)
-        is_steady = before is not None and report.sd_m <= MAX_PLAUSIBLE_SD_M and _is_continuous(before.report, report)
-        since_s = before.steady_since_s if before and is_steady else now_s
+        is_plausible = report.sd_m <= MAX_PLAUSIBLE_SD_M
+        is_steady = previous is not None and is_plausible and _is_continuous(previous.report, report)
+        since_s = previous.steady_since_s if previous and is_steady else now_s
         self._tracked[name] = _TrackedReceiver(report, message.time_usec, since_s)
 
     def choose_best(self, now_s: float, own: str | None = None) -> Receiver | None:
-        """Return the newest report of the most accurate receiver that had a fix in the last 2.5 s; None if there is
-        none. `own` is the name of the report of the receiver that edgevpr simulates."""
+        """Return the newest report of the most accurate receiver with a fix in the last 2.5 s; None if there is none.
+        `own`: message name of the receiver that edgevpr simulates."""
         real = (tracked for name, tracked in self._tracked.items() if name != own)
         recent = [tracked for tracked in real if now_s - tracked.report.t_s <= GPS_TIMEOUT_S]
         if not recent:
@@ -67,8 +68,8 @@ class Receivers:
 
 
 def extrapolate(receiver: Receiver, t_s: float, velocity_m_s: tuple[float, float] | None = None) -> tuple[float, float]:
-    """Return latitude and longitude of a receiver at `t_s`: its report, moved on by its lag with `velocity_m_s`, m/s
-    (east, north; None: with its own velocity)."""
+    """Return latitude and longitude of a receiver at `t_s`, extrapolated from its report and lag with `velocity_m_s`,
+    m/s (east, north; None: use the receiver's own velocity)."""
     since_s = t_s - receiver.t_s + RECEIVER_LAG_S
     east_m, north_m = (since_s * speed_m_s for speed_m_s in velocity_m_s or receiver.velocity_m_s or (0.0, 0.0))
     return offset_position(receiver.lat_deg, receiver.lon_deg, east_m, north_m)
@@ -86,7 +87,7 @@ def _to_receiver(message: Message, now_s: float) -> Receiver:
 
 
 def _read_velocity(message: Message) -> tuple[float, float] | None:
-    """Return the velocity of a report, m/s (east, north); None if it has none."""
+    """Return the velocity of a report in m/s (east, north); None if the report has none."""
     if _SPEED_UNKNOWN in (message.vel, message.cog):
         return None
     speed_m_s, course = message.vel / 100, math.radians(message.cog / 100)
@@ -94,7 +95,7 @@ def _read_velocity(message: Message) -> tuple[float, float] | None:
 
 
 def _is_continuous(before: Receiver, report: Receiver) -> bool:
-    """Return True if a report follows the one before without a gap or a jump."""
+    """Return True if a report follows the one `before` without a gap or a jump."""
     step_s = report.t_s - before.t_s
     if step_s > _MAX_GAP_S:
         return False

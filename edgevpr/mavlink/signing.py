@@ -1,8 +1,8 @@
-"""Signing of MAVLink 2: the key, the signatures of sent and received messages, and their time stamps, which never go
-back, neither in a flight nor from one flight to the next. Used by the link and by `edgevpr check` and `doctor`.
+"""Signing of MAVLink 2: the key, the signatures of sent and received messages, and their timestamps, which never go
+back, neither within a flight nor between flights. Used by the link and by `edgevpr check` and `doctor`.
 
-pymavlink signs what is sent. Its check of what arrives is not used: it would store the time stamp of a message before
-it compares the signature, so that one forged message from the far future would shut out all true ones.
+pymavlink signs sent messages. Its check of received messages is not used: it stores the timestamp of a message before
+it compares the signature, so a single forged message with a timestamp far in the future would lock out all true ones.
 """
 
 import hashlib
@@ -21,30 +21,30 @@ from edgevpr.core.errors import ConfigError
 from edgevpr.core.files import open_file, read_file, write_atomically
 from edgevpr.mavlink.wire import Message, mavlink
 
-TICKS_S = 100_000  # per second: a time stamp counts units of 10 microseconds since the beginning of 2015, UTC
+TICKS_S = 100_000  # per second: a timestamp counts units of 10 microseconds since the start of 2015, UTC
 _EPOCH_S = 1_420_070_400
-_MAX_STAMP = 2**48 - 1  # it has six bytes
+_MAX_STAMP = 2**48 - 1  # timestamps have six bytes
 _MAX_STREAM_OFFSET = 60 * TICKS_S
 _SAVE_INTERVAL = 30 * TICKS_S
-# Each start adds a minute to the largest time stamp that can have been used. So all earlier messages, ours and those to
-# us, are more than a minute old, and are not accepted as a new stream when somebody sends them again.
+# Each start adds a minute to the largest timestamp that may have been used. All earlier messages, sent and received,
+# are then more than a minute old, so nobody can replay them as a new stream.
 _START_ADVANCE = _SAVE_INTERVAL + 60 * TICKS_S
 
 KEY_BYTES = 32
-# Link ids. A receiver checks the time stamps of each stream (system, component and link id) on their own.
+# Link ids. A receiver checks the timestamps of each stream (system, component and link id) separately.
 AUTOPILOT_LINK_ID = 1
-CHECK_LINK_ID = 2  # of `edgevpr check` and `doctor`
+CHECK_LINK_ID = 2  # used by `edgevpr check` and `doctor`
 UNSIGNED = "unsigned"
 WRONG = "wrong signature"
 OLD = "old time stamp"
 FUTURE = "time stamp from the future"
-_KEY_ADVICE = "`(umask 077; head -c 32 /dev/urandom > FILE)` makes one"
+_KEY_ADVICE = "create one with `(umask 077; head -c 32 /dev/urandom > FILE)`"
 
 REFUSAL_MEANINGS = {
     UNSIGNED: "the other end does not sign: give it the key, or remove `mavlink.signing_key`",
-    WRONG: "the other end has another key, or the messages are forged",
-    OLD: "usual for a moment after a start; else they are replayed, or the other end does not receive our messages",
-    FUTURE: "the clock of one sender is wrong, or the clocks of all others",
+    WRONG: "the other end has a different key, or the messages are forged",
+    OLD: "normal just after a start; otherwise they are replayed, or the other end does not receive our messages",
+    FUTURE: "the clock of this sender is wrong, or the clocks of all other senders",
 }
 
 Stream = tuple[int, int, int]  # system, component and link id of a sender
@@ -54,12 +54,12 @@ log = logging.getLogger(__name__)
 
 
 class TimeStamps:
-    """The largest time stamp ever sent or received, and the last one of every stream (the messages of one sender with
-    one link id). Any thread may call it. The largest is kept in the file `path`, since a board without a clock chip
-    starts with an old time: it is written at the start (raises ConfigError), and then every half minute.
+    """The largest timestamp ever sent or received, and the last one of every stream (the messages of one sender with
+    one link id). Any thread may call it. The largest is saved in the file `path`, because a board without a clock chip
+    starts with an old time. It is written at the start (raises ConfigError), and then every half minute.
 
-    With `is_saved` False the file is only read, for a check before the flight: that may run as root, and the service
-    could not overwrite a file of root."""
+    If `is_saved` is False the file is only read. A check before the flight does so, because it may run as root, and the
+    service could not overwrite a file of root."""
 
     def __init__(
         self, path: Path, mono_s: Clock = time.monotonic, utc_s: Clock = time.time, is_saved: bool = True
@@ -73,16 +73,16 @@ class TimeStamps:
         self._save(may_fail=not path.exists())
 
     def next(self) -> int:
-        """Return the time stamp for the next message to be sent, larger than all before."""
+        """Return the timestamp for the next message to send, larger than all previous ones."""
         with self._lock:
             self._advance(max(self._largest + 1, self._now()))
             return min(self._largest, _MAX_STAMP)
 
     def check(self, stream: Stream, stamp: int) -> str | None:
-        """Return why a message with this time stamp is refused, or None if it is admitted; its time stamp is then kept,
-        so the signature must be right. Time stamps of a stream must increase. The first of a new stream must be within
-        a minute of the largest, but the very first stream may be ahead: a board without a clock chip learns the time.
-        """
+        """Return why a message with this timestamp is rejected, or None if it is admitted. An admitted timestamp is
+        stored, so check the signature first. The timestamps of a stream must increase. The first of a new stream must
+        be within a minute of the largest. The very first stream may be ahead: it sets the time of a board without a
+        clock chip."""
         with self._lock:
             now = max(self._largest, self._now())
             if stamp <= self._streams.get(stream, now - _MAX_STREAM_OFFSET):
@@ -96,7 +96,7 @@ class TimeStamps:
             return None
 
     def _now(self) -> int:
-        """Return the time stamp of now, by the system's clock or, if later, counted from the largest one learnt."""
+        """Return the current timestamp: by the system clock or, if later, by the base and the monotonic clock."""
         by_system = int((self._utc_s() - _EPOCH_S) * TICKS_S)
         return max(by_system, self._base + int((self._mono_s() - self._base_s) * TICKS_S))
 
@@ -107,11 +107,11 @@ class TimeStamps:
         self._largest = stamp
         if stamp - self._saved >= _SAVE_INTERVAL:
             self._saved = stamp
-            # Not in the thread of a link: a slow card must not hold up a fix.
+            # Not on a link's thread: a slow SD card must not delay a fix.
             Thread(target=self._save, name="signing time", daemon=True).start()
 
     def _save(self, may_fail: bool = False) -> None:
-        """Write the time stamp to be kept. If that fails, log one warning or, with `may_fail`, raise ConfigError."""
+        """Save the timestamp to the file. If that fails, log one warning or, with `may_fail`, raise ConfigError."""
         if not self._is_saved:
             return
         try:
@@ -119,17 +119,17 @@ class TimeStamps:
                 write_atomically(self._path, lambda path: path.write_text(f"{self._saved}\n"))
         except OSError as error:
             if may_fail:
-                why = f"the time of signed messages cannot be saved there ({error.strerror})"
+                why = f"the signing timestamp cannot be saved to this file ({error.strerror})"
                 raise ConfigError(f"{self._path}: {why}: correct `mavlink: {{signing_state: ...}}`.") from error
             if not self._has_warned:
                 self._has_warned = True
-                log.warning("%s: the time of signed messages is not saved (%s)", self._path, error.strerror)
+                log.warning("%s: cannot save the signing timestamp (%s)", self._path, error.strerror)
 
 
 class Signing:
-    """Signs the messages that a link sends, and admits those received that are signed with the same key and not older
-    than earlier ones. `refused` counts the others by reason; `verdicts` has the reason for each message received last
-    (None: admitted). Without a key (no `stamps`) nothing is signed, and every message is admitted."""
+    """Signs the messages that a link sends, and admits received messages that are signed with the same key and not
+    older than earlier ones. `refused` counts the others by reason. `verdicts` holds the reason for each message of the
+    last read (None: admitted). Without a key (no `stamps`) nothing is signed, and every message is admitted."""
 
     def __init__(self, key: bytes = b"", stamps: TimeStamps | None = None, link_id: int = AUTOPILOT_LINK_ID) -> None:
         self.refused: Counter[str] = Counter()
@@ -152,17 +152,17 @@ class Signing:
         if reason is None:
             return True
         if reason not in self.refused:
-            log.warning("messages are refused (%s): %s", reason, REFUSAL_MEANINGS[reason])
+            log.warning("rejecting messages (%s): %s", reason, REFUSAL_MEANINGS[reason])
         self.refused[reason] += 1
         return False
 
     def _refusal(self, stamps: TimeStamps, packet: bytes, header: Message) -> str | None:
-        """Return why a message is refused (None: it is admitted). A RADIO_STATUS needs no signature, since a radio has
-        no key, but must not have the component id of an autopilot."""
+        """Return why a message is rejected (None: it is admitted). A RADIO_STATUS needs no signature, because a radio
+        has no key, but must not have the component id of an autopilot."""
         if not header.incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED:
             is_status = header.msgId == mavlink.MAVLINK_MSG_ID_RADIO_STATUS
             return None if is_status and header.srcComponent != mavlink.MAV_COMP_ID_AUTOPILOT1 else UNSIGNED
-        # At the end: link id (1 byte), time stamp (6), signature (6).
+        # A signed packet ends with link id (1 byte), timestamp (6) and signature (6).
         expected = hashlib.sha256(self._key + packet[:-6]).digest()[:6]
         if not hmac.compare_digest(expected, packet[-6:]):
             return WRONG
@@ -174,8 +174,8 @@ NOT_SIGNING = Signing()
 
 
 def open_signing(settings: MavlinkConfig, is_read_only: bool = False) -> Signing:
-    """Open the signing with the configured key, if there is one. With `is_read_only` (a check before the flight) the
-    file of the time is not written. Raises ConfigError."""
+    """Open the signing with the configured key, if any. If `is_read_only` (a check before the flight), the timestamp
+    file is not written. Raises ConfigError."""
     if settings.signing_key is None:
         return NOT_SIGNING
     key, state = read_key(settings.signing_key), Path(settings.signing_state or f"{settings.signing_key}.time")
@@ -184,7 +184,7 @@ def open_signing(settings: MavlinkConfig, is_read_only: bool = False) -> Signing
 
 
 def read_key(path: str) -> bytes:
-    """Read the key, 32 bytes, from a file that only its owner may read. Raises ConfigError."""
+    """Read the 32-byte key from a file that only its owner may read. Raises ConfigError."""
     try:
         with open_file(path, 1_000_000) as handle:
             mode, key = stat.S_IMODE(os.fstat(handle.fileno()).st_mode), handle.read(KEY_BYTES + 1)
@@ -193,24 +193,24 @@ def read_key(path: str) -> bytes:
     if mode & 0o077 and not _is_credential(path, mode):
         raise ConfigError(f"{path}: other users can read the signing key (mode {mode:04o}): run `chmod 600 {path}`.")
     if len(key) != KEY_BYTES:
-        raise ConfigError(f"{path}: a signing key has {KEY_BYTES} bytes, this file has not: {_KEY_ADVICE}.")
+        raise ConfigError(f"{path}: a signing key must be {KEY_BYTES} bytes long, and this file is not: {_KEY_ADVICE}.")
     return key
 
 
 def _is_credential(path: str, mode: int) -> bool:
-    """Return True if systemd gives the file to this service alone; its access list shows as a right of the group."""
+    """Return True if systemd provides the file to this service alone; its access list appears as a group permission."""
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     return folder is not None and Path(path).absolute().parent == Path(folder) and not mode & 0o037
 
 
 def _read_stamp(path: Path) -> int:
-    """Read the kept time stamp from the file; 0 if there is no file. Raises ConfigError if it is damaged."""
+    """Read the saved timestamp from the file; 0 if there is no file. Raises ConfigError if the file is damaged."""
     try:
         text = read_file(path, 64).decode("ascii", "replace").strip()
     except FileNotFoundError:
         return 0
     except OSError as error:
-        raise ConfigError(f"{path}: the time of signed messages cannot be read ({error.strerror}).") from error
+        raise ConfigError(f"{path}: the signing timestamp cannot be read ({error.strerror}).") from error
     if not (text.isascii() and text.isdigit() and int(text) <= _MAX_STAMP):
-        raise ConfigError(f"{path} contains no time of signed messages: set the clock, and delete the file.")
+        raise ConfigError(f"{path} contains no signing timestamp: set the board's clock, and delete the file.")
     return int(text)

@@ -1,4 +1,4 @@
-"""Turns: one thread at a time uses a conversation, while its clock stands still."""
+"""Turns: one thread at a time uses a conversation, and the conversation's clock stands still meanwhile."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -6,7 +6,7 @@ from threading import RLock
 
 
 class Turns:
-    """Gives turns to one thread at a time. A conversation depends only on the times of its turns and on its input."""
+    """Gives turns to one thread at a time. A conversation depends only on its input and the times of its turns."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -14,13 +14,13 @@ class Turns:
         self._t_s: float | None = None  # time of the current turn; None between turns
 
     def now_s(self) -> float:
-        """Return the time of the current turn, or that of the clock between turns."""
+        """Return the time of the current turn or, between turns, the time of the clock."""
         t_s = self._t_s
         return self._clock() if t_s is None else t_s
 
     @contextmanager
     def take_turn(self, what: str) -> Iterator[None]:
-        """Context manager: take a turn in the flight's thread, or continue the one it has. `what` names it."""
+        """Context manager: take a turn in the flight's thread, or continue its current one. `what` names the turn."""
         with self._lock:
             if self._t_s is not None:
                 yield
@@ -30,7 +30,7 @@ class Turns:
 
     @contextmanager
     def freeze_clock(self, t_s: float) -> Iterator[None]:
-        """Context manager: let the time stand still at `t_s`; in a replay, this repeats the link's turn."""
+        """Context manager: make the time stand still at `t_s`. A replay repeats the link's turns with it."""
         self._t_s = t_s
         try:
             yield
@@ -39,10 +39,10 @@ class Turns:
 
     @contextmanager
     def take_link_turn(self) -> Iterator[None]:
-        """Context manager: take a turn in the thread of the link."""
+        """Context manager: take a turn in the link's thread."""
         with self._lock, self.freeze_clock(self._clock()):
             yield
 
     def _begin(self, what: str) -> float:
-        """Return the time of a turn of the flight's thread, which begins."""
+        """Begin a turn of the flight's thread, and return its time."""
         return self._clock()

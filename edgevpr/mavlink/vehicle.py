@@ -1,6 +1,6 @@
-"""The state of the vehicle (attitude and position accuracy) from the autopilot's messages of the last seconds,
-and the autopilot's readiness to accept a fix, with the likely reasons for its answers. These were read in the source
-code of ArduPilot 4.7-dev (`setLatLng` of its NavEKF3) and PX4 1.17-alpha (`EKF2.cpp`)."""
+"""Attitude and position accuracy of the vehicle, from the autopilot's messages of the last seconds, and the autopilot's
+readiness to accept a fix, with the likely reasons for its answers. The reasons are based on the sources of ArduPilot
+4.7-dev (`setLatLng` of its NavEKF3) and PX4 1.17-alpha (`EKF2.cpp`)."""
 
 import math
 from typing import NamedTuple
@@ -9,22 +9,22 @@ from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.mavlink.wire import Message, mavlink
 
-_HISTORY_S = 3.0  # of attitudes: a frame is hardly ever older when it is recognised
+_HISTORY_S = 3.0  # length of the attitude history: frames are hardly ever older when they are recognised
 _MAX_ATTITUDES = 200
-_MAX_ATTITUDE_AGE_S = 0.3  # from an attitude to the time of a frame that it is used for
-# A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that came up when GPS was lost. In a gale it would be
-# four times as much, or four standard deviations.
+_MAX_ATTITUDE_AGE_S = 0.3  # longest time between an attitude and a frame that it is used for
+# A simulated ArduPilot plane drifts at 5 m/s in a wind of 6 m/s that began when GPS was lost. In a gale it would drift
+# four times as fast, which is four standard deviations.
 DRIFT_M_S = 5.0
-MAX_FILTER_REPORT_AGE_S = 3.0  # of the filter's report, which is requested twice a second
+MAX_FILTER_REPORT_AGE_S = 3.0  # filter reports are requested twice a second
 
-# Flags of EKF_STATUS_REPORT (ArduPilot) and ESTIMATOR_STATUS (PX4), which are the same. An ArduPilot that dead-reckons
-# reports only a relative position, from where it was last known (NavEKF3: absolute means measured).
+# EKF_STATUS_REPORT (ArduPilot) and ESTIMATOR_STATUS (PX4) have the same flags. While ArduPilot dead-reckons, it reports
+# only a position relative to the last known one (NavEKF3: absolute means measured).
 _HAS_POSITION = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_POS_HORIZ_REL
 
 
 class Attitude(NamedTuple):
     """Roll (right wing down is positive), pitch (nose up) and yaw (clockwise from north) in degrees at time `t_s`, and
-    the rate of roll and pitch together (`tilt_rate_deg_s`)."""
+    the combined rate of roll and pitch (`tilt_rate_deg_s`)."""
 
     t_s: float
     roll_deg: float
@@ -40,18 +40,19 @@ class Attitudes:
         self._kept: tuple[Attitude, ...] = ()
 
     def rate_hz(self, now_s: float) -> float:
-        """Return the rate at which attitudes have come in the last three seconds."""
+        """Return the rate of attitudes received in the last three seconds."""
         return sum(now_s - attitude.t_s <= _HISTORY_S for attitude in self._kept) / _HISTORY_S
 
     def handle(self, message: Message, now_s: float) -> None:
-        """Add the attitude of an ATTITUDE message; one that is not finite is ignored."""
+        """Add the attitude of an ATTITUDE message; ignore one that is not finite."""
         radians = message.roll, message.pitch, message.yaw
         if all(map(math.isfinite, radians)):
             kept = [attitude for attitude in self._kept[1 - _MAX_ATTITUDES :] if now_s - attitude.t_s <= _HISTORY_S]
             self._kept = (*kept, Attitude(now_s, *map(math.degrees, radians)))
 
     def at(self, t_s: float) -> Attitude | None:
-        """Return the attitude at `t_s`: between those before and after it, or the only one within 0.3 s, if any."""
+        """Return the attitude at `t_s`, interpolated between neighbours within 0.3 s; one neighbour is returned as is.
+        Return None if there is none."""
         near = [attitude for attitude in self._kept if abs(attitude.t_s - t_s) <= _MAX_ATTITUDE_AGE_S]
         before = next((attitude for attitude in reversed(near) if attitude.t_s <= t_s), None)
         after = next((attitude for attitude in near if attitude.t_s > t_s), None)
@@ -65,33 +66,33 @@ class Attitudes:
 
 
 class PositionAccuracy:
-    """Estimates the standard deviation of one axis of the autopilot's own position: what its filter reports (PX4) or,
-    without that, what it was when last known, growing by DRIFT_M_S a second."""
+    """Estimates the standard deviation of one axis of the autopilot's own position: the value that its filter reports
+    (PX4) or, without a report, the last known value with a drift of DRIFT_M_S added."""
 
     def __init__(self) -> None:
         self._last_known: tuple[float, float] | None = None  # standard deviation, time
         self._reported: tuple[float, float] | None = None  # standard deviation that the filter reports, time
-        self._ratio: tuple[float, float] | None = None  # innovation of measured positions over the filter's gate, time
+        self._ratio: tuple[float, float] | None = None  # position innovation divided by the filter's gate, time
 
     def handle(self, message: Message, now_s: float) -> None:
         """Process a report of the autopilot's position filter: EKF_STATUS_REPORT or ESTIMATOR_STATUS."""
         is_px4 = message.get_type() == "ESTIMATOR_STATUS"
         self._ratio = (message.pos_horiz_ratio if is_px4 else message.pos_horiz_variance), now_s
-        # PX4 calls it constant too while it stands still with GPS.
+        # PX4 also sets this flag while the vehicle stands still with GPS.
         is_constant = message.flags & mavlink.EKF_CONST_POS_MODE and not is_px4
         if is_constant or not message.flags & _HAS_POSITION:
-            self._last_known = self._reported = None  # the position is still reported, but outdated
+            self._last_known = self._reported = None  # a position is still reported, but it is outdated
         elif is_px4:
-            # PX4 reports that of both axes together, larger than that of one: a cautious value. 0: it has none.
+            # PX4 reports the combined value of both axes, which is a conservative value for one. 0: unknown.
             sd_m = message.pos_horiz_accuracy
             self._reported = (sd_m, now_s) if 0 < sd_m < math.inf else None
 
     def innovation_ratio(self, now_s: float) -> float | None:
-        """Return the newest ratio of the innovation of measured positions to the filter's gate; None if it is old."""
+        """Return the newest ratio of position innovation to the filter's gate; None if it is outdated."""
         return self._ratio[0] if self._ratio and now_s - self._ratio[1] <= MAX_FILTER_REPORT_AGE_S else None
 
     def record_accuracy(self, sd_m: float, now_s: float) -> None:
-        """Record the accuracy of the position at `now_s`, by GPS or by an accepted fix of ours."""
+        """Record the accuracy of the position at `now_s`, from GPS or an accepted fix of ours."""
         self._last_known = sd_m, now_s
 
     def now(self, now_s: float) -> float | None:
@@ -102,19 +103,19 @@ class PositionAccuracy:
 
 
 class Readiness(NamedTuple):
-    """What is known of an autopilot's readiness to accept a fix. `has_gps`: a receiver has lately had a 3D fix.
-    `lacks_origin`: it has not answered when asked for its origin. `flags`: those of its filter, 0 if none are fresh."""
+    """An autopilot's readiness to accept a fix, as far as it is known. `has_gps`: a receiver recently had a 3D fix.
+    `lacks_origin`: a request for its origin was not answered. `flags`: its filter's flags, 0 if they are outdated."""
 
     is_px4: bool = False
     is_armed: bool | None = None  # None: unknown
     has_gps: bool = False
     lacks_origin: bool = False
     flags: int = 0
-    answers_others: bool = False  # our commands that are no fixes
+    answers_others: bool = False  # it answers our commands other than fixes
 
     @property
     def silence_reason(self) -> Reason:
-        """The likely reason why it does not answer fixes."""
+        """The likely reason why the autopilot does not answer fixes."""
         return Reason(ReasonCode.FIXES_NOT_ANSWERED if self.answers_others else ReasonCode.NO_COMMAND_ANSWERED)
 
     def explain(self, result: str) -> Reason:
@@ -130,8 +131,8 @@ class Readiness(NamedTuple):
         return Reason(codes[result]) if result in codes else Reason(ReasonCode.OTHER_ANSWER, {"result": result})
 
     def _explain_failure(self) -> ReasonCode:
-        """Return the likely reason for the answer FAILED: the first one in order that is known to apply."""
-        # PX4 answers with TEMPORARILY_REJECTED while it has GPS, and uses this flag for glitches of it.
+        """Return the likely reason for the answer FAILED: the first cause that is known to apply."""
+        # PX4 answers TEMPORARILY_REJECTED while it has GPS, and uses the bit of EKF_UNINITIALIZED for GPS glitches.
         if self.is_px4:
             return ReasonCode.NO_ORIGIN if self.lacks_origin else ReasonCode.NOT_PLAUSIBLE
         causes = {
@@ -141,4 +142,4 @@ class Readiness(NamedTuple):
             ReasonCode.NOT_ARMED: self.is_armed is False,
             ReasonCode.NOT_RECKONING: self.flags & mavlink.EKF_CONST_POS_MODE,
         }
-        return next((code for code, is_there in causes.items() if is_there), ReasonCode.NOT_SAID)
+        return next((code for code, applies in causes.items() if applies), ReasonCode.NOT_SAID)

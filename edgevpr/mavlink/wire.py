@@ -1,7 +1,7 @@
-"""The one import of pymavlink: its dialect and rotations, and the parser from bytes to messages.
+"""The only import of pymavlink: its dialect and rotations, and the parser from bytes to messages.
 
-`ardupilotmega` has all messages that ArduPilot and PX4 exchange with a companion computer; the dialect `all` would take
-another 1 MB of RAM. `mavutil` is not imported: it would take another 20 MB, and its connections hang, spin or raise.
+`ardupilotmega` has all messages that ArduPilot and PX4 exchange with a companion computer; the dialect `all` would need
+another 1 MB of RAM. `mavutil` is not imported: it would need another 20 MB, and its connections hang, spin or raise.
 """
 
 import math
@@ -17,24 +17,24 @@ __all__ = ["Message", "PacketReader", "mavlink", "quaternion", "read_parameter_v
 
 Message: TypeAlias = Any  # a mavlink.MAVLink_message; each kind has its own fields
 
-_MAX_SENDERS = 8  # senders whose incomplete messages are kept; a flood from invented addresses must not fill the memory
+_MAX_SENDERS = 8  # senders whose incomplete messages are kept; a flood from forged addresses must not fill the memory
 
 
 class PacketReader:
-    """Parses received bytes, separately for each sender, so that an incomplete message of one does not swallow the
+    """Parses received bytes separately for each sender, so that an incomplete message from one does not consume the
     bytes of another. `admits` decides which messages are yielded."""
 
     def __init__(self, admits: Callable[[Message], bool] = lambda message: True) -> None:
         self._admits = admits
         self.received: Counter[str] = Counter()  # messages by name
         self.bad_bytes = 0
-        self.parsers: dict[Hashable, mavlink.MAVLink] = {}  # by sender, the latest at the end
+        self.parsers: dict[Hashable, mavlink.MAVLink] = {}  # by sender, the most recent last
 
     def feed(self, data: bytes, sender: Hashable = None) -> Iterator[Message]:
-        """Yield the admitted messages that `data` completes. `sender` is its source, if there can be several."""
+        """Yield the admitted messages that `data` completes. `sender`: its source, if there can be several."""
         parser = self._find_parser(sender)
         while data:
-            # The portions end where a message ends, so the parser's buffer is emptied each time and never grows.
+            # Each portion ends at the end of a message, so the parser's buffer is emptied each time and never grows.
             portion = parser.bytes_needed()
             message = parser.parse_char(data[:portion])
             data = data[portion:]
@@ -52,7 +52,7 @@ class PacketReader:
     def _find_parser(self, sender: Hashable) -> mavlink.MAVLink:
         if (parser := self.parsers.pop(sender, None)) is None:
             parser = mavlink.MAVLink(None)
-            parser.robust_parsing = True  # bad data comes as BAD_DATA messages instead of an exception
+            parser.robust_parsing = True  # report bad data as BAD_DATA messages, not by exceptions
             if len(self.parsers) == _MAX_SENDERS:
                 self.parsers.pop(next(iter(self.parsers)))
         self.parsers[sender] = parser
@@ -60,12 +60,12 @@ class PacketReader:
 
 
 def read_parameter_value(message: Message, bytewise: bool) -> float | int | None:
-    """Return the number in a PARAM_VALUE, or None if it is not finite. Its float32 field holds the number itself or,
-    with `bytewise` (PX4), the four bytes of a whole number."""
-    is_whole = message.param_type < mavlink.MAV_PARAM_TYPE_REAL32
-    if is_whole and bytewise:
+    """Return the number in a PARAM_VALUE, or None if it is not finite. Its float32 field contains the number itself or,
+    if `bytewise` (PX4), the four bytes of an integer."""
+    is_integer = message.param_type < mavlink.MAV_PARAM_TYPE_REAL32
+    if is_integer and bytewise:
         return int.from_bytes(struct.pack("<f", message.param_value), "little", signed=True)
     value: float = message.param_value
     if not math.isfinite(value):
         return None
-    return int(value) if is_whole else value
+    return int(value) if is_integer else value

@@ -50,7 +50,7 @@ def test_a_configured_system_is_never_given_up_but_may_come_from_elsewhere(caplo
     identity = Identity(system_id=1)
     assert not any(beat(identity, Endpoint(2, HERE), *seconds(0, 99)))
     assert identity.foreign_messages == 100
-    assert caplog.text.count("fixes go to system 1 only") == 1
+    assert caplog.text.count("fixes are sent to system 1 only") == 1
     assert beat(identity, Endpoint(1, HERE), 100.0) == [True]
     assert not any(beat(identity, Endpoint(2, HERE), *seconds(101, 200)))
     assert beat(identity, Endpoint(1, THERE), 129.0, 130.0) == [False, True]

@@ -50,9 +50,9 @@ def test_a_fix_arrives_to_a_ten_millionth_of_a_degree_and_without_an_altitude(la
     ("wrong", "says"),
     [
         *(({"accuracy_m": accuracy_m}, "accuracy") for accuracy_m in (0.0, -1.0, math.nan, math.inf)),
-        *(({"lat_deg": lat_deg}, "the Earth") for lat_deg in (90.1, -91.0, math.nan)),
-        *(({"lon_deg": lon_deg}, "the Earth") for lon_deg in (180.1, -math.inf)),
-        ({"t_frame_s": math.nan}, "age"),
+        *(({"lat_deg": lat_deg}, "position on Earth") for lat_deg in (90.1, -91.0, math.nan)),
+        *(({"lon_deg": lon_deg}, "position on Earth") for lon_deg in (180.1, -math.inf)),
+        ({"t_frame_s": math.nan}, "frame time"),
     ],
 )
 def test_a_fix_that_says_nothing_is_refused(wrong, says):

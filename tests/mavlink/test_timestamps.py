@@ -98,7 +98,7 @@ def test_a_disk_that_becomes_full_in_flight_ends_nothing(path, monkeypatch, capl
     for _ in range(3):
         clock.now_s += 60
         assert stamps.next() > first
-    assert (len(tries), caplog.text.count("is not saved (No space left on device)")) == (3, 1)
+    assert (len(tries), caplog.text.count("cannot save the signing timestamp (No space left on device)")) == (3, 1)
     stamps_at(path)  # nor does it at the next start, where there is a time from before
 
 
