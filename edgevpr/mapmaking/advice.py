@@ -63,25 +63,25 @@ _MIN_KEPT_SHARE = 0.9  # of the strength of an edge that remains in the mean, if
 # sets have at most 0.0003, and nordland_tiny, with its rails, 0.005. In corridor, whose walls run along the picture's
 # edges, it is 0.09.
 _MIN_DISPLAY_SHARE = 0.006
-_MAX_STILL_EDGES = 0.5  # share of all edges; beyond, the camera itself did not move
+_MAX_STATIC_EDGES = 0.5  # share of all edges; beyond, the camera itself did not move
 
 
 def warn_of_gaps(pictures: FlightPictures, total: int, places: int | None) -> None:
     """Warn about what the map will lack. `total`: number of frames (0: unknown). `places`: number of places already in
     the map (None: the map will not be calibrated)."""
-    uri, is_placed = pictures.source, (pictures.positions or find_track(pictures.source)) is not None
+    uri, has_position = pictures.source, (pictures.positions or find_track(pictures.source)) is not None
     if pictures.folder:
         table = pictures.positions or find_positions(uri)
         tags = read_positions(table) if table else {}
         paths = [path for run in _choose_runs(pictures.folder) for path in run]
-        is_placed = any((tags.get(path.name) or read_exif(path)).position for path in paths)
+        has_position = any((tags.get(path.name) or read_exif(path)).position for path in paths)
     elif not pictures.rate_hz:
         with closing(_open_video(uri)) as video:
             duration_s = video.total
         if total > _MAX_USEFUL_HZ * duration_s:
             text = "every frame of %s becomes a place, %d in %d s: give --rate-hz 1 to make only %d"
             _log.warning(text, uri, total, duration_s, duration_s)
-    if not is_placed:
+    if not has_position:
         _log.warning(
             "no positions were found, and no fix can be sent without them: run edgevpr positions %s --images %s",
             next(Path(uri).parent.glob(f"{Path(uri).stem}.[sS][rR][tT]"), "LOG_OR_TRACK"),
@@ -151,8 +151,8 @@ def _compare_neighbours(pictures: FlightPictures, mask: OverlayMask | None) -> t
     runs = map(_read_usable, _choose_runs(folder)) if folder else [_read_video(pictures.source, _VIDEO_PICTURES)]
     pairs, clear, sideways = 0, 0, 0
     for run in runs:
-        marks = [detect_landmarks(image, mask.fit_to(image) if mask else None, _MAX_LANDMARKS) for image in run]
-        for match in (measure_agreement(first, second) for first, second in pairwise(marks)):
+        landmarks = [detect_landmarks(image, mask.fit_to(image) if mask else None, _MAX_LANDMARKS) for image in run]
+        for match in (measure_agreement(first, second) for first, second in pairwise(landmarks)):
             if (
                 match.inliers < MIN_PROVEN_INLIERS
                 or match.shift_share is None
@@ -165,9 +165,8 @@ def _compare_neighbours(pictures: FlightPictures, mask: OverlayMask | None) -> t
                 clear += 1
             elif abs(match.shift_share[0]) >= _MIN_SIDEWAYS_SHARE and abs(match.scale - 1) <= _MAX_SIDEWAYS_GROWTH:
                 sideways += 1
-    is_down = clear >= max(_MIN_CLEAR_PAIRS, _MIN_CLEAR_SHARE * pairs) or clear + sideways >= max(
-        _MIN_PAIRS, _MIN_SHARE * pairs
-    )
+    is_clear = clear >= max(_MIN_CLEAR_PAIRS, _MIN_CLEAR_SHARE * pairs)
+    is_down = is_clear or clear + sideways >= max(_MIN_PAIRS, _MIN_SHARE * pairs)
     return is_down, f"of {pairs} pairs of neighbours, {clear} rotate or move up or down, and {sideways} move sideways"
 
 
@@ -176,8 +175,8 @@ def warn_of_display(pictures: FlightPictures, mask: OverlayMask | None) -> None:
     """Warn if something in the pictures does not move where `mask` shows ground (None: everywhere)."""
     if pictures.folder:
         paths = list_images(pictures.folder)
-        spread = np.unique(np.linspace(0, len(paths) - 1, _DISPLAY_PICTURES, dtype=int))
-        images = _read_usable(paths[at] for at in spread)
+        indices = np.unique(np.linspace(0, len(paths) - 1, _DISPLAY_PICTURES, dtype=int))
+        images = _read_usable(paths[index] for index in indices)
     else:
         images = _read_video(pictures.source, _DISPLAY_PICTURES)
     share = measure_static_share(images, mask)
@@ -201,8 +200,8 @@ def measure_static_share(images: Iterable[Image], mask: OverlayMask | None) -> f
     if count < _MIN_DISPLAY_PICTURES:
         return None
     edges = allowed & (strength >= _MIN_EDGE * count)
-    still = edges & (cv2.magnitude(x, y) >= _MIN_KEPT_SHARE * strength)
-    return None if still.sum() > _MAX_STILL_EDGES * edges.sum() else float(still.mean())
+    static = edges & (cv2.magnitude(x, y) >= _MIN_KEPT_SHARE * strength)
+    return None if static.sum() > _MAX_STATIC_EDGES * edges.sum() else float(static.mean())
 
 
 def _compute_gradients(image: Image) -> tuple[Singles, Singles]:

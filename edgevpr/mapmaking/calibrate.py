@@ -1,6 +1,6 @@
 """Calibrates a map: makes queries with known answers from the map's own pictures, and fits the confidence model to the
-results. This model computes the probability that a match is right from the *evidence* of the match: named measurements,
-such as its score and margin.
+results. This model computes the probability that a match is correct from its *evidence*: named measurements, such as
+score and margin.
 
 Each picture is altered as if taken on another day and in another season (see `changes`), then searched for in the map
 in three ways:
@@ -58,9 +58,9 @@ NADIR_QUERIES = 60  # fewer, because each takes longer
 _MAX_WITHOUT_POSITION = 0.2  # share of places; in nadir maps the order of pictures does not show which ones overlap
 _LEFT_OUT_WEIGHT = 0.3  # weight of LEFT_OUT results: flights over ground outside the map are rarer
 # Prior precisions of the weights and of the bias around the shipped model (see `fit_logistic`). Chosen on corridor and
-# sat_marash, while watching the other sets. For a nadir camera with 5 and a free bias, the random draw of pictures
-# decided whether 14 or 39 of 80 queries of sat_marash were accepted. For a forward camera, a fixed bias costs half of
-# the queries accepted on corridor.
+# sat_marash, while watching the other sets. With a nadir camera, a precision of 5 and a free bias, the random draw of
+# pictures decided whether 14 or 39 of 80 queries of sat_marash were accepted. With a forward camera, a prior on the
+# bias halves the number of queries accepted on corridor.
 _PRIOR_PRECISIONS = {AHEAD: (50.0, 0.0), AHEAD_PROVEN: (50.0, 0.0), DOWN: (200.0, 200.0), DOWN_BARE: (200.0, 200.0)}
 _SEED = 15
 _LOW_PRECISION = 0.5  # required precision at which low confidence refuses hardly any match
@@ -69,7 +69,7 @@ _LOW_PRECISION = 0.5  # required precision at which low confidence refuses hardl
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryResult:
     """Result of one query made from a picture of the map. `place_id`: the place of this picture. `way`: how the query
-    was made (THERE, LEFT_OUT, MIRRORED). `right`: the best match is the right place. `evidence`: the evidence of the
+    was made (THERE, LEFT_OUT, MIRRORED). `right`: the best match is the correct place. `evidence`: the evidence of the
     best match (None: the picture has too little texture to search for). `refused`: the match was refused for a reason
     other than low confidence."""
 
@@ -100,8 +100,8 @@ def query_map(
     for place_id, picture in pictures:
         if (slot := search.slots.get(place_id)) is None:
             continue
-        may_be_same = search.find_same_ground(slot)
-        ways = ((THERE, picture, index), (LEFT_OUT, picture, index.select(~may_be_same)))
+        same_ground = search.find_same_ground(slot)
+        ways = ((THERE, picture, index), (LEFT_OUT, picture, index.select(~same_ground)))
         for way, original, candidates in (*ways, (MIRRORED, _mirror_picture(picture), index)):
             if not len(candidates):
                 continue
@@ -116,8 +116,8 @@ def query_map(
                 way == THERE
                 and not outside_neighbourhood(index, slot, np.array([best]), search.near_m, max_slots=max_slots)[0]
             )
-            if way == THERE and not right and may_be_same[best] and not np.isnan(index.lat_deg[best]):
-                continue  # the two pictures may overlap, so it is unknown whether the match is right
+            if way == THERE and not right and same_ground[best] and not np.isnan(index.lat_deg[best]):
+                continue  # the two pictures may overlap, so it is unknown whether the match is correct
             refused = not event.accepted and event.confidence >= low_precision_rule.threshold(event.evidence)
             yield QueryResult(place_id=place_id, way=way, right=bool(right), evidence=event.evidence, refused=refused)
 
@@ -252,7 +252,7 @@ def fit_logistic(
     precision: float,
     bias_precision: float = 0.0,
 ) -> Logistic:
-    """Fit a logistic regression to N `rows` of evidence. `right`, bool (N,), is True for right matches; `weights`,
+    """Fit a logistic regression to N `rows` of evidence. `right`, bool (N,), is True for correct matches; `weights`,
     float (N,), are the weights of the rows.
 
     Gaussian priors keep the regression near `start`: variance 1 / `precision` for its scaled coefficients, and

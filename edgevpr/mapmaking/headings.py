@@ -32,8 +32,8 @@ def find_headings(frames: Iterable[Frame], lens: Lens) -> Iterator[Frame]:
         features = detect_features(orb, frame.image) if lacks_heading(frame, lens) else None
         heading_deg = turn_deg = None
         if last and last[1] and features:
-            found = _measure_heading(last[0], last[1], frame, features, lens)
-            heading_deg, turn_deg = found or (None, None)
+            measured = _measure_heading(last[0], last[1], frame, features, lens)
+            heading_deg, turn_deg = measured or (None, None)
         if last:
             before_deg = None if heading_deg is None or turn_deg is None else heading_deg - turn_deg
             yield _set_heading(last[0], last[2], before_deg)
@@ -80,7 +80,8 @@ def _project_to_ground(points: Doubles, frame: Frame, lens: Lens) -> Array:
 
 def _set_heading(frame: Frame, before_deg: float | None, after_deg: float | None) -> Frame:
     """Set a frame's heading to the mean of those from the motion before and after it (None: unknown) if they agree."""
-    known = [heading_deg for heading_deg in (before_deg, after_deg) if heading_deg is not None]
-    if not known or abs(wrap_deg(known[0] - known[-1])) > _MAX_DIFFERENCE_DEG:
+    headings_deg = [heading_deg for heading_deg in (before_deg, after_deg) if heading_deg is not None]
+    if not headings_deg or abs(wrap_deg(headings_deg[0] - headings_deg[-1])) > _MAX_DIFFERENCE_DEG:
         return frame
-    return replace(frame, heading_deg=float(np.mod(known[0] + wrap_deg(known[-1] - known[0]) / 2, 360)))
+    mean_deg = headings_deg[0] + wrap_deg(headings_deg[-1] - headings_deg[0]) / 2
+    return replace(frame, heading_deg=float(np.mod(mean_deg, 360)))

@@ -92,47 +92,47 @@ def measure_look_alikes(
     slots = {int(place_id): slot for slot, place_id in enumerate(index.place_ids)}
     all_slots = np.arange(len(index))
 
-    def find_elsewhere(slot: int, max_slots: int) -> Bools:
+    def select_elsewhere(slot: int, max_slots: int) -> Bools:
         is_elsewhere: Bools = outside_neighbourhood(index, slot, all_slots, near_m, max_slots=max_slots)
         return np.asarray(is_elsewhere & (all_slots != slot))
 
-    def is_adjacent(slot: int) -> Bools:
+    def select_adjacent(slot: int) -> Bools:
         return np.asarray(abs(all_slots - slot) == 1)
 
-    def is_opposite(slot: int) -> Bools:
-        """Select two places half the map away: as many as are adjacent."""
+    def select_opposite(slot: int) -> Bools:
+        """Select two places half the map away, as many as there are adjacent ones."""
         return np.isin(all_slots, (slot + len(index) // 2 + np.array([0, 1])) % len(index))
 
     # Log agreement by the slots of both places. It depends slightly on which of the two pictures is the query.
-    agree: dict[int, dict[int, float]] = {slot: {} for slot in slots.values()}
+    agreements: dict[int, dict[int, float]] = {slot: {} for slot in slots.values()}
     for place_id, descriptor in pictures:
         if (slot := slots.get(place_id)) is None:
             continue
-        far = find_elsewhere(slot, MAX_NEIGHBOUR_SLOTS) & ~is_adjacent(slot)
-        near = ~far & (all_slots != slot)
-        for other, agreement in _search_parts(technique, place_map, index, descriptor, (far, near, is_opposite(slot))):
+        elsewhere = select_elsewhere(slot, MAX_NEIGHBOUR_SLOTS) & ~select_adjacent(slot)
+        parts = elsewhere, ~elsewhere & (all_slots != slot), select_opposite(slot)
+        for other, agreement in _search_parts(technique, place_map, index, descriptor, parts):
             for one, two in ((slot, other), (other, slot)):
-                agree[one][two] = max(agreement, agree[one].get(two, agreement))
-    best_adjacent = {slot: _find_best(others, is_adjacent(slot))[1] for slot, others in agree.items()}
-    best_opposite = [_find_best(others, is_opposite(slot))[1] for slot, others in agree.items()]
-    usual, chance = float(np.median(list(best_adjacent.values()))), log_share(CHANCE_SHARE)
+                agreements[one][two] = max(agreement, agreements[one].get(two, agreement))
+    best_adjacent = {slot: _find_best(others, select_adjacent(slot))[1] for slot, others in agreements.items()}
+    best_opposite = [_find_best(others, select_opposite(slot))[1] for slot, others in agreements.items()]
+    typical, chance = float(np.median(list(best_adjacent.values()))), log_share(CHANCE_SHARE)
     # Along a route, pictures agree better with the adjacent ones than with as many others.
-    overlap = usual >= max(chance, float(np.median(best_opposite)) + SMALL_LEAD)
+    overlap = typical >= max(chance, float(np.median(best_opposite)) + SMALL_LEAD)
     places = {}
-    for slot, others in agree.items():
-        twin, agreement = _find_best(others, find_elsewhere(slot, MAX_NEIGHBOUR_SLOTS if overlap else 0))
-        own = max(usual, best_adjacent[slot]) if overlap else chance
+    for slot, others in agreements.items():
+        twin, agreement = _find_best(others, select_elsewhere(slot, MAX_NEIGHBOUR_SLOTS if overlap else 0))
+        own = max(typical, best_adjacent[slot]) if overlap else chance
         if twin is not None:
             twin_id = int(index.place_ids[twin])
             places[int(index.place_ids[slot])] = LookAlike(twin_id, round(agreement, _DIGITS), round(own, _DIGITS))
     return LookAlikes(overlap=overlap, places=places)
 
 
-def _find_best(agree: Mapping[int, float], selected: Bools) -> tuple[int | None, float]:
+def _find_best(agreements: Mapping[int, float], selected: Bools) -> tuple[int | None, float]:
     """Return the slot and the log agreement of the place that agrees best among those where `selected`, bool (N,), is
     True. If no agreement is known for them, return None and the log of no agreement."""
-    slot = max((slot for slot in agree if selected[slot]), key=agree.__getitem__, default=None)
-    return slot, log_share(0.0) if slot is None else agree[slot]
+    slot = max((slot for slot in agreements if selected[slot]), key=agreements.__getitem__, default=None)
+    return slot, log_share(0.0) if slot is None else agreements[slot]
 
 
 def _search_parts(

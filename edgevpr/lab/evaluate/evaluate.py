@@ -110,7 +110,7 @@ def answer_queries(
         follows = options.follow and sequence == 1 and rule.confidence_rule is not None
         candidates = None if options.exact else options.candidates or technique.candidates
 
-        def open_recogniser(length: int, follows: bool) -> Recogniser:
+        def make_recogniser(length: int, follows: bool) -> Recogniser:
             return Recogniser(
                 FrameEncoder(technique=technique, gate=gate),
                 place_map,
@@ -124,12 +124,12 @@ def answer_queries(
         scored = {query.path.name: query for query in dataset.queries}
         paths = [query.path for query in dataset.queries]
         # Run one query without counting it, because the first one pays for lazy imports and a cold disk.
-        _recognise(open_recogniser(1, False), paths[0], _NO_TAG)
+        _recognise(make_recogniser(1, False), paths[0], _NO_TAG)
         if gate:
             gate.reset()
         if sequence > 1 or follows:  # a sequence includes the queries that are not scored
             paths = list_images(paths[0].parent)
-        recogniser, answers = open_recogniser(sequence, follows), []
+        recogniser, answers = make_recogniser(sequence, follows), []
         for path in progress(paths, len(paths), f"{spec.name}: queries"):
             event = _recognise(recogniser, path, tags.get(path, _NO_TAG))
             if query := scored.get(path.name):
