@@ -28,7 +28,7 @@ COUNT = 3
 def recording(request, tmp_path):
     """Three pictures, of which the second cannot be used."""
     if request.param == "fake":
-        pictures = [textured(0), ImageError("1.png is cut short"), textured(2)]
+        pictures = [textured(0), ImageError("1.png is truncated"), textured(2)]
         return FakeSource(pictures, FakeClock(), is_live=False)
     for number in range(COUNT):
         cv2.imwrite(str(tmp_path / f"{number}.png"), textured(number))
@@ -42,7 +42,7 @@ def test_source_of_a_recording_is_read_to_its_end(recording):
     assert (recording.condition, recording.state, recording.ended) == (Condition.RUNNING, "reading", False)
     first = recording.read(0.0)
     assert (first.image == textured(0)).all()
-    with pytest.raises(ImageError, match="cut short"):
+    with pytest.raises(ImageError, match="truncated"):
         recording.read(0.0)
     last = recording.read(0.0)
     assert (last.image == textured(2)).all()

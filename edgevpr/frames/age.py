@@ -1,5 +1,5 @@
-"""Estimates the time at which pictures of a stream were taken, with its standard deviation: by their time stamps
-(`StampedTime`), or by the wait for each (`UnstampedTime`)."""
+"""Estimates when the pictures of a stream were taken, with a standard deviation: from their time stamps
+(`StampedTime`), or from the time spent waiting for each (`UnstampedTime`)."""
 
 import logging
 import math
@@ -14,44 +14,44 @@ import numpy as np
 from edgevpr.core.arrays import Doubles
 from edgevpr.core.types import FRAME_TIME_SD_S
 
-# Standard deviation of the delay by encoder and buffer from exposure to the stamp (without one: to the arrival), which
-# nothing in the stream shows.
+# Standard deviation of the delay in encoder and buffers from exposure to time stamp (without stamps: to arrival).
+# Nothing in the stream reveals this delay.
 HIDDEN_DELAY_SD_S = 0.3
 
-_MAX_DELAY_CHANGE_S = 5.0  # after a larger one the sender has restarted, or the stream was held up
-_BACKLOG_TOLERANCE_S = 0.005  # a delay shorter than the least one so far by more than this is that of a backlog
-_TIMELY_PICTURES = 3  # so many in a row without a backlog end it
-_MIN_WAIT_S = 0.002  # a picture that is returned sooner was in a buffer already
-_MEDIAN_WAITS = 9  # number of waits whose median is the usual one
-_MAX_WAIT_RATIO = 1.5  # multiple of the usual wait that is normal
+_MAX_DELAY_CHANGE_S = 5.0  # a larger change means that the sender restarted or the stream stalled
+_BACKLOG_TOLERANCE_S = 0.005  # a picture belongs to a backlog if its delay is below the minimum so far by more
+_TIMELY_PICTURES = 3  # this many in a row end a backlog
+_MIN_WAIT_S = 0.002  # a picture returned sooner was already in a buffer
+_MEDIAN_WAITS = 9  # number of recent waits whose median is the usual wait
+_MAX_WAIT_RATIO = 1.5  # longest normal wait, as a multiple of the usual one
 _STEADY_SPAN_S = 5.0
-_MAX_STEADY_RANGE_S = 0.2  # delays that vary by less in `_STEADY_SPAN_S` are due to the path, and not to congestion
-_MAX_CLOCK_DRIFT = 1e-4  # largest usual error of the rate of a clock: 0.01 %
-_RATE_SD = 0.01  # standard deviation of a rate that was estimated: cameras that count change theirs with the light
-_CONFIRMING_RANGE_S = 0.02  # a picture with a delay so near to the least confirms it
+_MAX_STEADY_RANGE_S = 0.2  # delays that vary by less over `_STEADY_SPAN_S` are not due to congestion
+_MAX_CLOCK_DRIFT = 1e-4  # largest usual rate error of a clock: 0.01 %
+_RATE_SD = 0.01  # standard deviation of an estimated rate: frame-counting cameras change theirs with the light
+_CONFIRMING_RANGE_S = 0.02  # a picture whose delay is this close to the minimum confirms it
 
 _UPDATE_PERIOD_S = 0.5
-_MAX_PICTURES = 2000  # kept to find a trend
-_SPANS_S = (30.0, 6.0, 2.0, 0.7)  # in which a trend is looked for
+_MAX_PICTURES = 2000  # kept for the search for trends
+_SPANS_S = (30.0, 6.0, 2.0, 0.7)  # in which trends are searched for
 _MIN_PICTURES = 8  # in a span
 _MIN_COVERED_SHARE = 0.8  # of a span, from the first picture to the last
-_COLUMNS = 5  # arrival, order, stamp, sum of bytes, delay above the least one until then
-_SECTIONS = 6  # of a span; the least delay of each is that of the path alone
-_MIN_RISE_S = 0.06  # less is no trend
-_MAX_RAGGED_SHARE = 1 / 6  # of the rise: sections that are farther from a straight line are no trend but congestion
-_MAX_STRAIGHT_SHARE = 1 / 10  # with sections that are nearer, all of the span has the same rate
-_MAX_CLOCK_SHARE = 0.4  # of the bytes (see `bound_bytes_share`): a smaller one is due to a clock, not to a full link
-_MIN_LINK_SHARE = 0.55  # above it a link is certainly full: large pictures take longer in others too
-_YOUNG_STREAM_S = 10.0  # a younger stream has no usual rate
-_SPAN_AT_START_S = 2.0  # a trend of this length shows another rate,
-_SPAN_LATER_S = 6.0  # and of this one in a stream that kept the right rate before: a short congestion is likelier
-_MAX_GROWTH = 0.9  # of a delay, in seconds per second: stamps that nearly stand still give no time
-_RATE_TOLERANCE = 0.003  # a rate nearer to one is one
+_COLUMNS = 5  # arrival, order, stamp, total bytes, delay above the minimum until then
+_SECTIONS = 6  # per span; the minimum delay in each is due to the path alone
+_MIN_RISE_S = 0.06  # a smaller change is not a trend
+_MAX_RAGGED_SHARE = 1 / 6  # of the rise: sections further from a straight line show congestion, not a trend
+_MAX_STRAIGHT_SHARE = 1 / 10  # if all sections are closer to the line, the rate is constant over the span
+_MAX_CLOCK_SHARE = 0.4  # see `bound_bytes_share`: below it a clock is the cause, not a saturated link
+_MIN_LINK_SHARE = 0.55  # above it the link is certainly saturated: large pictures take longer on other links too
+_YOUNG_STREAM_S = 10.0  # a younger stream has no established rate
+_SPAN_AT_START_S = 2.0  # in a young stream, a trend this long shows a rate error
+_SPAN_LATER_S = 6.0  # in an older one, whose rate was right so far, brief congestion is more likely
+_MAX_GROWTH = 0.9  # of a delay, in seconds per second: time stamps that almost stand still are useless
+_RATE_TOLERANCE = 0.003  # a rate this close to 1 counts as 1
 _BOUND_SDS = 3.0
-_KEY_PICTURE_RATIO = 2.0  # to the usual size, of a key picture
-_PIECES = 3  # of a span, whose trends are taken out of a comparison with the bytes
-_DOUBT_S = 1.0  # for which a delay that grows may seem constant
-_MAX_DOUBTFUL_AGE_S = 0.3  # up to this the doubt is part of the standard deviation
+_KEY_PICTURE_RATIO = 2.0  # of the size of a key frame to the usual size
+_PIECES = 3  # of a span, each detrended before delays are compared with sizes
+_DOUBT_S = 1.0  # a growing delay may look constant for this long
+_MAX_DOUBTFUL_AGE_S = 0.3  # up to this age the standard deviation covers the doubt
 _MIN_LOGGED_CHANGE = 0.25
 
 _log = logging.getLogger(__name__)
@@ -67,15 +67,15 @@ class CaptureTime(NamedTuple):
 class StampedTime:
     """Estimates when pictures were taken, from the stream's time stamps, which count from an unknown zero.
 
-    The delay of a picture is its arrival time minus its stamp. A picture with a longer delay than the least one so far
-    is older by the difference. A larger value replaces the least delay only if delays have been steady for five
-    seconds, as after a pause of the sender; in a congested network they vary. `is_live`: the pictures that were
-    buffered before the opening have been fetched.
+    The delay of a picture is its arrival time minus its stamp. Its age is the excess over the smallest delay so far,
+    the minimum. A larger value replaces the minimum only after delays have been steady for five seconds, as after a
+    pause of the sender; in a congested network they vary. `is_live`: all pictures buffered before the stream was opened
+    have been fetched.
 
-    The delay grows if a camera delivers fewer pictures than its stamps say, and if a link carries less than is sent. In
-    a full link large pictures take longer than small ones, and pictures get older. From a camera all come at the same
-    intervals, and stamps are multiplied by the `rate` that the least delays show. If neither is certain, the time is
-    unknown."""
+    The delay grows if a camera delivers fewer pictures than its stamps claim, or if a link carries less than is sent.
+    On a saturated link, large pictures take longer than small ones, and pictures become older. A slow camera sends all
+    at equal intervals, and stamps are multiplied by the `rate` estimated from the minimum delays. If neither cause is
+    certain, the time is unknown."""
 
     def __init__(self) -> None:
         self._logged_rate = 1.0
@@ -83,8 +83,8 @@ class StampedTime:
 
     def _reset(self) -> None:
         self.is_live = False
-        self.rate = 1.0  # seconds of our clock that pass in one second of the stamps
-        self._max_known_age_s = math.inf  # pictures that seem older may be new ones
+        self.rate = 1.0  # seconds of our clock per second of the stamps
+        self._max_known_age_s = math.inf  # pictures that seem older may be new
         self._timely = 0
         self._order_s = -math.inf
         self._arrival_s = self._start_s = self._updated_s = math.nan
@@ -95,14 +95,14 @@ class StampedTime:
         self._window = array("d")  # rows of five, see `_update`
 
     def record_arrival(self, stamp_s: float, order_s: float, t_mono_s: float, size_bytes: int = 0) -> None:
-        """Record the arrival of a picture with the stamp `stamp_s`. `order_s`: its decoding time stamp, another one if
-        the stream sends pictures in another order than they were taken. All in seconds."""
+        """Record the arrival of a picture with the stamp `stamp_s`. `order_s`: its decoding time stamp, which differs
+        if pictures are not sent in the order in which they were taken. All in seconds."""
         held_up_s = t_mono_s - self._arrival_s - self.rate * (order_s - self._order_s)
         if order_s < self._order_s or abs(held_up_s) > _MAX_DELAY_CHANGE_S:
             self._reset()
         if not self._window:
             self._start_s = self._updated_s = self._settled_s = self._doubted_s = self._arrival_s = t_mono_s
-        # The least delay grows as by a slow clock: a network that is never steady would age pictures for ever.
+        # Raise the minimum as a slow clock would: otherwise pictures would seem ever older in an unsteady network.
         self._min_delay_s += _MAX_CLOCK_DRIFT * (t_mono_s - self._arrival_s)
         self._min_order_delay_s += _MAX_CLOCK_DRIFT * (t_mono_s - self._arrival_s)
         self._order_s, self._arrival_s = order_s, t_mono_s
@@ -113,7 +113,7 @@ class StampedTime:
         self._timely = self._timely + 1 if above_s > -_BACKLOG_TOLERANCE_S else 0
         if not self.is_live and self._timely >= _TIMELY_PICTURES:
             self.is_live = True
-            self._keep_newest(_TIMELY_PICTURES)  # those before came all at once
+            self._keep_newest(_TIMELY_PICTURES)  # earlier ones arrived all at once
         if t_mono_s - self._updated_s > _UPDATE_PERIOD_S:
             self._updated_s = t_mono_s
             self._update(np.frombuffer(self._window).reshape(-1, _COLUMNS).copy())
@@ -124,9 +124,9 @@ class StampedTime:
             self._confirmed_s = t_mono_s
 
     def estimate(self, stamp_s: float, t_mono_s: float) -> CaptureTime | None:
-        """Return when the picture with the stamp `stamp_s` was taken, at most its arrival `t_mono_s`. None if that is
-        unknown: pictures that were buffered before the opening are still being fetched, or the delay changes by a
-        clock's rate or by congestion, and it is unclear by which."""
+        """Return when the picture with the stamp `stamp_s` was taken, not later than its arrival `t_mono_s`. None if
+        unknown: pictures buffered before the opening are still being fetched, or the delay is changing, and it is
+        unclear whether because of a clock's rate or of congestion."""
         taken_s = min(t_mono_s, self.rate * stamp_s + self._min_delay_s)
         age_s = t_mono_s - taken_s
         if not self.is_live or age_s > self._max_known_age_s:
@@ -134,15 +134,15 @@ class StampedTime:
         is_estimated = self.rate != 1.0
         drift_s = (_RATE_SD if is_estimated else _MAX_CLOCK_DRIFT) * max(0.0, t_mono_s - self._confirmed_s)
         if t_mono_s - self._start_s < _SPAN_LATER_S:
-            drift_s += _MIN_RISE_S / 2  # another rate may not have shown yet
-        # A camera that counts may have taken any of its pictures later than its stamps say.
+            drift_s += _MIN_RISE_S / 2  # a rate error may not be visible yet
+        # A camera that stamps pictures by counting them may have taken any of them later than its stamp.
         is_uncertain = is_estimated or self._max_known_age_s < math.inf
         return CaptureTime(
             taken_s, math.hypot(FRAME_TIME_SD_S, drift_s, self._scatter_s, age_s / 2 if is_uncertain else 0.0)
         )
 
     def _keep_newest(self, pictures: int) -> None:
-        """Forget all but the newest pictures, so many as `pictures`."""
+        """Drop all but the newest pictures; `pictures` is their number."""
         del self._window[: -pictures * _COLUMNS]
 
     def _update(self, window: Doubles) -> None:
@@ -154,14 +154,14 @@ class StampedTime:
         for span_s in _SPANS_S:
             first = _find_span_start(arrival_s, span_s)
             if first is not None and (trend := fit_envelope_growth(arrival_s[first:], order_delay_s[first:])):
-                self._follow_trend(window[first:], *trend, span_s, is_new)
+                self._handle_trend(window[first:], *trend, span_s, is_new)
                 return
         if arrival_s[-1] - self._doubted_s > _DOUBT_S:
             self._max_known_age_s = math.inf
         if (first := _find_span_start(arrival_s, _SPAN_AT_START_S)) is not None:
             above_s = order_delay_s[first:] - self._min_order_delay_s
             if above_s.min() > _MAX_DOUBTFUL_AGE_S and np.ptp(above_s) < _MAX_STEADY_RANGE_S:
-                # All are late by the same time: the sender has paused, or the network holds all of them up.
+                # All are equally late: the sender has paused, or the network delays all of them.
                 self._max_known_age_s, self._doubted_s = _MAX_DOUBTFUL_AGE_S, arrival_s[-1]
         if arrival_s[-1] - self._settled_s > _STEADY_SPAN_S:
             self._settled_s = arrival_s[-1]
@@ -174,8 +174,8 @@ class StampedTime:
                 self._min_order_delay_s = float(order_delay_s[first:].min())
                 self._max_known_age_s = math.inf
 
-    def _follow_trend(self, window: Doubles, growth: float, is_straight: bool, span_s: float, is_new: bool) -> None:
-        """Decide whether a delay that changed steadily, by `growth` seconds per second, is due to a clock's rate."""
+    def _handle_trend(self, window: Doubles, growth: float, is_straight: bool, span_s: float, is_new: bool) -> None:
+        """Decide whether a steady change in delay, by `growth` seconds per second, is due to clock drift."""
         arrival_s, order_s, stamp_s, _, above_s = window.T
         least_share, most_share = bound_bytes_share(window)
         if growth > 0:
@@ -183,7 +183,7 @@ class StampedTime:
             is_congested = _MIN_LINK_SHARE < least_share < 1 / _MIN_LINK_SHARE
             max_known_age_s = _MAX_DOUBTFUL_AGE_S
         else:
-            # After a congestion each picture is less old than the one before, until the least delay is reached.
+            # As congestion clears, each picture arrives with less delay than the one before, down to the minimum.
             needed_s = _SPAN_AT_START_S if self.is_live else _SPAN_LATER_S
             is_congested = above_s[: len(above_s) // 2].min() > _CONFIRMING_RANGE_S
             max_known_age_s = -1.0
@@ -204,38 +204,38 @@ class StampedTime:
         self._scatter_s = 0.0 if self.rate == 1.0 else float(np.median(order_delay_s) - self._min_order_delay_s)
         if abs(self.rate / self._logged_rate - 1) > _MIN_LOGGED_CHANGE:
             self._logged_rate = self.rate
-            _log.warning("the stream's time stamps run at %.2f of the true rate: correcting them", 1 / self.rate)
+            _log.warning("the stream's time stamps run at %.2f times the true rate: correcting them", 1 / self.rate)
 
 
 def _find_span_start(arrival_s: Doubles, span_s: float) -> int | None:
-    """Return the first picture of the last `span_s` seconds; None if too few cover too little of the span."""
+    """Return the index of the first picture in the last `span_s` seconds; None if they cover too little of the span."""
     first = min(int(np.searchsorted(arrival_s, arrival_s[-1] - span_s)), max(0, len(arrival_s) - _MIN_PICTURES))
     return first if arrival_s[-1] - arrival_s[first] > _MIN_COVERED_SHARE * span_s else None
 
 
 def fit_envelope_growth(arrival_s: Doubles, delay_s: Doubles) -> tuple[float, bool] | None:
-    """Return by how many seconds per second the least delays of pictures grow, and whether in a very straight line;
-    None if they do not change linearly. `arrival_s` (n,): arrival times; `delay_s` (n,): delays, both in seconds."""
-    begins = np.searchsorted(arrival_s, np.linspace(arrival_s[0], arrival_s[-1], _SECTIONS + 1))
-    if len(arrival_s) < _MIN_PICTURES or not np.diff(begins).all():
+    """Return the growth of the minimum delays, in seconds per second, and whether it is very close to linear; None if
+    they do not change linearly. `arrival_s` (n,): arrival times; `delay_s` (n,): delays, both in seconds."""
+    starts = np.searchsorted(arrival_s, np.linspace(arrival_s[0], arrival_s[-1], _SECTIONS + 1))
+    if len(arrival_s) < _MIN_PICTURES or not np.diff(starts).all():
         return None
-    lowest = [int(begin + np.argmin(delay_s[begin:end])) for begin, end in pairwise(begins)]
+    lowest = [int(start + np.argmin(delay_s[start:end])) for start, end in pairwise(starts)]
     x_s, y_s = arrival_s[lowest] - arrival_s[lowest].mean(), delay_s[lowest] - delay_s[lowest].mean()
     growth = x_s @ y_s / (x_s @ x_s)
-    ragged_s = np.abs(y_s - growth * x_s).max()
+    residual_s = np.abs(y_s - growth * x_s).max()
     rise_s = abs(growth) * (arrival_s[-1] - arrival_s[0])
-    if rise_s < _MIN_RISE_S or ragged_s > _MAX_RAGGED_SHARE * rise_s:
+    if rise_s < _MIN_RISE_S or residual_s > _MAX_RAGGED_SHARE * rise_s:
         return None
-    return float(growth), bool(ragged_s < _MAX_STRAIGHT_SHARE * rise_s)
+    return float(growth), bool(residual_s < _MAX_STRAIGHT_SHARE * rise_s)
 
 
 def bound_bytes_share(window: Doubles) -> tuple[float, float]:
-    """Return lower and upper bound of the share to which the time between two pictures depends on their bytes (1: as in
-    a full link, 0: not at all). `window` (n, 5): see `_COLUMNS`."""
+    """Return a lower and an upper bound on how much the time between two pictures depends on their size (1: as on a
+    saturated link, 0: not at all). `window` (n, 5): see `_COLUMNS`."""
     steps = np.diff(window[:, [0, 1, 3]], axis=0)
     if len(steps) < 3 * _PIECES or steps[:, 2].sum() <= 0:
         return -math.inf, math.inf
-    # A link's capacity changes, so steps are compared with those around them.
+    # A link's capacity changes, so each step is compared with those around it.
     pieces = np.array_split(steps, _PIECES)
     late_s, by_bytes_s = np.concatenate([_subtract_expected(*piece.T) for piece in pieces], axis=1)
     share, sd = _fit_slope(late_s, by_bytes_s)
@@ -247,22 +247,21 @@ def bound_bytes_share(window: Doubles) -> tuple[float, float]:
 
 
 def _fit_slope(y: Doubles, x: Doubles) -> tuple[float, float]:
-    """Return the slope of the line of `y` (n,) over `x` (n,), and its standard deviation."""
+    """Return the slope of the regression of `y` (n,) on `x` (n,), and its standard deviation."""
     y, x = y - y.mean(), x - x.mean()
     power = float(x @ x)
     if len(x) < 3 * _PIECES or power < 1e-9:
         return 0.0, math.inf
     slope = float(y @ x) / power
-    rest = y - slope * x
-    return slope, math.sqrt(float(rest @ rest) / (len(x) - _PIECES - 1) / power)
+    residuals = y - slope * x
+    return slope, math.sqrt(float(residuals @ residuals) / (len(x) - _PIECES - 1) / power)
 
 
 def _subtract_expected(arrival_s: Doubles, order_s: Doubles, size: Doubles) -> Doubles:
-    """Return by how many seconds each step is longer than by its stamps, and by how many it would be by its bytes, (2,
-    n)."""
-    whole_s = arrival_s.sum()
-    by_stamps_s = order_s * (whole_s / order_s.sum()) if order_s.sum() else np.full_like(arrival_s, arrival_s.mean())
-    by_bytes_s = size * (whole_s / size.sum()) if size.sum() else by_stamps_s
+    """Return by how many seconds each step is longer than by its stamps: measured, and predicted from bytes, (2, n)."""
+    total_s = arrival_s.sum()
+    by_stamps_s = order_s * (total_s / order_s.sum()) if order_s.sum() else np.full_like(arrival_s, arrival_s.mean())
+    by_bytes_s = size * (total_s / size.sum()) if size.sum() else by_stamps_s
     return np.stack((arrival_s - by_stamps_s, by_bytes_s - by_stamps_s))
 
 
@@ -270,16 +269,16 @@ class UnstampedTime:
     """Estimates when pictures were taken, for streams without time stamps (MJPEG over HTTP). Only the time spent
     waiting for each picture is known.
 
-    After a wait of usual length the picture has just arrived. After a longer one it may have been delayed on its way by
-    as much as the wait. A picture returned without a wait was in a buffer, at most since the last wait ended."""
+    After a wait of the usual length, the picture has just arrived. After a longer wait, it may have been delayed in
+    transit by up to that wait. A picture returned without a wait was in a buffer, at most since the last wait ended."""
 
     def __init__(self, opened_s: float) -> None:
         self._since_s = opened_s
         self._waits_s: deque[float] = deque(maxlen=_MEDIAN_WAITS)
 
     def estimate(self, request_s: float, t_mono_s: float) -> CaptureTime:
-        """Return the earliest time at which a picture can have arrived, whose fetch began at `request_s` and ended at
-        `t_mono_s` (seconds, monotonic). All times up to `t_mono_s` are equally likely."""
+        """Return the earliest possible arrival time of a picture that was requested at `request_s` and returned at
+        `t_mono_s` (seconds, monotonic). All times from then to `t_mono_s` are equally likely."""
         wait_s = t_mono_s - request_s
         if wait_s > _MIN_WAIT_S:
             usual_s = median(self._waits_s) if len(self._waits_s) == _MEDIAN_WAITS else 0.0

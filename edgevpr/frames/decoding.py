@@ -1,5 +1,5 @@
 """Decoding of streams and video files with FFmpeg (PyAV), which unlike OpenCV reports lost packets and incomplete
-pictures. Imported only when a stream or video file is opened, because the library takes memory."""
+pictures. Imported only when a stream or video file is opened, because the library uses much memory."""
 
 import errno
 import logging
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
     from edgevpr.frames.webpictures import ResponseFile
 
-# FFmpeg's messages are searched for lost packets. All others are dropped: edgevpr reports faults in its own words.
+# FFmpeg's messages are searched for reports of lost packets and then dropped: edgevpr reports faults in its own words.
 av.logging.set_level(av.logging.WARNING)
 av.logging.set_skip_repeated(False)
 logging.getLogger("libav").setLevel(logging.CRITICAL + 1)
-_LOSS_WORD = "missed"  # "RTP: missed 3 packets" is the only sign of a loss
+_LOSS_WORD = "missed"  # "RTP: missed 3 packets" is the only sign of packet loss
 
-_DOUBTFUL_PACKETS = 2  # after a sign of loss: this packet and the next
-_NO_STAMPS_FLAG = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg: the time stamps are made up from a frame rate
+_DOUBTFUL_PACKETS = 2  # after a sign of packet loss: this packet and the next
+_NO_STAMPS_FLAG = 0x80  # AVFMT_NOTIMESTAMPS: FFmpeg derives the time stamps from a frame rate
 
 _UNKNOWN_HOST_PATTERN = re.compile(r"(?:resolve hostname |getaddrinfo\()([^\s:,]+)")
 _STATUS_PATTERN = re.compile(r"(?:failed:|HTTP error|returned) ([45]\d\d)\b")  # of RTSP and of HTTP
@@ -40,7 +40,7 @@ _ERRNO_CAUSES = {
     errno.ECONNRESET: "connection closed by the camera",
     errno.EHOSTUNREACH: "no route to the host",
     errno.ENETUNREACH: "no route to the host",
-    errno.EINVAL: "an address that cannot be used: correct host and port",
+    errno.EINVAL: "invalid address: correct host and port",
     errno.EADDRINUSE: "UDP port in use by another program",
 }
 
@@ -51,7 +51,7 @@ class TransportError(OpeningError):
 
 class TimedPacket(NamedTuple):
     """A packet of a stream. `is_doubtful`: packets before it may be missing. `request_s`, `arrival_s`: when the call
-    that fetched it began and returned (seconds, monotonic). `is_after_gap`: packets before it were dropped here."""
+    that fetched it began and returned (seconds, monotonic). `is_after_gap`: edgevpr dropped packets before it."""
 
     packet: "Packet[Any]"
     is_doubtful: bool = False
@@ -67,9 +67,9 @@ def open_decoder(
     form: str | None = None,
     file: "ResponseFile | None" = None,
 ) -> "VideoDecoder":
-    """Open the stream or file `uri` with `options` of FFmpeg. `timeouts_s`: time limits in seconds for opening it and
-    for each read (None: no limits). `form`: name of its format (None: FFmpeg detects it). `file`: an open file that is
-    read instead, and closed. Raises OpeningError with the cause if it cannot be opened or has no pictures."""
+    """Open the stream or file `uri` with FFmpeg's `options`. `timeouts_s`: time limits in seconds for opening it and
+    for each read (None: no limits). `form`: name of its format (None: FFmpeg detects it). `file`: an open file to read
+    instead, which the decoder closes. Raises OpeningError with the cause if it cannot be opened or has no video."""
     with av.logging.Capture() as logged:
         try:
             container = av.open(file or uri, "r", format=form, options=options, timeout=timeouts_s)
@@ -84,7 +84,7 @@ def open_decoder(
     container.close()
     if file:
         file.close()
-    raise OpeningError("a codec that FFmpeg does not know" if has_video else "no video in the stream")
+    raise OpeningError("the codec is unknown to FFmpeg" if has_video else "no video in the stream")
 
 
 def _has_loss(logged: list[tuple[int, str, str]]) -> bool:
@@ -92,8 +92,8 @@ def _has_loss(logged: list[tuple[int, str, str]]) -> bool:
 
 
 def _explain_failure(uri: str, error: Exception, messages: list[str], timeout_s: float) -> OpeningError:
-    """Return the error that says why FFmpeg could not open `uri` in `timeout_s` seconds. Some causes are found only in
-    the `messages` that FFmpeg logged. The text never contains the address, which may hold a password."""
+    """Return the error that explains why FFmpeg could not open `uri` in `timeout_s` seconds. Some causes appear only in
+    the `messages` that FFmpeg logged. The text never contains the address, which may contain a password."""
     text = "\n".join(messages)
     if "SETUP failed: 461" in text or "Nonmatching transport" in text:
         return TransportError("transport refused (461)")
@@ -102,7 +102,7 @@ def _explain_failure(uri: str, error: Exception, messages: list[str], timeout_s:
 
 def _find_cause(uri: str, error: Exception, text: str, timeout_s: float) -> str:
     if host := _UNKNOWN_HOST_PATTERN.search(text):
-        if uri.count("@") > 1:  # the host may be a part of the password
+        if uri.count("@") > 1:  # the host may be part of the password
             return "no such host: percent-encode the password's special characters, such as @ as %40"
         return f"no such host {host[1]}"
     if isinstance(error, (av.HTTPClientError, av.HTTPServerError)):
@@ -126,11 +126,11 @@ def _find_cause(uri: str, error: Exception, text: str, timeout_s: float) -> str:
 
 class VideoDecoder:
     """Decodes the complete pictures of one stream or file: `fetch` a packet, then `decode` it. A damaged picture is
-    rejected, and so are all after it up to the next key frame, which needs no other picture.
+    rejected, and so are all later ones until the next key frame, which depends on no other picture.
 
-    `is_cancelled`: set it to end a `fetch` in another thread with the next packet, even one of sound.
-    `is_backlog_doubtful`: FFmpeg reported lost packets while it read ahead at the opening. It does not say which ones:
-    all are rejected until this is set to False."""
+    `is_cancelled`: set it to True to end a `fetch` in another thread at the next packet, even an audio packet.
+    `is_backlog_doubtful`: FFmpeg reported lost packets while it read ahead during the opening, but not which ones. All
+    packets are rejected until this is set to False."""
 
     def __init__(
         self, container: "InputContainer", is_backlog_doubtful: bool, file: "ResponseFile | None" = None
@@ -141,17 +141,17 @@ class VideoDecoder:
         self.is_backlog_doubtful = is_backlog_doubtful
         self.is_cancelled = False
         self._codec = self.stream.codec_context
-        self._codec.thread_count = 1  # decoding several pictures in parallel delays them and takes memory
-        self._codec.options = {"err_detect": "explode"}  # damaged data is an error, and not filled in
+        self._codec.thread_count = 1  # parallel decoding delays pictures and uses memory
+        self._codec.options = {"err_detect": "explode"}  # damaged data is an error and not concealed
         self._packets = container.demux()
         self._converter = PixelConverter()
-        self._doubtful = 0  # number of packets from now on that are doubtful, if above zero
+        self._doubtful = 0  # number of the next packets that are doubtful, if above zero
         self._refusal: Refusal | None = Refusal.LATE  # reason to reject all pictures until the next key frame
         self._has_begun = False
 
     @property
     def facts(self) -> StreamFacts:
-        """The stream's own description of its pictures; known once one is decoded."""
+        """The stream's own description of its pictures; available once one has been decoded."""
         aspect, rate = self._codec.sample_aspect_ratio, self.stream.average_rate
         return StreamFacts(
             width_px=self._codec.width,
@@ -163,8 +163,8 @@ class VideoDecoder:
         )
 
     def fetch(self) -> TimedPacket | None:
-        """Wait for the next packet and return it; None at the end of the file, or if the stream is lost. One thread may
-        fetch while another one decodes."""
+        """Wait for the next packet and return it; None at the end of the file or if the stream is lost. One thread may
+        fetch while another decodes."""
         index = self.stream.index
         with av.logging.Capture() as logged:
             try:
@@ -175,18 +175,18 @@ class VideoDecoder:
         if packet is None or self.is_cancelled:
             return None
         if packet.is_corrupt or _has_loss(logged):
-            # FFmpeg reports a gap while it assembles the picture after the one it returns.
+            # FFmpeg reports a gap while it assembles the picture that follows the one it returns.
             self._doubtful = _DOUBTFUL_PACKETS
         self._doubtful -= 1
         return TimedPacket(packet, self._doubtful >= 0)
 
     def skip(self) -> Refusal:
-        """Reject the packet just fetched without decoding it, and all after it up to the next key frame. Returns the
-        reason: LATE, or that of an earlier rejection that still lasts."""
+        """Reject the packet just fetched without decoding it, and all later ones until the next key frame. Returns the
+        reason: LATE, or the reason of an earlier rejection that is still in effect."""
         return self._refuse(Refusal.LATE)
 
     def decode(self, fetched: TimedPacket) -> "list[VideoFrame] | Refusal":
-        """Return the pictures that this packet completes (none, one, or at the end several), or why it is rejected."""
+        """Return the pictures that this packet completes (none, one or, at the end, several), or why it is rejected."""
         packet = fetched.packet
         if not packet.size:
             return [] if self._refusal else self._decode_packet(packet)
@@ -198,8 +198,8 @@ class VideoDecoder:
             if self._has_begun:
                 self._codec.flush_buffers()
             self._refusal, self._has_begun = None, True
-        # Changed bytes within a JPEG are detected only if they are invalid or the data end early. Most are valid: the
-        # rest of the picture is shifted or brighter, but contains nothing of an older one.
+        # Corrupted bytes within a JPEG are detected only if they are invalid or the data ends early. Most are valid:
+        # the rest of the picture is shifted or brighter, but contains no parts of an older one.
         if self._codec.name == "mjpeg" and not is_whole_jpeg(bytes(packet)):
             return self._refuse()
         return self._decode_packet(packet)
@@ -210,7 +210,7 @@ class VideoDecoder:
 
     def prepare_conversion(self, picture: "VideoFrame") -> Callable[[], Image]:
         """Return a function that converts a picture to pixels, uint8 (H, W, 3) BGR or (H, W) grey; any thread may call
-        it. Maps and queries are both converted here, so that equal pictures give equal pixels."""
+        it. Pictures of maps and queries are both converted here, so that equal pictures give equal pixels."""
         aspect = self._codec.sample_aspect_ratio or self.stream.sample_aspect_ratio
         return self._converter.prepare_conversion(picture, float(aspect or 1))
 

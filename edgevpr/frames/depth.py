@@ -1,6 +1,6 @@
-"""Pictures of more than 8 bits a channel, such as those of thermal cameras. A scene takes a small part of their range
-of counts, somewhere in the middle: the upper 8 bits alone would show nothing. Streams, video files and folders of
-images are all converted here, so that a map and a flight show the same."""
+"""Pictures of more than 8 bits per channel, such as those of thermal cameras. A scene uses only a small part of their
+range of counts, somewhere in the middle: the upper 8 bits alone would show nothing. Streams, video files and folders of
+images are all converted here, so that a map and a flight use the same grey levels."""
 
 from typing import TypeAlias
 
@@ -14,22 +14,22 @@ Counts: TypeAlias = NDArray[np.uint16]
 Limits: TypeAlias = tuple[int, int]  # the counts that become grey levels 0 and 255
 
 _RANGE_PERCENTILES = (1.0, 99.0)  # dead pixels and small hot spots lie outside
-_MIN_SPAN_COUNTS = 64  # so that a picture of sensor noise alone stays flat
-_TIME_CONSTANT_PICTURES = 30  # so long that a passing object does not change the grey levels of the rest
-_MAX_CLIPPED_SHARE = 0.25  # of a picture; with more outside the range, the camera or the scene has changed
-_MIN_USED_SHARE = 0.25  # of the range; a picture that uses less would have too little contrast
+_MIN_SPAN_COUNTS = 64  # so that a picture of mere sensor noise stays flat
+_TIME_CONSTANT_PICTURES = 30  # long enough that a passing object does not change the other grey levels
+_MAX_CLIPPED_SHARE = 0.25  # of a picture; if more is outside the range, the camera or the scene has changed
+_MIN_USED_SHARE = 0.25  # of the range; a picture that used less would have too little contrast
 
 
 class DepthRange:
-    """The range of counts of one source, which follows its pictures slowly, in the order in which they are passed."""
+    """The range of counts of one source. It adapts slowly to the pictures, in the order in which they are passed."""
 
     def __init__(self) -> None:
         self._low = 0.0
         self._high = 0.0
 
     def update(self, counts: Counts) -> Limits:
-        """Return the range in which to show this picture, uint16 (H, W[, C]): at first, and when a picture does not fit
-        the range, the picture's own."""
+        """Update the range with this picture, uint16 (H, W[, C]), and return it. The first picture, and any picture
+        that does not fit the range, sets the range to its own."""
         sample = make_thumbnail(counts)
         low, high = _find_limits(sample)
         clipped_share = float(((sample < self._low) | (sample > self._high)).mean())
@@ -41,19 +41,19 @@ class DepthRange:
         return round(self._low), round(self._high)
 
     def to_8_bits(self, counts: Counts) -> Image:
-        """Return the picture in grey levels, uint8 of the same shape; its counts update the range first."""
+        """Return the picture in grey levels, uint8 of the same shape, after updating the range with its counts."""
         return to_8_bits(counts, self.update(counts))
 
 
 def make_counts_thumbnail(counts: Counts) -> Image:
-    """Return a coarse copy of a picture, see `shot.coarse`, over its own range, so that copies of a frozen picture are
-    equal."""
+    """Return a coarse copy of a picture (see `shot.make_thumbnail`), scaled to its own range so that copies of a frozen
+    picture are equal."""
     sample = make_thumbnail(counts)
     return to_8_bits(sample, _find_limits(sample))
 
 
 def to_8_bits(counts: Counts, limits: Limits) -> Image:
-    """Return a picture in grey levels, uint8 of the same shape; counts outside of `limits` become black or white."""
+    """Return a picture in grey levels, uint8 of the same shape; counts outside `limits` become black or white."""
     low, high = limits
     levels = (np.clip(counts, low, high).astype(np.float32) - low) * (255 / (high - low))
     return np.asarray(np.rint(levels), np.uint8)
@@ -61,6 +61,6 @@ def to_8_bits(counts: Counts, limits: Limits) -> Image:
 
 def _find_limits(sample: Counts) -> Limits:
     low, high = (int(count) for count in np.percentile(sample, _RANGE_PERCENTILES))
-    missing = max(0, _MIN_SPAN_COUNTS - (high - low))
-    low = max(0, low - missing // 2)
+    missing_counts = max(0, _MIN_SPAN_COUNTS - (high - low))
+    low = max(0, low - missing_counts // 2)
     return low, max(high, low + _MIN_SPAN_COUNTS)

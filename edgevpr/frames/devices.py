@@ -1,4 +1,4 @@
-"""V4L2 cameras: opens one, with the cause if that fails, and reads its pictures."""
+"""V4L2 cameras: opens one, or explains why that fails, and reads its pictures."""
 
 import contextlib
 import errno
@@ -47,11 +47,11 @@ def _find_cause(path: str) -> str:
     try:
         fcntl.ioctl(device, _QUERY_CAPABILITIES, capabilities)
     except OSError:
-        return "no V4L2 camera"
+        return "not a V4L2 camera"
     finally:
         os.close(device)
     if not int.from_bytes(capabilities[_DEVICE_CAPABILITIES], "little") & _VIDEO_CAPTURE:
-        return "this /dev/video number of the camera gives no pictures: use another of its numbers"
+        return "this /dev/video node does not capture video: use another node of the same camera"
     return "in use by another program, or in a format that OpenCV cannot read"
 
 
@@ -62,10 +62,10 @@ class DeviceCapture:
         self._capture, self._clock = capture, clock
         self._time, self._depth = UnstampedTime(clock()), DepthRange()
         if int(capture.get(cv2.CAP_PROP_FOURCC)) in _COUNT_FORMATS:
-            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # else OpenCV keeps the upper 8 bits only
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # otherwise OpenCV keeps only the upper 8 bits
 
     def read(self) -> Shot | None:
-        with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a loss
+        with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a lost source
             request_s = self._clock()
             is_read, picture = self._capture.read()
             if is_read:

@@ -1,5 +1,5 @@
-"""Reads what the camera wrote into an image file: position, heading and time from EXIF, roll, pitch and height from
-XMP. Used for images without a line in a positions.csv."""
+"""Reads the camera's metadata from an image file: position, heading and time from EXIF, roll, pitch and height from
+XMP. Used for images that are not listed in a positions.csv."""
 
 import contextlib
 import logging
@@ -19,14 +19,14 @@ Tags = Mapping[str, Any]  # values of exifread by their names, such as "GPS GPSL
 _FILM_DIAGONAL_MM = 43.27
 _MAX_SIDE_SHARE = 0.82  # of the diagonal
 _HEAD_BYTES = 300_000  # in a JPEG the XMP comes before the picture, after at most 64 KB of EXIF data
-# A value in XMP, an attribute or an element, of DJI, Parrot, Skydio, Autel (`drone`) or Pix4D (`Camera`).
+# An XMP value, as an attribute or an element, by DJI, Parrot, Skydio, Autel (`drone`) or Pix4D (`Camera`).
 _XMP_PATTERN = re.compile(
     rb"""\b((?:drone(?:-dji|-parrot|-skydio)?|Camera):\w+)(?:\s*=\s*["']|>)\s*([-+.\deE]+)\s*["'<]"""
 )
 _GIMBAL_NAMES = (
     "drone-dji:Gimbal{}Degree", "drone:Gimbal{}Degree", "drone-parrot:Camera{}Degree", "NED drone-skydio:{}"
 )  # fmt: skip
-# Skydio uses the same names for the angles in several coordinate frames; those in north, east and down count.
+# Skydio uses the same names for the angles in several coordinate frames; edgevpr uses those in NED.
 _SKYDIO_PATTERN = re.compile(
     rb"<drone-skydio:CameraOrientationNED\b(.*?)(?:/>|</drone-skydio:CameraOrientationNED)", re.DOTALL
 )
@@ -34,8 +34,8 @@ _SKYDIO_PATTERN = re.compile(
 
 def read_exif(path: str | Path) -> GeoTag:
     """Read the EXIF and XMP data of a JPEG, TIFF, PNG or WebP file. Never raises: a value that is absent, damaged or
-    impossible is None. The time is that of the GPS receiver, else that of the camera clock, taken as UTC if it has no
-    time zone. Heading, roll, pitch and height are those of `read_xmp`, else the heading is that of EXIF."""
+    impossible is None. The time is from the GPS receiver, or else from the camera clock, taken as UTC if it has no time
+    zone. Heading, roll, pitch and height are those of `read_xmp`, with the heading of EXIF as a fallback."""
     tags, xmp = _read_tags(path), read_xmp(path)
 
     def read_first(*readers: Callable[[Tags], T]) -> T | None:
@@ -54,13 +54,13 @@ def read_exif(path: str | Path) -> GeoTag:
 
 
 def read_fov_deg(path: str | Path) -> float | None:
-    """Return the approximate field of view along the longest side of a picture, by the 35 mm equivalent focal length in
-    its EXIF data, which compares views along the diagonal (CIPA DCG-001); None if there is none. Never raises."""
+    """Return the approximate field of view in degrees along the longest side of a picture, from the 35 mm equivalent
+    focal length in its EXIF data, which refers to the diagonal (CIPA DCG-001); None if it has none. Never raises."""
     with contextlib.suppress(Exception):
         tags = _read_tags(path)
         focal_mm = float(tags["EXIF FocalLengthIn35mmFilm"].values[0])
         sides = [float(tags[f"EXIF ExifImage{side}"].values[0]) for side in ("Width", "Length")]
-        # Pictures wider than 4:3 and 3:2 are cut out of the sensor's, and as long.
+        # Pictures wider than 4:3 and 3:2 are cropped from the sensor's at full width.
         longest = min(max(sides) / math.hypot(*sides), _MAX_SIDE_SHARE)
         return _require_range(math.degrees(2 * math.atan(_FILM_DIAGONAL_MM * longest / 2 / focal_mm)), 5, 150)
     return None
@@ -70,7 +70,7 @@ def _read_tags(path: str | Path) -> Tags:
     import exifread  # not at the top: most sources never need it
 
     logging.getLogger("exifread").setLevel(logging.CRITICAL)  # it would report every file without EXIF
-    with contextlib.suppress(Exception), open(path, "rb") as handle:  # files of any origin
+    with contextlib.suppress(Exception), open(path, "rb") as handle:  # malformed files can raise anything
         tags: Tags = exifread.process_file(handle, details=False)
         return tags
     return {}
@@ -106,7 +106,7 @@ def _read_alt_m(tags: Tags) -> float:
 
 def _read_heading_deg(tags: Tags) -> float | None:
     if "GPS GPSImgDirectionRef" in tags and tags["GPS GPSImgDirectionRef"].values != "T":
-        return None  # magnetic: off by the declination, which is unknown
+        return None  # magnetic: wrong by the declination, which is unknown
     return _require_range(float(tags["GPS GPSImgDirection"].values[0]), 0, 360) % 360
 
 
@@ -127,29 +127,29 @@ def _read_camera_time_s(tags: Tags) -> float:
 
 
 def _parse_time_s(text: str) -> float:
-    if ":" not in text:  # seconds, which EXIF does not have
+    if ":" not in text:  # a number of seconds, which is not an EXIF time
         raise ValueError(text)
     return parse_time(text)
 
 
 def read_xmp(path: str | Path) -> GeoTag:
-    """Read the XMP tags of DJI, Autel, Parrot, Skydio and Pix4D from the first 300 KB of a file. Never raises: a
-    value that is absent, damaged or impossible is None. The heading is that of the picture's top, else of the
-    aircraft's nose. Roll and pitch are the camera's deviation from straight down. The height is over the take-off
+    """Read the XMP tags of DJI, Autel, Parrot, Skydio and Pix4D from the first 300 KB of a file. Never raises: a value
+    that is absent, damaged or impossible is None. The heading is that of the picture's top or, if unknown, of the
+    aircraft's nose. Roll and pitch are the camera's deviation from straight down. The height is above the take-off
     point."""
     head = b""
     with contextlib.suppress(OSError), open(path, "rb") as handle:
         head = handle.read(_HEAD_BYTES)
     values = _find_values(head)
-    if oriented := _SKYDIO_PATTERN.search(head):
-        values |= {f"NED {name}": text for name, text in _find_values(oriented[1]).items()}
+    if orientation := _SKYDIO_PATTERN.search(head):
+        values |= {f"NED {name}": text for name, text in _find_values(orientation[1]).items()}
     height_m = _find_number(values, "RelativeAltitude", ("drone-dji", "drone", "drone-skydio"), *ALT_LIMITS_M)
     for name in _GIMBAL_NAMES:
-        # Zeros, which small drones of DJI write, mean nothing: no gimbal looks exactly north and ahead.
+        # All zeros, which small DJI drones write, mean unknown: no gimbal points exactly north and level.
         if angles := _find_angles(values, name):
             heading_deg, roll_deg, pitch_deg = to_nadir_angles(*angles)
             return GeoTag(heading_deg=heading_deg, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
-    # In tags of Pix4D 0 is straight down. Zeros, which a camera without an IMU writes, are ignored.
+    # In Pix4D tags, 0 is straight down. All zeros, which a camera without an IMU writes, are ignored.
     if angles := _find_angles(values, "Camera:{}"):
         yaw_deg, pitch_deg, roll_deg = angles
         return GeoTag(heading_deg=yaw_deg % 360, roll_deg=roll_deg, pitch_deg=pitch_deg, height_m=height_m)
@@ -158,11 +158,11 @@ def read_xmp(path: str | Path) -> GeoTag:
 
 
 def _find_values(packet: bytes) -> dict[str, bytes]:
-    return {name.decode(): text for name, text in reversed(_XMP_PATTERN.findall(packet))}  # the first of a name counts
+    return {name.decode(): text for name, text in reversed(_XMP_PATTERN.findall(packet))}  # the first of a name wins
 
 
 def _find_angles(values: Mapping[str, bytes], name: str) -> tuple[float, float, float] | None:
-    """Return yaw, pitch and roll by a name with {} for each; None if one is missing, or if all are zero."""
+    """Return yaw, pitch and roll; `name` has {} in place of the axis. None if one is missing or all are zero."""
     with contextlib.suppress(KeyError, ValueError):
         yaw, pitch, roll = (
             _require_range(float(values[name.format(axis)]), -360, 360) for axis in ("Yaw", "Pitch", "Roll")
@@ -181,14 +181,14 @@ def _find_number(
 
 
 def to_nadir_angles(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
-    """Convert the angles of a gimbal (a pitch of -90 is straight down) to (heading of the picture's top, roll, pitch),
-    where roll and pitch are the camera's deviation from straight down. All in degrees."""
-    # The result is the attitude of an imaginary airframe, its nose along the top of the picture and its down along the
-    # camera's viewing direction. If the camera looks straight down, the gimbal's roll only turns the picture.
+    """Convert gimbal angles (a pitch of -90 is straight down) to (heading of the picture's top, roll, pitch), where
+    roll and pitch are the camera's deviation from straight down. All in degrees."""
+    # The result is the attitude of an imaginary airframe whose nose points to the picture's top and whose down axis is
+    # the viewing direction. If the camera looks straight down, the gimbal's roll only rotates the picture.
     yaw, pitch, roll = map(math.radians, (yaw_deg, pitch_deg, roll_deg))
-    # The nose before the yaw is applied. Adding or subtracting 0.0 avoids -0.0, with which atan2 is off by half a turn.
-    ahead, aside = 0.0 - math.cos(roll) * math.sin(pitch), 0.0 + math.sin(roll)
-    north, east = ahead * math.cos(yaw) - aside * math.sin(yaw), ahead * math.sin(yaw) + aside * math.cos(yaw)
+    # The nose before the yaw is applied. Adding or subtracting 0.0 avoids -0.0, for which atan2 is off by 180 degrees.
+    forward, right = 0.0 - math.cos(roll) * math.sin(pitch), 0.0 + math.sin(roll)
+    north, east = forward * math.cos(yaw) - right * math.sin(yaw), forward * math.sin(yaw) + right * math.cos(yaw)
     return (
         math.degrees(math.atan2(east, north)) % 360,
         math.degrees(math.atan2(math.sin(roll) * math.cos(pitch) + 0.0, 0.0 - math.sin(pitch))),

@@ -1,4 +1,4 @@
-"""Warps pictures by a homography, and cuts out the part of a picture that it can warp."""
+"""Warps pictures by a homography, and clips a picture to the part that can be warped."""
 
 import cv2
 import numpy as np
@@ -10,8 +10,8 @@ _SUBPIXEL_BITS = 4
 
 
 class Homography:
-    """The warp of a picture without distortion to (side, side) pixels by a homography (3, 3), like `lens.Remap`.
-    `corners` are those of the part of the picture that is used, homogeneous pixels (3, n)."""
+    """Warp of an undistorted picture to (side, side) pixels by a homography (3, 3), with the interface of `lens.Remap`.
+    `corners`: corners of the part of the picture that is used, in homogeneous pixels (3, n)."""
 
     def __init__(self, out_from_pixel: Doubles, corners: Doubles, side: int, shrink: float) -> None:
         self._out_from_pixel, self._side, self._shrink = out_from_pixel, side, shrink
@@ -30,15 +30,15 @@ class Homography:
         if small is not image:
             along, across = (before / after for before, after in zip(image.shape[:2], small.shape[:2], strict=True))
             out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]
-        # Outside the picture, where the mask is False, its edge is repeated, so that no false gradient arises.
+        # Outside the picture, where the mask is False, its edge is replicated, so that no false gradient arises.
         return cv2.warpPerspective(  # type: ignore[return-value]  # of the same dtype
             small, out_from_pixel, (self._side, self._side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
 
 
 def cut_polygon(corners: Doubles, depth: Doubles) -> Doubles:
-    """Return the corners of the part of a convex polygon, homogeneous (3, n), with a positive depth; `depth` (n,) is
-    that of its corners."""
+    """Clip a convex polygon, homogeneous (3, n), to its part with positive depth, and return the corners of that part.
+    `depth` (n,) is the depth of each corner."""
     points = []
     for previous, current in zip(range(-1, len(depth) - 1), range(len(depth)), strict=True):
         if (depth[previous] > 0) != (depth[current] > 0):

@@ -1,5 +1,5 @@
-"""Lists, decodes and encodes image files. An incomplete file is an error and never decoded in part. OpenCV's log is
-turned off, since edgevpr reports each fault once, in its own words; OPENCV_LOG_LEVEL turns it on again."""
+"""Lists, decodes and encodes image files. An incomplete file is an error and is never partially decoded. OpenCV's log
+is off because edgevpr reports each fault once, in its own words; set OPENCV_LOG_LEVEL to turn it on."""
 
 import contextlib
 import os
@@ -17,15 +17,15 @@ from edgevpr.core.files import read_file
 from edgevpr.frames.depth import DepthRange
 
 if "OPENCV_LOG_LEVEL" not in os.environ:
-    # OpenCV 4 has the function in `cv2`, OpenCV 5 in a submodule; level 0 is silent in both.
+    # The function is in `cv2` in OpenCV 4 and in a submodule in OpenCV 5; level 0 is silent in both.
     (getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(0)
-# Read when the first camera is opened, not at import.
-os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "3")  # seconds; else a hung camera blocks a read for 10 s
+# OpenCV reads this when the first camera is opened, not at import. By default, a hung camera blocks a read for 10 s.
+os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "3")  # seconds
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 MIN_SIDE_PX = 16
 MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])
-_MAX_FILE_BYTES = 4 * MAX_PIXELS  # of an uncompressed picture with transparency
+_MAX_FILE_BYTES = 4 * MAX_PIXELS  # of an uncompressed picture with an alpha channel
 _SMALL_PX = 640
 _SMALL_QUALITY = 80
 _WEBP_QUALITY = 55
@@ -42,23 +42,23 @@ _END_OF_IMAGE = 0xD9
 
 
 def list_images(folder: str | Path) -> list[Path]:
-    """List the paths of the images directly in `folder`, sorted by name, numbers in counting order (2 before 10).
-    Raises SourceError for a folder that cannot be read or has no images."""
+    """List the paths of the images directly in `folder`, sorted by name, with numbers in counting order (2 before 10).
+    Raises SourceError if the folder cannot be read or contains no images."""
     folder = Path(folder)
     try:
         names = sorted((path.name for path in folder.iterdir()), key=make_sort_key)
     except OSError as error:
-        raise SourceError(f"{folder} cannot be listed ({error.strerror}): give a folder of images.") from None
+        raise SourceError(f"{folder} cannot be read ({error.strerror}): give a folder of images.") from None
     if images := [folder / name for name in names if is_image(name)]:
         return images
     inner = [str(folder / name) for name in names if any(is_image(path.name) for path in (folder / name).glob("*"))]
     advice = " or ".join(inner[:3]) or "one that does"
-    raise SourceError(f"The folder {folder} holds no images ({' '.join(EXTENSIONS)}): give {advice}.")
+    raise SourceError(f"The folder {folder} contains no images ({' '.join(EXTENSIONS)}): give {advice}.")
 
 
 def is_image(name: str) -> bool:
     """Return True if the file name is that of an image."""
-    # Files that begin with a dot are metadata of other systems (._IMG_1.jpg), not photographs.
+    # Names that begin with a dot are metadata of other systems (._IMG_1.jpg), not photographs.
     return name.lower().endswith(EXTENSIONS) and not name.startswith(".")
 
 
@@ -69,31 +69,31 @@ def make_sort_key(name: str) -> tuple[list[str | int], str]:
 
 
 def read_image(path: str | Path, depth: DepthRange | None = None) -> Image:
-    """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey, rotated by its EXIF data, without transparency. An
-    image of 16 bits is shown in the range `depth` of the images before it (None: in its own). Raises ImageError for any
-    file but a whole image of 8 or 16 bits, at least 16x16 pixels and at most `MAX_PIXELS`."""
+    """Decode an image file to uint8, (H, W, 3) BGR or (H, W) grey, rotated by its EXIF data, without alpha channel. A
+    16-bit image is scaled to the range `depth` of the images before it (None: to its own). Raises ImageError unless the
+    file is a complete image of 8 or 16 bits, with at least 16x16 and at most `MAX_PIXELS` pixels."""
     try:
         data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
         raise ImageError(f"The image {path} cannot be read ({error.strerror}): give a readable file.") from error
     except MemoryError:
-        raise ImageError(f"{path} does not fit into the free memory: give a smaller image.") from None
+        raise ImageError(f"{path} does not fit in the free memory: give a smaller image.") from None
     return decode_image(data, str(path), depth)
 
 
 def decode_image(data: bytes, path: str, depth: DepthRange | None = None) -> Image:
-    """Decode the content of an image file, as `read_image` does; `path` names it in the errors."""
+    """Decode the content of an image file, as `read_image` does; `path` is its name in error messages."""
     if _is_incomplete(data):
-        raise ImageError(f"{path} is empty, cut short or damaged: copy it again from the camera.")
+        raise ImageError(f"{path} is empty, truncated or damaged: copy it again from the camera.")
     image = None
     with contextlib.suppress(cv2.error):  # raised for too many pixels
         if _START_PATTERN.match(data):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
-    # OpenCV has another limit if a program imported it before edgevpr, so the size is checked here as well.
+    # OpenCV has a different limit if a program imported it before edgevpr, so the size is checked here too.
     if image is None or image.dtype not in (np.uint8, np.uint16) or image.shape[0] * image.shape[1] > MAX_PIXELS:
         raise ImageError(
-            f"{path} is not an image edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file of 8 or 16 bits a "
-            f"channel and at most {MAX_PIXELS / 1e6:.0f} megapixels."
+            f"{path} is not an image that edgevpr can decode: give a JPEG, PNG, TIFF, BMP or WebP file with 8 or 16 "
+            f"bits per channel and at most {MAX_PIXELS / 1e6:.0f} megapixels."
         )
     height, width = image.shape[:2]
     if min(height, width) < MIN_SIDE_PX:
@@ -111,17 +111,17 @@ def decode_jpeg(jpeg: bytes) -> Image:
 
 
 def encode_jpeg(image: Image) -> bytes:
-    """Encode a picture, uint8 (H, W, 3) BGR or (H, W) grey, as a JPEG of the quality used in recordings of flights."""
+    """Encode a picture, uint8 (H, W, 3) BGR or (H, W) grey, as a JPEG of the quality used in flight recordings."""
     return _encode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _RECORDING_QUALITY))
 
 
 def encode_small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
-    """Encode a picture, uint8 (H, W[, 3]), as a JPEG for people, its longest side at most `longest_px`."""
+    """Encode a picture, uint8 (H, W[, 3]), as a JPEG for viewing, its longest side at most `longest_px`."""
     return _encode(".jpg", limit_size(image, longest_px), (cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY))
 
 
 def encode_small_webp(image: Image, longest_px: int) -> bytes:
-    """Encode a picture, uint8 (H, W[, 3 or 4]), as a WebP, which is half as large, and can be transparent."""
+    """Encode a picture, uint8 (H, W[, 3 or 4]), as a WebP, which is half as large and can have an alpha channel."""
     return _encode(".webp", limit_size(image, longest_px), (cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY))
 
 
@@ -134,13 +134,13 @@ def limit_size(image: Image, longest_px: int) -> Image:
 
 
 def resize(image: Image, size_px: tuple[int, int]) -> Image:
-    """Scale a picture to `size_px` (width, height). In a smaller picture each pixel is the mean of those it covers."""
+    """Scale a picture to `size_px` (width, height). When downscaling, each pixel is the mean of those it covers."""
     return cv2.resize(image, size_px, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]  # of the same dtype
 
 
 def shrink_image(image: Image, shrink: float) -> Image:
-    """Scale a picture down by the factor `shrink` before a warp, whose interpolation alone would ignore most pixels. Up
-    to 2 the picture is returned as it is."""
+    """Downscale a picture by the factor `shrink` before a warp, whose interpolation alone would skip most pixels. Up to
+    a factor of 2, the picture is returned unchanged."""
     if shrink <= 2:
         return image
     height, width = image.shape[:2]
@@ -152,16 +152,16 @@ def _encode(extension: str, image: Image, options: Sequence[int] = ()) -> bytes:
 
 
 def _is_incomplete(data: bytes) -> bool:
-    # OpenCV 4 fills the missing part of a JPEG with grey and ignores the checksums of a PNG; its decoders of the other
-    # formats detect damage. Bytes after the end mark are allowed.
+    # OpenCV 4 fills the missing part of a JPEG with grey and ignores the checksums of a PNG; its decoders for other
+    # formats detect damage. Bytes after the end marker are allowed.
     if data.startswith(_JPEG_START):
         return not is_whole_jpeg(data)
     return not data or (data.startswith(_PNG_START) and not _is_whole_png(data))
 
 
 def is_whole_jpeg(data: bytes) -> bool:
-    """Return True if the end mark of a JPEG is there (ITU-T T.81, annex B). Segments are skipped by their length, so
-    that an EXIF thumbnail's end mark is not taken for the image's."""
+    """Return True if a JPEG has its end marker (ITU-T T.81, annex B). Segments are skipped by their length, so that the
+    end marker of an EXIF thumbnail is not mistaken for the image's."""
     position = 2
     while marker := _MARKER_PATTERN.search(data, position):
         if data[marker.end() - 1] == _END_OF_IMAGE:
@@ -171,7 +171,7 @@ def is_whole_jpeg(data: bytes) -> bool:
 
 
 def _is_whole_png(data: bytes) -> bool:
-    """Return True if all chunks (length, kind, content, checksum) of a PNG are intact, to the end."""
+    """Return True if all chunks (length, type, data, checksum) of a PNG are intact up to IEND."""
     position = len(_PNG_START)
     while position + 12 <= len(data):
         end = position + 8 + int.from_bytes(data[position : position + 4], "big")

@@ -1,8 +1,8 @@
 """Lenses with distortion: reads calibrations of OpenCV, ROS and Kalibr, and undistorts pictures.
 
 An *undistorted* picture is the one that a lens without distortion would take from the same place, along the same axis.
-Its longest side shows as much as the calibrated lens does (at most `_MAX_STRAIGHT_FOV_DEG`), so everything that is
-computed with a field of view holds for it. A *ray* is a direction from the lens, as its tangents to the right and down.
+Its longest side has the field of view of the calibrated lens (at most `_MAX_STRAIGHT_FOV_DEG`), so everything computed
+from a field of view applies to it. A *ray* is a direction from the lens, given by its tangents to the right and down.
 """
 
 import math
@@ -21,33 +21,33 @@ from edgevpr.core.files import read_file
 from edgevpr.core.yamlfile import parse_yaml
 from edgevpr.frames.images import shrink_image
 
-_MAX_FILE_BYTES = 300_000  # OpenCV's program writes all corners of the board into its file too
-# These parts of OpenCV's files are not YAML. Its own reader is not used: it crashes on damaged files.
+_MAX_FILE_BYTES = 300_000  # OpenCV's program also writes all chessboard corners to its file
+# These parts of OpenCV's files are not YAML. OpenCV's own reader is not used because it crashes on damaged files.
 _OPENCV_TAGS = re.compile(rb"^%YAML.*|!!opencv-matrix\b", re.MULTILINE)
-_COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)  # numbers of them that OpenCV knows, k1 k2 p1 p2 first; of a fisheye only 4
+_COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)  # that OpenCV supports, beginning with k1 k2 p1 p2; fisheye: only 4
 _FISHEYE = "equidistant"
 _NO_DISTORTION = "none"
-# Names of models in files of ROS and Kalibr; "" stands for a file of OpenCV.
+# Names of models in ROS and Kalibr files; "" stands for an OpenCV file.
 _MODELS = ("", "plumb_bob", "rational_polynomial", "radtan", _FISHEYE, _NO_DISTORTION)
-_MAX_STRAIGHT_FOV_DEG = 100.0  # of an undistorted picture: beyond, its corners would show little, in many pixels
-_MAX_SKEW = 0.002  # over the focal length: ignored, it moves a pixel by less than one
+_MAX_STRAIGHT_FOV_DEG = 100.0  # of an undistorted picture: beyond, its corners would waste many pixels
+_MAX_SKEW = 0.002  # relative to the focal length; ignored because it shifts points by less than a pixel
 _MIN_FOV_DEG = 5.0  # as of `source.fov_deg`
-_MAX_OFF_AXIS_DEG = 85.0  # up to which a lens is sampled
+_MAX_OFF_AXIS_DEG = 85.0  # up to which a lens is sampled, from its axis
 _OFF_AXIS_STEP_DEG = 0.25
 _DIRECTIONS_DEG = range(0, 360, 15)
 _RIGHT = _DIRECTIONS_DEG.index(0)
 _DOWN = _DIRECTIONS_DEG.index(90)
 _LEFT = _DIRECTIONS_DEG.index(180)
 _UP = _DIRECTIONS_DEG.index(270)
-_CELL_PX = 8  # pixels are computed for every eighth one and interpolated, with an error below a tenth of a pixel
-_OUTSIDE_PX = -1e6  # so far outside that values interpolated with it are outside as well
+_CELL_PX = 8  # the warp is computed at every eighth pixel and interpolated; the error is below 0.1 pixels
+_OUTSIDE_PX = -1e6  # far enough outside that values interpolated with it are also outside
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibratedLens:
-    """A camera's calibration. `path`: its file. `focal_px`, `centre_px`: focal lengths and principal point, along the
-    columns and rows of pictures of `size_px` (width, height); the centre of the first pixel is (0, 0).
-    `coefficients` of the distortion, in the order and number of OpenCV's model (`is_fisheye`: of its fisheye model)."""
+    """A camera calibration. `path`: its file. `focal_px`, `centre_px`: focal lengths and principal point (x, y) in
+    pictures of `size_px` (width, height); the centre of the first pixel is (0, 0). `coefficients`: distortion
+    coefficients in the order and number of OpenCV's model (`is_fisheye`: of its fisheye model)."""
 
     path: str
     focal_px: tuple[float, float]
@@ -57,34 +57,34 @@ class CalibratedLens:
     size_px: tuple[int, int]
 
     def matrix(self) -> Doubles:
-        """Return the camera matrix (3, 3) of OpenCV."""
+        """Return OpenCV's camera matrix (3, 3)."""
         (focal_x, focal_y), (column, row) = self.focal_px, self.centre_px
         return np.array([[focal_x, 0, column], [0, focal_y, row], [0, 0, 1]])
 
     def project(self, rays: Doubles) -> Doubles:
-        """Return the pixels (N, 2) of the rays (N, 2)."""
+        """Project rays (N, 2) to pixels (N, 2)."""
         points = np.ascontiguousarray(np.column_stack([rays, np.ones(len(rays))]))[:, None]
         project = cv2.fisheye.projectPoints if self.is_fisheye else cv2.projectPoints
         pixels, _ = project(points, np.zeros(3), np.zeros(3), self.matrix(), np.array(self.coefficients))
         return np.asarray(pixels, np.float64).reshape(-1, 2)
 
     def resize_to(self, size_px: tuple[int, int]) -> "CalibratedLens":
-        """Return the calibration for pictures of another size, of the same part of the sensor."""
+        """Return the calibration scaled to pictures of another size that cover the same part of the sensor."""
         scale_x, scale_y = size_px[0] / self.size_px[0], size_px[1] / self.size_px[1]
         (focal_x, focal_y), (column, row) = self.focal_px, self.centre_px
         centre_px = scale_x * (column + 0.5) - 0.5, scale_y * (row + 0.5) - 0.5
         return replace(self, focal_px=(scale_x * focal_x, scale_y * focal_y), centre_px=centre_px, size_px=size_px)
 
     def make_error(self, why: str) -> ConfigError:
-        """Return the error of an impossible calibration."""
-        return ConfigError(f"{self.path} is no possible calibration ({why}): calibrate the camera again.")
+        """Return the error for an impossible calibration."""
+        return ConfigError(f"{self.path} is not a valid calibration ({why}): calibrate the camera again.")
 
 
 @dataclass(frozen=True, slots=True)
 class LensView:
-    """The view of a `lens`, for pictures of its size. `half`: the ray to the lower right corner of its undistorted
-    picture. `max_ray`: the length of a ray up to which its model holds. `field_deg`: its whole field of view across the
-    longest side of its pictures, at most 170."""
+    """The view through a `lens` in pictures of its size. `half`: ray to the lower right corner of the undistorted
+    picture. `max_ray`: ray length up to which the distortion model is valid. `field_deg`: full field of view across the
+    longest side of the distorted picture, at most 170."""
 
     lens: CalibratedLens
     half: tuple[float, float]
@@ -98,7 +98,7 @@ class LensView:
 
     @property
     def straight_px(self) -> tuple[int, int]:
-        """Size (width, height) of the undistorted picture; its longest side is as long as the lens's own."""
+        """Size (width, height) of the undistorted picture; its longest side is as long as that of the distorted one."""
         longest = max(self.lens.size_px)
         width, height = (max(1, round(longest * tangent / max(self.half))) for tangent in self.half)
         return width, height
@@ -113,16 +113,16 @@ class LensView:
         return self.make_remap(out_from_ray, focal_px, (width, height))
 
     def make_remap(self, out_from_ray: Doubles, out_px: float, size_px: tuple[int, int]) -> "Remap":
-        """Return the remap to a picture of `size_px` (width, height) and the focal length `out_px`; `out_from_ray` is
-        the homography (3, 3) from rays to its pixels."""
+        """Return the remap to a picture of `size_px` (width, height) with a focal length of `out_px` pixels;
+        `out_from_ray` is the homography (3, 3) from rays to its pixels."""
         columns, rows = (np.arange(0, side + _CELL_PX, _CELL_PX) for side in size_px)
         across, down = np.meshgrid(columns, rows)
-        rays = np.stack([across, down, np.ones_like(down)], axis=-1) @ np.linalg.inv(out_from_ray).T
-        is_ahead = rays[..., 2] > 0
-        flat = rays[..., :2] / np.where(is_ahead, rays[..., 2], 1)[..., None]
-        holds = is_ahead & (np.hypot(flat[..., 0], flat[..., 1]) <= self.max_ray)
-        nodes = self.lens.project(np.where(holds[..., None], flat, 0).reshape(-1, 2)).reshape(flat.shape)
-        nodes[~holds] = _OUTSIDE_PX
+        rays_xyz = np.stack([across, down, np.ones_like(down)], axis=-1) @ np.linalg.inv(out_from_ray).T
+        is_ahead = rays_xyz[..., 2] > 0
+        rays_xy = rays_xyz[..., :2] / np.where(is_ahead, rays_xyz[..., 2], 1)[..., None]
+        is_valid = is_ahead & (np.hypot(rays_xy[..., 0], rays_xy[..., 1]) <= self.max_ray)
+        nodes = self.lens.project(np.where(is_valid[..., None], rays_xy, 0).reshape(-1, 2)).reshape(rays_xy.shape)
+        nodes[~is_valid] = _OUTSIDE_PX
         pixel_from_node = np.array([[_CELL_PX, 0, 0], [0, _CELL_PX, 0]], float)
         pixels = np.asarray(cv2.warpAffine(nodes.astype(np.float32), pixel_from_node, size_px), np.float32)
         lower_right = np.array([side - 0.5 for side in self.lens.size_px])
@@ -132,63 +132,63 @@ class LensView:
 
 @dataclass(frozen=True, slots=True)
 class Remap:
-    """A warp of a camera's picture to (H, W): `pixels` (H, W, 2) are those that show the same, `shown` (H, W) is False
-    where they lie outside of the camera's picture, and `shrink` of them along a side become one."""
+    """A warp of a camera's picture to (H, W). `pixels` (H, W, 2): source coordinates of each output pixel. `shown` (H,
+    W): False where they lie outside the camera's picture. `shrink`: source pixels per output pixel, along a side."""
 
     pixels: Singles
     shown: Mask
     shrink: float
 
     def warp_mask(self, overlay: Mask) -> Mask:
-        """Warp a mask, bool, of the camera's picture."""
+        """Warp a mask of the camera's picture, bool."""
         return _remap_image(overlay.view(np.uint8), self.pixels, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT).view(bool)
 
     def warp_image(self, image: Image) -> Image:
-        """Warp the camera's picture. Outside of it its edge is repeated, so that no false gradient arises."""
+        """Warp the camera's picture. Outside it, its edge is replicated, so that no false gradient arises."""
         small, pixels = shrink_image(image, self.shrink), self.pixels
         if small is not image:
-            pixels = pixels + np.float32(0.5)  # the only copy: a board has little memory
+            pixels = pixels + np.float32(0.5)  # the only copy: boards have little memory
             pixels *= np.array([small.shape[axis] / image.shape[axis] for axis in (1, 0)], np.float32)
             pixels -= np.float32(0.5)
         return _remap_image(small, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
 
 def _remap_image(image: Image, pixels: Singles, interpolation: int, border: int) -> Image:
-    # None: the first of the two maps has both coordinates. OpenCV's types demand a second one.
+    # None: the first of the two maps has both coordinates. OpenCV's type stubs demand a second one.
     return cv2.remap(image, pixels, None, interpolation, borderMode=border)  # type: ignore
 
 
 @lru_cache(maxsize=8)
 def compute_lens_view(lens: CalibratedLens, size_px: tuple[int, int]) -> LensView:
-    """Return the view of a lens in pictures of `size_px` (width, height). Raises ImageError for pictures of another
-    shape than those it was calibrated with, and ConfigError for an impossible calibration."""
+    """Return the view through a lens in pictures of `size_px` (width, height). Raises ImageError if their aspect ratio
+    differs from that of the calibration, and ConfigError for an impossible calibration."""
     (width, height), (lens_width, lens_height), (column, row) = size_px, lens.size_px, lens.centre_px
     if not np.isfinite([*lens.focal_px, column, row, *lens.coefficients]).all():
-        raise lens.make_error("a value is no number")
+        raise lens.make_error("a value is not a number")
     if min(lens.focal_px) <= 0:
         raise lens.make_error("a focal length is not above zero")
     if not (0 < column < lens_width and 0 < row < lens_height):
-        raise lens.make_error("its centre lies outside of the picture")
+        raise lens.make_error("its principal point lies outside the picture")
     if abs(height - width * lens_height / lens_width) > 1 and abs(width - height * lens_width / lens_height) > 1:
         raise ImageError(
-            f"The picture has {width}x{height} pixels, and {lens.path} was calibrated with {lens_width}x{lens_height}: "
-            "take pictures of that aspect ratio, or calibrate the camera again."
+            f"The picture has {width}x{height} pixels, but {lens.path} was calibrated with {lens_width}x{lens_height}: "
+            "use pictures with that aspect ratio, or calibrate the camera again."
         )
     lens = lens.resize_to(size_px)
     tangents = np.tan(np.radians(np.arange(0, _MAX_OFF_AXIS_DEG + _OFF_AXIS_STEP_DEG, _OFF_AXIS_STEP_DEG)))
-    around = np.radians(_DIRECTIONS_DEG)
-    rays = np.stack([np.outer(np.cos(around), tangents), np.outer(np.sin(around), tangents)], axis=-1)
+    angles = np.radians(_DIRECTIONS_DEG)
+    rays = np.stack([np.outer(np.cos(angles), tangents), np.outer(np.sin(angles), tangents)], axis=-1)
     with np.errstate(all="ignore"):
-        off_px = lens.project(rays.reshape(-1, 2)).reshape(rays.shape) - lens.centre_px
-        grows = np.diff(np.hypot(off_px[..., 0], off_px[..., 1]), axis=1) > 0  # False for NaN as well
-    steady = np.logical_and.accumulate(grows, axis=1).sum(axis=1)  # steps in which each ray moves outwards
+        offset_px = lens.project(rays.reshape(-1, 2)).reshape(rays.shape) - lens.centre_px
+        grows = np.diff(np.hypot(offset_px[..., 0], offset_px[..., 1]), axis=1) > 0  # False for NaN as well
+    steady = np.logical_and.accumulate(grows, axis=1).sum(axis=1)  # steps over which each ray's pixel moves outwards
 
     def find_edge(direction: int, axis: int, edge_px: float) -> float:
-        """Return the tangent at which the picture ends in a direction."""
+        """Return the tangent of the ray that meets the edge of the picture in a direction."""
         steps = slice(steady[direction] + 1)
-        along_px, to_edge_px = np.abs(off_px[direction, steps, axis]), abs(edge_px - lens.centre_px[axis])
+        along_px, to_edge_px = np.abs(offset_px[direction, steps, axis]), abs(edge_px - lens.centre_px[axis])
         if along_px[-1] < to_edge_px and steady[direction] < len(tangents) - 1:
-            raise lens.make_error("pixels before the edge of the picture have no direction of their own")
+            raise lens.make_error("its distortion is not invertible up to the edge of the picture")
         return float(np.interp(to_edge_px, along_px, tangents[steps]))
 
     right, left = find_edge(_RIGHT, 0, width - 0.5), find_edge(_LEFT, 0, -0.5)
@@ -197,38 +197,38 @@ def compute_lens_view(lens: CalibratedLens, size_px: tuple[int, int]) -> LensVie
     half, max_ray = (min(right, left, widest), min(lower, upper, widest)), float(tangents[steady.min()])
     field_deg = math.degrees(sum(map(math.atan, (right, left) if width >= height else (lower, upper))))
     if math.hypot(*half) > max_ray:
-        raise lens.make_error("pixels towards the corners of the picture have no direction of their own")
+        raise lens.make_error("its distortion is not invertible up to the corners of the picture")
     if field_deg < _MIN_FOV_DEG:
         raise lens.make_error(f"its field of view is {field_deg:.1f} degrees")
     return LensView(lens, half, max_ray, field_deg)
 
 
 def read_lens(path: str) -> CalibratedLens:
-    """Read a calibration from a file of OpenCV (YAML, XML or JSON of its FileStorage), of ROS (camera_info) or of
-    Kalibr (camchain, the camera cam0). Raises ConfigError for any other file, and for an impossible calibration."""
+    """Read a calibration file of OpenCV (FileStorage as YAML, XML or JSON), ROS (camera_info) or Kalibr (camchain,
+    camera cam0). Raises ConfigError for any other file, and for an impossible calibration."""
     try:
         data = read_file(path, _MAX_FILE_BYTES)
     except OSError as error:
-        raise ConfigError(f"{path} cannot be read ({error.strerror}): give the calibration of the lens.") from error
+        raise ConfigError(f"{path} cannot be read ({error.strerror}): give a camera calibration.") from error
     content = _read_xml(data, path) if data.lstrip().startswith(b"<") else parse_yaml(_OPENCV_TAGS.sub(b"", data), path)
-    fields = {str(name).lower(): value for name, value in content.items()}  # old files of OpenCV have capitals
+    fields = {str(name).lower(): value for name, value in content.items()}  # old OpenCV files use capitals
     try:
         lens = _read_kalibr(fields["cam0"], path) if "cam0" in fields else _read_matrix(fields, path)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         fault = f"lacks `{error.args[0]}`" if isinstance(error, KeyError) else "is incomplete"
-        advice = "give a calibration of OpenCV, ROS or Kalibr (docs/how-to/cameras.md)"
+        advice = "give a calibration file of OpenCV, ROS or Kalibr (docs/how-to/cameras.md)"
         raise ConfigError(f"{path} {fault}: {advice}.") from error
     compute_lens_view(lens, lens.size_px)
     return lens
 
 
 def _read_matrix(fields: Mapping[str, Any], path: str) -> CalibratedLens:
-    """Make the lens of a file of OpenCV or ROS: they name their fields alike."""
+    """Make the lens from the fields of an OpenCV or ROS file, which have the same names."""
     matrix, coefficients = _read_numbers(fields["camera_matrix"]), _read_numbers(fields["distortion_coefficients"])
     if len(matrix) != 9:
-        raise ConfigError(f"{path}: `camera_matrix` has {len(matrix)} numbers, and needs 9.")
+        raise ConfigError(f"{path}: `camera_matrix` has {len(matrix)} numbers but needs 9.")
     if abs(matrix[1]) > _MAX_SKEW * abs(matrix[0]):
-        raise ConfigError(f"{path} has skew (the second number of `camera_matrix`): calibrate without skew.")
+        raise ConfigError(f"{path} has skew (second number of `camera_matrix`): calibrate without skew.")
     model = fields.get("distortion_model", _FISHEYE if int(fields.get("fisheye_model") or 0) else "")
     size_px = int(fields["image_width"]), int(fields["image_height"])
     return _make_lens(path, (matrix[0], matrix[4], matrix[2], matrix[5]), model, coefficients, size_px)
@@ -246,15 +246,15 @@ def _read_kalibr(camera: Mapping[str, Any], path: str) -> CalibratedLens:
 def _make_lens(
     path: str, pinhole: tuple[float, ...], model: str, coefficients: tuple[float, ...], size_px: tuple[int, int]
 ) -> CalibratedLens:
-    """Make a lens of the distortion model named `model`; `pinhole`: focal lengths and centre. Raises ConfigError for an
-    unknown model."""
+    """Make a lens. `model`: its distortion model. `pinhole`: focal lengths and principal point. Raises ConfigError for
+    an unknown model."""
     focal_x, focal_y, column, row = pinhole
     if model not in _MODELS:
         raise ConfigError(f"{path} has the distortion model `{model}`: calibrate with {', '.join(_MODELS[1:])}.")
     if model == _NO_DISTORTION or not coefficients:
         model, coefficients = "", (0.0,) * 4
     if len(coefficients) not in (_COEFFICIENT_COUNTS[:1] if model == _FISHEYE else _COEFFICIENT_COUNTS):
-        raise ConfigError(f"{path} has {len(coefficients)} coefficients, which fit no supported distortion model.")
+        raise ConfigError(f"{path} has {len(coefficients)} coefficients, which no supported distortion model has.")
     return CalibratedLens(
         path=path,
         focal_px=(focal_x, focal_y),
@@ -266,13 +266,13 @@ def _make_lens(
 
 
 def _read_numbers(value: Any) -> tuple[float, ...]:
-    """Return the numbers of a matrix: a list or, in files of ROS, a section with `data`."""
+    """Return the numbers of a matrix: a list or, in ROS files, a section with `data`."""
     return tuple(map(float, value["data"] if isinstance(value, dict) else value))
 
 
 def _read_xml(data: bytes, path: str) -> dict[str, Any]:
-    """Read the fields of an XML file of OpenCV, matrices as in files of ROS."""
-    from xml.etree import ElementTree  # hardly any calibration is XML
+    """Read the fields of an OpenCV XML file, with matrices in the form that ROS files have."""
+    from xml.etree import ElementTree  # rarely needed
 
     try:
         root = ElementTree.fromstring(data)

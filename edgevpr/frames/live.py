@@ -1,9 +1,9 @@
-"""Live sources: cameras and network streams. Only the newest picture counts; a source that gives none is reopened.
+"""Live sources: cameras and network streams. Only the newest picture counts; a source that delivers none is reopened.
 
-A call into a driver or a decoder may never return, and a thread that hangs in one cannot be ended. So one thread opens
-and reads a source, another converts the pictures that are used, and a third, which calls nothing that could hang,
-abandons both and starts others; the process ends without them (`cli.main`). A separate process, which could be ended,
-needs 40 MB more and a copy of every picture, and a driver that hangs in the kernel holds a process like a thread."""
+A call into a driver or a decoder may never return, and a thread that hangs in one cannot be killed. So one thread opens
+and reads the source, another converts the pictures that are used, and a third, which makes no calls that can hang,
+replaces both if they hang; the process exits without them (`cli.main`). A separate process could be killed, but needs
+40 MB more and a copy of every picture, and a driver that hangs in the kernel blocks it too."""
 
 import threading
 from collections.abc import Callable
@@ -21,14 +21,14 @@ _FIRST_WAIT_S = 0.5
 _MAX_WAIT_S = 10.0
 _CLOSE_TIMEOUT_S = 0.5
 _POLL_PERIOD_S = 0.2
-_OPENING_TIMEOUT_S = 90.0  # longer than any opening that ends on its own, see `frames.programs`
+_OPENING_TIMEOUT_S = 90.0  # longer than any opening that does not hang, see `frames.programs`
 _STALE_PICTURE_S = 1.0
-_MAX_HANGING_THREADS = 3  # a source that hangs each time must not take ever more threads
+_MAX_HANGING_THREADS = 3  # so that a source that hangs each time does not use up threads
 
 
 class _Opening:
-    """One opening of a camera or stream. `opened_s`: when it was open (None: not yet). `cause`: in a few words, why it
-    could not be opened or read on (None: it is lost, or cancelled). `thread` runs `read` with this object."""
+    """One opening of a camera or stream. `opened_s`: when it was open (None: not yet). `cause`: why it could not be
+    opened or read further, in a few words (None: lost or cancelled). `thread` runs `read` with this object."""
 
     def __init__(self, read: Callable[["_Opening"], None], began_s: float) -> None:
         self.began_s = began_s
@@ -40,14 +40,14 @@ class _Opening:
         self.thread.start()
 
     def cancel(self) -> None:
-        """Let the thread end as soon as its present call returns."""
+        """Let the thread end as soon as its current call returns."""
         self.is_cancelled = True
         if self.capture is not None:
             self.capture.cancel()
 
 
 class _Conversion:
-    """The conversion of a picture, requested at `began_s`. `image`: the result, once it is `done`; None: it failed."""
+    """The conversion of a picture, requested at `began_s`. `image`: result once `done` is set; None if it failed."""
 
     def __init__(self, number: int, shot: Shot, began_s: float) -> None:
         self.number, self.shot, self.began_s = number, shot, began_s
@@ -56,7 +56,7 @@ class _Conversion:
 
 
 class _Converter:
-    """A thread that converts the pictures in `requests`, one after the other, until it comes to None."""
+    """A thread that converts the pictures in `requests` one after the other until it receives None."""
 
     def __init__(self) -> None:
         self.requests: SimpleQueue[_Conversion | None] = SimpleQueue()
@@ -65,18 +65,18 @@ class _Converter:
 
     def _run(self) -> None:
         while (conversion := self.requests.get()) is not None:
-            with suppress(Exception):  # a picture that cannot be decoded is left out
+            with suppress(Exception):  # a picture that cannot be decoded is skipped
                 conversion.image = conversion.shot.convert()
             conversion.done.set()
             del conversion  # its picture is large
 
 
 class LiveSource(Source):
-    """Gives the newest frame of the camera or stream that `open_capture` opens, or cannot open (OpeningError).
+    """Delivers the newest frame of the camera or stream that `open_capture` opens, unless it raises OpeningError.
 
-    `dropped` counts frames not read in time, and `refused` pictures that were not new and complete, by reason.
-    `latency_s` grows while no new picture comes. If none comes in time (`Liveness`), the source is reopened again and
-    again, after pauses that grow. `read` and `close` never wait for a call that hangs."""
+    `dropped` counts frames that were not read in time, and `refused` pictures that were not new and complete, by
+    reason. `latency_s` grows while no new picture arrives. If none arrives in time (`Liveness`), the source is
+    reopened, after increasing pauses, until it delivers. `read` and `close` never wait for a call that hangs."""
 
     def __init__(self, open_capture: Callable[[], Capture], clock: Callable[[], float]):
         self.is_live, self.total, self.ended = True, 0, False
@@ -89,7 +89,7 @@ class LiveSource(Source):
         self._t_start_s = clock()
         self._captured = 0
         self._last_taken_s = float("-inf")
-        self._repeats = RepeatDetector()  # for all openings: a server may begin with the picture that it has kept
+        self._repeats = RepeatDetector()  # across openings: a server may begin with a stored picture
         self._liveness = Liveness()
         self._newest: tuple[int, Shot] | None = None
         self._conversion: _Conversion | None = None
@@ -111,7 +111,7 @@ class LiveSource(Source):
                 self._newest = None
                 self._converter.requests.put(self._conversion)
             conversion = self._conversion
-        if not conversion.done.wait(timeout_s):  # the next call waits on
+        if not conversion.done.wait(timeout_s):  # the next call continues to wait
             return None
         with self._changed:
             if conversion is not self._conversion:  # abandoned
@@ -126,7 +126,7 @@ class LiveSource(Source):
         return Frame(image=image, name=name, t_mono_s=shot.t_mono_s, t_sd_s=shot.t_sd_s, delay_sd_s=shot.delay_sd_s)
 
     def close(self) -> None:
-        """Stop all threads; return after a second at most, whether they have ended or not."""
+        """Stop all threads. Returns after at most a second or so, whether they have ended or not."""
         with self._changed:
             self._closing.set()
             opening = self._opening
@@ -155,7 +155,7 @@ class LiveSource(Source):
             self._wait_for_threads(fault)
 
     def _watch(self, opening: _Opening) -> Fault:
-        """Wait until a source must be reopened, and return why."""
+        """Wait until the source must be reopened, and return the reason."""
         while opening.thread.is_alive() and not self._closing.is_set():
             opening.thread.join(_POLL_PERIOD_S)
             with self._changed:
@@ -188,11 +188,11 @@ class LiveSource(Source):
             self._hanging = [thread for thread in self._hanging if thread.is_alive()]
             if len(self._hanging) < _MAX_HANGING_THREADS:
                 return
-            self._set_condition(fault.condition, f"{fault.text}; {len(self._hanging)} calls into it hang")
+            self._set_condition(fault.condition, f"{fault.text}; {len(self._hanging)} calls to it hang")
             self._closing.wait(_FIRST_WAIT_S)
 
     def _read_capture(self, opening: _Opening) -> None:
-        """Open the source, handle its pictures until it is lost or cancelled, and release it: the work of a thread."""
+        """Open the source, handle its pictures until it is lost or cancelled, and release it. Runs in a thread."""
         try:
             capture = opening.capture = self._open_capture()
             try:
@@ -213,7 +213,7 @@ class LiveSource(Source):
         return opening is self._opening and not opening.is_cancelled
 
     def _handle_shot(self, opening: _Opening, shot: Shot | Refusal) -> None:
-        """Store or count what an opening has read, unless it was abandoned."""
+        """Store or count what was read by an opening, unless the opening was abandoned."""
         with self._changed:
             if not self._is_current(opening):
                 return
@@ -226,7 +226,7 @@ class LiveSource(Source):
                 self._liveness.record_refusal(refusal, now_s)
 
     def _store_shot(self, shot: Shot, now_s: float) -> Refusal | None:
-        """Store a picture as the newest one, or return why it is not."""
+        """Store a picture as the newest one, or return why it is rejected."""
         if refusal := self._repeats.find_repeat(shot.thumbnail):
             return refusal
         if shot.t_mono_s < self._last_taken_s:

@@ -1,5 +1,5 @@
-"""Decides when a live source counts as lost, frozen or damaged, and when to reopen it: by the time since its last new
-picture, whatever else arrives (sound, damaged pictures, repeats)."""
+"""Decides when a live source counts as lost, frozen or damaged, and when to reopen it: from the time since its last new
+picture, whatever else arrives (audio, damaged pictures, repeats)."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -7,25 +7,25 @@ from statistics import median_low
 
 from edgevpr.frames.shot import Condition, Refusal
 
-LOST_AFTER_S = 3.0  # without a new picture, if the source has given more than one in this time
-# While the rate is unknown: key frames, and pictures of a slow camera, come at least every ten seconds.
+LOST_AFTER_S = 3.0  # without a new picture, for a source that usually delivers more than one in this time
+# While the rate is unknown: key frames, and pictures of a slow camera, arrive at least every ten seconds.
 _UNKNOWN_RATE_TIMEOUT_S = 12.0
-_RATE_INTERVALS = 5  # between pictures, whose median is that of a source
-_MISSED_INTERVALS = 2.5  # a slow source is lost if two pictures are missing,
-_MAX_TIMEOUT_S = 30.0  # or if none comes for so long
+_RATE_INTERVALS = 5  # number of recent intervals between pictures whose median is used
+_MISSED_INTERVALS = 2.5  # a slow source counts as lost if two pictures are missing
+_MAX_TIMEOUT_S = 30.0  # or if none arrives for this long
 _FROZEN_AFTER_S = 1.0
-_MIN_REPEATS = 3  # and the time: a slow camera may take less than three pictures a second
-_DAMAGED_REOPEN_S = 5.0  # longer than streams need to recover from a lost packet
-_FROZEN_REOPEN_S = 5.0  # doubled each time that it does not help
+_MIN_REPEATS = 3  # besides the time: a slow camera may deliver fewer than three pictures a second
+_DAMAGED_REOPEN_S = 5.0  # longer than a stream needs to recover from a lost packet
+_FROZEN_REOPEN_S = 5.0  # doubled each time reopening does not help
 _MAX_FROZEN_REOPEN_S = 30.0
-_LATE_TEXT = "late: the age of its pictures is unknown, as time stamps do not keep time or decoding lags behind"
-_LATE_REOPEN_S = 30.0  # longer than it takes to find the rate of a clock
+_LATE_TEXT = "late: the age of its pictures is unknown, because time stamps are unsteady or decoding lags behind"
+_LATE_REOPEN_S = 30.0  # longer than it takes to estimate a clock's rate
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What is wrong with a source, in words for people. `must_reopen`: it has lasted so long that only reopening the
-    source may help."""
+    """What is wrong with a source. `text` is for people. `must_reopen`: the fault has lasted so long that the source
+    should be reopened."""
 
     condition: Condition
     text: str
@@ -33,7 +33,7 @@ class Fault:
 
 
 class Liveness:
-    """Judges a source by its pictures. Times are in seconds of the monotonic clock."""
+    """Finds faults of a source from its pictures. Times are in seconds of the monotonic clock."""
 
     def __init__(self) -> None:
         self._intervals_s: deque[float] = deque(maxlen=_RATE_INTERVALS)
@@ -51,8 +51,8 @@ class Liveness:
         self._refusal, self._repeats = None, 0
 
     def record_picture(self, now_s: float) -> Refusal | None:
-        """Record a picture that differs from those before it. Returns FROZEN for the first one after a frozen source
-        was reopened, which may be the frozen picture in another encoding; else None."""
+        """Record a picture that differs from those before it. Returns FROZEN for the first picture after a frozen
+        source was reopened, because it may be the frozen picture encoded anew; otherwise None."""
         if self._is_doubtful:
             self._is_doubtful = False
             return Refusal.FROZEN
@@ -70,27 +70,27 @@ class Liveness:
         self._repeats = self._repeats + 1 if refusal is Refusal.FROZEN else 0
 
     def find_fault(self, now_s: float) -> Fault | None:
-        """Return what is wrong with the source at this time (None: nothing)."""
+        """Return the fault of the source at this time, or None if there is none."""
         silent_s, usual_s = now_s - self._since_s, LOST_AFTER_S
         if self._is_rate_known:
             usual_s = min(max(LOST_AFTER_S, _MISSED_INTERVALS * median_low(self._intervals_s)), _MAX_TIMEOUT_S)
         limit_s = usual_s if self._is_rate_known else _UNKNOWN_RATE_TIMEOUT_S
         if self._repeats >= _MIN_REPEATS and silent_s > _FROZEN_AFTER_S:
             must_reopen = silent_s > max(self._frozen_reopen_s, usual_s)
-            return Fault(Condition.FROZEN, "frozen: the same picture over and over", must_reopen)
+            return Fault(Condition.FROZEN, "frozen: the same picture again and again", must_reopen)
         if self._refusal in (Refusal.DAMAGED, Refusal.PATCHED) and silent_s > usual_s:
             must_reopen = silent_s > max(_DAMAGED_REOPEN_S, limit_s)
-            return Fault(Condition.DAMAGED, "damaged: no picture is whole", must_reopen)
+            return Fault(Condition.DAMAGED, "damaged: no picture is complete", must_reopen)
         is_late = self._refusal is Refusal.LATE and now_s - self._refused_s <= LOST_AFTER_S
         if silent_s > limit_s and is_late:
-            # Before the first picture they may only wait for a key frame, or be too few for an estimate of their age.
+            # Before the first picture, they may only be waiting for a key frame, or be too few to estimate their age.
             return Fault(Condition.LATE, _LATE_TEXT, silent_s > _LATE_REOPEN_S)
         if silent_s > limit_s:
             return Fault(Condition.LOST, "lost: no new picture", True)
         return None
 
     def record_reopening(self, fault: Fault) -> None:
-        """Record that the source is reopened because of this fault."""
+        """Record that the source is being reopened because of this fault."""
         if fault.condition is Condition.FROZEN:
             self._is_doubtful = True
             self._frozen_reopen_s = min(2 * self._frozen_reopen_s, _MAX_FROZEN_REOPEN_S)

@@ -1,4 +1,4 @@
-"""The overlay mask: the part of every frame that shows ground, not an on-screen display or the aircraft."""
+"""The overlay mask: the part of every frame that shows ground and not an on-screen display or the aircraft."""
 
 import hashlib
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from edgevpr.core.arrays import Bools, Image
 from edgevpr.core.errors import ImageError, UsageError
 from edgevpr.frames.images import read_image
 
-MAX_MASKED_SHARE = 0.6  # of the frame: with more masked, too little ground is left
+MAX_MASKED_SHARE = 0.6  # of the frame: with a larger mask, too little ground is left
 _MIN_WHITE_LEVEL = 128  # grey level from which a pixel of a mask file shows ground
 
 
@@ -30,19 +30,19 @@ class OverlayMask:
 
 
 def load_mask(path: str | None) -> OverlayMask | None:
-    """Read the mask image of the configuration, `source.mask` (None: there is none): bright pixels show ground. Raises
-    ImageError for a file that is no image, and UsageError for a mask that leaves too little of the frame."""
+    """Read the mask image that the configuration names in `source.mask` (None: no mask): bright pixels show ground.
+    Raises ImageError for a file that is not an image, and UsageError for a mask that leaves too little of the frame."""
     if not path:
         return None
     try:
         image = read_image(path)
-    except ImageError as error:  # its message speaks of a frame
+    except ImageError as error:  # its message refers to a frame
         raise ImageError(f"The mask of `source.mask` (--mask) cannot be used: {error}") from error
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     allowed = grey >= _MIN_WHITE_LEVEL
     if (masked := 1 - allowed.mean()) > MAX_MASKED_SHARE:
         raise UsageError(
-            f"{path} masks {masked:.0%} of the frame, at most {MAX_MASKED_SHARE:.0%} is allowed: leave more white."
+            f"{path} masks {masked:.0%} of the frame, but at most {MAX_MASKED_SHARE:.0%} is allowed: leave more white."
         )
     pixels = repr(allowed.shape).encode() + np.packbits(allowed).tobytes()
     return OverlayMask(allowed, hashlib.sha256(pixels).hexdigest())

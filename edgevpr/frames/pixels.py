@@ -1,4 +1,4 @@
-"""Converts decoded pictures of any pixel format to the pixels that edgevpr works with: 8 bits, square."""
+"""Converts decoded pictures of any pixel format to the pixels that edgevpr uses: 8 bits per channel, square."""
 
 import re
 import threading
@@ -16,19 +16,18 @@ from edgevpr.frames.shot import make_thumbnail
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
-# Formats whose first plane is the luma: grey, bits a channel (none: 8), and the order of its two bytes.
+# Formats whose first plane is luma: grey, bits per channel (none: 8), and byte order.
 _LUMA_FORMATS = re.compile(r"(?:(gray)|yuv[aj]?\d{3}p|nv12|nv21|nv16)(?:(9|1\d)(le|be))?")
-_SQUARE_TOLERANCE = 0.01  # of the aspect ratio of square pixels: it moves positions less than other errors
-_MAX_ASPECT = 4.0  # the widest in use is 2.2; an encoder that states more, or less than 1/4, is wrong
+_SQUARE_TOLERANCE = 0.01  # in the aspect ratio of square pixels: its effect on positions is smaller than other errors
+_MAX_ASPECT = 4.0  # the widest in use is 2.2; an encoder that claims more, or less than 1/4, is wrong
 
 
 class PixelConverter:
-    """Converts the pictures of one stream or file. `make_thumbnail` and `prepare_conversion` are called by the thread
-    that decodes, for every picture and in order; the functions that `prepare_conversion` returns may be called by any
-    thread.
+    """Converts the pictures of one stream or file. The decoding thread calls `make_thumbnail` and `prepare_conversion`
+    for every picture, in order; any thread may call the functions that `prepare_conversion` returns.
 
-    Grey pictures of more than 8 bits hold counts, and are shown over their own range (`frames.depth`). The levels of
-    coloured video of more than 8 bits are defined, like those of 8 bits."""
+    Grey pictures of more than 8 bits hold counts, which are scaled to their own range (`frames.depth`). In colour video
+    of more than 8 bits, the levels are standardised, as with 8 bits."""
 
     def __init__(self) -> None:
         self._local = threading.local()  # FFmpeg's converter hangs or crashes if two threads share it
@@ -46,7 +45,7 @@ class PixelConverter:
 
     def prepare_conversion(self, picture: "VideoFrame", aspect: float) -> Callable[[], Image]:
         """Return a function that converts a picture to uint8 (H, W, 3) BGR, or (H, W) grey for counts, with square
-        pixels of the same height. `aspect`: width of its pixels over their height."""
+        pixels of the same height. `aspect`: width of its pixels divided by their height."""
         is_usable = abs(aspect - 1) > _SQUARE_TOLERANCE and 1 / _MAX_ASPECT <= aspect <= _MAX_ASPECT
         width_px = round(picture.width * aspect) if is_usable else picture.width
         layout = _match_layout(picture)
@@ -64,8 +63,8 @@ class PixelConverter:
 
 
 def _match_layout(picture: "VideoFrame") -> re.Match[str] | None:
-    """Return how the luma lies in the first plane, by `_LUMA_FORMATS`; None if it must be computed. Rows from bottom to
-    top cannot be read in place."""
+    """Return the match of `_LUMA_FORMATS` that describes the luma in the first plane; None if luma must be computed.
+    Rows stored from bottom to top cannot be read in place."""
     return None if picture.planes[0].line_size < 0 else _LUMA_FORMATS.fullmatch(picture.format.name)
 
 

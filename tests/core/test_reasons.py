@@ -25,7 +25,7 @@ def parse_package():
     ("code", "parameters", "sentence"),
     [
         ("LOW_SCORE", {"score": 0.05, "needed": 0.1}, "not similar enough to any place: score 0.050, 0.100 needed"),
-        ("UNUSABLE", {"problem": "1.png is cut short."}, "1.png is cut short."),
+        ("UNUSABLE", {"problem": "1.png is truncated."}, "1.png is truncated."),
         (
             "LOW_CONFIDENCE",
             {

@@ -208,8 +208,8 @@ def test_read_gives_the_newest_frame_and_counts_the_others(live):
     ("given", "condition", "text"),
     [
         ([], Condition.LOST, "lost: no new picture"),
-        (itertools.repeat(Refusal.DAMAGED), Condition.DAMAGED, "damaged: no picture is whole"),
-        ((shot(4) for _ in itertools.count()), Condition.FROZEN, "frozen: the same picture over and over"),
+        (itertools.repeat(Refusal.DAMAGED), Condition.DAMAGED, "damaged: no picture is complete"),
+        ((shot(4) for _ in itertools.count()), Condition.FROZEN, "frozen: the same picture again and again"),
     ],
 )
 def test_source_without_a_new_picture_is_reported_and_opened_anew(given, condition, text, live):
@@ -262,7 +262,7 @@ def test_source_that_hangs_each_time_takes_no_more_than_three_threads(monkeypatc
     monkeypatch.setattr(live_module, "_FIRST_WAIT_S", 0.01)
     opened, go = [], threading.Event()
     source = LiveSource(lambda: opened.append(1) or (go.wait(PATIENCE_S) and Camera()), time.monotonic)
-    wait_until(lambda: source.state == "lost: the opening hangs; 3 calls into it hang")
+    wait_until(lambda: source.state == "lost: the opening hangs; 3 calls to it hang")
     assert len(opened) == 3
     go.set()
     wait_until(lambda: len(opened) > 3)

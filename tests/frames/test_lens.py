@@ -108,8 +108,8 @@ def test_read_lens_of_ros_and_kalibr(tmp_path, text, model, coefficients):
         (KALIBR, {"camera": "omni", "model": "radtan", "coefficients": "0,0,0,0"}, "model `omni`"),
         (KALIBR, {"camera": "pinhole", "model": "fov", "coefficients": "0.9"}, "model `fov`"),
         (KALIBR, {"camera": "pinhole", "model": "radtan", "coefficients": "0,0,0"}, "3 coefficients"),
-        (ROS, {"model": "plumb_bob", "number": 5, "coefficients": ".nan,0,0,0,0"}, "no number"),
-        (ROS, {"model": "plumb_bob", "number": 5, "coefficients": "-3,0,0,0,0"}, "no direction of their own"),
+        (ROS, {"model": "plumb_bob", "number": 5, "coefficients": ".nan,0,0,0,0"}, "not a number"),
+        (ROS, {"model": "plumb_bob", "number": 5, "coefficients": "-3,0,0,0,0"}, "not invertible"),
         (ROS.replace("400.0", "-400.0"), {"model": "plumb_bob", "number": 4, "coefficients": "0,0,0,0"}, "above zero"),
         (ROS.replace("322.0", "3220"), {"model": "plumb_bob", "number": 4, "coefficients": "0,0,0,0"}, "outside"),
         (ROS.replace("400.0", "9e9"), {"model": "plumb_bob", "number": 4, "coefficients": "0,0,0,0"}, "0.0 degrees"),
@@ -236,5 +236,5 @@ def test_frames_of_another_size_are_scaled_and_of_another_shape_refused(ground):
     half = undistort_frame(small, None, UNKNOWN_VIEW, lens).image
     full = undistort_frame(frame.image, None, UNKNOWN_VIEW, lens).image
     assert difference(half, cv2.resize(full, half.shape[1::-1], interpolation=cv2.INTER_AREA)) < 1
-    with pytest.raises(ImageError, match=r"640x360 pixels, and lens\.yaml was calibrated with 640x480"):
+    with pytest.raises(ImageError, match=r"640x360 pixels, but lens\.yaml was calibrated with 640x480"):
         undistort_frame(frame.image[60:420], None, UNKNOWN_VIEW, lens)

@@ -32,7 +32,7 @@ def test_mask_is_known_by_its_pixels(tmp_path):
 
 @pytest.mark.parametrize("share", [0.61, 1.0])
 def test_mask_that_leaves_too_little_is_refused(tmp_path, share):
-    with pytest.raises(UsageError, match=f"masks {share:.0%} of the frame, at most 60% is allowed"):
+    with pytest.raises(UsageError, match=f"masks {share:.0%} of the frame, but at most 60% is allowed"):
         load_mask(written(tmp_path / "m.png", masked(share, 100, 100)))
     assert load_mask(written(tmp_path / "m.png", masked(0.6, 100, 100))).allowed.mean() == 0.4
 

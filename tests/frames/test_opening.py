@@ -106,7 +106,7 @@ def test_open_address_names_the_cause_without_a_camera(monkeypatch):
     for uri in (f"rtsp://127.0.0.1:{closed}/a", f"http://127.0.0.1:{closed}/a", f"tcp://127.0.0.1:{closed}"):
         assert find_cause(uri) == "connection refused"
     assert find_cause("udp://:99999") == "no host and port in the address"
-    assert find_cause("rtsp://127.0.0.1:99999/a") == "an address that cannot be used: correct host and port"
+    assert find_cause("rtsp://127.0.0.1:99999/a") == "invalid address: correct host and port"
     assert find_cause("rtsp://camera.invalid/a") == "no such host camera.invalid"
     assert find_cause("rtsp://pilot:a@b/secret@10.0.0.1/a").startswith("no such host: percent-encode the password's")
     monkeypatch.setattr(streams, "OPEN_TIMEOUT_S", 0.3)
@@ -135,7 +135,7 @@ def test_open_address_decodes_a_percent_encoded_password(serve):
     stream.release()
 
 
-@pytest.mark.parametrize(("path", "cause"), [("/dev/null", "no V4L2 camera"), ("/dev/video97", "not connected")])
+@pytest.mark.parametrize(("path", "cause"), [("/dev/null", "not a V4L2 camera"), ("/dev/video97", "not connected")])
 def test_open_device_names_the_cause(path, cause):
     with pytest.raises(OpeningError) as refusal:
         open_device(path, lambda: 0.0)

@@ -73,10 +73,10 @@ def test_a_stop_before_the_flight_begins_ends_it_at_once():
 
 def test_a_frame_that_cannot_be_read_is_logged_and_the_next_is_recognised(flight, clock):
     flown = flight()
-    pictures = [PICTURE, ImageError("1.png is cut short: copy it again."), PICTURE]
+    pictures = [PICTURE, ImageError("1.png is truncated: copy it again."), PICTURE]
     lines = flown.fly(FakeSource(pictures, clock, is_live=False))
     assert [line["reason"]["parameters"]["problem"] for line in of_kind(lines, "unusable")] == [
-        "1.png is cut short: copy it again."
+        "1.png is truncated: copy it again."
     ]
     assert len(of_kind(lines, "query")) == 2
     assert (flown.end["queries"], flown.end["unusable"]) == (2, 1)

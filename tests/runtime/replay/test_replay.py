@@ -175,7 +175,7 @@ def test_what_is_missing_is_said(fly, recording, tmp_path, capsys):
     (frame,) = (there / "recorded").glob("*/frames/000020.jpg")
     frame.write_bytes(frame.read_bytes()[:100])
     assert main(["replay", moved, "--map", str(tmp_path / "elsewhere.gpkg")]) == 0
-    assert "cut short" in capsys.readouterr().out
+    assert "truncated" in capsys.readouterr().out
     (tape,) = (there / "recorded").glob(f"*/{TAPE}")
     tape.write_text(tape.read_text().replace('"mavlink": {', '"mavlink": {"ground": "udpout:10.0.0.2:14550", ', 1))
     assert "second link" in refused(capsys, "replay", moved)
