@@ -1,6 +1,6 @@
-"""Levelling: warps the picture of a camera that looks down as if it were taken straight from above, north-up and to
-scale. The ground is assumed flat. "Level" means without roll and pitch. The footprint of a picture is the ground that
-it shows. Recognition and mapping level their pictures by `runtime.recognise.levelling`, which calls this module."""
+"""Levelling: warps the picture of a downward camera as if it were taken from straight above, north-up and to scale. The
+ground is assumed flat. "Level" means without roll and pitch. The footprint of a picture is the ground that it shows.
+Recognition and mapping level their pictures through `runtime.recognise.levelling`, which calls this module."""
 
 import math
 from collections.abc import Iterator
@@ -17,40 +17,40 @@ from edgevpr.core.types import Frame, Vehicle
 from edgevpr.frames.homography import Homography, cut_polygon
 from edgevpr.frames.lens import CalibratedLens, Remap, compute_lens_view
 
-MAX_TILT_DEG = 63.0  # a camera that looks 60 degrees ahead, and sways
-# Without a lens an image is not levelled, and beyond this tilt it differs too much from one taken straight down. With a
-# lens, the ground under the aircraft lies at the edge of the image or outside, and the middle takes its place.
+MAX_TILT_DEG = 63.0  # for a camera mounted 60 degrees forward that sways
+# Without a known lens an image is not levelled, and beyond this tilt it differs too much from one taken straight down.
+# With a lens, the nadir is near the edge of the image or outside it, and the middle is used in its place.
 MAX_TILT_UNLEVELLED_DEG = 20.0
-# Rays, (right, down, 1) in focal lengths, that go down by less are left out: they show too distant ground, or the sky.
+# Rays, (right, down, 1) in focal lengths, with a smaller down component are ignored: they show distant ground or sky.
 _MIN_RAY_DOWN = 0.1
-# Standard deviations of a tilt, as tangents: of a reported one, and of one known only by the camera's mount.
+# Standard deviations of the tilt, as tangents: of a reported tilt, and of one known only from the camera's mount.
 _REPORTED_TILT_SD = math.tan(math.radians(1.0))
 _MOUNT_TILT_SD = math.tan(math.radians(3.0))
-# Of a height, as a share: a tilted camera shows ground that is higher or lower than that below (tilt_ariel).
+# Of the height, as a share: a tilted camera shows ground that is higher or lower than that below (tilt_ariel).
 _HEIGHT_SD_SHARE = 0.13
 # Smaller corrections do not affect matches.
 _MIN_TILT_DEG = 1.0
 _MIN_TURN_DEG = 1.0
 _MIN_ZOOM_CHANGE = 0.03
-# Of a picture's footprint over the requested one. Beyond these limits too few of its pixels are left, or too little of
-# the output is filled, and the height is more likely wrong than so far from the map's.
+# Ratio of a picture's footprint to the requested one. Beyond these limits too few of its pixels are used, or too little
+# of the output is filled, and the height is more likely wrong than really so different from the map's.
 _ZOOM_LIMITS = (0.3, 4.0)
-_MIN_FILLED_SHARE = 1 / 3  # of the output area that the same picture would fill if it were taken straight down
+_MIN_FILLED_SHARE = 1 / 3  # of the output area that the picture would fill if it were taken straight down
 _MAX_HEIGHT_M = 10_000.0
-_MAX_SIDE_PX = 1024  # largest side of a warped picture: no technique uses more pixels
+_MAX_SIDE_PX = 1024  # longest side of a warped picture: no technique uses more pixels
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Constant angles by which a camera looks ahead and to the right of straight down, seen from the airframe or gimbal
-    (negative: behind, to the left)."""
+    """Fixed angles of the camera forward and to the right of straight down, relative to the airframe or gimbal
+    (negative: backward, to the left)."""
 
     ahead_deg: float = 0.0
     right_deg: float = 0.0
 
     def body_from_straight(self) -> Doubles:
-        """Return the rotation (3, 3), in the axes of the airframe, from straight down to where the camera looks."""
-        # The camera looks ahead if the airframe's nose is up, and to the right if its left wing is down.
+        """Return the rotation (3, 3), in airframe axes, from straight down to the viewing direction of the camera."""
+        # The camera looks forward if the airframe's nose is up, and to the right if its left wing is down.
         return _rotate_body_to_level(-self.right_deg, self.ahead_deg)
 
 
@@ -59,8 +59,8 @@ STRAIGHT_DOWN = Mount()
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """A camera's lens and mount. `fov_deg`: field of view across the longest side of the picture, which is undistorted
-    if there is a calibration, `calibrated`. `up_deg`: direction of the picture's top, from the nose."""
+    """A camera's lens and mount. `fov_deg`: field of view across the longest side of the picture, after undistortion if
+    the calibration `calibrated` is given. `up_deg`: direction of the picture's top, clockwise from the nose."""
 
     fov_deg: float
     up_deg: float = 0.0
@@ -73,12 +73,12 @@ class View:
     """Direction, size and offset of a picture on the ground (None: unknown).
 
     `up_deg`: compass direction (0..360) of the picture's top. `footprint_m`: ground length of its longest side.
-    `aside`: offset from the picture's middle to the point under the camera, the nadir, (right, up) in shares of the
-    longest side. `aside_sd`: standard deviation of each, by the errors of a large tilt. `zoom`: factor by which the
-    picture was enlarged; its longest side shows that many times less ground.
-    `lean_m`: that offset on the ground (east, north), of a picture that was not warped because its lens is unknown.
-    `focal`: focal length in shares of the longest side. `turned_deg`: by how much the picture was turned clockwise.
-    `reason`: why a tilted picture was not warped."""
+    `aside`: offset from the picture's middle to the nadir, the point below the camera, (right, up) in shares of the
+    longest side. `aside_sd`: standard deviation of each component due to errors of a large tilt. `zoom`: factor by
+    which the picture was enlarged; its longest side shows that many times less ground. `lean_m`: the nadir offset on
+    the ground (east, north), for a picture that was not warped because its lens is unknown. `focal`: focal length in
+    shares of the longest side. `turned_deg`: clockwise rotation that was applied to the picture. `reason`: why a tilted
+    picture was not warped."""
 
     up_deg: float | None = None
     footprint_m: float | None = None
@@ -92,12 +92,12 @@ class View:
 
     @property
     def is_georeferenced(self) -> bool:
-        """True if direction and size of the picture and the offset of the nadir are known."""
+        """True if the picture's direction and size and the nadir offset are known."""
         return None not in (self.up_deg, self.footprint_m, self.aside)
 
     @property
     def is_tilt_known(self) -> bool:
-        """True if the offset of the nadir is known, in the picture or on the ground."""
+        """True if the nadir offset is known, in the picture or on the ground."""
         return self.aside is not None or self.lean_m is not None
 
     def fields(self) -> dict[str, Any]:
@@ -134,16 +134,16 @@ def level_image(
     below: bool = False,
     scale: float = 1.0,
 ) -> LevelledImage:
-    """Warp a picture as if it had been taken straight from above. Roll, pitch, heading and height are those of the
-    frame, or else of `vehicle` (None: no report).
+    """Warp a picture as if it had been taken from straight above. Roll, pitch, heading and height are those of the
+    frame or, if unknown there, of `vehicle` (None: no report).
 
-    The warp removes roll and pitch (unknown: taken as 0), turns the picture north-up (heading unknown: not
-    turned) and scales it until its longest side shows `footprint_m` (None, or height unknown: by `scale` only). The
-    picture shows `scale` times as much ground as by the height. Its middle shows the same point as before or, with
-    `below`, the point under the camera. `overlay`, bool (H, W), is False where the picture shows no ground (None:
+    The warp removes roll and pitch (unknown: taken as 0), rotates the picture north-up (unless the heading is unknown)
+    and scales it until its longest side shows `footprint_m` (None, or height unknown: by `scale` only). `scale`: ratio
+    of the ground that the picture really shows to that computed from its height. The middle shows the same point as
+    before or, with `below`, the nadir. `overlay`, bool (H, W), is False where the picture shows no ground (None:
     nowhere). A picture of known pose is returned unchanged. One that needs no warp, or is tilted too far for one, is
-    only undistorted. Raises ImageError for a picture of another aspect ratio than the calibrated lens takes; impossible
-    values in frame or vehicle raise nothing."""
+    only undistorted. Raises ImageError if the picture's aspect ratio differs from that of the lens calibration;
+    impossible values in frame or vehicle never raise."""
     if frame.pose is not None:
         view = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
         return LevelledImage(frame.image, overlay, view)
@@ -152,7 +152,7 @@ def level_image(
         view = View(up_deg=camera.top_deg, reason=Reason(ReasonCode.TILTED, {"tilt_deg": camera.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     if below and camera.tilt_deg > MAX_TILT_UNLEVELLED_DEG and camera.heading_deg is None:
-        # The ground that it shows lies far from the aircraft, in a direction that only a match can tell.
+        # The picture shows ground far from the aircraft, in a direction that only a match can reveal.
         view = View(reason=Reason(ReasonCode.TILTED_WITHOUT_HEADING, {"tilt_deg": camera.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     image_m = camera.footprint_m and scale * camera.footprint_m
@@ -192,14 +192,14 @@ def level_image(
 
 
 def compute_level_rotation(frame: Frame, lens: Lens) -> Doubles:
-    """Return the rotation (3, 3) from the axes of the lens to those of a level picture with the same top, by roll and
-    pitch of a frame (unknown: taken as 0) and the mount of the lens."""
+    """Return the rotation (3, 3) from the axes of the lens to those of a level picture with the same top, from the roll
+    and pitch of a frame (unknown: taken as 0) and the mount of the lens."""
     return _CameraGeometry(frame, None, lens).straight
 
 
 def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> float | None:
-    """Return the ground length in metres of a picture's longest side if it were level, by the height of `frame` or else
-    of `vehicle`; None: unknown."""
+    """Return the ground length in metres of the longest side that a picture would have if it were level, from the
+    height of `frame` or, if unknown, of `vehicle`; None if unknown in both."""
     *_, height_m = _choose_attitude(frame, vehicle)
     if height_m is None or not 0 < height_m <= _MAX_HEIGHT_M:
         return None
@@ -207,8 +207,8 @@ def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> floa
 
 
 def undistort_frame(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> LevelledImage:
-    """Take the distortion of `lens` from a picture that is not warped otherwise (None: it has none). `overlay` is as
-    in `level_image`. Raises ImageError for a picture of another shape than the lens takes."""
+    """Remove the distortion of `lens` (None: it has none) from a picture that is not warped otherwise. `overlay` is as
+    in `level_image`. Raises ImageError if the picture's aspect ratio differs from that of the calibration."""
     if lens is None:
         return LevelledImage(image, overlay, view)
     height, width = image.shape[:2]
@@ -221,22 +221,22 @@ def _warp_image(image: Image, overlay: Mask | None, warp: Homography | Remap, vi
 
 
 def enlarge_image(picture: LevelledImage, zoom: float) -> LevelledImage:
-    """Enlarge a picture around its middle; its size in pixels stays."""
+    """Enlarge a picture around its middle, at the same size in pixels."""
     if zoom == 1:
         return picture
-    high_px, wide_px = picture.image.shape[:2]
-    middle = np.array([wide_px - 1, high_px - 1]) / 2
+    height_px, width_px = picture.image.shape[:2]
+    middle = np.array([width_px - 1, height_px - 1]) / 2
     matrix = np.column_stack([zoom * np.eye(2), (1 - zoom) * middle])
-    image = cv2.warpAffine(picture.image, matrix, (wide_px, high_px), borderMode=cv2.BORDER_REPLICATE)
-    shows = np.ones((high_px, wide_px), np.uint8) if picture.mask is None else picture.mask.astype(np.uint8)
-    mask = cv2.warpAffine(shows, matrix, (wide_px, high_px), flags=cv2.INTER_NEAREST) > 0
+    image = cv2.warpAffine(picture.image, matrix, (width_px, height_px), borderMode=cv2.BORDER_REPLICATE)
+    visible = np.ones((height_px, width_px), np.uint8) if picture.mask is None else picture.mask.astype(np.uint8)
+    mask = cv2.warpAffine(visible, matrix, (width_px, height_px), flags=cv2.INTER_NEAREST) > 0
     view = replace(picture.view, zoom=zoom * picture.view.zoom)
     return LevelledImage(np.asarray(image, np.uint8), None if mask.all() else mask, view)
 
 
 def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN) -> View:
     """Return the view of a picture that cannot be warped because its lens is unknown. It has only `lean_m`, or only
-    `reason` if the picture is tilted too far, or neither if too little is known. The arguments are as in `level_image`;
+    `reason` if the picture is tilted too far, or neither if too little is known. Arguments are as in `level_image`;
     impossible values never raise."""
     roll_deg, pitch_deg, heading_deg, height_m = _choose_attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
@@ -254,15 +254,15 @@ def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = S
 
 
 class _CameraGeometry:
-    """The geometry of a picture when it was taken, as far as known; with a calibrated lens, of the undistorted picture.
+    """Geometry of a picture when it was taken, as far as known; with a calibrated lens, of the undistorted picture.
 
     Rotation matrices are (3, 3). Their axes are those of the lens (right and down in the picture, viewing direction),
     of the airframe (nose, right, down), and of the level picture (right, down in the picture, to the ground).
-    `straight`: rotation from lens to level picture without a turn. `tilt_deg`: angle between the viewing direction and
-    straight down; `is_too_tilted` for a warp. `top_deg`: compass direction of the picture's top. `footprint_m`: ground
-    length of the longest side if the picture were level. `corners` (3, n): those of the part of the picture that goes
-    down enough, homogeneous pixels. `is_tilt_known`: by a reported attitude or, within some degrees, by the mount
-    alone."""
+    `straight`: rotation from lens to level picture without a turn about the vertical. `tilt_deg`: angle between the
+    viewing direction and straight down; `is_too_tilted`: it is too large for a warp. `top_deg`: compass direction of
+    the picture's top. `footprint_m`: ground length of the longest side if the picture were level. `corners` (3, n):
+    corners of the usable part of the picture, whose rays point down enough, in homogeneous pixels. `is_tilt_known`:
+    from a reported attitude or, within a few degrees, from the mount alone."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
         roll_deg, pitch_deg, self.heading_deg, _ = _choose_attitude(frame, vehicle)
@@ -291,8 +291,8 @@ class _CameraGeometry:
         self.top_deg = None if self.heading_deg is None else (self.heading_deg + lens.up_deg) % 360
 
     def warp(self, out_from_ray: Doubles, out_px: float, side: int) -> Homography | Remap:
-        """Return the warp to (side, side) pixels by the homography `out_from_ray` (3, 3) from rays to pixels of an
-        output of the focal length `out_px`."""
+        """Return the warp to (side, side) pixels. `out_from_ray`: homography (3, 3) from rays to pixels of the output,
+        whose focal length is `out_px` pixels."""
         if self._sight:
             return self._sight.make_remap(out_from_ray, out_px, (side, side))
         return Homography(out_from_ray @ self.lens_from_pixel, self.corners, side, self.focal_px / out_px)
@@ -310,7 +310,7 @@ class _CameraGeometry:
 
     def aside_sd(self, zoom: float) -> float:
         """Return `View.aside_sd` after scaling by `zoom`. An error of a tilt t moves the nadir by 1 + tan(t)^2 times
-        the height; the 1 of a reported tilt is part of the errors of all positions."""
+        the height; for a reported tilt, the 1 is already part of the error of every position."""
         if not self.is_tilt_known:
             return 0.0
         tangent, focal = math.tan(math.radians(self.tilt_deg)), zoom * self.focal_px / self.longest_px
@@ -320,14 +320,14 @@ class _CameraGeometry:
 
 
 def _choose_attitude(frame: Frame, vehicle: Vehicle | None) -> Iterator[float | None]:
-    """Yield roll, pitch, heading (degrees) and height (m): each of the frame, else of the vehicle, else None."""
+    """Yield roll, pitch, heading (degrees) and height (m): each from the frame, else from the vehicle, else None."""
     for name in ("roll_deg", "pitch_deg", "heading_deg", "height_m"):
         values = (getattr(frame, name), getattr(vehicle, name, None))
         yield next((value for value in values if value is not None and math.isfinite(value)), None)
 
 
 def _rotate_body_to_level(roll_deg: float, pitch_deg: float) -> Doubles:
-    """Return the rotation (3, 3) of the airframe's axes (nose, right, down) to those of a level one."""
+    """Return the rotation (3, 3) from the airframe's axes (nose, right, down) to those of a level airframe."""
     roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)
     about_right = [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]]
     about_nose = [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]]
@@ -335,6 +335,6 @@ def _rotate_body_to_level(roll_deg: float, pitch_deg: float) -> Doubles:
 
 
 def _rotate_lens_to_body(up_deg: float) -> Doubles:
-    """Return the rotation (3, 3) of the axes of a camera that looks straight down to those of the airframe."""
+    """Return the rotation (3, 3) from the axes of a camera that looks straight down to those of the airframe."""
     up = math.radians(up_deg)
     return np.array([[-math.sin(up), -math.cos(up), 0], [math.cos(up), -math.sin(up), 0], [0, 0, 1]])

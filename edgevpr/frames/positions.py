@@ -1,5 +1,5 @@
-"""Tables of positions in CSV: position, attitude and time of each image of a folder (positions.csv), or of a video at
-given seconds. The sources of frames read them. `where` in this module is "FILE, line N" for error messages."""
+"""Tables of positions in CSV: position, attitude and time of each image of a folder (positions.csv), or of a video by
+video time. The sources of frames read them. In this module, `where` is "FILE, line N" for error messages."""
 
 import csv
 import io
@@ -18,7 +18,7 @@ from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.types import Position
 
 ALT_LIMITS_M = (-1000.0, 100_000.0)  # plausible altitudes
-# Each column of numbers with its limits. heading_deg takes precedence over yaw_deg, and height_m over rel_alt.
+# Numeric columns with their limits. heading_deg takes precedence over yaw_deg, and height_m over rel_alt.
 _COLUMN_LIMITS = {
     "lat": (-90.0, 90.0),
     "lon": (-180.0, 180.0),
@@ -34,18 +34,18 @@ _TAG_COLUMNS = ("lat", "lon", "alt", "yaw_deg", "roll_deg", "pitch_deg", "height
 _NEEDED_COLUMNS = ("file", "lat", "lon")
 _TRACK_COLUMNS = ("time", "lat", "lon")
 _MAX_FILE_BYTES = 100_000_000  # a million images
-# The years 1900 to 2200. A time in milliseconds, a thousand times too large, lies outside.
+# The years 1900 to 2200. A time in milliseconds, a thousand times too large, is out of range.
 _MIN_TIME_S = -2_208_988_800
 _MAX_TIME_S = 7_258_118_400
-MAX_GAP_S = 5.0  # no interpolation between positions further apart: the aircraft may have turned
-_TIME_ROUNDING_S = 0.001  # Matroska counts in milliseconds
-_ANGLE_INDICES = [1, 3, 4]  # in `_to_numbers`, of angles of a full turn
+MAX_GAP_S = 5.0  # no interpolation across longer gaps: the aircraft may have turned
+_TIME_ROUNDING_S = 0.001  # Matroska stores milliseconds
+_ANGLE_INDICES = [1, 3, 4]  # of the angles that wrap at 360 degrees, in `_to_numbers`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GeoTag:
-    """Position, heading and time (seconds since 1970) of an image, and roll, pitch and height above the ground, as
-    defined by `Frame`. None: unknown."""
+    """Position, heading, time (seconds since 1970), roll, pitch and height above ground of an image, as defined by
+    `Frame`. None: unknown."""
 
     position: Position | None = None
     heading_deg: float | None = None
@@ -63,29 +63,29 @@ def find_positions(folder: str | Path) -> Path | None:
 
 
 def find_track(video: str | Path) -> Path | None:
-    """Return the path of the table of positions beside a video, of the same name and .csv, or None."""
+    """Return the path of the table of positions beside a video (same name, ending .csv), or None."""
     table = Path(video).with_suffix(".csv")
     return table if table.is_file() else None
 
 
 def read_positions(csv_path: str | Path) -> dict[str, GeoTag]:
-    """Read a positions.csv. Returns the data of each image by its file name.
+    """Read a positions.csv. Returns the tag of each image by file name.
 
     Columns: file, lat, lon (degrees) and, optionally, alt (m), heading_deg or yaw_deg, time, roll_deg (right wing down
-    is positive), pitch_deg (nose up), and height_m above the ground or rel_alt (DJI's, over the take-off point). All
-    cells but the name may be empty; other columns are ignored. Raises UsageError for a file that cannot be read, and
-    for a wrong value, with its line."""
+    is positive), pitch_deg (nose up), and height_m above the ground or rel_alt (DJI: above the take-off point). All
+    cells except the name may be empty; other columns are ignored. Raises UsageError for a file that cannot be read, and
+    for an invalid value, with its line."""
     return {row["file"]: _parse_tag(row, where) for where, row in _read_rows(csv_path)}
 
 
 def write_positions(csv_path: str | Path, tags: Mapping[str, GeoTag]) -> None:
-    """Write a positions.csv of `tags` by file name. `read_positions` gives exactly the same tags back."""
+    """Write `tags`, by file name, to a positions.csv. `read_positions` returns exactly the same tags."""
     rows = [(name, *_to_numbers(tag), tag.t_utc_s) for name, tag in tags.items()]
     _write_table(csv_path, ("file", *_TAG_COLUMNS, "time"), rows)
 
 
 def write_track(csv_path: str | Path, track: "Track") -> None:
-    """Write the table of positions of a video. `read_track` gives exactly the same track back."""
+    """Write the table of positions of a video. `read_track` returns exactly the same track."""
     rows = ((t_s, *_to_numbers(tag)) for t_s, tag in zip(track.t_s, track.tags, strict=True))
     _write_table(csv_path, ("time", *_TAG_COLUMNS), rows)
 
@@ -106,8 +106,8 @@ def _to_numbers(tag: GeoTag) -> tuple[Any, ...]:
 
 
 def _read_rows(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) -> list[tuple[str, dict[str, str]]]:
-    """Read the rows of a table with the columns `needed`: "FILE, line N" and the values as text by column name of each.
-    If `file` is one of `needed`, file names must be unique. Raises UsageError as `read_positions` does."""
+    """Read the rows of a table that must have the columns `needed`. Returns "FILE, line N" and the cells by column name
+    of each row. If `file` is needed, file names must be unique. Raises UsageError as `read_positions` does."""
     try:
         text = read_file(csv_path, _MAX_FILE_BYTES).decode("utf-8-sig")
         table = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
@@ -120,29 +120,29 @@ def _read_rows(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) ->
     for name in (*needed, *_COLUMN_LIMITS, "time"):
         if header.count(name) > 1 or (name in needed and name not in header):
             raise UsageError(
-                f"{csv_path}, line 1 has no column `{name}`, or two: it must name {', '.join(needed)} once each, "
-                "separated by commas."
+                f"{csv_path}: line 1 must name each of the columns {', '.join(needed)} exactly once, separated by "
+                f"commas; `{name}` is missing or repeated."
             )
     records, names = [], {""}
     for where, row in rows:
-        if None in row or None in row.values():  # DictReader's sign of too many values, and of too few
-            raise UsageError(f"{where} has another number of values than line 1 has columns: correct it.")
+        if None in row or None in row.values():  # how DictReader marks too many values, and too few
+            raise UsageError(f"{where} does not have as many values as line 1 has columns: correct it.")
         record = {name: value.strip() for name, value in row.items()}
         if "file" in needed and record["file"] in names:
-            raise UsageError(f"{where} names no image, or that of an earlier line (`{record['file']}`): correct it.")
+            raise UsageError(f"{where} has no image name, or repeats an earlier one (`{record['file']}`): correct it.")
         names.add(record.get("file", ""))
         records.append((where, record))
     return records
 
 
 def _parse_tag(row: Mapping[str, str], where: str) -> GeoTag:
-    """Convert a table's row (text by column name) to a GeoTag. Raises UsageError for a wrong value."""
+    """Convert a row (cells by column name) to a GeoTag. Raises UsageError for an invalid value."""
     values = {column: _parse_number(row, column, *limits, where) for column, limits in _COLUMN_LIMITS.items()}
     lat_deg, lon_deg, position = values["lat"], values["lon"], None
     if lat_deg is not None and lon_deg is not None:
         position = make_position(lat_deg, lon_deg, values["alt"])
     elif lat_deg is not None or lon_deg is not None:
-        raise UsageError(f"{where} has only one of lat and lon: write both, or leave both empty.")
+        raise UsageError(f"{where} has only one of lat and lon: give both, or leave both empty.")
     heading_deg = values["yaw_deg"] if values["heading_deg"] is None else values["heading_deg"]
     return GeoTag(
         position=position,
@@ -155,13 +155,13 @@ def _parse_tag(row: Mapping[str, str], where: str) -> GeoTag:
 
 
 def make_position(lat_deg: float, lon_deg: float, alt_m: float | None) -> Position | None:
-    """Make a position; return None for exactly (0, 0), which a receiver without a fix writes."""
+    """Make a position, or return None for exactly (0, 0), which a receiver without a fix writes."""
     return None if lat_deg == lon_deg == 0 else Position(lat_deg, lon_deg, alt_m)
 
 
 def _parse_number(row: Mapping[str, str], column: str, low: float, high: float, where: str) -> float | None:
     """Return the number in `column` of a row; None if the cell is empty or missing. Raises UsageError for text that is
-    no number from `low` to `high`."""
+    not a number from `low` to `high`."""
     if not (text := row.get(column)):
         return None
     try:
@@ -185,44 +185,44 @@ def _parse_time_cell(row: Mapping[str, str], where: str) -> float | None:
 
 
 def parse_time(text: str) -> float:
-    """Convert a time to seconds since 1970 (UTC): `2016:06:23 16:31:59` (EXIF), ISO 8601, or seconds; without a zone it
-    is UTC. Raises ValueError for any other text, and for a time outside 1900 to 2200."""
+    """Convert a time to seconds since 1970 (UTC): `2016:06:23 16:31:59` (EXIF), ISO 8601, or seconds. A time without a
+    zone is UTC. Raises ValueError for any other text, and for a year outside 1900 to 2200."""
     try:
         seconds = float(text)
     except ValueError:
         if text[4:5] == text[7:8] == ":":
             text = text.replace(":", "-", 2)
-        moment = datetime.fromisoformat(text.replace("Z", "+00:00"))  # Python 3.10 does not know Z
+        moment = datetime.fromisoformat(text.replace("Z", "+00:00"))  # Python 3.10 does not accept Z
         seconds = (moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)).timestamp()
     if not _MIN_TIME_S <= seconds < _MAX_TIME_S:  # false for NaN too
-        raise ValueError(f"{text} is no time between 1900 and 2200")
+        raise ValueError(f"{text} is not a time between 1900 and 2200")
     return seconds
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Positions and attitudes along a video. `t_s`: seconds from its first frame, ascending. `tags`: the data at each,
-    all with a position. `path`: the table's file, for messages."""
+    """Positions and attitudes over time. `t_s`: seconds from the first frame of a video, ascending. `tags`: the tag at
+    each time, all with a position. `path`: the table's file, for messages."""
 
     path: Path
     t_s: tuple[float, ...]
     tags: tuple[GeoTag, ...]
 
     def interpolate_tag(self, t_s: float) -> GeoTag:
-        """Return position, attitude and height at the video time `t_s`, interpolated linearly between the two table
-        rows around it. The tag is empty outside the table, and if these rows are more than `MAX_GAP_S` apart."""
+        """Return position, attitude and height at the video time `t_s`, interpolated linearly between the rows before
+        and after it. The tag is empty outside the table, and if these rows are more than `MAX_GAP_S` apart."""
         nearest = int(np.abs(np.subtract(self.t_s, t_s)).argmin())
         if abs(self.t_s[nearest] - t_s) <= _TIME_ROUNDING_S:
             return self.tags[nearest]
         after = int(np.searchsorted(self.t_s, t_s))
         if not 0 < after < len(self.t_s) or self.t_s[after] - self.t_s[after - 1] > MAX_GAP_S:
             return GeoTag()
-        one, other = (np.array(_to_numbers(tag), float) for tag in self.tags[after - 1 : after + 1])  # NaN: unknown
-        way = other - one
-        way[_ANGLE_INDICES] = wrap_deg(way[_ANGLE_INDICES])
+        earlier, later = (np.array(_to_numbers(tag), float) for tag in self.tags[after - 1 : after + 1])  # NaN: unknown
+        change = later - earlier
+        change[_ANGLE_INDICES] = wrap_deg(change[_ANGLE_INDICES])
         share = (t_s - self.t_s[after - 1]) / (self.t_s[after] - self.t_s[after - 1])
-        between: list[Any] = [None if math.isnan(number) else number for number in (one + share * way).tolist()]
-        lat_deg, lon_deg, alt_m, heading_deg, roll_deg, pitch_deg, height_m = between
+        numbers: list[Any] = [None if math.isnan(number) else number for number in (earlier + share * change).tolist()]
+        lat_deg, lon_deg, alt_m, heading_deg, roll_deg, pitch_deg, height_m = numbers
         return GeoTag(
             position=Position(lat_deg, wrap_deg(lon_deg), alt_m),
             heading_deg=None if heading_deg is None else heading_deg % 360,
@@ -233,18 +233,18 @@ class Track:
 
     def require_overlap(self, video: Path, lasts_s: float) -> None:
         """Raise UsageError if the times of the table and of the video, which lasts `lasts_s` seconds, do not overlap.
-        `video` is its path, for the message."""
+        `video`: its path, for the message."""
         if self.t_s[-1] < -_TIME_ROUNDING_S or self.t_s[0] > lasts_s:
             raise UsageError(
-                f"{self.path} has positions from {self.t_s[0]:.1f} to {self.t_s[-1]:.1f} s, and {video} lasts from 0 "
-                f"to {lasts_s:.1f} s: write `time` in seconds from its first frame."
+                f"{self.path} has positions from {self.t_s[0]:.1f} to {self.t_s[-1]:.1f} s, but {video} lasts from 0 "
+                f"to {lasts_s:.1f} s: give `time` in seconds from the first frame of the video."
             )
 
 
 def read_track(csv_path: str | Path) -> Track:
     """Read the table of positions of a video: the columns time (seconds from its first frame, ascending), lat, lon and,
     optionally, those of a positions.csv. Rows without a position are ignored. Raises UsageError for a file that cannot
-    be read, a wrong value, and a table without any position."""
+    be read, an invalid value, and a table without any position."""
     tags: dict[float, GeoTag] = {}
     for where, row in _read_rows(csv_path, _TRACK_COLUMNS):
         tag = _parse_tag(row, where)
@@ -252,10 +252,10 @@ def read_track(csv_path: str | Path) -> Track:
             continue
         if tag.t_utc_s is None or (tags and tag.t_utc_s <= next(reversed(tags))):
             raise UsageError(
-                f"{where} has no time, or one that is not after that of the line before: write the seconds from the "
-                "first frame of the video, one line for each."
+                f"{where} has no time, or one that is not later than that of the line before: give the seconds from "
+                "the first frame of the video, in ascending order."
             )
         tags[tag.t_utc_s] = replace(tag, t_utc_s=None)
     if not tags:
-        raise UsageError(f"{csv_path} has no line with time, lat and lon: the positions of a video need them.")
+        raise UsageError(f"{csv_path} has no line with time, lat and lon: write one for each position of the video.")
     return Track(Path(csv_path), tuple(tags), tuple(tags.values()))

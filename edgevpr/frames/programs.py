@@ -1,9 +1,9 @@
-"""Cameras that are read by a program of the system. `rpicam`, or `rpicam:1` for the second one, is a Raspberry Pi's
-ribbon-cable camera, read by rpicam-vid; `gst: PIPELINE` is whatever GStreamer can read, by gst-launch-1.0.
+"""Cameras that a system program reads. `rpicam`, or `rpicam:1` for the second one, is a Raspberry Pi's ribbon-cable
+camera, read with rpicam-vid; `gst: PIPELINE` is anything that GStreamer can read, with gst-launch-1.0.
 
 The program sends MJPEG over loopback, which is read like any stream, with the same timeouts. So the flight loads no
-camera library, and a camera that hangs does not stop it. The program ends with the thread that started it (setpriv),
-whatever ends that thread: a leftover program would keep the camera."""
+camera library, and a camera that hangs does not stop it. The program dies with the thread that started it (setpriv),
+however that thread ends: a leftover program would block the camera."""
 
 import logging
 import re
@@ -31,29 +31,29 @@ _PACKAGES = {
     _GSTREAMER: "gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-good",
 }
 _ADVICE = {
-    _RPICAM: "run `rpicam-hello --list-cameras` to see whether the camera is found and in use",
-    _GSTREAMER: "run `gst-launch-1.0 -v` with the pipeline to see why, and let it end with raw video (video/x-raw)",
+    _RPICAM: "run `rpicam-hello --list-cameras` to see whether the camera is detected and in use",
+    _GSTREAMER: "run `gst-launch-1.0 -v` with the pipeline to see why, and end it with raw video (video/x-raw)",
 }
-# For this size the usual sensors (OV5647, IMX219, IMX477, IMX708) read all of their pixels, binned. For a smaller size
-# some read only the middle, and see less.
+# At this size the usual sensors (OV5647, IMX219, IMX477, IMX708) read out all of their pixels, binned. At a smaller
+# size some crop to the middle and see less.
 _SIZE_PX = (1280, 960)
 _RATE_HZ = 10
 _QUALITY = 90
-_APPSINK_PATTERN = re.compile(r"!\s*appsink\b[^!]*$")  # as pipelines for OpenCV end
-_MAX_QUEUED_PICTURES = 10  # for a reader that does not read: older ones are dropped
-# From the start to the first picture. A camera takes a second or two; a search of GStreamer for plugins, or a sensor
-# behind several drivers, 10 s or more on a small board. A program ended too early starts as slowly again.
+_APPSINK_PATTERN = re.compile(r"!\s*appsink\b[^!]*$")  # at the end of pipelines for OpenCV
+_MAX_QUEUED_PICTURES = 10  # if the reader does not keep up, older ones are dropped
+# From the start to the first picture. A camera needs a second or two; GStreamer's scan for plugins, or a sensor behind
+# several drivers, needs 10 s or more on a small board. A program stopped too early is as slow the next time.
 _FIRST_PICTURE_TIMEOUT_S = 60.0
 _POLL_PERIOD_S = 0.2
 _TERMINATE_TIMEOUT_S = 2.0
-_STDERR_LINES = 20  # the last ones are kept
-_STDERR_CHARS = 160  # a longer line explains nothing in a status
+_STDERR_LINES = 20  # the last of them are kept
+_STDERR_CHARS = 160  # a longer line is no help in a status
 _log = logging.getLogger(__name__)
 
 
 def require_program(uri: str) -> str:
-    """Return the path of the system's program that reads this camera. Raises SourceError if it is not installed, or if
-    `uri` is no pipeline."""
+    """Return the path of the system program that reads this camera. Raises SourceError if it is not installed, or if
+    `uri` is not a pipeline."""
     name = _choose_program(uri)
     if name == _GSTREAMER:
         _split_pipeline(uri)
@@ -66,8 +66,8 @@ def require_program(uri: str) -> str:
 
 
 def open_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
-    """Start the program for the camera `uri`, connect to it, and wait for its first picture while it runs, at most a
-    minute. `clock` is the monotonic clock, in seconds. Raises OpeningError if no picture comes."""
+    """Start the program for the camera `uri`, connect to it, and wait at most a minute for its first picture while it
+    runs. `clock` is the monotonic clock, in seconds. Raises OpeningError if no picture arrives."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -82,15 +82,15 @@ def open_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
     end_s = time.monotonic() + _FIRST_PICTURE_TIMEOUT_S
     while process.poll() is None and (left_s := end_s - time.monotonic()) > 0:
         with suppress(OpeningError):
-            # A pipeline may read a stream.
+            # A pipeline may read a stream, which has a hidden delay.
             delay_sd_s = HIDDEN_DELAY_SD_S if uri.startswith("gst:") else FRAME_TIME_SD_S
             stream = open_raw(f"tcp://127.0.0.1:{port}", clock, "mjpeg", left_s, delay_sd_s)
             if time.monotonic() < end_s:
                 return ProgramCapture(stream, process)
-            stream.release()  # FFmpeg calls a stream open after its timeout, even without a picture
+            stream.release()  # FFmpeg reports a stream as open after its timeout, even without a picture
         time.sleep(_POLL_PERIOD_S)
     exit_code = process.poll()
-    _log.warning("%s gives no picture: %s", uri, _ADVICE[name])
+    _log.warning("%s delivers no picture: %s", uri, _ADVICE[name])
     _terminate(process)
     if exit_code is None:
         raise OpeningError(f"no picture from {name} in {_FIRST_PICTURE_TIMEOUT_S:g} s")
@@ -98,7 +98,7 @@ def open_program(uri: str, clock: Callable[[], float]) -> "ProgramCapture":
 
 
 class ProgramCapture:
-    """The pictures of a camera that `process` reads and sends: a `Capture`."""
+    """The pictures that `process` reads from a camera and sends: a `Capture`."""
 
     def __init__(self, stream: StreamCapture, process: "subprocess.Popen[bytes]") -> None:
         self._stream, self._process = stream, process
@@ -116,7 +116,7 @@ class ProgramCapture:
 
 
 class ErrorLines:
-    """The last lines that a program writes to stderr, read by a thread: a program whose pipe is full hangs."""
+    """The last lines that a program writes to stderr. A thread reads them: a program whose pipe is full hangs."""
 
     def __init__(self, process: "subprocess.Popen[bytes]") -> None:
         self._process = process
@@ -125,7 +125,7 @@ class ErrorLines:
         self._thread.start()
 
     def explain_exit(self) -> str:
-        """Return the line that best explains why the program ended, after a colon; "" if there is none."""
+        """Return ": " and the line that best explains why the program ended; "" if there is none."""
         self._thread.join(_POLL_PERIOD_S)
         lines = [line.decode(errors="replace").strip() for line in list(self._lines)]
         lines = [line for line in lines if 0 < len(line) <= _STDERR_CHARS]
@@ -145,7 +145,7 @@ def _choose_program(uri: str) -> str:
 def _make_rpicam_command(uri: str, port: int) -> list[str]:
     """Return the command that sends the pictures of a ribbon-cable camera to the first client at `port`."""
     return [
-        *("setpriv", "--pdeathsig", "KILL"),  # with our thread; it has nothing to close
+        *("setpriv", "--pdeathsig", "KILL"),  # when our thread ends; the program has nothing to close
         *(require_program(uri), "--camera", uri.partition(":")[2] or "0", "--timeout", "0", "--nopreview"),
         *("--verbose", "0", "--codec", "mjpeg", "--quality", str(_QUALITY), "--framerate", str(_RATE_HZ)),
         *("--width", str(_SIZE_PX[0]), "--height", str(_SIZE_PX[1])),
@@ -154,19 +154,19 @@ def _make_rpicam_command(uri: str, port: int) -> list[str]:
 
 
 def _make_gstreamer_command(uri: str, port: int) -> list[str]:
-    """Return the command that sends the pictures of a pipeline to all clients at `port`. It does not end with them."""
+    """Return the command that sends the pictures of a pipeline to all clients at `port`. It runs on without them."""
     sink = f"sync=false buffers-soft-max={_MAX_QUEUED_PICTURES} recover-policy=latest host=127.0.0.1 port={port}"
     encoder = f"! videoconvert ! jpegenc quality={_QUALITY} ! tcpserversink {sink}"
-    guard = "setpriv", "--pdeathsig", "TERM"  # with our thread; on this signal it closes its camera
+    guard = "setpriv", "--pdeathsig", "TERM"  # when our thread ends; on this signal the program closes its camera
     return [*guard, require_program(uri), "-q", *_split_pipeline(uri), *encoder.split()]
 
 
 def _split_pipeline(uri: str) -> list[str]:
-    """Split a pipeline, without an appsink, into words. Raises SourceError if it is empty or a quote is not closed."""
+    """Split a pipeline into words, without a final appsink. Raises SourceError if it is empty or a quote is open."""
     with suppress(ValueError):
         if words := shlex.split(_APPSINK_PATTERN.sub("", uri.removeprefix("gst:"))):
             return words
-    raise SourceError(f"`{uri}` is no pipeline: write one as for gst-launch-1.0 after `gst:`, and close all quotes.")
+    raise SourceError(f"`{uri}` is not a pipeline: write it as for gst-launch-1.0, after `gst:`, and close all quotes.")
 
 
 def _terminate(process: "subprocess.Popen[bytes]") -> None:

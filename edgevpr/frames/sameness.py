@@ -1,9 +1,9 @@
-"""Tells whether two pictures show the same, unmoved, whatever noise, clock or display they carry. (Exactly equal
-pictures are found by `shot.RepeatDetector`, before they are decoded in full.)
+"""Detects whether two pictures show the same unmoved scene, regardless of noise and on-screen clock or display.
+(`shot.RepeatDetector` finds exactly equal pictures before they are fully decoded.)
 
-Coarse copies are compared block by block. The texture of a block determines by how much its correlation falls if the
-picture moves by 1.5 of their pixels in any direction; a block that lost less has not moved. So no limit is needed for
-the kind of ground or its contrast. Blocks whose texture cannot show every motion, such as furrows, are not used."""
+Coarse copies are compared block by block. The texture of a block determines by how much its correlation drops if the
+picture moves by 1.5 of their pixels in any direction; a block with a smaller drop has not moved. So no threshold
+depends on the kind of ground or its contrast. Blocks that cannot show every motion, such as furrows, are not used."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,12 +13,12 @@ import numpy as np
 
 from edgevpr.core.arrays import Array, Bools, Image, Singles
 
-_SIZE_PX = (128, 96)  # of a coarse copy, columns and rows
+_SIZE_PX = (128, 96)  # columns and rows of a coarse copy
 _BLOCK_PX = 16
-_MIN_TEXTURE_LEVELS = 2.5  # standard deviation of a block, grey levels; noise of a dark picture has less
+_MIN_TEXTURE_LEVELS = 2.5  # standard deviation of a block, grey levels; the noise of a dark picture is lower
 _MOTION_PX = 1.5
-_MIN_LOSS = 0.05  # of correlation by that motion: less may be the noise of a compressed picture
-_MAX_READ_COLUMNS = 640  # that are averaged, of a larger picture
+_MIN_LOSS = 0.05  # of correlation through that motion: a smaller loss may be compression noise
+_MAX_READ_COLUMNS = 640  # columns to average; a larger picture is subsampled first
 _THUMBNAIL_PX = (16, 12)
 BLOCK_COUNT = _SIZE_PX[0] // _BLOCK_PX * (_SIZE_PX[1] // _BLOCK_PX)
 
@@ -31,7 +31,7 @@ class CoarsePicture:
 
     @cached_property
     def blocks(self) -> Singles:
-        """Its blocks, float32 (48, 256), each without its mean and of length 1; of length 0 without texture."""
+        """Blocks, float32 (48, 256), each minus its mean and normalised to length 1; zero if without texture."""
         blocks = _cut_blocks(self.grey)
         blocks = blocks - blocks.mean(axis=1, keepdims=True)
         length = np.linalg.norm(blocks, axis=1, keepdims=True)
@@ -40,15 +40,15 @@ class CoarsePicture:
 
     @cached_property
     def thumb(self) -> Singles:
-        """A still coarser copy, float32 (192,), without its mean and of length 1."""
+        """An even coarser copy, float32 (192,), minus its mean and normalised to length 1."""
         small = cv2.resize(self.grey.astype(np.float32), _THUMBNAIL_PX, interpolation=cv2.INTER_AREA).ravel()
         small -= small.mean()
         return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6), np.float32)
 
     @cached_property
     def min_loss(self) -> Singles:
-        """Loss of correlation of each block, float32 (48,), if the picture moves by 1.5 pixels in the direction that
-        shows it least: from the smallest eigenvalue of the block's structure tensor."""
+        """Loss of correlation of each block, float32 (48,), if the picture moves by 1.5 pixels in the least visible
+        direction: from the smallest eigenvalue of the block's structure tensor."""
         dx, dy = (_cut_blocks(cv2.Sobel(self.grey, cv2.CV_32F, 1 - axis, axis, ksize=1) / 2) for axis in (0, 1))
         xx, yy, xy = (dx * dx).sum(axis=1), (dy * dy).sum(axis=1), (dx * dy).sum(axis=1)
         eigenvalue = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
@@ -58,17 +58,17 @@ class CoarsePicture:
 
     @cached_property
     def is_textured(self) -> Bools:
-        """True for each block whose texture would show a motion, bool (48,)."""
+        """True for each block whose texture reveals any motion, bool (48,)."""
         return np.asarray(self.blocks.any(axis=1) & (self.min_loss > _MIN_LOSS))
 
     def find_unmoved_blocks(self, other: "CoarsePicture") -> Bools:
-        """Return True for each textured block that shows the same in the other picture, unmoved: bool (48,)."""
+        """Return True for each textured block that is unmoved in the other picture, bool (48,)."""
         loss = 1 - (self.blocks * other.blocks).sum(axis=1)
         return np.asarray(self.is_textured & (loss < self.min_loss))
 
 
 def make_coarse(image: Image) -> CoarsePicture:
-    """Return the coarse copy of a picture, uint8 (H, W) grey or (H, W, 3) BGR, of which green is taken."""
+    """Return the coarse copy of a picture, uint8 (H, W) grey or (H, W, 3) BGR; of BGR, the green channel is used."""
     step = max(1, image.shape[1] // _MAX_READ_COLUMNS)
     plane = np.ascontiguousarray((image if image.ndim == 2 else image[:, :, 1])[::step, ::step])
     return CoarsePicture(np.asarray(cv2.resize(plane, _SIZE_PX, interpolation=cv2.INTER_AREA), np.uint8))

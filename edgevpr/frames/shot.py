@@ -1,7 +1,7 @@
 """Pictures of a camera or stream (`Shot`), their source (`Capture`), and the detection of repeats (`RepeatDetector`).
 
-A decoder that fills lost parts from older pictures, and a camera that hangs, do not always report it. But the camera's
-noise makes all new pictures differ. They are compared by coarse grey copies, in bands of rows."""
+A decoder that fills lost parts from older pictures, and a camera that hangs, do not always report it. But noise makes
+every new picture of a camera different. Coarse grey copies of the pictures are compared in bands of rows."""
 
 from collections import deque
 from collections.abc import Callable
@@ -19,21 +19,21 @@ Plane = TypeVar("Plane", bound=NDArray[Any])
 
 _MIN_THUMBNAIL_PX = (60, 80)  # rows and columns of a coarse copy
 _BANDS = 12
-_HISTORY_PICTURES = 6  # decoders use about as many buffers in rotation
+_HISTORY_PICTURES = 6  # decoders rotate through about as many buffers
 # Bands are equal if this share of their pixels differs by at most this many grey levels.
 _MIN_EQUAL_SHARE = 0.99
 _MAX_EQUAL_LEVELS = 1
-_MIN_TEXTURE_LEVELS = 8.0  # least standard deviation of a band with enough texture to be judged, in grey levels
-_MIN_CHANGE_LEVELS = 3.0  # mean difference, in grey levels, of a band that has certainly changed
+_MIN_TEXTURE_LEVELS = 8.0  # in grey levels: bands with a smaller standard deviation are not judged
+_MIN_CHANGE_LEVELS = 3.0  # in grey levels: a band with a larger mean difference has certainly changed
 _MIN_BANDS = 2
 _LEARNING_PICTURES = 8  # time constant of the share of pictures in which a band changed
 _MIN_CHANGE_SHARE = 0.75  # a band that changed in a smaller share of pictures is not judged
 
 
 class Condition(Enum):
-    """The condition of a source. OPENING: no picture has come yet. RUNNING: new and complete pictures come. DAMAGED: no
-    picture is complete. LATE: their age is unknown. FROZEN: the same picture comes again and again. LOST: no picture
-    comes, and the source is being reopened. ENDED: no more will come."""
+    """The condition of a source. OPENING: no picture has arrived yet. RUNNING: new and complete pictures arrive.
+    DAMAGED: no picture is complete. LATE: the age of pictures is unknown. FROZEN: the same picture arrives again and
+    again. LOST: no picture arrives, and the source is being reopened. ENDED: no more pictures will come."""
 
     OPENING = auto()
     RUNNING = auto()
@@ -45,10 +45,10 @@ class Condition(Enum):
 
 
 class Refusal(Enum):
-    """The reason why a picture is rejected. DAMAGED: it is incomplete, or was decoded by means of an incomplete one.
-    PATCHED: parts of it are copies from an older picture. FROZEN: it equals the picture before. LATE: its age is
-    unknown, because it was buffered before the source was opened, arrived out of order, or has a wrong time stamp; or
-    it was skipped because decoding lags behind."""
+    """The reason why a picture is rejected. DAMAGED: it is incomplete, or was decoded from an incomplete one. PATCHED:
+    parts of it are copies from an older picture. FROZEN: it equals the previous picture. LATE: its age is unknown
+    because it was buffered before the source was opened, arrived out of order or has a bad time stamp; or it was
+    skipped because decoding lags behind."""
 
     DAMAGED = "damaged"
     PATCHED = "patched"
@@ -58,10 +58,10 @@ class Refusal(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shot:
-    """A complete picture. `t_mono_s`: when it was taken, at most its arrival (seconds of the monotonic clock).
-    `t_sd_s`: standard deviation of that. `delay_sd_s`: that of the usual hidden delay of such a camera, in addition.
-    `thumbnail`: coarse grey copy, uint8 (h, w). `convert`: returns the pixels of a picture that is used, uint8 (H, W,
-    3) BGR or (H, W) grey."""
+    """A complete picture. `t_mono_s`: when it was taken, not later than its arrival (seconds of the monotonic clock).
+    `t_sd_s`: standard deviation of `t_mono_s`. `delay_sd_s`: standard deviation of the hidden delay that such cameras
+    usually have, in addition. `thumbnail`: coarse grey copy, uint8 (h, w). `convert`: called for pictures that are
+    used, returns their pixels, uint8 (H, W, 3) BGR or (H, W) grey."""
 
     t_mono_s: float
     thumbnail: Image
@@ -71,13 +71,13 @@ class Shot:
 
 
 class OpeningError(Exception):
-    """A camera or stream cannot be opened now. The text names the cause in a few words, for `Source.state`."""
+    """A camera or stream cannot be opened now. The text gives the cause in a few words, for `Source.state`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamFacts:
-    """A stream's own description of its pictures. `pixel_aspect`: width of a pixel by its height. `rate_hz`: None if
-    not stated."""
+    """A stream's own description of its pictures. `pixel_aspect`: width of a pixel divided by its height. `rate_hz`:
+    None if not stated."""
 
     width_px: int
     height_px: int
@@ -88,36 +88,36 @@ class StreamFacts:
 
     def __str__(self) -> str:
         shape = "square pixels" if self.pixel_aspect == 1 else f"pixels {self.pixel_aspect:.3g} times as wide as high"
-        rate = f", {self.rate_hz:.3g} pictures a second" if self.rate_hz else ""
-        return f"{self.codec}, {self.bits} bits a channel, {shape}{rate}"
+        rate = f", {self.rate_hz:.3g} pictures per second" if self.rate_hz else ""
+        return f"{self.codec}, {self.bits} bits per channel, {shape}{rate}"
 
 
 class Capture(Protocol):
-    """An open camera or stream, used by one thread from opening to release; other threads may call `cancel` only."""
+    """An open camera or stream. One thread uses it from opening to release; other threads may only call `cancel`."""
 
     def read(self) -> Shot | Refusal | None:
-        """Wait for the next picture and return it, or the reason why it is rejected; None if the source is lost."""
+        """Wait for the next picture and return it, or the reason for its rejection; None if the source is lost."""
 
     def cancel(self) -> None:
-        """Let a waiting `read` return soon, if possible. Returns at once."""
+        """Make a waiting `read` return soon, if possible. Returns immediately."""
 
     def release(self) -> None:
         """Close the camera or the connection."""
 
 
 def make_thumbnail(plane: Plane) -> Plane:
-    """Return a small copy of a picture's grey plane (H, W[, C]): every n-th row and column, 60 x 80 pixels or a few
-    more. Pixels are not averaged: that would remove the noise by which new pictures differ from repeats."""
+    """Return a small copy of a picture's grey plane (H, W[, C]): every n-th row and column, 60 x 80 pixels or slightly
+    more. Pixels are not averaged, because that would remove the noise that distinguishes new pictures from repeats."""
     height, width = plane.shape[:2]
     return plane[:: max(1, height // _MIN_THUMBNAIL_PX[0]), :: max(1, width // _MIN_THUMBNAIL_PX[1])].copy()  # type: ignore[return-value]
 
 
 class RepeatDetector:
-    """Compares every picture of one source with the six before.
+    """Compares every picture of one source with the previous six.
 
-    A picture is PATCHED if at least two bands of rows equal those of an older picture, while at least two others have
-    changed. Only bands with texture that changed in nearly all pictures so far count, which excludes borders, text over
-    the picture, and static parts of a scene."""
+    A picture is PATCHED if at least two bands of rows equal those of an older picture while at least two others have
+    changed. Only textured bands that changed in nearly all pictures so far count, which excludes borders, text overlays
+    and static parts of a scene."""
 
     def __init__(self) -> None:
         self._history: deque[NDArray[np.int16]] = deque(maxlen=_HISTORY_PICTURES)  # pictures as bands, newest first
@@ -131,14 +131,14 @@ class RepeatDetector:
             self._history.appendleft(bands)
             return None
         differences = np.abs(np.stack(self._history) - bands)
-        same = (differences <= _MAX_EQUAL_LEVELS).mean(-1) >= _MIN_EQUAL_SHARE  # (pictures, bands)
-        if same[0].all():
-            return Refusal.FROZEN  # not remembered, so that it does not push out an older picture
+        is_equal = (differences <= _MAX_EQUAL_LEVELS).mean(-1) >= _MIN_EQUAL_SHARE  # (pictures, bands)
+        if is_equal[0].all():
+            return Refusal.FROZEN  # not stored, so that it does not displace an older picture
         self._history.appendleft(bands)
-        has_changed = (differences[0].mean(-1) > _MIN_CHANGE_LEVELS) & ~same[0]
-        must_move = (bands.std(-1) > _MIN_TEXTURE_LEVELS) & (self._change_share > _MIN_CHANGE_SHARE)
-        is_patched = ((same & must_move).sum(-1) >= _MIN_BANDS).any()
+        has_changed = (differences[0].mean(-1) > _MIN_CHANGE_LEVELS) & ~is_equal[0]
+        should_change = (bands.std(-1) > _MIN_TEXTURE_LEVELS) & (self._change_share > _MIN_CHANGE_SHARE)
+        is_patched = ((is_equal & should_change).sum(-1) >= _MIN_BANDS).any()
         if is_patched and has_changed.sum() >= _MIN_BANDS:
-            return Refusal.PATCHED  # without the update below: a band patched for long must not count as static
+            return Refusal.PATCHED  # before the update below: a band that stays patched must not become static
         self._change_share += (has_changed - self._change_share) / _LEARNING_PICTURES
         return None

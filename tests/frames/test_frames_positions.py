@@ -92,8 +92,8 @@ def test_parse_time_refuses(text):
         ("b.jpg,ref,46,2,,,,1466699519000", "line 3: time is `1466699519000`: write 2016-06-23T16:31:59Z"),  # ms
         ("b.jpg,ref,46,2,,,,0001-01-01T00:00:00+14:00", "line 3: time is"),
         ("b.jpg,ref,46,,,,,", "line 3 has only one of lat and lon"),
-        ("b.jpg,46,2", "line 3 has another number of values"),
-        ("b.jpg,ref,46,84,2,0,,,,", "line 3 has another number of values"),
+        ("b.jpg,46,2", "line 3 does not have as many values"),
+        ("b.jpg,ref,46,84,2,0,,,,", "line 3 does not have as many values"),
         (",ref,46,2,,,,", "line 3 names no image"),
         ("0000.jpg,ref,46,2,,,,", "that of an earlier line (`0000.jpg`)"),
     ],
@@ -182,8 +182,8 @@ def test_tag_at_makes_nothing_up_outside_the_table_and_in_wide_gaps(track):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("file,lat,lon\na.jpg,1,2\n", "line 1 has no column `time`"),
-        ("time,lat,lon\n2,2,3\n1,2,3\n", "line 3 has no time, or one that is not after that of the line before"),
+        ("file,lat,lon\na.jpg,1,2\n", "`time` is missing or repeated"),
+        ("time,lat,lon\n2,2,3\n1,2,3\n", "line 3 has no time, or one that is not later than that of the line before"),
         ("time,lat,lon\n,2,3\n", "line 2 has no time"),
         ("time,lat,lon\nsoon,2,3\n", "line 2: time is `soon`"),
         ("time,lat,lon\n1,,\n2,0,0\n", "has no line with time, lat and lon"),

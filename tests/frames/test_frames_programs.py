@@ -128,7 +128,7 @@ def test_without_the_program_the_sentence_says_what_to_install(monkeypatch, tmp_
 
 @pytest.mark.parametrize("pipeline", ["gst:", "gst: ! appsink", "gst: v4l2src device='/dev/video0"])
 def test_what_is_no_pipeline_is_refused(pipeline):
-    with pytest.raises(SourceError, match="is no pipeline"):
+    with pytest.raises(SourceError, match="is not a pipeline"):
         open_source(pipeline, live=True)
 
 

@@ -193,7 +193,7 @@ def send_unknown(port, is_on):
 
 def test_rtp_of_an_unknown_codec_asks_for_a_description(sending):
     cause = find_cause(f"udp://:{sending(send_unknown)}")
-    assert cause == "RTP of an unknown codec (payload type 98): describe it in an .sdp file"
+    assert cause == "RTP with an unknown codec (payload type 98): describe it in an .sdp file"
 
 
 @pytest.mark.parametrize("has_length", [True, False])
@@ -289,6 +289,6 @@ def test_check_frame_has_the_facts_of_the_first_picture_and_refuses_an_old_one(s
     uri = f"http://{serve(multipart('image/jpg', '.jpg'))}/video"
     code, found = check_source(uri)
     assert (code, found["width"], found["height"]) == (FindingCode.FRAME_RECEIVED, WIDTH, HEIGHT)
-    assert found["facts"] == "mjpeg, 8 bits a channel, square pixels"
+    assert found["facts"] == "mjpeg, 8 bits per channel, square pixels"
     monkeypatch.setattr(camera, "MAX_FIX_AGE_S", -1.0)
     assert check_source(uri)[0] is FindingCode.FRAMES_LATE
