@@ -1,7 +1,7 @@
-"""Profiles of boards: hardware, power, and what edgevpr may use of them. Each is a YAML file in `profiles/`. This
-module also detects the machine that it runs on. The flight, `edgevpr profile` and `edgevpr service` use it.
+"""Board profiles: hardware, power, and the resources that edgevpr may use. Each is a YAML file in `profiles/`. This
+module also detects the board that it runs on. The flight, `edgevpr profile` and `edgevpr service` use it.
 
-`root` is the root of the file system with /proc and /sys: another tree can stand in.
+`root`: root of the file system with /proc and /sys, which tests replace by another tree.
 """
 
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ _FALLBACK_BOARD = "generic-x86"
 class MachineSpeed:
     """Speed of a machine relative to one core of the reference machine of `profiles/generic-x86.yaml` (None: unknown).
 
-    `single`: one thread at integer and byte operations. `products`: one thread at matrix products.
+    `single`: one thread doing integer and byte operations. `products`: one thread doing matrix products.
     `arm64_mips`: million instructions per second of one thread of an aarch64 board (not relative).
     `verified`: True if `source` measured the figures on this very board.
     """
@@ -43,17 +43,17 @@ class MachineSpeed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Board:
-    """Profile of a board.
+    """Board profile.
 
-    `idle_w`, `full_w`: power at the board's input, idle and with all cores busy (a and a + s in the thesis).
+    `idle_w`, `full_w`: power at the board's input when idle and with all cores busy (a and a + s in the thesis).
     `verified`: True if `source` measured this power on this very board.
-    `rate_hz`: queries per second, unless the user sets another rate.
-    `cpu_share` (of all cores), `budget_mb` (index of the map), `memory_max_mb` (whole process): what edgevpr may use.
+    `rate_hz`: queries per second unless the user sets a rate.
+    `cpu_share` (of all cores), `budget_mb` (map index), `memory_max_mb` (whole process): limits of what edgevpr uses.
     `thermal_limit_c`: degrees Celsius at which the board begins to slow down (None: read from its kernel).
-    `technique`: used if the user names none, provided that it fits (None: the best that fits).
+    `technique`: default technique if it fits in the budget (None: the best that fits).
     `threads`: number of threads that a network may use.
-    `recognised_by`: a machine is this board if its model, by device tree or firmware, contains this text (None: no
-    machine is).
+    `recognised_by`: a machine is this board if its model name in device tree or firmware contains this text (None:
+    never).
     """
 
     name: str
@@ -75,7 +75,7 @@ class Board:
     threads: int = bounded_key(1, 64, default=1)
 
     def is_this_machine(self, root: Path = Path("/")) -> bool:
-        """Return True if the profile is that of the machine this runs on."""
+        """Return True if this is the profile of the machine that edgevpr runs on."""
         return self.name == _detect_board(root).name or _is_model_of(self, root)
 
 
@@ -85,8 +85,8 @@ def list_boards() -> tuple[str, ...]:
 
 
 def load_board(name: str, root: Path = Path("/")) -> Board:
-    """Load the profile called `name`: "this" (the machine itself), one of `list_boards()`, or the path of a YAML file.
-    Raises ConfigError if there is no such board, or if the file is incomplete or invalid."""
+    """Load the profile `name`: "this" (the machine itself), one of `list_boards()`, or the path of a YAML file. Raises
+    ConfigError if there is no such board, or if the file is incomplete or invalid."""
     if name == "this":
         return _detect_board(root)
     if name.endswith((".yaml", ".yml")) or "/" in name:
@@ -99,12 +99,12 @@ def load_board(name: str, root: Path = Path("/")) -> Board:
 
 
 def resolve_board(board: Board, source: SourceConfig, memory: MemoryConfig) -> Board:
-    """Return a board with the configured rate of queries and memory of the index in place of its own."""
+    """Return the board with its query rate and index memory replaced by the configured ones, if any."""
     return replace(board, rate_hz=source.rate_hz or board.rate_hz, budget_mb=memory.budget_mb or board.budget_mb)
 
 
 def _is_model_of(board: Board, root: Path) -> bool:
-    """Return True if the model of the machine below `root` contains the text that `board` is recognised by."""
+    """Return True if the model name of the machine at `root` contains the text `board.recognised_by`."""
     model = machine.read_model(root)
     return bool(model and board.recognised_by and board.recognised_by.lower() in model.lower())
 
@@ -117,7 +117,7 @@ def _read_board(path: Path) -> Board:
     board = build(Board, {"name": path.stem, **read_yaml(path)}, str(path))
     if board.full_w < board.idle_w:
         raise ConfigError(
-            f"{path}: `full_w` is {board.full_w:g}, below `idle_w`, {board.idle_w:g}: correct one of them."
+            f"{path}: `full_w` ({board.full_w:g}) is below `idle_w` ({board.idle_w:g}): correct one of them."
         )
     if not board.budget_mb <= board.memory_max_mb <= board.ram_mb:
         raise ConfigError(
@@ -128,7 +128,7 @@ def _read_board(path: Path) -> Board:
 
 
 def _detect_board(root: Path) -> Board:
-    """Return the profile of this machine's board, else generic-x86, with the machine's own cores and memory."""
+    """Return the profile of this machine's board, or else generic-x86, with the cores and memory of this machine."""
     model = machine.read_model(root)
     recognised = next(
         (board for board in map(_read_shipped_board, list_boards() if model else ()) if _is_model_of(board, root)), None
@@ -136,11 +136,11 @@ def _detect_board(root: Path) -> Board:
     profile = recognised or _read_shipped_board(_FALLBACK_BOARD)
     title = profile.title
     if model and not recognised:
-        title = f"{model}, which has no profile: the figures of {_FALLBACK_BOARD}"
+        title = f"{model}, which has no profile: using the figures of {_FALLBACK_BOARD}"
     ram_mb = machine.read_ram_mb(root)
-    # Keep the profile's shares, but of the memory that the machine really has; a control group may allow less.
+    # Scale the profile's memory limits to the machine's real memory; a control group may allow less.
     memory_max_mb = min(profile.memory_max_mb / profile.ram_mb * ram_mb, machine.read_ram_limit_mb(root))
-    # The power model counts all cores of the machine, so a CPU quota lowers `cpu_share` and not the number of cores.
+    # The power model counts all cores of the machine, so a CPU quota reduces `cpu_share` and not the number of cores.
     cores = machine.count_cores_online(root)
     cpu_share = min(profile.cpu_share, machine.count_usable_cores(root) / cores)
     return replace(

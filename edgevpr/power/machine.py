@@ -1,7 +1,7 @@
 """Hardware of this machine and memory of this process, as the kernel reports them in /proc and /sys.
 
-Board profiles, meters of queries and trials of techniques use it. `root` is the root of the file system: another tree
-can stand in. A megabyte (MB) is 10^6 bytes.
+Board profiles, query meters and technique trials use it. `root`: root of the file system, which tests replace by
+another tree. A megabyte (MB) is 10^6 bytes.
 """
 
 import os
@@ -15,20 +15,20 @@ _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 def read_model(root: Path = _ROOT) -> str | None:
-    """Return the machine's name by its maker, from the device tree ("Raspberry Pi 4 Model B Rev 1.4") or, of an x86
-    machine, the firmware (DMI); None if neither says one."""
+    """Return the manufacturer's model name from the device tree ("Raspberry Pi 4 Model B Rev 1.4") or, on an x86
+    machine, from the firmware (DMI); None if neither has one."""
     names = (read_text(root / "sys/class/dmi/id" / name) for name in ("sys_vendor", "product_name"))
     return read_text(root / "proc/device-tree/model") or " ".join(filter(None, names)) or None
 
 
 def count_cores_online(root: Path = _ROOT) -> int:
-    """Count the cores of the machine that are switched on, including those that this process may not use."""
+    """Count the machine's online cores, including those that this process may not use."""
     spans = re.findall(r"(\d+)(?:-(\d+))?", read_text(root / "sys/devices/system/cpu/online") or "")
     return sum(int(last or first) - int(first) + 1 for first, last in spans) or os.cpu_count() or 1
 
 
 def count_usable_cores(root: Path = _ROOT) -> float:
-    """Return how many cores this process may use, by CPU affinity and the quotas (cpu.max) of its control groups."""
+    """Return how many cores this process may use according to CPU affinity and the quotas (cpu.max) of its cgroups."""
     quotas = (int(quota_us) / int(period_us) for quota_us, period_us in _read_cgroup_limits("cpu.max", root))
     return min([float(len(os.sched_getaffinity(0))), *quotas])
 
@@ -39,8 +39,8 @@ def read_ram_mb(root: Path = _ROOT) -> float:
 
 
 def read_ram_limit_mb(root: Path = _ROOT) -> float:
-    """Return the RAM in MB that this process may use: the machine's, or the lowest limit (memory.max) of its control
-    groups."""
+    """Return the RAM in MB that this process may use: the machine's RAM or the lowest limit (memory.max) of its
+    cgroups."""
     return min([read_ram_mb(root), *(int(limit) / 1e6 for (limit,) in _read_cgroup_limits("memory.max", root))])
 
 
@@ -53,19 +53,19 @@ def read_rss_mb(root: Path = _ROOT) -> float:
 
 
 def reset_peak(root: Path = _ROOT) -> bool:
-    """Reset the peak of `read_peak_mb` to the memory resident now. Returns False if the kernel does not allow it."""
+    """Reset the peak of `read_peak_mb` to the current resident memory. Returns False if the kernel refuses."""
     with suppress(OSError):
         return bool((root / "proc/self/clear_refs").write_text("5"))
     return False
 
 
 def read_peak_mb(root: Path = _ROOT) -> float:
-    """Return the largest resident memory that this process has had, in MB, since it started or since `reset_peak`."""
+    """Return the peak resident memory of this process in MB since its start or since `reset_peak`."""
     return _read_kib_line(root / "proc/self/status", "VmHWM:")
 
 
 def read_text(path: Path) -> str | None:
-    """Read a small file and strip zero bytes, line ends and blanks from both ends; None if it cannot be read."""
+    """Read a small file, stripped of zero bytes, line ends and blanks; None if it cannot be read."""
     try:
         return path.read_text(errors="replace").strip("\0\n ")
     except OSError:
@@ -73,13 +73,13 @@ def read_text(path: Path) -> str | None:
 
 
 def _read_kib_line(path: Path, label: str) -> float:
-    """Return the number of the line "LABEL 1234 kB" of a file, converted to MB."""
+    """Return the number in the line "LABEL 1234 kB" of a file, converted to MB."""
     line = next(line for line in path.read_text().splitlines() if line.startswith(label))
     return int(line.split()[1]) * 1024 / 1e6
 
 
 def _read_cgroup_limits(name: str, root: Path) -> Iterator[list[str]]:
-    """Yield the fields of the limit file `name` (cgroup v2) of this process's control group and all above it."""
+    """Yield the fields of the limit file `name` (cgroup v2) of this process's cgroup and all of its parents."""
     memberships = (read_text(root / "proc/self/cgroup") or "").splitlines()
     for group in (PurePosixPath(line.removeprefix("0::")) for line in memberships if line.startswith("0::")):
         for level in (group, *group.parents):

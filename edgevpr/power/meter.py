@@ -1,9 +1,8 @@
-"""Metering of queries: wall and CPU seconds, utilisation and charge of each, and the totals of a flight. Also the CPU
-load and memory of the machine, for flight controller and ground station.
+"""Metering of queries: wall and CPU seconds, utilisation and charge of each query, and the totals of a flight. Also the
+machine's CPU load and memory, for autopilot and ground station.
 
 Energies add up, powers do not (see `equations`, which explains a, s and U). The idle energy a T of a flight of T
-seconds, plus s U t of every stage, is exactly the integral of 5.1 over the flight, in whatever order the stages run.
-"""
+seconds, plus s U t of every stage, is exactly the integral of 5.1 over the flight, whatever the order of the stages."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -19,32 +18,32 @@ from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, marginal_energy_j, pack_ah, parse_pack, stage_energy_j
 
 Clock = Callable[[], float]
-_MIN_WAITING_SHARE = 0.15  # of the time of the work; a thread off the CPU for more waited for other programs
+_MIN_WAITING_SHARE = 0.15  # of working time; a thread that is off the CPU for longer was kept waiting by other programs
 
 
 @dataclass(slots=True)
 class Stage:
-    """A stage that is being metered. `cost` is set when the stage ends, unless a signal interrupts just then."""
+    """A metered stage. `cost` is set when the stage ends, unless a signal interrupts at that moment."""
 
     cost: StageCost = NO_COST
 
 
 @contextmanager
 def meter_stage(wall_clock: Clock = time.perf_counter, cpu_clock: Clock = time.process_time) -> Iterator[Stage]:
-    """Meter a block of code: `with stage() as encoding: ...`, then read `encoding.cost`. It counts the CPU time of all
-    threads."""
-    metered = Stage()
+    """Meter a block of code: `with meter_stage() as encoding: ...`, then read `encoding.cost`. The CPU time is that of
+    all threads."""
+    stage = Stage()
     wall_s, cpu_s = wall_clock(), cpu_clock()
     try:
-        yield metered
+        yield stage
     finally:
-        metered.cost = StageCost(wall_clock() - wall_s, cpu_clock() - cpu_s)
+        stage.cost = StageCost(wall_clock() - wall_s, cpu_clock() - cpu_s)
 
 
 class QueryMeter:
-    """Measures the steps of one query after another, and the charge that each draws from the `battery` (None: any,
-    where only seconds count). `wall_clock` and `cpu_clock` (all threads) return seconds, `memory_mb` the resident
-    memory of this process."""
+    """Measures the steps of one query after another, and the charge that each query draws from the `battery` (None: a
+    default, if only times are needed). `wall_clock` and `cpu_clock` (all threads) return seconds, `memory_mb` the
+    resident memory of this process."""
 
     def __init__(
         self,
@@ -63,18 +62,19 @@ class QueryMeter:
         self._taken: dict[str, StageCost] = {}
 
     def begin(self) -> None:
-        """Begin a new query, without the steps of the last one."""
+        """Begin a new query and discard the steps of the previous one."""
         self._taken = {}
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Meter a step of the query (a field of `StepCosts`): `with meter.step("encode"):`. A repeated step adds up."""
-        metered = Stage()
+        """Meter a step of the query (a field of `StepCosts`): `with meter.step("encode"):`. The costs of a repeated
+        step are summed."""
+        stage = Stage()
         try:
-            with meter_stage(self._wall_clock, self._cpu_clock) as metered:
+            with meter_stage(self._wall_clock, self._cpu_clock) as stage:
                 yield
         finally:
-            self._taken[name] = self._taken.get(name, NO_COST) + metered.cost
+            self._taken[name] = self._taken.get(name, NO_COST) + stage.cost
 
     def steps(self) -> StepCosts:
         """Return the cost of every step of the query so far."""
@@ -97,8 +97,8 @@ def compute_query_cost(
     *,
     rss_mb: float,
 ) -> QueryCost:
-    """Compute the cost of one query by equations 5.1-5.6; the energies of both stages are added. Charges are drawn from
-    the pack: `used_mah` is (a + s U) t, and `marginal_mah` is s U t, what is added to an idle board."""
+    """Compute the cost of one query by equations 5.1-5.6, with the energies of both stages summed. Charges are drawn
+    from the pack: `used_mah` for (a + s U) t, and `marginal_mah` for s U t, the addition to an idle board."""
     stages = [(cost.utilisation(board.cores), cost.wall_s) for cost in (encode, match)]
     used_j = sum(stage_energy_j(board.idle_w, board.full_w, u, t_s) for u, t_s in stages)
     marginal_j = sum(marginal_energy_j(board.idle_w, board.full_w, u, t_s) for u, t_s in stages)
@@ -115,8 +115,8 @@ def compute_query_cost(
 
 
 class FlightEnergy:
-    """Adds up the stages of a flight, from the creation of this object on: `marginal_j`, the energy that they added, in
-    joules at the board's input, and `stages_cpu_s`, their CPU-seconds. `cpu_clock` counts all threads."""
+    """Sums the stages of a flight from the creation of this object: `marginal_j`, the energy that they added, in joules
+    at the board's input, and `stages_cpu_s`, their CPU-seconds. `cpu_clock` counts all threads."""
 
     def __init__(self, board: Board, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
         self._board, self._clock, self._cpu_clock = board, clock, cpu_clock
@@ -131,7 +131,7 @@ class FlightEnergy:
             self.stages_cpu_s += stage.cpu_s
 
     def measure_process(self) -> StageCost:
-        """Return the wall seconds since the creation of this object, and the whole process's CPU-seconds since."""
+        """Return the wall seconds and the CPU-seconds of the whole process since the creation of this object."""
         return StageCost(self._clock() - self._start_s, self._cpu_clock() - self._cpu_start_s)
 
 
@@ -146,14 +146,14 @@ class MachineLoad:
 
 
 def measure_machine_load() -> MachineLoad:
-    """Measure the load of the machine. The first call has no earlier one to compare with and reports idle cores."""
+    """Measure the load of the machine. The first call has no earlier call to compare with and reports idle cores."""
     memory, percents = psutil.virtual_memory(), psutil.cpu_percent(percpu=True)
     return MachineLoad(tuple(percent / 100 for percent in percents), memory.total - memory.available, memory.total)
 
 
 class ProcessLoad:
-    """Measures how much of all `cores` this process uses, and for how much of the time other programs keep its work
-    waiting, between two calls of `measure`. `cpu_clock` counts all threads of this process."""
+    """Measures which share of all `cores` this process uses, and for which share of the time other programs delay its
+    work, between two calls of `measure`. `cpu_clock` counts all threads of this process."""
 
     def __init__(self, cores: int, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
         self._cores, self._clock, self._cpu_clock = cores, clock, cpu_clock
@@ -166,18 +166,18 @@ class ProcessLoad:
         return self._clock() - self._measured_s
 
     def add_work(self, work: StageCost) -> None:
-        """Add a piece of work. Its `cpu_s` is that of the one thread (`time.thread_time`) that did the work or waited
+        """Add a piece of work. Its `cpu_s` is the CPU time of the one thread (`time.thread_time`) that did it or waited
         for it."""
         self._busy_s += work.wall_s
         self._ran_s += work.cpu_s
 
     def measure(self) -> tuple[float, float]:
-        """Return two shares of the time since the last call, 0..1: that of all cores that this process used, and that
-        of the recorded work if other programs kept it waiting, else 0."""
+        """Return two shares since the last call, 0..1: the share of all cores that this process used, and the share of
+        time taken by the added work if other programs delayed it, else 0."""
         now_s, cpu_s = self._clock(), self._cpu_clock()
         span = StageCost(now_s - self._measured_s, cpu_s - self._cpu_s)
-        waited = self._ran_s < (1 - _MIN_WAITING_SHARE) * self._busy_s
-        late_share = min(1.0, self._busy_s / span.wall_s) if waited and span.wall_s > 0 else 0.0
+        was_delayed = self._ran_s < (1 - _MIN_WAITING_SHARE) * self._busy_s
+        late_share = min(1.0, self._busy_s / span.wall_s) if was_delayed and span.wall_s > 0 else 0.0
         self._measured_s, self._cpu_s = now_s, cpu_s
         self._busy_s = self._ran_s = 0.0
         return span.utilisation(self._cores), late_share

@@ -1,7 +1,7 @@
 """Micro-benchmark: speed of this machine relative to the reference machine of `profiles/generic-x86.yaml`.
 
-Two figures are measured, because machines differ in them: matrix products (cohog's matching) depend on wide vector
-units, passes over bytes (encoding an image, scanning a map) do not. Small ARM cores fall behind more at products.
+Two figures are measured because machines differ in both: matrix products (cohog's matching) depend on wide vector
+units; passes over bytes (encoding an image, scanning a map) do not. Small ARM cores are further behind in products.
 """
 
 import time
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Rounds per second of one core of the reference machine, an AMD EPYC (Zen 4) in a virtual machine. Measured by
-# `_time_rounds_s` with OPENBLAS_NUM_THREADS=1, Python 3.11 and NumPy 2.4 (OpenBLAS 0.3.31).
+# Rounds per second of one core of the reference machine, an AMD EPYC (Zen 4) in a virtual machine. Measured with
+# `_time_rounds_s`, OPENBLAS_NUM_THREADS=1, Python 3.11 and NumPy 2.4 (OpenBLAS 0.3.31).
 REFERENCE_PRODUCTS_HZ = 1585.0
 REFERENCE_PASSES_HZ = 1960.0
 
@@ -21,8 +21,8 @@ _MIN_ROUNDS = 5
 
 @dataclass(frozen=True, slots=True)
 class Speed:
-    """Speed of one thread of a machine divided by that of another machine. `products`: at matrix products (networks,
-    and full comparisons of candidates). `passes`: at passes over bytes (everything else)."""
+    """Speed of one thread of a machine divided by that of another machine. `products`: in matrix products (networks,
+    and full comparisons of candidates). `passes`: in passes over bytes (everything else)."""
 
     products: float
     passes: float
@@ -30,7 +30,7 @@ class Speed:
 
 def run_micro_benchmark() -> Speed:
     """Measure the speed of this machine relative to the reference, in about a second (longer on a slow board). Nothing
-    else should run. NumPy's library must have one thread (OPENBLAS_NUM_THREADS=1, which edgevpr's command line sets
+    else should be running. NumPy's BLAS must use one thread (OPENBLAS_NUM_THREADS=1, which edgevpr's command line sets
     before NumPy is imported)."""
     return Speed(
         products=1 / min(_time_rounds_s(make_product_round())) / REFERENCE_PRODUCTS_HZ,
@@ -39,7 +39,7 @@ def run_micro_benchmark() -> Speed:
 
 
 def make_product_round() -> Callable[[], object]:
-    """Return a function that computes one float32 product of 961 x 32 by 32 x 961, which compares the regions of a
+    """Return a function that computes one float32 product of 961 x 32 by 32 x 961, as used to compare the regions of a
     query with those of a place."""
     random = np.random.default_rng(1)
     query, place = random.random((2, 961, 32), np.float32)
@@ -67,8 +67,8 @@ def make_pass_round() -> Callable[[], object]:
 
 
 def _time_rounds_s(work: Callable[[], object]) -> list[float]:
-    """Call `work` again and again, and return the seconds of each call. A first call is not counted. Of them the least
-    counts: a slower round was disturbed by something else."""
+    """Call `work` repeatedly and return the seconds of each call, after one call to warm up. Callers use the minimum,
+    because slower rounds were disturbed by something else."""
     work()
     times_s: list[float] = []
     while len(times_s) < _MIN_ROUNDS or sum(times_s) < _MIN_TIME_S:

@@ -1,6 +1,6 @@
-"""Temperature, CPU frequency and supply of the machine, and signs that it slows itself down, for the flight.
+"""Temperature, CPU frequency and supply voltage of the machine, and signs of throttling, for the flight.
 
-A reading opens some files of /sys.
+Each reading opens some files in /sys.
 """
 
 import re
@@ -10,9 +10,9 @@ from pathlib import Path
 
 from edgevpr.power import machine
 
-_DEFAULT_LIMIT_C = 80.0  # a Raspberry Pi's firmware slows the board down from here; cautious for other boards
+_DEFAULT_LIMIT_C = 80.0  # the Raspberry Pi firmware throttles from here; cautious for other boards
 _CPU_ZONE = re.compile(r"cpu|soc|pkg|tj|acpitz|bigcore|littlecore", re.IGNORECASE)
-# Bits of the firmware's answer for the present state. Shifted by 16, they hold for any time since start.
+# Bits of the firmware's reply for the current state. Shifted by 16, they stand for any time since boot.
 _FIRMWARE_BITS = ((1, "under-voltage"), (2, "frequency capped"), (4, "throttled"), (8, "soft temperature limit"))
 _UNDER_VOLTAGE_BIT = 1
 _SLOWDOWN_BITS = 2 | 4 | 8
@@ -21,10 +21,10 @@ _SOFT_LIMIT_BIT = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ThermalState:
-    """State at one reading: `temperature_c` of the hottest CPU sensor, `frequency_mhz` of the fastest cluster of cores
-    (None: unknown), `throttled`, True if the machine slows itself down now, and `why`, the signs that it does or did,
-    as text ("": none). `under_voltage`: the supply is too low, or was since the reading before. `hot`: the temperature
-    at which it begins to slow down is reached. None: unknown."""
+    """State at one reading. `temperature_c`: of the hottest CPU sensor. `frequency_mhz`: of the fastest core cluster.
+    `throttled`: True if the machine is throttling now. `why`: signs that it is or was, as text ("": none).
+    `under_voltage`: the supply voltage is too low, or was since the last reading. `hot`: throttling temperature
+    reached. None: unknown."""
 
     temperature_c: float | None
     frequency_mhz: float | None
@@ -35,8 +35,8 @@ class ThermalState:
 
 
 class ThermalWatch:
-    """Reader of the sensors of temperature, frequency and supply, which are searched for once, when it is created.
-    `hot_c` is the temperature in degrees Celsius that counts as hot (None: `read_limit_c` of the machine)."""
+    """Reads the temperature, frequency and voltage sensors, which are located once, at creation. `hot_c`: temperature
+    in degrees Celsius that counts as hot (None: `read_limit_c` of the machine)."""
 
     def __init__(self, root: Path = Path("/"), hot_c: float | None = None) -> None:
         self._temperatures = [zone / "temp" for zone in _find_cpu_zones(root)]
@@ -47,7 +47,7 @@ class ThermalWatch:
         self._top_khz = (self._policy and _read_number(self._policy / "cpuinfo_max_freq")) or 0
         self._allowed_khz = 0
         self._firmware = next((root / "sys/devices/platform").glob("soc*/*firmware/get_throttled"), None)
-        # Driver of the Raspberry Pi. Its alarm holds for 2 s, so that a dip between two readings is not missed.
+        # Raspberry Pi driver. Its alarm lasts 2 s, so that a dip between two readings is not missed.
         volts = (
             name.parent for name in (root / "sys/class/hwmon").glob("*/name") if machine.read_text(name) == "rpi_volt"
         )
@@ -62,52 +62,53 @@ class ThermalWatch:
         frequency_mhz = khz / 1000 if khz is not None and khz > 0 else None
         bits = _read_number(self._firmware, 16) if self._firmware else None
         signs = list(self._find_slowdown_signs(bits or 0, temperature_c, khz))
-        can_tell = bits is not None or self._top_khz > 0
+        is_known = bits is not None or self._top_khz > 0
         is_hot = temperature_c is not None and temperature_c >= self._hot_c
         return ThermalState(
             temperature_c=temperature_c,
             frequency_mhz=frequency_mhz,
-            throttled=any(slows for slows, _ in signs) if can_tell else None,
+            throttled=any(slows for slows, _ in signs) if is_known else None,
             why="; ".join(why for _, why in signs),
             under_voltage=self._is_under_voltage(bits),
             hot=None if temperature_c is None and bits is None else is_hot or bool((bits or 0) & _SOFT_LIMIT_BIT),
         )
 
     def _is_under_voltage(self, bits: int | None) -> bool | None:
-        """Return True if the supply is too low by the `bits` of the firmware or the driver's alarm, or if the firmware
-        has recorded since the last call that it was (None: unknown)."""
+        """Return True if the firmware `bits` or the driver's alarm report a low supply voltage now, or if the firmware
+        has recorded one since the last call (None: unknown)."""
         alarm = _read_number(self._alarm) if self._alarm else None
         if bits is None:
             return None if alarm is None else alarm > 0
-        before = bits if self._bits_before is None else self._bits_before
+        previous_bits = bits if self._bits_before is None else self._bits_before
         self._bits_before = bits
-        return bool((alarm or 0) > 0 or bits & _UNDER_VOLTAGE_BIT or (bits & ~before) >> 16 & _UNDER_VOLTAGE_BIT)
+        return bool((alarm or 0) > 0 or bits & _UNDER_VOLTAGE_BIT or (bits & ~previous_bits) >> 16 & _UNDER_VOLTAGE_BIT)
 
     def _find_slowdown_signs(
         self, bits: int, temperature_c: float | None, khz: int | None
     ) -> Iterator[tuple[bool, str]]:
-        """Yield a pair for each sign that the machine slows down: True if it does so now (False: it is only a warning,
-        or over), and a text. `bits` are the flags of the firmware (0: none), `khz` is the CPU's frequency now."""
+        """Yield a pair for each sign of throttling: True if it is throttling now (False: only a warning, or over), and
+        a text. `bits`: flags of the firmware (0: none). `khz`: current CPU frequency."""
         if now := [word for bit, word in _FIRMWARE_BITS if bits & bit]:
             yield bool(bits & _SLOWDOWN_BITS), f"{', '.join(now)} now"
         if before := [word for bit, word in _FIRMWARE_BITS if bits >> 16 & bit and not bits & bit]:
             yield False, f"{', '.join(before)} since start"
         if self._policy:
-            # The kernel lowers this limit to cool the CPU. A power mode may keep it low, so the highest seen is normal.
+            # The kernel lowers this limit to cool the CPU. A power mode may keep it low, so the highest so far is
+            # normal.
             allowed_khz = _read_number(self._policy / "scaling_max_freq") or 0
             self._allowed_khz = max(self._allowed_khz, allowed_khz)
             normal_khz = self._allowed_khz or self._top_khz
             hot = temperature_c is not None and temperature_c >= self._limit_c
             if 0 < allowed_khz < 0.98 * normal_khz:
                 yield True, f"frequency limited to {allowed_khz / 1000:g} of {normal_khz / 1000:g} MHz"
-            # A low frequency alone says nothing, since idle cores slow down; a hot machine is not idle.
+            # A low frequency alone proves nothing, because idle cores slow down; a hot machine is not idle.
             elif hot and khz and khz < 0.9 * normal_khz:
                 yield True, f"{khz / 1000:g} of {normal_khz / 1000:g} MHz at {temperature_c:g} degrees"
 
 
 def read_limit_c(root: Path = Path("/")) -> float:
-    """Return the degrees Celsius at which this machine begins to slow down: the lowest passive trip point of its CPU.
-    If the kernel has none (Raspberry Pi), it is 80 degrees, or 10 below the point where the machine switches off."""
+    """Return the degrees Celsius at which this machine begins to throttle: the lowest passive trip point of its CPU. If
+    the kernel has none (Raspberry Pi), it is 80 degrees, or 10 below the shutdown temperature if that is lower."""
     trips: dict[str, list[float]] = {}
     for zone in _find_cpu_zones(root):
         for path in zone.glob("trip_point_*_type"):

@@ -1,4 +1,4 @@
-"""The flight log of a recorded flight of ours: where its pictures were taken, as the autopilot reported it with GPS."""
+"""Flight logs of edgevpr: where the pictures of a recorded flight were taken, as the autopilot reported with GPS."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -10,24 +10,24 @@ from edgevpr.runtime.flight.recording import has_live_source, list_frames, read_
 from edgevpr.tracks.record import Record, make_tag
 
 _MAX_REPORT_AGE_S = 1.0
-# Seconds after a fix that the autopilot took, or perhaps took, in which its position may only repeat that fix.
+# For this long after a fix that the autopilot may have accepted, its position may only repeat that fix.
 _FIX_ECHO_S = 10.0
 
 
 def read_flight(path: Path) -> Record:
-    """Read the last flight of a log, by the names of the pictures in the folder `frames` of its recording. A picture
-    has no position if the autopilot had no GPS, its report was old, or it may only have repeated a fix of ours. Raises
-    UsageError if the flight was not recorded, or not by a camera, and EdgevprError if the file holds no flight."""
+    """Read the tags of the last flight in a log, by picture names in the folder `frames` of its recording. A picture
+    has no position if the autopilot had no GPS, its report was old, or it may only repeat one of our fixes. Raises
+    UsageError if no flight with a camera was recorded, and EdgevprError if the log has no flight."""
     lines, folder = read_recorded(path)
     if not has_live_source(folder):
         raise UsageError(
-            f"{path}: its images came from a folder or a video, not from a camera of that flight: place them by the "
-            "record of their own flight."
+            f"{path}: the images came from a folder or a video, not from a camera on that flight: give the log or "
+            "track of the flight on which they were taken."
         )
     files, named = list_frames(folder), dict[str, GeoTag]()
     for line in lines:
         if line.get("kind") == "query" and (file := files.get(str(line.get("query")))):
-            with suppress(KeyError, TypeError):  # a line that is damaged, or has no vehicle
+            with suppress(KeyError, TypeError):  # a damaged line, or one without a vehicle
                 if tag := _read_tag(line["vehicle"], line["t_frame_s"]):
                     named[file.name] = tag
     return Record(kind="flight log of edgevpr", named=named)

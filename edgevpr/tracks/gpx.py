@@ -1,4 +1,4 @@
-"""Tracks of GPS receivers: GPX files."""
+"""GPX files: tracks recorded by GPS receivers."""
 
 from pathlib import Path
 
@@ -6,11 +6,11 @@ from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import parse_time
 from edgevpr.tracks.record import Record, make_tag, make_track, require_package
 
-_FIRST_YEAR = 1990  # a receiver without the time writes earlier years
+_FIRST_YEAR = 1990  # a receiver that does not know the time writes earlier years
 
 
 def read_gpx(path: Path) -> Record:
-    """Read the points with a time of all tracks of a GPX file; a time without a zone is UTC."""
+    """Read all track points of a GPX file that have a time; a time without a zone is UTC."""
     require_package("gpxpy", "gpxpy", "A GPX file")
     import gpxpy
     from gpxpy.gpx import GPXException
@@ -22,7 +22,7 @@ def read_gpx(path: Path) -> Record:
     points = [point for point, *_ in content.walk()]
     timed = [point for point in points if point.time and point.time.year >= _FIRST_YEAR]
     if points and not timed:
-        raise UsageError(f"{path} has no times: export the track with times, by which pictures are placed.")
+        raise UsageError(f"{path} has no times, which are needed to place pictures: export the track with times.")
     lines = [
         (parse_time(point.time.isoformat()), make_tag(point.latitude, point.longitude, point.elevation))
         for point in timed

@@ -1,5 +1,5 @@
-"""Logs of autopilots: ArduPilot's DataFlash (.bin, .log), telemetry of MAVLink (.tlog) and PX4's (.ulg). Position and
-attitude over time, and for each picture that the autopilot triggered, if it did."""
+"""Autopilot logs: ArduPilot DataFlash (.bin, .log), MAVLink telemetry (.tlog) and PX4 ULog (.ulg). Position and
+attitude over time and, if the autopilot triggered the camera, for each picture."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -16,12 +16,12 @@ from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import GeoTag
 from edgevpr.tracks.record import Attitude, Record, make_tag, make_track, require_package
 
-_FIX_3D = 3  # GPS status from which on a position counts
+_FIX_3D = 3  # lowest GPS status with which a position is used
 _NO_HEADING = 65535  # of GLOBAL_POSITION_INT
 _RECEIVERS = ("vehicle_gps_position", "sensor_gps")
 _PX4_TOPICS = (*_RECEIVERS, "vehicle_global_position", "vehicle_attitude", "vehicle_local_position", "camera_capture")
 
-Topics = dict[str, dict[str, Array]]  # the values of each field of PX4's messages, by the names of message and field
+Topics = dict[str, dict[str, Array]]  # values of PX4 messages by topic and field
 
 
 def read_ardupilot(path: Path) -> Record:
@@ -39,7 +39,7 @@ def read_ardupilot(path: Path) -> Record:
         elif kind != "GPS" or message.Status >= _FIX_3D:
             height_m = getattr(message, "RelHomeAlt", getattr(message, "RelAlt", None))
             angles_deg = attitude
-            if kind in ("CAM", "TRIG"):  # older logs write the names out
+            if kind in ("CAM", "TRIG"):  # older logs have long field names
                 is_long = hasattr(message, "Yaw")
                 angles_deg = tuple(getattr(message, name if is_long else name[0]) for name in ("Yaw", "Roll", "Pitch"))
             tag = make_tag(message.Lat, message.Lng, message.Alt, angles_deg, None if kind == "GPS" else height_m)
@@ -49,8 +49,8 @@ def read_ardupilot(path: Path) -> Record:
 
 
 def read_telemetry(path: Path) -> Record:
-    """Read a telemetry log of a ground station: GLOBAL_POSITION_INT, ATTITUDE and CAMERA_FEEDBACK of the first vehicle
-    that reports its position. Times are those of the ground station's clock."""
+    """Read a ground station's telemetry log: GLOBAL_POSITION_INT, ATTITUDE and CAMERA_FEEDBACK of the first vehicle
+    that reports a position. Times are from the ground station's clock."""
     from pymavlink import mavutil
 
     kinds = ["GLOBAL_POSITION_INT", "ATTITUDE", "CAMERA_FEEDBACK"]
@@ -76,32 +76,31 @@ def read_telemetry(path: Path) -> Record:
 
 
 def _read_messages(open_log: Callable[[str], Any], path: Path, kinds: list[str]) -> list[Any]:
-    """Return the messages of these kinds to the end of a log, or to where it is damaged."""
-    os.environ["PYMAVLINK_FAST_INDEX"] = "0"  # the compiled index prints, past Python, each byte that it skips
+    """Return the messages of these types up to the end of a log or up to the first damage."""
+    os.environ["PYMAVLINK_FAST_INDEX"] = "0"  # the compiled index prints every byte that it skips, bypassing sys.stdout
     messages = []
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # pymavlink prints what it skips
         try:
             log = open_log(str(path))
-        except Exception as error:  # files of any content
+        except Exception as error:  # malformed files can raise anything
             raise UsageError(f"{path} cannot be read as a log ({error}): copy it from the autopilot again.") from error
-        with suppress(Exception):  # what is cut off or damaged is not read
+        with suppress(Exception):  # read up to a truncated or damaged message
             while message := log.recv_match(type=kinds):
                 messages.append(message)
-        with suppress(AttributeError):  # of a log as text
+        with suppress(AttributeError):  # a text log has no close()
             log.close()
     return messages
 
 
 def read_px4(path: Path) -> Record:
-    """Read a log of PX4: its estimate of position, height over the place where it started, attitude, and
-    `camera_capture`."""
-    require_package("pyulog", "pyulog", "A log of PX4")
+    """Read a PX4 log: estimated position, height above the start, attitude, and `camera_capture`."""
+    require_package("pyulog", "pyulog", "A PX4 log")
     from pyulog import ULog
 
     try:
         with open(path, "rb") as file:
             datasets = ULog(file, list(_PX4_TOPICS), disable_str_exceptions=True).data_list
-    except Exception as error:  # files of any content
+    except Exception as error:  # malformed files can raise anything
         raise UsageError(f"{path} cannot be read as a PX4 log ({error}): copy it from the autopilot again.") from error
     data = {topic.name: topic.data for topic in reversed(datasets) if len(topic.data["timestamp"])}  # the first of each
     shots = tuple(tag for _, tag in _read_positions(data, "camera_capture"))
@@ -109,7 +108,7 @@ def read_px4(path: Path) -> Record:
 
 
 def _read_positions(data: Topics, topic: str) -> list[tuple[float, GeoTag]]:
-    """Return seconds since 1970 and a tag for each position of a topic, with attitude and height at that time."""
+    """Return (seconds since 1970, tag) for each position of a topic, with attitude and height at that time."""
     if (positions := data.get(topic)) is None:
         return []
     at_us = positions["timestamp"]
@@ -119,14 +118,13 @@ def _read_positions(data: Topics, topic: str) -> list[tuple[float, GeoTag]]:
         heights_m = np.interp(at_us, local["timestamp"], -local["z"]).tolist()
     if attitude := data.get("vehicle_attitude"):
         attitudes = _interpolate_attitudes(attitude, at_us)
-    where = (positions[name].tolist() for name in ("lat", "lon", "alt"))
-    tags = map(make_tag, *where, attitudes, heights_m)
+    coordinates = (positions[name].tolist() for name in ("lat", "lon", "alt"))
+    tags = map(make_tag, *coordinates, attitudes, heights_m)
     return list(zip((at_us / 1e6 + _read_utc_offset_s(data)).tolist(), tags, strict=True))
 
 
 def _read_utc_offset_s(data: Topics) -> float:
-    """Return what is to be added to seconds since the start of the autopilot to get those since 1970; 0 if no receiver
-    has the time."""
+    """Return the offset from seconds since autopilot start to seconds since 1970; 0 if no receiver knows the time."""
     for receiver in filter(None, map(data.get, _RECEIVERS)):
         if (has_time := receiver["time_utc_usec"] > 0).any():
             utc_us = receiver["time_utc_usec"][has_time].astype(np.float64)
@@ -135,9 +133,9 @@ def _read_utc_offset_s(data: Topics) -> float:
 
 
 def _interpolate_attitudes(attitude: dict[str, Array], at_us: Array) -> list[Attitude]:
-    """Return yaw, roll and pitch in degrees, those last reported at each time."""
-    last = np.clip(np.searchsorted(attitude["timestamp"], at_us, side="right") - 1, 0, None)
-    w, x, y, z = (attitude[f"q[{axis}]"][last].astype(float) for axis in range(4))
+    """Return the yaw, roll and pitch last reported before each time, in degrees."""
+    indices = np.clip(np.searchsorted(attitude["timestamp"], at_us, side="right") - 1, 0, None)
+    w, x, y, z = (attitude[f"q[{axis}]"][indices].astype(float) for axis in range(4))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))

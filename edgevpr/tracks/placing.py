@@ -1,5 +1,5 @@
-"""Says where the pictures of a folder, or of a video, were taken, by a `Record`: by their names, in the order in which
-the autopilot triggered them, or by time."""
+"""Assigns positions from a `Record` to the pictures of a folder or video: by name, in the order in which the autopilot
+triggered them, or by time."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -18,18 +18,18 @@ from edgevpr.frames.video import read_start_s
 from edgevpr.tracks.clock import estimate_clock_offset_s
 from edgevpr.tracks.record import Record
 
-_ZONE_STEP_S = 900  # time zones differ by quarters of an hour
-_MAX_ZONE_STEPS = 4 * 14  # and by 14 hours at most
-_MAX_COMPARED = 200  # pictures that are compared to set the clock
+_ZONE_STEP_S = 900  # time zones are multiples of a quarter of an hour
+_MAX_ZONE_STEPS = 4 * 14  # and at most 14 hours
+_MAX_COMPARED = 200  # pictures compared to estimate the clock offset
 _MIN_SHARE_IN_TRACK = 0.5  # of the pictures that must lie within the track
-_ROUNDING_DEG = 1e-4  # as subtitles with four decimals
+_ROUNDING_DEG = 1e-4  # as in subtitles with four decimals
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Placement:
-    """`how`: in words, how pictures were told apart. `tags`: position and attitude of those of the `pictures` that were
-    placed, by name; empty for a video. `track`: that of a video, by its own time. `offset_s`: seconds added to the
-    clock of the camera (None: no clock was needed)."""
+    """`how`: how pictures were assigned, in words. `pictures`: number of pictures in the folder. `tags`: position and
+    attitude by name of those that were placed; empty for a video. `track`: track of a video, in video time. `offset_s`:
+    seconds added to the camera's clock (None: no clock was needed)."""
 
     how: str
     tags: Mapping[str, GeoTag] = field(default_factory=dict)
@@ -39,31 +39,30 @@ class Placement:
 
 
 def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Placement:
-    """Place the pictures of a folder. `offset_s` is what is to be added to the clock of the camera (None: estimated).
-    What the record does not say of a picture is taken from its EXIF data. Raises UsageError if they do not belong
-    together."""
+    """Place the pictures of a folder. `offset_s`: seconds to add to the camera's clock (None: estimated). Values that
+    the record lacks are taken from the EXIF data. Raises UsageError if pictures and record do not belong together."""
     paths = list_images(folder)
     own = {path.name: read_exif(path) for path in progress(paths, len(paths), "reading pictures")}
     if record.named:
-        found, how = _match_names(record.named, list(own)), "by their names"
+        matched, how = _match_names(record.named, list(own)), "by their names"
     elif len(record.shots) == len(own):
-        found, how = dict(zip(own, record.shots, strict=True)), "in the order of the autopilot's pictures"
+        matched, how = dict(zip(own, record.shots, strict=True)), "in the order of the autopilot's pictures"
     elif record.track and record.is_utc:
         return _match_times(record.track, folder, own, offset_s)
     elif record.shots:
         raise UsageError(
-            f"{len(record.shots)} images were triggered, and {folder} holds {len(own)}: remove the others from it."
+            f"{len(record.shots)} images were triggered, but {folder} contains {len(own)}: keep only those in it."
         )
     else:
-        raise UsageError(f"These positions ({record.kind}) are those of a video: give it as --images.")
-    if not found:
-        raise UsageError(f"No image of {folder} is named in the {record.kind}: give the folder of its images.")
-    tags = {name: _fill_tag(tag, own[name]) for name, tag in found.items()}
+        raise UsageError(f"These positions ({record.kind}) belong to a video: give that video as --images.")
+    if not matched:
+        raise UsageError(f"The {record.kind} lists none of the images in {folder}: give the folder of its images.")
+    tags = {name: _fill_tag(tag, own[name]) for name, tag in matched.items()}
     return Placement(how=how, tags=tags, pictures=len(own))
 
 
 def _match_names(named: Mapping[str, GeoTag], names: list[str]) -> dict[str, GeoTag]:
-    """Find the pictures by their whole names, or by what stands before the ending, in letters of either case."""
+    """Match pictures by full name or else by name without extension, ignoring case."""
     whole = {name.casefold(): tag for name, tag in named.items()}
     stems = {Path(name).stem.casefold(): tag for name, tag in named.items()}
     tags = {name: whole.get(name.casefold(), stems.get(Path(name).stem.casefold())) for name in names}
@@ -73,7 +72,7 @@ def _match_names(named: Mapping[str, GeoTag], names: list[str]) -> dict[str, Geo
 def _match_times(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s: float | None) -> Placement:
     times = {name: tag.t_utc_s for name, tag in own.items() if tag.t_utc_s is not None}
     if not times:
-        raise UsageError("The images have no times (EXIF DateTimeOriginal): give the original files of the camera.")
+        raise UsageError("The images have no times (EXIF DateTimeOriginal): give the camera's original files.")
     how, times_s = "by time", np.array(list(times.values()))
     if offset_s is None:
         offset_s = _estimate_zone_offset_s(track, times_s, "the pictures")
@@ -83,24 +82,24 @@ def _match_times(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s
         offset_s += fine_s or 0.0
         how += ", the camera's clock set by " + ("its time zone" if fine_s is None else "how the pictures move")
     times = {name: t_s + offset_s for name, t_s in times.items()}
-    found = {name: replace(track.interpolate_tag(t_s), t_utc_s=t_s) for name, t_s in times.items()}
-    tags = {name: _fill_tag(tag, own[name]) for name, tag in found.items() if tag.position}
+    interpolated = {name: replace(track.interpolate_tag(t_s), t_utc_s=t_s) for name, t_s in times.items()}
+    tags = {name: _fill_tag(tag, own[name]) for name, tag in interpolated.items() if tag.position}
     if not tags:
-        raise UsageError(f"No image lies in the track with --offset-s {offset_s:g}: {_format_spans(track, times_s)}")
+        raise UsageError(f"With --offset-s {offset_s:g}, no image is within the track: {_format_spans(track, times_s)}")
     return Placement(how=how, tags=tags, pictures=len(own), offset_s=offset_s)
 
 
 def _fill_tag(tag: GeoTag, own: GeoTag) -> GeoTag:
-    """Return `tag`, with what it does not know taken from `own`."""
+    """Return `tag` with its unknown values taken from `own`."""
     missing = [item.name for item in fields(GeoTag) if getattr(tag, item.name) is None]
     return replace(tag, **{name: getattr(own, name) for name in missing})
 
 
 def place_video(record: Record, video: Path, offset_s: float | None) -> Placement:
-    """Place the frames of a video. `offset_s` is what is to be added to the clock of the camera (None: estimated), or
-    to the time of the video if the record goes by it. Raises UsageError if they do not belong together."""
+    """Place the frames of a video. `offset_s`: seconds to add to the camera's clock (None: estimated), or to the video
+    time if the record is in video time. Raises UsageError if video and record do not belong together."""
     if record.track is None:
-        raise UsageError(f"These positions ({record.kind}) have no times: a video needs them.")
+        raise UsageError(f"These positions ({record.kind}) have no times, but a video needs them: give a log or track.")
     began_s, lasts_s = read_start_s(video)
     if record.is_utc:
         if began_s is None:
@@ -117,34 +116,34 @@ def place_video(record: Record, video: Path, offset_s: float | None) -> Placemen
 
 
 def _estimate_zone_offset_s(track: Track, times_s: Doubles, what: str) -> float:
-    """Estimate what is to be added to the clock of a camera that shows a local time, so that most of its times, float
-    (N,), lie within the track: whole hours, else half hours, else quarters."""
+    """Estimate the offset to add to a camera clock set to local time so that most of its times, float (N,), fall within
+    the track: whole hours, else half hours, else quarters."""
     offsets_s = np.arange(-_MAX_ZONE_STEPS, _MAX_ZONE_STEPS + 1) * _ZONE_STEP_S
     first_s, last_s = track.t_s[0], track.t_s[-1]
-    within = np.array([np.mean((times_s + by_s >= first_s) & (times_s + by_s <= last_s)) for by_s in offsets_s])
-    if within.max() < _MIN_SHARE_IN_TRACK:
-        raise UsageError(f"No time zone brings {what} into the track: {_format_spans(track, times_s)}")
-    fitting_s = offsets_s[within == within.max()].tolist()
+    shares = np.array([np.mean((times_s + by_s >= first_s) & (times_s + by_s <= last_s)) for by_s in offsets_s])
+    if shares.max() < _MIN_SHARE_IN_TRACK:
+        raise UsageError(f"In no time zone does the track cover {what}: {_format_spans(track, times_s)}")
+    fitting_s = offsets_s[shares == shares.max()].tolist()
     for unit_s in (4 * _ZONE_STEP_S, 2 * _ZONE_STEP_S, _ZONE_STEP_S):
-        of_unit = sorted((offset_s for offset_s in fitting_s if offset_s % unit_s == 0), key=abs)
-        if len(of_unit) > 1:
-            choices = ", ".join(f"{offset_s:g}" for offset_s in of_unit[:4])
-            raise UsageError(f"The camera's clock may be off by {choices} s: set one with --offset-s (0: it is right).")
-        if of_unit:
-            return float(of_unit[0])
+        candidates_s = sorted((offset_s for offset_s in fitting_s if offset_s % unit_s == 0), key=abs)
+        if len(candidates_s) > 1:
+            choices = ", ".join(f"{offset_s:g}" for offset_s in candidates_s[:4])
+            raise UsageError(f"The camera's clock may be off by {choices} s: give one as --offset-s (0: it is right).")
+        if candidates_s:
+            return float(candidates_s[0])
     raise AssertionError("the smallest unit fits")
 
 
 def _format_spans(track: Track, times_s: Doubles) -> str:
-    """Return the time spans of camera and track as text."""
+    """Return the time spans of camera and track as text, with advice."""
     ends_s = np.array([times_s.min(), times_s.max(), track.t_s[0], track.t_s[-1]])
-    return "the camera says {} to {}, the track lasts from {} to {} (UTC): give --offset-s.".format(
+    return "the camera's clock gives {} to {}, the track lasts from {} to {} (UTC): give --offset-s.".format(
         *ends_s.astype("datetime64[s]").astype(str)
     )
 
 
 def find_rounding_m(placed: Placement) -> float | None:
-    """Return to how many metres all positions are rounded, if it is much (None: not)."""
+    """Return the rounding step of all positions in metres if it is coarse, otherwise None."""
     tags = placed.track.tags if placed.track else placed.tags.values()
     parts = np.array([(tag.position.lat_deg, tag.position.lon_deg) for tag in tags if tag.position]) / _ROUNDING_DEG
     is_rounded = np.allclose(parts, np.round(parts), rtol=0, atol=1e-4)

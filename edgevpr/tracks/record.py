@@ -1,5 +1,5 @@
-"""Recordings that say where an aircraft was: logs of autopilots, subtitles of drones' videos, tracks of receivers,
-and tables of other programs. `read_record` finds out which a file is."""
+"""Recordings of where an aircraft was: autopilot logs, subtitles of drone videos, receiver tracks, and tables of other
+programs. `read_record` detects the type of a file."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from pathlib import Path
 from edgevpr.core.errors import UsageError
 from edgevpr.frames.positions import ALT_LIMITS_M, GeoTag, Track, make_position
 
-_MIN_INTERVAL_S = 1.0  # while nothing moves, a track keeps a line each second
+_MIN_INTERVAL_S = 1.0  # while nothing moves, a track keeps one line per second
 Attitude = tuple[float | None, float | None, float | None]  # heading, roll and pitch, degrees
 _UNKNOWN: Attitude = (None, None, None)
 
@@ -18,11 +18,10 @@ _UNKNOWN: Attitude = (None, None, None)
 class Record:
     """Content of a recording.
 
-    `kind`: what it is, in words. `track`: position and attitude over time (None: it has no times). `is_utc`: the times
-    of the track are seconds since 1970; else seconds from the first frame of the video that it belongs to.
-    `shots`: what the autopilot logged for each picture that it triggered, in this order. `named`: position and
-    attitude by the name of the picture, of a table that names pictures.
-    """
+    `kind`: type of recording, in words. `track`: position and attitude over time (None: it has no times). `is_utc`: the
+    times of the track are seconds since 1970; otherwise seconds from the first frame of the video that it belongs to.
+    `shots`: what the autopilot logged for each picture that it triggered, in order. `named`: position and attitude by
+    picture name, from a table that names pictures."""
 
     kind: str
     track: Track | None = None
@@ -32,12 +31,12 @@ class Record:
 
 
 def read_record(path: Path) -> Record:
-    """Read a recording; its name says which it is: .bin and .log, .tlog, .ulg, .srt, .gpx, .jsonl, and any other is a
-    table. Raises UsageError for a file that cannot be read, or that has no position."""
+    """Read a recording. Its type follows from its extension: .bin, .log, .tlog, .ulg, .srt, .gpx or .jsonl; any other
+    file is a table. Raises UsageError for a file that cannot be read or has no position."""
     from edgevpr.tracks import flown, gpx, logs, srt, tables
 
     if not path.is_file():
-        raise UsageError(f"{path} does not exist: name a log, a track, subtitles or a table.")
+        raise UsageError(f"{path} does not exist: give a log, a track, subtitles or a table.")
     readers: dict[str, Callable[[Path], Record]] = {
         ".bin": logs.read_ardupilot,
         ".log": logs.read_ardupilot,
@@ -60,7 +59,7 @@ def make_tag(
     attitude: Attitude | None = None,
     height_m: float | None = None,
 ) -> GeoTag:
-    """Make a tag of what a recording says. None and what is impossible, NaN too, are unknown."""
+    """Make a tag from recorded values. None, NaN and impossible values become unknown."""
     heading_deg, roll_deg, pitch_deg = attitude or _UNKNOWN
     low_m, high_m = ALT_LIMITS_M
     alt_m, height_m = (m if m is not None and low_m <= m <= high_m else None for m in (alt_m, height_m))
@@ -77,17 +76,17 @@ def make_tag(
 
 
 def make_track(path: Path, lines: Iterable[tuple[float, GeoTag]]) -> Track | None:
-    """Make a track of times and positions in any order; None if there is none. Of lines that repeat a position, as
-    subtitles do for each frame, one a second is kept: between two lines positions are interpolated."""
+    """Make a track from times and tags in any order; None if no tag has a position. Of lines that repeat a position, as
+    subtitles do for each frame, one per second is kept: positions between two lines are interpolated."""
     kept: dict[float, GeoTag] = {}
-    last_s, last = float("-inf"), GeoTag()
+    previous_s, previous = float("-inf"), GeoTag()
     for t_s, tag in sorted(lines, key=lambda line: line[0]):
-        if tag.position and (tag.position != last.position or t_s - last_s >= _MIN_INTERVAL_S):
-            kept[t_s], last_s, last = tag, t_s, tag
+        if tag.position and (tag.position != previous.position or t_s - previous_s >= _MIN_INTERVAL_S):
+            kept[t_s], previous_s, previous = tag, t_s, tag
     return Track(path, tuple(kept), tuple(kept.values())) if kept else None
 
 
 def require_package(module: str, package: str, what: str) -> None:
-    """Raise UsageError if the module that reads `what` is not installed; `package` is its name on PyPI."""
+    """Raise UsageError if the module that reads `what` is not installed. `package`: its name on PyPI."""
     if find_spec(module) is None:
         raise UsageError(f"{what} needs {package}, which is not installed: run `pip install {package}`.")

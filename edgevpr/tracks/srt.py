@@ -1,5 +1,5 @@
-"""Subtitles (.srt) that drones of DJI write beside a video: position, height and gimbal of each frame or second, in the
-forms of their models. Times are those of the video, so that no clock matters."""
+"""Subtitles (.srt) that DJI drones write beside a video: position, height and gimbal angles of each frame or second, in
+formats that depend on the model. Times are video times, so no clock is involved."""
 
 import re
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from edgevpr.tracks.record import Attitude, Record, make_tag, make_track
 _MAX_FILE_BYTES = 200_000_000  # an hour at 60 frames a second
 _START_TIME = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
-# `[latitude: 50.1]`, `[longtitude : 8.5]` (so misspelt by some), `[rel_alt: 1.2 abs_alt: 230.4]`, `[gb_yaw: 12.0 ...]`.
+# `[latitude: 50.1]`, `[longtitude : 8.5]` (misspelt by some), `[rel_alt: 1.2 abs_alt: 230.4]`, `[gb_yaw: 12.0 ...]`.
 _NAMED_VALUE = re.compile(
     rf"\b(lat|latitude|lon|longitude|longtitude|altitude|rel_alt|abs_alt|gb_\w+|drone_yaw|Yaw)\s*:\s*{_NUMBER}"
 )
@@ -34,10 +34,10 @@ def read_subtitles(path: Path) -> Record:
 
 
 def _read_blocks(text: str) -> Iterator[tuple[float, GeoTag]]:
-    """Yield the time of each subtitle in the video, in seconds, and what it says."""
+    """Yield the video time of each subtitle, in seconds, and its tag."""
     starts = list(_START_TIME.finditer(text))
     ends = [start.start() for start in starts[1:]] + [len(text)]
-    for start, end in zip(starts, ends, strict=False):  # one end more in an empty file
+    for start, end in zip(starts, ends, strict=False):  # an empty file has one end too many
         hours, minutes, seconds, fraction = start.groups()
         t_s = 3600 * int(hours) + 60 * int(minutes) + int(seconds) + float(f"0.{fraction}")
         yield t_s, _parse_block(text[start.end() : end])
@@ -49,7 +49,7 @@ def _parse_block(block: str) -> GeoTag:
     lon_deg = named.get("lon", named.get("longitude", named.get("longtitude")))
     if gps := _GPS.search(block):
         lon_deg, lat_deg = float(gps[1]), float(gps[2])  # the third is an altitude, or the number of satellites
-        if gps[4] or abs(lat_deg) > 90:  # the forms with an altitude in M have the latitude first
+        if gps[4] or abs(lat_deg) > 90:  # formats with the altitude in M have the latitude first
             lon_deg, lat_deg = lat_deg, lon_deg
     if height_m is None and (height := _HEIGHT.search(block)):
         height_m = float(height[1])

@@ -1,5 +1,5 @@
-"""Tables of pictures and their positions that other programs write: exiftool (-csv), Pix4D, Metashape, OpenDroneMap
-(geo.txt). Separators and columns are guessed, and reported."""
+"""Tables of pictures and their positions written by other programs: exiftool (-csv), Pix4D, Metashape, OpenDroneMap
+(geo.txt). Separator and columns are detected, and reported to the user."""
 
 import csv
 import re
@@ -17,8 +17,8 @@ from edgevpr.tracks.record import Attitude, Record, make_tag
 
 _MAX_FILE_BYTES = 100_000_000
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
-_MAX_HEADING_ROWS = 10  # rows among which the names of the columns stand
-# Names of columns, in letters alone; the first that is there counts.
+_MAX_HEADING_ROWS = 10  # rows that are searched for the column names
+# Column names, reduced to letters; the first one present is used.
 _COLUMN_NAMES = {
     "file": ("sourcefile", "filename", "file", "imagename", "image", "label", "photo", "name"),
     "lat": ("latitude", "lat", "gpslatitude", "ylatitude"),
@@ -32,7 +32,7 @@ _COLUMN_NAMES = {
     "time": ("datetimeoriginal", "time"),
 }
 _REQUIRED_COLUMNS = ("file", "lat", "lon")
-_DEFAULT_COLUMNS = ("file", "lat", "lon", "alt")  # as Pix4D orders them
+_DEFAULT_COLUMNS = ("file", "lat", "lon", "alt")  # in Pix4D's order
 _OPENDRONEMAP_COLUMNS = ("file", "lon", "lat", "alt")
 _WGS84 = re.compile(r"epsg:4326|wgs\s?84|\+proj=(longlat|latlong)", re.IGNORECASE)
 _NO_LETTERS = re.compile(r"\[.*?\]|\(.*?\)|[^a-z]")
@@ -40,12 +40,12 @@ _NUMBERS = re.compile(r"[-+]?\d+(?:[.,]\d+)?")
 _PROJECTION = re.compile(r"epsg:\d+|wgs\s?84|\+proj=", re.IGNORECASE)
 
 Rows = Sequence[Sequence[str]]
-Layout = tuple[Mapping[str, int], int, Sequence[str]]  # the column of each part, the first row of values, and names
+Layout = tuple[Mapping[str, int], int, Sequence[str]]  # column of each part, first row of values, and column names
 
 
 def read_table(path: Path) -> Record:
-    """Read a table of pictures. Raises UsageError for one in which pictures, latitude and longitude are not found, and
-    for a wrong value."""
+    """Read a table of pictures. Raises UsageError for a table without columns for picture, latitude and longitude, and
+    for an invalid value."""
     try:
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -53,7 +53,7 @@ def read_table(path: Path) -> Record:
     lines, order = [line for line in text.splitlines() if line.strip(" \t;,")], _DEFAULT_COLUMNS
     if lines and _PROJECTION.match(lines[0]):
         if not _WGS84.match(lines[0]):
-            raise UsageError(f"{path} is in `{lines[0]:.40}`: export it in latitude and longitude (WGS 84).")
+            raise UsageError(f"{path} uses `{lines[0]:.40}`: export it in latitude and longitude (WGS 84).")
         lines, order = lines[1:], _OPENDRONEMAP_COLUMNS
     for separator, divider in _SEPARATORS.items():
         rows = list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
@@ -66,12 +66,12 @@ def read_table(path: Path) -> Record:
         else:
             continue
         needed = ", ".join(f"`{names[column]}`" for part, column in columns.items() if part in _REQUIRED_COLUMNS)
-        return Record(kind=f"table of {needed}, {divider} between them", named=_read_rows(rows[first:], columns, path))
-    raise UsageError(f"{path}: no columns of image, latitude and longitude: name them file, lat and lon in line 1.")
+        return Record(kind=f"table of {needed}, separated by {divider}", named=_read_rows(rows[first:], columns, path))
+    raise UsageError(f"{path}: no columns for image, latitude and longitude: in line 1, call them file, lat and lon.")
 
 
 def _find_columns(rows: Rows) -> Layout | None:
-    """Find the row with the names of the columns."""
+    """Find the row with the column names."""
     for number, row in enumerate(rows[:_MAX_HEADING_ROWS]):
         names = [_NO_LETTERS.sub("", cell.lower()) for cell in row]
         numbers = {part: _find_column(choices, names) for part, choices in _COLUMN_NAMES.items()}
@@ -83,7 +83,7 @@ def _find_columns(rows: Rows) -> Layout | None:
 
 
 def _find_column(choices: Sequence[str], names: Sequence[str]) -> int | None:
-    """Return the column of the first of `choices`, or of `vehicle latitude` and the like."""
+    """Return the column of the first of `choices`, else of an angle's name that ends with it (`vehicle latitude`)."""
     exact = [names.index(name) for name in choices if name in names]
     is_angle = choices[0] in ("latitude", "longitude")
     angles = [column for column, name in enumerate(names) if is_angle and name.endswith(choices[0])]
@@ -97,29 +97,29 @@ def _read_rows(rows: Rows, columns: Mapping[str, int], path: Path) -> dict[str, 
         try:
             named[PureWindowsPath(cells["file"]).name] = _parse_row(cells)
         except (KeyError, ValueError) as error:
-            raise UsageError(f"{path}: `{' '.join(row):.80}` cannot be read ({error}): correct the line.") from error
+            raise UsageError(f"{path}: `{' '.join(row):.80}` is invalid ({error}): correct the line.") from error
     if named and not any(tag.position for tag in named.values()):
         raise UsageError(f"{path} has no valid position: are latitude and longitude swapped, or not in degrees?")
     return named
 
 
 def _parse_row(cells: Mapping[str, str]) -> GeoTag:
-    """Make a tag of the cells of a row; an impossible position is unknown. Raises ValueError for what is no number."""
+    """Make a tag from a row's cells; an impossible position becomes unknown. Raises ValueError for a non-number."""
     number = {part: _parse_angle(text) for part, text in cells.items() if text and part not in ("file", "time")}
     attitude: Attitude = (number.get("nose"), None, None)
     if {"yaw", "pitch", "roll"} <= number.keys():
         attitude = to_nadir_angles(number["yaw"], number["pitch"], number["roll"])
     tag = make_tag(number.get("lat"), number.get("lon"), number.get("alt"), attitude, number.get("height"))
-    with suppress(KeyError, ValueError, OverflowError):  # no time, or none that can be read
+    with suppress(KeyError, ValueError, OverflowError):  # no time, or an unreadable one
         return replace(tag, t_utc_s=parse_time(cells["time"]))
     return tag
 
 
 def _parse_angle(text: str) -> float:
-    """Convert `50.05`, `50,05`, `50.05 N` or `50 deg 3' 12.30" N`, and heights as `12.3 m`. Raises ValueError."""
+    """Convert `50.05`, `50,05`, `50.05 N`, `50 deg 3' 12.30" N`, or a height `12.3 m`. Raises ValueError otherwise."""
     numbers = _NUMBERS.findall(text)
     if not 1 <= len(numbers) <= 3:
-        raise ValueError(f"{text} is no number")
+        raise ValueError(f"{text} is not a number")
     value: float = sum(abs(float(part.replace(",", "."))) / 60**place for place, part in enumerate(numbers))
     is_negative = numbers[0].startswith("-") or text.rstrip().upper().endswith(("S", "W", "BELOW SEA LEVEL"))
     return -value if is_negative else value

@@ -139,7 +139,7 @@ def test_tables_of_other_programs_are_understood_and_said(tmp_path, text, expect
     record = read_record(tmp_path / "table.csv")
     at = record.named["a.JPG"].position
     assert (at.lat_deg, at.lon_deg, at.alt_m) == expected
-    assert "between them" in record.kind
+    assert "separated by" in record.kind
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,7 @@ def test_tables_of_other_programs_are_understood_and_said(tmp_path, text, expect
     [
         ("t.csv", b"file,x,y\na.jpg,1,2\n", "line 1"),
         ("t.csv", b"EPSG:32632\na.jpg 1 2 3\n", "WGS 84"),
-        ("t.csv", b"file,lat,lon\na.jpg,here,8\n", "cannot be read"),
+        ("t.csv", b"file,lat,lon\na.jpg,here,8\n", "is invalid"),
         ("t.csv", b"file,lat,lon\na.jpg,150,200\n", "swapped"),
         ("t.csv", bytes(range(256)), "UTF-8"),
         ("t.bin", b"", "log"),
