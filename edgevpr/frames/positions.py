@@ -120,7 +120,7 @@ def _read_rows(csv_path: str | Path, needed: Sequence[str] = _NEEDED_COLUMNS) ->
     for name in (*needed, *_COLUMN_LIMITS, "time"):
         if header.count(name) > 1 or (name in needed and name not in header):
             raise UsageError(
-                f"{csv_path}: line 1 must name each of the columns {', '.join(needed)} exactly once, separated by "
+                f"{csv_path}, line 1 must name each of the columns {', '.join(needed)} exactly once, separated by "
                 f"commas; `{name}` is missing or repeated."
             )
     records, names = [], {""}

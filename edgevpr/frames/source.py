@@ -1,5 +1,5 @@
-"""Sources of frames: a folder of images, a video file, a camera or a network stream. All have the interface `Source`
-and are opened by `open_source`. `RecordingSource` is the base class of those that end, `FolderSource` a folder."""
+"""Sources of frames: a folder of images, a video file, a camera or a network stream. `open_source` opens any of them as
+a `Source`. `RecordingSource` is the base class of sources that end; `FolderSource` reads a folder."""
 
 import os
 import re
@@ -27,23 +27,23 @@ _SNAPSHOT_PERIOD_S = 0.5
 _PROGRAM_PATTERN = re.compile(r"rpicam(:\d+)?|gst:.*", re.DOTALL)
 # udp://:PORT: on all interfaces.
 _ADDRESS_PATTERN = re.compile(r"(?i)(rtsps?|https?)://[^/].*|tcp://.+:\d+.*|(udp|rtp)://.*:\d+.*")
-# A password with a character that ends the part of an address in which FFmpeg looks for it. A port is no password.
+# A password with a character at which FFmpeg stops looking for the password in an address. A port is not a password.
 _UNESCAPED_PASSWORD = re.compile(r"\w+://(?!\[)[^\s/?#@:]*:(?!\d*([/?#]|$))[^@]*[\s/?#].*@.*", re.DOTALL)
 
 
 class Source:
     """A source of frames.
 
-    `is_live`: a camera or stream, of which only the newest picture is read; a recording is read to its end.
-    `ended`: no more frames will come. `total`: approximate number of frames, 0 if unknown.
+    `is_live`: a camera or stream, from which only the newest picture is read; a recording is read to its end. `ended`:
+    there are no more frames. `total`: approximate number of frames, 0 if unknown.
     `dropped`: number of pictures not read in time; None for a recording.
-    `refused`: numbers of rejected pictures by reason (values of `Refusal`).
-    `latency_s`: seconds from the taking of the newest picture until it could be read, or until now if no newer one has
-    come for long; None if unknown.
+    `refused`: number of rejected pictures by reason (values of `Refusal`).
+    `latency_s`: seconds from the capture of the newest picture until it could be read, or until now if none has arrived
+    for a while; None if unknown.
     `condition`: see `Condition`. `state`: the condition in words for people ("reading", "lost, reopening in 2 s").
     `facts`: a stream's description of its pictures, None if unknown.
-    `step_s`: seconds from the last picture read to the next, if a recording is replayed by its times.
-    `twins`: refuses pictures whose halves show the same."""
+    `step_s`: seconds from the last picture read to the next, if a recording is replayed at its original times.
+    `twins`: rejects stereo pictures, whose halves show the same scene."""
 
     is_live: bool
     ended: bool
@@ -58,15 +58,15 @@ class Source:
     twins: TwinCheck
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame (of a live source the newest), or None if none comes within `timeout_s` seconds. Raises
-        ImageError for an image that cannot be used; the next call continues with the image after it."""
+        """Return the next frame (of a live source, the newest), or None if there is none within `timeout_s` seconds.
+        Raises ImageError for an image that cannot be used; the next call continues with the one after it."""
         raise NotImplementedError
 
     def close(self) -> None:
         """Release the file, the device or the connection."""
 
     def end(self) -> None:
-        """Mark the source as ended: no more frames will come."""
+        """Mark the source as ended: there are no more frames."""
         self.ended, self.condition, self.state = True, Condition.ENDED, "ended"
 
 
@@ -82,7 +82,7 @@ class RecordingSource(Source):
         self._only = None if only is None else frozenset(only)
 
     def is_selected(self, name: str) -> bool:
-        """Return True if the frame of this name is to be read."""
+        """Return True if the frame of this name should be read."""
         return self._only is None or name in self._only
 
 
@@ -93,9 +93,8 @@ def make_frame(image: Image, name: str, t_mono_s: float, tag: GeoTag) -> Frame:
 
 
 class FolderSource(RecordingSource):
-    """Gives each image of a folder once, in counting order of the names (2 before 10), with position, attitude and time
-    from its line in the table of positions, or without a line from its EXIF data. For the arguments see `open_source`.
-    """
+    """Delivers each image of a folder once, in counting order of the names (2 before 10). Position, attitude and time
+    are from its line in the table of positions, else from its EXIF data. See `open_source` for the arguments."""
 
     def __init__(
         self,
@@ -111,7 +110,7 @@ class FolderSource(RecordingSource):
         paths = {decode_name(path.name): path for path in list_images(folder)}  # names in maps and tables are UTF-8
         self._tags = _read_table(folder, positions)
         if positions and not self._tags.keys() & paths:
-            raise UsageError(f"{positions} names none of the images in {folder}: correct its column `file`.")
+            raise UsageError(f"{positions} lists none of the images in {folder}: correct its column `file`.")
         self._unread = [(name, path) for name, path in paths.items() if self.is_selected(name)][::-1]
         self.total = len(self._unread)
         self._clock = clock
@@ -140,15 +139,15 @@ def _read_table(folder: Path, positions: Path | None) -> dict[str, GeoTag]:
 
 
 def read_tags(folder: Path, positions: Path | None = None) -> dict[Path, GeoTag]:
-    """Read the tags of the images of a folder by path, as a `FolderSource` gives them; `positions` is the source's.
-    Raises UsageError for an unusable table."""
+    """Read the tags of the images of a folder by path, as a `FolderSource` with these `positions` returns them. Raises
+    UsageError for an unusable table."""
     tags = _read_table(folder, positions)
     return {path: tags.get(decode_name(path.name)) or read_exif(path) for path in list_images(folder)}
 
 
 def read_intervals(uri: str | None, positions: Path | None = None) -> list[float]:
-    """Read the seconds from each image of a folder to the next, by their times in `positions` or EXIF data. Empty if
-    `uri` is no usable folder, an image has no time, one is older than the one before it, or all times are equal."""
+    """Read the seconds from each image of a folder to the next, from their times in `positions` or EXIF data. Empty if
+    `uri` is not a usable folder, an image has no time, one is older than the one before it, or all times are equal."""
     times: list[float | None] = []
     if uri is not None and os.path.isdir(uri):
         with suppress(EdgevprError):
@@ -168,19 +167,19 @@ def open_source(
     only: Collection[str] | None = None,
     steps_s: Sequence[float] = (),
 ) -> Source:
-    """Open the source that `uri` names: a path, device or address.
+    """Open the source at `uri`: a path, device or address.
 
-    `step_s`: least video time in seconds between two frames of a video file (None: every frame); of an address of a
+    `step_s`: minimum video time in seconds between two frames of a video file (None: every frame); for the address of a
     single picture, seconds between two requests (None: 0.5). `positions`: table of the positions of a recording (None:
-    of a folder the positions.csv in or beside it, else EXIF data; of a video the .csv of the same name beside it).
-    `live`: allow cameras and streams, which never end. A missing one is opened as soon as it is there.
-    `clock`: the monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`:
-    of a folder that is replayed by its times, the result of `read_intervals`.
+    for a folder, the positions.csv in or beside it, else EXIF data; for a video, the .csv of the same name beside it).
+    `live`: allow cameras and streams, which never end. A missing one is opened as soon as it appears. `clock`: the
+    monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`: for a folder
+    that is replayed at its original times, the result of `read_intervals`.
     Raises SourceError for a source that is unknown, missing or not allowed, and UsageError for unusable positions.
     """
     path = Path(uri)
     if positions and is_live(uri):
-        raise UsageError(f"{positions} is a table for recordings, and {uri} is live: leave the table out.")
+        raise UsageError(f"{positions} is a table for recordings, but {uri} is live: leave the table out.")
     if os.path.isdir(uri):  # Path.is_dir raises OSError for a long pipeline
         return FolderSource(folder=path, positions=positions, clock=clock, only=only, steps_s=steps_s)
     if is_live(uri):
@@ -192,7 +191,7 @@ def open_source(
     if not path.is_file():
         raise SourceError(f"There is nothing at `{uri}`: give {SOURCE_HELP}.")
     if path.name.lower().endswith(EXTENSIONS):
-        raise SourceError(f"{uri} is a single image: give the folder that holds it.")
+        raise SourceError(f"{uri} is a single image: give the folder that contains it.")
     from edgevpr.frames.video import VideoSource  # loads FFmpeg
 
     table = positions or find_track(path)
@@ -201,7 +200,7 @@ def open_source(
 
 def read_to_end(source: Source, on_error: Callable[[ImageError], None]) -> Iterator[Frame | None]:
     """Yield all frames of a recording, and close it at the end. For an image that cannot be used, `on_error` is called
-    with the error, and None is yielded, as it is if reading the next frame takes longer than a second."""
+    with the error and None is yielded. None is also yielded if reading the next frame takes longer than a second."""
     while not source.ended:
         try:
             yield source.read(_READ_TIMEOUT_S)
@@ -212,32 +211,32 @@ def read_to_end(source: Source, on_error: Callable[[ImageError], None]) -> Itera
 
 
 def is_live(uri: str | None) -> bool:
-    """Return True if `uri` names a camera or a stream; anything else is a recording (None: there is no source)."""
+    """Return True if `uri` is a camera or a stream; anything else is a recording (None: there is no source)."""
     if uri is None:
         return False
-    is_device = uri.startswith("/dev/") and not Path(uri).is_file()  # /dev/shm holds plain files
+    is_device = uri.startswith("/dev/") and not Path(uri).is_file()  # /dev/shm contains plain files
     return "://" in uri or is_device or uri.lower().endswith(".sdp") or is_program_uri(uri)
 
 
 def is_program_uri(uri: str) -> bool:
-    """Return True if `uri` names a camera that a program of the system reads, see `frames.programs`."""
+    """Return True if `uri` is a camera that a system program reads, see `frames.programs`."""
     return bool(_PROGRAM_PATTERN.fullmatch(uri))
 
 
 def find_missing_cause(uri: str) -> str | None:
-    """Return in a few words why the device or .sdp file `uri` cannot be read; None if it can, or `uri` is neither."""
+    """Return in a few words why the device or .sdp file `uri` cannot be read; None if it can be read or is neither."""
     if "://" in uri or is_program_uri(uri):
         return None
     if not Path(uri).exists():
         return f"there is nothing at {uri}"
     if not os.access(uri, os.R_OK):
-        return f"this user may not read {uri}: add the user to the group of the file, often `video`"
+        return f"this user may not read {uri}: add the user to the group of that file, often `video`"
     return None
 
 
 def _make_capture(uri: str, clock: Callable[[], float], period_s: float) -> Callable[[], Capture]:
     """Return a function that opens the camera or stream `uri`. `period_s`: seconds between requests, if each picture
-    must be requested. Raises SourceError if that can never succeed; a missing device or file may come later."""
+    must be requested. Raises SourceError if opening can never succeed; a missing device or file may appear later."""
     if is_program_uri(uri):
         from edgevpr.frames.programs import open_program, require_program  # loads FFmpeg
 
@@ -250,7 +249,7 @@ def _make_capture(uri: str, clock: Callable[[], float], period_s: float) -> Call
         )
     if "://" in uri and not _ADDRESS_PATTERN.fullmatch(uri):
         raise SourceError(
-            f"{uri} is no address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCE_HELP}."
+            f"{uri} is not the address of a stream, such as rtsp://HOST/PATH or udp://HOST:PORT: give {SOURCE_HELP}."
         )
 
     def open_capture() -> Capture:

@@ -1,5 +1,5 @@
-"""Network streams, decoded by FFmpeg: complete pictures, each with the time at which it was taken (`frames.age`). A
-thread receives packets as they arrive (`PacketQueue`), the thread of `frames.live` decodes them (`StreamCapture`)."""
+"""Network streams, decoded by FFmpeg: complete pictures, each with the time at which it was taken (`frames.age`). One
+thread receives packets as they arrive (`PacketQueue`); the thread of `frames.live` decodes them (`StreamCapture`)."""
 
 import threading
 from collections import deque
@@ -17,27 +17,27 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
 OPEN_TIMEOUT_S = 5.0
-# `frames.live` closes a stream without pictures sooner than this, which allows for the second picture of a slow camera.
-# A UDP port cannot be reopened while FFmpeg still waits at it, so that wait is short.
+# `frames.live` closes a stream without pictures earlier; this limit allows for the second picture of a slow camera. A
+# UDP port cannot be reopened while FFmpeg is still waiting on it, so that wait is short.
 READ_TIMEOUT_S = 15.0
 UDP_READ_TIMEOUT_S = 3.0
 # RTSP over TCP loses no packets, but the camera may lose some before sending. FFmpeg reports that only if it may hold
-# back at least two packets to wait for the missing one. Its search for the rate, which is not needed, takes longer than
-# the opening may if one picture comes per second. It opens addresses in an .sdp file only of allowed protocols.
+# back at least two packets while it waits for a missing one. Probing for the frame rate, which is not needed, would
+# exceed the opening timeout at 1 picture/s. FFmpeg opens addresses in an .sdp file only for whitelisted protocols.
 _OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2", "fpsprobesize": "0"}
-# Some cameras send RTSP by UDP only. FFmpeg then waits 0.1 s for a packet that is missing, and reports it.
+# Some cameras send RTSP over UDP only. FFmpeg then waits 0.1 s for a missing packet, and reports it.
 _UDP_OPTIONS = {"rtsp_transport": "udp", "fpsprobesize": "0"}
 _SDP_OPTIONS = {"protocol_whitelist": "data,file,rtp,udp"}
-_RAW_OPTIONS = {"analyzeduration": "1", "fpsprobesize": "0"}  # else FFmpeg looks for the rate for up to 5 s
+_RAW_OPTIONS = {"analyzeduration": "1", "fpsprobesize": "0"}  # otherwise FFmpeg probes for the frame rate for up to 5 s
 _SKIPPABLE_AGE_S = 0.3  # a packet queued for longer is skipped if a later key frame has arrived
-_MAX_PACKET_AGE_S = 5.0  # a packet queued for longer is skipped in any case
+_MAX_PACKET_AGE_S = 5.0  # a packet queued for longer is always skipped
 _MAX_QUEUED_BYTES = 16_000_000  # five seconds of 25 Mbit/s
 _MAX_QUEUED_PACKETS = 2000
 _CLOSE_TIMEOUT_S = 0.5
 
 
 def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "StreamCapture | SnapshotCapture":
-    """Open a network stream, an .sdp file, or an address of a single picture, which is requested every `period_s`
+    """Open a network stream, an .sdp file, or the address of a single picture, which is requested every `period_s`
     seconds. `clock` is the monotonic clock, in seconds. Raises OpeningError with the cause."""
     opened_s = clock()
     response = try_request(uri, OPEN_TIMEOUT_S) if uri.lower().startswith("http") else None
@@ -46,7 +46,7 @@ def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "Stre
     if response and kind.startswith("multipart/"):
         parts = ResponseFile(response, is_multipart=True)
         return StreamCapture(open_decoder(uri, _RAW_OPTIONS, timeouts_s, "mpjpeg", parts), clock, opened_s)
-    if response and kind == "application/octet-stream":  # FFmpeg as a server would answer no second request
+    if response and kind == "application/octet-stream":  # FFmpeg as a server would not answer a second request
         file = ResponseFile(response, is_multipart=False)
         return StreamCapture(open_decoder(uri, _OPTIONS, timeouts_s, file=file), clock, opened_s)
     if response:
@@ -54,15 +54,15 @@ def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "Stre
     if kind.startswith("image/"):
         return SnapshotCapture(uri, period_s, OPEN_TIMEOUT_S, clock)
     if kind == "text/html":
-        raise OpeningError(f"no video at this address, but {kind}")
+        raise OpeningError(f"no video at this address but {kind}")
     return StreamCapture(_open_stream(uri), clock, opened_s)
 
 
 def open_raw(
     uri: str, clock: Callable[[], float], form: str, timeout_s: float, delay_sd_s: float = FRAME_TIME_SD_S
 ) -> "StreamCapture":
-    """Open a stream of a format without time stamps, `form` by its name in FFmpeg, and wait for its first picture up to
-    `timeout_s` seconds. `delay_sd_s`: see `Shot`. Raises OpeningError with the cause."""
+    """Open a stream in a format without time stamps (`form`: its name in FFmpeg), and wait up to `timeout_s` seconds
+    for its first picture. `delay_sd_s`: see `Shot`. Raises OpeningError with the cause."""
     opened_s = clock()
     decoder = open_decoder(uri, _RAW_OPTIONS, (timeout_s, READ_TIMEOUT_S), form)
     return StreamCapture(decoder, clock, opened_s, delay_sd_s)
@@ -137,7 +137,7 @@ class StreamCapture:
         order = packet.pts if packet.dts is None else packet.dts
         stamped.record_arrival(packet.pts * unit_s, order * unit_s, arrival.arrival_s, packet.size)
         if stamped.is_live:
-            self._decoder.is_backlog_doubtful = False  # packets from now on were sent after the opening
+            self._decoder.is_backlog_doubtful = False  # from now on, packets were sent after the opening
 
     def _make_shot(self, picture: "VideoFrame", by_wait: CaptureTime, arrival_s: float) -> Shot | Refusal:
         taken: CaptureTime | None = by_wait
@@ -154,11 +154,11 @@ class StreamCapture:
 
 class PacketQueue:
     """A queue that a thread fills with packets as soon as they arrive. If the board decodes too slowly, packets wait
-    here, with known arrival times, and not in network buffers, where the time would be unknown. If too many wait, all
-    are dropped, and those to come up to the next key frame.
+    here with known arrival times, and not in network buffers, where those would be unknown. If too many wait, all of
+    them are dropped, and so are new packets up to the next key frame.
 
-    The thread closes the stream by `close_stream`, since only it knows when its last fetch has returned: FFmpeg cannot
-    be interrupted, and closing a stream in use would crash the process."""
+    The thread itself closes the stream, with `close_stream`, because only it knows when its last fetch has returned:
+    FFmpeg cannot be interrupted, and closing a stream in use would crash the process."""
 
     def __init__(
         self, fetch: Callable[[], TimedPacket | None], clock: Callable[[], float], close_stream: Callable[[], None]
@@ -183,20 +183,20 @@ class PacketQueue:
             return arrival
 
     def has_key_frame(self) -> bool:
-        """Return True if a key frame is in the queue: it can be decoded without the packets before it."""
+        """Return True if the queue has a key frame, which can be decoded without the packets before it."""
         with self._changed:
             return any(arrival.packet.is_keyframe for arrival in self._queued)
 
     def cancel(self) -> None:
-        """Drop all packets, and let `next` return None from now on."""
+        """Drop all packets and make `next` return None from now on."""
         with self._changed:
             self._is_lost = True
             self._clear()
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Let the thread close the stream as soon as its fetch has returned; wait for that up to half a second. The
-        stream must not be used any more."""
+        """Let the thread close the stream as soon as its fetch has returned, and wait for that up to half a second. The
+        stream must not be used after this call."""
         self.cancel()
         self._is_unused.set()
         self._thread.join(_CLOSE_TIMEOUT_S)

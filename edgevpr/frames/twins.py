@@ -1,5 +1,5 @@
-"""Detects pictures whose two halves show the same, as sent by a stereo camera: side by side, or one above the other.
-They match places by a part of the picture only, so that positions are off by tens of metres."""
+"""Detects stereo pictures, whose two halves show the same scene side by side or one above the other. Such a picture
+matches places with only part of its area, which would make positions wrong by tens of metres."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,32 +8,32 @@ from edgevpr.core.arrays import Image
 from edgevpr.core.errors import ImageError
 from edgevpr.frames.images import cv2, resize
 
-_HALVES = ("left and the right", "upper and the lower")
+_HALVES = ("left and right", "upper and lower")
 _COPY_PX = (128, 96)  # width and height of the copy that is compared
-_DETAIL_SIGMA_PX = 3.0  # brightness over longer distances may be alike in halves that show something else
-_MAX_SHIFT_SHARE = 0.125  # of the width of a half, between the views of both eyes
-_MAX_OFFSET_SHARE = 0.04  # of its height, by how the lenses are mounted
+_DETAIL_SIGMA_PX = 3.0  # brightness over longer distances may be similar in halves that show different scenes
+_MAX_SHIFT_SHARE = 0.125  # of the width of a half, between the left and right views
+_MAX_OFFSET_SHARE = 0.04  # of its height, due to the mounting of the lenses
 _PEAK_RADIUS_PX = 4.0
-# Chosen on 975 pictures of 14 sets and on stereo pictures made of them, with another exposure, turned by half a degree,
-# shifted, squeezed and noisy: 96 % of these reach both, and none of the ordinary ones (the nearest: 0.46 and 0.13).
+# Chosen on 975 pictures of 14 sets and on stereo pictures made from them with a different exposure, half a degree of
+# rotation, shifts, scaling and noise: 96 % of these reach both, and no ordinary picture does (closest: 0.46, 0.13).
 _MIN_TWIN_CORRELATION = 0.5
-_MIN_LEAD = 0.15  # over correlations farther from the largest one; roads and rows of crops have none
-_MIN_DETAIL_LEVELS = 1.5  # standard deviation in grey levels; with less, nothing can be compared
-_TWINS_TO_DECIDE = 5  # how many more pictures must be twins than single ones
-_SINGLES_TO_DECIDE = 10  # how many more must be single ones until no more are compared
+_MIN_LEAD = 0.15  # over correlations away from the peak; roads and crop rows have no such lead
+_MIN_DETAIL_LEVELS = 1.5  # standard deviation in grey levels; halves with less cannot be compared
+_TWINS_TO_DECIDE = 5  # how many more pictures must be stereo than single
+_SINGLES_TO_DECIDE = 10  # how many more must be single before the check stops
 
 
 class TwinCheck:
-    """Compares the halves of the first pictures of one source until it is clear whether they are twins. Each picture of
-    twins is refused at once."""
+    """Compares the halves of the first pictures of one source until it is clear whether they are twins (stereo
+    pictures). Every picture with twin halves is rejected immediately."""
 
     def __init__(self) -> None:
-        self._evidence = 0  # above zero for twins
+        self._evidence = 0  # above zero: twins
         self._are_twins = False
-        self._twins: list[str] = []  # the halves that were last alike
+        self._twins: list[str] = []  # the halves that last matched
 
     def require_single(self, image: Image) -> Image:
-        """Return the picture, uint8 (H, W[, 3]), as it is. Raises ImageError if its halves show the same."""
+        """Return the picture, uint8 (H, W[, 3]), unchanged. Raises ImageError if its halves show the same scene."""
         if self._evidence == -_SINGLES_TO_DECIDE:
             return image
         by_side = {side: correlate_halves(image, side) for side in _HALVES}
@@ -45,15 +45,15 @@ class TwinCheck:
         self._are_twins = self._evidence == _TWINS_TO_DECIDE or (self._are_twins and self._evidence > 0)
         if twins or self._are_twins:
             raise ImageError(
-                f"The {self._twins[0]} half of the picture show the same, as from a stereo camera: give one half only, "
-                "by a pipeline with videocrop (docs/how-to/cameras.md), or cropped images."
+                f"The {self._twins[0]} halves of the picture show the same scene, as from a stereo camera: use only "
+                "one half, with a videocrop pipeline (docs/how-to/cameras.md) or cropped images."
             )
         return image
 
 
 def correlate_halves(image: Image, side: str) -> tuple[float, float]:
-    """Return the largest correlation, 0 to 1, between the halves of a picture, one of `_HALVES`, over the shifts that a
-    stereo camera causes, and by how much it exceeds all others; 0 and 0 if there is too little detail."""
+    """Return the largest correlation, 0 to 1, between two halves of a picture over the shifts that a stereo camera
+    causes, and its lead over all others; 0 and 0 if there is too little detail. `side`: one of `_HALVES`."""
     are_above = side == _HALVES[1]
     copy = resize(image, _COPY_PX)
     grey = copy if copy.ndim == 2 else copy[:, :, 1]
@@ -67,9 +67,9 @@ def correlate_halves(image: Image, side: str) -> tuple[float, float]:
     rows, columns = np.indices(correlations.shape)
     is_possible = (abs(rows - dy) <= _MAX_OFFSET_SHARE * height) & (abs(columns - dx) <= _MAX_SHIFT_SHARE * width)
     row, column = np.unravel_index(np.argmax(np.where(is_possible, correlations, -1)), correlations.shape)
-    is_elsewhere = np.hypot(rows - row, columns - column) > _PEAK_RADIUS_PX
+    is_off_peak = np.hypot(rows - row, columns - column) > _PEAK_RADIUS_PX
     best = max(0.0, float(correlations[row, column]))
-    return best, best - float(correlations[is_elsewhere].max())
+    return best, best - float(correlations[is_off_peak].max())
 
 
 def _extract_detail(half: Image) -> NDArray[np.float32]:

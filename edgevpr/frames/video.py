@@ -1,4 +1,4 @@
-"""A video file as a source of frames: it is read in order to its end, and damaged and missing parts are reported."""
+"""A video file as a source of frames. It is read in order to its end; damaged and missing parts are reported."""
 
 import math
 from collections import deque
@@ -17,14 +17,14 @@ from edgevpr.frames.source import RecordingSource, make_frame
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
-_TIMESTAMP_ROUNDING_S = 0.001  # Matroska counts in milliseconds
+_TIMESTAMP_ROUNDING_S = 0.001  # Matroska stores milliseconds
 _DEFAULT_RATE_HZ = 25.0
-_MAX_MISSING_S = 1.0  # at the end without a report: other streams in the file may last longer
+_MAX_MISSING_S = 1.0  # at the end, tolerated without a report: other streams in the file may be longer
 
 
 def read_start_s(path: Path) -> tuple[float | None, float]:
-    """Return the start of a video, in seconds since 1970 by the clock of the camera (None: unknown), and its duration
-    in seconds (0: unknown). Raises SourceError for a file that is no video."""
+    """Return the start of a video, in seconds since 1970 by the camera's clock (None: unknown), and its duration in
+    seconds (0: unknown). Raises SourceError for a file that is not a video."""
     decoder = _open_video(path, "the video file of the positions")
     start = {**decoder.container.metadata, **decoder.stream.metadata}.get("creation_time")
     duration_s = (decoder.container.duration or 0) / 1e6
@@ -43,10 +43,10 @@ def _open_video(path: Path, advice: str) -> VideoDecoder:
 
 class VideoSource(RecordingSource):
     """The frames of the video file `path`, at least `step_s` seconds of video time apart (0: every frame); every run
-    gives the same frames. `track` has the positions of the frames (None: unknown).
+    returns the same frames. `track`: positions of the frames (None: unknown).
 
-    Damaged frames, and those decoded by means of them, are left out: `read` raises ImageError once for each sequence of
-    them, and once if the end of the file is missing."""
+    Damaged frames, and frames decoded from them, are skipped: `read` raises ImageError once for each sequence of them,
+    and once if the end of the file is missing."""
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class VideoSource(RecordingSource):
         lasts_s = stream.duration * decoder.unit_s if stream.duration else (decoder.container.duration or 0) / 1e6
         stated_s = lasts_s if decoder.is_stamped else 0.0
         frames = stream.frames or stated_s / self._frame_s
-        self._expected_s = max(stated_s, stream.frames * self._frame_s)  # in a cut AVI file only the latter is right
+        self._expected_s = max(stated_s, stream.frames * self._frame_s)  # truncated AVI: only the latter is right
         self.total = math.ceil(frames * self._frame_s / max(step_s, self._frame_s))
         if track and self._expected_s:
             track.require_overlap(path, self._expected_s)
@@ -111,7 +111,7 @@ class VideoSource(RecordingSource):
             self._ready.extend(pictures)
 
     def _advance(self, picture: "VideoFrame") -> bool:
-        """Set index and video time to those of `picture`, the next one decoded; return True if it should be given."""
+        """Advance index and video time to `picture`, the next one decoded; return True if it should be returned."""
         self._index += 1
         stamp_s = ((picture.pts or 0) - self._first_stamp) * self._decoder.unit_s
         # Without usable time stamps, as in a raw H.264 or MJPEG file, the frame rate is used.
@@ -125,7 +125,7 @@ class VideoSource(RecordingSource):
         self._t_s += 0.0 if self._decoder.is_stamped else count * self._frame_s
         which = f"frame {first:06d} (t={t_s:.1f} s)" + (f" and {count - 1} after it" if count > 1 else "")
         raise ImageError(
-            f"{self._path}: {which} cannot be used{until}: damaged, or decoded from damage: copy the video again.",
+            f"{self._path}: {which} cannot be used{until} (damaged, or decoded from damage): copy the video again.",
             count,
         )
 
@@ -136,7 +136,7 @@ class VideoSource(RecordingSource):
         missing_s = self._expected_s - self._read_s - self._frame_s
         if missing_s > _MAX_MISSING_S:
             raise ImageError(
-                f"{self._path} ends after {self._expected_s - missing_s:.1f} s of {self._expected_s:.1f} s: it is cut "
-                "short: copy the video again.",
+                f"{self._path} is truncated ({self._expected_s - missing_s:.1f} s of {self._expected_s:.1f} s): copy "
+                "the video again.",
                 round(missing_s / self._frame_s),
             )

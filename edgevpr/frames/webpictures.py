@@ -1,5 +1,5 @@
-"""Pictures over HTTP that FFmpeg cannot read as a stream: the address of a single picture, requested again and again
-(`SnapshotCapture`), and a multipart stream whose parts are of any image type (`ResponseFile`)."""
+"""Pictures over HTTP that FFmpeg cannot read as a stream: the address of a single picture, requested repeatedly
+(`SnapshotCapture`), and a multipart stream with parts of any image type (`ResponseFile`)."""
 
 import http.client
 import re
@@ -18,7 +18,7 @@ from edgevpr.frames.images import decode_image, encode_jpeg, is_whole_jpeg
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, make_thumbnail
 
 _MAX_BYTES = 64_000_000  # of one picture
-_MAX_PART_S = 15.0  # for one picture of a multipart stream: a trickling sender must not hold a thread for ever
+_MAX_PART_S = 15.0  # for one picture of a multipart stream: a trickling sender must not block a thread for ever
 _CHUNK_BYTES = 65536
 _MAX_PERIOD_S = 1.0  # from one request for a picture to the next
 _JPEG_START = b"\xff\xd8"
@@ -27,8 +27,8 @@ _REQUEST_ERRORS = (OSError, http.client.HTTPException, ValueError)
 
 
 def send_request(uri: str, timeout_s: float) -> http.client.HTTPResponse:
-    """Request `uri`, http or https, which may hold user and password, and return the response. `timeout_s` limits each
-    wait. Raises one of `_REQUEST_ERRORS`."""
+    """Request the http or https address `uri`, which may contain user and password, and return the response.
+    `timeout_s` limits each wait. Raises one of `_REQUEST_ERRORS`."""
     parts = urlsplit(uri)
     account, _, host = parts.netloc.rpartition("@")
     address = parts._replace(netloc=host).geturl()
@@ -36,7 +36,7 @@ def send_request(uri: str, timeout_s: float) -> http.client.HTTPResponse:
     passwords = urllib.request.HTTPPasswordMgrWithDefaultRealm()
     passwords.add_password(None, address, unquote(user), unquote(password))
     context = ssl.create_default_context()
-    context.check_hostname = False  # cameras sign their certificates themselves; FFmpeg does not check them either
+    context.check_hostname = False  # cameras use self-signed certificates; FFmpeg does not check them either
     context.verify_mode = ssl.CERT_NONE
     opener = urllib.request.build_opener(
         urllib.request.ProxyHandler({}),
@@ -49,7 +49,8 @@ def send_request(uri: str, timeout_s: float) -> http.client.HTTPResponse:
 
 
 def try_request(uri: str, timeout_s: float) -> http.client.HTTPResponse | None:
-    """Request `uri`; return None if that fails by a cause that FFmpeg can find. Raises OpeningError after a timeout."""
+    """Request `uri`; return None if that fails for a reason that FFmpeg will report itself. Raises OpeningError on
+    timeout."""
     try:
         return send_request(uri, timeout_s)
     except _REQUEST_ERRORS as error:
@@ -60,8 +61,8 @@ def try_request(uri: str, timeout_s: float) -> http.client.HTTPResponse | None:
 
 class SnapshotCapture:
     """A `Capture` that requests the picture at `uri` every `period_s` seconds. Its time is that of the request, when
-    most cameras take it. A camera that gave the same file twice keeps a picture ready, which may be as old as the
-    request before."""
+    most cameras take it. A camera that returned the same file twice keeps a picture ready, which may be as old as the
+    previous request."""
 
     def __init__(self, uri: str, period_s: float, timeout_s: float, clock: Callable[[], float]) -> None:
         self._uri, self._timeout_s, self._clock = uri, timeout_s, clock
@@ -94,12 +95,12 @@ class SnapshotCapture:
         """Do nothing: a request lasts a few seconds at most."""
 
     def release(self) -> None:
-        """Do nothing: no connection is open between two requests."""
+        """Do nothing: no connection stays open between requests."""
 
 
 class ResponseFile:
-    """The body of a `response` as a file that never waits for more bytes than have come; with `is_multipart` each part
-    becomes an image/jpeg, which FFmpeg can read. It ends if the connection is lost."""
+    """The body of a `response` as a file that returns bytes as soon as they arrive; with `is_multipart` each part
+    becomes an image/jpeg, which FFmpeg can read. The file ends if the connection is lost."""
 
     def __init__(self, response: http.client.HTTPResponse, is_multipart: bool) -> None:
         self._pieces, self._unread = (_read_parts if is_multipart else _read_chunks)(response), b""
@@ -121,31 +122,30 @@ def _read_chunks(response: http.client.HTTPResponse) -> Iterator[bytes]:
 def _read_parts(response: http.client.HTTPResponse) -> Iterator[bytes]:
     boundary = re.escape((response.headers.get_boundary() or "").strip('-" ').encode("latin-1", "replace"))
     head = re.compile(boundary + rb"[^\n]*\n((?:[^\r\n]+\r?\n)*)\r?\n")
-    seen, whole_s = bytearray(), time.monotonic()
+    received, whole_s = bytearray(), time.monotonic()
     for chunk in _read_chunks(response):
-        seen += chunk
-        while (part := head.search(seen)) and (end := _find_end(seen, part, boundary)):
-            data = bytes(seen[part.end() : end])
-            del seen[:end]
+        received += chunk
+        while (part := head.search(received)) and (end := _find_end(received, part, boundary)):
+            data = bytes(received[part.end() : end])
+            del received[:end]
             whole_s = time.monotonic()
             with suppress(ImageError):
                 jpeg = data if data.startswith(_JPEG_START) else encode_jpeg(decode_image(data, "the part"))
                 yield b"--part\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n" % (len(jpeg), jpeg)
-        if len(seen) > _MAX_BYTES or time.monotonic() > whole_s + _MAX_PART_S:
+        if len(received) > _MAX_BYTES or time.monotonic() > whole_s + _MAX_PART_S:
             return
 
 
-def _find_end(seen: bytearray, part: re.Match[bytes], boundary: bytes) -> int:
-    """Return the end of the picture that begins after the head of a `part`; 0 if it has not come. Without a stated
-    length a JPEG ends with its end mark. FFmpeg would wait for the next part, so that each picture were a period older.
-    """
+def _find_end(received: bytearray, part: re.Match[bytes], boundary: bytes) -> int:
+    """Return the end of the picture that begins after the head of a `part`; 0 if it has not arrived. Without a stated
+    length, a JPEG ends at its end marker. FFmpeg would wait for the next part, making each picture one period older."""
     start = part.end()
     if length := re.search(rb"(?im)^content-length:\s*(\d+)", part[1]):
         end = start + int(length[1])
-        return end if end <= len(seen) else 0
+        return end if end <= len(received) else 0
     end = start
-    while seen.startswith(_JPEG_START, start) and (end := seen.find(_JPEG_END, end) + 2) >= 2:
-        if is_whole_jpeg(bytes(seen[start:end])):
+    while received.startswith(_JPEG_START, start) and (end := received.find(_JPEG_END, end) + 2) >= 2:
+        if is_whole_jpeg(bytes(received[start:end])):
             return end
-    next_part = re.search(rb"\r?\n--" + boundary, seen[start:])
+    next_part = re.search(rb"\r?\n--" + boundary, received[start:])
     return start + next_part.start() if next_part else 0

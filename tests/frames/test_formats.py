@@ -235,7 +235,7 @@ def test_both_pictures_of_a_stereo_camera_in_one_are_refused(join, shift_px):
     check = TwinCheck()
     for step in range(12):
         scene = np.roll(np.clip(SCENE, 0, 255).astype(np.uint8), 15 * step, 1)
-        with pytest.raises(ImageError, match=r"half of the picture show the same.*videocrop"):
+        with pytest.raises(ImageError, match=r"halves of the picture show the same scene.*videocrop"):
             check.require_single(join(stereo_pair(scene, shift_px)))
     for _ in range(10):
         with contextlib.suppress(ImageError):
@@ -263,4 +263,4 @@ def test_folder_of_stereo_pictures_gives_no_frame(tmp_path):
         cv2.imwrite(str(tmp_path / f"{step}.png"), np.hstack(stereo_pair(scene, 4)))
     problems = []
     assert not any(read_to_end(open_source(str(tmp_path), live=False), problems.append))
-    assert ["left and the right half" in str(problem) for problem in problems] == [True] * 3
+    assert ["left and right halves" in str(problem) for problem in problems] == [True] * 3

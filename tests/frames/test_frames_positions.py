@@ -94,8 +94,8 @@ def test_parse_time_refuses(text):
         ("b.jpg,ref,46,,,,,", "line 3 has only one of lat and lon"),
         ("b.jpg,46,2", "line 3 does not have as many values"),
         ("b.jpg,ref,46,84,2,0,,,,", "line 3 does not have as many values"),
-        (",ref,46,2,,,,", "line 3 names no image"),
-        ("0000.jpg,ref,46,2,,,,", "that of an earlier line (`0000.jpg`)"),
+        (",ref,46,2,,,,", "line 3 has no image name"),
+        ("0000.jpg,ref,46,2,,,,", "repeats an earlier one (`0000.jpg`)"),
     ],
 )
 def test_read_positions_names_line_and_value_of_a_wrong_row(row, complaint, written):

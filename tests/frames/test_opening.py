@@ -89,7 +89,7 @@ def hang(connection, asked):
         ("http://", http("403 Forbidden"), "access forbidden (403)"),
         ("http://", http("404 Not Found"), "no stream at this path (404)"),
         ("http://", http("500 Internal Server Error"), "refused by the camera (500)"),
-        ("http://", http("200 OK", "text/html", b"<html>log in</html>"), "no video at this address, but text/html"),
+        ("http://", http("200 OK", "text/html", b"<html>log in</html>"), "no video at this address but text/html"),
         ("http://", hang, "no answer within 0.7 s"),
     ],
 )
