@@ -32,9 +32,11 @@ _PLACE_SLOPE_SD = 0.1
 # those of 45 degrees 0.08 to 0.25; it is the square of the tangent of half the tilt.
 _CLEAR_STRETCH = 0.075
 _TILT_SD_SHARE = 0.3  # of a tilt: clear enough for what a match may claim, too little to refuse 30 degrees
-# Of the mean of several matches: slopes of the ground, which a map of an orthophoto does not show.
+# Of a mean over several matches: slopes of the ground, which a map of an orthophoto does not show. Of each match: the
+# tilt of the place's image, as that of a map of the same camera.
 _COMMON_TILT_SD = math.tan(math.radians(2.0))
-_SCATTER_SHARE = 2 / 3  # from match to match, tilts scatter by less than their regions say (sat_marash: half)
+_SINGLE_TILT_SD = math.tan(math.radians(4.0))
+_MAX_TILT = math.tan(math.radians(60.0))  # more is a wrong fit
 _COMMON_SD_SHARE = 0.15  # of a tilt: so large ones count little, which are mostly wrong
 _KEPT_SHARE = 0.98  # of a mean from match to match: a gimbal may move
 # Relief moves neighbouring landmarks alike: so many of them count as one. The place's own picture is tilted too.
@@ -116,8 +118,7 @@ class CommonTilt:
         """The mean so far."""
         if not self._weight:
             return ShownTilt(0.0, _UNKNOWN_TILT_SD)
-        sd = _SCATTER_SHARE / math.sqrt(self._weight)
-        return ShownTilt(abs(self._weighted) / self._weight, sd, _COMMON_TILT_SD)
+        return ShownTilt(abs(self._weighted) / self._weight, self._weight**-0.5, _COMMON_TILT_SD)
 
     def add(self, found: Perspective, view: View, place_id: int) -> None:
         """Add the perspective of an accepted match; the same place again shows nothing new."""
@@ -126,7 +127,9 @@ class CommonTilt:
         self._place_id = place_id
         right, down = found.over_place[2, :2]
         tilt = cmath.rect(view.focal, -math.radians(view.turned_deg)) * complex(right, down)
-        sd = math.hypot(view.focal * found.slope_sd, view.focal * _PLACE_SLOPE_SD, _COMMON_SD_SHARE * abs(tilt))
+        if abs(tilt) > _MAX_TILT:
+            return
+        sd = math.hypot(view.focal * found.slope_sd, _SINGLE_TILT_SD, _COMMON_SD_SHARE * abs(tilt))
         weight = sd**-2
         self._weighted = _KEPT_SHARE * self._weighted + weight * tilt
         self._weight = _KEPT_SHARE * self._weight + weight
