@@ -41,7 +41,7 @@ class MapConnection:
     @classmethod
     def create(cls, path: str | Path, spec: TechniqueSpec) -> "Self":
         """Create an empty map for descriptors of `spec`; if writing fails, remove the file. Raises MapError if the file
-        has content already or cannot be written, and UsageError for a name that no file can have."""
+        is not empty or cannot be written, and UsageError for a name that no file can have."""
         path = mapfiles.parse_map_path(path)
         mapfiles.require_regular(path)
         with ExitStack() as undo:
@@ -145,7 +145,7 @@ class MapConnection:
                 raise
 
     def scan_rows(self, columns: str) -> Iterator[tuple[int, Values | None]]:
-        """Yield (place id, values of `columns` or None if unreadable) of every place (see `rows.scan`). Raises
+        """Yield (place id, values of `columns` or None if unreadable) of every place (see `rows.scan_rows`). Raises
         MapError."""
         with translate_errors(self.path):
             yield from rows.scan_rows(self.db, columns)

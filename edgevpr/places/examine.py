@@ -26,8 +26,8 @@ _LOW_QUALITY_FACTOR = 0.5  # on the value of a place that was added only to clos
 
 class PlaceCheck(NamedTuple):
     """The result of checking one place. `problem` describes the damage in a few words (None: no damage). `content` has
-    the values of its row by column name, without damaged landmarks (empty: unreadable). `is_usable`: nothing but its
-    landmarks is damaged."""
+    the values of its row by column name, without damaged landmarks (empty: unreadable). `is_usable`: True if at most
+    its landmarks are damaged."""
 
     place_id: int
     problem: str | None

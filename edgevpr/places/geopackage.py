@@ -15,7 +15,7 @@ _WGS84_WKT = (
 )
 
 # The checksums (CRC-32 of zlib) precede the BLOBs: SQLite reads all of a large BLOB to find what comes after it. A
-# program that moves a place (QGIS) does not know the checksums. So a trigger deletes those of position and pose, and
+# program that moves a place (QGIS) does not update the checksums. So a trigger deletes those of position and pose, and
 # the recorded position (see `core.types.Pose`): a place that was moved must not be refined from it again.
 SCHEMA = f"""
 CREATE TABLE gpkg_spatial_ref_sys (

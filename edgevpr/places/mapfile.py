@@ -65,7 +65,7 @@ class PlaceMap(MapConnection):
 
     `mask_sha256`: hash of the overlay mask that was used to make the places. `lens`: name of the camera calibration
     used to undistort their pictures. `attribution`: owners of the orthophotos from which places were cut, in their own
-    words. `calibration`: the calibration of confidences (see `mapmaking.calibrate`). None: there is none, or it is
+    words. `calibration`: the calibration of confidences (see `mapmaking.calibrate`). Each is None if absent or
     unknown."""
 
     mask_sha256 = _StoredText(mapspec.MASK)
@@ -136,7 +136,7 @@ class PlaceMap(MapConnection):
         self._record_text(mapspec.CALIBRATION, text)
 
     def read_places(self, place_ids: Iterable[int] | None = None) -> Iterator[Place]:
-        """Yield the places with `place_ids` in this order (None: all places, in the order they were added). Raises
+        """Yield the places `place_ids`, in that order (None: all places, in the order they were added). Raises
         PlaceError for a place that is missing or damaged."""
         for place_id in [place_id for place_id, _ in self.scan_rows("1")] if place_ids is None else map(int, place_ids):
             with self._convert_row_errors(place_id):

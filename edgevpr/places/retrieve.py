@@ -80,7 +80,7 @@ def compare_places(query: Query, scanned: Scan, candidates: int | None, apart_m:
     """Compare the `candidates` places that have the best scan scores with the query, and rank them.
 
     If there are more candidates than the technique's `in_full`, only those with the best quick scores are compared in
-    full. With a nadir camera, no heading and at least 2,000 places, there are 1.6 times as many. All places are
+    full. With a nadir camera, no heading and at least 2,000 places, `candidates` is multiplied by 1.6. All places are
     compared if `candidates` is None, or at least the number of places and more than the technique's own number. If all
     candidates are within `apart_m` metres of the best one, those elsewhere with the best scan scores are compared too,
     for the margin. If `expected.in_reach` is known, so are five out of reach and at least five elsewhere.
@@ -238,8 +238,8 @@ def load_candidates(
     ranking: Ranking, index: PlaceIndex, place_map: PlaceMap, first: int | None = None
 ) -> list[Candidate]:
     """Return the best `first` places of a ranking (None: all) as candidates, best first, with data from the map file.
-    Raises PlaceError if one of them cannot be read, was left out before, or has changed its position since the index
-    was loaded. The place is left out from then on."""
+    Raises PlaceError if one of them cannot be read, was left out before, or has moved since the index was loaded. The
+    place is left out from then on."""
     candidates = []
     for slot, score in zip(ranking.slots[:first].tolist(), ranking.scores[:first].tolist(), strict=True):
         place_id = int(index.place_ids[slot])

@@ -22,7 +22,7 @@ CONTRAST = {"forward": (75, 200, 0.4), "nadir": (40, 40, 0.25)}
 MATCHINGS = ("displacement", "thesis")
 # Candidate places or, with a nadir camera, pairs of a place and a rotation.
 CANDIDATES = {"forward": 42, "nadir": 30}
-# Places compared in full: those with the best `score_quickly`, forward from every fourth good region. On corridor, the
+# Places compared in full: those with the best quick scores (forward: from every fourth good region). On corridor, the
 # seasons and nordland_tiny, 12 of 42 compared in full find as many places as all (four fewer of the 994 of
 # nordland_tiny). With a nadir camera, 6 of 30 find as many as 10 on sat_marash, aerial_swindale and kite_ochota.
 MAX_FULL_MATCHES = {"forward": 12, "nadir": 6}

@@ -2,8 +2,8 @@
 
 Dim ground has as little entropy as a blank wall. Such a picture is smoothed, since stretching amplifies sensor noise,
 and then *stretched* to more grey levels. A picture with enough contrast, or almost none, is left unchanged: noise must
-not look like ground. Results are rounded equally on every processor (see `gradients`): means of integer grey levels are
-exact, and products and sums are computed one by one."""
+not look like ground. Results are rounded identically on every processor (see `gradients`): means of integer grey levels
+are exact, and products and sums are computed one by one."""
 
 import math
 
@@ -15,7 +15,7 @@ from edgevpr.techniques.gradients import round_levels
 
 _BLOCKS_PER_SIDE = 64  # the contrast is measured on means of blocks, which have little noise
 _CLIPPED_SHARE = 0.01  # of the blocks, at the dark end and at the bright end each
-# Minimum contrast of ground, in grey levels; where a block has few pixels, noise of 3 levels needs more.
+# Minimum contrast of ground, in grey levels. If a block has few pixels, noise of 3 levels raises it.
 _MIN_CONTRAST_LEVELS = 4.0
 _NOISE_LEVELS = 3 * 4.65  # from the 1st to the 99th percentile of a normal distribution
 _MAX_SIGMA_PIXELS = 1.4

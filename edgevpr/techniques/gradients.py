@@ -1,8 +1,8 @@
 """Histograms of oriented gradients over cells and blocks, for `hog`, `cohog` and the training of CALC, and the
 low-frequency ("slow") patterns of blocks.
 
-A map made on one processor is used on another, so results must be rounded equally on all of them: products, sums and
-roots are computed one by one. OpenCV's fused operations and matrix products are rounded differently.
+A map made on one processor is used on another, so results must be rounded identically on all of them: products, sums
+and roots are computed one by one. OpenCV's fused operations and matrix products are rounded differently.
 """
 
 from functools import lru_cache

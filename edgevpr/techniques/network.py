@@ -178,7 +178,7 @@ def make_gaussian_projection(size: int, length: int, seed: int) -> Callable[[Sin
     preserves angles, and lengths on average. Raises ModelError if `length` is larger than `size`.
 
     Each activation is multiplied by a random sign. The rows of the matrix are the cyclic shifts of *one* Gaussian
-    vector (Hinrichs and Vybíral 2011), so the product is a correlation, computed by the Fourier transform. For 43 008
+    vector (Hinrichs and Vybíral 2011), so the product is a correlation, computed by the Fourier transform. For 43,008
     activations and 1064 dimensions a full matrix would take 183 MB."""
     if length > size:
         raise ModelError(

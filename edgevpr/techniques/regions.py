@@ -3,7 +3,7 @@ the map with one vector per picture, then compare the best places region by regi
 
 Cross-Region-BoW and Region-VLAD (see `network`) find regions in the same way: the 8-connected components of positive
 activations in each channel. The regions with the highest mean activation (*energy*) over all channels are kept. Each is
-described by the sums of all channels' activations in its bounding box, L2-normalised."""
+described by the sum of each channel's activations in its bounding box, L2-normalised."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -48,7 +48,7 @@ def decode_hypothesis(number: int) -> tuple[float, int]:
 
 def count_cells(cells: int, ratio: float) -> int:
     """Return the number of cells along one side of a view of height ratio `ratio`, for a place with `cells` along one
-    side. The two differ by an even number, so that the middle region of the view lies on that of the place."""
+    side. The two differ by an even number, so that the middle region of the view is on that of the place."""
     return cells + 2 * round(cells * (ratio - 1) / 2)
 
 
@@ -59,7 +59,7 @@ def compute_scale(cells: int, ratio: float) -> float:
 
 
 class QueryViews:
-    """The views of one query, each made on first use. `square` is the unchanged view: its blocks float32 (n, n, 4
+    """The views of one query, each made on first use. `unchanged` is the unchanged view: its blocks float32 (n, n, 4
     bins), and bool (n, n), True for good blocks. `encode` makes such a pair for another view, with cells of `cell_px`
     pixels. Views rotated by quarter turns reuse the same cells, rotated. `seen` bool (n, n) is True for blocks of the
     unchanged view that have only allowed pixels."""

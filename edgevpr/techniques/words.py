@@ -35,8 +35,8 @@ def load_words(model: str, kind: str, count: int) -> tuple[Singles, str]:
         raise ModelError(f"{path} cannot be read as a visual vocabulary ({error}): {command}.") from error
     learned_on, fingerprint = str(arrays.get("model_sha256")), load_card(model).fingerprint
     if learned_on != fingerprint:
-        networks = f"({learned_on[:12]}...) than `{model}` is now ({fingerprint[:12]}...)"
-        raise ModelError(f"{name} was trained with a different network ({networks}): {command}.")
+        networks = f"({learned_on[:12]}...) than the current `{model}` ({fingerprint[:12]}...)"
+        raise ModelError(f"{name} was trained with a different network {networks}: {command}.")
     if words.ndim != 2 or len(words) != count or not np.isfinite(words).all():
         raise ModelError(f"{name} must have {count} words, but has an array of shape {words.shape}: {command}.")
     sha256 = hashlib.sha256((fingerprint + hashlib.sha256(content).hexdigest()).encode()).hexdigest()
