@@ -202,7 +202,7 @@ class Flight:
         self._governing.update()  # here, so that each reading covers a whole number of queries
 
     def _recognise(self, frame: Frame | ImageError, is_query: bool) -> Recognition:
-        """Recognise a frame or, unless it `is_query`, measure its stride; refuse one of pictures that are frozen."""
+        """Recognise a frame or, unless it `is_query`, measure its motion only; refuse frozen pictures."""
         if isinstance(frame, ImageError):
             return self._parts.recogniser.report_unread(frame)
         parts, is_live = self._parts, self._parts.source.is_live

@@ -115,7 +115,7 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
             if steps_s:
                 _log.info("%d pictures are played at their recorded times, over %.0f s", source.total, sum(steps_s))
             elif Path(uri).is_dir():
-                _log.info("pictures come at %.3g a second: not all have a time, in their order", 1 / step_s)
+                _log.info("pictures are played in order at %.3g Hz, as not all have a time", 1 / step_s)
             return source
 
         io = FlightIO(

@@ -148,7 +148,7 @@ class FrozenWatch:
                 self._repeats_in_a_row = 0
             self._begin_row(now)
         self._newest = now
-        self._decide(now.t_s)
+        self._update_verdict(now.t_s)
         return self.reason
 
     def _locate_picture(self, picture: CoarsePicture, t_s: float, vehicle: Vehicle | None) -> TimedPicture:
@@ -219,14 +219,15 @@ class FrozenWatch:
             self._stays += textured * (unmoved - self._stays) / _BLOCK_MEMORY
         return None if judged.sum() < _MIN_BLOCKS else bool(unmoved[judged].mean() >= _MIN_SAME_SHARE)
 
-    def _decide(self, now_s: float) -> None:
-        for witnesses in (self._rotations, self._repeats):
-            while witnesses and now_s - witnesses[0][0] > _PROOF_WINDOW_S:
-                witnesses.popleft()
-        stays_s = now_s - self._first.t_s if self._first else 0.0
-        stays_share = self._flown_share + sum(share for _, share in self._rotations)
+    def _update_verdict(self, now_s: float) -> None:
+        """Decide, by the motions of the last seconds that the pictures did not show, whether pictures are frozen."""
+        for motions in (self._rotations, self._repeats):
+            while motions and now_s - motions[0][0] > _PROOF_WINDOW_S:
+                motions.popleft()
+        unchanged_s = now_s - self._first.t_s if self._first else 0.0
+        motion_share = self._flown_share + sum(share for _, share in self._rotations)
         is_repeating = sum(share for _, share in self._repeats) >= MIN_PROOF_SHARE
-        if stays_share >= MIN_PROOF_SHARE and stays_s >= _MIN_FROZEN_S:
+        if motion_share >= MIN_PROOF_SHARE and unchanged_s >= _MIN_FROZEN_S:
             self._report(_NEW_AFTER_STAY)
         elif is_repeating or self._repeats_in_a_row >= _MIN_REPEATS:
             self._report(_NEW_AFTER_REPEATS)
