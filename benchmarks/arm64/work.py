@@ -78,7 +78,7 @@ def of_camera(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable
 def of_landmarks(picture: Image) -> Iterator[tuple[str, Callable[[], object]]]:
     """Yield what a flight does beside its queries: the landmarks of a frame, and its stride."""
     moved = cv2.warpAffine(picture, np.float32([[1, 0, 40], [0, 1, 15]]), picture.shape[::-1])
-    view = View(up_deg=0.0, footprint_m=130.0, aside=(0.0, 0.0), focal=0.77)
+    view = View(up_deg=0.0, footprint_m=130.0, nadir_offset=(0.0, 0.0), focal=0.77)
     before, now = detect_landmarks(picture, None, QUERY_LANDMARKS), detect_landmarks(moved, None, QUERY_LANDMARKS)
 
     def stride() -> object:

@@ -73,19 +73,19 @@ class View:
     """Direction, size and offset of a picture on the ground (None: unknown).
 
     `up_deg`: compass direction (0..360) of the picture's top. `footprint_m`: ground length of its longest side.
-    `aside`: offset from the picture's middle to the nadir, the point below the camera, (right, up) in shares of the
-    longest side. `aside_sd`: standard deviation of each component due to errors of a large tilt. `zoom`: factor by
-    which the picture was enlarged; its longest side shows that many times less ground. `lean_m`: the nadir offset on
-    the ground (east, north), for a picture that was not warped because its lens is unknown. `focal`: focal length in
-    shares of the longest side. `turned_deg`: clockwise rotation that was applied to the picture. `reason`: why a tilted
-    picture was not warped."""
+    `nadir_offset`: from the picture's middle to the nadir, the point below the camera, (right, up) in shares of the
+    longest side. `nadir_offset_sd`: standard deviation of each component due to errors of a large tilt. `zoom`: factor
+    by which the picture was enlarged; its longest side shows that many times less ground. `nadir_offset_m`: the nadir
+    offset on the ground (east, north), for a picture that was not warped because its lens is unknown. `focal`: focal
+    length in shares of the longest side. `turned_deg`: clockwise rotation that was applied to the picture.
+    `reason`: why a tilted picture was not warped."""
 
     up_deg: float | None = None
     footprint_m: float | None = None
-    aside: tuple[float, float] | None = None
-    aside_sd: float = 0.0
+    nadir_offset: tuple[float, float] | None = None
+    nadir_offset_sd: float = 0.0
     zoom: float = 1.0
-    lean_m: tuple[float, float] | None = None
+    nadir_offset_m: tuple[float, float] | None = None
     focal: float | None = None
     turned_deg: float = 0.0
     reason: Reason | None = None
@@ -93,20 +93,20 @@ class View:
     @property
     def is_georeferenced(self) -> bool:
         """True if the picture's direction and size and the nadir offset are known."""
-        return None not in (self.up_deg, self.footprint_m, self.aside)
+        return None not in (self.up_deg, self.footprint_m, self.nadir_offset)
 
     @property
     def is_tilt_known(self) -> bool:
         """True if the nadir offset is known, in the picture or on the ground."""
-        return self.aside is not None or self.lean_m is not None
+        return self.nadir_offset is not None or self.nadir_offset_m is not None
 
     def fields(self) -> dict[str, Any]:
         """Return this view as fields of the flight log, with rounded numbers. None: unknown."""
         return {
             "up_deg": self.up_deg and round(self.up_deg, 1),
             "footprint_m": self.footprint_m and round(self.footprint_m, 2),
-            "aside": self.aside and [round(share, 4) for share in self.aside],
-            "lean_m": self.lean_m and [round(offset_m, 2) for offset_m in self.lean_m],
+            "nadir_offset": self.nadir_offset and [round(share, 4) for share in self.nadir_offset],
+            "nadir_offset_m": self.nadir_offset_m and [round(offset_m, 2) for offset_m in self.nadir_offset_m],
             "reason": self.reason and self.reason.fields(),
         }
 
@@ -145,7 +145,7 @@ def level_image(
     only undistorted. Raises ImageError if the picture's aspect ratio differs from that of the lens calibration;
     impossible values in frame or vehicle never raise."""
     if frame.pose is not None:
-        view = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, aside=(0.0, 0.0))
+        view = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, nadir_offset=(0.0, 0.0))
         return LevelledImage(frame.image, overlay, view)
     camera = _CameraGeometry(frame, vehicle, lens)
     if camera.is_too_tilted:
@@ -161,8 +161,9 @@ def level_image(
         zoom = 1.0
     turn_deg = abs(wrap_deg(camera.top_deg or 0.0))
     if camera.tilt_deg < _MIN_TILT_DEG and turn_deg < _MIN_TURN_DEG and abs(zoom - 1) < _MIN_ZOOM_CHANGE:
-        aside, focal = camera.aside(camera.straight, 1.0), camera.focal_px / camera.longest_px
-        view = View(up_deg=camera.top_deg, footprint_m=image_m, aside=aside, aside_sd=camera.aside_sd(1.0), focal=focal)
+        nadir_offset, focal = camera.nadir_offset(camera.straight, 1.0), camera.focal_px / camera.longest_px
+        view = View(up_deg=camera.top_deg, footprint_m=image_m, nadir_offset=nadir_offset, focal=focal)
+        view = replace(view, nadir_offset_sd=camera.nadir_offset_sd(1.0))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
 
     below &= camera.tilt_deg <= MAX_TILT_UNLEVELLED_DEG
@@ -185,8 +186,8 @@ def level_image(
         zoom=zoom,
         focal=out_px / side,
         turned_deg=camera.top_deg or 0.0,
-        aside=(0.0, 0.0) if below and camera.is_tilt_known else camera.aside(out_from_lens, zoom),
-        aside_sd=camera.aside_sd(zoom),
+        nadir_offset=(0.0, 0.0) if below and camera.is_tilt_known else camera.nadir_offset(out_from_lens, zoom),
+        nadir_offset_sd=camera.nadir_offset_sd(zoom),
     )
     return _warp_image(frame.image, overlay, warp, view)
 
@@ -235,9 +236,9 @@ def enlarge_image(picture: LevelledImage, zoom: float) -> LevelledImage:
 
 
 def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN) -> View:
-    """Return the view of a picture that cannot be warped because its lens is unknown. It has only `lean_m`, or only
-    `reason` if the picture is tilted too far, or neither if too little is known. Arguments are as in `level_image`;
-    impossible values never raise."""
+    """Return the view of a picture that cannot be warped because its lens is unknown: only with `nadir_offset_m`, or
+    only with `reason` if the picture is tilted too far, or empty if too little is known. Arguments are as in
+    `level_image`; impossible values never raise."""
     roll_deg, pitch_deg, heading_deg, height_m = _choose_attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
         return UNKNOWN_VIEW
@@ -250,7 +251,7 @@ def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = S
     heading = math.radians(heading_deg)
     north = height_m / down * (ahead * math.cos(heading) - right * math.sin(heading))
     east = height_m / down * (ahead * math.sin(heading) + right * math.cos(heading))
-    return View(lean_m=(-float(east), -float(north)))
+    return View(nadir_offset_m=(-float(east), -float(north)))
 
 
 class _CameraGeometry:
@@ -303,14 +304,14 @@ class _CameraGeometry:
             _rotate_lens_to_body(up_deg).T @ self._level_from_straight @ _rotate_lens_to_body(self._lens.up_deg)
         )
 
-    def aside(self, out_from_lens: Doubles, zoom: float) -> tuple[float, float] | None:
-        """Return `View.aside` after the rotation `out_from_lens` and scaling by `zoom`; None if the tilt is unknown."""
+    def nadir_offset(self, out_from_lens: Doubles, zoom: float) -> tuple[float, float] | None:
+        """Return `View.nadir_offset` after rotation by `out_from_lens` and scaling by `zoom`; None: tilt unknown."""
         right, back = out_from_lens[:2, 2] / out_from_lens[2, 2] * zoom * self.focal_px / self.longest_px
         return (float(-right), float(back)) if self.is_tilt_known else None
 
-    def aside_sd(self, zoom: float) -> float:
-        """Return `View.aside_sd` after scaling by `zoom`. An error of a tilt t moves the nadir by 1 + tan(t)^2 times
-        the height; for a reported tilt, the 1 is already part of the error of every position."""
+    def nadir_offset_sd(self, zoom: float) -> float:
+        """Return `View.nadir_offset_sd` after scaling by `zoom`. An error of a tilt t moves the nadir by 1 + tan(t)^2
+        times the height; for a reported tilt, the 1 is already part of the error of every position."""
         if not self.is_tilt_known:
             return 0.0
         tangent, focal = math.tan(math.radians(self.tilt_deg)), zoom * self.focal_px / self.longest_px

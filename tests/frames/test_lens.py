@@ -194,7 +194,7 @@ def test_a_picture_is_levelled_and_straightened_in_one_warp(camera, ground, pose
         footprint_m,
         below=True,
     )
-    assert (found.view.aside, found.view.footprint_m) == ((0.0, 0.0), pytest.approx(footprint_m))
+    assert (found.view.nadir_offset, found.view.footprint_m) == ((0.0, 0.0), pytest.approx(footprint_m))
     side = found.image.shape[0]
     straight = photograph(make_pinhole(side * 100.0 / footprint_m, (side, side)), ground).image
     shown = np.ones((side, side), bool) if found.mask is None else found.mask

@@ -40,7 +40,7 @@ def taken(ground, **pose):
 
 def photograph_above(ground, view):
     """What a square camera sees from straight above the middle of a levelled picture."""
-    right_m, up_m = (share * view.footprint_m for share in view.aside)
+    right_m, up_m = (share * view.footprint_m for share in view.nadir_offset)
     camera = replace(CAMERA, width=640, height=640)
     return photograph_ground(ground, camera, -right_m, -up_m, height_m=view.footprint_m * CAMERA.focal_px / 640)
 
@@ -74,7 +74,7 @@ def test_levelled_gives_one_taken_from_straight_above(ground, pose, shown, below
     assert difference(found.image, straight, mask) < 0.5
     assert difference(np.roll(found.image, 8, axis=1), straight, mask) > 2, "one that is 8 pixels off would be noticed"
     is_steep = math.hypot(pose.get("roll_deg", 0.0), pose.get("pitch_deg", 0.0)) > MAX_TILT_UNLEVELLED_DEG
-    assert not below or is_steep or found.view.aside == (0.0, 0.0)
+    assert not below or is_steep or found.view.nadir_offset == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("up_deg", [90.0, 180.0, 270.0])
@@ -85,7 +85,7 @@ def test_levelled_with_a_camera_that_is_mounted_turned(ground, up_deg):
     image = np.ascontiguousarray(np.rot90(photograph_ground(ground, square, **pose), up_deg / 90))
     one = level_image(make_frame(photograph_ground(ground, square, **pose), **pose), None, LENS, FOOTPRINT_M)
     other = level_image(make_frame(image, **pose), None, Lens(LENS.fov_deg, up_deg), FOOTPRINT_M)
-    assert other.view.aside == pytest.approx(one.view.aside)
+    assert other.view.nadir_offset == pytest.approx(one.view.nadir_offset)
     assert difference(one.image, other.image, one.mask & other.mask) < 0.1
     upright = level_image(make_frame(image, heading_deg=(360 - up_deg) % 360), None, Lens(LENS.fov_deg, up_deg))
     assert (upright.image is image, upright.view.up_deg) == (True, 0.0), "its top points north as it is"
@@ -112,9 +112,9 @@ def test_levelled_without_a_height_scales_nothing(ground):
 def test_levelled_without_an_attitude_knows_no_point_below(ground):
     found = level_image(replace(taken(ground, heading_deg=90), roll_deg=None), None, LENS, FOOTPRINT_M)
     assert found.view == View(
-        up_deg=0.0, footprint_m=pytest.approx(FOOTPRINT_M), aside=None, focal=pytest.approx(LENS_FOCAL)
+        up_deg=0.0, footprint_m=pytest.approx(FOOTPRINT_M), nadir_offset=None, focal=pytest.approx(LENS_FOCAL)
     )
-    assert difference(found.image, photograph_above(ground, replace(found.view, aside=(0, 0))), found.mask) < 0.5
+    assert difference(found.image, photograph_above(ground, replace(found.view, nadir_offset=(0, 0))), found.mask) < 0.5
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_levelled_leaves_a_surveyed_picture_as_it_is(ground):
     frame = replace(taken(ground, heading_deg=90, pitch_deg=20), pose=pose)
     found = level_image(frame, None, LENS, FOOTPRINT_M)
     assert found.image is frame.image
-    assert found.view == View(up_deg=30.0, footprint_m=50.0, aside=(0.0, 0.0))
+    assert found.view == View(up_deg=30.0, footprint_m=50.0, nadir_offset=(0.0, 0.0))
 
 
 @pytest.mark.parametrize("height_m", [0.0, -3.0, 10_001.0, math.nan, math.inf, 25.0, 500.0])
@@ -162,14 +162,14 @@ def test_levelled_leaves_a_picture_that_bears_no_warp_with_a_reason(pose):
     found = level_image(make_frame(image, **TILTED | pose), None, LENS)
     assert found.image is image
     assert found.view.reason.code is ReasonCode.TILTED
-    assert (found.view.footprint_m, found.view.aside) == (None, None)
+    assert (found.view.footprint_m, found.view.nadir_offset) == (None, None)
 
 
 @pytest.mark.parametrize("below", [False, True])
 def test_levelled_keeps_the_middle_of_a_steep_picture_in_place_of_what_is_below(below):
     found = level_image(make_frame(np.zeros((48, 64), np.uint8), **TILTED), None, Lens(40.0), below=below)
     assert found.view.reason is None
-    assert found.view.aside != (0.0, 0.0)
+    assert found.view.nadir_offset != (0.0, 0.0)
 
 
 def test_levelled_takes_from_the_vehicle_what_the_frame_does_not_know(ground):

@@ -39,13 +39,14 @@ def match_at(
     position: Position, t_s: float, vehicle: Vehicle | None, sd_m: float, places, view: View | None = None, lean=None
 ) -> Recognition:
     """An accepted match of a frame taken at `t_s`."""
+    fix = {"position": position, "covariance_m2": (sd_m**2, 0.0, sd_m**2)}
     return Recognition(
         frame=Frame(image=_PICTURE, name=f"{t_s:.1f} s", t_mono_s=t_s),
         vehicle=vehicle,
         picture=view and LevelledImage(_PICTURE, None, view),
         best=Candidate(Place(place_id=places[0] if places else 1, source_image="", position=position), FineMatch(0.5)),
         accepted=True,
-        located=Located(position=position, covariance_m2=(sd_m**2, 0.0, sd_m**2), places=tuple(places), lean=lean),
+        located=Located(**fix, places=tuple(places), attitude_error=lean),
         accuracy_m=sd_m,
         steps=StepCosts(),
         cost=_NO_COST,

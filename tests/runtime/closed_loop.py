@@ -28,7 +28,7 @@ _FRAME_S = 1.0  # from frame to frame
 _MATCH_SD_M = 1.0
 _STRIDE_SD_M = 0.2
 _SHOWN_SD = math.tan(math.radians(1.0))
-_VIEW = View(up_deg=0.0, footprint_m=60.0, aside=(0.0, 0.0))
+_VIEW = View(up_deg=0.0, footprint_m=60.0, nadir_offset=(0.0, 0.0))
 _PICTURE = np.zeros((8, 8), np.uint8)
 
 

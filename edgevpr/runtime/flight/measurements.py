@@ -96,7 +96,7 @@ def measure_frame(
         sweep_m_s = height_m * math.radians(0.0 if is_level else vehicle.tilt_rate_deg_s)
         attitude_sd = ATTITUDE_SD if has_attitude else _UNKNOWN_ATTITUDE_SD
         sd_m = picture_error_m(vehicle, height_m, event.frame.t_sd_s, attitude_sd, sweep_m_s)
-    is_unaffected = is_level or not has_attitude or not (event.view.aside or event.view.lean_m)
+    is_unaffected = is_level or not has_attitude or not (event.view.nadir_offset or event.view.nadir_offset_m)
     can_scale = 1 / _MAX_HEIGHT_RATIO < height_ratio < _MAX_HEIGHT_RATIO
     return FrameMeasurement(
         t_s=event.frame.t_mono_s,
@@ -148,7 +148,7 @@ def position_match(event: Recognition, frame: FrameMeasurement) -> PositionedMat
         accuracy_m=event.accuracy_m,
         covariance_m2=covariance_matrix(event.located.covariance_m2),
         places=event.located.places or (event.best.place.place_id,),
-        attitude_error=event.located.lean,
+        attitude_error=event.located.attitude_error,
         heading_error_deg=heading_error_deg,
     )
 

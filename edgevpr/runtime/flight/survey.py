@@ -124,7 +124,7 @@ class MapSurvey:
         # Without a view or a pose, the point under the camera is not known within metres.
         if located is None or located.heading_deg is None or view.reason:
             return False
-        if view.aside is None and view.lean_m is None:
+        if view.nadir_offset is None and view.nadir_offset_m is None:
             return False
         t_s, height_m = event.frame.t_mono_s, located.height_m or vehicle.height_m
         frame_sd_m = picture_error_m(vehicle, height_m or 0.0, event.frame.t_sd_s)

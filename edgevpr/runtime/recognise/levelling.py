@@ -33,7 +33,7 @@ GPS_SD_M = 5.0  # standard deviation along one axis of a recorded position, unle
 # Distance, as a share of the footprint, from the picture's middle to the point below an aircraft tilted by 3 degrees.
 # Chosen on generated flights and aerial_swindale.
 TILT_SD_WITHOUT_ATTITUDE = 0.04
-_MAX_ASIDE_WITHOUT_HEADING = 0.25  # of the longest side: farther from the aircraft, the picture shows other ground
+_MAX_OFFSET_WITHOUT_HEADING = 0.25  # of the longest side: farther from the aircraft, the picture shows other ground
 _MAX_FIELD_DIFFERENCE_DEG = 5.0  # that of a data sheet is rounded
 
 _log = logging.getLogger(__name__)
@@ -154,21 +154,21 @@ def centre_place(frame: Frame, view: View) -> Frame:
     this becomes the position of the picture's middle instead of the aircraft's, as far as that can be computed, and
     with a known height and heading it gets a pose."""
     frame = set_picture_heading(frame, view)
-    if view.aside and view.up_deg is None and math.hypot(*view.aside) > _MAX_ASIDE_WITHOUT_HEADING:
+    if view.nadir_offset and view.up_deg is None and math.hypot(*view.nadir_offset) > _MAX_OFFSET_WITHOUT_HEADING:
         return replace(frame, position=None)
-    if frame.position and view.lean_m:
-        east_m, north_m = view.lean_m
+    if frame.position and view.nadir_offset_m:
+        east_m, north_m = view.nadir_offset_m
         middle = offset_position(frame.position.lat_deg, frame.position.lon_deg, -east_m, -north_m)
         return replace(frame, position=Position(*middle, frame.position.alt_m))
     if frame.pose is not None or frame.position is None or view.up_deg is None or view.footprint_m is None:
         return frame
     variance_m2, position = GPS_SD_M**2, frame.position
-    if view.aside is None:
+    if view.nadir_offset is None:
         variance_m2 += (TILT_SD_WITHOUT_ATTITUDE * view.footprint_m) ** 2
     else:
-        # The point `aside` is below the aircraft: the picture's middle is as far from it, in the opposite direction.
-        variance_m2 += (view.aside_sd * view.footprint_m) ** 2
-        off_m = -view.footprint_m * picture_axes(view.up_deg) @ view.aside
+        # The nadir is below the aircraft, and the picture's middle as far from it in the opposite direction.
+        variance_m2 += (view.nadir_offset_sd * view.footprint_m) ** 2
+        off_m = -view.footprint_m * picture_axes(view.up_deg) @ view.nadir_offset
         position = Position(*offset_position(position.lat_deg, position.lon_deg, *off_m.tolist()), position.alt_m)
     pose = Pose(up_deg=view.up_deg, footprint_m=view.footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2))
     return replace(frame, position=position, pose=pose)

@@ -40,9 +40,9 @@ class Located:
     compass direction of the top of the picture. `height_ratio` is the height of the camera divided by that of the map's
     pictures, `footprint_m` the length on the ground of the longest side, and `height_m` the height above the ground
     that follows from it, whatever was reported (None: unknown). `places` are the numbers of the places that agree on
-    it. `objection` is the reason not to trust the position (None: no reason). `lean` is what the picture shows of an
-    error of the reported attitude, which the position is computed with. `tilt_m2` is the part of both variances by a
-    tilt that is not reported."""
+    it. `objection` is the reason not to trust the position (None: no reason). `attitude_error` is the error of the
+    reported attitude that the picture shows; the position contains its effect. `tilt_m2` is the part of both variances
+    by a tilt that is not reported."""
 
     position: Position
     covariance_m2: Covariance
@@ -52,7 +52,7 @@ class Located:
     height_m: float | None = None
     places: tuple[int, ...] = ()
     objection: Reason | None = None
-    lean: AttitudeError | None = None
+    attitude_error: AttitudeError | None = None
     tilt_m2: float = 0.0
 
     @property
@@ -95,34 +95,34 @@ def locate_at_place(position: Position, accuracy_m: float) -> Located:
 
 
 def locate(
-    places: Sequence[Candidate], cells: int | None, view: View = UNKNOWN_VIEW, proof: Agreement | None = None
+    places: Sequence[Candidate], cells: int | None, view: View = UNKNOWN_VIEW, agreement: Agreement | None = None
 ) -> Located | None:
     """Return the position of the aircraft by the `places` found, best first; None if the best has no pose or its match
     no shift. `cells` is the number of cells along the longest side of a picture (None: shifts cannot be converted to
     metres). `view` is how the query's picture lies on the ground; if the point below the aircraft is unknown, it is
-    about the middle. `proof` is the agreement of the landmarks of the best place, which gives another shift.
+    about the middle. `agreement` is the agreement of the landmarks of the best place, which gives another shift.
 
     Of the places that show the same ground, those whose position agrees with the first are used: all of them are named,
     and the first five with at least half of the best one's score determine the position. Those with such a score whose
     position is far from the first contradict it. If together they weigh too much, the position is not to be trusted.
     """
-    best, pose, aside, lean = places[0].place, places[0].place.pose, view.aside or (0.0, 0.0), None
-    first = _estimate(places[0], best, cells, aside)
+    best, pose, nadir, error = places[0].place, places[0].place.pose, view.nadir_offset or (0.0, 0.0), None
+    first = _estimate(places[0], best, cells, nadir)
     if first is None or best.position is None or pose is None:
         return None
-    estimates = [first, *filter(None, (_estimate(place, best, cells, aside) for place in places[1:]))]
-    if proof and proof.is_expected and proof.inliers >= MIN_CONFIRMED_INLIERS:
-        first = _estimate(places[0], best, cells, aside, proof) or first
+    estimates = [first, *filter(None, (_estimate(place, best, cells, nadir) for place in places[1:]))]
+    if agreement and agreement.is_expected and agreement.inliers >= MIN_CONFIRMED_INLIERS:
+        first = _estimate(places[0], best, cells, nadir, agreement) or first
         estimates.insert(0, first)
-        if proof.inlier_points:
-            lean = fit_attitude_error(*proof.inlier_points, view, pose.up_deg + first.rotation_deg)
+        if agreement.inlier_points:
+            error = fit_attitude_error(*agreement.inlier_points, view, pose.up_deg + first.rotation_deg)
     least = _MIN_SCORE_SHARE * first.score
     agreeing = [estimate for estimate in estimates if first.agrees_with(estimate)]
     position_m, covariance = _average([each for each in agreeing if each.score >= least][:_MAX_PLACES_AVERAGED])
-    if view.lean_m is not None:
-        position_m = position_m + view.lean_m
+    if view.nadir_offset_m is not None:
+        position_m = position_m + view.nadir_offset_m
     else:
-        tilt_sd = TILT_SD_WITHOUT_ATTITUDE if view.aside is None else view.aside_sd
+        tilt_sd = TILT_SD_WITHOUT_ATTITUDE if view.nadir_offset is None else view.nadir_offset_sd
         covariance += (tilt_sd * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
     objection, far_m = None, _CONTRADICTION_SHARE * pose.footprint_m
     against = []
@@ -143,7 +143,7 @@ def locate(
         height_m=view.focal and view.focal * footprint_m,
         places=tuple(dict.fromkeys(each.place_id for each in agreeing)),
         objection=objection,
-        lean=lean,
+        attitude_error=error,
     )
 
 
@@ -180,11 +180,11 @@ def _average(estimates: list[_PlaceEstimate]) -> tuple[Doubles, Doubles]:
 
 
 def _estimate(
-    found: Candidate, best: Place, cells: int | None, aside: tuple[float, float], proof: Agreement | None = None
+    found: Candidate, best: Place, cells: int | None, nadir: tuple[float, float], agreement: Agreement | None = None
 ) -> _PlaceEstimate | None:
-    """Compute the position of the aircraft from one place, by the shift of its match or, with `proof`, by the landmarks
+    """Compute the position of the aircraft from one place, by its shift or, with `agreement`, by the landmarks
     that agree. None if the match has no shift or rotation, the place no pose, or the `best` place's picture is too far
-    away to show the same ground. `cells` is as in `locate`, and `aside` as in `View`."""
+    away to show the same ground. `cells` is as in `locate`, and `nadir` is `View.nadir_offset`."""
     match, place, pose = found.match, found.place, found.place.pose
     if cells is None or match.shift_cells is None or match.rotation_deg is None:
         return None
@@ -193,9 +193,10 @@ def _estimate(
     off_m = _offset_m(best.position, place.position)
     if float(np.hypot(*off_m)) > (pose.footprint_m + best.pose.footprint_m) / 2:
         return None
-    if proof:
-        rotation_deg, height_ratio, step = proof.rotation_deg or 0.0, proof.scale, np.array(proof.shift_share)
-        covariance = covariance_matrix(proof.covariance_share2 or (0.0, 0.0, 0.0)) + _LANDMARK_SD_SHARE**2 * np.eye(2)
+    if agreement:
+        rotation_deg, height_ratio = agreement.rotation_deg or 0.0, agreement.scale
+        step, landmark_share2 = np.array(agreement.shift_share), _LANDMARK_SD_SHARE**2 * np.eye(2)
+        covariance = covariance_matrix(agreement.covariance_share2 or (0.0, 0.0, 0.0)) + landmark_share2
     else:
         rotation_deg, height_ratio, step = match.rotation_deg, match.height_ratio, np.array(match.shift_cells) / cells
         # The match's covariance is that of single votes; their mean has a fraction of it.
@@ -203,7 +204,7 @@ def _estimate(
         covariance = covariance * _MEAN_VARIANCE_SHARE + _VOTE_SD_SHARE**2 * np.eye(2)
     # The point below the aircraft, in the place's picture: that of the query's picture, turned, scaled and shifted.
     ratio, turn = height_ratio or 1.0, math.radians(rotation_deg)
-    right, up = aside
+    right, up = nadir
     dx = step[0] + ratio * (right * math.cos(turn) + up * math.sin(turn))
     dy = step[1] + ratio * (right * math.sin(turn) - up * math.cos(turn))
     axes = picture_axes(pose.up_deg)

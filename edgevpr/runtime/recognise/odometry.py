@@ -59,7 +59,7 @@ class VisualOdometry:
         if stored is None or not 0 < t_s - stored[0] <= _MAX_ELAPSED_S:
             return None
         from_s, start, previous = stored
-        if start.aside is None or view.aside is None or start.up_deg is None or view.up_deg is None:
+        if start.nadir_offset is None or view.nadir_offset is None or start.up_deg is None or view.up_deg is None:
             return None
         if start.footprint_m is None or view.footprint_m is None:
             return None
@@ -74,8 +74,8 @@ class VisualOdometry:
             return None
         # The point under the camera, in the picture before: that of this picture, turned, scaled and shifted.
         factor = agreement.scale * complex(math.cos(turn := math.radians(agreement.rotation_deg)), math.sin(turn))
-        step = factor * complex(view.aside[0], -view.aside[1]) + complex(*agreement.shift_share)
-        step -= complex(start.aside[0], -start.aside[1])
+        step = factor * complex(view.nadir_offset[0], -view.nadir_offset[1]) + complex(*agreement.shift_share)
+        step -= complex(start.nadir_offset[0], -start.nadir_offset[1])
         east_m, north_m = start.footprint_m * picture_axes(start.up_deg) @ (step.real, -step.imag)
         return OdometryStep(
             from_s=from_s,

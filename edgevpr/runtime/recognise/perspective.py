@@ -149,11 +149,11 @@ def fit_attitude_error(asked: Array, known: Array, view: View, up_deg: float) ->
     the compass direction of the top of the query's levelled picture.
     """
     count = len(asked)
-    if count < _MIN_LANDMARKS or view.aside is None or view.focal is None:
+    if count < _MIN_LANDMARKS or view.nadir_offset is None or view.focal is None:
         return None
     # A ray at x + iy (focal lengths right and down of straight down) moves by t + (x Re t + y Im t)(x + iy) when the
     # camera turns by the small angle t = right + i down. Of the picture's own scale and turn, t is in the same units.
-    ray = (asked - complex(view.aside[0], -view.aside[1])) / view.focal
+    ray = (asked - complex(view.nadir_offset[0], -view.nadir_offset[1])) / view.focal
     turn_scale, _ = fit_similarity(asked, known)
     by_right, by_down = (turn_scale * view.focal * part * ray for part in (ray.real, ray.imag))
     # A slope of the ground stretches and shears the picture too, by a few per cent.

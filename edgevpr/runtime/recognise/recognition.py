@@ -130,8 +130,8 @@ def _located_fields(where: Located) -> dict[str, Any]:
     fields = _where(where) | {"height_ratio": _round(where.height_ratio, 3), "places": list(where.places)}
     if where.height_m is not None:
         fields["height_m"] = round(where.height_m, 1)
-    if where.lean:
-        fields["lean"] = [round(each, 4) for each in (*where.lean.over_height, where.lean.sd)]
+    if error := where.attitude_error:
+        fields["attitude_error"] = [round(value, 4) for value in (*error.over_height, error.sd)]
     return fields
 
 

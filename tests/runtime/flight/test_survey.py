@@ -29,7 +29,7 @@ SPEED_M_S = 15.0
 FIX_SD_M = 2.0
 GPS_SD_M = 1.0
 GPS_LASTS_S = 60.0
-SEEN = View(up_deg=0.0, footprint_m=130.0, aside=(0.0, 0.0))
+SEEN = View(up_deg=0.0, footprint_m=130.0, nadir_offset=(0.0, 0.0))
 
 
 def circle(t_s):

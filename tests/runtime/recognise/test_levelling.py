@@ -101,7 +101,7 @@ def test_a_query_from_another_height_heading_and_tilt_finds_its_place(walk, grou
     assert event.view.up_deg == 0.0
     assert event.view.footprint_m == pytest.approx(FOOTPRINT_M)
     off_m = 45 * math.tan(math.radians(20))
-    assert math.hypot(*event.view.aside) * FOOTPRINT_M == pytest.approx(off_m)
+    assert math.hypot(*event.view.nadir_offset) * FOOTPRINT_M == pytest.approx(off_m)
 
 
 @pytest.mark.slow
@@ -159,7 +159,7 @@ def test_a_tilt_that_a_picture_does_not_bear_is_refused_and_said_once(walk, grou
 def test_a_place_has_the_position_of_the_middle_of_its_picture():
     at = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=Position(50.0, 8.0, 300.0))
     east = centre_place(
-        at, View(up_deg=90.0, footprint_m=100.0, aside=(0.0, -0.3))
+        at, View(up_deg=90.0, footprint_m=100.0, nadir_offset=(0.0, -0.3))
     )  # the aircraft is west of the middle
     assert east.position.lon_deg == pytest.approx(8.0 + 30 / (M_PER_DEG * math.cos(math.radians(50))), abs=1e-7)
     assert east.position.lat_deg == pytest.approx(50.0, abs=1e-9)
@@ -169,7 +169,7 @@ def test_a_place_has_the_position_of_the_middle_of_its_picture():
     assert (untold.position, untold.pose.covariance_m2) == (at.position, (41.0, 0.0, 41.0)), "its tilt is unknown"
 
 
-@pytest.mark.parametrize("view", [View(), View(up_deg=0.0), View(footprint_m=50.0, aside=(0.1, 0.1))])
+@pytest.mark.parametrize("view", [View(), View(up_deg=0.0), View(footprint_m=50.0, nadir_offset=(0.1, 0.1))])
 def test_without_height_or_heading_a_place_has_no_pose(view):
     at = Frame(image=np.zeros((8, 8), np.uint8), name="", t_mono_s=0.0, position=Position(50.0, 8.0), heading_deg=70.0)
     found = centre_place(at, view)
@@ -206,7 +206,7 @@ def test_a_picture_of_an_unknown_lens_says_how_far_it_looks_aside(roll_deg, pitc
     vehicle = vehicle_at(50.0, 8.0, 5.0, **told)
     frame = Frame(image=np.zeros((48, 64), np.uint8), name="", t_mono_s=5.0)
     view = Levelling(None, is_live=True).prepare(frame, vehicle, None).view
-    assert view.lean_m == pytest.approx((-east / scale, -north / scale), abs=0.15)
+    assert view.nadir_offset_m == pytest.approx((-east / scale, -north / scale), abs=0.15)
     assert Levelling(None, is_live=False).prepare(frame, vehicle, None).view == UNKNOWN_VIEW, "it is of another time"
     assert Levelling(None, is_live=True).prepare(replace(frame, t_mono_s=7.0), vehicle, None).view == UNKNOWN_VIEW
     assert Levelling(None, is_live=False).prepare(replace(frame, **told), None, None).view == view, "a recording's own"
@@ -237,7 +237,7 @@ def test_the_mount_of_the_configuration_counts_with_a_lens_and_without_and_on_a_
         frame = Frame(image=np.zeros((480, 640), np.uint8), name="", t_mono_s=5.0)
         vehicle = vehicle_at(50.0, 8.0, 5.0, heading_deg=90.0, height_m=HEIGHT_M, roll_deg=0.0, pitch_deg=0.0)
         view = make_levelling(config, technique).prepare(frame, vehicle, None, layers=LAYER).view
-        off_m = view.lean_m if fov_deg is None else FOOTPRINT_M * np.array(view.aside)
+        off_m = view.nadir_offset_m if fov_deg is None else FOOTPRINT_M * np.array(view.nadir_offset)
         assert off_m == pytest.approx((-HEIGHT_M * math.tan(math.radians(9)), 0.0), abs=1e-6)
 
 

@@ -46,7 +46,7 @@ def off_m(position):
     ],
 )
 def test_a_step_in_the_picture_is_one_on_the_ground(shift, up_deg, there):
-    found = locate([candidate(shift=shift, up_deg=up_deg)], CELLS, View(aside=(0.0, 0.0)))
+    found = locate([candidate(shift=shift, up_deg=up_deg)], CELLS, View(nadir_offset=(0.0, 0.0)))
     assert off_m(found.position) == pytest.approx(there, abs=0.01)
     assert found.position.alt_m == ORIGIN.alt_m
 
@@ -58,7 +58,7 @@ def test_the_heading_is_that_of_the_place_and_the_turn_since(up_deg, turned_deg,
 
 
 @pytest.mark.parametrize(
-    ("turned_deg", "aside", "there"),
+    ("turned_deg", "nadir_offset", "there"),
     [
         (0, (0.25, 0.0), (16, 0)),
         (0, (0.0, 0.25), (0, 16)),
@@ -66,22 +66,22 @@ def test_the_heading_is_that_of_the_place_and_the_turn_since(up_deg, turned_deg,
         (90, (0.25, 0.0), (0, -16)),
     ],
 )
-def test_the_aircraft_is_where_the_camera_hangs_and_not_where_it_looks(turned_deg, aside, there):
-    found = locate([candidate(turned_deg=turned_deg)], CELLS, View(aside=aside))
+def test_the_aircraft_is_where_the_camera_hangs_and_not_where_it_looks(turned_deg, nadir_offset, there):
+    found = locate([candidate(turned_deg=turned_deg)], CELLS, View(nadir_offset=nadir_offset))
     assert off_m(found.position) == pytest.approx(there, abs=0.01)
 
 
 def test_what_is_aside_of_a_query_from_higher_up_is_farther():
     proof = agreed(20, (0.0, 0.0), scale=2.0)
-    found = locate([candidate()], CELLS, View(aside=(0.25, 0.0)), proof)
+    found = locate([candidate()], CELLS, View(nadir_offset=(0.25, 0.0)), proof)
     assert off_m(found.position) == pytest.approx((32, 0), abs=0.01)
     assert (found.height_ratio, found.footprint_m) == (2.0, 128.0)
 
 
 def test_landmarks_are_heard_before_the_vote():
     proof = agreed(20, (0.11, -0.05), rotation_deg=4.0, covariance_share2=(1e-5, 0.0, 1e-5))
-    by_vote = locate([candidate(shift=(4, -2))], CELLS, View(aside=(0.0, 0.0)))
-    found = locate([candidate(shift=(4, -2))], CELLS, View(aside=(0.0, 0.0)), proof)
+    by_vote = locate([candidate(shift=(4, -2))], CELLS, View(nadir_offset=(0.0, 0.0)))
+    found = locate([candidate(shift=(4, -2))], CELLS, View(nadir_offset=(0.0, 0.0)), proof)
     between = 0.125 * 64, 0.0625 * 64  # what the vote says
     assert off_m(found.position) == pytest.approx((0.11 * 64, 0.05 * 64), abs=0.5)
     assert math.dist(off_m(found.position), between) > 0.5
@@ -92,21 +92,22 @@ def test_landmarks_are_heard_before_the_vote():
 
 def test_places_of_the_same_ground_are_heard_together():
     one, other = candidate(1, shift=(4, 0)), candidate(2, shift=(-4, 0), east_m=16.4)
-    found = locate([one, other], CELLS, View(aside=(0.0, 0.0)))
+    found = locate([one, other], CELLS, View(nadir_offset=(0.0, 0.0)))
     assert off_m(found.position) == pytest.approx((8.2, 0), abs=0.01)
     assert found.places == (1, 2)
-    assert found.accuracy_m < locate([one], CELLS, View(aside=(0.0, 0.0))).accuracy_m
+    assert found.accuracy_m < locate([one], CELLS, View(nadir_offset=(0.0, 0.0))).accuracy_m
     assert found.accuracy_m >= 2.0, "what is wrong with the map does not become less by hearing more of it"
     assert found.objection is None
 
 
 def test_places_that_contradict_each_other_are_refused():
-    found = locate([candidate(1, shift=(4, 0)), candidate(2, east_m=22)], CELLS, View(aside=(0.0, 0.0)))
+    found = locate([candidate(1, shift=(4, 0)), candidate(2, east_m=22)], CELLS, View(nadir_offset=(0.0, 0.0)))
     assert found.objection.code is ReasonCode.POSITIONS_DISAGREE
 
 
 def test_a_place_a_little_amiss_is_not_heard_and_no_objection():
-    found = locate([candidate(1, shift=(4, 0)), candidate(2, shift=(0, 0), east_m=20)], CELLS, View(aside=(0.0, 0.0)))
+    candidates = [candidate(1, shift=(4, 0)), candidate(2, shift=(0, 0), east_m=20)]
+    found = locate(candidates, CELLS, View(nadir_offset=(0.0, 0.0)))
     assert found.places == (1,)
     assert found.objection is None
     assert off_m(found.position) == pytest.approx((8, 0), abs=0.01)
@@ -133,7 +134,7 @@ def test_without_a_pose_or_a_step_there_is_nothing_to_say():
 
 
 def test_the_covariance_is_that_of_the_place_turned_to_the_ground():
-    found = locate([candidate(covariance_m2=(100.0, 0.0, 1.0))], CELLS, View(aside=(0.0, 0.0)))
+    found = locate([candidate(covariance_m2=(100.0, 0.0, 1.0))], CELLS, View(nadir_offset=(0.0, 0.0)))
     var_east, cov, var_north = found.covariance_m2
     assert var_east > 100 > 10 > var_north > 1
     assert abs(cov) < 0.1

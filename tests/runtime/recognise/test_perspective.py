@@ -16,16 +16,16 @@ from edgevpr.runtime.recognise.landmarks import QUERY_LANDMARKS, detect_landmark
 from edgevpr.runtime.recognise.perspective import CommonTilt, convert_to_tilt, fit_attitude_error
 
 FOCAL = 0.77  # shares of the longest side: 66 degrees across
-SEEN = View(aside=(0.0, 0.0), focal=FOCAL, up_deg=0.0)
+SEEN = View(nadir_offset=(0.0, 0.0), focal=FOCAL, up_deg=0.0)
 
 
-def landmarks(count=60, roll_deg=0.0, pitch_deg=0.0, turned_deg=0.0, scale=1.0, noise=0.0, aside=(0.0, 0.0)):
+def landmarks(count=60, roll_deg=0.0, pitch_deg=0.0, turned_deg=0.0, scale=1.0, noise=0.0, nadir_offset=(0.0, 0.0)):
     """Points of a query whose camera rolls and pitches more than reported, and of the place seen straight from above:
     the nose is the top of the query, the top of the place north."""
     rng = np.random.default_rng(3)
     right, down = rng.uniform(-0.5, 0.5, count), rng.uniform(-0.37, 0.37, count)
     # Rays through the picture, in the axes nose, right, down of the aircraft, turned to those of a level one.
-    rays = np.stack([-(down + aside[1]), right - aside[0], np.full(count, FOCAL)])
+    rays = np.stack([-(down + nadir_offset[1]), right - nadir_offset[0], np.full(count, FOCAL)])
     roll, pitch = map(math.radians, (roll_deg, pitch_deg))
     about_nose = [[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]]
     about_right = [[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]]
@@ -59,8 +59,9 @@ def test_it_is_as_exact_as_it_says():
 
 
 def test_the_point_under_the_camera_may_be_beside_the_middle():
-    aside = (0.2, -0.1)
-    lean = fit_attitude_error(*landmarks(roll_deg=2.0, aside=aside), View(aside=aside, focal=FOCAL), 0.0)
+    nadir_offset = (0.2, -0.1)
+    view = View(nadir_offset=nadir_offset, focal=FOCAL)
+    lean = fit_attitude_error(*landmarks(roll_deg=2.0, nadir_offset=nadir_offset), view, 0.0)
     assert lean.over_height == pytest.approx((math.tan(math.radians(2.0)), 0.0), abs=0.005)
 
 
@@ -73,7 +74,7 @@ def test_a_slope_of_the_ground_is_no_tilt():
     assert math.hypot(*lean.over_height) < 2 * lean.sd < 0.1
 
 
-@pytest.mark.parametrize("view", [View(), View(aside=(0.0, 0.0)), View(focal=FOCAL)])
+@pytest.mark.parametrize("view", [View(), View(nadir_offset=(0.0, 0.0)), View(focal=FOCAL)])
 def test_without_attitude_or_lens_nothing_is_said(view):
     assert fit_attitude_error(*landmarks(roll_deg=2.0), view, 0.0) is None
 
