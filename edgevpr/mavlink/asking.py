@@ -37,7 +37,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
 
     - `system_id`: system id of the autopilot; None until its first heartbeat, unless one was given.
     - `received`: number of messages from the autopilot, by name; `signed`: number of signed messages among them.
-    - `uses_mavlink_1`: its last message was MAVLink 1; `round_trips_s`: seconds from each request to its answer.
+    - `says_version_1`: its last message was MAVLink 1; `round_trips_s`: seconds from each request to its answer.
     - `others`: system ids of other autopilots on the link; `reader` counts bytes that belong to no message."""
 
     def __init__(
@@ -49,7 +49,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         self.received: Counter[str] = Counter()
         self.signed = 0
         self.others: set[int] = set()
-        self.uses_mavlink_1 = False
+        self.says_version_1 = False
         self.round_trips_s: list[float] = []
         self.signing, self.reader = signing, PacketReader(signing.admits)
         self._address = address
@@ -154,7 +154,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
             return False
         self.received[message.get_type()] += 1
         self.signed += bool(message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
-        self.uses_mavlink_1 = message.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V1
+        self.says_version_1 = message.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V1
         return True
 
     def _send(self, message: Message) -> None:
@@ -182,7 +182,7 @@ class AutopilotReading:
     signs: bool  # its messages are signed
     is_signed_to: bool  # our messages to it are signed
     answers: bool  # it has answered a request
-    uses_mavlink_1: bool
+    says_version_1: bool  # it sends MAVLink 1
     other_systems: tuple[int, ...]  # system ids of other autopilots on the link
     bad_bytes: int  # bytes that belong to no valid message
     round_trip_s: float | None  # median round trip of requests
@@ -238,7 +238,7 @@ def read_autopilot(link: RequestLink, wanted: Mapping[str, Iterable[str]]) -> Au
         signs=link.signed > 0,
         is_signed_to=link.signing is not NOT_SIGNING,
         answers=answers,
-        uses_mavlink_1=link.uses_mavlink_1,
+        says_version_1=link.says_version_1,
         other_systems=tuple(sorted(link.others)),
         bad_bytes=link.reader.bad_bytes,
         round_trip_s=statistics.median(link.round_trips_s) if link.round_trips_s else None,

@@ -41,7 +41,7 @@ def test_all_that_an_autopilot_says_is_read(address):
     assert said.filter_flags & mavlink.EKF_POS_HORIZ_ABS
     assert abs(said.clock_ahead_s) < 60
     assert said.round_trip_s > 0
-    assert (said.answers, said.signs, said.uses_mavlink_1, said.other_systems) == (True, False, False, ())
+    assert (said.answers, said.signs, said.says_version_1, said.other_systems) == (True, False, False, ())
     assert {"GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT"} <= set(said.received)
     assert peer.names() == READ_ONLY, "nothing is ever set"
     assert {message.command for message in peer.heard if message.get_type() == "COMMAND_LONG"} == {512}
@@ -83,7 +83,7 @@ def test_an_autopilot_that_is_heard_and_answers_nothing_is_told_from_one_that_si
 
 def test_mavlink_1_and_damaged_bytes_are_seen(address):
     said, _ = read(address, messages=healthy_messages(), version_1=True, noise=bytes(50))
-    assert said.uses_mavlink_1
+    assert said.says_version_1
     assert said.bad_bytes >= 50
 
 

@@ -112,7 +112,7 @@ def _check_px4(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Findin
 
 
 def _check_port(reading: AutopilotReading, change: str) -> Finding:
-    if reading.uses_mavlink_1:
+    if reading.says_version_1:
         return report_fault("port", FindingCode.MAVLINK_1, change)
     return report_ok("port", FindingCode.MAVLINK_2)
 

@@ -40,7 +40,7 @@ COPTER = AutopilotReading(
     signs=False,
     is_signed_to=False,
     answers=True,
-    uses_mavlink_1=False,
+    says_version_1=False,
     other_systems=(),
     bad_bytes=0,
     round_trip_s=0.02,
@@ -133,7 +133,7 @@ def test_check_autopilot_wants_a_source_set_and_an_origin_for_odometry():
         ({"version": (4, 4, 4), "version_text": "4.4.4"}, "firmware", ()),
         ({"version": None, "version_text": None}, "firmware", ()),
         ({"firmware": "other"}, "firmware", ("mavlink: {send_fixes: false}",)),
-        ({"uses_mavlink_1": True}, "port", ("SERIALn_PROTOCOL=2",)),
+        ({"says_version_1": True}, "port", ("SERIALn_PROTOCOL=2",)),
         ({"bad_bytes": 5000}, "link", ()),
         ({"other_systems": (2, 3)}, "vehicles", ("mavlink: {system_id: 1}",)),
         ({"filter_flags": None}, "filter", ()),
@@ -214,7 +214,7 @@ def test_check_autopilot_finds_an_old_px4():
         "firmware": ()
     }
     assert set(wrong(replace(PX4, version=None))) == {"firmware"}
-    assert wrong(replace(PX4, uses_mavlink_1=True)) == {"port": ("MAV_PROTO_VER=2",)}
+    assert wrong(replace(PX4, says_version_1=True)) == {"port": ("MAV_PROTO_VER=2",)}
 
 
 @pytest.mark.parametrize(
