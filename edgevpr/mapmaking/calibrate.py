@@ -139,7 +139,7 @@ def calibrate(
 
     def require(condition: object, problem: str) -> None:
         if not condition:
-            raise UsageError(f"{place_map.path} cannot be calibrated and flies with the shipped confidence: {problem}.")
+            raise UsageError(f"{place_map.path} cannot be calibrated and uses the shipped confidence: {problem}.")
 
     technique = encoder.technique
     kinds = list_evidence_kinds(technique.spec)
@@ -151,16 +151,16 @@ def calibrate(
     rule = make_accept_rule(technique, config)
     if not technique.spec.looks_down:
         near_m = MapSearch(technique, place_map, index, rule, meter=meter).near_m
-        described = (
+        descriptors = (
             (place_id, encoded.descriptor)
-            for place_id, encoded in _read_mapped(encoder, place_map, pictures, progress, len(place_map))
+            for place_id, encoded in _encode_pictures(encoder, place_map, pictures, progress, len(place_map))
         )
-        rule = replace(rule, look_alikes=measure_look_alikes(technique, place_map, index, near_m, described))
+        rule = replace(rule, look_alikes=measure_look_alikes(technique, place_map, index, near_m, descriptors))
     count = count_queries(technique)
-    as_mapped = (
-        (place_id, encoded.picture) for place_id, encoded in _read_mapped(encoder, place_map, pictures, progress, count)
+    queries = (
+        (place_id, frame.picture) for place_id, frame in _encode_pictures(encoder, place_map, pictures, progress, count)
     )
-    answers = list(query_map(technique, place_map, index, rule, meter, as_mapped))
+    answers = list(query_map(technique, place_map, index, rule, meter, queries))
     place_count = len({answer.place_id for answer in answers})
     require(
         place_count >= MIN_PLACES,
@@ -177,7 +177,7 @@ def count_queries(technique: Technique) -> int:
     return NADIR_QUERIES if technique.spec.looks_down else FORWARD_QUERIES
 
 
-def _read_mapped(
+def _encode_pictures(
     encoder: FrameEncoder, place_map: PlaceMap, pictures: Pictures, progress: Progress, count: int
 ) -> Iterator[tuple[int, EncodedFrame]]:
     """Yield (a place's number, its picture as encoded for the map) for `count` pictures in random order, starting over

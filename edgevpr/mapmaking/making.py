@@ -71,8 +71,8 @@ class BuiltMap:
     not_done: tuple[str, ...] = ()
 
 
-def make_map(plan: MapPlan, config: Config, unusable: Callable[[ImageError], None], progress: Progress) -> BuiltMap:
-    """Make the map that `plan` describes, or continue it. `unusable` is called with the error of each picture that
+def make_map(plan: MapPlan, config: Config, on_error: Callable[[ImageError], None], progress: Progress) -> BuiltMap:
+    """Make the map that `plan` describes, or continue it. `on_error` is called with the error of each picture that
     cannot be used. `progress` reports progress. Raises EdgevprError."""
     path, board, pictures = parse_map_path(plan.path), load_board("this"), plan.pictures
     source_config, salience = config.source, config.salience
@@ -97,13 +97,13 @@ def make_map(plan: MapPlan, config: Config, unusable: Callable[[ImageError], Non
     with place_map:
         try:
             if isinstance(pictures, FlightPictures):
-                is_calibrated = plan.calibrate and list_evidence_kinds(technique.spec)
-                advice.warn_of_gaps(pictures, source.total, len(place_map) if is_calibrated else None)
+                will_calibrate = plan.calibrate and list_evidence_kinds(technique.spec)
+                advice.warn_of_gaps(pictures, source.total, len(place_map) if will_calibrate else None)
                 advice.suggest_lens(pictures, source_config, technique)
                 advice.warn_of_display(pictures, mask)
             else:
                 place_map.add_attribution(pictures.attribution)
-            frames: Iterator[Frame] = filter(None, progress(read_to_end(source, unusable), source.total, "mapping"))
+            frames: Iterator[Frame] = filter(None, progress(read_to_end(source, on_error), source.total, "mapping"))
             if (
                 technique.spec.looks_down
                 and isinstance(pictures, FlightPictures)
@@ -116,14 +116,14 @@ def make_map(plan: MapPlan, config: Config, unusable: Callable[[ImageError], Non
                 replace(encoder, gate=open_salience_gate(salience, board.threads)),
                 place_map,
                 PlaceSelector(salience.gap_frames, salience.gap_m),
-                unusable,
+                on_error,
             )
         except EdgevprError:
             if is_new and not len(place_map):  # e.g. the disk is full; an empty file would block the next attempt
                 remove_map(path)
             raise
-        if covered := measure_ground(place_map):
-            _log.info("%s", covered.describe(is_flown=isinstance(pictures, FlightPictures)))
+        if ground := measure_ground(place_map):
+            _log.info("%s", ground.describe(is_flown=isinstance(pictures, FlightPictures)))
         finished = finish_map(
             place_map, encoder, config.match, pictures, progress, refine=plan.refine, calibrate=plan.calibrate
         )
@@ -135,7 +135,7 @@ def make_map(plan: MapPlan, config: Config, unusable: Callable[[ImageError], Non
             places=len(place_map),
             with_position=info.with_position,
             result=replace(result, **counts),
-            covered=covered,
+            covered=ground,
             refined=finished.refined,
             calibration=finished.calibration,
             not_done=finished.not_done,

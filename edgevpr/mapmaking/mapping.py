@@ -141,13 +141,13 @@ def build_map(
     encoder: FrameEncoder,
     place_map: PlaceMap,
     selector: PlaceSelector | None = None,
-    unusable: Callable[[ImageError], None] | None = None,
+    on_error: Callable[[ImageError], None] | None = None,
 ) -> MappingResult:
     """Add a place for every selected frame that is not in the map yet, so that an interrupted build can be continued.
 
     Frames are encoded by the same steps as queries. A frame is in the map already if a place has the same name and
     nearly the same descriptor; the name alone is not enough, because cameras restart their numbering. If a frame cannot
-    be encoded, `unusable` is called with the error; with `unusable` None, ModelError is raised. Pictures cut from an
+    be encoded, `on_error` is called with the error; with `on_error` None, ModelError is raised. Pictures cut from an
     orthophoto (surveyed ones) are skipped if they have too little texture to be recognised.
     """
     place_map.require_technique(encoder.technique.spec)
@@ -170,9 +170,9 @@ def build_map(
         try:
             encoded = encoder.encode(frame, layers=layers)
         except Exception as error:
-            if unusable is None:
+            if on_error is None:
                 raise ModelError(str(explain_failure(error))) from error
-            unusable(ImageError(f"{frame.name}: {explain_failure(error)}"))
+            on_error(ImageError(f"{frame.name}: {explain_failure(error)}"))
             continue
         if encoded.view.reason:
             if encoded.view.reason.code is ReasonCode.TILTED_WITHOUT_HEADING:

@@ -25,7 +25,7 @@ _MAX_FILE_BYTES = 50_000_000
 _WAYPOINT_COLUMNS = 12
 # The MAV_CMDs that fly to their position: waypoint, loiter (unlimited, turns, time, to altitude), land, takeoff, spline
 # waypoint, VTOL takeoff and VTOL land. The position of others, such as a region of interest, is only looked at.
-_FLOWN_COMMANDS = {16, 17, 18, 19, 21, 22, 31, 82, 84, 85}
+_NAV_COMMANDS = {16, 17, 18, 19, 21, 22, 31, 82, 84, 85}
 _RELATIVE_FRAMES = {3, 6, 10, 11}  # MAV_FRAMEs with altitude relative to home or the terrain
 _CIRCLE_PATTERN = re.compile(r"\s*-?[\d.]+\s*,\s*-?[\d.]+\s*,\s*-?[\d.]+\s*")  # LAT,LON,RADIUS_M
 _MAX_RADIUS_M = 200_000.0
@@ -57,12 +57,12 @@ class Area:
     def extent_deg(self) -> Extent:
         """The bounding box of the path or circle (see `compute_extent`)."""
         sides_m = (-self.radius_m, self.radius_m)
-        return compute_extent([offset_position(way.lat_deg, way.lon_deg, m, m) for way in self.path for m in sides_m])
+        return compute_extent([offset_position(wp.lat_deg, wp.lon_deg, m, m) for wp in self.path for m in sides_m])
 
     def project_ground(self, project: Projection, circle_margin_m: float, path_margin_m: float) -> "shapely.Geometry":
         """Return the ground within these margins of the circle or path, projected to a plane by `project`."""
         waypoints = (*self.path, self.path[-1])  # a LineString needs at least two points
-        points: Doubles = np.column_stack(project(*np.array([(way.lat_deg, way.lon_deg) for way in waypoints]).T))
+        points: Doubles = np.column_stack(project(*np.array([(wp.lat_deg, wp.lon_deg) for wp in waypoints]).T))
         # A point that cannot be projected is far away.
         line = shapely.LineString(np.nan_to_num(points, nan=_FAR_M, posinf=_FAR_M))
         margin_m = self.radius_m + circle_margin_m if self.radius_m else path_margin_m
@@ -79,8 +79,8 @@ def read_area(path: str | Path) -> Area:
         if _CIRCLE_PATTERN.fullmatch(str(path)):
             return _make_circle(*map(float, str(path).split(",")))
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
-        is_list = text.startswith("QGC WPL")
-        waypoints = _read_waypoints(text.splitlines()) if is_list else _read_plan(json.loads(text)["mission"]["items"])
+        is_wpl = text.startswith("QGC WPL")
+        waypoints = _read_waypoints(text.splitlines()) if is_wpl else _read_plan(json.loads(text)["mission"]["items"])
     except OSError as error:
         raise UsageError(
             f"{path} cannot be read ({error.strerror}): give a mission file, or LAT,LON,RADIUS_M."
@@ -91,7 +91,7 @@ def read_area(path: str | Path) -> Area:
         ) from None
     if not waypoints:
         raise UsageError(f"{path} contains no position to fly to: save the mission again.")
-    if any(abs(way.lat_deg) > 90 or abs(way.lon_deg) > 180 for way in waypoints):
+    if any(abs(wp.lat_deg) > 90 or abs(wp.lon_deg) > 180 for wp in waypoints):
         raise UsageError(f"{path} has invalid coordinates: positions must be WGS-84 degrees (-90..90, -180..180).")
     return Area(tuple(waypoints))
 
@@ -120,7 +120,7 @@ def _parse_waypoint(command: int, frame: int, location: Sequence[float | str | N
     """Return a list with the waypoint of a mission item, empty if the aircraft does not fly to it. `command` is a
     MAV_CMD, `frame` a MAV_FRAME, `location` latitude, longitude and altitude; (0, 0) is the aircraft's own position."""
     lat_deg, lon_deg, alt_m = map(_parse_finite, location)
-    if command not in _FLOWN_COMMANDS or lat_deg == lon_deg == 0:
+    if command not in _NAV_COMMANDS or lat_deg == lon_deg == 0:
         return []
     # No pictures are taken from height 0, as at home and on landing, so it counts as missing.
     return [Waypoint(lat_deg, lon_deg, alt_m if frame in _RELATIVE_FRAMES and alt_m > 0 else None)]

@@ -120,8 +120,8 @@ def refine(
     )
     if not placed:
         return result
-    recorded_at = [_recorded_position(place) for place in placed]
-    east_m, north_m = project_to_metres(*np.array([(position.lat_deg, position.lon_deg) for position in recorded_at]).T)
+    positions = [_get_recorded_position(place) for place in placed]
+    east_m, north_m = project_to_metres(*np.array([(position.lat_deg, position.lon_deg) for position in positions]).T)
     recorded = east_m + 1j * north_m
     compare_pair = _make_comparer(place_map, technique, placed, images)
     pairs = _find_likely_pairs(recorded)
@@ -131,9 +131,9 @@ def refine(
     if more:
         ties |= {pair: tie for pair in progress(more, len(more), "refining") if (tie := compare_pair(*pair))}
         solved = solve_graph(recorded, _to_ties(ties))
-    is_mirrored = _is_mirrored(recorded_at, recorded, _to_ties(ties), solved)
+    is_mirrored = _is_mirrored(positions, recorded, _to_ties(ties), solved)
     refined = _is_determined(solved) & (not is_mirrored)
-    _write_poses(place_map, placed, recorded_at, solved, refined)
+    _write_poses(place_map, placed, positions, solved, refined)
     moved_m = abs(solved.position - recorded)
     inconsistent = refined & ~solved.recorded_agree & (moved_m > _INCONSISTENT_SDS * solved.recorded_sd_m)
     return replace(
@@ -153,7 +153,7 @@ def refine(
     )
 
 
-def _recorded_position(place: Place) -> Position:
+def _get_recorded_position(place: Place) -> Position:
     """Return the position of a place as it was before any refinement."""
     position = place.pose.recorded if place.pose and place.pose.recorded else place.position
     assert position is not None  # callers pass only places with a position
@@ -167,7 +167,7 @@ def _is_determined(solved: GraphSolution) -> Bools:
     return is_determined
 
 
-def _is_mirrored(recorded_at: list[Position], recorded: Complexes, ties: Ties, solved: GraphSolution) -> bool:
+def _is_mirrored(positions: list[Position], recorded: Complexes, ties: Ties, solved: GraphSolution) -> bool:
     """Return True if the ties fit a mirror image of the recorded positions much better than the positions themselves,
     as when lat and lon are exchanged or a sign is lost. Places on a straight line or in small groups do not show it."""
     sample = slice(_MAX_MIRROR_PLACES)
@@ -176,7 +176,7 @@ def _is_mirrored(recorded_at: list[Position], recorded: Complexes, ties: Ties, s
         return False
     in_sample = (ties.query < _MAX_MIRROR_PLACES) & (ties.place < _MAX_MIRROR_PLACES)
     sample_ties = Ties(**{field.name: getattr(ties, field.name)[in_sample] for field in fields(Ties)})
-    lat_deg, lon_deg = np.array([(position.lat_deg, position.lon_deg) for position in recorded_at[sample]]).T
+    lat_deg, lon_deg = np.array([(position.lat_deg, position.lon_deg) for position in positions[sample]]).T
     mirrored = [recorded[sample].conj()]
     if abs(lon_deg).max() < 90:  # exchanging lat and lon also changes the proportions of the track
         east_m, north_m = project_to_metres(lon_deg, lat_deg)
@@ -205,14 +205,14 @@ def _read_places(place_map: PlaceMap) -> Iterator[Place]:
 
 
 def _write_poses(
-    place_map: PlaceMap, placed: list[Place], recorded_at: list[Position], solved: GraphSolution, refined: Bools
+    place_map: PlaceMap, placed: list[Place], positions: list[Position], solved: GraphSolution, refined: Bools
 ) -> None:
     """Write the solved positions and poses to the map for places where `refined`, bool (N,), is True. The others are
     reset to their recorded positions, without a pose."""
-    origin = recorded_at[0]
+    origin = positions[0]
     with place_map.transaction():
         for index, place in enumerate(placed):
-            position, pose = recorded_at[index], None
+            position, pose = positions[index], None
             if refined[index]:
                 var_m2, offset_m = float(solved.position_var[index]) / 2, solved.position[index]
                 position = Position(*offset_position(origin.lat_deg, origin.lon_deg, offset_m.real, offset_m.imag))
@@ -220,7 +220,7 @@ def _write_poses(
                     up_deg=float(-np.degrees(solved.log[index].imag)) % 360,
                     footprint_m=float(np.exp(solved.log[index].real)),
                     covariance_m2=(var_m2, 0.0, var_m2),
-                    recorded=recorded_at[index],
+                    recorded=positions[index],
                 )
             if pose or place.pose is None or place.pose.recorded:
                 place_map.move_place(place.place_id, position, pose)

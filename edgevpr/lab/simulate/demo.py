@@ -33,18 +33,18 @@ _SEED = 1
 _INTERVAL_S = 0.2  # between pictures of the later flight, which is replayed at the times of its pictures
 _CAMERA = ("--camera", "nadir", "--fov-deg", 66)  # of the generated flights
 # A place is correct if the two pictures share 30 % of their ground. From a height of 80 m a picture is 78 m long.
-MAX_RIGHT_M = 55.0
+MAX_CORRECT_M = 55.0
 _PICTURE_PX = (1600, 1050)
 # Colours (blue, green, red) of the places, of the later flight, and of matches by outcome.
 _MAPPED = (255, 255, 255)
 _LATER = (10, 214, 255)
-_RIGHT = (91, 191, 47)
+_CORRECT = (91, 191, 47)
 _WRONG = (59, 56, 229)
 _REJECTED = (36, 165, 245)
 _LEGEND = {
     "places of flight 1": _MAPPED,
     "flight 2": _LATER,
-    "accepted": _RIGHT,
+    "accepted": _CORRECT,
     "accepted, wrong": _WRONG,
     "rejected: no position is sent": _REJECTED,
 }
@@ -100,13 +100,13 @@ def read_queries(log_path: Path, mapped: Path, flown: Path) -> tuple[list[Logged
     return queries, list(places.values())
 
 
-def is_right(query: LoggedQuery) -> bool:
+def is_correct(query: LoggedQuery) -> bool:
     """Return True if the matched place is near enough to the true position of the query."""
     return _are_near(query.true_position, query.place_position)
 
 
 def _are_near(point: LatLon | None, other: LatLon | None) -> bool:
-    return point is not None and other is not None and float(distance_m(*point, *other)) <= MAX_RIGHT_M
+    return point is not None and other is not None and float(distance_m(*point, *other)) <= MAX_CORRECT_M
 
 
 def summarise(queries: Sequence[LoggedQuery], places: Sequence[LatLon]) -> str:
@@ -116,11 +116,11 @@ def summarise(queries: Sequence[LoggedQuery], places: Sequence[LatLon]) -> str:
     errors_m = [query.off_m or 0.0 for query in accepted] or [np.nan]
     off_map = len(queries) - len(on_map)
     off_map_rejected = off_map - sum(query not in on_map for query in accepted)
-    recall = sum(map(is_right, on_map)) / max(len(on_map), 1)
+    recall = sum(map(is_correct, on_map)) / max(len(on_map), 1)
     return f"""
 queries           {len(queries)}: {len(on_map)} over the map, {off_map} outside it
-recall@1          {recall:.2f} of the queries over the map (best place within {MAX_RIGHT_M:g} m)
-accepted          {len(accepted)}, {sum(not is_right(query) for query in accepted)} of them wrong
+recall@1          {recall:.2f} of the queries over the map (best place within {MAX_CORRECT_M:g} m)
+accepted          {len(accepted)}, {sum(not is_correct(query) for query in accepted)} of them wrong
 rejected          {len(queries) - len(accepted)}, including {off_map_rejected} of the {off_map} outside the map
 position error    median {np.median(errors_m):.1f} m, 90 % within {np.quantile(errors_m, 0.9):.1f} m, \
 largest {max(errors_m):.1f} m (accepted queries; places are 21 m apart)"""
@@ -129,7 +129,7 @@ largest {max(errors_m):.1f} m (accepted queries; places are 21 m apart)"""
 def _choose_colour(query: LoggedQuery) -> tuple[int, int, int]:
     if not query.accepted:
         return _REJECTED
-    return _RIGHT if is_right(query) else _WRONG
+    return _CORRECT if is_correct(query) else _WRONG
 
 
 def _draw(path: Path, ground: Image, mapping: GeneratedFlight, queries: Sequence[LoggedQuery]) -> None:

@@ -58,10 +58,10 @@ def _plan_mission_shots(path: str | Path, every_m: float) -> list[GeoTag]:
     waypoints = read_area(path).path
     if len(waypoints) < 2:
         return []
-    lat_deg, lon_deg = (np.array([getattr(way, name) for way in waypoints]) for name in ("lat_deg", "lon_deg"))
+    lat_deg, lon_deg = (np.array([getattr(wp, name) for wp in waypoints]) for name in ("lat_deg", "lon_deg"))
     track_m = np.append(0, np.cumsum(distance_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])))
     shot_m = np.arange(0, track_m[-1] + 1e-6, every_m)  # along the track
-    waypoint_m = np.array([way.height_m for way in waypoints], float)  # heights; NaN for home and landings
+    waypoint_m = np.array([wp.height_m for wp in waypoints], float)  # heights; NaN for home and landings
     known = np.isfinite(waypoint_m)
     heights_m = np.interp(shot_m, track_m[known], waypoint_m[known]).tolist() if known.any() else [None] * len(shot_m)
     places = zip(*(np.interp(shot_m, track_m, degrees).tolist() for degrees in (lat_deg, lon_deg)), strict=True)
