@@ -230,9 +230,9 @@ def run_map_info(args: Namespace) -> int:
     else:
         confidence = explain_not_calibrated(info.places) if info.spec.name == CONFIDENCE_TECHNIQUE else None
     ram_mb = info.places * place_bytes / 1e6
-    known = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": place_bytes}
+    figures = {"calibration": calibration.figures() if calibration else None, "bytes_per_place": place_bytes}
     lines = list(format_info(info, confidence, ram_mb))
-    print_result({**asdict(info), **known, "ram_mb": ram_mb}, args.json, lines)
+    print_result({**asdict(info), **figures, "ram_mb": ram_mb}, args.json, lines)
     if args.page:
         _write_page(args, lines, calibration.recognisable if calibration else {})
     return 0

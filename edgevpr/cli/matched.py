@@ -65,22 +65,23 @@ def format_matches(matches: Sequence[dict[str, Any]]) -> Iterator[str]:
 def _format_place(match: dict[str, Any], measure: str) -> tuple[str, ...]:
     """Return the left part of a row: the query and the place found."""
     place, value = match["place"], match.get(measure)
-    certainty = "-" if value is None else format_probability(value) if measure == "confidence" else f"{value:.3f}"
+    text = "-" if value is None else format_probability(value) if measure == "confidence" else f"{value:.3f}"
     label = f"{place['number']} {_shorten_name(place['image'])}" if place else "-"
-    return _shorten_name(match["query"]), "yes" if match["accepted"] else "no", certainty, label
+    return _shorten_name(match["query"]), "yes" if match["accepted"] else "no", text, label
 
 
 def _format_fix(match: dict[str, Any]) -> tuple[str, ...]:
     """Return the right part of a row with a fix; a star marks a fix that is the position of the place itself."""
-    fix, away_m = match["position"], match["from_gps_tag_m"]
+    fix, from_tag_m = match["position"], match["from_gps_tag_m"]
     accuracy = f"{fix['accuracy_m']:.1f}{'*' if fix['of_place'] else ' '}"
-    return f"{fix['lat_deg']:.6f}", f"{fix['lon_deg']:.6f}", accuracy, "-" if away_m is None else f"{away_m:.1f}"
+    distance = "-" if from_tag_m is None else f"{from_tag_m:.1f}"
+    return f"{fix['lat_deg']:.6f}", f"{fix['lon_deg']:.6f}", accuracy, distance
 
 
 def _format_refusal(match: dict[str, Any]) -> str:
     """Return the right part of a row without a fix: the reason in a few words."""
-    words = "its place has no position" if match["accepted"] else ReasonCode[match["reason"]["code"]].summary
-    return textwrap.shorten(words, _REASON_COLUMNS, placeholder=" ...")
+    reason = "its place has no position" if match["accepted"] else ReasonCode[match["reason"]["code"]].summary
+    return textwrap.shorten(reason, _REASON_COLUMNS, placeholder=" ...")
 
 
 def _shorten_name(name: str) -> str:
@@ -92,14 +93,14 @@ def _shorten_name(name: str) -> str:
 def _summarise(matches: Sequence[dict[str, Any]], fixes: Sequence[dict[str, Any]]) -> Iterator[str]:
     refused = Counter(ReasonCode[match["reason"]["code"]] for match in matches if not match["accepted"])
     counts = ", ".join(f"{count} {code.summary}" for code, count in refused.most_common())
-    why = f"; refused: {counts}" if refused else ""
-    yield f"{len(matches)} queries, {len(matches) - refused.total()} accepted{why}"
+    reasons = f"; refused: {counts}" if refused else ""
+    yield f"{len(matches)} queries, {len(matches) - refused.total()} accepted{reasons}"
     if not fixes:
         return
     in_world_m, on_map_m = (median(match["position"][key] for match in fixes) for key in ("accuracy_m", "on_map_m"))
     text = f"± m: 1 sigma of the fix in the world, median {in_world_m:.1f} m; on the map {on_map_m:.1f} m"
-    if away_m := [match["from_gps_tag_m"] for match in fixes if match["from_gps_tag_m"] is not None]:
-        text += f"; {median(away_m):.1f} m from the GPS tags, which have errors of their own"
+    if from_tag_m := [match["from_gps_tag_m"] for match in fixes if match["from_gps_tag_m"] is not None]:
+        text += f"; {median(from_tag_m):.1f} m from the GPS tags, which have errors of their own"
     yield text
     if of_place := sum(match["position"]["of_place"] for match in fixes):
         yield f"*: {of_place} positions are simply those of the matched places: the offset from the place is unknown"

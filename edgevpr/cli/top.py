@@ -95,13 +95,13 @@ def _format_optional(template: str, value: float | None) -> str:
 def _format_query(query: dict[str, Any] | None, now_s: float) -> str:
     if query is None:
         return "none yet"
-    ago = f"{now_s - query['t_frame_s']:.0f} s ago"
+    age = f"{now_s - query['t_frame_s']:.0f} s ago"
     if not query["accepted"]:
-        return f"{ago}, refused: {read_reason(query['reason']) or 'unknown'}"
-    certainty = "" if query["confidence"] is None else f", confidence {format_probability(query['confidence'])}"
-    certainty += _format_optional(", score {:.3f}", query["score"])
+        return f"{age}, refused: {read_reason(query['reason']) or 'unknown'}"
+    confidence = "" if query["confidence"] is None else f", confidence {format_probability(query['confidence'])}"
+    score = _format_optional(", score {:.3f}", query["score"])
     accuracy = _format_optional(", accurate to {:.0f} m", query["accuracy_m"])
-    return f"{ago}, place {query['place']} ({query['reference_image']}){certainty}{accuracy}"
+    return f"{age}, place {query['place']} ({query['reference_image']}){confidence}{score}{accuracy}"
 
 
 def _format_link(link: dict[str, Any]) -> list[tuple[str, str]]:

@@ -24,14 +24,14 @@ class FixOutcome(Enum):
     """Outcome of a fix, in the words of the report. CONTINUOUS: the fix was included in the position that is sent many
     times a second, which the autopilot does not answer. NOT_SENT: it was not sent, see `why`."""
 
-    TAKEN = "fix accepted"
+    ACCEPTED = "fix accepted"
     REFUSED = "fix refused"
     UNANSWERED = "fix not answered"
     CONTINUOUS = "in continuous position"
     NOT_SENT = "fix not sent"
 
 
-SENT_OUTCOMES = (FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.UNANSWERED)
+SENT_OUTCOMES = (FixOutcome.ACCEPTED, FixOutcome.REFUSED, FixOutcome.UNANSWERED)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -174,7 +174,7 @@ def _read_outcome(fix: dict[str, Any], answer: object) -> FixOutcome:
         return FixOutcome.CONTINUOUS if why and why.code is ReasonCode.CONTINUOUS else FixOutcome.NOT_SENT
     if answer is None:
         return FixOutcome.UNANSWERED
-    return FixOutcome.TAKEN if answer == "ACCEPTED" else FixOutcome.REFUSED
+    return FixOutcome.ACCEPTED if answer == "ACCEPTED" else FixOutcome.REFUSED
 
 
 def _is_fresh(t_s: float | None, t_frame_s: float | None) -> bool:
@@ -195,13 +195,13 @@ def _locate_gps(line: dict[str, Any], t_frame_s: float | None) -> Point | None:
 
 def _read_text(line: dict[str, Any]) -> str:
     reasons = [str(reason) for key in _REASON_FIELDS if (reason := read_reason(line.get(key)))]
-    words = next(iter([*reasons, *(text for key in _TEXT_FIELDS if (text := get_text(line, key)))]), None)
+    text = next(iter([*reasons, *(value for key in _TEXT_FIELDS if (value := get_text(line, key)))]), None)
     match line:
         case {"from": dict() as before, "to": dict() as after}:  # a change by the governor
             changed = [f"{key} {before.get(key)} to {now}" for key, now in after.items() if before.get(key) != now]
-            return f"{', '.join(changed)}: {words}"
-    others = {"kind", "time", "t_mono_s"}
-    return words or ", ".join(f"{key} {field_value}" for key, field_value in line.items() if key not in others)
+            return f"{', '.join(changed)}: {text}"
+    hidden = {"kind", "time", "t_mono_s"}
+    return text or ", ".join(f"{key} {field_value}" for key, field_value in line.items() if key not in hidden)
 
 
 def get_value(record: Any, *keys: str) -> Any:

@@ -61,15 +61,15 @@ def make_map_page(
     pairs = [(points.get(twin.place_id), points.get(twin.other_id)) for twin in twins.values()]
     tags = [(read_recorded_position(place), to_point(place)) for place in ground if place.place_id in tags_off_m]
     layers = [
-        Layer("coverage gaps", "hole", gaps, "area"),
+        Layer("coverage gaps", "gap", gaps, "area"),
         Layer("look alike", "alike", [(point, other) for point, other in pairs if point and other], "line"),
-        Layer("inconsistent GPS tags", "amiss", tags, "line"),
-        make_layer(steps, "hard to recognise", "weak"),
+        Layer("inconsistent GPS tags", "tag", tags, "line"),
+        make_layer(steps, "hard to recognise", "hard"),
         *(make_layer(steps, f"{quality} quality", quality) for quality in _QUALITY_CLASSES),
     ]
     figures = {
         "places": str(len(places)),
-        "ground seen": format_number(covered_m2 / 1e4 if covered_m2 else None, "ha"),
+        "ground covered": format_number(covered_m2 / 1e4 if covered_m2 else None, "ha"),
         "coverage gaps": format_number(gaps_m2 / 1e4 if covered_m2 else None, "ha"),
         "inconsistent GPS tags": str(len(tags_off_m)),
         "hard to recognise": str(len(hard)) if recognisable else UNKNOWN,
@@ -124,7 +124,7 @@ def _make_steps(
         if confidence is not None:
             texts.append(f"mean confidence of altered copies of its image: {format_probability(confidence)}")
         pictures = [("place", place.source_image, f"place {place_id}: {place.source_image}")]
-        marks = {"alike": points.get(twin.other_id) if twin else None, "weak": position if is_hard else None}
+        marks = {"alike": points.get(twin.other_id) if twin else None, "hard": position if is_hard else None}
         if twin:
             image = images.get(twin.other_id, "")
             texts.append(f"looks like place {twin.other_id}: confidence {format_probability(twin.confidence)}")
@@ -171,19 +171,19 @@ def find_gaps(ground: Sequence[Place]) -> tuple[list[list[Point]], float, float]
     footprint_m = float(np.median([pose.footprint_m for _, pose in posed]))
     low, high = middles.min(axis=0) - 2 * footprint_m, middles.max(axis=0) + 2 * footprint_m
     cell_m = max(footprint_m / _CELLS_PER_FOOTPRINT, float(np.sqrt(np.prod(high - low) / _MAX_CELLS)))
-    shown = np.zeros(np.ceil((high - low) / cell_m).astype(int)[::-1], np.uint8)
+    covered = np.zeros(np.ceil((high - low) / cell_m).astype(int)[::-1], np.uint8)
     square = np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]]) * _COVERED_SHARE / 2
     for middle, (_, pose) in zip(middles, posed, strict=True):
         corners = (middle - low)[:, None] + picture_axes(pose.up_deg) @ square * pose.footprint_m
-        cv2.fillConvexPoly(shown, np.rint(corners.T / cell_m).astype(np.int32), (1,))
-    thin, wide = (
+        cv2.fillConvexPoly(covered, np.rint(corners.T / cell_m).astype(np.int32), (1,))
+    opening_kernel, closing_kernel = (
         cv2.getStructuringElement(cv2.MORPH_ELLIPSE, [max(1, round(share * footprint_m / cell_m))] * 2)
         for share in (_MIN_GAP_FOOTPRINTS, _MAX_GAP_FOOTPRINTS)
     )
-    closed = cv2.morphologyEx(shown, cv2.MORPH_CLOSE, wide)
-    around, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(closed, around, -1, (1,), cv2.FILLED)  # enclosed gaps count however wide they are
-    between = cv2.morphologyEx(closed & (1 - shown), cv2.MORPH_OPEN, thin)
-    outlines, _ = cv2.findContours(between, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    closed = cv2.morphologyEx(covered, cv2.MORPH_CLOSE, closing_kernel)
+    contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(closed, contours, -1, (1,), cv2.FILLED)  # enclosed gaps count however wide they are
+    uncovered = cv2.morphologyEx(closed & (1 - covered), cv2.MORPH_OPEN, opening_kernel)
+    outlines, _ = cv2.findContours(uncovered, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     gaps = [[offset_position(*origin, *(low + cell_m * point)) for point in outline[:, 0]] for outline in outlines]
-    return gaps, float(shown.sum()) * cell_m**2, float(between.sum()) * cell_m**2
+    return gaps, float(covered.sum()) * cell_m**2, float(uncovered.sum()) * cell_m**2

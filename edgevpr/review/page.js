@@ -7,7 +7,7 @@
   const find = (query, within = document) => within.querySelector(query);
   const all = (query, within = document) => [...within.querySelectorAll(query)];
 
-  // ---- Make elements: of HTML, and of SVG.
+  // ---- Create HTML and SVG elements.
   function put(made, attributes, inside) {
     for (const [key, value] of Object.entries(attributes)) {
       if (value !== null && value !== false) made.setAttribute(key, value === true ? "" : value);
@@ -26,7 +26,7 @@
     return `${hours}:${two(all_s % 60)}`;
   }
 
-  // ---- The axis of time: 0 to 1000 in each chart and lane.
+  // ---- The time axis: 0 to 1000 in each chart and lane.
   const has_times = span_s !== null;
   const across = (t_s) => 1000 * Math.min(Math.max(t_s / (span_s || 1), 0), 1);
   const STEPS_S = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400];
@@ -39,7 +39,7 @@
   const strip = (label, height, ...inside) => svg("svg", {
     role: "img", "aria-label": label, viewBox: `0 0 1000 ${height}`, preserveAspectRatio: "none" }, grid(height), ...inside);
 
-  // A line through points, an area inside them, or dots: lines of length 0, whose round ends make dots.
+  // A line through points, an area bounded by them, or dots: lines of length 0 with round ends.
   function path(points, form) {
     if (form === "dots" || points.length === 1) return points.map(([x, y]) => `M${x} ${y}h0`).join("");
     return `M${points.map(([x, y]) => `${x} ${y}`).join("L")}${form === "area" ? "z" : ""}`;
@@ -60,7 +60,7 @@
         html("div", {}, strip(`${title}, ${unit}`, 100, ...lines), times())));
   }
 
-  // ---- The ground: squares or pictures of the places, and the layers over them.
+  // ---- The ground: squares or pictures of the places, with the layers above them.
   const square = ([x, y, side, up_deg]) =>
     ({ x: -side / 2, y: -side / 2, width: side, height: side, transform: `translate(${x} ${y}) rotate(${up_deg})` });
   function drawGround() {
@@ -68,9 +68,9 @@
     const laid = ground.squares.map((each) => (each[4] === null ? null
       : svg("image", { class: "layer-ground", href: pictures[each[4]], ...square(each) }))).filter(Boolean);
     const squares = laid.length ? [] : ground.squares.map((each) => svg("rect", { class: "footprints layer-ground", ...square(each) }));
-    const paths = ground.layers.map(({ colour, form, ways }) => svg("path", {
-      class: `${form} ${colour} layer-${colour}`, d: ways.map((way) => path(way, form)).join("") }));
-    const names = [...(ground.squares.length ? [["ground", "the ground seen"]] : []),
+    const paths = ground.layers.map(({ colour, form, polylines }) => svg("path", {
+      class: `${form} ${colour} layer-${colour}`, d: polylines.map((line) => path(line, form)).join("") }));
+    const names = [...(ground.squares.length ? [["ground", "ground in the images"]] : []),
       ...ground.layers.map(({ colour, name }) => [colour, name])];
     const keys = names.map(([colour, name]) => {
       const box = html("input", { type: "checkbox", checked: true });
@@ -96,13 +96,13 @@
     return html("div", { class: "stepper" }, slide, now);
   }
 
-  // Boxes by which the reader chooses steps, each with its count and, where they have times, a lane of them.
+  // Check boxes that filter the steps, each with its count and, if steps have times, a lane that shows them.
   function choices() {
     const rows = groups.flatMap(([group, colour, count], number) => [
       html("label", {}, html("input", { type: "checkbox", "data-group": number }), group, " ", html("b", {}, `${count}`)),
       has_times && strip(group, 20, svg("path", { class: `mark ${colour}`, "data-lane": number }))].filter(Boolean));
     const inside = has_times ? html("div", { class: "lanes" }, ...rows, html("span"), times()) : html("div", { class: "boxes" }, ...rows);
-    return html("details", { class: "choose", open: true }, html("summary", {}, "Show only some"), inside);
+    return html("details", { class: "choose", open: true }, html("summary", {}, "Filter steps"), inside);
   }
 
   function sectionOf({ title, lines, rows, folded }) {
@@ -130,8 +130,8 @@
   const slider = document.getElementById("step"), play = document.getElementById("play");
   let shown = steps, now = steps[0];
 
-  // ---- Zoom and pan: the part of the drawing that is seen is the viewBox of its SVG, in metres.
-  function fit([left, top, wide, high]) { // into the shape of the view
+  // ---- Zoom and pan: the visible part of the drawing is the viewBox of its SVG, in metres.
+  function fit([left, top, wide, high]) { // extends the box to the shape of the view
     const shape = Math.min(Math.max(wide / high, 0.56), 1.8), width = Math.max(wide, high * shape), height = width / shape;
     return [left - (width - wide) / 2, top - (height - high) / 2, width, height];
   }
@@ -154,7 +154,7 @@
     ruler.style.width = `${100 * length / box[2]}%`;
     ruler.textContent = length < 1000 ? `${+length.toPrecision(1)} m` : `${length / 1000} km`;
   }
-  // Zoom about the point that is [right, down] of the view, 0 to 1 each.
+  // Zoom about the point at [right, down] in the view, 0 to 1 each.
   const zoom = (by, right = 0.5, down = 0.5) => {
     const wide = Math.min(Math.max(box[2] / by, whole[2] / MAX_ZOOM), whole[2]);
     look(box[0] + right * (box[2] - wide), box[1] + down * (box[3] - wide * whole[3] / whole[2]), wide);
@@ -179,7 +179,7 @@
       event.preventDefault();
       keys[event.key]();
     });
-    // A wheel scrolls the page until the ground has the focus; a pinch on a touchpad comes as a wheel with Ctrl.
+    // The wheel scrolls the page unless the ground has the focus; a pinch on a touchpad arrives as a wheel with Ctrl.
     view.addEventListener("wheel", (event) => {
       if (!event.ctrlKey && document.activeElement !== view) return;
       event.preventDefault();
@@ -195,17 +195,17 @@
     view.addEventListener("pointermove", (event) => {
       const before = fingers.get(event.pointerId);
       if (!before) return;
-      const here = share(event), others = [...fingers].filter(([id]) => id !== event.pointerId);
-      const [right, down] = [here[0] - before[0], here[1] - before[1]];
+      const after = share(event), others = [...fingers].filter(([id]) => id !== event.pointerId);
+      const [right, down] = [after[0] - before[0], after[1] - before[1]];
       moved += Math.hypot(right * view.clientWidth, down * view.clientHeight);
       if (others.length) {
         const other = others[0][1], far = (point) => Math.hypot(point[0] - other[0], point[1] - other[1]) || 1e-6;
-        zoom(far(here) / far(before), ...other);
+        zoom(far(after) / far(before), ...other);
       } else if (zoomed() > 1.01) {
         pan(-right, -down);
       }
       if (moved > 5) view.setPointerCapture(event.pointerId);
-      fingers.set(event.pointerId, here);
+      fingers.set(event.pointerId, after);
     });
     for (const end of ["pointerup", "pointercancel"]) {
       view.addEventListener(end, (event) => {
@@ -219,13 +219,13 @@
     look(...whole);
   }
 
-  // ---- The step that is shown: its texts, its pictures, and its points over the ground.
+  // ---- The current step: its texts, its pictures, and its points on the ground.
   function show(step) {
     now = step;
     const at = shown.indexOf(step), panel = find(".now");
     slider.value = at;
     document.getElementById("which").textContent = shown.length ? `${at + 1} of ${shown.length}` : "none";
-    find("h3", panel).textContent = step ? step.title : "Nothing is left: show more below.";
+    find("h3", panel).textContent = step ? step.title : "No step passes the filter: select more below.";
     const texts = find("div", panel), pair = find(".pair", panel);
     texts.textContent = pair.textContent = "";
     nowAt && (nowAt.textContent = "");
@@ -248,7 +248,7 @@
       if (last && zoomed() > 1.01) bring(last);
     }
   }
-  const bring = ([x, y]) => { // into the view
+  const bring = ([x, y]) => { // pans until the point is in the view
     const inside = x > box[0] && x < box[0] + box[2] && y > box[1] && y < box[1] + box[3];
     if (!inside) look(x - box[2] / 2, y - box[3] / 2, box[2]);
   };
@@ -262,7 +262,7 @@
 
   const inLane = (marks) => shown.filter((step) => step.groups.includes(+marks.dataset.lane));
 
-  // ---- Choosing steps by their groups: the others vanish from ground, lanes and slider.
+  // ---- Filter steps by their groups: the others are hidden on the ground, in the lanes and by the slider.
   function filter() {
     const wanted = new Set(all("[data-group]:checked").map((each) => +each.dataset.group));
     shown = wanted.size ? steps.filter((step) => step.groups.some((group) => wanted.has(group))) : steps;
@@ -277,7 +277,7 @@
     show(shown.includes(now) ? now : shown[0]);
   }
 
-  // ---- Put together.
+  // ---- Start.
   if (view) moveGround();
   if (!steps.length) return;
   slider.oninput = () => show(shown[slider.value]);

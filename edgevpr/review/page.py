@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 _MAX_REMARKS = 200
 _MAX_GPS_ERROR_M = 15.0  # smaller distances are receiver error and not dangerous
 _FIX_COLOURS = {
-    FixOutcome.TAKEN: "taken",
+    FixOutcome.ACCEPTED: "taken",
     FixOutcome.UNANSWERED: "unanswered",
     FixOutcome.REFUSED: "refused",
     FixOutcome.CONTINUOUS: "taken",
@@ -180,7 +180,7 @@ def _compute_figures(flight: LoggedFlight) -> dict[str, str]:
         "frames not usable": str(flight.unusable) if flight.unusable else UNKNOWN,
         "longest without a match": format_number(max(after_s - t_s for t_s, after_s in pairwise(ends_s)), "s"),
         "fixes sent": f"{sum(outcomes[outcome] for outcome in SENT_OUTCOMES)}{between}",
-        "fixes accepted": str(outcomes[FixOutcome.TAKEN]),
+        "fixes accepted": str(outcomes[FixOutcome.ACCEPTED]),
         "charge": format_number(_find_highest(flight, "totals", "used_mah"), "mAh"),
         "RAM, maximum": format_number(_find_highest(flight, "costs", "rss_mb"), "MB"),
         "temperature, maximum": format_number(_find_highest(flight, "board", "temperature_c"), "°C"),

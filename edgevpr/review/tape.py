@@ -151,7 +151,7 @@ class Playback(Tape):
         self.packets = PacketComparison()
         self.guessed = 0
         self.t_s = 0.0  # time of the newest turn or clock reading
-        self._notes, self._at = list(notes), 0
+        self._notes, self._index = list(notes), 0
         self._known: dict[str, Any] = {}
         self._is_stopping = False
 
@@ -159,7 +159,7 @@ class Playback(Tape):
         """Return the value of `kind` that the flight read here. `look` reads the real machine; it is called only if the
         tape has no value. Raises StopNow where the flight was stopped, and TapeEnded."""
         if self._peek_kind() == "stopped":
-            self._at += 1
+            self._index += 1
             self._is_stopping = True
         # A flight that was stopped may have read more values while cleaning up: these are returned first.
         if self._is_stopping and self._peek_kind() != kind:
@@ -170,9 +170,9 @@ class Playback(Tape):
             if not self._has_answer(kind):
                 return self._guess(kind, look)
             while self._peek_kind() not in (kind, "stopped"):
-                self._at += 1
-        head, *values = self._notes[self._at]
-        self._at += 1
+                self._index += 1
+        head, *values = self._notes[self._index]
+        self._index += 1
         if head == "stopped":
             raise StopNow
         value = self._known[kind] = values[0]
@@ -189,19 +189,19 @@ class Playback(Tape):
         while note := self._peek_note():
             if note[0] != LINK or self.perform_turn is None:
                 return cast(str, note[0])
-            self._at += 1
+            self._index += 1
             self.t_s = max(self.t_s, note[1])
             self.perform_turn(note[1], note[2])
         raise TapeEnded
 
     def _peek_note(self) -> Note | None:
-        return self._notes[self._at] if self._at < len(self._notes) else None
+        return self._notes[self._index] if self._index < len(self._notes) else None
 
     def _has_answer(self, kind: str) -> bool:
         """Return True if a value of `kind`, or the end of the flight, comes before the next frame. Return False for a
         clock, because no notes are skipped to read one."""
         until = (kind, "stopped", "frame")
-        first = next((note[0] for note in islice(self._notes, self._at, None) if note[0] in until), None)
+        first = next((note[0] for note in islice(self._notes, self._index, None) if note[0] in until), None)
         return first in (kind, "stopped") and kind not in _CLOCKS
 
     def _guess(self, kind: str, look: Callable[[], Any]) -> Any:

@@ -52,12 +52,12 @@ _PAGE = """<!doctype html>
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """A layer of the drawing, which the reader can hide. `colour`: CSS class that sets its colour. `ways`: sequences of
-    positions, each drawn in a `form`: dots, a line or an area."""
+    """A layer of the drawing, which the reader can hide. `colour`: CSS class that sets its colour. `polylines`:
+    sequences of positions, each drawn in a `form`: dots, a line or an area."""
 
     name: str
     colour: str
-    ways: Sequence[Sequence[Point]]
+    polylines: Sequence[Sequence[Point]]
     form: Form = "dots"
 
 
@@ -175,8 +175,8 @@ class _Drawing:
     bounding box (left, top, width, height) of the drawing; None: nothing has a position."""
 
     def __init__(self, ground: Sequence[Place], layers: Sequence[Layer], steps: Sequence[Step]) -> None:
-        layers = [layer for layer in layers if any(layer.ways)]
-        points = [point for layer in layers for way in layer.ways for point in way]
+        layers = [layer for layer in layers if any(layer.polylines)]
+        points = [point for layer in layers for line in layer.polylines for point in line]
         points += [point for step in steps for point in step.points.values()]
         self._origin = points[0] if points else (0.0, 0.0)
         self.box: list[float] | None = None
@@ -186,7 +186,7 @@ class _Drawing:
             low, high = drawn.min(axis=0) - margin_m, drawn.max(axis=0) + margin_m
             self.box = [round(edge_m, 2) for edge_m in (*low.tolist(), *(high - low).tolist())]
         self.layers = [
-            {**asdict(layer), "ways": [[self.convert(point) for point in way] for way in layer.ways if way]}
+            asdict(layer) | {"polylines": [[self.convert(point) for point in line] for line in layer.polylines if line]}
             for layer in layers
         ]
 

@@ -109,7 +109,10 @@ def test_main_exits_with_2_and_a_sentence_if_the_request_is_wrong(capsys, flight
     wrong_row = tmp_path / "positions.csv"
     wrong_row.write_text("file,lat,lon\n0.png,91,8\n")
     for argv, says in [
-        (["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", "udp:1"], "not a MAVLink link"),
+        (
+            ["run", "--map", valley, "--source", query, "--log", tmp_path / "x", "--link", "udp:1"],
+            "not a MAVLink address",
+        ),
         (["match", valley, "--images", query, "--min-score", "3"], "between 0 and 1"),
         (["match", valley, "--images", query, "--accept-precision", "nan"], "`match.accept_precision` is"),
         (["match", valley, "--images", query, "--board", "rpi5"], "did you mean `rpi-5`"),
@@ -120,7 +123,7 @@ def test_main_exits_with_2_and_a_sentence_if_the_request_is_wrong(capsys, flight
         (["map", "build", tmp_path / "m.gpkg", "--images", query, "--param", "gt"], "write KEY=VALUE"),
         (["map", "build", tmp_path / "m.gpkg", "--images", query, "--positions", wrong_row], "line 2: lat is `91`"),
         (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row, "--techniques", ","], "is empty"),
-        (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row], "`query_file` is missing"),
+        (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row], "lacks the column `query_file`"),
     ]:
         assert says in refused(capsys, *argv)
 

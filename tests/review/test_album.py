@@ -3,11 +3,12 @@
 from dataclasses import replace
 
 import pytest
-from ground import places_in, write_positions
+from ground import places_in
 from rasters import HOME, textured_raster
 
 from edgevpr.core.types import Place, Pose
 from edgevpr.frames.level import Lens
+from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.review.album import embed_pictures, make_album, make_map_album
 
 LENS = Lens(60.0)
@@ -15,7 +16,8 @@ LENS = Lens(60.0)
 
 def test_align_picture_gives_the_picture_whose_top_points_where_the_pose_says(tmp_path):
     places = places_in(tmp_path)
-    write_positions(tmp_path / "positions.csv", places)
+    tags = {place.source_image: GeoTag(position=place.position, heading_deg=place.pose.up_deg) for place in places}
+    write_positions(tmp_path / "positions.csv", tags)
     album, turned = make_album([tmp_path]), places[4]
     north_up = replace(turned, pose=replace(turned.pose, up_deg=0.0))
     assert album.align_picture(turned, None).mask is None

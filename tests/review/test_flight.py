@@ -22,7 +22,7 @@ def test_an_answer_that_comes_later_says_what_became_of_the_fix(tmp_path):
         for query, result, why in (("a", "ACCEPTED", None), ("b", "DENIED", refused), ("c", None, superseded))
     ]
     flight = read_flight(write_log(tmp_path / "log", *lines, *answers))
-    assert outcomes(flight) == [FixOutcome.TAKEN, FixOutcome.REFUSED, FixOutcome.NOT_SENT, FixOutcome.UNANSWERED]
+    assert outcomes(flight) == [FixOutcome.ACCEPTED, FixOutcome.REFUSED, FixOutcome.NOT_SENT, FixOutcome.UNANSWERED]
     assert flight.queries[1].fix.why.code is ReasonCode.WRONG_FORM
 
 

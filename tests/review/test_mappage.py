@@ -62,7 +62,7 @@ def test_map_page_shows_places_and_their_problems(browser, mapped):
         assert page.locator(".spot.alike").count() == 1
         page.locator("label:has([data-group])", has_text="inconsistent GPS tag").locator("input").check()
         assert page.inner_text(".now h3") == "Place 3: 02.png"
-        assert page.locator(".line.amiss").count() == 1
+        assert page.locator(".line.tag").count() == 1
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
 
 
