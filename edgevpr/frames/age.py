@@ -239,7 +239,7 @@ def bound_bytes_share(window: Doubles) -> tuple[float, float]:
     pieces = np.array_split(steps, _PIECES)
     late_s, by_bytes_s = np.concatenate([_subtract_expected(*piece.T) for piece in pieces], axis=1)
     share, sd = _fit_slope(late_s, by_bytes_s)
-    # A large picture that came just before or after a change must not outweigh all the others.
+    # A large picture that arrived just before or after a change must not outweigh all the others.
     is_usual = steps[:, 2] <= _KEY_PICTURE_RATIO * np.median(steps[:, 2])
     usual, usual_sd = _fit_slope(late_s[is_usual], by_bytes_s[is_usual])
     least = max(share - _BOUND_SDS * sd, usual - _BOUND_SDS * usual_sd)

@@ -228,6 +228,6 @@ class VideoDecoder:
                 return self._refuse()
         return self._refuse() if any(picture.is_corrupt for picture in pictures) else pictures
 
-    def _refuse(self, why: Refusal = Refusal.DAMAGED) -> Refusal:
-        self._refusal = self._refusal or why
+    def _refuse(self, reason: Refusal = Refusal.DAMAGED) -> Refusal:
+        self._refusal = self._refusal or reason
         return self._refusal

@@ -26,13 +26,13 @@ class Homography:
         return cv2.warpPerspective(pixels, self._out_from_pixel, size, flags=cv2.INTER_NEAREST).view(bool)
 
     def warp_image(self, image: Image) -> Image:
-        small, out_from_pixel = shrink_image(image, self._shrink), self._out_from_pixel
-        if small is not image:
-            along, across = (before / after for before, after in zip(image.shape[:2], small.shape[:2], strict=True))
-            out_from_pixel = out_from_pixel @ [[across, 0, (across - 1) / 2], [0, along, (along - 1) / 2], [0, 0, 1]]
+        shrunk, out_from_pixel = shrink_image(image, self._shrink), self._out_from_pixel
+        if shrunk is not image:
+            fy, fx = (before / after for before, after in zip(image.shape[:2], shrunk.shape[:2], strict=True))
+            out_from_pixel = out_from_pixel @ [[fx, 0, (fx - 1) / 2], [0, fy, (fy - 1) / 2], [0, 0, 1]]
         # Outside the picture, where the mask is False, its edge is replicated, so that no false gradient arises.
         return cv2.warpPerspective(  # type: ignore[return-value]  # of the same dtype
-            small, out_from_pixel, (self._side, self._side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            shrunk, out_from_pixel, (self._side, self._side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
 
 

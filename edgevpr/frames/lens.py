@@ -75,9 +75,9 @@ class CalibratedLens:
         centre_px = scale_x * (column + 0.5) - 0.5, scale_y * (row + 0.5) - 0.5
         return replace(self, focal_px=(scale_x * focal_x, scale_y * focal_y), centre_px=centre_px, size_px=size_px)
 
-    def make_error(self, why: str) -> ConfigError:
+    def make_error(self, reason: str) -> ConfigError:
         """Return the error for an impossible calibration."""
-        return ConfigError(f"{self.path} is not a valid calibration ({why}): calibrate the camera again.")
+        return ConfigError(f"{self.path} is not a valid calibration ({reason}): calibrate the camera again.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +116,8 @@ class LensView:
         """Return the remap to a picture of `size_px` (width, height) with a focal length of `out_px` pixels;
         `out_from_ray` is the homography (3, 3) from rays to its pixels."""
         columns, rows = (np.arange(0, side + _CELL_PX, _CELL_PX) for side in size_px)
-        across, down = np.meshgrid(columns, rows)
-        rays_xyz = np.stack([across, down, np.ones_like(down)], axis=-1) @ np.linalg.inv(out_from_ray).T
+        grid_x, grid_y = np.meshgrid(columns, rows)
+        rays_xyz = np.stack([grid_x, grid_y, np.ones_like(grid_y)], axis=-1) @ np.linalg.inv(out_from_ray).T
         is_ahead = rays_xyz[..., 2] > 0
         rays_xy = rays_xyz[..., :2] / np.where(is_ahead, rays_xyz[..., 2], 1)[..., None]
         is_valid = is_ahead & (np.hypot(rays_xy[..., 0], rays_xy[..., 1]) <= self.max_ray)
@@ -145,12 +145,12 @@ class Remap:
 
     def warp_image(self, image: Image) -> Image:
         """Warp the camera's picture. Outside it, its edge is replicated, so that no false gradient arises."""
-        small, pixels = shrink_image(image, self.shrink), self.pixels
-        if small is not image:
+        shrunk, pixels = shrink_image(image, self.shrink), self.pixels
+        if shrunk is not image:
             pixels = pixels + np.float32(0.5)  # the only copy: boards have little memory
-            pixels *= np.array([small.shape[axis] / image.shape[axis] for axis in (1, 0)], np.float32)
+            pixels *= np.array([shrunk.shape[axis] / image.shape[axis] for axis in (1, 0)], np.float32)
             pixels -= np.float32(0.5)
-        return _remap_image(small, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+        return _remap_image(shrunk, pixels, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
 
 def _remap_image(image: Image, pixels: Singles, interpolation: int, border: int) -> Image:
@@ -186,10 +186,10 @@ def compute_lens_view(lens: CalibratedLens, size_px: tuple[int, int]) -> LensVie
     def find_edge(direction: int, axis: int, edge_px: float) -> float:
         """Return the tangent of the ray that meets the edge of the picture in a direction."""
         steps = slice(steady[direction] + 1)
-        along_px, to_edge_px = np.abs(offset_px[direction, steps, axis]), abs(edge_px - lens.centre_px[axis])
-        if along_px[-1] < to_edge_px and steady[direction] < len(tangents) - 1:
+        distances_px, edge_distance_px = np.abs(offset_px[direction, steps, axis]), abs(edge_px - lens.centre_px[axis])
+        if distances_px[-1] < edge_distance_px and steady[direction] < len(tangents) - 1:
             raise lens.make_error("its distortion is not invertible up to the edge of the picture")
-        return float(np.interp(to_edge_px, along_px, tangents[steps]))
+        return float(np.interp(edge_distance_px, distances_px, tangents[steps]))
 
     right, left = find_edge(_RIGHT, 0, width - 0.5), find_edge(_LEFT, 0, -0.5)
     lower, upper = find_edge(_DOWN, 1, height - 0.5), find_edge(_UP, 1, -0.5)

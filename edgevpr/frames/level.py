@@ -242,15 +242,15 @@ def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = S
     roll_deg, pitch_deg, heading_deg, height_m = _choose_attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
         return UNKNOWN_VIEW
-    ahead, right, down = (_rotate_body_to_level(roll_deg, pitch_deg) @ mount.body_from_straight())[:, 2]
+    forward, right, down = (_rotate_body_to_level(roll_deg, pitch_deg) @ mount.body_from_straight())[:, 2]
     tilt_deg = math.degrees(math.acos(max(-1.0, min(1.0, down))))
     if tilt_deg > MAX_TILT_UNLEVELLED_DEG:
         return View(reason=Reason(ReasonCode.TILTED, {"tilt_deg": tilt_deg}))
     if heading_deg is None or height_m is None or not 0 <= height_m <= _MAX_HEIGHT_M:
         return UNKNOWN_VIEW
     heading = math.radians(heading_deg)
-    north = height_m / down * (ahead * math.cos(heading) - right * math.sin(heading))
-    east = height_m / down * (ahead * math.sin(heading) + right * math.cos(heading))
+    north = height_m / down * (forward * math.cos(heading) - right * math.sin(heading))
+    east = height_m / down * (forward * math.sin(heading) + right * math.cos(heading))
     return View(nadir_offset_m=(-float(east), -float(north)))
 
 
@@ -273,16 +273,16 @@ class _CameraGeometry:
         self._level_from_straight = _rotate_body_to_level(*attitude_deg) @ lens.mount.body_from_straight()
         self._lens = lens
         height, width = frame.image.shape[:2]
-        self._sight = compute_lens_view(lens.calibrated, (width, height)) if lens.calibrated else None
-        if self._sight:
-            width, height = self._sight.straight_px
+        self._lens_view = compute_lens_view(lens.calibrated, (width, height)) if lens.calibrated else None
+        if self._lens_view:
+            width, height = self._lens_view.straight_px
         self.size_px, self.longest_px = (width, height), max(height, width)
         self.focal_px = self.longest_px / 2 / math.tan(math.radians(lens.fov_deg) / 2)
         self.footprint_m = compute_footprint(frame, vehicle, lens)
         focal, middle = self.focal_px, ((width - 1) / 2, (height - 1) / 2)
         self.lens_from_pixel = np.linalg.inv([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]])
-        right, lower = width - 0.5, height - 0.5
-        self.corners = np.array([[-0.5, right, right, -0.5], [-0.5, -0.5, lower, lower], [1] * 4])
+        right, bottom = width - 0.5, height - 0.5
+        self.corners = np.array([[-0.5, right, right, -0.5], [-0.5, -0.5, bottom, bottom], [1] * 4])
         self.straight = self.level_from_lens(lens.up_deg)
         self.tilt_deg = math.degrees(math.acos(np.clip(self.straight[2, 2], -1, 1)))
         self.is_too_tilted = self.tilt_deg > MAX_TILT_DEG
@@ -294,8 +294,8 @@ class _CameraGeometry:
     def warp(self, out_from_ray: Doubles, out_px: float, side: int) -> Homography | Remap:
         """Return the warp to (side, side) pixels. `out_from_ray`: homography (3, 3) from rays to pixels of the output,
         whose focal length is `out_px` pixels."""
-        if self._sight:
-            return self._sight.make_remap(out_from_ray, out_px, (side, side))
+        if self._lens_view:
+            return self._lens_view.make_remap(out_from_ray, out_px, (side, side))
         return Homography(out_from_ray @ self.lens_from_pixel, self.corners, side, self.focal_px / out_px)
 
     def level_from_lens(self, up_deg: float) -> Doubles:

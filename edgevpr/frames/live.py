@@ -163,7 +163,7 @@ class LiveSource(Source):
                     self._set_condition(fault.condition, fault.text)
                     if fault.must_reopen:
                         return fault
-        return Fault(Condition.LOST, opening.cause or ("lost" if self._captured else "no picture came"), True)
+        return Fault(Condition.LOST, opening.cause or ("lost" if self._captured else "no picture arrived"), True)
 
     def _find_fault(self, opening: _Opening) -> Fault | None:
         now_s, conversion = self._clock(), self._conversion

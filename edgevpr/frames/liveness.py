@@ -52,7 +52,7 @@ class Liveness:
 
     def record_picture(self, now_s: float) -> Refusal | None:
         """Record a picture that differs from those before it. Returns FROZEN for the first picture after a frozen
-        source was reopened, because it may be the frozen picture encoded anew; otherwise None."""
+        source was reopened, because it may be the frozen picture re-encoded; otherwise None."""
         if self._is_doubtful:
             self._is_doubtful = False
             return Refusal.FROZEN

@@ -60,8 +60,8 @@ def _open_port(port: int) -> socket.socket:
     except (OSError, OverflowError) as error:
         receiver.close()
         is_taken = getattr(error, "errno", None) == errno.EADDRINUSE
-        why = "is in use by another program" if is_taken else f"cannot be used: {error}"
-        raise OpeningError(f"UDP port {port} {why}") from None
+        cause = "is in use by another program" if is_taken else f"cannot be used: {error}"
+        raise OpeningError(f"UDP port {port} {cause}") from None
     return receiver
 
 

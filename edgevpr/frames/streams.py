@@ -134,13 +134,13 @@ class StreamCapture:
         packet, unit_s = arrival.packet, self._decoder.unit_s
         if packet.pts is None:
             return
-        order = packet.pts if packet.dts is None else packet.dts
-        stamped.record_arrival(packet.pts * unit_s, order * unit_s, arrival.arrival_s, packet.size)
+        dts = packet.pts if packet.dts is None else packet.dts
+        stamped.record_arrival(packet.pts * unit_s, dts * unit_s, arrival.arrival_s, packet.size)
         if stamped.is_live:
             self._decoder.is_backlog_doubtful = False  # from now on, packets were sent after the opening
 
-    def _make_shot(self, picture: "VideoFrame", by_wait: CaptureTime, arrival_s: float) -> Shot | Refusal:
-        taken: CaptureTime | None = by_wait
+    def _make_shot(self, picture: "VideoFrame", unstamped: CaptureTime, arrival_s: float) -> Shot | Refusal:
+        taken: CaptureTime | None = unstamped
         if self._stamped:
             taken = (
                 None if picture.pts is None else self._stamped.estimate(picture.pts * self._decoder.unit_s, arrival_s)

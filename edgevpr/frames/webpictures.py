@@ -122,17 +122,17 @@ def _read_chunks(response: http.client.HTTPResponse) -> Iterator[bytes]:
 def _read_parts(response: http.client.HTTPResponse) -> Iterator[bytes]:
     boundary = re.escape((response.headers.get_boundary() or "").strip('-" ').encode("latin-1", "replace"))
     head = re.compile(boundary + rb"[^\n]*\n((?:[^\r\n]+\r?\n)*)\r?\n")
-    received, whole_s = bytearray(), time.monotonic()
+    received, last_part_s = bytearray(), time.monotonic()
     for chunk in _read_chunks(response):
         received += chunk
         while (part := head.search(received)) and (end := _find_end(received, part, boundary)):
             data = bytes(received[part.end() : end])
             del received[:end]
-            whole_s = time.monotonic()
+            last_part_s = time.monotonic()
             with suppress(ImageError):
                 jpeg = data if data.startswith(_JPEG_START) else encode_jpeg(decode_image(data, "the part"))
                 yield b"--part\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n" % (len(jpeg), jpeg)
-        if len(received) > _MAX_BYTES or time.monotonic() > whole_s + _MAX_PART_S:
+        if len(received) > _MAX_BYTES or time.monotonic() > last_part_s + _MAX_PART_S:
             return
 
 

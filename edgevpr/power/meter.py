@@ -59,11 +59,11 @@ class QueryMeter:
         self._pack, self._regulator_efficiency = parse_pack(battery.pack), battery.regulator_efficiency
         self._wall_clock, self._cpu_clock = wall_clock, cpu_clock
         self._memory_mb = memory_mb
-        self._taken: dict[str, StageCost] = {}
+        self._costs: dict[str, StageCost] = {}
 
     def begin(self) -> None:
         """Begin a new query and discard the steps of the previous one."""
-        self._taken = {}
+        self._costs = {}
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
@@ -74,11 +74,11 @@ class QueryMeter:
             with meter_stage(self._wall_clock, self._cpu_clock) as stage:
                 yield
         finally:
-            self._taken[name] = self._taken.get(name, NO_COST) + stage.cost
+            self._costs[name] = self._costs.get(name, NO_COST) + stage.cost
 
     def steps(self) -> StepCosts:
         """Return the cost of every step of the query so far."""
-        return StepCosts(**self._taken)
+        return StepCosts(**self._costs)
 
     def cost(self) -> QueryCost:
         """Return the cost of the query so far."""

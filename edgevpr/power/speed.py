@@ -56,10 +56,10 @@ def make_pass_round() -> Callable[[], object]:
     queries = codes[:2].copy()
 
     def work() -> None:
-        wide = grey.astype(np.int16)
-        across = wide[1:-1, 2:] - wide[1:-1, :-2]
-        down = wide[2:, 1:-1] - wide[:-2, 1:-1]
-        np.sqrt(across.astype(np.float32) ** 2 + down.astype(np.float32) ** 2)
+        signed = grey.astype(np.int16)
+        dx = signed[1:-1, 2:] - signed[1:-1, :-2]
+        dy = signed[2:, 1:-1] - signed[:-2, 1:-1]
+        np.sqrt(dx.astype(np.float32) ** 2 + dy.astype(np.float32) ** 2)
         for query in queries:
             np.bitwise_count(codes ^ query).sum(axis=1, dtype=np.uint16)
 

@@ -111,16 +111,16 @@ def _read_positions(data: Topics, topic: str) -> list[tuple[float, GeoTag]]:
     """Return (seconds since 1970, tag) for each position of a topic, with attitude and height at that time."""
     if (positions := data.get(topic)) is None:
         return []
-    at_us = positions["timestamp"]
-    heights_m: Sequence[float | None] = [None] * len(at_us)
-    attitudes: Sequence[Attitude | None] = [None] * len(at_us)
+    times_us = positions["timestamp"]
+    heights_m: Sequence[float | None] = [None] * len(times_us)
+    attitudes: Sequence[Attitude | None] = [None] * len(times_us)
     if local := data.get("vehicle_local_position"):
-        heights_m = np.interp(at_us, local["timestamp"], -local["z"]).tolist()
+        heights_m = np.interp(times_us, local["timestamp"], -local["z"]).tolist()
     if attitude := data.get("vehicle_attitude"):
-        attitudes = _interpolate_attitudes(attitude, at_us)
+        attitudes = _interpolate_attitudes(attitude, times_us)
     coordinates = (positions[name].tolist() for name in ("lat", "lon", "alt"))
     tags = map(make_tag, *coordinates, attitudes, heights_m)
-    return list(zip((at_us / 1e6 + _read_utc_offset_s(data)).tolist(), tags, strict=True))
+    return list(zip((times_us / 1e6 + _read_utc_offset_s(data)).tolist(), tags, strict=True))
 
 
 def _read_utc_offset_s(data: Topics) -> float:
@@ -132,9 +132,9 @@ def _read_utc_offset_s(data: Topics) -> float:
     return 0.0
 
 
-def _interpolate_attitudes(attitude: dict[str, Array], at_us: Array) -> list[Attitude]:
+def _interpolate_attitudes(attitude: dict[str, Array], times_us: Array) -> list[Attitude]:
     """Return the yaw, roll and pitch last reported before each time, in degrees."""
-    indices = np.clip(np.searchsorted(attitude["timestamp"], at_us, side="right") - 1, 0, None)
+    indices = np.clip(np.searchsorted(attitude["timestamp"], times_us, side="right") - 1, 0, None)
     w, x, y, z = (attitude[f"q[{axis}]"][indices].astype(float) for axis in range(4))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))

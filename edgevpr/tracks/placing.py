@@ -42,35 +42,35 @@ def place_pictures(record: Record, folder: Path, offset_s: float | None) -> Plac
     """Place the pictures of a folder. `offset_s`: seconds to add to the camera's clock (None: estimated). Values that
     the record lacks are taken from the EXIF data. Raises UsageError if pictures and record do not belong together."""
     paths = list_images(folder)
-    own = {path.name: read_exif(path) for path in progress(paths, len(paths), "reading pictures")}
+    exif_tags = {path.name: read_exif(path) for path in progress(paths, len(paths), "reading pictures")}
     if record.named:
-        matched, how = _match_names(record.named, list(own)), "by their names"
-    elif len(record.shots) == len(own):
-        matched, how = dict(zip(own, record.shots, strict=True)), "in the order of the autopilot's pictures"
+        matched, how = _match_names(record.named, list(exif_tags)), "by their names"
+    elif len(record.shots) == len(exif_tags):
+        matched, how = dict(zip(exif_tags, record.shots, strict=True)), "in the order of the autopilot's pictures"
     elif record.track and record.is_utc:
-        return _match_times(record.track, folder, own, offset_s)
+        return _match_times(record.track, folder, exif_tags, offset_s)
     elif record.shots:
         raise UsageError(
-            f"{len(record.shots)} images were triggered, but {folder} contains {len(own)}: keep only those in it."
+            f"{len(record.shots)} images were triggered, but {folder} contains {len(exif_tags)}: keep only those in it."
         )
     else:
         raise UsageError(f"These positions ({record.kind}) belong to a video: give that video as --images.")
     if not matched:
         raise UsageError(f"The {record.kind} lists none of the images in {folder}: give the folder of its images.")
-    tags = {name: _fill_tag(tag, own[name]) for name, tag in matched.items()}
-    return Placement(how=how, tags=tags, pictures=len(own))
+    tags = {name: _fill_tag(tag, exif_tags[name]) for name, tag in matched.items()}
+    return Placement(how=how, tags=tags, pictures=len(exif_tags))
 
 
 def _match_names(named: Mapping[str, GeoTag], names: list[str]) -> dict[str, GeoTag]:
     """Match pictures by full name or else by name without extension, ignoring case."""
-    whole = {name.casefold(): tag for name, tag in named.items()}
-    stems = {Path(name).stem.casefold(): tag for name, tag in named.items()}
-    tags = {name: whole.get(name.casefold(), stems.get(Path(name).stem.casefold())) for name in names}
+    tags_by_name = {name.casefold(): tag for name, tag in named.items()}
+    tags_by_stem = {Path(name).stem.casefold(): tag for name, tag in named.items()}
+    tags = {name: tags_by_name.get(name.casefold(), tags_by_stem.get(Path(name).stem.casefold())) for name in names}
     return {name: tag for name, tag in tags.items() if tag and tag.position}
 
 
-def _match_times(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s: float | None) -> Placement:
-    times = {name: tag.t_utc_s for name, tag in own.items() if tag.t_utc_s is not None}
+def _match_times(track: Track, folder: Path, exif_tags: Mapping[str, GeoTag], offset_s: float | None) -> Placement:
+    times = {name: tag.t_utc_s for name, tag in exif_tags.items() if tag.t_utc_s is not None}
     if not times:
         raise UsageError("The images have no times (EXIF DateTimeOriginal): give the camera's original files.")
     how, times_s = "by time", np.array(list(times.values()))
@@ -83,16 +83,16 @@ def _match_times(track: Track, folder: Path, own: Mapping[str, GeoTag], offset_s
         how += ", the camera's clock set by " + ("its time zone" if fine_s is None else "how the pictures move")
     times = {name: t_s + offset_s for name, t_s in times.items()}
     interpolated = {name: replace(track.interpolate_tag(t_s), t_utc_s=t_s) for name, t_s in times.items()}
-    tags = {name: _fill_tag(tag, own[name]) for name, tag in interpolated.items() if tag.position}
+    tags = {name: _fill_tag(tag, exif_tags[name]) for name, tag in interpolated.items() if tag.position}
     if not tags:
         raise UsageError(f"With --offset-s {offset_s:g}, no image is within the track: {_format_spans(track, times_s)}")
-    return Placement(how=how, tags=tags, pictures=len(own), offset_s=offset_s)
+    return Placement(how=how, tags=tags, pictures=len(exif_tags), offset_s=offset_s)
 
 
-def _fill_tag(tag: GeoTag, own: GeoTag) -> GeoTag:
-    """Return `tag` with its unknown values taken from `own`."""
+def _fill_tag(tag: GeoTag, fallback: GeoTag) -> GeoTag:
+    """Return `tag` with its unknown values taken from `fallback`."""
     missing = [item.name for item in fields(GeoTag) if getattr(tag, item.name) is None]
-    return replace(tag, **{name: getattr(own, name) for name in missing})
+    return replace(tag, **{name: getattr(fallback, name) for name in missing})
 
 
 def place_video(record: Record, video: Path, offset_s: float | None) -> Placement:
@@ -115,14 +115,15 @@ def place_video(record: Record, video: Path, offset_s: float | None) -> Placemen
     return Placement(how=how, track=track, offset_s=offset_s)
 
 
-def _estimate_zone_offset_s(track: Track, times_s: Doubles, what: str) -> float:
+def _estimate_zone_offset_s(track: Track, times_s: Doubles, label: str) -> float:
     """Estimate the offset to add to a camera clock set to local time so that most of its times, float (N,), fall within
     the track: whole hours, else half hours, else quarters."""
     offsets_s = np.arange(-_MAX_ZONE_STEPS, _MAX_ZONE_STEPS + 1) * _ZONE_STEP_S
     first_s, last_s = track.t_s[0], track.t_s[-1]
-    shares = np.array([np.mean((times_s + by_s >= first_s) & (times_s + by_s <= last_s)) for by_s in offsets_s])
+    shifted_s = times_s + offsets_s[:, None]
+    shares = ((shifted_s >= first_s) & (shifted_s <= last_s)).mean(axis=1)
     if shares.max() < _MIN_SHARE_IN_TRACK:
-        raise UsageError(f"In no time zone does the track cover {what}: {_format_spans(track, times_s)}")
+        raise UsageError(f"In no time zone does the track cover {label}: {_format_spans(track, times_s)}")
     fitting_s = offsets_s[shares == shares.max()].tolist()
     for unit_s in (4 * _ZONE_STEP_S, 2 * _ZONE_STEP_S, _ZONE_STEP_S):
         candidates_s = sorted((offset_s for offset_s in fitting_s if offset_s % unit_s == 0), key=abs)

@@ -50,11 +50,11 @@ def read_table(path: Path) -> Record:
         text = read_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path} cannot be read as text ({error}): save the table as CSV in UTF-8.") from error
-    lines, order = [line for line in text.splitlines() if line.strip(" \t;,")], _DEFAULT_COLUMNS
+    lines, default_columns = [line for line in text.splitlines() if line.strip(" \t;,")], _DEFAULT_COLUMNS
     if lines and _PROJECTION.match(lines[0]):
         if not _WGS84.match(lines[0]):
             raise UsageError(f"{path} uses `{lines[0]:.40}`: export it in latitude and longitude (WGS 84).")
-        lines, order = lines[1:], _OPENDRONEMAP_COLUMNS
+        lines, default_columns = lines[1:], _OPENDRONEMAP_COLUMNS
     for separator, divider in _SEPARATORS.items():
         rows = list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
         if layout := _find_columns(rows):
@@ -62,7 +62,7 @@ def read_table(path: Path) -> Record:
         elif (
             rows and len(rows[0]) >= len(_REQUIRED_COLUMNS) and is_image(rows[0][0].strip())
         ):  # without names: the usual order
-            columns, first, names = {part: column for column, part in enumerate(order)}, 0, order
+            columns, first, names = {part: column for column, part in enumerate(default_columns)}, 0, default_columns
         else:
             continue
         needed = ", ".join(f"`{names[column]}`" for part, column in columns.items() if part in _REQUIRED_COLUMNS)

@@ -46,7 +46,7 @@ def test_load_board_gives_a_whole_profile_with_its_sources(name):
     [
         ({"full_w": 1.5}, "`full_w` (1.5) is below `idle_w` (2.29): correct one of them."),
         ({"wats": 3}, "unknown key `wats`"),
-        ({"source": None}, "the key `source` is missing: add it."),
+        ({"source": None}, "key `source` is missing: add it."),
         ({"  single": 0}, "`benchmark_score.single` is 0; it must be between 0.0001 and 100."),
         (
             {"budget_mb": 600},
