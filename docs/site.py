@@ -1,8 +1,8 @@
-"""What the site holds beside the pages of this folder: pages that stand elsewhere in the repository, and the references
-of the configuration and of the command line, made from the code, and of the output as JSON, made from its schema.
+"""Adds to the site what is not a page of this folder: pages from elsewhere in the repository, and the references of the
+configuration, the command line and the JSON output, generated from the code and the schema.
 
-A link between two files of the repository stays one between two pages of the site; one to a file that is no page leads
-to the repository.
+A link between two files of the repository becomes one between two pages of the site; a link to a file that is not a
+page leads to the repository.
 """
 
 import argparse
@@ -43,18 +43,18 @@ CHANNELS = {
     Channel.VISION: "ODOMETRY",
 }
 PARAMETERS_INTRODUCTION = """\
-These parameters change what the positions of edgevpr do. Made from the table in `edgevpr/mavlink` by which `run` and
-`doctor` go. `doctor` names each that is not right, with the exact change.
+These parameters determine the effect of edgevpr's positions. Generated from the table in `edgevpr/mavlink` that `run`
+and `doctor` use. `doctor` lists each parameter with a wrong value, and the exact change.
 
-In flight all are read at the start, and again in turn: a change is noticed at once where the autopilot broadcasts it,
-else within two minutes. Until they are answered, and while one is dangerous, nothing is sent, and the ground station
-shows why. What only makes edgevpr useless or weak is reported once. A parameter that your firmware does not have needs
-nothing. "We" and "us" are edgevpr."""
+A flight reads all of them at the start, and then again in turn: it notices a change at once if the autopilot broadcasts
+it, otherwise within two minutes. Nothing is sent until they are answered, or while one is dangerous; the ground station
+shows why. A value that only makes edgevpr useless or weak is reported once. Ignore a parameter that your firmware does
+not have. "We" and "us" refer to edgevpr."""
 LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that are no files of the documents' folder."""
+    """Add the pages that are not in the folder of the documents."""
     for source, page in (PAGES | results()).items():
         files.append(File.generated(config, page, abs_src_path=str(ROOT / source)))
     files.append(File.generated(config, "results/index.md", content=contents_of_results()))
@@ -80,7 +80,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             shown = target.removeprefix("docs/")
         if shown is None:
             if not (ROOT / target).exists():
-                raise FileNotFoundError(f"{source}: {link[1]} is not there")
+                raise FileNotFoundError(f"{source}: {link[1]} does not exist")
             return f"]({config.repo_url}/blob/main/{target}{link[2] or ''})"
         return f"]({posixpath.relpath(shown, posixpath.dirname(page.file.src_uri) or '.')}{link[2] or ''})"
 
@@ -96,7 +96,7 @@ def results() -> dict[str, str]:
 
 def contents_of_results() -> str:
     """Return a page that lists the pages of results by their titles."""
-    lines = ["# All results", "", "Each page names the command and the machine that made it.", ""]
+    lines = ["# All results", "", "Each page names the command and the machine that produced it.", ""]
     for source, page in results().items():
         if source.endswith(".md"):
             title = re.search(r"^# (.+)$", (ROOT / source).read_text("utf-8"), re.M)
@@ -105,8 +105,8 @@ def contents_of_results() -> str:
 
 
 def configuration() -> str:
-    """Return the page of the configuration: its text is that of `deploy/config.yaml`, its types are the code's."""
-    lines = ["# Configuration", "", "Made from `deploy/config.yaml` and `edgevpr/core/config.py`."]
+    """Return the page of the configuration, with the text of `deploy/config.yaml` and the types of the code."""
+    lines = ["# Configuration", "", "Generated from `deploy/config.yaml` and `edgevpr/core/config.py`."]
     text, comment, section = (ROOT / "deploy/config.yaml").read_text("utf-8"), [], ""
     keys = {key.name: key for key in list_keys(Config)}
     for line in text.splitlines():
@@ -128,7 +128,7 @@ def configuration() -> str:
 
 
 def details(key: Key, default: str) -> str:
-    """Return what the code knows of a key: type, default, limits and flag."""
+    """Return type, default, limits and flag of a key."""
     facts = [KINDS[key.kind], f"default `{default}`"]
     if key.within:
         facts.append(f"{key.within[0]:g} to {key.within[1]:g}")
@@ -138,13 +138,13 @@ def details(key: Key, default: str) -> str:
 
 
 def parameters() -> str:
-    """Return the page of the autopilot's parameters, made from the table that `run` and `doctor` go by."""
+    """Return the page of the autopilot's parameters, made from the table that `run` and `doctor` use."""
     lines = ["# Parameters of the autopilot", "", PARAMETERS_INTRODUCTION]
     for table in TABLES.values():
         lines += ["", f"## {table.name}"]
         for channel in dict.fromkeys(channel for rule in table.rules for channel in rule.channels):
             lines += ["", f"### {table.name} by {CHANNELS[channel]}", ""]
-            lines += ["| parameter | right | otherwise | why |", "|---|---|---|---|"]
+            lines += ["| parameter | correct value | otherwise | why |", "|---|---|---|---|"]
             for rule in (rule for rule in table.rules if channel in rule.channels):
                 otherwise = "**nothing is sent**" if rule.is_dangerous else "reported"
                 lines.append(f"| `{rule.label}` | {rule.right} | {otherwise} | {rule.why} |")
@@ -153,7 +153,7 @@ def parameters() -> str:
 
 def commands() -> str:
     """Return the page of the command line: every command with its usage and its flags."""
-    lines = ["# Command line", "", "Made from the program's own help. `--debug` shows the traceback of an error.", ""]
+    lines = ["# Command line", "", "Generated from the program's help. `--debug` shows the traceback of an error.", ""]
     lines += ["## Exit codes", "", "| code | meaning |", "|---|---|"]
     lines += [*(f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items()), ""]
     for parser in parsers(make_parser()):
@@ -169,14 +169,14 @@ def commands() -> str:
 
 
 def json_output() -> str:
-    """Return the page of what `--json` prints, made from its schema."""
+    """Return the page of the output of `--json`, made from its schema."""
     path = "docs/reference/json-output.yaml"
     schema = yaml.safe_load((ROOT / path).read_text("utf-8"))
     lines = ["# JSON output", "", "\n".join(re.findall(r"^# ?(.*)", (ROOT / path).read_text("utf-8"), re.M)), ""]
     lines += [
         "With `--json` a command prints its result on stdout and nothing else; messages go to stderr. A field keeps",
-        "its name and meaning from version to version; new ones may come, so read those that you know.",
-        f"[The schema]({path}) is what the tests hold every output to.",
+        "its name and meaning from version to version; new fields may be added, so ignore those that you do not know.",
+        f"The tests check every output against [the schema]({path}).",
     ]
     for name, part in schema["$defs"].items():
         lines += ["", f"## {name}", "", part.get("description", ""), "", "| field | type | meaning |", "|---|---|---|"]
@@ -188,10 +188,10 @@ def reasons() -> str:
     """Return the page of the reasons and findings, made from their tables."""
     lines = ["# Reasons", ""]
     lines += [
-        "Why a match is accepted or refused, and a fix not sent or not taken, and what `check` and `doctor` find."
+        "Why a match is accepted or refused, why a fix is not sent or not accepted, and what `check` and `doctor` find."
     ]
     lines += [
-        "Flight log and `--json` carry the code and the parameters, here in braces; sentences may change. Made from"
+        "Flight log and `--json` contain the code and its parameters (here in braces); sentences may change. Made from"
     ]
     lines += ["`edgevpr/core/reasons.py` and `edgevpr/runtime/service/findingcodes.py`.", ""]
     lines += ["| code | in short | sentence |", "|---|---|---|"]
@@ -210,7 +210,7 @@ def sentence_of(code: Code) -> str:
 
 
 def fields_of(part: dict[str, Any], prefix: str) -> Iterator[tuple[str, str, str]]:
-    """Yield field, type and meaning of all fields that a part of the schema has, those of inner objects included."""
+    """Yield field, type and meaning of all fields in a part of the schema, including those of inner objects."""
     if "$ref" in part:
         name = part["$ref"].rpartition("/")[2]
         yield f"`{prefix}*`", "", f"the fields of [{name}](#{name})"
@@ -229,7 +229,7 @@ def fields_of(part: dict[str, Any], prefix: str) -> Iterator[tuple[str, str, str
 
 
 def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """Yield a parser's commands, each before its own, but not those that only hold others."""
+    """Yield the parsers of all commands that can be run, depth first."""
     inner = [each for each in parser._actions if isinstance(each, argparse._SubParsersAction)]
     if not inner:
         yield parser
@@ -239,7 +239,7 @@ def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser
 
 
 def named(action: argparse.Action) -> str:
-    """Return how an argument is written: its flags and its placeholder."""
+    """Return the notation of an argument: its flags and its placeholder."""
     if isinstance(action, argparse._SubParsersAction):
         return ""
     placeholder = action.metavar or (action.choices and "{" + ",".join(map(str, action.choices)) + "}")
