@@ -55,12 +55,12 @@ def make_subset(
             counts, lost_calibration = merge_maps(paths, all_near, progress, list(ids_near.values()))
             near = sum(copied for copied, _ in counts)
         if not paths or not near:
-            raise UsageError(f"No place of {source} is within {margin_m:g} m of the mission: enlarge --margin-m.")
+            raise UsageError(f"No place of {source} is within {margin_m:g} m of the mission: check both or --margin-m.")
         count, file_bytes = near, all_near.stat().st_size
         if max_bytes is not None and file_bytes > max_bytes:
             count = int(near * max_bytes / file_bytes)
             if not count:
-                raise UsageError(f"{max_bytes / 1e6:g} MB hold no place: each needs {file_bytes / near / 1e6:.3f} MB.")
+                raise UsageError(f"--mb {max_bytes / 1e6:g} holds no place: each is {file_bytes / near / 1e6:.3f} MB.")
             shrink_map(all_near, best_near, count, progress)
         shutil.move(best_near if count < near else all_near, unfinished)
         size = unfinished.stat().st_size

@@ -68,16 +68,16 @@ def _paint_border(rng: np.random.Generator, canvas: Scene, line_m: Doubles, leve
     box = canvas.box(line_m, 5.0)
     if canvas.height_cm[box].size == 0:
         return np.empty((0, 4))
-    away_m = canvas.distance_m(box, line_m)
-    verge = smooth_step(away_m + 0.4 * make_noise(rng, away_m.shape, 25, 2), 3.4, 1.8)
+    distance_m = canvas.distance_m(box, line_m)
+    verge = smooth_step(distance_m + 0.4 * make_noise(rng, distance_m.shape, 25, 2), 3.4, 1.8)
     canvas.paint(box, verge * 0.8, _DRY if rng.random() < 0.5 else _LUSH)
     canvas.height_cm[box] = np.where(verge > 0.5, BASE_CM, canvas.height_cm[box])
     kind = "lane" if level <= 1 else rng.choice(["hedge", "wall", "strip"], p=[0.6, 0.15, 0.25])
     if kind == "lane":
-        canvas.paint(box, smooth_step(away_m, 1.9, 1.4), _MUD)
-        canvas.paint(box, smooth_step(np.abs(away_m - 0.85), 0.5, 0.2), _GRAVEL)
+        canvas.paint(box, smooth_step(distance_m, 1.9, 1.4), _MUD)
+        canvas.paint(box, smooth_step(np.abs(distance_m - 0.85), 0.5, 0.2), _GRAVEL)
     if kind == "wall":
-        wall = smooth_step(away_m, 0.6, 0.4)
+        wall = smooth_step(distance_m, 0.6, 0.4)
         canvas.paint(box, wall, _STONE)
         canvas.height_cm[box] = np.where(wall > 0.5, BASE_CM + 130, canvas.height_cm[box])
     if kind == "strip" or (kind in ("lane", "wall") and rng.random() < 0.6):
@@ -91,10 +91,10 @@ def _paint_border(rng: np.random.Generator, canvas: Scene, line_m: Doubles, leve
 
 def _make_trees(rng: np.random.Generator, line_m: Doubles, step_m: float, spread_m: float, radius_m: float) -> Doubles:
     """Return trees with radii of about `radius_m`, about every `step_m` along a line and about `spread_m` from it."""
-    run_m = np.concatenate(([0], np.cumsum(np.hypot(*np.diff(line_m, axis=0).T))))
-    at_m = np.arange(rng.uniform(0, step_m), run_m[-1], step_m)
-    at_m += rng.normal(0, step_m * 0.25, len(at_m))
-    points = np.column_stack([np.interp(at_m, run_m, line_m[:, axis]) for axis in (0, 1)])
+    length_m = np.concatenate(([0], np.cumsum(np.hypot(*np.diff(line_m, axis=0).T))))
+    tree_m = np.arange(rng.uniform(0, step_m), length_m[-1], step_m)
+    tree_m += rng.normal(0, step_m * 0.25, len(tree_m))
+    points = np.column_stack([np.interp(tree_m, length_m, line_m[:, axis]) for axis in (0, 1)])
     points += rng.normal(0, spread_m, points.shape)
     return _grow_trees(rng, points, radius_m, (1.4, 2.2))
 
@@ -104,30 +104,30 @@ def _paint_river(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> Do
     shape = canvas.height_cm[box].shape
     wide = make_noise(rng, shape, 40 / canvas.metres_per_pixel, 2)
     fine = make_noise(rng, shape, 5 / canvas.metres_per_pixel)
-    away_m = canvas.distance_m(box, line_m) + 1.3 * wide + 0.5 * fine
-    canvas.paint(box, 0.85 * smooth_step(away_m, 15, 9), _LUSH)
-    canvas.paint(box, smooth_step(away_m, 7.2, 6.2) * smooth_step(fine, -3, 1), _GRAVEL)
-    bars = smooth_step(wide + 0.3 * fine, 1.2, 1.5) * smooth_step(away_m, 1.0, 2.5)
-    water = smooth_step(away_m, 5.6, 5.0) * (1 - bars)
+    distance_m = canvas.distance_m(box, line_m) + 1.3 * wide + 0.5 * fine
+    canvas.paint(box, 0.85 * smooth_step(distance_m, 15, 9), _LUSH)
+    canvas.paint(box, smooth_step(distance_m, 7.2, 6.2) * smooth_step(fine, -3, 1), _GRAVEL)
+    bars = smooth_step(wide + 0.3 * fine, 1.2, 1.5) * smooth_step(distance_m, 1.0, 2.5)
+    water = smooth_step(distance_m, 5.6, 5.0) * (1 - bars)
     canvas.paint(box, water, _WATER)
-    canvas.paint(box, water * (0.15 * smooth_step(away_m, 2, 5.5) + 0.08 * smooth_step(fine, 0, 2)), _STONE)
-    bank = smooth_step(away_m, 12.5, 9)
-    level_cm = BASE_CM + bank * 12 * fine - 170 * smooth_step(away_m, 8.5, 5.5)
+    canvas.paint(box, water * (0.15 * smooth_step(distance_m, 2, 5.5) + 0.08 * smooth_step(fine, 0, 2)), _STONE)
+    bank = smooth_step(distance_m, 12.5, 9)
+    level_cm = BASE_CM + bank * 12 * fine - 170 * smooth_step(distance_m, 8.5, 5.5)
     canvas.height_cm[box] = np.where(bank > 0, np.clip(level_cm, 0, None), canvas.height_cm[box])
-    beside = np.gradient(line_m, axis=0)[:, ::-1] * (-1, 1) / np.hypot(*np.gradient(line_m, axis=0).T)[:, None]
-    return np.concatenate([_make_trees(rng, line_m + side * 11 * beside, 8.0, 2.5, 2.6) for side in (-1, 1)])
+    across = np.gradient(line_m, axis=0)[:, ::-1] * (-1, 1) / np.hypot(*np.gradient(line_m, axis=0).T)[:, None]
+    return np.concatenate([_make_trees(rng, line_m + side * 11 * across, 8.0, 2.5, 2.6) for side in (-1, 1)])
 
 
 def _paint_road(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> None:
     box = canvas.box(line_m, 7.0)
-    away_m = canvas.distance_m(box, line_m)
-    worn = make_noise(rng, away_m.shape, 12 / canvas.metres_per_pixel)
-    canvas.paint(box, 0.9 * smooth_step(away_m + 0.3 * worn, 5.5, 4.2), _DRY)
-    canvas.paint(box, smooth_step(away_m, 2.95, 2.75), _ASPHALT)
-    canvas.paint(box, 0.3 * smooth_step(away_m, 2.95, 2.75) * smooth_step(worn, -1, 2), _STONE)
-    canvas.paint(box, 0.3 * smooth_step(np.abs(away_m - 1.3), 0.7, 0.2), (146, 148, 150))
-    canvas.paint(box, 0.7 * smooth_step(np.abs(away_m - 2.5), 0.14, 0.06), (215, 220, 222))
-    canvas.height_cm[box] = np.where(away_m < 4.2, BASE_CM + 20, canvas.height_cm[box])
+    distance_m = canvas.distance_m(box, line_m)
+    worn = make_noise(rng, distance_m.shape, 12 / canvas.metres_per_pixel)
+    canvas.paint(box, 0.9 * smooth_step(distance_m + 0.3 * worn, 5.5, 4.2), _DRY)
+    canvas.paint(box, smooth_step(distance_m, 2.95, 2.75), _ASPHALT)
+    canvas.paint(box, 0.3 * smooth_step(distance_m, 2.95, 2.75) * smooth_step(worn, -1, 2), _STONE)
+    canvas.paint(box, 0.3 * smooth_step(np.abs(distance_m - 1.3), 0.7, 0.2), (146, 148, 150))
+    canvas.paint(box, 0.7 * smooth_step(np.abs(distance_m - 2.5), 0.14, 0.06), (215, 220, 222))
+    canvas.height_cm[box] = np.where(distance_m < 4.2, BASE_CM + 20, canvas.height_cm[box])
 
 
 def _paint_farms(rng: np.random.Generator, canvas: Scene, road_m: Doubles, river_m: Doubles) -> Doubles:
@@ -136,8 +136,8 @@ def _paint_farms(rng: np.random.Generator, canvas: Scene, road_m: Doubles, river
     for index in range(18, len(road_m) - 18, 13):
         ahead = road_m[index + 1] - road_m[index]
         turn_rad = float(np.arctan2(ahead[1], ahead[0])) + rng.normal(0, 0.12)
-        along, beside = rotate_axes(turn_rad)
-        centre = road_m[index] + beside * rng.choice([-1, 1]) * 24 + along * rng.normal(0, 4)
+        along, across = rotate_axes(turn_rad)
+        centre = road_m[index] + across * rng.choice([-1, 1]) * 24 + along * rng.normal(0, 4)
         if np.hypot(*(river_m - centre).T).min() > 42 and rng.random() < 0.7:
             _paint_farm(rng, canvas, centre, turn_rad)
             yards.append(centre)
@@ -146,8 +146,8 @@ def _paint_farms(rng: np.random.Generator, canvas: Scene, road_m: Doubles, river
 
 def _paint_farm(rng: np.random.Generator, canvas: Scene, yard_centre: Doubles, turn_rad: float) -> None:
     """Paint a yard with ragged edges, buildings around it and vehicles on it."""
-    along, beside = rotate_axes(turn_rad)
-    yard = np.array([yard_centre + a * along * 19 + b * beside * 17 for a, b in CORNERS])
+    along, across = rotate_axes(turn_rad)
+    yard = np.array([yard_centre + a * along * 19 + b * across * 17 for a, b in CORNERS])
     box = canvas.box(yard, 4.0)
     cover = canvas.polygon(box, yard)
     ragged = smooth_step(cv2.GaussianBlur(cover, (0, 0), 8) + 0.16 * make_noise(rng, cover.shape, 30), 0.42, 0.58)
@@ -155,13 +155,13 @@ def _paint_farm(rng: np.random.Generator, canvas: Scene, yard_centre: Doubles, t
     canvas.height_cm[box] = np.where(ragged > 0.3, BASE_CM, canvas.height_cm[box])
     for u_m, v_m, length_m, width_m, quarter_turns in _BUILDINGS:
         if rng.random() < 0.8:
-            centre = yard_centre + (u_m + rng.normal(0, 1)) * along + (v_m + rng.normal(0, 1)) * beside
+            centre = yard_centre + (u_m + rng.normal(0, 1)) * along + (v_m + rng.normal(0, 1)) * across
             length_m, width_m = (np.array((length_m, width_m)) * rng.uniform(0.8, 1.25, 2)).tolist()
             colour = np.array(_ROOFS[rng.integers(len(_ROOFS))]) * rng.uniform(0.85, 1.1)
             ridge_rad = turn_rad + quarter_turns * np.pi / 2
             paint_building(canvas, centre, length_m, width_m, ridge_rad, rng.uniform(2.6, 5), colour)
     for _ in range(rng.integers(2, 7)):
-        centre = yard_centre + rng.uniform(-14, 14) * along + rng.uniform(-2, 3) * beside
+        centre = yard_centre + rng.uniform(-14, 14) * along + rng.uniform(-2, 3) * across
         colour = rng.uniform(60, 225) * rng.uniform(0.6, 1.2, 3)
         ridge_rad = turn_rad + rng.integers(2) * np.pi / 2 + rng.normal(0, 0.2)
         paint_building(canvas, centre, 4.3, 1.9, ridge_rad, 1.4, colour)
