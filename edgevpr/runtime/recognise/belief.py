@@ -20,6 +20,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Ints
+from edgevpr.runtime.recognise.gaussians import (
+    MIN_VARIANCE_RATIO,
+    compute_distances,
+    fuse_positions,
+    mix_gaussians,
+    regularize_covariance,
+)
 
 _MAX_HYPOTHESES = 64
 # Chances between two queries to leave the map, to jump to any place on it, and to enter it. A history can raise the
@@ -41,8 +48,6 @@ _NEWEST_WEIGHT = 0.2  # weight of the newest displacement in the mean velocity
 _SAME_POSITION_SIGMAS = 2.0  # of a position: a shorter displacement may be none
 _MIN_WEIGHT = 1e-9  # a hypothesis of less weight is dropped
 _MIN_DIVISOR = 1e-300  # instead of zero
-_ROUNDING = 1e-12  # relative error of the difference of two squares
-_MIN_VARIANCE_RATIO = 1e-6  # least ratio of the variances along both axes of a covariance that can be inverted
 _MAX_DISTANCE = 1e8  # metres or places: farther than any two points on the Earth
 _MIN_SD = 0.25  # least standard deviation of a position, in spacings of the map
 _UNIT_VARIANCE = 1 / (2 * np.pi)  # of a Gaussian with the density 1 in its middle: second axis of ordinal maps
@@ -237,7 +242,7 @@ class Belief:
         strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
         repeated, self._strongest = min(before, strongest), strongest
         sd = np.sqrt(cov[:, 0, 0] if scale.is_ordinal else np.trace(cov, axis1=1, axis2=2) / 2)
-        fresh = np.clip((_compute_distances(now.anchor, at) - _SAME_POSITION_SIGMAS * sd) / scale.spacing, 0, 1)
+        fresh = np.clip((compute_distances(now.anchor, at) - _SAME_POSITION_SIGMAS * sd) / scale.spacing, 0, 1)
         evidence = np.exp(ratio + (1 - fresh) * (repeated - now.credited[:, None])) * (scale.cell * now.w[:, None])
         # Of each motion: the weight (M, K) that each hypothesis gives to each candidate.
         weights = [move.share[:, None] * evidence * _compute_density(move, at, cov, scale.is_ordinal) for move in moves]
@@ -250,12 +255,12 @@ class Belief:
         agreement = float(weight.sum()) * rest / max(_MIN_DIVISOR, float(now.w.sum() * proposed.p.sum()))
         likelihood = (1 - _RESEMBLANCE + _RESEMBLANCE * agreement) ** (1 - staleness) if len(now.w) else 1.0
 
-        predicted_at, predicted_cov = _mix_gaussians(
+        predicted_at, predicted_cov = mix_gaussians(
             np.concatenate(weights).T / np.maximum(weight, _MIN_DIVISOR)[:, None],
             np.concatenate([move.at for move in moves]),
             np.concatenate([move.covariance for move in moves]),
         )
-        fused_at, fused_cov = _fuse(at, cov, predicted_at, predicted_cov)
+        fused_at, fused_cov = fuse_positions(at, cov, predicted_at, predicted_cov)
         gain = np.where(np.isnan(now.velocity[:, :1]), 1.0, _NEWEST_WEIGHT)
         kept = (1 - gain) * np.nan_to_num(now.velocity) - gain * now.at / elapsed_s
         velocity = (origin.T @ gain) * at / elapsed_s + origin.T @ kept
@@ -277,11 +282,11 @@ class Belief:
         now = self._now
         if not len(now.w):
             return Posterior(lost=self._lost, p=p)
-        is_near = _compute_distances(now.at, now.at) <= self._scale.near
+        is_near = compute_distances(now.at, now.at) <= self._scale.near
         chosen = is_near[(is_near @ now.w).argmax()]
         mass = float(now.w[chosen].sum())
         share = now.w[chosen] / mass
-        (at,), (covariance,) = _mix_gaussians(share[None], now.at[chosen], now.covariance[chosen])
+        (at,), (covariance,) = mix_gaussians(share[None], now.at[chosen], now.covariance[chosen])
         north, east = (share @ now.heading[chosen]).tolist()
         heading_deg = math.degrees(math.atan2(east, north)) % 360 if math.hypot(north, east) > 0.5 else None
         return Posterior(lost=self._lost, p=p, mass=mass, at=at, covariance=covariance, heading_deg=heading_deg)
@@ -298,48 +303,16 @@ def _keep_missed(now: _Hypotheses, moves: list[_Prediction], likelihood: float) 
     return replace(now, w=likelihood * now.w, at=mean, covariance=spread)
 
 
-def _compute_distances(one: Doubles, other: Doubles) -> Doubles:
-    """Return the distance between each of `one` (M, 2) and each of `other` (K, 2): (M, K)."""
-    return np.asarray(np.sqrt(((one[:, None] - other) ** 2).sum(2)))
-
-
 def _compute_density(move: _Prediction, at: Doubles, covariance: Doubles, is_ordinal: bool) -> Doubles:
     """Return the density (M, K) at positions `at` (K, 2) with `covariance` (K, 2, 2), after M hypotheses have moved."""
     xx, xy, yy = (move.covariance[:, None, i, j] + covariance[None, :, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     dx, dy = (at[None, :, i] - move.at[:, None, i] for i in (0, 1))
     if is_ordinal:
         xy, yy, dy = np.zeros(()), np.full((), _UNIT_VARIANCE), np.zeros(())
-    determinant = np.maximum(xx * yy - xy * xy, _MIN_VARIANCE_RATIO * xx * yy)
+    determinant = np.maximum(xx * yy - xy * xy, MIN_VARIANCE_RATIO * xx * yy)
     squared = (yy * (dx * dx) - 2 * xy * (dx * dy) + xx * (dy * dy)) / determinant
     gaussian: Doubles = np.exp(-np.maximum(squared, 0) / 2) / (2 * np.pi * np.sqrt(determinant))
     return np.maximum(gaussian, move.least)
-
-
-def _regularize(covariance: Doubles, least: float) -> Doubles:
-    """Make covariances (K, 2, 2) invertible: add the variance `least`, and a small share of their own, to each axis."""
-    more: Doubles = least + _MIN_VARIANCE_RATIO * np.abs(np.trace(covariance, axis1=1, axis2=2))
-    return covariance + more[:, None, None] * np.eye(2)
-
-
-def _fuse(one: Doubles, cov: Doubles, other: Doubles, other_cov: Doubles) -> tuple[Doubles, Doubles]:
-    """Combine K positions and K others of correlated errors by covariance intersection (Julier and Uhlmann 1997)."""
-    trace, other_trace = (np.trace(covariance, axis1=1, axis2=2) for covariance in (cov, other_cov))
-    share = (other_trace / (trace + other_trace))[:, None, None]
-    information, other_information = share * np.linalg.inv(cov), (1 - share) * np.linalg.inv(other_cov)
-    covariance = np.linalg.inv(information + other_information)
-    at = covariance @ (information @ one[..., None] + other_information @ other[..., None])
-    return at[..., 0], covariance
-
-
-def _mix_gaussians(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
-    """Return the means (K, 2) and covariances (K, 2, 2) of K mixtures of M Gaussians with means `at` (M, 2) and
-    `covariance` (M, 2, 2), weighted by `share` (K, M)."""
-    middle = at.mean(0) if len(at) else np.zeros(2)  # coordinates far from zero would lose digits in their squares
-    off = at - middle
-    second = covariance + off[:, :, None] * off[:, None]
-    mean = share @ off
-    spread = (share @ second.reshape(-1, 4)).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None]
-    return middle + mean, _regularize(spread, _ROUNDING * float(np.abs(second).max(initial=1)))
 
 
 def _select_usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposals]:
@@ -353,6 +326,6 @@ def _select_usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposal
     return numbers, Proposals(
         p=p / max(1.0, float(p.sum())),
         at=proposed.at[numbers],
-        covariance=_regularize(proposed.covariance[numbers], (_MIN_SD * scale.spacing) ** 2),
+        covariance=regularize_covariance(proposed.covariance[numbers], (_MIN_SD * scale.spacing) ** 2),
         heading_deg=proposed.heading_deg[numbers],
     )

@@ -1,0 +1,40 @@
+"""Gaussian positions in a plane: distances, fusion and mixtures of many at once. `belief` uses them."""
+
+import numpy as np
+
+from edgevpr.core.arrays import Doubles
+
+MIN_VARIANCE_RATIO = 1e-6  # least ratio of the variances along both axes of a covariance that can be inverted
+_ROUNDING = 1e-12  # relative error of the difference of two squares
+
+
+def compute_distances(one: Doubles, other: Doubles) -> Doubles:
+    """Return the distance between each of `one` (M, 2) and each of `other` (K, 2): (M, K)."""
+    return np.asarray(np.sqrt(((one[:, None] - other) ** 2).sum(2)))
+
+
+def regularize_covariance(covariance: Doubles, least: float) -> Doubles:
+    """Make covariances (K, 2, 2) invertible: add the variance `least`, and a small share of their own, to each axis."""
+    more: Doubles = least + MIN_VARIANCE_RATIO * np.abs(np.trace(covariance, axis1=1, axis2=2))
+    return covariance + more[:, None, None] * np.eye(2)
+
+
+def fuse_positions(one: Doubles, cov: Doubles, other: Doubles, other_cov: Doubles) -> tuple[Doubles, Doubles]:
+    """Combine K positions and K others of correlated errors by covariance intersection (Julier and Uhlmann 1997)."""
+    trace, other_trace = (np.trace(covariance, axis1=1, axis2=2) for covariance in (cov, other_cov))
+    share = (other_trace / (trace + other_trace))[:, None, None]
+    information, other_information = share * np.linalg.inv(cov), (1 - share) * np.linalg.inv(other_cov)
+    covariance = np.linalg.inv(information + other_information)
+    at = covariance @ (information @ one[..., None] + other_information @ other[..., None])
+    return at[..., 0], covariance
+
+
+def mix_gaussians(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
+    """Return the means (K, 2) and covariances (K, 2, 2) of K mixtures of M Gaussians with means `at` (M, 2) and
+    `covariance` (M, 2, 2), weighted by `share` (K, M)."""
+    middle = at.mean(0) if len(at) else np.zeros(2)  # coordinates far from zero would lose digits in their squares
+    off = at - middle
+    second = covariance + off[:, :, None] * off[:, None]
+    mean = share @ off
+    spread = (share @ second.reshape(-1, 4)).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None]
+    return middle + mean, regularize_covariance(spread, _ROUNDING * float(np.abs(second).max(initial=1)))
