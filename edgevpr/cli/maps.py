@@ -40,7 +40,7 @@ _RECORDING_FLAGS = ("positions", "rate_hz")
 
 def add(commands: Any) -> None:
     """Add the commands and their flags."""
-    maps = add_group(commands, "map", "build, inspect, check, repair, merge and cut maps")
+    maps = add_group(commands, "map", "build, refine, calibrate, inspect, check, repair, merge and cut maps")
 
     def add_to_map(name: str, run: Callable[[Namespace], int], text: str, more: str | None = None) -> ArgumentParser:
         parser = add_command(maps, name, run, text)

@@ -27,7 +27,7 @@ def add(commands: Any) -> None:
         help="folder of this flight's frames (repeatable), or its video; not needed if the flight was recorded",
     )
     add_map_images(report)
-    replay = add_command(commands, "replay", run_replay, "replay a recorded flight and compare lines and packets")
+    replay = add_command(commands, "replay", run_replay, "replay a recorded flight and compare log and packets")
     replay.add_argument("log", metavar="LOG", help="flight log; its last flight is replayed")
     replay.add_argument("--map", metavar="MAP", help="map of the flight (default: its recorded path)")
     add_json(replay)

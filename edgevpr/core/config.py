@@ -29,7 +29,7 @@ SOURCE_HELP = (
 
 _MAX_INTEGER = 2**63
 _MAX_VALUE_CHARS = 80  # characters shown of a wrong value in a message
-_NOT_IN_NAMES = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")  # other surrogates stand for raw bytes in file names
+_NOT_IN_NAMES = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")  # in no file name; other surrogates are raw bytes
 
 T = TypeVar("T", bound="DataclassInstance")
 _TYPE_NAMES = {float: "a number", int: "a whole number", str: "text", bool: "true or false", list: "a list"}

@@ -27,7 +27,7 @@ _PASSWORD = re.compile(r"(\w:/{1,2}[^\s/:@]*):\S*@")
 _SECRET = re.compile(r"(?i)([?&](?:password|passwd|passwort|pass|pwd|token|secret|api_?key|key|auth)=)[^&\s#]*")
 _LINE_COLUMNS = 120
 _TERMINAL_COLUMNS = 79
-_MAX_ODDS_WRONG = 1e-3  # up to this probability of an error, per cent would show no difference: odds are shown
+_MAX_ODDS_WRONG = 1e-3  # smaller error probabilities are shown as odds, because they would look equal in per cent
 _MIN_WRONG = 1e-6
 _MAX_SILENCE_S = 5.0  # a progress line is written at least this often
 _MIN_ESTIMATE_S = 10.0  # the remaining time is shown only if it and the time since the start are at least this long

@@ -20,7 +20,7 @@ class _StrictLoader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         event = self.peek_event()  # type: ignore[no-untyped-call]  # PyYAML
         if isinstance(event, yaml.AliasEvent):
-            raise _error(f"alias `*{event.anchor}` is not allowed: write out its value", event.start_mark)
+            raise _make_error(f"alias `*{event.anchor}` is not allowed: write out its value", event.start_mark)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
@@ -28,12 +28,12 @@ class _StrictLoader(yaml.SafeLoader):
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
                 if key.value in lines:
-                    raise _error(f"the key `{key.value}` is already in line {lines[key.value]}", key.start_mark)
+                    raise _make_error(f"the key `{key.value}` is already in line {lines[key.value]}", key.start_mark)
                 lines[key.value] = key.start_mark.line + 1
         return super().construct_mapping(node, deep)
 
 
-def _error(problem: str, mark: Any) -> yaml.YAMLError:
+def _make_error(problem: str, mark: Any) -> yaml.YAMLError:
     return yaml.constructor.ConstructorError(None, None, problem, mark)
 
 

@@ -27,7 +27,7 @@ _CUT_PX = 512  # side of a picture cut from an orthophoto, as in the map build
 
 _FRAME_NAME = re.compile(r"frame \d{6} t=(\d+\.\d+) s")  # the names that `VideoSource` gives
 
-Key = tuple[str, str]  # which album, and the name of a picture in it
+Key = tuple[str, str]  # name of an album, and name of a picture in it
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,7 +51,7 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
     notes = read_tape(folder / TAPE)
     note = next(notes, None)
     if not (note and note[0] == "flight" and isinstance(note[1], dict)):
-        raise EdgevprError(f"{folder / TAPE} is not a tape of a flight, or is truncated in its first line.")
+        raise EdgevprError(f"{folder / TAPE} is not a flight tape or is cut off in its first line: nothing to replay.")
     header = note[1]
     if header["config"].get("mavlink", {}).get("ground"):
         raise UsageError(

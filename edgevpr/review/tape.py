@@ -96,7 +96,7 @@ class ReplayedDriver:
                 self._leaving.clear()
                 conversation.break_off(*count) if event == "lost" else conversation.end()
             case _:
-                raise EdgevprError(f"The recording has a link event that this version of edgevpr does not know: {step}")
+                raise EdgevprError(f"The tape has an unknown link event, {step}: replay it with the version that flew.")
 
 
 class ReplayedSigning(Signing):
