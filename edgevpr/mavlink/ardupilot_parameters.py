@@ -88,8 +88,8 @@ def choose_ardupilot_channel(kind: VehicleKind, parameters: Parameters) -> Chann
     if kind is VehicleKind.PLANE:
         return ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_TO_PLANE))
     change = f"{resolve_name(parameters, RECEIVERS[ADVISED_RECEIVER])}={MAVLINK_GPS}"
-    why = Reason(ReasonCode.COMMAND_NEEDS_FLOW, {"vehicle": kind.value, "change": change})
-    return ChannelChoice(Channel.COMMAND, why)
+    reason = Reason(ReasonCode.COMMAND_NEEDS_FLOW, {"vehicle": kind.value, "change": change})
+    return ChannelChoice(Channel.COMMAND, reason)
 
 
 def _has_other_receiver(parameters: Parameters, choice: ChannelChoice) -> bool:
@@ -159,8 +159,8 @@ def _refuse_source(quantity: str, wrong: int, right: int) -> Check:
 
 
 def _has_source(parameters: Parameters, source: int) -> bool:
-    first, *others = _name_sources("POSXY")
-    return parameters.get(first, _SOURCE_GPS) == source or source in map(parameters.get, others)
+    first_set, *other_sets = _name_sources("POSXY")
+    return parameters.get(first_set, _SOURCE_GPS) == source or source in map(parameters.get, other_sets)
 
 
 def _check_source_set(parameters: Parameters, choice: ChannelChoice) -> Iterator[str]:

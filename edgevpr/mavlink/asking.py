@@ -59,9 +59,9 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         try:
             self._port = open_port(address)
         except OSError as error:
-            why = error.strerror or error
+            cause = error.strerror or error
             advice = "connect the device or start the other end, or correct the link address"
-            raise LinkError(f"{address} cannot be opened ({why}): {advice}.") from error
+            raise LinkError(f"{address} cannot be opened ({cause}): {advice}.") from error
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         self._port.close()
@@ -215,7 +215,7 @@ def read_autopilot(link: RequestLink, wanted: Mapping[str, Iterable[str]]) -> Au
     )
     names = tuple(wanted.get(firmware, ())) if answers else ()
     # If the autopilot does not answer, each request would take three seconds. The last two messages are only counted.
-    filter_state, first, second, origin, clock, *_ = (
+    filter_state, gps_1, gps_2, origin, clock, *_ = (
         link.request_message(number) if answers else None for number in message_ids
     )
     parameters = link.request_parameters(names, is_px4)
@@ -232,7 +232,7 @@ def read_autopilot(link: RequestLink, wanted: Mapping[str, Iterable[str]]) -> Au
         version_text=".".join(map(str, version)) + _RELEASES.get(packed & 255, "") if version_message else None,
         parameters=parameters,
         received=tuple(sorted(link.received)),
-        gps_fix=(first and first.fix_type, second and second.fix_type),
+        gps_fix=(gps_1 and gps_1.fix_type, gps_2 and gps_2.fix_type),
         filter_flags=filter_state and filter_state.flags,
         origin=(origin.latitude / 1e7, origin.longitude / 1e7) if origin else None,
         signs=link.signed > 0,

@@ -71,9 +71,9 @@ class Interview:
         """Process a message from the autopilot; irrelevant kinds are ignored."""
         match message.get_type():
             case "HEARTBEAT":
-                before = self._autopilot, self._kind
+                previous = self._autopilot, self._kind
                 self._autopilot, self._kind = message.autopilot, classify_vehicle(message.type)
-                if before != (self._autopilot, self._kind):
+                if previous != (self._autopilot, self._kind):
                     self._decide()
             case "AUTOPILOT_VERSION":
                 self._version = message.flight_sw_version >> 24 & 255, message.flight_sw_version >> 16 & 255
@@ -117,10 +117,10 @@ class Interview:
 
     def _handle_value(self, name: str, value: float) -> None:
         self._record_answer(name)
-        before = self._values.get(name)
+        previous = self._values.get(name)
         self._values[name] = value
         self._absent.discard(name)
-        if value != before:
+        if value != previous:
             self._decide()
 
     def _record_answer(self, name: str) -> None:

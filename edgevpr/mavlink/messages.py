@@ -133,7 +133,7 @@ def make_position_sensor(state: MotionState) -> Message:
 def make_gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_unix_s: float | None) -> Message:
     """Make a GPS_INPUT (232) for GPS receiver `receiver` (0: the first). A `state` of None is sent as "no fix", a
     reserve as a poor fix. `stamp_s`: time of the state. `t_unix_s`: the same in seconds since 1970 (None: unknown)."""
-    week, rest_s = (0, 0) if t_unix_s is None else divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, _WEEK_S)
+    week, time_of_week_s = (0, 0) if t_unix_s is None else divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, _WEEK_S)
     east, north, down = state.velocity_m_s if state else (0, 0, 0)
     satellites, sd_m, sd_m_s = 0, 0.0, 0.0
     if state:
@@ -144,7 +144,7 @@ def make_gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_u
         time_usec=round(stamp_s * 1e6),
         gps_id=receiver,
         ignore_flags=mavlink.GPS_INPUT_IGNORE_FLAG_HDOP | mavlink.GPS_INPUT_IGNORE_FLAG_VDOP,
-        time_week_ms=int(rest_s * 1000),
+        time_week_ms=int(time_of_week_s * 1000),
         time_week=int(week),
         fix_type=mavlink.GPS_FIX_TYPE_3D_FIX if state else mavlink.GPS_FIX_TYPE_NO_FIX,
         hdop=0.0,
@@ -286,7 +286,7 @@ def make_computer_status(
 ) -> Message:
     """Make an ONBOARD_COMPUTER_STATUS (390) from the load of each core (0..1; the first eight are sent), used and total
     RAM (sent in MiB), and the temperature in degrees Celsius (None: unknown)."""
-    percents = [min(100, max(0, round(100 * share))) for share in loads[:8]]
+    percents = [min(100, max(0, round(100 * load))) for load in loads[:8]]
     temperature = 127 if temperature_c is None else min(126, max(-128, round(temperature_c)))
     return mavlink.MAVLink_onboard_computer_status_message(
         time_usec=round(t_mono_s * 1e6),
@@ -302,8 +302,8 @@ def make_computer_status(
         gpu_combined=[255] * 10,
         temperature_board=127,
         fan_speed=[32_767] * 4,
-        **{f"storage_{what}": [_UNKNOWN_UINT32] * 4 for what in ("type", "usage", "total")},
-        **{f"link_{what}": [_UNKNOWN_UINT32] * 6 for what in ("type", "tx_rate", "rx_rate", "tx_max", "rx_max")},
+        **{f"storage_{field}": [_UNKNOWN_UINT32] * 4 for field in ("type", "usage", "total")},
+        **{f"link_{field}": [_UNKNOWN_UINT32] * 6 for field in ("type", "tx_rate", "rx_rate", "tx_max", "rx_max")},
     )
 
 

@@ -306,5 +306,5 @@ class Autopilot:
     def _receiver(self, now_s: float) -> Receiver | None:
         """Return the last report of the best GPS receiver except the one that we simulate; None if none has a fix."""
         choice = self.interview.choice
-        own = GPS_REPORTS[choice.receiver] if choice.channel is Channel.GPS_INPUT else None
-        return self.receivers.choose_best(now_s, own)
+        own_report = GPS_REPORTS[choice.receiver] if choice.channel is Channel.GPS_INPUT else None
+        return self.receivers.choose_best(now_s, own_report)

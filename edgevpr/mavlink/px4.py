@@ -66,8 +66,8 @@ class Px4Fusion:
         silent_s = now_s - self._sent_s
         if silent_s < _SENDING_TIMEOUT_S:
             # A test ratio above 1 is outside the filter's gate.
-            ours = _FUSES_ANY if self._is_vision else _FUSES_ABSOLUTE
-            is_used = bool(report.flags & ours) and not report.pos_horiz_ratio > 1
+            flag = _FUSES_ANY if self._is_vision else _FUSES_ABSOLUTE
+            is_used = bool(report.flags & flag) and not report.pos_horiz_ratio > 1
             self.used, self.unused = self.used + is_used, self.unused + (not is_used)
         if not self._reports_fusion:
             return

@@ -96,12 +96,12 @@ def _read_velocity(message: Message) -> tuple[float, float] | None:
 
 def _is_continuous(before: Receiver, report: Receiver) -> bool:
     """Return True if a report follows the one `before` without a gap or a jump."""
-    step_s = report.t_s - before.t_s
-    if step_s > _MAX_GAP_S:
+    interval_s = report.t_s - before.t_s
+    if interval_s > _MAX_GAP_S:
         return False
     speeds = [velocity for velocity in (before.velocity_m_s, report.velocity_m_s) if velocity]
     if len(speeds) < 2:
         return True
-    east_m, north_m = (step_s * (one + other) / 2 for one, other in zip(*speeds, strict=True))
+    east_m, north_m = (interval_s * (start + end) / 2 for start, end in zip(*speeds, strict=True))
     expected = offset_position(before.lat_deg, before.lon_deg, east_m, north_m)
     return math.hypot(*map(float, offset_m(*expected, report.lat_deg, report.lon_deg))) <= _MAX_STEP_M

@@ -119,8 +119,8 @@ class TimeStamps:
                 write_atomically(self._path, lambda path: path.write_text(f"{self._saved}\n"))
         except OSError as error:
             if may_fail:
-                why = f"the signing timestamp cannot be saved to this file ({error.strerror})"
-                raise ConfigError(f"{self._path}: {why}: correct `mavlink: {{signing_state: ...}}`.") from error
+                fault = f"the signing timestamp cannot be saved to this file ({error.strerror})"
+                raise ConfigError(f"{self._path}: {fault}: correct `mavlink: {{signing_state: ...}}`.") from error
             if not self._has_warned:
                 self._has_warned = True
                 log.warning("%s: cannot save the signing timestamp (%s)", self._path, error.strerror)

@@ -47,22 +47,22 @@ class Attitudes:
         """Add the attitude of an ATTITUDE message; ignore one that is not finite."""
         radians = message.roll, message.pitch, message.yaw
         if all(map(math.isfinite, radians)):
-            kept = [attitude for attitude in self._kept[1 - _MAX_ATTITUDES :] if now_s - attitude.t_s <= _HISTORY_S]
-            self._kept = (*kept, Attitude(now_s, *map(math.degrees, radians)))
+            recent = [attitude for attitude in self._kept[1 - _MAX_ATTITUDES :] if now_s - attitude.t_s <= _HISTORY_S]
+            self._kept = (*recent, Attitude(now_s, *map(math.degrees, radians)))
 
     def at(self, t_s: float) -> Attitude | None:
         """Return the attitude at `t_s`, interpolated between neighbours within 0.3 s; one neighbour is returned as is.
         Return None if there is none."""
-        near = [attitude for attitude in self._kept if abs(attitude.t_s - t_s) <= _MAX_ATTITUDE_AGE_S]
-        before = next((attitude for attitude in reversed(near) if attitude.t_s <= t_s), None)
-        after = next((attitude for attitude in near if attitude.t_s > t_s), None)
+        neighbours = [attitude for attitude in self._kept if abs(attitude.t_s - t_s) <= _MAX_ATTITUDE_AGE_S]
+        before = next((attitude for attitude in reversed(neighbours) if attitude.t_s <= t_s), None)
+        after = next((attitude for attitude in neighbours if attitude.t_s > t_s), None)
         if before is None or after is None:
             return before or after
         step_s = after.t_s - before.t_s
-        changed_deg = [wrap_deg(other - one) for one, other in zip(before[1:4], after[1:4], strict=True)]
-        share = (t_s - before.t_s) / step_s
-        roll, pitch, yaw = (one + share * change for one, change in zip(before[1:4], changed_deg, strict=True))
-        return Attitude(t_s, roll, pitch, yaw, math.hypot(*changed_deg[:2]) / step_s)
+        change_deg = [wrap_deg(end - start) for start, end in zip(before[1:4], after[1:4], strict=True)]
+        fraction = (t_s - before.t_s) / step_s
+        roll, pitch, yaw = (start + fraction * change for start, change in zip(before[1:4], change_deg, strict=True))
+        return Attitude(t_s, roll, pitch, yaw, math.hypot(*change_deg[:2]) / step_s)
 
 
 class PositionAccuracy:

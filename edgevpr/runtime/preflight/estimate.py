@@ -121,11 +121,11 @@ def _recommend(rows: list[TechniqueEstimate], board: Board, plan: FlightPlan) ->
     if chosen is None:
         return None, f"None: {explain_no_choice(options, board)}."
     row, fit = rows[options.index(chosen)], chosen.fit
-    why = "the board's profile names it, and it was never measured"
+    reason = "the board's profile names it, and it was never measured"
     if chosen.accuracy:
-        why = f"the most accurate that fits: {chosen.accuracy}"
+        reason = f"the most accurate that fits: {chosen.accuracy}"
     return chosen.label, (
-        f"{chosen.label}: {why}; {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
+        f"{chosen.label}: {reason}; {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
         f"{fit.reachable_hz:.3g} Hz ({plan.rate_hz:g} needed), {fit.cpu_s / fit.t_query_s / board.cores:.0%} of "
         f"the CPU during a query, and {row.flight_marginal_mah:.3g} mAh per flight in addition to the "
         f"{row.flight_mah - row.flight_marginal_mah:.3g} mAh of the idle board."

@@ -28,13 +28,13 @@ def format_table(estimate: FlightEstimate) -> str:
     )
     accuracies = align_table([_ACCURACY_COLUMNS, *(_make_accuracy_row(row, estimate.recommended) for row in rows)])
     notes = [f"{row.option.label} {row.option.fit.misfit}." for row in rows if row.option.fit.misfit]
-    for why in dict.fromkeys(estimate.unusable.values()):
-        names = [name for name, problem in estimate.unusable.items() if problem == why]
-        notes.append(f"{', '.join(names)} cannot be used: {why}")
+    for reason in dict.fromkeys(estimate.unusable.values()):
+        names = [name for name, problem in estimate.unusable.items() if problem == reason]
+        notes.append(f"{', '.join(names)} cannot be used: {reason}")
     notes += estimate.notes
     recommendation = wrap_sentence(f"Recommended: {estimate.reason}")
-    text = [line for note in notes for line in wrap_sentence(note)]
-    return "\n".join([*recommendation, "", heading, "", *costs, "", *accuracies, "", *text])
+    note_lines = [line for note in notes for line in wrap_sentence(note)]
+    return "\n".join([*recommendation, "", heading, "", *costs, "", *accuracies, "", *note_lines])
 
 
 def _make_cost_row(row: TechniqueEstimate) -> list[str]:

@@ -153,11 +153,11 @@ class _Bench:
         encoder = FrameEncoder(technique=self._technique)
         frame = Frame(image=self._images[0], name="trial", t_mono_s=0.0)
         try:
-            first = encoder.encode(frame)
+            encoded = encoder.encode(frame)
         except Exception as error:
             raise ModelError(str(explain_failure(error))) from error
         for _ in range(_TRIAL_PLACES):
-            trial_map.add(frame, first.descriptor, landmarks=encoder.pack_landmarks(first.picture))
+            trial_map.add(frame, encoded.descriptor, landmarks=encoder.pack_landmarks(encoded.picture))
 
     def try_map(
         self, place_map: PlaceMap, index: PlaceIndex, candidates: int, max_tries: int = _MAX_TRIES

@@ -67,8 +67,8 @@ def run_trials(trials: Sequence[Trial], threads: int) -> Iterator[Trial]:
             except EdgevprError as error:
                 yield replace(variants[0], label=name, problem=str(error))
             except BrokenProcessPool:
-                why = f"The trial of {name} crashed: memory ran out, or a library does not support this processor."
-                yield replace(variants[0], label=name, problem=why)
+                problem = f"The trial of {name} crashed: memory ran out, or a library does not support this processor."
+                yield replace(variants[0], label=name, problem=problem)
 
 
 def _begin_child(parent_pid: int) -> None:

@@ -100,13 +100,13 @@ def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
         return report_fault(what, FindingCode.DEVICE_ABSENT, path=path, problem=error.strerror)
     if not stat.S_ISCHR(status.st_mode):
         return report_fault(what, FindingCode.NOT_A_DEVICE, path=path)
-    is_serial, no_login = what == "serial", f"sudo systemctl disable --now serial-getty@{port.name}"
+    is_serial, disable_login = what == "serial", f"sudo systemctl disable --now serial-getty@{port.name}"
     if is_serial and (console := _find_console(port, root)):
-        return report_fault(what, FindingCode.PORT_IS_CONSOLE, no_login, path=path, console=console)
+        return report_fault(what, FindingCode.PORT_IS_CONSOLE, disable_login, path=path, console=console)
     program, is_login = _find_program(port, root)
     if program:
         return report_fault(
-            what, FindingCode.DEVICE_IN_USE, *([no_login] if is_login else []), path=path, program=program
+            what, FindingCode.DEVICE_IN_USE, *([disable_login] if is_login else []), path=path, program=program
         )
     group = str(status.st_gid)
     with suppress(KeyError):
@@ -117,7 +117,7 @@ def check_device(what: str, path: str, root: Path = Path("/")) -> Finding:
     changes = [f"sudo usermod --append --groups {group} USER", f"docker run --group-add {status.st_gid}"]
     if group in _SYSTEM_GROUPS:
         rules = find_shipped("deploy") / "99-edgevpr.rules"
-        changes = [no_login if is_serial else f"sudo install -D -m 644 -t /etc/udev/rules.d {rules}"]
+        changes = [disable_login if is_serial else f"sudo install -D -m 644 -t /etc/udev/rules.d {rules}"]
     return report_fault(what, FindingCode.DEVICE_DENIED, *changes, user=os.getuid(), **access)
 
 

@@ -70,14 +70,14 @@ def _check_single_fixes(choice: ChannelChoice, reading: AutopilotReading, sends_
     flow = parameters.get("FLOW_TYPE", 0)
     if flow and any(parameters.get(name) == _SOURCE_OPTICAL_FLOW for name in _VELOCITY_SOURCES):
         return report_ok("channel", FindingCode.COMMAND_WITH_FLOW, flow=flow)
-    second = resolve_name(parameters, RECEIVERS[ADVISED_RECEIVER])
-    changes = [f"{second}={MAVLINK_GPS}"]
+    receiver_name = resolve_name(parameters, RECEIVERS[ADVISED_RECEIVER])
+    changes = [f"{receiver_name}={MAVLINK_GPS}"]
     if parameters.get("GPS_AUTO_SWITCH") not in _AUTO_SWITCH_VALUES:
         changes.append("GPS_AUTO_SWITCH=1")
     if not sends_fixes:
         return report_ok("channel", FindingCode.CHANGES_AFTER_DRY_RUN, changes=" and ".join(changes))
-    replaced = parameters.get(second) or None
-    figures = {"receiver_type": replaced, "parameter": None, "value": None}
+    replaced_type = parameters.get(receiver_name) or None
+    figures = {"receiver_type": replaced_type, "parameter": None, "value": None}
     return report_fault("channel", FindingCode.NOT_CARRIED, *changes, vehicle=reading.vehicle, **figures)
 
 
