@@ -36,7 +36,7 @@ class Homography:
         )
 
 
-def cut_polygon(corners: Doubles, depth: Doubles) -> Doubles:
+def clip_polygon(corners: Doubles, depth: Doubles) -> Doubles:
     """Clip a convex polygon, homogeneous (3, n), to its part with positive depth, and return the corners of that part.
     `depth` (n,) is the depth of each corner."""
     points = []

@@ -1,8 +1,8 @@
 """Lenses with distortion: reads calibrations of OpenCV, ROS and Kalibr, and undistorts pictures.
 
 An *undistorted* picture is the one that a lens without distortion would take from the same place, along the same axis.
-Its longest side has the field of view of the calibrated lens (at most `_MAX_STRAIGHT_FOV_DEG`), so everything computed
-from a field of view applies to it. A *ray* is a direction from the lens, given by its tangents to the right and down.
+Its longest side has the field of view of the calibrated lens (at most `_MAX_UNDISTORTED_FOV_DEG`), so results computed
+from a field of view hold for it. A *ray* is a direction from the lens, given by its tangents to the right and down.
 """
 
 import math
@@ -29,7 +29,7 @@ _FISHEYE = "equidistant"
 _NO_DISTORTION = "none"
 # Names of models in ROS and Kalibr files; "" stands for an OpenCV file.
 _MODELS = ("", "plumb_bob", "rational_polynomial", "radtan", _FISHEYE, _NO_DISTORTION)
-_MAX_STRAIGHT_FOV_DEG = 100.0  # of an undistorted picture: beyond, its corners would waste many pixels
+_MAX_UNDISTORTED_FOV_DEG = 100.0  # of an undistorted picture: beyond, its corners would waste many pixels
 _MAX_SKEW = 0.002  # relative to the focal length; ignored because it shifts points by less than a pixel
 _MIN_FOV_DEG = 5.0  # as of `source.fov_deg`
 _MAX_OFF_AXIS_DEG = 85.0  # up to which a lens is sampled, from its axis
@@ -83,13 +83,13 @@ class CalibratedLens:
 @dataclass(frozen=True, slots=True)
 class LensView:
     """The view through a `lens` in pictures of its size. `half`: ray to the lower right corner of the undistorted
-    picture. `max_ray`: ray length up to which the distortion model is valid. `field_deg`: full field of view across the
+    picture. `max_ray`: ray length up to which the distortion model is valid. `full_fov_deg`: field of view across the
     longest side of the distorted picture, at most 170."""
 
     lens: CalibratedLens
     half: tuple[float, float]
     max_ray: float
-    field_deg: float
+    full_fov_deg: float
 
     @property
     def fov_deg(self) -> float:
@@ -97,7 +97,7 @@ class LensView:
         return math.degrees(2 * math.atan(max(self.half)))
 
     @property
-    def straight_px(self) -> tuple[int, int]:
+    def undistorted_px(self) -> tuple[int, int]:
         """Size (width, height) of the undistorted picture; its longest side is as long as that of the distorted one."""
         longest = max(self.lens.size_px)
         width, height = (max(1, round(longest * tangent / max(self.half))) for tangent in self.half)
@@ -105,9 +105,9 @@ class LensView:
 
     def make_undistortion(self, longest_px: int) -> "Remap":
         """Return the remap to an undistorted picture with at most `longest_px` pixels along its longest side."""
-        longest = max(self.straight_px)
+        longest = max(self.undistorted_px)
         scale = min(1.0, longest_px / longest)
-        width, height = (max(1, round(scale * side)) for side in self.straight_px)
+        width, height = (max(1, round(scale * side)) for side in self.undistorted_px)
         focal_px = scale * longest / 2 / max(self.half)
         out_from_ray = np.array([[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]])
         return self.make_remap(out_from_ray, focal_px, (width, height))
@@ -193,14 +193,14 @@ def compute_lens_view(lens: CalibratedLens, size_px: tuple[int, int]) -> LensVie
 
     right, left = find_edge(_RIGHT, 0, width - 0.5), find_edge(_LEFT, 0, -0.5)
     lower, upper = find_edge(_DOWN, 1, height - 0.5), find_edge(_UP, 1, -0.5)
-    widest = math.tan(math.radians(_MAX_STRAIGHT_FOV_DEG / 2))
+    widest = math.tan(math.radians(_MAX_UNDISTORTED_FOV_DEG / 2))
     half, max_ray = (min(right, left, widest), min(lower, upper, widest)), float(tangents[steady.min()])
-    field_deg = math.degrees(sum(map(math.atan, (right, left) if width >= height else (lower, upper))))
+    full_fov_deg = math.degrees(sum(map(math.atan, (right, left) if width >= height else (lower, upper))))
     if math.hypot(*half) > max_ray:
         raise lens.make_error("its distortion is not invertible up to the corners of the picture")
-    if field_deg < _MIN_FOV_DEG:
-        raise lens.make_error(f"its field of view is {field_deg:.1f} degrees")
-    return LensView(lens, half, max_ray, field_deg)
+    if full_fov_deg < _MIN_FOV_DEG:
+        raise lens.make_error(f"its field of view is {full_fov_deg:.1f} degrees")
+    return LensView(lens, half, max_ray, full_fov_deg)
 
 
 def read_lens(path: str) -> CalibratedLens:

@@ -14,7 +14,7 @@ from edgevpr.core.arrays import Doubles, Image, Mask
 from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
-from edgevpr.frames.homography import Homography, cut_polygon
+from edgevpr.frames.homography import Homography, clip_polygon
 from edgevpr.frames.lens import CalibratedLens, Remap, compute_lens_view
 
 MAX_TILT_DEG = 63.0  # for a camera mounted 60 degrees forward that sways
@@ -77,7 +77,7 @@ class View:
     longest side. `nadir_offset_sd`: standard deviation of each component due to errors of a large tilt. `zoom`: factor
     by which the picture was enlarged; its longest side shows that many times less ground. `nadir_offset_m`: the nadir
     offset on the ground (east, north), for a picture that was not warped because its lens is unknown. `focal`: focal
-    length in shares of the longest side. `turned_deg`: clockwise rotation that was applied to the picture.
+    length in shares of the longest side. `rotation_deg`: clockwise rotation that was applied to the picture.
     `reason`: why a tilted picture was not warped."""
 
     up_deg: float | None = None
@@ -87,7 +87,7 @@ class View:
     zoom: float = 1.0
     nadir_offset_m: tuple[float, float] | None = None
     focal: float | None = None
-    turned_deg: float = 0.0
+    rotation_deg: float = 0.0
     reason: Reason | None = None
 
     @property
@@ -185,7 +185,7 @@ def level_image(
         footprint_m=image_m and image_m / zoom,
         zoom=zoom,
         focal=out_px / side,
-        turned_deg=camera.top_deg or 0.0,
+        rotation_deg=camera.top_deg or 0.0,
         nadir_offset=(0.0, 0.0) if below and camera.is_tilt_known else camera.nadir_offset(out_from_lens, zoom),
         nadir_offset_sd=camera.nadir_offset_sd(zoom),
     )
@@ -275,7 +275,7 @@ class _CameraGeometry:
         height, width = frame.image.shape[:2]
         self._lens_view = compute_lens_view(lens.calibrated, (width, height)) if lens.calibrated else None
         if self._lens_view:
-            width, height = self._lens_view.straight_px
+            width, height = self._lens_view.undistorted_px
         self.size_px, self.longest_px = (width, height), max(height, width)
         self.focal_px = self.longest_px / 2 / math.tan(math.radians(lens.fov_deg) / 2)
         self.footprint_m = compute_footprint(frame, vehicle, lens)
@@ -288,7 +288,7 @@ class _CameraGeometry:
         self.is_too_tilted = self.tilt_deg > MAX_TILT_DEG
         if not self.is_too_tilted:
             depth = (self.straight @ self.lens_from_pixel @ self.corners)[2]
-            self.corners = cut_polygon(self.corners, depth - _MIN_RAY_DOWN)
+            self.corners = clip_polygon(self.corners, depth - _MIN_RAY_DOWN)
         self.top_deg = None if self.heading_deg is None else (self.heading_deg + lens.up_deg) % 360
 
     def warp(self, out_from_ray: Doubles, out_px: float, side: int) -> Homography | Remap:

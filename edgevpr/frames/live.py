@@ -15,7 +15,7 @@ from edgevpr.core.types import Frame
 from edgevpr.frames.liveness import LOST_AFTER_S, Fault, Liveness
 from edgevpr.frames.shot import Capture, Condition, OpeningError, Refusal, RepeatDetector, Shot
 from edgevpr.frames.source import Source
-from edgevpr.frames.twins import TwinCheck
+from edgevpr.frames.stereo import StereoCheck
 
 _FIRST_WAIT_S = 0.5
 _MAX_WAIT_S = 10.0
@@ -84,7 +84,7 @@ class LiveSource(Source):
         self.dropped: int = 0
         self.refused = {reason.value: 0 for reason in Refusal}
         self.latency_s = None
-        self.twins = TwinCheck()
+        self.stereo = StereoCheck()
         self._open_capture, self._clock = open_capture, clock
         self._t_start_s = clock()
         self._captured = 0
@@ -122,7 +122,7 @@ class LiveSource(Source):
                 return None
         shot = conversion.shot
         name = f"frame {conversion.number:06d} t={shot.t_mono_s - self._t_start_s:.3f} s"
-        image = self.twins.require_single(conversion.image)
+        image = self.stereo.require_single(conversion.image)
         return Frame(image=image, name=name, t_mono_s=shot.t_mono_s, t_sd_s=shot.t_sd_s, delay_sd_s=shot.delay_sd_s)
 
     def close(self) -> None:

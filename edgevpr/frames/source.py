@@ -20,7 +20,7 @@ from edgevpr.frames.exif import read_exif
 from edgevpr.frames.images import EXTENSIONS, list_images, read_image
 from edgevpr.frames.positions import GeoTag, find_positions, find_track, read_positions, read_track
 from edgevpr.frames.shot import Capture, Condition, OpeningError, Refusal, StreamFacts
-from edgevpr.frames.twins import TwinCheck
+from edgevpr.frames.stereo import StereoCheck
 
 _READ_TIMEOUT_S = 1.0
 _SNAPSHOT_PERIOD_S = 0.5
@@ -43,7 +43,7 @@ class Source:
     `condition`: see `Condition`. `state`: the condition in words for people ("reading", "lost, reopening in 2 s").
     `facts`: a stream's description of its pictures, None if unknown.
     `step_s`: seconds from the last picture read to the next, if a recording is replayed at its original times.
-    `twins`: rejects stereo pictures, whose halves show the same scene."""
+    `stereo`: rejects stereo pictures, whose halves show the same scene."""
 
     is_live: bool
     ended: bool
@@ -55,7 +55,7 @@ class Source:
     state: str
     facts: StreamFacts | None = None
     step_s: float | None = None
-    twins: TwinCheck
+    stereo: StereoCheck
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the next frame (of a live source, the newest), or None if there is none within `timeout_s` seconds.
@@ -78,7 +78,7 @@ class RecordingSource(Source):
 
     def __init__(self, only: Collection[str] | None = None) -> None:
         self.refused = {Refusal.DAMAGED.value: 0}
-        self.twins = TwinCheck()
+        self.stereo = StereoCheck()
         self._only = None if only is None else frozenset(only)
 
     def is_selected(self, name: str) -> bool:
@@ -126,7 +126,7 @@ class FolderSource(RecordingSource):
         if not self._unread:
             self.end()
         try:
-            image = self.twins.require_single(read_image(path, self._depth))
+            image = self.stereo.require_single(read_image(path, self._depth))
         except ImageError:
             self.refused[Refusal.DAMAGED.value] += 1
             raise

@@ -18,7 +18,7 @@ from edgevpr.frames.depth import DepthRange
 from edgevpr.frames.devices import DeviceCapture
 from edgevpr.frames.images import read_image
 from edgevpr.frames.source import open_source, read_to_end
-from edgevpr.frames.twins import TwinCheck
+from edgevpr.frames.stereo import StereoCheck
 
 SIZE_PX = (256, 64)
 RAMP = np.repeat(np.arange(256, dtype=np.uint8)[None, :], SIZE_PX[1], 0)
@@ -232,7 +232,7 @@ def stereo_pair(picture: np.ndarray, shift_px: int) -> tuple[np.ndarray, np.ndar
 @pytest.mark.parametrize("join", [np.hstack, np.vstack, lambda pair: np.hstack(pair)[:, ::2]])
 @pytest.mark.parametrize("shift_px", [1, 12])
 def test_both_pictures_of_a_stereo_camera_in_one_are_refused(join, shift_px):
-    check = TwinCheck()
+    check = StereoCheck()
     for step in range(12):
         scene = np.roll(np.clip(SCENE, 0, 255).astype(np.uint8), 15 * step, 1)
         with pytest.raises(ImageError, match=r"halves of the picture show the same scene.*videocrop"):
@@ -252,7 +252,7 @@ def test_ground_that_repeats_itself_is_not_taken_for_a_stereo_picture():
     for ground in (crops, road, houses, np.full(rows.shape, 90)):
         picture = np.clip(ground + noise, 0, 255).astype(np.uint8)
         for turned in (picture, picture.T.copy()):
-            check = TwinCheck()
+            check = StereoCheck()
             for _ in range(15):
                 check.require_single(turned)
 

@@ -165,7 +165,7 @@ def test_a_straightened_picture_is_that_of_a_camera_without_distortion(camera, g
     found = undistort_frame(frame.image, None, UNKNOWN_VIEW, lens)
     sight = compute_lens_view(lens, SIZE_PX)
     height, width = found.image.shape[:2]
-    assert (width, height) == sight.straight_px
+    assert (width, height) == sight.undistorted_px
     assert max(width, height) == max(SIZE_PX)
     other = make_pinhole(max(SIZE_PX) / 2 / math.tan(math.radians(sight.fov_deg / 2)), (width, height))
     truth = photograph(other, ground).image

@@ -112,7 +112,7 @@ def test_levelled_without_a_height_scales_nothing(ground):
 def test_levelled_without_an_attitude_knows_no_point_below(ground):
     found = level_image(replace(taken(ground, heading_deg=90), roll_deg=None), None, LENS, FOOTPRINT_M)
     width_m, focal = pytest.approx(FOOTPRINT_M), pytest.approx(LENS_FOCAL)
-    assert found.view == View(up_deg=0.0, footprint_m=width_m, focal=focal, turned_deg=90.0)
+    assert found.view == View(up_deg=0.0, footprint_m=width_m, focal=focal, rotation_deg=90.0)
     assert difference(found.image, photograph_above(ground, replace(found.view, nadir_offset=(0, 0))), found.mask) < 0.5
 
 

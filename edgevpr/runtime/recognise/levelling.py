@@ -135,11 +135,11 @@ def load_calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
     if config.lens is None:
         return None
     lens = read_lens(config.lens)
-    field_deg = compute_lens_view(lens, lens.size_px).field_deg
-    if config.fov_deg is not None and abs(config.fov_deg - field_deg) > _MAX_FIELD_DIFFERENCE_DEG:
+    full_fov_deg = compute_lens_view(lens, lens.size_px).full_fov_deg
+    if config.fov_deg is not None and abs(config.fov_deg - full_fov_deg) > _MAX_FIELD_DIFFERENCE_DEG:
         raise UsageError(
-            f"`source.fov_deg` is {config.fov_deg:g}, and {config.lens} says {field_deg:.0f} degrees: leave `fov_deg` "
-            "out, or name the calibration of this camera."
+            f"`source.fov_deg` is {config.fov_deg:g}, but it is {full_fov_deg:.0f} in {config.lens}: leave `fov_deg` "
+            "out, or give the calibration of this camera."
         )
     return lens
 

@@ -126,7 +126,7 @@ class CommonTilt:
             return
         self._place_id = place_id
         right, down = found.over_place[2, :2]
-        tilt = cmath.rect(view.focal, -math.radians(view.turned_deg)) * complex(right, down)
+        tilt = cmath.rect(view.focal, -math.radians(view.rotation_deg)) * complex(right, down)
         if abs(tilt) > _MAX_TILT:
             return
         sd = math.hypot(view.focal * found.slope_sd, _SINGLE_TILT_SD, _COMMON_SD_SHARE * abs(tilt))

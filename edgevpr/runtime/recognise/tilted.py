@@ -10,7 +10,7 @@ import numpy as np
 
 from edgevpr.core.arrays import Array
 from edgevpr.core.contract import FineMatch, Perspective, Technique
-from edgevpr.frames.homography import Homography, cut_polygon
+from edgevpr.frames.homography import Homography, clip_polygon
 from edgevpr.frames.level import LevelledImage
 
 _MAX_SIDE_PX = 512
@@ -29,7 +29,7 @@ def measure_again(picture: LevelledImage, technique: Technique, fine: Array, fou
     out_from_share = np.array([[side, 0, (side - 1) / 2], [0, side, (side - 1) / 2], [0, 0, 1]])
     out_from_pixel = out_from_share @ found.over_place @ share_from_pixel
     corners = np.array([[0, width - 1, width - 1, 0], [0, 0, height - 1, height - 1], [1] * 4], float)
-    corners = cut_polygon(corners, (out_from_pixel @ corners)[2] - _MIN_SCALE)
+    corners = clip_polygon(corners, (out_from_pixel @ corners)[2] - _MIN_SCALE)
     scale = math.sqrt(math.prod(found.scales))
     warp = Homography(out_from_pixel, corners, side, longest / (side * scale))
     mask = warp.shown if picture.mask is None else warp.shown & warp.warp_mask(picture.mask)

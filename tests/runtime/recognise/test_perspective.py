@@ -136,7 +136,7 @@ def add_matches(tilt, slope_of_ground, seed=5, count=6, place_ids=None):
         slope += 0.1 * complex(*rng.normal(size=2))
         over_place = np.eye(3)
         over_place[2, :2] = slope.real, slope.imag
-        view = replace(SEEN, turned_deg=turned_deg)
+        view = replace(SEEN, rotation_deg=turned_deg)
         common.add(Perspective(over_place, slope_sd=0.15, regions=40), view, (place_ids or range(count))[number])
     return common.shown
 

@@ -16,37 +16,37 @@ _MAX_OFFSET_SHARE = 0.04  # of its height, due to the mounting of the lenses
 _PEAK_RADIUS_PX = 4.0
 # Chosen on 975 pictures of 14 sets and on stereo pictures made from them with a different exposure, half a degree of
 # rotation, shifts, scaling and noise: 96 % of these reach both, and no ordinary picture does (closest: 0.46, 0.13).
-_MIN_TWIN_CORRELATION = 0.5
+_MIN_CORRELATION = 0.5
 _MIN_LEAD = 0.15  # over correlations away from the peak; roads and crop rows have no such lead
 _MIN_DETAIL_LEVELS = 1.5  # standard deviation in grey levels; halves with less cannot be compared
-_TWINS_TO_DECIDE = 5  # how many more pictures must be stereo than single
+_STEREO_TO_DECIDE = 5  # how many more pictures must be stereo than single
 _SINGLES_TO_DECIDE = 10  # how many more must be single before the check stops
 
 
-class TwinCheck:
-    """Compares the halves of the first pictures of one source until it is clear whether they are twins (stereo
-    pictures). Every picture with twin halves is rejected immediately."""
+class StereoCheck:
+    """Compares the halves of the first pictures of one source until it is clear whether they are stereo pictures. Every
+    picture whose halves match is rejected immediately."""
 
     def __init__(self) -> None:
-        self._evidence = 0  # above zero: twins
-        self._are_twins = False
-        self._twins: list[str] = []  # the halves that last matched
+        self._evidence = 0  # above zero: stereo
+        self._is_stereo = False
+        self._matching_halves: list[str] = []  # the halves that last matched
 
     def require_single(self, image: Image) -> Image:
         """Return the picture, uint8 (H, W[, 3]), unchanged. Raises ImageError if its halves show the same scene."""
         if self._evidence == -_SINGLES_TO_DECIDE:
             return image
         by_side = {side: correlate_halves(image, side) for side in _HALVES}
-        twins = [side for side, (best, lead) in by_side.items() if best >= _MIN_TWIN_CORRELATION and lead >= _MIN_LEAD]
+        matching = [side for side, (best, lead) in by_side.items() if best >= _MIN_CORRELATION and lead >= _MIN_LEAD]
         has_detail = all(best > 0 for best, _ in by_side.values())
-        is_single = has_detail and all(best < _MIN_TWIN_CORRELATION for best, _ in by_side.values())
-        self._evidence = min(self._evidence + bool(twins) - is_single, _TWINS_TO_DECIDE)
-        self._twins = twins or self._twins
-        self._are_twins = self._evidence == _TWINS_TO_DECIDE or (self._are_twins and self._evidence > 0)
-        if twins or self._are_twins:
+        is_single = has_detail and all(best < _MIN_CORRELATION for best, _ in by_side.values())
+        self._evidence = min(self._evidence + bool(matching) - is_single, _STEREO_TO_DECIDE)
+        self._matching_halves = matching or self._matching_halves
+        self._is_stereo = self._evidence == _STEREO_TO_DECIDE or (self._is_stereo and self._evidence > 0)
+        if matching or self._is_stereo:
             raise ImageError(
-                f"The {self._twins[0]} halves of the picture show the same scene, as from a stereo camera: use only "
-                "one half, with a videocrop pipeline (docs/how-to/cameras.md) or cropped images."
+                f"The {self._matching_halves[0]} halves of the picture show the same scene, as from a stereo camera: "
+                "use only one half, with a videocrop pipeline (docs/how-to/cameras.md) or cropped images."
             )
         return image
 
