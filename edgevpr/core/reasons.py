@@ -100,7 +100,7 @@ class ReasonCode(Code):
     NO_TELEMETRY = "not sent: no telemetry from the autopilot yet"
     CONTINUOUS = "included in the continuous position"
     HAS_GPS = "not needed: the autopilot has GPS"
-    HAS_WRONG_GPS = "not sent: the map contradicts the autopilot's GPS, but it accepts no fixes while it has GPS"
+    HAS_WRONG_GPS = "not sent: the map contradicts GPS, but the autopilot accepts no fixes while it has GPS"
     MAP_CONTRADICTS_GPS = "not sent: the map has contradicted GPS since the first match"
     NOT_BETTER = (
         "not needed: the autopilot's position is as good",
