@@ -67,9 +67,9 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
         (
             ["--orthophoto", "GROUND", "--footprint-m", "80", "--spacing-m", "20", "--camera", "forward"],
             2,
-            "give nadir",
+            "give --camera nadir",
         ),
-        (["--orthophoto", "nothing.tif", "--footprint-m", "80", "--spacing-m", "20"], 1, "no orthophoto nothing.tif"),
+        (["--orthophoto", "nothing.tif", "--footprint-m", "80", "--spacing-m", "20"], 1, "nothing.tif does not exist"),
     ],
 )
 def test_map_build_refuses_a_wrong_request(tmp_path, ground, capsys, flags, code, said):
