@@ -1,6 +1,5 @@
-"""ArduPilot's channel and the table of its parameters (see `parameters`). With GPS_INPUT edgevpr acts as one of the GPS
-receivers, and a real receiver with a fix must always take precedence. Each rule names the file of ArduPilot 4.7-dev
-that it is based on."""
+"""ArduPilot's channel and the table of its parameters (see `parameters`). With GPS_INPUT edgevpr acts as a receiver,
+but a real one with a fix must always take precedence. Each rule names the file of ArduPilot 4.7-dev it is based on."""
 
 from collections.abc import Iterator
 

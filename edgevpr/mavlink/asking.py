@@ -132,8 +132,7 @@ class RequestLink(AbstractContextManager["RequestLink"]):
             # Generic type, not onboard controller: otherwise PX4 would report a lost companion after this exchange.
             self._send(messages.make_heartbeat(Health.BOOT, mavlink.MAV_TYPE_GENERIC))
         readable, _, _ = select.select([self._port], [], [], wait_s)
-        # Reading a serial port without data would look like a disconnect, so select first. A refused datagram makes a
-        # UDP port readable again and again, so pause.
+        # Reading an idle serial port would look like a disconnect. A refused datagram keeps a UDP port readable.
         data = self._port.read() if readable else b""
         if readable and not data:
             time.sleep(0.01)
@@ -215,9 +214,7 @@ def read_autopilot(link: RequestLink, wanted: Mapping[str, Iterable[str]]) -> Au
     )
     names = tuple(wanted.get(firmware, ())) if answers else ()
     # If the autopilot does not answer, each request would take three seconds. The last two messages are only counted.
-    filter_state, gps_1, gps_2, origin, clock, *_ = (
-        link.request_message(number) if answers else None for number in message_ids
-    )
+    filter_state, gps_1, gps_2, origin, clock, *_ = (link.request_message(n) if answers else None for n in message_ids)
     parameters = link.request_parameters(names, is_px4)
     other_names = (ALTERNATIVES.get(name) for name in names if name not in parameters)
     parameters |= link.request_parameters(filter(None, other_names), is_px4)

@@ -237,7 +237,7 @@ class ForeignStamps:
         if (sender, kind) in self._reported:
             return None
         self._reported.add((sender, kind))
-        cause = "ArduPilot has one timestamp correction for all senders of a link, and dates ODOMETRY up to 0.5 s back"
+        cause = "ArduPilot has one timestamp correction per link, so it now treats our ODOMETRY as up to 0.5 s too old"
         advice = "have that program use TIMESYNC, or connect it to another port"
         fault = f"the timestamps of {kind} from {sender} differ from the autopilot's time by {stamp_s - boot_s:.1f} s"
         log.warning("%s: %s; %s", fault, cause, advice)

@@ -33,8 +33,7 @@ class CommandRequest(NamedTuple):
 class Requests:
     """Answers requests received over the link, and keeps the newest command until the flight's main loop takes it.
     Commands are rejected until `is_flying` is set. `results` counts commands by the name of their result. `ignored`
-    counts other messages addressed to us: of an unknown kind, or above the rate limit. While `is_paused`, no fix may be
-    sent."""
+    counts other messages to us: of an unknown kind, or above the rate limit. While `is_paused`, no fix may be sent."""
 
     def __init__(self) -> None:
         self.is_flying = False

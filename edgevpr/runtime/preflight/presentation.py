@@ -18,14 +18,8 @@ def format_table(estimate: FlightEstimate) -> str:
         f"{plan.pack.capacity_mah} at {plan.regulator_efficiency:.0%} regulator efficiency; times measured"
         + {"measured": "", "scaled": ", scaled", "unscaled": " here, unscaled"}[estimate.times]
     )
-    costs = align_table(
-        [
-            _RESOURCE_COLUMNS + _CHARGE_COLUMNS,
-            *map(_make_cost_row, rows),
-            *([name, "n/a"] for name in estimate.unusable),
-        ],
-        left=2,
-    )
+    unusable = ([name, "n/a"] for name in estimate.unusable)
+    costs = align_table([_RESOURCE_COLUMNS + _CHARGE_COLUMNS, *map(_make_cost_row, rows), *unusable], left=2)
     accuracies = align_table([_ACCURACY_COLUMNS, *(_make_accuracy_row(row, estimate.recommended) for row in rows)])
     notes = [f"{row.option.label} {row.option.fit.misfit}." for row in rows if row.option.fit.misfit]
     for reason in dict.fromkeys(estimate.unusable.values()):
