@@ -281,7 +281,7 @@ class Conversation:
         """Request the parameters that are due, and reports that have stopped or arrive at less than half the rate."""
         if self._next_request_s is None:
             return
-        self.send(*self.autopilot.interview.questions(now_s, system_id))
+        self.send(*self.autopilot.interview.make_requests(now_s, system_id))
         if self.channel is not self._reported_channel:
             self._reported_channel, self._origin_missing_since_s, self._next_request_s = self.channel, now_s, now_s
             self.settings.listener.handle_channel(self.channel)

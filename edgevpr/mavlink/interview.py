@@ -77,17 +77,17 @@ class Interview:
                     self._decide()
             case "AUTOPILOT_VERSION":
                 self._version = message.flight_sw_version >> 24 & 255, message.flight_sw_version >> 16 & 255
-            case "PARAM_VALUE" if message.param_id in self._all_names():
+            case "PARAM_VALUE" if message.param_id in self._list_all_names():
                 value = read_parameter_value(message, bytewise=self._autopilot == mavlink.MAV_AUTOPILOT_PX4)
                 if value is not None:
                     self._handle_value(message.param_id, value)
             case "PARAM_ERROR" if message.error == mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST:
-                if message.param_id in self._all_names() and message.param_id not in self._values:
+                if message.param_id in self._list_all_names() and message.param_id not in self._values:
                     self._record_answer(message.param_id)
                     self._absent.add(message.param_id)
                     self._decide()
 
-    def questions(self, now_s: float, target_system: int) -> Iterator[Message]:
+    def make_requests(self, now_s: float, target_system: int) -> Iterator[Message]:
         """Yield the requests that are due at `now_s`."""
         if not self._has_begun:
             self._has_begun = True
@@ -149,7 +149,7 @@ class Interview:
     def _table(self) -> ParameterTable | None:
         return TABLES.get(self._autopilot)
 
-    def _all_names(self) -> frozenset[str]:
+    def _list_all_names(self) -> frozenset[str]:
         return self._table.all_names if self._table else frozenset()
 
     def _is_known(self, name: str) -> bool:

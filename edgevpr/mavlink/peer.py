@@ -255,7 +255,7 @@ class Autopilot:
                 self._flags, self._flags_s = message.flags, now_s
                 self.accuracy.handle(message, now_s)
                 if name == "ESTIMATOR_STATUS":
-                    self.px4.handle(message, now_s, self._receiver(now_s), self._listener.trusts_gps())
+                    self.px4.handle(message, now_s, self._choose_receiver(now_s), self._listener.trusts_gps())
             case "GLOBAL_POSITION_INT":
                 self._handle_position(message, now_s)
             case "ATTITUDE":
@@ -272,7 +272,7 @@ class Autopilot:
 
     def _handle_position(self, message: Message, now_s: float) -> None:
         """Process a GLOBAL_POSITION_INT. If its position is invalid, or 0, 0, `vehicle` becomes None."""
-        gps, lat_deg, lon_deg = self._receiver(now_s), message.lat / 1e7, message.lon / 1e7
+        gps, lat_deg, lon_deg = self._choose_receiver(now_s), message.lat / 1e7, message.lon / 1e7
         is_near = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= MAX_GPS_DISAGREEMENT_M)
         # On a continuous channel the estimate may derive from our own positions, so it proves nothing about GPS.
         has_gps = bool(gps) and (is_near or self.interview.choice.channel.is_continuous) and self.px4.uses_gps
@@ -303,7 +303,7 @@ class Autopilot:
         )
         self._listener.handle_vehicle(self.vehicle)
 
-    def _receiver(self, now_s: float) -> Receiver | None:
+    def _choose_receiver(self, now_s: float) -> Receiver | None:
         """Return the last report of the best GPS receiver except the one that we simulate; None if none has a fix."""
         choice = self.interview.choice
         own_report = GPS_REPORTS[choice.receiver] if choice.channel is Channel.GPS_INPUT else None

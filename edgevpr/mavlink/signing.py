@@ -147,7 +147,7 @@ class Signing:
         """Return True if a received message may be processed."""
         if not self._stamps:
             return True
-        reason = self._refusal(self._stamps, message.get_msgbuf(), message.get_header())
+        reason = self._find_refusal(self._stamps, message.get_msgbuf(), message.get_header())
         self.verdicts.append(reason)
         if reason is None:
             return True
@@ -156,7 +156,7 @@ class Signing:
         self.refused[reason] += 1
         return False
 
-    def _refusal(self, stamps: TimeStamps, packet: bytes, header: Message) -> str | None:
+    def _find_refusal(self, stamps: TimeStamps, packet: bytes, header: Message) -> str | None:
         """Return why a message is rejected (None: it is admitted). A RADIO_STATUS needs no signature, because a radio
         has no key, but must not have the component id of an autopilot."""
         if not header.incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED:

@@ -37,7 +37,7 @@ def check_setup(config: Config, address: LinkAddress) -> tuple[list[Finding], Au
             show_wait(f"waiting for a frame of {uri}")
             camera_findings.append(run_check("frames", lambda what: check_frame(what, source)))
         machine_findings += camera_findings
-    show_wait(f"asking the autopilot at {address}")
+    show_wait(f"querying the autopilot at {address}")
     reading = None
     try:
         with RequestLink(address, settings.component_id, settings.system_id, signing) as link:
