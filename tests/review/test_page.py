@@ -105,7 +105,7 @@ def test_report_makes_a_page_without_the_map(flown, tmp_path):
         (["gone", "--out", "out.html"], 2, "there is no such flight log"),
         (["LOG", "--out", "out.html", "--map", "gone.gpkg"], 1, "There is no map"),
         (["LOG", "--out", "out.html", "--images", "gone"], 2, "does not exist: give a folder"),
-        (["empty", "--out", "out.html"], 1, "holds no line of a flight log"),
+        (["empty", "--out", "out.html"], 1, "contains no flight-log lines"),
     ],
 )
 def test_report_refuses_what_cannot_be_done_in_a_sentence(tmp_path, monkeypatch, capsys, argv, code, said):

@@ -1,4 +1,4 @@
-"""Estimates the errors of a path, such as the offset from the path to the aircraft. `navigation` uses it."""
+"""Estimates the errors of a path, such as the offset from the path to the aircraft, for `navigation`."""
 
 import math
 from dataclasses import dataclass, replace
@@ -13,21 +13,21 @@ GRAVITY_M_S2 = 9.80665
 # if its variance grew without limit, every fix would be attributed to it.
 _ATTITUDE_ERROR_TIME_S = 20.0
 # With poor gyros the attitude error wanders up to nine times as fast as with good ones: in PX4's simulator by 0.1 in
-# eight seconds after GPS was lost. The gyros are judged by the mean square of the attitude errors that the last twenty
-# pictures show, over their variances: 0.2 in flights of ArduPilot's simulator, 1.3 in those of PX4's.
+# eight seconds after GPS was lost. The gyros are judged by the mean square of the attitude errors in the last twenty
+# pictures, divided by their variances: 0.2 in ArduPilot's simulator, 1.3 in PX4's.
 _MAX_NOISE_FACTOR = 8.0
 _ATTITUDE_ERROR_GAIN = 0.05
 _CALM_ERROR = 0.3
 _ROUGH_ERROR = 0.8
-# An autopilot that starts to dead-reckon mistakes a new wind for a turn: its attitude error wanders so many times
-# faster, for about so long. In simulation, that of an ArduPilot plane was 4.5 degrees after ten seconds.
+# An autopilot that starts to dead-reckon mistakes a new wind for a turn: its attitude error wanders this many times
+# faster, for about this long. In simulation, an ArduPilot plane's was 4.5 degrees after ten seconds.
 _GPS_LOSS_NOISE_FACTOR = 6.0
 _GPS_LOSS_TIME_S = 10.0
 _MAX_INNOVATION_SIGMA = 4.0  # odometry that differs by more is not used
 _ODOMETRY_SD = 0.05  # error of scale and direction of all odometry steps
-_ODOMETRY_NOISE = 0.003  # its change in one second
-# Its heading goes wrong then too, and so the direction of odometry changes so many times faster: that of an ArduPilot
-# plane by 6 degrees in 3 s. The rotation of a match shows it (radians: standard deviation, and the most that is used).
+_ODOMETRY_NOISE = 0.003  # random change of that error in one second
+# Its heading then goes wrong too, so the direction of odometry changes this many times faster: by 6 degrees in 3 s on
+# an ArduPilot plane. The rotation of a match shows it (radians: standard deviation, and the largest that is used).
 _GPS_LOSS_TURN_FACTOR = 10.0
 _ROTATION_SD_RAD = 0.035
 _MAX_ROTATION_RAD = 0.3
@@ -37,37 +37,37 @@ _SIZE = 12
 _EYE = np.eye(2)
 _TURN = 11
 _FRAME = np.zeros((2, _SIZE))  # measurement matrix of `f`
-_FIX = np.zeros((2, _SIZE))  # that of the fix of a frame
+_FIX = np.zeros((2, _SIZE))  # measurement matrix of a frame's fix
 _FRAME[:, _F] = _FIX[:, _F] = _FIX[:, _M] = _EYE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drift:
-    """Size of the errors of a path, standard deviations of one axis: `velocity_sd` (m/s) and `acceleration_sd` (m/s2)
-    of one that nothing corrects; `position_noise` (m), `velocity_noise` (m/s) and `acceleration_noise` (m/s2) of the
-    random change in one second."""
+    """Size of the errors of a path, as standard deviations of one axis. `velocity_sd` (m/s) and `acceleration_sd`
+    (m/s2): errors of an uncorrected path; `position_noise` (m), `velocity_noise` (m/s) and `acceleration_noise` (m/s2):
+    random change of the errors in one second."""
 
     velocity_sd: float
     acceleration_sd: float
     position_noise: float
     velocity_noise: float
     acceleration_noise: float
-    is_of_attitude: bool  # the path is integrated by the attitude, whose error is one of the path's acceleration
-    # The autopilot follows our positions closely, and mistakes their errors for motion. So its attitude is assumed to
-    # be poor when GPS is lost, until pictures have shown that it is good.
+    is_inertial: bool  # the path is integrated from accelerations, so an attitude error is one of its acceleration
+    # The autopilot follows our positions closely and mistakes their errors for motion, so its attitude is assumed to be
+    # poor when GPS is lost, until pictures show that it is good.
     attitude_follows_positions: bool = False
 
 
-# Dead reckoning by an autopilot: nearly all of the error is unknown wind. In simulation, the velocity of an ArduPilot
-# plane in a wind of 6 m/s was 5 m/s wrong 10 s after the loss of GPS, and up to 7.5 m/s later.
+# Dead reckoning by an autopilot: nearly all of the error is unknown wind. In simulation with a wind of 6 m/s, an
+# ArduPilot plane's velocity was wrong by 5 m/s at 10 s after GPS was lost, and by up to 7.5 m/s later.
 DEAD_RECKONING = Drift(
     velocity_sd=4.0, acceleration_sd=0.1, position_noise=0.3, velocity_noise=0.5, acceleration_noise=0.03,
-    is_of_attitude=False,
+    is_inertial=False,
 )  # fmt: skip
 # Accelerations, rotated into east and north by the autopilot's attitude: an error of half a degree is 0.09 m/s2.
 INERTIAL = Drift(
     velocity_sd=0.5, acceleration_sd=0.1, position_noise=0.05, velocity_noise=0.1, acceleration_noise=0.02,
-    is_of_attitude=True,
+    is_inertial=True,
 )  # fmt: skip
 INERTIAL_PX4 = replace(INERTIAL, attitude_follows_positions=True)
 
@@ -89,14 +89,14 @@ class DriftFilter:
     The state has six parts, each east and north:
     - `c` (m): the offset from the path to the aircraft
     - `s` (m/s): the aircraft's velocity minus the path's
-    - `b` (m/s2): minus the acceleration that an attitude error makes of gravity; of a path of accelerations, ds/dt
+    - `b` (m/s2): minus the acceleration error that an attitude error causes through gravity; ds/dt of an inertial path
     - `m` (m): the offset from GPS positions to fixes
-    - `f` (m): the offset from the path to the position by the last frame's picture
+    - `f` (m): the offset from the path to the position measured in the last frame's picture
     - `k`: the error of scale and direction (radians, clockwise) of all odometry
 
     A frame may have been taken seconds ago: it is compared with the path at that time. An attitude error shifts its
-    `f`, and so its fix, by minus `b` times `attitude_gain_s2`: the height above the ground over gravity (0: the picture
-    does not depend on the attitude). Odometry carries `f` from one frame to the next, with the errors of both.
+    `f`, and so its fix, by minus `b` times `attitude_gain_s2`: the height above ground divided by gravity (0: the
+    picture does not depend on the attitude). Odometry carries `f` from one frame to the next, with the errors of both.
     """
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
@@ -104,12 +104,12 @@ class DriftFilter:
         self._x, self._p = np.zeros(_SIZE), np.zeros((_SIZE, _SIZE))
         self._frame = np.zeros((2, _SIZE)), 0.0  # its measurement matrix, and the variance of each axis
         self._gps_loss = 0.0  # 1 when GPS is lost, then decaying
-        # Mean square of the attitude errors of the last pictures, over their variances.
+        # Mean square of the attitude errors in the last pictures, divided by their variances.
         self._attitude_error = _ROUGH_ERROR if drift.attitude_follows_positions else 0.0
 
     def start(self, sd_m: float, velocity_sd_m_s: float) -> None:
         """Start with the aircraft on the path. `sd_m` and `velocity_sd_m_s` are the standard deviations, of one axis,
-        of its offset and of the error of velocity."""
+        of its offset and of the velocity error."""
         self._x = np.zeros(_SIZE)
         sds = sd_m, velocity_sd_m_s, self._drift.acceleration_sd, self._map_sd_m, 0.0, _ODOMETRY_SD
         self._p = np.diag(np.repeat(np.square(sds), 2))
@@ -118,15 +118,15 @@ class DriftFilter:
         """Predict the state `step_s` seconds later."""
         move = np.eye(_SIZE)
         move[_C, _S] = step_s * _EYE
-        if self._drift.is_of_attitude:
+        if self._drift.is_inertial:
             move[_C, _B] = step_s**2 / 2 * _EYE
             move[_S, _B] = step_s * _EYE
         else:
             move[_B, _B] = math.exp(-step_s / _ATTITUDE_ERROR_TIME_S) * _EYE
         drift = self._drift
-        # How poor the gyros are, by the attitude errors that pictures have shown. Poor gyros err in heading, too.
+        # How poor the gyros are, judged by the attitude errors seen in pictures. Poor gyros also give a poor heading.
         share = (self._attitude_error - _CALM_ERROR) / (_ROUGH_ERROR - _CALM_ERROR)
-        rough = 1.0 + _MAX_NOISE_FACTOR * min(1.0, max(0.0, share)) * drift.is_of_attitude
+        rough = 1.0 + _MAX_NOISE_FACTOR * min(1.0, max(0.0, share)) * drift.is_inertial
         wander = drift.acceleration_noise * (rough + _GPS_LOSS_NOISE_FACTOR * self._gps_loss)
         noise = np.repeat((drift.position_noise, drift.velocity_noise, wander, 0.0, 0.0, _ODOMETRY_NOISE * rough), 2)
         noise[_TURN] += _ODOMETRY_NOISE * _GPS_LOSS_TURN_FACTOR * self._gps_loss
@@ -135,19 +135,19 @@ class DriftFilter:
         self._gps_loss *= math.exp(-step_s / _GPS_LOSS_TIME_S)
 
     def lose_gps(self) -> None:
-        """Process the loss of GPS: the error of velocity becomes more uncertain, since nothing corrects it any more,
-        and so does the attitude error of an autopilot that dead-reckons."""
+        """Process the loss of GPS: the velocity error becomes more uncertain, since nothing corrects it any more, and
+        so does the attitude error of an autopilot that dead-reckons."""
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
-        self._gps_loss = 0.0 if self._drift.is_of_attitude else 1.0
+        self._gps_loss = 0.0 if self._drift.is_inertial else 1.0
         if self._drift.attitude_follows_positions:
             self._attitude_error = max(self._attitude_error, _ROUGH_ERROR)
 
     def correct_by_gps(
         self, offset_m: Doubles, sd_m: float, error_m_s: Doubles | None, velocity_sd_m_s: float, age_s: float = 0.0
     ) -> None:
-        """Correct the state by GPS of `age_s` seconds ago: `offset_m` (2,) from the path to its position, and
-        `error_m_s` (2,), its velocity minus the path's (None: unknown). Standard deviations are those of one axis."""
-        matrix = self._measure_motion(age_s)
+        """Correct the state by a GPS measurement `age_s` seconds old. `offset_m` (2,): from the path to the GPS
+        position; `error_m_s` (2,): GPS velocity minus the path's (None: unknown). Standard deviations: of one axis."""
+        matrix = self._make_motion_jacobian(age_s)
         errors = offset_m if error_m_s is None else np.concatenate([offset_m, error_m_s])
         variances = [sd_m**2] * 2 + [velocity_sd_m_s**2] * 2
         self._correct(matrix[: errors.size], errors, np.diag(variances[: errors.size]))
@@ -155,10 +155,10 @@ class DriftFilter:
     def add_frame(
         self, age_s: float, attitude_gain_s2: float, sd_m: float, odometry: OdometryMeasurement | None = None
     ) -> bool:
-        """Process a frame taken `age_s` ago, and correct the state by the `odometry` since the frame before (None:
-        unknown). `sd_m` is the standard deviation of its position, of each axis, without the effect of the attitude
+        """Process a frame taken `age_s` ago, and correct the state by the `odometry` since the previous frame (None:
+        unknown). `sd_m` is the standard deviation of its position on each axis, without the effect of the attitude
         error. Returns False if the odometry contradicts the state and is not used."""
-        self._frame = position, variance_m2 = self._measure_position(age_s, attitude_gain_s2), sd_m**2
+        self._frame = position, variance_m2 = self._make_position_jacobian(age_s, attitude_gain_s2), sd_m**2
         if odometry is None:
             self._begin_frame()
             return True
@@ -176,9 +176,9 @@ class DriftFilter:
 
     def correct_by_rotation(self, rotation: float) -> None:
         """Correct the direction of odometry by a match whose picture is rotated by `rotation` (radians, clockwise)
-        against the compass. A large rotation is ignored, since odometry then contradicts the path and is not used; so
-        is any beside a path of accelerations, which has the same error of the compass."""
-        if abs(rotation) <= _MAX_ROTATION_RAD and not self._drift.is_of_attitude:
+        against the compass. A large rotation is ignored, since odometry then contradicts the path and is not used.
+        Rotations are also ignored if the path is integrated from accelerations: it then has the same compass error."""
+        if abs(rotation) <= _MAX_ROTATION_RAD and not self._drift.is_inertial:
             matrix = np.zeros((1, _SIZE))
             matrix[0, _TURN] = 1.0
             self._correct(matrix, np.array([rotation]), np.array([[_ROTATION_SD_RAD**2]]))
@@ -197,7 +197,7 @@ class DriftFilter:
         self._correct(matrix, over_height, sd**2 * _EYE)
 
     def reset_to_fix(self, offset_m: Doubles, covariance_m2: Doubles) -> None:
-        """Correct the state by a fix that contradicts it, after forgetting the position."""
+        """Discard the position, then correct the state by a fix that contradicts it."""
         self._p[_C] = self._p[:, _C] = 0.0
         self._p[_C, _C] = 1e6 * _EYE
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
@@ -206,24 +206,24 @@ class DriftFilter:
 
     def predict_fix(self) -> tuple[Doubles, Doubles]:
         """Predict the fix of the last frame. Returns its offset (2,) from the path, metres, and the covariance (2, 2)
-        of this prediction, without that of the fix itself."""
+        of the prediction, excluding that of the fix itself."""
         return _FIX @ self._x, _FIX @ self._p @ _FIX.T
 
     def errors(self, age_s: float) -> tuple[Doubles, Doubles, Doubles]:
         """Return the errors of the path `age_s` seconds ago (negative: in the future):
         - offset (2,) from the path to the aircraft, metres
-        - error of velocity (2,), m/s
+        - velocity error (2,), m/s
         - covariance (4, 4) of both.
         """
-        matrix = self._measure_motion(age_s)
+        matrix = self._make_motion_jacobian(age_s)
         errors = matrix @ self._x
         return errors[:2], errors[2:], matrix @ self._p @ matrix.T
 
-    def _measure_motion(self, age_s: float) -> Doubles:
-        """Return the matrix (4, 12) that gives offset and error of velocity of the path `age_s` seconds ago."""
+    def _make_motion_jacobian(self, age_s: float) -> Doubles:
+        """Return the observation matrix (4, 12) for the offset and the velocity error of the path `age_s` ago."""
         matrix = np.zeros((4, _SIZE))
-        matrix[:2] = self._measure_position(age_s, 0.0)
-        matrix[2:, _S], matrix[2:, _B] = _EYE, -age_s * self._drift.is_of_attitude * _EYE
+        matrix[:2] = self._make_position_jacobian(age_s, 0.0)
+        matrix[2:, _S], matrix[2:, _B] = _EYE, -age_s * self._drift.is_inertial * _EYE
         return matrix
 
     def _begin_frame(self) -> None:
@@ -241,10 +241,10 @@ class DriftFilter:
         kept = np.eye(_SIZE) - gain @ matrix
         self._p = kept @ self._p @ kept.T + gain @ covariance @ gain.T  # Joseph form: keeps it positive semidefinite
 
-    def _measure_position(self, age_s: float, attitude_gain_s2: float) -> Doubles:
-        """Return the matrix (2, 12) that gives the offset from the path to the aircraft `age_s` seconds ago, by a
-        picture with this `attitude_gain_s2`."""
+    def _make_position_jacobian(self, age_s: float, attitude_gain_s2: float) -> Doubles:
+        """Return the observation matrix (2, 12) of a position measured `age_s` seconds ago, as an offset from the
+        path. `attitude_gain_s2`: how strongly an attitude error shifts the position measured in the picture."""
         matrix = np.zeros((2, _SIZE))
         matrix[:, _C], matrix[:, _S] = _EYE, -age_s * _EYE
-        matrix[:, _B] = (age_s**2 / 2 * self._drift.is_of_attitude - attitude_gain_s2) * _EYE
+        matrix[:, _B] = (age_s**2 / 2 * self._drift.is_inertial - attitude_gain_s2) * _EYE
         return matrix

@@ -215,8 +215,8 @@ class Flight:
         return parts.autopilot.check_age(event) if is_live and parts.autopilot and event.accepted else event
 
     def _is_odometry_due(self) -> bool:
-        """Return True if a frame for visual odometry is due: between rare queries, without GPS. The pictures of a
-        recording are all queries."""
+        """Return True if a visual-odometry frame is due. Such frames are taken between queries when queries are
+        infrequent and there is no GPS. In a recording every picture is a query."""
         parts = self._parts
         if parts.autopilot is None or not parts.source.is_live or not parts.recogniser.measures_motion:
             return False
@@ -283,7 +283,7 @@ class Flight:
         )
         fixes = f", {parts.autopilot.summary}" if parts.autopilot else ""
         counts = f"{self._tally.queries} queries, {self._tally.accepted} accepted{fixes}"
-        _log.info("%s, %.3f mAh (%.3f of them for recognising)", counts, totals["used_mah"], totals["marginal_mah"])
+        _log.info("%s, %.3f mAh (%.3f mAh of it for recognition)", counts, totals["used_mah"], totals["marginal_mah"])
 
 
 def _open_log(io: FlightIO) -> FlightLog:

@@ -83,9 +83,9 @@ class FlightLog:
                 if not wait:
                     raise EdgevprError(
                         f"The flight log {path} cannot be opened ({error.strerror}): give each flight a file of its "
-                        "own, in a folder that is there and may be written to."
+                        "own, in a folder that exists and is writable."
                     ) from error
-                self._record_trouble(error)
+                self._record_error(error)
 
     def __enter__(self) -> "FlightLog":
         return self
@@ -120,20 +120,20 @@ class FlightLog:
                 self._sync(file, now_s)
         except OSError as error:
             self.lost_lines += 1
-            self._record_trouble(error)
+            self._record_error(error)
         else:
             if self.state is not None:
                 self.state = None
                 _log.warning("The flight log %s is written again; %d lines are missing.", self.path, self.lost_lines)
 
-    def sync_due(self, now_s: float) -> None:
+    def sync_if_due(self, now_s: float) -> None:
         """Sync lines to the disk if a second has passed since the last sync; `now_s` is the time. Never raises."""
         if self._file is None or self._is_synced or now_s - self._synced_s < _SYNC_INTERVAL_S:
             return
         try:
             self._sync(self._file, now_s)
         except OSError as error:
-            self._record_trouble(error)
+            self._record_error(error)
 
     def close(self) -> None:
         """Sync all lines to the disk and close the file. A failure is logged, not raised."""
@@ -184,7 +184,7 @@ class FlightLog:
         sync_file(file)
         self._is_synced, self._synced_s = True, now_s
 
-    def _record_trouble(self, error: OSError) -> None:
+    def _record_error(self, error: OSError) -> None:
         """Note that the file cannot be written. The next line opens it anew: the card may be another one."""
         if self.state is None:
             self.state = (
@@ -283,7 +283,7 @@ def select_last_flight(path: str | Path) -> FlightLines:
     if not path.is_file():
         raise UsageError(f"{path}: there is no such flight log: give the file that `log.path` names.")
     if not any(isinstance(line.get("kind"), str) for line in read_log(path)):
-        raise EdgevprError(f"{path} holds no line of a flight log: give one that a flight has written.")
+        raise EdgevprError(f"{path} contains no flight-log lines: give a log written by a flight.")
     starts = _read_starts(path)
     if not starts:
         return FlightLines(files=(path,), flight=None, missing=None)

@@ -102,7 +102,7 @@ class Navigation:
         if vehicle.velocity_m_s is None:
             return
         has_gps = is_gps_aided(vehicle) and trusts_gps
-        if self._drift.is_of_attitude:
+        if self._drift.is_inertial:
             self._correct_by_receiver(vehicle, vehicle.gps if has_gps else None, is_estimate_ours)
         else:
             self._correct_by_estimate(vehicle, has_gps)
@@ -201,7 +201,7 @@ class Navigation:
 
     def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> None:
         """Process the mean acceleration (2,) over the ground, east and north, since the last call."""
-        if (path := self._valid_path) and self._drift.is_of_attitude:
+        if (path := self._valid_path) and self._drift.is_inertial:
             self._filter.predict(path.add_acceleration(t_s, acceleration_m_s2))
 
     def add_frame(self, frame: FrameMeasurement, is_query: bool = True, heading_error_deg: float | None = None) -> None:
@@ -241,7 +241,7 @@ class Navigation:
     def correct_by_fix(self, fix: PredictedFix, verdict: GateResult = ACCEPTED) -> None:
         """Correct our position by a fix that `Consistency` has accepted by this verdict."""
         match = fix.match
-        if self._path and verdict.restarts_path and self._drift.is_of_attitude:
+        if self._path and verdict.restarts_path and self._drift.is_inertial:
             self.start_at_fix(match.position, worst_sd(match.scatter_m2), match.t_s, self._path.now.t_s)
         elif self._path:
             correct = self._filter.reset_to_fix if verdict.overrules_path else self._filter.correct_by_fix
@@ -265,7 +265,7 @@ class Navigation:
     def start_at_fix(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
         """Start the path at `now_s`, when neither position nor velocity is known, at the `position` of a fix whose
         frame was taken at `t_s`; `sd_m` is its standard deviation. A path of velocities starts with a report only."""
-        if self._drift.is_of_attitude:
+        if self._drift.is_inertial:
             sd_m = math.hypot(sd_m, _UNKNOWN_VELOCITY_SD_M_S * (now_s - t_s))
             self._start(position, sd_m, np.zeros(2), now_s, _UNKNOWN_VELOCITY_SD_M_S)
             self._last_fix_s = t_s

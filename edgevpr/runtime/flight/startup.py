@@ -78,7 +78,7 @@ def log_start(config: Config, io: FlightIO, recogniser: Recogniser) -> dict[str,
     reason = explain_technique(recogniser, is_named=config.technique is not None)
     _log.info("%s", reason)
     if not board.verified:
-        _log.warning("mAh are estimates: the power of %s is unverified (%s)", board.title, board.source)
+        _log.warning("mAh figures are estimates: the power draw of %s is unverified (%s)", board.title, board.source)
     decided = {
         "reason": reason,
         "rule": recogniser.rule,

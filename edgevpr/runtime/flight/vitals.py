@@ -83,7 +83,7 @@ class Vitals:
             self._parts.autopilot.log_answers()
         if now_s >= self._report_due_s:
             self._report_due_s = now_s + _REPORT_INTERVAL_S
-            self._parts.flight_log.sync_due(now_s)
+            self._parts.flight_log.sync_if_due(now_s)
             self._report()
 
     def _is_silence_explained(self, now_s: float) -> bool:

@@ -106,7 +106,7 @@ def test_the_disk_is_synced_at_most_once_a_second_and_at_the_end(path, syncs):
     log.write("match")
     for waited_s, count in ((0.0, 3), (1.0, 4), (1.0, 4)):  # a line that no other follows, then none
         clock.now_s += waited_s
-        log.sync_due(clock())
+        log.sync_if_due(clock())
         assert len(syncs) == count
     log.close()
     assert len(syncs) == 5
@@ -120,7 +120,7 @@ def test_a_sync_that_fails_between_lines_is_trouble_and_no_exception(path, monke
         clock.now_s += 1.0
         with monkeypatch.context() as patch:
             patch.setattr(os, "fdatasync", lambda fd: os.write(os.open("/dev/full", os.O_WRONLY), b"x"))
-            log.sync_due(clock())
+            log.sync_if_due(clock())
         assert "No space" in log.state
         log.write("third")
     assert kinds(path) == ["first", "second", "gap", "third"]
