@@ -64,7 +64,7 @@ _MAX_OUTLIERS = 3  # contradictions in a row that no delay explains: then the re
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimedMatch:
     """An accepted match of a picture with the time stamp `t_s`: the aircraft's position, metres east and north, its
-    standard sigmas `sd_m`, and its heading (NaN: unknown). `delay_s`: the delay of this match, if it differs from
+    standard deviation `sd_m`, and its heading (NaN: unknown). `delay_s`: the delay of this match, if it differs from
     that of the others (None: it does not)."""
 
     t_s: float
@@ -77,7 +77,7 @@ class TimedMatch:
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """A hidden delay and its standard sigmas, seconds."""
+    """A hidden delay and its standard deviation, seconds."""
 
     s: float
     sd_s: float
@@ -254,7 +254,7 @@ class AgeWatch:
         self, matches: list[TimedMatch], delays_s: Doubles, compass: tuple[float, float] = _UNKNOWN_COMPASS
     ) -> Doubles:
         """Return the chi-square (k,) of matches against the reported motion, with k sets of delays (k, n). `compass`:
-        the headings by matches minus those reported, and the standard sigmas, degrees."""
+        the headings by matches minus those reported, and the standard deviation, degrees."""
         moved_s, east_m, north_m, headings_deg, _, _, grown, start = np.array(self._motion).T
         rows = [(match.t_s, match.east_m, match.north_m, match.heading_deg, match.sd_m) for match in matches]
         t_s, *matched_m, matched_deg, sd_m = np.array(rows).T

@@ -1,4 +1,4 @@
-"""Observers of a flight's events that report turned or mirrored pictures."""
+"""Observers of a flight's events that report rotated or mirrored pictures."""
 
 import cmath
 import math
@@ -16,27 +16,27 @@ from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# Accepted matches in a row by which pictures are turned, and the least turn; with this length of the mean of their
-# directions they agree to some ten degrees. A compass is rarely wrong by so much, a camera is by 90 or 180.
+# Accepted matches in a row that must show the rotation, and the smallest rotation to report. With this length of their
+# mean direction they agree within about ten degrees. A compass is rarely that wrong; a camera is rotated by 90 or 180.
 _TURN_MATCHES = 10
 _MIN_TURN_DEG = 20.0
 _MIN_MEAN_LENGTH = 0.97
-_MISSES_TO_TRY = 15  # queries without a match before a mirrored picture is tried; over poor ground ten are usual
+_MISSES_TO_TRY = 15  # queries without a match before a mirrored picture is tried; ten are common over poor ground
 _MISSES_TO_TRY_AGAIN = 30
 _MAX_TRIES = 8  # each costs two queries
-_MIRRORED_TO_REPORT = 2  # tries in a row that match: one may be wrong
+_MIRRORED_TO_REPORT = 2  # matching tries in a row: a single one may be wrong
 
 
 class TurnWatch:
-    """Reports once if pictures are turned against the autopilot's heading: they are then levelled along wrong axes, and
-    the heading keeps matches from being found. Either `source.up_deg` is wrong, or the compass."""
+    """Reports once if pictures are rotated against the autopilot's heading: they are then levelled about the wrong
+    axes, and the heading prevents matches. Either `source.up_deg` or the compass is wrong."""
 
     def __init__(self, notifier: Notifier, source: SourceConfig) -> None:
         self._notifier, self._up_deg, self._has_reported = notifier, source.up_deg, False
         self._turns: deque[complex] = deque(maxlen=_TURN_MATCHES)  # each of length 1
 
     def update(self, event: Recognition) -> None:
-        """Take the direction that the match of an event shows."""
+        """Process the rotation between the match of an event and the reported heading."""
         where, view_up_deg = event.located, event.view.up_deg
         if self._has_reported or where is None or where.heading_deg is None or view_up_deg is None or event.view.reason:
             return
@@ -52,17 +52,17 @@ class TurnWatch:
 
 
 class MirrorWatch:
-    """Reports once if pictures are mirrored, as by a setting of the camera: they never match. Where many queries in a
-    row have no match, and none had one before, a picture is tried flipped left to right, and top to bottom."""
+    """Reports once if pictures are mirrored, for example by a camera setting: they never match. After many queries in a
+    row without a match, and none with one before, a picture is tried flipped left to right, and top to bottom."""
 
     def __init__(self, notifier: Notifier, recogniser: Recogniser) -> None:
         self._notifier, self._recogniser = notifier, recogniser
-        self._meter = QueryMeter(recogniser.meter.board)  # its own: that of the flight may be recorded
+        self._meter = QueryMeter(recogniser.meter.board)  # its own, since the flight's meter may be recorded
         self._misses = self._tries = self._matches = 0
         self._next_try = _MISSES_TO_TRY
 
     def update(self, event: Recognition) -> None:
-        """Count a query without a match, and try its picture mirrored if it is time to."""
+        """Count a query without a match, and try its picture mirrored if enough have been counted."""
         if event.accepted:
             self._tries = _MAX_TRIES
         has_ground = event.is_query and not (event.failed or event.lacks_texture or event.view.reason)
@@ -81,9 +81,9 @@ class MirrorWatch:
             self._notifier.report("camera", Severity.WARNING, note, topic="mirror")
 
     def _matches_mirrored(self, event: Recognition, axis: int) -> bool:
-        """Search the whole map for the flipped picture, by nothing that the flight knows."""
+        """Search the whole map for the flipped picture, without using any state of the flight."""
         assert event.frame is not None
-        now, settings = self._recogniser, MatchSettings(candidates=self._recogniser.candidates)
-        alone = Recogniser(now.encoder, now.place_map, Matcher(now.index, now.rule), self._meter, settings=settings)
+        base, settings = self._recogniser, MatchSettings(candidates=self._recogniser.candidates)
+        fresh = Recogniser(base.encoder, base.place_map, Matcher(base.index, base.rule), self._meter, settings=settings)
         frame = replace(event.frame, image=np.flip(event.frame.image, axis).copy())
-        return alone.step(frame, event.vehicle).accepted
+        return fresh.step(frame, event.vehicle).accepted

@@ -1,4 +1,4 @@
-"""Watch over the companion computer itself: reports when it is hot, throttled or short of voltage, for `vitals`."""
+"""Watches the companion computer itself, for `vitals`: reports when it is hot, throttled or under-voltage."""
 
 import math
 
@@ -7,7 +7,7 @@ from edgevpr.mavlink.messages import Severity
 from edgevpr.power.thermal import ThermalState
 from edgevpr.runtime.flight.notifier import Notifier
 
-# Least time between two reports of a problem, and without the problem until it is over: under-voltage flickers.
+# Shortest time between two reports of a problem, and time without it until it counts as over: under-voltage flickers.
 _MIN_REPORT_INTERVAL_S = 30.0
 # Fields of the state that are problems, each with the notes for its start and its end.
 _NOTES = {
@@ -28,7 +28,7 @@ class CompanionWatch:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """Texts of the present problems."""
+        """Texts of the current problems."""
         return tuple(self._active.values())
 
     def take(self, now_s: float, state: ThermalState) -> None:

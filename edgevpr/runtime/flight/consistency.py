@@ -1,4 +1,4 @@
-"""The innovation gate: checks each fix against its prediction by the path. `navigator` uses it."""
+"""The innovation gate: checks each fix against its prediction from the path, for `navigator`."""
 
 import math
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.runtime.flight.measurements import PositionedMatch
 from edgevpr.runtime.recognise.locate import mahalanobis
 
-# In standard deviations: a right fix is farther than this from its prediction once in 3000 times.
+# In standard deviations: one correct fix in 3000 is farther than this from its prediction.
 _MAX_INNOVATION_SIGMA = 4.0
-# A second right fix is within this of the first seven times in eight; otherwise the one after it is.
+# A second correct fix is within this of the first seven times in eight; otherwise the next one is.
 _MAX_DISAGREEMENT_SIGMA = 2.0
 _HELD_FIX_TIMEOUT_S = 30.0  # a fix held for longer is not compared: the path may have drifted too far
 _CONFIRMATION_TIMEOUT_S = 2.5
-_DRIFT_M_S = 2.5  # of the path, that is allowed between two fixes that agree
+_DRIFT_M_S = 2.5  # path drift allowed between two fixes that agree
 _TRACKED_DRIFT_M_S = 0.5  # the same, where visual odometry has tracked the path
 _FIXES_TO_OVERRULE_TRACK = 4
 _MAX_ROUTE_INTERVAL_S = 10.0
@@ -26,9 +26,9 @@ _MAX_SPEED_M_S = 30.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedFix:
-    """The fix of a `match` and its prediction by the path, in metres east and north. `path_point_m` (2,): the point of
-    the path when the frame was taken; `offset_m` (2,): the offset of the fix from that point; `predicted_m`
-    (2,): its prediction; `covariance_m2` (2, 2): covariance of the prediction, without that of the fix."""
+    """The fix of a `match` and its prediction from the path, in metres east and north. `path_point_m` (2,): the point
+    of the path when the frame was taken; `offset_m` (2,): the offset of the fix from that point; `predicted_m` (2,):
+    the predicted offset; `covariance_m2` (2, 2): covariance of the prediction, without that of the fix."""
 
     match: PositionedMatch
     path_point_m: Doubles
@@ -58,15 +58,15 @@ class Consistency:
     """Holds a fix that contradicts its prediction until a second, independent fix agrees with it. While GPS is trusted,
     contradicting fixes are rejected.
 
-    The path drifts slowly, so only another fix can tell whether a distant fix or the path is wrong. Two right fixes
-    have the same offset from the path; two wrong ones hardly ever do. If the path is wrong by more than a drift, right
-    fixes do not agree either: then four fixes at different places are accepted, if an aircraft can have flown from each
-    to the next. Four are also needed where visual odometry has tracked the path, since repetitive ground can give the
+    The path drifts slowly, so only another fix can show whether a distant fix or the path is wrong. Two correct fixes
+    have the same offset from the path; two wrong ones hardly ever do. If the path error exceeds drift, correct fixes
+    disagree too: then four fixes at different places are accepted, if an aircraft could have flown from each to the
+    next. Four are also needed where visual odometry has tracked the path, since repetitive ground can give the
     same wrong fix twice."""
 
     def __init__(self) -> None:
         self._agreeing: list[PredictedFix] = []  # held fixes: one, and later ones that agree with it
-        self._heading_error_deg: float | None = None  # of the last accepted fix: the error of the compass
+        self._heading_error_deg: float | None = None  # compass error of the last accepted fix
         self._flyable: list[PredictedFix] = []  # held fixes at different places, along a route that can be flown
 
     def is_contradicted(self, now_s: float, is_tracked: bool) -> bool:
@@ -76,7 +76,7 @@ class Consistency:
         return bool(self._agreeing) and now_s - self._agreeing[-1].match.t_s <= timeout_s
 
     def judge(self, fix: PredictedFix, has_gps: bool, is_tracked: bool) -> GateResult:
-        """Judge a fix by its prediction. `has_gps`: the autopilot has a trusted GPS; `is_tracked`: visual odometry has
+        """Gate a fix by its prediction. `has_gps`: the autopilot has a trusted GPS; `is_tracked`: visual odometry has
         tracked the path."""
         match, innovation_m = fix.match, fix.innovation_m
         heading_agrees = match.heading_agrees_with(self._heading_error_deg)
@@ -113,14 +113,14 @@ class Consistency:
 
 
 def _compute_distance(one: PredictedFix, other: PredictedFix, drift_m_s: float) -> float:
-    """Return by how many standard deviations the innovations of two fixes differ; infinity if they are 30 s apart."""
+    """Return by how many standard deviations the innovations of two fixes differ; infinity if over 30 s apart."""
     if abs(other.match.t_s - one.match.t_s) > _HELD_FIX_TIMEOUT_S:
         return math.inf
     return mahalanobis(other.innovation_m - one.innovation_m, _sum_covariances(one, other, drift_m_s))
 
 
 def _is_flyable(one: PredictedFix, other: PredictedFix) -> bool:
-    """Return True if an aircraft can have flown from one fix to the other within ten seconds."""
+    """Return True if an aircraft could have flown from one fix to the other within ten seconds."""
     apart_s = other.match.t_s - one.match.t_s
     if not 0 < apart_s <= _MAX_ROUTE_INTERVAL_S or not other.match.heading_agrees_with(one.match.heading_error_deg):
         return False

@@ -1,4 +1,4 @@
-"""The watch over GPS: compares it with the matches. A GPS that is wrong is not used for navigation."""
+"""Compares GPS with the matches. A GPS that is wrong is not used for navigation."""
 
 import math
 
@@ -14,12 +14,12 @@ from edgevpr.runtime.flight.measurements import PositionedMatch, measure_for_gps
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.recognition import Recognition
 
-# In standard deviations of match and receiver together: right ones differ by more in one flight of 3000. Errors of map
-# and receiver last for minutes, so averaging does not reduce them. With a standard deviation of 5 m for the map, the
-# limit is 23 m for good matches and a good receiver.
+# In combined standard deviations of match and receiver: correct ones differ by more in one flight of 3000. Map and
+# receiver errors last for minutes, so averaging does not reduce them. With a standard deviation of 5 m for the map,
+# the limit is 23 m for good matches and a good receiver.
 _MAX_GPS_SIGMA = 4.0
-_MIN_GPS_ERROR_M = 15.0  # less is no danger, and may be a few bad seconds of the receiver
-# Deviation from the usual offset of matches from GPS, in which lasting errors of map and receiver cancel out.
+_MIN_GPS_ERROR_M = 15.0  # a smaller error is harmless, and may be a few bad seconds of the receiver
+# Deviation from the usual offset between matches and GPS, which cancels lasting errors of map and receiver.
 _MAX_MOVE_SIGMA = 3.5
 _MIN_MOVE_M = 7.0
 _MIN_USUAL_MATCHES = 10
@@ -28,7 +28,7 @@ _MIN_MATCHES_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones
 _MAX_MATCH_AGE_S = 30.0  # of the matches in a row
 _MIN_DOUBTS = 5  # contradicting matches, with or without agreeing ones between them
 _DOUBT_WINDOW_S = 20.0
-_MAX_DRIFT_M_S = 10.0  # so fast the offset from GPS may change, as a spoofer leads the receiver away
+_MAX_DRIFT_M_S = 10.0  # how fast the offset from GPS may change while a spoofer leads the receiver away
 _REPORT_FACTOR = 2.0  # times the distance that was last reported
 
 
@@ -36,11 +36,11 @@ class GpsWatch:
     """Compares GPS with the matches. It reports when they contradict each other, whenever the distance has doubled, and
     when they agree again. Every comparison is sent to the autopilot, and navigation does not use a GPS that is wrong.
 
-    GPS `is_wrong` after three matches in a row that contradict it, of different places and with about the same offset
-    from GPS; it is right again after three matches in a row that agree with it. A match contradicts GPS if its offset
+    GPS `is_wrong` after three matches in a row contradict it, at different places and with about the same offset from
+    GPS; it is right again after three matches in a row agree with it. A match contradicts GPS if its offset
     from GPS is large, or differs from the usual one of earlier matches. While the aircraft hovers, the same place
-    counts again if it agreed with GPS before. A jammer that comes and goes is found by five contradicting matches
-    within twenty seconds, and GPS is not right again before there are fewer. `map_sd_m` is the standard deviation of
+    counts again if it agreed with GPS before. Intermittent jamming is detected by five contradicting matches
+    within twenty seconds, and GPS stays wrong until there are fewer. `map_sd_m` is the standard deviation of
     the error that all matches share."""
 
     def __init__(self, map_sd_m: float, notifier: Notifier, autopilot: AutopilotOutput | None) -> None:
@@ -55,7 +55,7 @@ class GpsWatch:
         self.is_wrong = False
 
     def reset(self) -> None:
-        """Forget the offsets from GPS so far, since matches have other errors from now on."""
+        """Discard the offsets from GPS so far, since later matches have different errors."""
         self._against.clear()
         self._doubts.clear()
         self._usual_m, self._usual_count = np.zeros(2), 0
@@ -86,8 +86,8 @@ class GpsWatch:
             self._notifier.report("gps", severity, note, off_m=round(distance_m, 1), is_wrong=self.is_wrong)
 
     def _judge(self, match: PositionedMatch, off_m: Doubles, sd_m: float) -> None:
-        """Judge GPS anew by a match that is `off_m` (2,) metres from it. `sd_m` is the standard deviation of this
-        offset, without the error that all matches share."""
+        """Update the verdict on GPS with a match that is `off_m` (2,) metres from it. `sd_m` is the standard deviation
+        of this offset, without the error that all matches share."""
         is_far = _is_beyond(off_m, _MIN_GPS_ERROR_M, _MAX_GPS_SIGMA * math.hypot(sd_m, self._map_sd_m))
         is_usual_known = self._usual_count >= _MIN_USUAL_MATCHES
         has_moved = is_usual_known and _is_beyond(off_m - self._usual_m, _MIN_MOVE_M, _MAX_MOVE_SIGMA * sd_m)
@@ -122,8 +122,8 @@ class GpsWatch:
 
 
 def _compute_attitude_error(match: PositionedMatch) -> float:
-    """Return the tangent of the least error of the reported attitude that the picture of a match shows: by this share
-    of the height the match is off GPS."""
+    """Return the tangent of the smallest attitude error that the picture of a match shows. It shifts the match from GPS
+    by this fraction of the height."""
     error = match.attitude_error
     return max(0.0, math.hypot(*error.over_height) - error.sd) if error else 0.0
 

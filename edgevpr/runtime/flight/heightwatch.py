@@ -1,4 +1,4 @@
-"""Compares the reported height above the ground with the scale of the pictures. A wrong height makes each
+"""Compares the reported height above ground with the scale of the pictures. A wrong height makes each
 picture's footprint, the motion between two pictures and the correction of tilt wrong."""
 
 import statistics
@@ -13,8 +13,8 @@ from edgevpr.runtime.recognise.recognition import Recognition
 MIN_CONTRADICTION_RATIO = 1.25
 MIN_CORRECTION_RATIO = 1.1  # a larger error is corrected; five matches scatter by less
 MATCHES_IN_A_ROW = 5
-_GROUND_CHANGE_SHARE = 0.3  # of the height: further change, between matches, of ground that has begun to change
-MIN_HEIGHT_M = 1.0  # a height below this, as on the ground, is compared as this
+_GROUND_CHANGE_SHARE = 0.3  # of the height: how much further ground that rises or falls may change between matches
+MIN_HEIGHT_M = 1.0  # lower heights, as on the ground, are compared as if they were this
 
 
 class HeightWatch:
@@ -32,16 +32,16 @@ class HeightWatch:
 
     @property
     def ratio(self) -> float:
-        """Height by the pictures over that by the autopilot, median of the last five matches; 1.0 unless all are
-        off."""
+        """Visual height divided by the autopilot's, median of the last five matches; 1.0 unless all five deviate in the
+        same direction."""
         ratios = self._ratios
         is_off = len(ratios) == MATCHES_IN_A_ROW and _are_beyond(MIN_CORRECTION_RATIO, ratios)
         return statistics.median(ratios) if is_off else 1.0
 
     @property
     def ratio_sd(self) -> float:
-        """Relative error of that ratio: the deviation of the newest match, as over ground that has begun to fall or
-        rise, plus its further change. 0.0: no more than the scatter of matches."""
+        """Relative error of `ratio`: the deviation of the newest match, for example where the ground begins to fall or
+        rise, plus its further change. 0.0: within the scatter of matches."""
         change = self._ratios[-1] / self.ratio if self._heights_m else 1.0
         return (
             0.0
@@ -71,12 +71,12 @@ class HeightWatch:
         ratios = self._ratios
         if len(ratios) < MATCHES_IN_A_ROW:
             return
-        was_so = self.by_pictures_m is not None
+        was_contradicted = self.by_pictures_m is not None
         if all(1 / MIN_CONTRADICTION_RATIO <= ratio <= MIN_CONTRADICTION_RATIO for ratio in ratios):
             self.by_pictures_m = self.by_autopilot_m = None
-        elif was_so or _are_beyond(MIN_CONTRADICTION_RATIO, ratios):
+        elif was_contradicted or _are_beyond(MIN_CONTRADICTION_RATIO, ratios):
             self.by_pictures_m, self.by_autopilot_m = map(statistics.median, zip(*self._heights_m, strict=True))
-        if was_so != (self.by_pictures_m is not None):
+        if was_contradicted != (self.by_pictures_m is not None):
             self._report()
 
     def _report(self) -> None:

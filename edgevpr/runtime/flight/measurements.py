@@ -1,5 +1,5 @@
-"""Measurements of the aircraft's position by a frame and its match, with their errors: the one place for errors of
-attitude and time. `navigator`, `survey` and the watch over GPS use it."""
+"""Measurements of the aircraft's position from a frame and its match, with their errors. Attitude and time errors are
+modelled only here. `navigator`, `survey` and `gpswatch` use it."""
 
 import math
 from dataclasses import dataclass
@@ -16,24 +16,24 @@ from edgevpr.runtime.recognise.perspective import AttitudeError
 from edgevpr.runtime.recognise.recognition import Recognition
 
 # Standard deviation of a reported attitude, as a tangent: half a degree, which a filter averages over many frames. The
-# watch over GPS allows for twice as much: its false alarm costs an aircraft its GPS, and successive matches share the
-# error of one turn.
+# GPS watch allows twice as much: a false alarm costs the aircraft its GPS, and successive matches in one turn share
+# their error.
 ATTITUDE_SD = math.tan(math.radians(0.5))
 CAUTIOUS_ATTITUDE_SD = math.tan(math.radians(1.0))
 RECEIVER_LAG_SD_S = 0.1  # standard deviation of a receiver's lag, whose mean is `receivers.RECEIVER_LAG_S`
 _UNKNOWN_ATTITUDE_SD = math.tan(math.radians(15.0))  # without a reported attitude: a turning aircraft banks
-_UNKNOWN_SPEED_M_S = 15.0  # of an aircraft that reports none
-_MAX_HEIGHT_RATIO = 2.0  # beyond it, odometry is not scaled but left out
-_CORRELATION_LENGTH_SHARE = 0.25  # of the footprint: nearer fixes share errors, by changes of the ground
-_MAX_HEADING_CHANGE_DEG = 45.0  # most by which the error of a compass changes between two fixes
+_UNKNOWN_SPEED_M_S = 15.0  # assumed if the aircraft reports none
+_MAX_HEIGHT_RATIO = 2.0  # beyond it, odometry is discarded instead of scaled
+_CORRELATION_LENGTH_SHARE = 0.25  # of the footprint: closer fixes share errors due to changed ground
+_MAX_HEADING_CHANGE_DEG = 45.0  # largest change of the compass error between two fixes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameMeasurement:
-    """A frame taken at `t_s`. `sd_m`: standard deviation of its position, of each axis, without the error that an
-    error of the attitude causes by `attitude_gain_s2` (see `DriftFilter`). `odometry`: motion since the previous frame
+    """A frame taken at `t_s`. `sd_m`: standard deviation of its position on each axis, without the error that an
+    attitude error causes through `attitude_gain_s2` (see `DriftFilter`). `odometry`: motion since the previous frame
     (None: unknown); `scale_sd`: relative error of its scale, where heights contradict each other.
-    `correlation_length_m`: distance from which on the fixes of two frames have independent errors."""
+    `correlation_length_m`: distance beyond which the fixes of two frames have independent errors."""
 
     t_s: float
     sd_m: float
@@ -45,10 +45,10 @@ class FrameMeasurement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PositionedMatch:
-    """An accepted match with a position: its `frame`; `position` of the aircraft then; `accuracy_m`, to be sent with
-    it; `covariance_m2` (2, 2), without the error that all fixes share and that of the frame; numbers of the `places` it
-    comes from; the `attitude_error` that its picture shows (None: unknown); and `heading_error_deg`, the heading that
-    it shows minus the autopilot's (None: unknown)."""
+    """An accepted match with a position. `frame`: its frame; `position`: the aircraft's position at that time;
+    `accuracy_m`: the accuracy to send; `covariance_m2` (2, 2): without the error that all fixes share and the frame's;
+    `places`: numbers of the matched places; `attitude_error`: measured in the picture (None: unknown);
+    `heading_error_deg`: the heading measured in the picture minus the autopilot's (None: unknown)."""
 
     frame: FrameMeasurement
     position: Position
@@ -73,7 +73,7 @@ class PositionedMatch:
         return set(self.places).isdisjoint(other.places)
 
     def heading_agrees_with(self, heading_error_deg: float | None) -> bool:
-        """Return True if the compass errs by about `heading_error_deg` here too, or if one of both is unknown."""
+        """Return True if the compass error is about `heading_error_deg` here too, or if either is unknown."""
         if self.heading_error_deg is None or heading_error_deg is None:
             return True
         return abs(wrap_deg(self.heading_error_deg - heading_error_deg)) <= _MAX_HEADING_CHANGE_DEG
@@ -82,11 +82,11 @@ class PositionedMatch:
 def measure_frame(
     event: Recognition, vehicle: Vehicle | None, *, is_level: bool, height_ratio: float, height_ratio_sd: float
 ) -> FrameMeasurement | None:
-    """Return the measurement of an event's frame; None if the frame could not be read. `is_level`: the camera hangs in
-    a gimbal; `height_ratio`: height by the pictures over the reported one, with the relative error `height_ratio_sd`.
+    """Return the measurement of an event's frame; None if the frame could not be read. `is_level`: the camera is
+    on a gimbal; `height_ratio`: visual height divided by the reported one, with the relative error `height_ratio_sd`.
 
-    An error of the attitude does not matter to a camera in a gimbal, nor where no attitude was used for the picture. An
-    error of the time shifts the nadir by the aircraft's motion and by its rolling.
+    An attitude error does not affect a camera on a gimbal, nor a picture for which no attitude was used. A time error
+    shifts the nadir by the aircraft's motion and roll.
     """
     if event.frame is None:
         return None
@@ -109,7 +109,7 @@ def measure_frame(
 
 
 def measure_for_gps(event: Recognition, vehicle: Vehicle) -> PositionedMatch | None:
-    """Return the match of an event, with errors as for a comparison with a GPS receiver; None if there is none."""
+    """Return the match of an event, with the errors of a comparison with a GPS receiver; None if there is none."""
     if event.frame is None:
         return None
     t_sd_s = math.hypot(RECEIVER_LAG_SD_S, event.frame.t_sd_s)
@@ -120,14 +120,14 @@ def measure_for_gps(event: Recognition, vehicle: Vehicle) -> PositionedMatch | N
 def picture_error_m(
     vehicle: Vehicle, height_m: float, t_sd_s: float, attitude_sd: float = ATTITUDE_SD, sweep_m_s: float = 0.0
 ) -> float:
-    """Return the standard deviation (metres, of one axis) of a position by a picture. `t_sd_s` is that of its time,
+    """Return the standard deviation (metres, of one axis) of a position from a picture. `t_sd_s` is that of its time,
     `sweep_m_s` the speed at which rolling sweeps the camera over the ground."""
     speed_m_s = math.hypot(sweep_m_s, *(vehicle.velocity_m_s or (0.0, 0.0)))
     return math.hypot(attitude_sd * height_m, t_sd_s * speed_m_s)
 
 
 def shared_time_error_m(event: Recognition, vehicle: Vehicle | None) -> float:
-    """Return the standard deviation (metres) of the position error that frames share if their times are known worse
+    """Return the standard deviation (metres) of the position error that frames share if their times are less accurate
     than usual. It has one direction, so averaging over frames does not reduce it."""
     t_sd_s = event.frame.t_sd_s if event.frame else 0.0
     velocity_m_s = vehicle and vehicle.velocity_m_s
