@@ -4,8 +4,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-# Pictures further apart share too little ground for the visual odometry of an aeroplane. Between such queries other
-# pictures are taken: 100 m high, at 20 m/s, they share more than half of the ground.
+# Pictures further apart overlap too little for visual odometry on an aeroplane. Additional pictures are taken between
+# such queries: at a height of 100 m and 20 m/s, they share more than half of the ground.
 _MAX_QUERY_INTERVAL_S = 4.0
 _ODOMETRY_INTERVAL_S = 2.0
 
@@ -13,7 +13,7 @@ _ODOMETRY_INTERVAL_S = 2.0
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
     """Clocks, in seconds. The monotonic `mono_s` stamps frames and messages; `wall_s` times the steps of a query;
-    `utc_s` counts from 1970. CPU times are those of this process, and of the calling thread."""
+    `utc_s` counts from 1970. CPU times are of this process and of the calling thread."""
 
     mono_s: Callable[[], float] = time.monotonic
     wall_s: Callable[[], float] = time.perf_counter
@@ -24,8 +24,8 @@ class Clock:
 
 
 class Pace:
-    """Decides when to take the next frame: `rate_hz` a second, or by the steps of a recording; never more after a
-    delay."""
+    """Decides when to take the next frame: `rate_hz` per second, or at the intervals of a recording. After a delay it
+    does not catch up."""
 
     def __init__(self, rate_hz: float, clock: Clock) -> None:
         self._clock = clock
@@ -34,18 +34,18 @@ class Pace:
         self._odometry_due_s = self._due_s
 
     def wait_s(self) -> float:
-        """Return the seconds until the next frame is due; 0 or less: it is due."""
+        """Return the seconds until the next frame is due; 0 or less if it is due now."""
         return self._due_s - self._clock.mono_s()
 
     def record_frame(self, step_s: float | None = None) -> None:
-        """Record that a frame was taken. The next is due after `step_s` (None: by the rate), or later by as much as
-        the rate has been lowered."""
+        """Record that a frame was taken. The next is due after `step_s` (None: by the rate), or later in proportion to
+        how far the rate has been lowered."""
         wait_s = 1 / self.rate_hz if step_s is None else step_s * self._requested_hz / self.rate_hz
         self._due_s = max(self._due_s + wait_s, self._clock.mono_s())
         self._odometry_due_s = self._clock.mono_s() + _ODOMETRY_INTERVAL_S
 
     def is_odometry_due(self) -> bool:
-        """Return True, once, if a frame for visual odometry is due between two queries that are far apart."""
+        """Return True, once, if a visual-odometry frame is due between two queries that are far apart."""
         now_s = self._clock.mono_s()
         is_early = now_s < self._odometry_due_s or self._due_s - now_s < _ODOMETRY_INTERVAL_S / 2
         if is_early or self.rate_hz * _MAX_QUERY_INTERVAL_S > 1:

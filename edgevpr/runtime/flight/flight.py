@@ -287,7 +287,7 @@ class Flight:
 
 
 def _open_log(io: FlightIO) -> FlightLog:
-    log, clock, is_service = io.log, io.clock, systemd.is_there()
+    log, clock, is_service = io.log, io.clock, systemd.is_service()
     return FlightLog(log.path, clock.mono_s, clock.utc_s, wait=is_service, max_mb=log.max_mb)
 
 

@@ -159,7 +159,7 @@ def _open_optional(opened: Callable[[], T]) -> T | None:
     try:
         return opened()
     except EdgevprError as error:
-        if not systemd.is_there():
+        if not systemd.is_service():
             raise
         _log.warning("%s", error)
         return None

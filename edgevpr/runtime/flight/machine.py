@@ -1,4 +1,4 @@
-"""The computer of a flight: its heat, load and memory, and whether its disk takes the flight log."""
+"""The computer of a flight: its temperature, load and memory, and whether the flight log can be written."""
 
 from edgevpr.power.boards import Board
 from edgevpr.power.machine import read_rss_mb
@@ -8,13 +8,13 @@ from edgevpr.runtime.flight.flightlog import FlightLog
 
 
 class Machine:
-    """Measures the computer. `watch` reads the sensors (None: its own, with the limit of the `board`)."""
+    """Measures the computer. `watch` reads the sensors (None: a new one with the limit of the `board`)."""
 
     def __init__(self, board: Board, watch: ThermalWatch | None = None) -> None:
         self._watch = watch or ThermalWatch(hot_c=board.thermal_limit_c)
 
     def limit_c(self) -> float:
-        """Return the temperature at which this computer slows itself down, degrees Celsius."""
+        """Return the temperature at which this computer throttles itself, degrees Celsius."""
         return read_limit_c()
 
     def measure_heat(self) -> ThermalState:
@@ -26,9 +26,9 @@ class Machine:
         return measure_machine_load()
 
     def rss_mb(self) -> float:
-        """Return the memory that this process takes, MB."""
+        """Return the memory that this process uses, MB."""
         return read_rss_mb()
 
     def is_written(self, flight_log: FlightLog) -> bool:
-        """Return True if the disk took the last line of a flight log."""
+        """Return True if the last line of a flight log was written."""
         return flight_log.state is None

@@ -1,4 +1,4 @@
-"""What a flight takes from its board: charge, CPU time, memory, heat."""
+"""What a flight uses of its board: charge, CPU time, memory, heat."""
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadReading:
-    """One measurement for the governor. `cpu_share` (0..1): of all cores, by this process since the last measurement.
-    `late_share` (0..1): of that time, by queries, if other programs or the disk kept them waiting, else 0. `rss_mb`: of
-    this process; the rest is of the board (None: unknown)."""
+    """One measurement for the governor. `cpu_share` (0..1): share of all cores used by this process since the last
+    measurement. `late_share` (0..1): share of that time spent on queries if other programs or the disk delayed them,
+    else 0. `rss_mb`: memory of this process. The rest describes the board (None: unknown)."""
 
     cpu_share: float
     late_share: float
@@ -26,9 +26,9 @@ class LoadReading:
 
 
 class FlightMeter:
-    """Meter of a flight, from when it is made. `energy` sums up the costs of queries, `load` the time for which the
-    loop is busy. `thermal` is the newest measurement of heat and supply, `limit_c` the temperature at which the board
-    slows itself down. `machine` measures (None: this one)."""
+    """Meter of a flight, starting when it is created. `energy` sums the costs of queries, `load` the busy time of the
+    loop. `thermal` is the newest measurement of temperature and supply, `limit_c` the temperature at which the board
+    throttles itself. `machine` is the computer to measure (None: this one)."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class FlightMeter:
         self.queries_throttled = 0
 
     def measure_cost(self, thread_only: bool = False) -> AbstractContextManager[Stage]:
-        """Return a context manager that measures time and CPU time: of all threads or, with `thread_only`, of this
+        """Return a context manager that measures wall time and CPU time: of all threads or, with `thread_only`, of this
         one."""
         return meter_stage(self._clock.mono_s, self._clock.thread_cpu_s if thread_only else self._clock.process_cpu_s)
 
@@ -57,10 +57,10 @@ class FlightMeter:
         self.queries_throttled += event.is_query and bool(self.thermal.throttled)
 
     def totals(self) -> dict[str, float]:
-        """Return the totals since the start: charge drawn by idle board and this process (`used_mah`), the part of this
-        process (`process_mah`, `process_cpu_s`), and of it that of queries: reading, recognising, reporting
-        (`marginal_mah`, `stages_cpu_s`); `queries_throttled`, the number of those while the board slowed itself
-        down."""
+        """Return the totals since the start: charge drawn by the idle board and this process (`used_mah`); this
+        process alone (`process_mah`, `process_cpu_s`); its part for queries, which is reading, recognition and
+        reporting (`marginal_mah`, `stages_cpu_s`); and `queries_throttled`, the queries made while the board was
+        throttled."""
         process, board = self.energy.measure_process(), self._board
         process_j = marginal_energy_j(board.idle_w, board.full_w, process.utilisation(board.cores), process.wall_s)
         return {
@@ -74,7 +74,7 @@ class FlightMeter:
         }
 
     def measure_heat(self) -> None:
-        """Measure the heat of the board. Call it about once a second."""
+        """Measure the temperature and supply of the board. Call it about once a second."""
         self.thermal = self._machine.measure_heat()
 
     def machine_load(self) -> MachineLoad:
@@ -82,11 +82,11 @@ class FlightMeter:
         return self._machine.measure_load()
 
     def rss_mb(self) -> float:
-        """Return the memory that this process takes, MB."""
+        """Return the memory that this process uses, MB."""
         return self._machine.rss_mb()
 
     def reading(self) -> LoadReading:
-        """Return a measurement for the governor: the load since the last one, and the present memory and heat."""
+        """Return a measurement for the governor: load since the last one, and current memory and temperature."""
         cpu_share, late_share = self.load.measure()
         return LoadReading(
             cpu_share=cpu_share,

@@ -1,4 +1,4 @@
-"""Estimates the position of the aircraft at any moment, by its `path` and the filter of the path's errors (`drift`)."""
+"""Estimates the aircraft's position at any moment, from its `path` and the filter of the path's errors (`drift`)."""
 
 import math
 from dataclasses import dataclass
@@ -18,21 +18,21 @@ from edgevpr.runtime.recognise.locate import mahalanobis
 
 _GPS_INTERVAL_S = 1.0
 _MAX_GPS_AGE_S = 0.7  # receivers report five times a second; without new reports the autopilot dead-reckons
-# Errors of GPS are correlated from one second to the next, so its standard deviation is multiplied by this.
+# GPS errors are correlated from one second to the next, so the standard deviation is multiplied by this.
 _GPS_CORRELATION_FACTOR = 2.0
 _GPS_VELOCITY_SD_M_S = 0.3
 _UNKNOWN_POSITION_SD_M = 1e4
 _UNKNOWN_VELOCITY_SD_M_S = 10.0  # while only a fix is known
 _MAX_TRACKING_GAP_S = 4.0  # since the last odometry step, and between two queries
-_MAX_REPETITION_FACTOR = 16.0  # fixes of the same ground that count as one
-# Between matches the ground may rise or fall, which scales odometry wrongly. The zooms between neighbouring pictures
-# add up to that change. An error of the attitude of two degrees adds up to a zoom of 0.1 over 300 m at a height of
-# 100 m, so less proves nothing. After a gap the change is unknown: 0.3 is a valley of 30 m below a height of 100 m.
+_MAX_REPETITION_FACTOR = 16.0  # fixes over the same ground that count as one
+# Between matches the ground may rise or fall, which makes the scale of odometry wrong. The zooms between successive
+# pictures add up to that change. An attitude error of two degrees adds up to a zoom of 0.1 over 300 m at a height of
+# 100 m, so a smaller zoom proves nothing. After a gap the change is unknown: 0.3 is a valley 30 m deep below 100 m.
 _ZOOM_DEAD_BAND = 0.1
 _MAX_ODOMETRY_GAP_S = 5.0
 _SCALE_SD_AFTER_GAP = 0.3
 _MAX_RECEIVER_SIGMA = 5.0  # a receiver that is farther from our position is not used to correct it
-# A steady receiver that contradicts our position for so long is right, unless a match of the last seconds proves ours.
+# A steady receiver that contradicts our position for this long is right, unless a recent match proves ours.
 _GPS_OVERRULES_S = 2.0
 _MIN_STEADY_S = 1.0
 
@@ -40,7 +40,7 @@ _MIN_STEADY_S = 1.0
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NavState:
     """Position and velocity (m/s, east and north) of the aircraft at `t_s`. The accuracies (metres, m/s) are standard
-    deviations along the direction in which they are largest."""
+    deviations along the worst direction."""
 
     t_s: float
     position: Position
@@ -54,9 +54,9 @@ class Navigation:
     the autopilot's velocities (`DEAD_RECKONING`) or from accelerations (`INERTIAL`, `INERTIAL_PX4`). `map_sd_m` is the
     standard deviation, of one axis, of the error that all fixes share.
 
-    Accelerations are used beside a continuous channel, where the autopilot's estimate may come from our positions: GPS
-    is then what the receiver itself reports. `has_gps`: there is a trusted GPS. `is_in_doubt`: a GPS contradicts our
-    position, and no recent match proves ours."""
+    Accelerations are used with a continuous channel, where the autopilot's estimate may come from our positions: GPS
+    is then the position that the receiver itself reports. `has_gps`: there is a trusted GPS. `is_in_doubt`: a GPS
+    contradicts our position, and no recent match proves ours."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
@@ -72,7 +72,7 @@ class Navigation:
 
     @property
     def last_fix_s(self) -> float:
-        """Time of the last match that was accepted as a fix; -inf if there was none."""
+        """Time of the last match accepted as a fix; -inf if there was none."""
         return self._last_fix_s
 
     @property
@@ -87,17 +87,17 @@ class Navigation:
 
     @property
     def path_velocity_m_s(self) -> Doubles | None:
-        """Velocity (2,) of the path now, not corrected by any match; None if it is not known."""
+        """Current velocity (2,) of the path, not corrected by any match; None if unknown."""
         return self._valid_path.now.velocity_m_s if self._valid_path else None
 
     def is_tracked(self, t_s: float) -> bool:
-        """Return True if visual odometry tracks the path, without contradiction, and queries are so frequent that
-        several could soon show that the path is wrong."""
+        """Return True if visual odometry tracks the path without contradiction, and queries are frequent enough that
+        several would soon show an error of the path."""
         return max(t_s - self._last_odometry_s, self._query_interval_s) <= _MAX_TRACKING_GAP_S
 
     def add_report(self, vehicle: Vehicle, trusts_gps: bool = True, is_estimate_ours: bool = False) -> None:
-        """Process a report of the autopilot; one without velocity is ignored. With GPS, if `trusts_gps`, our position
-        is corrected by the autopilot's or, for a path of accelerations, by the receiver's. `is_estimate_ours`: the
+        """Process a report from the autopilot; reports without velocity are ignored. With GPS, if `trusts_gps`, our
+        position is corrected by the autopilot's or, for an inertial path, by the receiver's. `is_estimate_ours`: the
         autopilot may have derived the reported position from ours."""
         if vehicle.velocity_m_s is None:
             return
@@ -128,7 +128,7 @@ class Navigation:
             self._filter.correct_by_gps(offset_m, sd_m, velocity_m_s - point.velocity_m_s, _GPS_VELOCITY_SD_M_S)
 
     def _correct_by_receiver(self, vehicle: Vehicle, receiver: Receiver | None, is_estimate_ours: bool) -> None:
-        """Correct the path of accelerations by a receiver (None: there is no trusted GPS)."""
+        """Correct an inertial path by a receiver (None: there is no trusted GPS)."""
         path, had_gps = self._valid_path, self.has_gps
         if path is None:
             self.has_gps = receiver is not None and self._start_at_receiver(receiver, vehicle.t_received_s)
@@ -153,7 +153,7 @@ class Navigation:
             self._filter.correct_by_gps(offset_m, sd_m, error_m_s, sd_m_s, age_s)
 
     def _handle_contradiction(self, receiver: Receiver, now_s: float) -> None:
-        """Process a receiver that contradicts our position: if it lasts and no match proves ours, start there anew."""
+        """Process a receiver that contradicts our position: if it persists and no match proves ours, restart there."""
         self.has_gps, self.is_in_doubt = False, now_s - self._last_fix_s > MATCH_PROOF_S
         if self._contradicted_since_s is None:
             self._contradicted_since_s = now_s
@@ -174,7 +174,7 @@ class Navigation:
         speed_m_s = float(np.hypot(*point.velocity_m_s))
         sd_m = math.hypot(_GPS_CORRELATION_FACTOR * receiver.sd_m, RECEIVER_LAG_SD_S * speed_m_s)
         error_m_s = None if receiver.velocity_m_s is None else np.array(receiver.velocity_m_s) - point.velocity_m_s
-        # In a turn an error of the receiver's lag changes its velocity, which would look like an error of the attitude.
+        # In a turn, an error in the receiver's lag changes its velocity, which would look like an attitude error.
         sd_m_s = math.hypot(_GPS_VELOCITY_SD_M_S, *(point.velocity_m_s - before.velocity_m_s))
         return offset_m, sd_m, error_m_s, sd_m_s, path.now.t_s - measured_s
 
@@ -184,7 +184,7 @@ class Navigation:
             self._start(position, vehicle.position_sd_m, velocity_m_s, vehicle.t_received_s, self._drift.velocity_sd)
 
     def _start_at_receiver(self, receiver: Receiver, now_s: float) -> bool:
-        """Start the path at a receiver's position, if that is steady; return True if it was started."""
+        """Start the path at a receiver's position if it is steady; return True if the path was started."""
         if receiver.steady_for_s < _MIN_STEADY_S:
             return False
         velocity_m_s, velocity_sd_m_s = np.zeros(2), _UNKNOWN_VELOCITY_SD_M_S
@@ -205,8 +205,8 @@ class Navigation:
             self._filter.predict(path.add_acceleration(t_s, acceleration_m_s2))
 
     def add_frame(self, frame: FrameMeasurement, is_query: bool = True, heading_error_deg: float | None = None) -> None:
-        """Process a frame, whether it was recognised or not; one that is no query only gives odometry.
-        `heading_error_deg` is that of its match (see `PositionedMatch`)."""
+        """Process a frame, whether it was recognised or not; one that is not a query only provides odometry.
+        `heading_error_deg`: heading error of its match (see `PositionedMatch`)."""
         if is_query:
             self._query_interval_s, self._last_query_s = frame.t_s - self._last_query_s, frame.t_s
         path, before = self._valid_path, self._frame_point
@@ -225,7 +225,7 @@ class Navigation:
             self._last_odometry_s = frame.t_s
 
     def predict_fix(self, match: PositionedMatch) -> PredictedFix | None:
-        """Predict the fix of a match, of the last frame added or a new one; None if the path is unknown at its time."""
+        """Predict the fix of a match in the last frame added or a new one; None if the path is unknown at that time."""
         if self._frame_point is None or self._frame_point.t_s != match.t_s:
             self.add_frame(match.frame, heading_error_deg=match.heading_error_deg)
         path, point = self._valid_path, self._frame_point
@@ -239,7 +239,7 @@ class Navigation:
         )
 
     def correct_by_fix(self, fix: PredictedFix, verdict: GateResult = ACCEPTED) -> None:
-        """Correct our position by a fix that `Consistency` has accepted by this verdict."""
+        """Correct our position by a fix that `Consistency` has accepted with this verdict."""
         match = fix.match
         if self._path and verdict.restarts_path and self._drift.is_inertial:
             self.start_at_fix(match.position, worst_sd(match.scatter_m2), match.t_s, self._path.now.t_s)
@@ -252,8 +252,8 @@ class Navigation:
             self._odometry_since_fix = _OdometrySinceFix(self._last_fix_s)
 
     def _repetition_factor(self, fix: PredictedFix) -> float:
-        """Return the factor of the covariance of a fix: the nearer it is to the last fix, the more of its error is
-        repeated. It is 1 without odometry, since nothing else carries the last fix on."""
+        """Return the factor for the covariance of a fix: the closer it is to the last fix, the more of its error is
+        repeated. It is 1 without odometry, since only odometry propagates the last fix."""
         fix_m, last_fix_m = fix.path_point_m + fix.offset_m, self._last_fix_m
         self._last_fix_m = fix_m
         length_m = fix.match.frame.correlation_length_m
@@ -264,14 +264,14 @@ class Navigation:
 
     def start_at_fix(self, position: Position, sd_m: float, t_s: float, now_s: float) -> None:
         """Start the path at `now_s`, when neither position nor velocity is known, at the `position` of a fix whose
-        frame was taken at `t_s`; `sd_m` is its standard deviation. A path of velocities starts with a report only."""
+        frame was taken at `t_s`; `sd_m` is its standard deviation. Only an inertial path can start at a fix."""
         if self._drift.is_inertial:
             sd_m = math.hypot(sd_m, _UNKNOWN_VELOCITY_SD_M_S * (now_s - t_s))
             self._start(position, sd_m, np.zeros(2), now_s, _UNKNOWN_VELOCITY_SD_M_S)
             self._last_fix_s = t_s
 
     def estimate_state(self, t_s: float) -> NavState | None:
-        """Return position and velocity at `t_s`, now or in the last seconds; None if they are not known."""
+        """Return position and velocity at `t_s`, now or in the last seconds; None if unknown."""
         path = self._valid_path
         point = path.interpolate(t_s) if path else None
         if path is None or point is None:
@@ -304,27 +304,27 @@ class Navigation:
 
 
 class _OdometrySinceFix:
-    """Visual odometry since the last fix or GPS, at `last_fix_s`: its displacement, and the change of its scale."""
+    """Visual odometry since the last fix or GPS position, at `last_fix_s`: its displacement and change of scale."""
 
     def __init__(self, last_fix_s: float = -math.inf) -> None:
         self._moved_m, self._zoom, self._last_s = np.zeros(2), 0.0, last_fix_s
         self._has_gap, self._scale_sd = False, 0.0
 
     def add(self, moved_m: Doubles, zoom: float, frame: FrameMeasurement) -> None:
-        """Add the odometry to a frame: `moved_m` (2,) metres since the one before."""
+        """Add the odometry of a frame: `moved_m` (2,) metres since the previous frame."""
         self._has_gap |= frame.t_s - self._last_s > _MAX_ODOMETRY_GAP_S
         self._scale_sd = max(self._scale_sd, frame.scale_sd)
         self._moved_m, self._zoom, self._last_s = self._moved_m + moved_m, self._zoom + zoom, frame.t_s
 
     @property
     def error_m(self) -> float:
-        """Standard deviation, of one axis, of the error by a changed height of the ground, metres."""
+        """Standard deviation, of one axis, of the error due to changed terrain height, metres."""
         gap_sd = _SCALE_SD_AFTER_GAP if self._has_gap else 0.0
-        # The error of the height by the last match, and the change since.
+        # Height error at the last match, and the change since.
         scale_sd = self._scale_sd + max(gap_sd, abs(self._zoom) - _ZOOM_DEAD_BAND, 0.0)
         return float(np.hypot(*self._moved_m)) * scale_sd
 
 
 def is_gps_aided(vehicle: Vehicle) -> bool:
-    """Return True if the autopilot's position rests on GPS: a receiver has a fix near it, at most 0.7 s old."""
+    """Return True if the autopilot's position is based on GPS: a receiver has a fix near it, at most 0.7 s old."""
     return vehicle.has_gps and vehicle.gps is not None and vehicle.t_received_s - vehicle.gps.t_s <= _MAX_GPS_AGE_S

@@ -14,7 +14,7 @@ _COMMAND_CODES = {
     UserCommand.PAUSE: ReasonCode.PAUSED_BY_COMMAND,
     UserCommand.RESUME: ReasonCode.RESUMED_BY_COMMAND,
 }
-_MAX_GCS_BYTES = MAX_TEXT_BYTES - len("edgevpr: ")  # of a text for the ground station
+_MAX_GCS_BYTES = MAX_TEXT_BYTES - len("edgevpr: ")  # length limit of a text for the ground station
 
 _log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ class Notifier:
 
     def announce(self, severity: Severity, text: str, *, ground: str | None = None, topic: str | None = None) -> None:
         """Write a text to the journal, and queue it for the ground station (the shorter text `ground` instead, if
-        given). A text that still waits is replaced by a newer one of the same `topic`."""
+        given). A queued text is replaced by a newer one of the same `topic`."""
         _log.log(logging.INFO if severity is Severity.INFO else logging.WARNING, "%s", text)
         if self._link:
             self._link.announce(severity, ground or text, topic)
@@ -46,9 +46,9 @@ class Notifier:
         topic: str | None = None,
         **fields: Any,
     ) -> None:
-        """Report to flight log, journal and ground station: write a line of `kind` with the `note` and `fields` to the
-        flight log, and announce the note to the other two; to the ground station its summary if its sentence is too
-        long, or the text `ground`. Without a `topic`, the kind is the topic of the text."""
+        """Report to flight log, journal and ground station: write a line of `kind` with `note` and `fields` to the
+        flight log, and announce the note to the other two. The ground station gets the text `ground` or, if the
+        note's sentence is too long, its summary. `topic` defaults to the kind."""
         self.log(kind, note=note, **fields)
         text = str(note)
         ground = ground or (note.code.summary if len(text.encode()) > _MAX_GCS_BYTES else None)
@@ -56,7 +56,7 @@ class Notifier:
 
 
 class Alert:
-    """Reports a bad condition once when it begins (`onset`), and once when it ends (`cleared`). `kind` is that of its
+    """Reports a bad condition once when it begins (`onset`), and once when it ends (`cleared`). `kind`: kind of its
     lines in the flight log."""
 
     def __init__(self, notifier: Notifier, kind: str, onset: Reason, cleared: ReasonCode) -> None:
@@ -85,7 +85,7 @@ class Commands:
         return "paused" if self.is_paused else None
 
     def obey(self) -> None:
-        """Carry out the request received since the last call, and let the link accept requests from now on."""
+        """Carry out the request received since the last call, then let the link accept new requests."""
         if self._link is None:
             return
         if request := self._link.take_command():

@@ -1,4 +1,4 @@
-"""What a continuous channel sends, and the watch that withdraws it: an autopilot that flies by our positions follows
+"""What a continuous channel sends, and the watch that stops it: an autopilot that flies by our positions follows
 their errors."""
 
 import math
@@ -9,18 +9,18 @@ from edgevpr.core.types import Vehicle
 from edgevpr.mavlink.messages import Severity
 from edgevpr.mavlink.receivers import extrapolate
 
-MATCH_PROOF_S = 5.0  # a match of the last seconds proves our position
-_MAX_INNOVATION_RATIO = 1.0  # to the gate of the autopilot's filter
+MATCH_PROOF_S = 5.0  # a match within this time proves our position
+_MAX_INNOVATION_RATIO = 1.0  # innovation over the gate of the autopilot's filter
 _MIN_REFUSED_S = 3.0
-_MAX_ESTIMATE_ERROR_M = 15.0  # of the autopilot's estimate from a good receiver, and no less
+_MAX_ESTIMATE_ERROR_M = 15.0  # distance between the autopilot's estimate and a good receiver; at least this
 _MAX_ESTIMATE_ERROR_SD = 4.0
 _MIN_LED_AWAY_S = 2.0
 _MIN_STEADY_S = 3.0
-INFLUENCE_S = 10.0  # so long our last position may affect the estimate of an autopilot that has GPS
+INFLUENCE_S = 10.0  # how long our last position may affect the estimate of an autopilot that has GPS
 
 
 class Output(Enum):
-    """What is sent, with its severity and the text for the ground station, of 41 bytes at most."""
+    """What is sent, with the severity and the text (41 bytes at most) for the ground station."""
 
     STARTING = Severity.INFO, "position not known yet"
     SENDING = Severity.WARNING, "no GPS: positions are sent"
@@ -47,7 +47,7 @@ class Output(Enum):
 
 
 class OutputWatch:
-    """Withdraws our positions if the autopilot's filter refuses them, or if its estimate leaves a good receiver while
+    """Stops our positions if the autopilot's filter rejects them, or if its estimate departs from a good receiver while
     they are sent, until a match or GPS proves them. `withdrawn` is the reason (None: positions may be sent)."""
 
     def __init__(self) -> None:
@@ -61,8 +61,8 @@ class OutputWatch:
         self._sent_s = t_s
 
     def update(self, vehicle: Vehicle, match_s: float, has_gps: bool) -> None:
-        """Process a report of the autopilot. `match_s` is the time of the last match that was believed; `has_gps`: a
-        receiver is believed."""
+        """Process a report from the autopilot. `match_s`: time of the last accepted fix; `has_gps`: there is a trusted
+        receiver."""
         now_s = vehicle.t_received_s
         is_led_away = has_gps and _is_off_receiver(vehicle) and now_s - self._sent_s <= INFLUENCE_S
         is_over_gate = (vehicle.innovation_ratio or 0.0) > _MAX_INNOVATION_RATIO
@@ -79,7 +79,7 @@ class OutputWatch:
 
 
 def _is_off_receiver(vehicle: Vehicle) -> bool:
-    """Tell whether the autopilot's estimate is farther from a steady receiver than both allow."""
+    """Return True if the autopilot's estimate is farther from a steady receiver than the accuracy of both allows."""
     receiver = vehicle.gps
     if receiver is None or receiver.steady_for_s < _MIN_STEADY_S:
         return False

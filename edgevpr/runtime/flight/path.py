@@ -1,6 +1,5 @@
-"""The path of an aircraft: its velocities or accelerations summed up from a known position. It never jumps, so that
-offsets from it can be compared at any two times; the position that an autopilot reports jumps whenever it is
-corrected."""
+"""The path of an aircraft: its velocities or accelerations integrated from a known position. It never jumps, so
+offsets from it can be compared at any two times; the position that an autopilot reports jumps at each correction."""
 
 import math
 from bisect import bisect_left
@@ -13,7 +12,7 @@ from edgevpr.core.geodesy import offset_m
 from edgevpr.core.types import Position
 
 HISTORY_S = 6.0  # a frame is at most 5 s old when it is recognised
-_MAX_STEP_S = 1.0  # after a longer gap in the reports the path is not known
+_MAX_STEP_S = 1.0  # after a longer gap in the reports the path is unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +44,7 @@ class Path:
 
     def add_velocity(self, t_s: float, velocity_m_s: Doubles) -> float:
         """Add a point at `t_s` with this velocity (2,), and return the seconds since the last point. If `t_s` is not
-        later than that, nothing is added, and 0 returned."""
+        later than the last point, add nothing and return 0."""
         last = self._points[-1]
         step_s = t_s - last.t_s
         if not step_s > 0:
@@ -59,13 +58,13 @@ class Path:
         return step_s
 
     def add_acceleration(self, t_s: float, acceleration_m_s2: Doubles) -> float:
-        """Add a point, as `add_velocity` does, that is reached with this mean acceleration (2,) over the ground."""
+        """Add a point like `add_velocity`, given the mean acceleration (2,) over the ground since the last point."""
         last = self._points[-1]
         step_s = max(0.0, t_s - last.t_s)
         return self.add_velocity(t_s, last.velocity_m_s + step_s * np.asarray(acceleration_m_s2, float))
 
     def interpolate(self, t_s: float) -> Point | None:
-        """Return the point at `t_s`; after the last point, its velocity is continued. None if `t_s` is before the first
+        """Return the point at `t_s`; after the last point, its velocity continues. None if `t_s` is before the first
         point kept or more than a second after the last."""
         if not self._points[0].t_s <= t_s <= self._points[-1].t_s + _MAX_STEP_S:
             return None
@@ -87,7 +86,7 @@ def to_ground_acceleration(
     force_m_s2: tuple[float, float, float], roll_deg: float, pitch_deg: float, yaw_deg: float
 ) -> Doubles:
     """Return the acceleration over the ground (2,), east and north, from the specific force that accelerometers measure
-    (nose, right, down) at an attitude. Gravity, being vertical, has no part in it."""
+    (nose, right, down) at an attitude. Gravity is vertical and does not contribute."""
     roll, pitch, yaw = map(math.radians, (roll_deg, pitch_deg, yaw_deg))
     ahead, right, down = force_m_s2
     low = right * math.sin(roll) + down * math.cos(roll)

@@ -6,14 +6,14 @@ from edgevpr.core.geodesy import offset_m, offset_position
 from edgevpr.runtime.flight.navigation import NavState
 
 MAX_CORRECTION_M_S = 2.0  # ArduPilot did not follow a jump of 25 m for 8 s
-# A position that lags by more jumps. The autopilot's filter refuses the jump for seven to ten seconds, then resets to
+# At a larger lag the position jumps. The autopilot's filter rejects the jump for seven to ten seconds, then resets to
 # it: sooner than the slew would make up the lag, and nothing far from the estimate is sent meanwhile.
 MAX_LAG_M = 40.0
 
 
 class Slew:
-    """A position that does not jump: it moves with the velocity of the estimates, and approaches them by 2 m/s at most.
-    It restarts at the estimate if it is more than 40 m off."""
+    """A position that does not jump: it moves with the velocity of the estimates and approaches them at 2 m/s at most.
+    It restarts at the estimate if it is more than 40 m away."""
 
     def __init__(self) -> None:
         self._last: NavState | None = None

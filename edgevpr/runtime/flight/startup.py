@@ -1,4 +1,4 @@
-"""The start of a flight: opening of the recogniser, and the first line of the flight log."""
+"""The start of a flight: opens the recogniser and makes the first line of the flight log."""
 
 import logging
 import math
@@ -26,14 +26,14 @@ from edgevpr.runtime.recognise.levelling import read_camera_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-_ORIGIN_PLACES = 15  # the first places of the map, for the altitude of the ground
+_ORIGIN_PLACES = 15  # first places of the map, used for the ground altitude
 _LIBRARIES = ("numpy", "cv2", "onnxruntime")
 
 _log = logging.getLogger(__name__)
 
 
 def open_map(config: Config, io: FlightIO) -> Recogniser:
-    """Open the recogniser of a flight, metered by the clock of the flight. Raises EdgevprError."""
+    """Open the recogniser of a flight, metered with the clock of the flight. Raises EdgevprError."""
     meter = QueryMeter(
         io.board,
         config.battery,
@@ -46,18 +46,18 @@ def open_map(config: Config, io: FlightIO) -> Recogniser:
 
 
 def apply_recorded_rate(source: SourceConfig, steps_s: Sequence[float]) -> SourceConfig:
-    """Return the settings of a source with the rate at which most pictures of a recording come, `steps_s` apart (empty:
-    as it is configured)."""
+    """Return the settings of a source with the median rate of a recording whose pictures are `steps_s` apart (empty:
+    the configured rate)."""
     if not steps_s:
         return source
-    usual_hz = 1 / median(step_s for step_s in steps_s if step_s > 0)
-    usual_hz = min(max(usual_hz, MIN_RATE_HZ), MAX_RATE_HZ)
-    return replace(source, rate_hz=usual_hz)
+    median_hz = 1 / median(step_s for step_s in steps_s if step_s > 0)
+    median_hz = min(max(median_hz, MIN_RATE_HZ), MAX_RATE_HZ)
+    return replace(source, rate_hz=median_hz)
 
 
 def find_origin(place_map: PlaceMap, source: SourceConfig) -> Position | None:
     """Return the first position of a map (None: it has none), at the altitude of the ground: the median, over the first
-    places, of the camera's altitude less its height by footprint and lens. The altitude is None if one is unknown."""
+    places, of the camera's altitude minus its height (from footprint and lens). The altitude is None if unknown."""
     first, altitudes_m, lens = None, [], read_camera_lens(source)
     has_lens_of_map = place_map.lens is None or place_map.lens == (source.lens and Path(source.lens).name)
     with suppress(PlaceError):  # a damaged place ends the search
@@ -71,8 +71,8 @@ def find_origin(place_map: PlaceMap, source: SourceConfig) -> Position | None:
 
 
 def log_start(config: Config, io: FlightIO, recogniser: Recogniser) -> dict[str, Any]:
-    """Log which technique is used, and what its fixes or figures lack; return the fields of the flight log's first
-    line."""
+    """Log the technique in use, and whether the power figures are estimates. Return the fields of the first line of
+    the flight log."""
     board = io.board
     _log.info("version %s on %s", __version__, board.title)
     reason = explain_technique(recogniser, is_named=config.technique is not None)
@@ -96,7 +96,7 @@ def log_start(config: Config, io: FlightIO, recogniser: Recogniser) -> dict[str,
 
 
 def start_fields(config: Config, board_name: str, spec: TechniqueSpec, place_map: PlaceMap) -> dict[str, Any]:
-    """Return the fields of a flight log's first line (kind "start"): all that a flight depends on but what comes in."""
+    """Return the fields of a flight log's first line (kind "start"): all that a flight depends on, except its input."""
     loaded = {name: getattr(sys.modules.get(name), "__version__", None) for name in _LIBRARIES}
     return {
         "version": __version__,

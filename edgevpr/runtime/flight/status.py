@@ -1,5 +1,5 @@
-"""The file with the status of a flight: one JSON object, replaced as a whole once a second. `vitals` writes it and
-documents its keys, the command `edgevpr top` reads it."""
+"""The status file of a flight: one JSON object, replaced as a whole once a second. `vitals` writes it and documents its
+keys; the command `edgevpr top` reads it."""
 
 import json
 import os
@@ -17,7 +17,7 @@ _FILE_MODE = 0o660  # positions are private, but the flight's group may read the
 
 
 class StatusFile:
-    """Writes the status of a flight (see `Vitals._make_status`) to a file, which is removed when it is closed."""
+    """Writes the status of a flight (see `Vitals._make_status`) to a file, and removes the file at the end."""
 
     def __init__(self, path: str | Path) -> None:
         """Check that the file `path` can be written; `write` writes it. Raises EdgevprError if it cannot be created."""
@@ -56,7 +56,7 @@ class StatusFile:
 
 def read_status(path: str | Path) -> tuple[dict[str, Any], float] | None:
     """Return the status in a file, and its age in seconds; None if there is none. Raises EdgevprError if it cannot be
-    read, or is of another version."""
+    read, or was written by another version."""
     try:
         with open(path, "rb") as file:
             age_s = time.time() - os.fstat(file.fileno()).st_mtime

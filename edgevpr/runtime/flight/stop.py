@@ -1,15 +1,15 @@
-"""The end of a flight by a signal."""
+"""Ends a flight on a signal."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 
 class StopNow(BaseException):
-    """Raised by a signal to end a flight at once; a BaseException, so that no handler of errors catches it."""
+    """Raised by a signal to end a flight at once; a BaseException, so that no error handler catches it."""
 
 
 class Stop:
-    """Signal handler that ends a flight: by StopNow during its start and while a frame is recognised, otherwise after
+    """Signal handler that ends a flight: with StopNow during startup and while a frame is recognised, otherwise after
     the current pass of the loop."""
 
     def __init__(self) -> None:
@@ -17,7 +17,7 @@ class Stop:
 
     @property
     def is_requested(self) -> bool:
-        """True if a signal has asked for the end of the flight."""
+        """True if a signal has requested the end of the flight."""
         return self._is_requested
 
     def __call__(self, *_: object) -> None:
@@ -30,7 +30,7 @@ class Stop:
 
     @contextmanager
     def interrupt_start(self) -> Iterator[None]:
-        """Context manager for the start of a flight: a signal, also an earlier one, raises StopNow."""
+        """Context manager for the start of a flight: a signal, even an earlier one, raises StopNow."""
         self._is_starting = True
         try:
             if self._is_requested:
@@ -41,7 +41,7 @@ class Stop:
 
     @contextmanager
     def allow_interrupt(self) -> Iterator[None]:
-        """Context manager: a signal interrupts the work inside it by StopNow."""
+        """Context manager: a signal interrupts the enclosed work with StopNow."""
         self._is_interruptible = True
         try:
             yield

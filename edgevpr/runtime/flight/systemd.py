@@ -1,4 +1,4 @@
-"""Messages to systemd by sd_notify(3): `KEY=value` lines in one datagram to $NOTIFY_SOCKET. Without it none is sent."""
+"""Messages to systemd (sd_notify(3)): `KEY=value` lines in one datagram to $NOTIFY_SOCKET. If unset, none is sent."""
 
 import os
 import socket
@@ -6,25 +6,25 @@ from contextlib import suppress
 
 from edgevpr.core.text import sanitize
 
-# Asked for at the start: loading a map or picking a technique takes minutes on a slow board.
+# Requested at startup: loading a map or choosing a technique takes minutes on a slow board.
 MAX_START_US = 1_800_000_000
 _SEND_TIMEOUT_S = 0.5
 
 
-def is_there() -> bool:
-    """Tell whether systemd has started this process as a service that reports to it."""
+def is_service() -> bool:
+    """Return True if systemd has started this process as a service that reports to it."""
     return "NOTIFY_SOCKET" in os.environ
 
 
 def notify(**assignments: object) -> None:
-    """Send assignments, such as READY=1 or STATUS="12 places". Never raises: a flight must not end for want of a
-    reader."""
+    """Send assignments, such as READY=1 or STATUS="12 places". Never raises: a flight must not end because nothing
+    reads them."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return
-    if address[0] == "@":  # a name in the abstract namespace, which begins with a zero byte
+    if address[0] == "@":  # a name in the abstract namespace begins with a zero byte
         address = "\0" + address[1:]
-    # A line break in a value would begin an assignment of its own.
+    # A line break in a value would start another assignment.
     lines = (f"{key}={sanitize(' '.join(str(value).splitlines()))}" for key, value in assignments.items())
     with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
         sender.settimeout(_SEND_TIMEOUT_S)  # the receiver's queue may be full; the main loop must not hang on it
