@@ -114,7 +114,7 @@ def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recognise
     """Raise UsageError if no query, or no place of the map, has the data that --known lists."""
     from edgevpr.frames.positions import find_track, read_track
     from edgevpr.frames.source import read_tags
-    from edgevpr.runtime.recognise.hints import explain_useless
+    from edgevpr.runtime.recognise.hints import explain_why_unusable
 
     source, positions = Path(args.source), to_path(args.positions)
     if source.is_dir():
@@ -122,7 +122,7 @@ def _require_known(args: Namespace, known: Sequence[str], recogniser: "Recognise
     else:
         table = positions or find_track(source)
         queries = list(read_track(table).tags) if table else []
-    if problem := explain_useless(known, queries, list(recogniser.place_map.read_places()), recogniser.sequence):
+    if problem := explain_why_unusable(known, queries, list(recogniser.place_map.read_places()), recogniser.sequence):
         raise UsageError(problem)
 
 

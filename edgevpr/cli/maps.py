@@ -269,8 +269,8 @@ def run_map_check(args: Namespace) -> int:
     from edgevpr.places.examine import check_map
 
     result = check_map(args.map, progress)
-    print_result({**asdict(result), "is_whole": result.is_whole}, args.json, format_check(result))
-    return 0 if result.is_whole else 1
+    print_result({**asdict(result), "is_whole": result.is_intact}, args.json, format_check(result))
+    return 0 if result.is_intact else 1
 
 
 def run_map_repair(args: Namespace) -> int:
@@ -278,7 +278,7 @@ def run_map_repair(args: Namespace) -> int:
     from edgevpr.places.examine import check_map, repair_map
 
     result = check_map(args.map, progress)
-    original = None if result.is_whole else repair_map(args.map, progress)
+    original = None if result.is_intact else repair_map(args.map, progress)
     dropped = result.total - result.places
     fields = {"path": args.map, "kept": result.places, "dropped": dropped, "original": original and str(original)}
     repaired = f"{args.map}: repaired, {result.places} places kept, {dropped} removed; the original is now {original}"

@@ -29,7 +29,7 @@ def add(commands: Any) -> None:
     add_map_images(report)
     replay = add_command(commands, "replay", run_replay, "replay a recorded flight and compare log and packets")
     replay.add_argument("log", metavar="LOG", help="flight log; its last flight is replayed")
-    replay.add_argument("--map", metavar="MAP", help="map of the flight (default: its recorded path)")
+    replay.add_argument("--map", metavar="MAP", help="map of the flight (default: the path in the flight log)")
     add_json(replay)
 
 

@@ -145,7 +145,7 @@ class MemoryConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SalienceConfig:
-    use: bool = key(False, "--salience", "store and match only memorable images")
+    use: bool = key(False, "--salience", "store and match only distinctive (salient) images")
     memorability: float = bounded_key(0, 1, default=0.3)
     staticity: float = bounded_key(0, 1, default=0.6)
     entropy: float = bounded_key(0, 1, default=0.4)

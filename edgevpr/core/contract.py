@@ -201,7 +201,7 @@ class Technique(Protocol):
 
         `mean`: mean of the map's coarse parts, for techniques that pack them (else None).
         `turned_deg`: expected `FineMatch.rotation_deg` at each place, float (N,), NaN: unknown. Other rotations are
-        ruled out. None: nothing is expected. Given only to a technique with `spec.heading_within_deg`.
+        ruled out. None: no expectation. Given only to a technique with `spec.heading_within_deg`.
         `height_ratio`: expected `FineMatch.height_ratio` (None: 1). `in_reach`: bool (N,), places to examine more
         closely (None: all). Both are given only to a technique with `spec.height_ratios`."""
 

@@ -121,7 +121,7 @@ class ReasonCode(Code):
     SUPERSEDED = "replaced by a newer fix"
     NO_AUTOPILOT = "no autopilot to receive it", "{summary} within {limit_s:g} s"
     CLOCK_UNKNOWN = "the autopilot's clock was not known", "{summary} within {limit_s:g} s"
-    NOT_ENCODABLE = "it cannot be encoded in its message", "{summary} ({problem})"
+    NOT_ENCODABLE = "it cannot be encoded in its MAVLink message", "{summary} ({problem})"
     LINK_LOST = "the link was lost before it was sent"
 
     # Fix without an answer
@@ -160,7 +160,7 @@ class ReasonCode(Code):
 
     # Notes of a flight. The ground station gets the summary if the sentence is too long for a STATUSTEXT.
     FAILING = "frames keep failing", "{count:.0f} frames in a row have failed"
-    NOT_FAILING = "frames no longer fail"
+    NOT_FAILING = "frames are being processed again"
     NOTHING_SHOWN = "camera image is blank"
     GROUND_SHOWN = "camera sees the ground again"
     MAP_LEFT = "aircraft has left the map"

@@ -236,7 +236,7 @@ class Track:
         `video`: its path, for the message."""
         if self.t_s[-1] < -_TIME_ROUNDING_S or self.t_s[0] > lasts_s:
             raise UsageError(
-                f"{self.path} has positions from {self.t_s[0]:.1f} to {self.t_s[-1]:.1f} s, but {video} lasts from 0 "
+                f"{self.path} has positions from {self.t_s[0]:.1f} to {self.t_s[-1]:.1f} s, but {video} runs from 0 "
                 f"to {lasts_s:.1f} s: give `time` in seconds from the first frame of the video."
             )
 

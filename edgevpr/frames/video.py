@@ -125,7 +125,8 @@ class VideoSource(RecordingSource):
         self._t_s += 0.0 if self._decoder.is_stamped else count * self._frame_s
         which = f"frame {first:06d} (t={t_s:.1f} s)" + (f" and {count - 1} after it" if count > 1 else "")
         raise ImageError(
-            f"{self._path}: {which} cannot be used{until} (damaged, or decoded from damage): copy the video again.",
+            f"{self._path}: {which} cannot be used{until} (damaged, or dependent on damaged frames): "
+            "copy the video again.",
             count,
         )
 

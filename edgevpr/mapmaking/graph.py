@@ -160,13 +160,13 @@ class _Graph:
         return normal, agree
 
     def compute_tie_residuals(self) -> Floats:
-        """Return the difference of each tie from the solution, in standard deviations of the tie: float (T,)."""
+        """Return the residual of each tie, in its standard deviations: float (T,)."""
         steps, turns = self._compute_residuals()
         residuals: Floats = np.hypot(abs(steps) / self._ties.step_sd, abs(turns) / self._ties.turn_sd)
         return residuals
 
     def _compute_residuals(self) -> tuple[Complexes, Complexes]:
-        """Return the differences of the current solution from the steps and turns of the ties, complex (T,) each."""
+        """Return the residuals of the ties in step and turn, complex (T,) each."""
         position, log, ties = self.position, self.log, self._ties
         steps = (position[ties.query] - position[ties.place]) * np.exp(-log[ties.place]) - ties.step
         turns = log[ties.query] - log[ties.place] - ties.turn

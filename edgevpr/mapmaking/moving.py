@@ -53,8 +53,8 @@ def move_map(place_map: PlaceMap, log: str | Path) -> MapMove:
     move = _read_move(survey or {}, len(place_map))
     if move is None:
         raise UsageError(
-            f"{log} contains no measured map offset: fly for some minutes with good GPS, accepted matches and changing "
-            "headings."
+            f"{log} contains no measured map offset: fly for a few minutes with good GPS, accepted matches and "
+            "changing headings."
         )
     with place_map.transaction():
         for place in list(place_map.read_places()):

@@ -70,7 +70,7 @@ class Fix:
 class MotionState:
     """Position and motion of the vehicle at `t_mono_s`: altitude above sea level, velocity (east, north, down), and
     standard deviations (`accuracy_m` and `speed_accuracy_m_s` of one axis, `alt_accuracy_m` of the altitude).
-    `attitude`: (roll, pitch, yaw) in radians, None if unknown. `is_reserve`: a real GPS receiver has a good fix."""
+    `attitude`: (roll, pitch, yaw) in radians, None if unknown. `is_reserve`: a fallback, as real GPS has a fix."""
 
     t_mono_s: float
     lat_deg: float
@@ -132,7 +132,8 @@ def make_position_sensor(state: MotionState) -> Message:
 
 def make_gps_input(state: MotionState | None, receiver: int, stamp_s: float, t_unix_s: float | None) -> Message:
     """Make a GPS_INPUT (232) for GPS receiver `receiver` (0: the first). A `state` of None is sent as "no fix", a
-    reserve as a poor fix. `stamp_s`: time of the state. `t_unix_s`: the same in seconds since 1970 (None: unknown)."""
+    fallback (`is_reserve`) as a poor fix. `stamp_s`: time of the state. `t_unix_s`: the same in seconds since 1970
+    (None: unknown)."""
     week, time_of_week_s = (0, 0) if t_unix_s is None else divmod(t_unix_s - _GPS_EPOCH_S + _LEAP_S, _WEEK_S)
     east, north, down = state.velocity_m_s if state else (0, 0, 0)
     satellites, sd_m, sd_m_s = 0, 0.0, 0.0

@@ -54,7 +54,7 @@ class MapCheck:
     faults: tuple[str, ...]
 
     @property
-    def is_whole(self) -> bool:
+    def is_intact(self) -> bool:
         return not (self.damaged or self.faults)
 
 

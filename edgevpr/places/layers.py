@@ -42,25 +42,25 @@ class Layers:
         if footprint_m is None or len(self.footprints_m) < 2:
             return expected
         rows = np.minimum(np.searchsorted(self.place_ids, index.place_ids), len(self.place_ids) - 1)
-        is_cut, layer = self.place_ids[rows] == index.place_ids, _find_nearest(self.footprints_m, footprint_m)
-        is_other = is_cut & (self.layer[rows] != layer)
+        is_listed, layer = self.place_ids[rows] == index.place_ids, _find_nearest(self.footprints_m, footprint_m)
+        is_other = is_listed & (self.layer[rows] != layer)
         in_reach = ~is_other if expected.in_reach is None else expected.in_reach & ~is_other
         return replace(expected, in_reach=in_reach) if in_reach.any() else expected
 
 
 def read_layers(place_map: PlaceMap) -> Layers:
     """Read the layers of a map. Raises MapError."""
-    place_ids, length_m, is_cut = place_map.read_footprints()
+    place_ids, length_m, is_surveyed = place_map.read_footprints()
     footprints_m: list[float] = []
-    for footprint_m in np.unique(length_m[is_cut]).tolist():
+    for footprint_m in np.unique(length_m[is_surveyed]).tolist():
         if not footprints_m or footprint_m > _MAX_LAYER_RATIO * footprints_m[-1]:
             footprints_m.append(footprint_m)
     median_m = float(np.median(length_m)) if len(length_m) else None
     if len(footprints_m) < 2:
         return Layers(median_m, (median_m,) if median_m else (), np.zeros(0, int), np.zeros(0, int))
-    order = np.argsort(place_ids[is_cut])
-    layer = _find_nearest(footprints_m, length_m[is_cut][order])
-    return Layers(median_m, tuple(footprints_m), place_ids[is_cut][order], layer)
+    order = np.argsort(place_ids[is_surveyed])
+    layer = _find_nearest(footprints_m, length_m[is_surveyed][order])
+    return Layers(median_m, tuple(footprints_m), place_ids[is_surveyed][order], layer)
 
 
 def _find_nearest(footprints_m: Sequence[float], length_m: float | Doubles) -> Ints:

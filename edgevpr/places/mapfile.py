@@ -32,11 +32,11 @@ _MAX_RELATIVE_DIFFERENCE = 0.01  # norm of their difference: far above rounding,
 
 class Footprints(NamedTuple):
     """The places of a map that have a footprint: `place_ids` int64 (M,), `length_m` float64 (M,) of the ground along a
-    picture's longest side, and `is_cut` bool (M,), True if it was cut from an orthophoto."""
+    picture's longest side, and `is_surveyed` bool (M,), True if it was cut from an orthophoto."""
 
     place_ids: Ints
     length_m: Doubles
-    is_cut: Bools
+    is_surveyed: Bools
 
 
 class _StoredText:
@@ -183,9 +183,9 @@ class PlaceMap(MapConnection):
         """Read the footprints of all places that have one, in the order they were added. Raises MapError."""
         places = [(place_id, *row) for place_id, row in self.scan_rows("footprint_m, is_surveyed") if row]
         places = [place for place in places if isinstance(place[1], float) and 0 < place[1] < math.inf]
-        ids, length_m, is_cut = zip(*places, strict=True) if places else ((), (), ())
+        ids, length_m, is_surveyed = zip(*places, strict=True) if places else ((), (), ())
         return Footprints(
-            np.array(ids, np.int64), np.array(length_m, float), np.array([bool(cut) for cut in is_cut], bool)
+            np.array(ids, np.int64), np.array(length_m, float), np.array([bool(value) for value in is_surveyed], bool)
         )
 
     def select_ids(self, columns: str) -> dict[Values, list[int]]:

@@ -43,21 +43,21 @@ def make_map_page(
     name: str,
     lines: Sequence[str],
     places: Sequence[Place],
-    recognisable: Mapping[int, float],
+    mean_confidences: Mapping[int, float],
     look_alikes: Sequence[FoundLookAlike | None],
     pictures: Album,
     lens: "Lens | None",
 ) -> str:
-    """Return the whole page of the map `name`. `lines`: the output of `map info`. `recognisable`: mean confidence of
-    the correct matches of each place that calibration queried, by place number. `look_alikes`: for each place whose
+    """Return the complete page for the map `name`. `lines`: the output of `map info`. `mean_confidences`: of the
+    correct matches of each place that calibration queried, by place number. `look_alikes`: for each place whose
     picture was searched, the place that looks alike (None: none does). `pictures`: the map's album. `lens`: lens of
     its camera (None: unknown)."""
     ground = [place for place in places if place.position]
     points = {place.place_id: to_point(place) for place in ground}
     tags_off_m, twins = find_inconsistent_tags(ground), {twin.place_id: twin for twin in look_alikes if twin}
-    hard = {place_id for place_id, confidence in recognisable.items() if confidence < _MAX_HARD_CONFIDENCE}
+    hard = {place_id for place_id, confidence in mean_confidences.items() if confidence < _MAX_HARD_CONFIDENCE}
     gaps, covered_m2, gaps_m2 = find_gaps(ground)
-    steps = list(_make_steps(places, recognisable, tags_off_m, twins, points))
+    steps = list(_make_steps(places, mean_confidences, tags_off_m, twins, points))
     pairs = [(points.get(twin.place_id), points.get(twin.other_id)) for twin in twins.values()]
     tags = [(read_recorded_position(place), to_point(place)) for place in ground if place.place_id in tags_off_m]
     layers = [
@@ -72,7 +72,7 @@ def make_map_page(
         "ground covered": format_number(covered_m2 / 1e4 if covered_m2 else None, "ha"),
         "coverage gaps": format_number(gaps_m2 / 1e4 if covered_m2 else None, "ha"),
         "inconsistent GPS tags": str(len(tags_off_m)),
-        "hard to recognise": str(len(hard)) if recognisable else UNKNOWN,
+        "hard to recognise": str(len(hard)) if mean_confidences else UNKNOWN,
         "look alike": f"{len(twins)} of {len(look_alikes)}" if look_alikes else UNKNOWN,
     }
     notes = [*_NOTES, *([] if look_alikes else [_NO_PICTURES])]
@@ -94,7 +94,7 @@ def _classify_quality(place: Place) -> str:
 
 def _make_steps(
     places: Sequence[Place],
-    recognisable: Mapping[int, float],
+    mean_confidences: Mapping[int, float],
     tags_off_m: Mapping[int, float],
     twins: Mapping[int, FoundLookAlike],
     points: Mapping[int, Point],
@@ -102,7 +102,7 @@ def _make_steps(
     images = {place.place_id: place.source_image for place in places}
     for place in places:
         place_id, pose = place.place_id, place.pose
-        confidence, twin = recognisable.get(place_id), twins.get(place_id)
+        confidence, twin = mean_confidences.get(place_id), twins.get(place_id)
         is_hard, position = confidence is not None and confidence < _MAX_HARD_CONFIDENCE, points.get(place_id)
         groups = {
             f"{_classify_quality(place)} quality": True,

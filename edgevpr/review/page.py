@@ -50,10 +50,10 @@ _HEAD_FIELDS = (("map", "map"), ("technique", "technique"), ("board", "board"), 
 
 
 def make_flight_page(
-    flight: LoggedFlight, ground: Sequence[Place], frames: Album, references: Album, no_ground: str = ""
+    flight: LoggedFlight, places: Sequence[Place], frames: Album, references: Album, no_places: str = ""
 ) -> str:
-    """Return the whole page. `ground`: the map's places. `frames`: album of the flight's pictures; `references`: album
-    of the map's. `no_ground`: a sentence on why there is no `ground`."""
+    """Return the whole page. `places`: the map's places. `frames`: album of the flight's pictures; `references`: album
+    of the map's. `no_places`: a sentence on why `places` is empty."""
     queries = flight.queries
     time = get_text(flight.start, "time") or next((get_text(query.line, "time") for query in queries), None)
     start = [f"{name} {value}" for name, key in _HEAD_FIELDS if (value := get_text(flight.start, key))]
@@ -61,15 +61,15 @@ def make_flight_page(
         "title": f"Flight of {time[:16].replace('T', ' ')} UTC" if time else "Flight at an unknown time",
         "known": [f"{format_duration(flight.span_s)} long", *start, str(flight.path)],
         "figures": _compute_figures(flight),
-        "warnings": _list_warnings(flight, bool(ground), no_ground),
+        "warnings": _list_warnings(flight, bool(places), no_places),
         "span_s": flight.span_s,
     }
-    steps = _make_steps(ground, flight)
+    steps = _make_steps(places, flight)
     return make_page(
         head,
         steps,
-        ground,
-        _make_layers(ground, flight, steps),
+        places,
+        _make_layers(places, flight, steps),
         {"seen": frames, "place": references},
         lens=_read_lens(flight.start),
         charts=_make_charts(flight),
@@ -77,15 +77,15 @@ def make_flight_page(
     )
 
 
-def _make_layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
+def _make_layers(places: Sequence[Place], flight: LoggedFlight, steps: Sequence[Step]) -> list[Layer]:
     """Return the layers of the drawing, bottom layer first."""
     return [
-        Layer("places of the map", "places", [[to_point(place) for place in ground]]),
+        Layer("places of the map", "places", [[to_point(place) for place in places]]),
         make_layer(steps, "places found", "found"),
         Layer("fixes between matches", "between", [list(filter(None, map(get_point, flight.between)))]),
         make_layer(steps, "GPS", "gps", "line"),
         make_layer(steps, "autopilot", "autopilot", "line"),
-        make_layer(steps, "refused there", "missed"),
+        make_layer(steps, "positions of refused queries", "refused_at"),
         make_layer(steps, "matches", "accepted"),
         make_layer(steps, "fixes accepted", "taken"),
         make_layer(steps, "fixes not answered", "unanswered"),
@@ -93,11 +93,11 @@ def _make_layers(ground: Sequence[Place], flight: LoggedFlight, steps: Sequence[
     ]
 
 
-def _make_steps(ground: Sequence[Place], flight: LoggedFlight) -> list[Step]:
-    """Return a step for each query of a flight over the places `ground`."""
-    places = {place.place_id: place for place in ground}
+def _make_steps(places: Sequence[Place], flight: LoggedFlight) -> list[Step]:
+    """Return a step for each query of a flight over the map places `places`."""
+    by_id = {place.place_id: place for place in places}
     has_link = any(query.has_link for query in flight.queries)
-    return [_make_step(query, places.get(query.place or 0), flight.span_s > 0, has_link) for query in flight.queries]
+    return [_make_step(query, by_id.get(query.place or 0), flight.span_s > 0, has_link) for query in flight.queries]
 
 
 def _make_step(query: LoggedQuery, place: Place | None, has_times: bool, has_link: bool) -> Step:
@@ -105,7 +105,7 @@ def _make_step(query: LoggedQuery, place: Place | None, has_times: bool, has_lin
     fix, verdict = query.fix, "accepted" if query.accepted else "refused"
     points = {
         "found": query.place_position,
-        "missed": None if query.accepted else query.true_position or query.autopilot_position,
+        "refused_at": None if query.accepted else query.true_position or query.autopilot_position,
         "gps": query.gps_position,
         "autopilot": query.autopilot_position,
     }
@@ -192,9 +192,9 @@ def _find_highest(flight: LoggedFlight, *keys: str) -> float | None:
     return max((value for value in values if value is not None), default=None)
 
 
-def _list_warnings(flight: LoggedFlight, has_ground: bool, no_ground: str) -> list[str]:
+def _list_warnings(flight: LoggedFlight, has_map_places: bool, no_places: str) -> list[str]:
     queries = flight.queries
-    has_places = has_ground or any(query.place_position for query in queries)
+    has_places = has_map_places or any(query.place_position for query in queries)
     warnings = [
         (flight.start, "The log lacks the first line of this flight: its configuration is unknown."),
         (flight.end, "The log has no last line: it was cut off (power, full disk), or the flight is still running."),
@@ -204,7 +204,7 @@ def _list_warnings(flight: LoggedFlight, has_ground: bool, no_ground: str) -> li
             not queries or any(query.has_link for query in queries),
             "The log has no autopilot position reports, so its track and the distance from GPS are unknown.",
         ),
-        (not no_ground, no_ground),
+        (not no_places, no_places),
     ]
     return [sentence for is_known, sentence in warnings if not is_known]
 

@@ -38,12 +38,12 @@ from edgevpr.techniques.displacement import (
 )
 from edgevpr.techniques.entropy import average_blocks, find_good_blocks
 from edgevpr.techniques.gradients import (
+    compute_histograms,
     make_grey_square,
     make_mask_square,
     make_slow_patterns,
     normalise_blocks,
     normalise_rows,
-    orient_cells,
     pad_to_square,
     round_levels,
 )
@@ -159,7 +159,7 @@ class CoHog:
 
     def _make_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools]:
         """Return the first two results of `_make_good_blocks`."""
-        blocks = normalise_blocks(orient_cells(grey, cell_px, self.bins, signed=True, allowed=allowed))
+        blocks = normalise_blocks(compute_histograms(grey, cell_px, self.bins, signed=True, allowed=allowed))
         if allowed is None:
             return blocks, np.ones(blocks.shape[:2], bool)
         return blocks, average_blocks(allowed.astype(np.float32), cell_px) >= 1.0

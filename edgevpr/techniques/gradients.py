@@ -75,7 +75,7 @@ def pad_to_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
     )
 
 
-def orient_cells(grey: Array, cell_px: int, bins: int, signed: bool, allowed: Mask | None = None) -> Singles:
+def compute_histograms(grey: Array, cell_px: int, bins: int, signed: bool, allowed: Mask | None = None) -> Singles:
     """Compute histograms of gradient orientation, one per cell (Dalal and Triggs 2005; thesis 6.2.2, steps 1 and 2):
     the square root of the image over its maximum, central differences, and the gradient magnitude, shared between the
     two nearest of `bins` orientations over 360 degrees (`signed`) or 180. `grey` is float32 or uint8 (H, W), 0 to 255,

@@ -122,7 +122,7 @@ def import_onnxruntime() -> Any:
     except Exception as error:  # a broken installation raises OSError or a NumPy error
         raise ModelError(
             f"onnxruntime cannot be imported ({_join_lines(error)}): reinstall it (`pip install onnxruntime`) to use "
-            "the techniques with networks; hog, cohog and seqslam work without it."
+            "the neural-network techniques; hog, cohog and seqslam work without it."
         ) from error
     return onnxruntime
 

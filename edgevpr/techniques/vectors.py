@@ -12,7 +12,7 @@ from edgevpr.core.arrays import Array, Bytes, Image, Ints, Mask, Singles
 from edgevpr.core.config import FORMS
 from edgevpr.core.contract import Descriptor, PartSpec, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
-from edgevpr.techniques.gradients import make_grey_square, make_mask_square, normalise_blocks, orient_cells
+from edgevpr.techniques.gradients import compute_histograms, make_grey_square, make_mask_square, normalise_blocks
 
 # A margin that no match reaches. The margins of wrong matches are known for the shipped weights only: with other
 # weights no match is accepted until the configuration sets a minimum margin.
@@ -182,5 +182,5 @@ class Hog(VectorTechnique):
         """Encode uint8 (H, W[, 3]) to float32 (length,); gradients where `mask` bool (H, W) is False do not count."""
         grey = make_grey_square(image, self._w1)
         allowed = make_mask_square(mask, self._w1)
-        cells = orient_cells(grey, self._cell, self._bins, signed=False, allowed=allowed)
+        cells = compute_histograms(grey, self._cell, self._bins, signed=False, allowed=allowed)
         return normalise_blocks(cells).ravel()

@@ -129,7 +129,7 @@ def _estimate_zone_offset_s(track: Track, times_s: Doubles, label: str) -> float
         candidates_s = sorted((offset_s for offset_s in fitting_s if offset_s % unit_s == 0), key=abs)
         if len(candidates_s) > 1:
             choices = ", ".join(f"{offset_s:g}" for offset_s in candidates_s[:4])
-            raise UsageError(f"The camera's clock may be off by {choices} s: give one as --offset-s (0: it is right).")
+            raise UsageError(f"The camera's clock may be {choices} s off: pass one as --offset-s (0 if it is right).")
         if candidates_s:
             return float(candidates_s[0])
     raise AssertionError("the smallest unit fits")

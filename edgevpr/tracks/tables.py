@@ -17,7 +17,7 @@ from edgevpr.tracks.record import Attitude, Record, make_tag
 
 _MAX_FILE_BYTES = 100_000_000
 _SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
-_MAX_HEADING_ROWS = 10  # rows that are searched for the column names
+_MAX_HEADER_ROWS = 10  # rows that are searched for the column names
 # Column names, reduced to letters; the first one present is used.
 _COLUMN_NAMES = {
     "file": ("sourcefile", "filename", "file", "imagename", "image", "label", "photo", "name"),
@@ -35,7 +35,7 @@ _REQUIRED_COLUMNS = ("file", "lat", "lon")
 _DEFAULT_COLUMNS = ("file", "lat", "lon", "alt")  # in Pix4D's order
 _OPENDRONEMAP_COLUMNS = ("file", "lon", "lat", "alt")
 _WGS84 = re.compile(r"epsg:4326|wgs\s?84|\+proj=(longlat|latlong)", re.IGNORECASE)
-_NO_LETTERS = re.compile(r"\[.*?\]|\(.*?\)|[^a-z]")
+_NON_LETTERS = re.compile(r"\[.*?\]|\(.*?\)|[^a-z]")
 _NUMBERS = re.compile(r"[-+]?\d+(?:[.,]\d+)?")
 _PROJECTION = re.compile(r"epsg:\d+|wgs\s?84|\+proj=", re.IGNORECASE)
 
@@ -72,8 +72,8 @@ def read_table(path: Path) -> Record:
 
 def _find_columns(rows: Rows) -> Layout | None:
     """Find the row with the column names."""
-    for number, row in enumerate(rows[:_MAX_HEADING_ROWS]):
-        names = [_NO_LETTERS.sub("", cell.lower()) for cell in row]
+    for number, row in enumerate(rows[:_MAX_HEADER_ROWS]):
+        names = [_NON_LETTERS.sub("", cell.lower()) for cell in row]
         numbers = {part: _find_column(choices, names) for part, choices in _COLUMN_NAMES.items()}
         columns = {part: column for part, column in numbers.items() if column is not None}
         is_split = not any(separator in cell for cell in row for separator in ",;\t")

@@ -24,7 +24,7 @@ from edgevpr.core.errors import EdgevprError, UsageError
 from edgevpr.core.text import progress
 from edgevpr.frames.images import cv2
 from edgevpr.techniques.card import InputRule
-from edgevpr.techniques.gradients import normalise_blocks, orient_cells
+from edgevpr.techniques.gradients import compute_histograms, normalise_blocks
 
 HEIGHT, WIDTH = 120, 160  # of the network's input
 CODE = (4, 14, 19)
@@ -234,7 +234,7 @@ def batch(pictures: Sequence[Image], size: int, rng: np.random.Generator) -> tup
 def gradients_of(sight: Image) -> Singles:
     """Compute the target, the HOG of a view: uint8 (120, 160) to float32 (TARGET_LENGTH,) in 0..1. Cells are 8x8
     pixels, blocks 2x2 cells with a stride of one cell, orientations 9 over 180 degrees."""
-    return normalise_blocks(orient_cells(sight, _CELL_PX, _ORIENTATIONS, signed=False)).ravel()
+    return normalise_blocks(compute_histograms(sight, _CELL_PX, _ORIENTATIONS, signed=False)).ravel()
 
 
 def two_sights(picture: Image, rng: np.random.Generator) -> tuple[Image, Image]:

@@ -208,7 +208,7 @@ def test_video_leaves_out_damaged_frames_and_those_built_on_them(tmp_path):
     assert damaged == missing == 75 - len(frames)
     (complaint,) = complaints
     assert f"{path}: frame 0000" in complaint
-    assert "cannot be used (damaged, or decoded from damage): copy the video again." in complaint
+    assert "cannot be used (damaged, or dependent on damaged frames): copy the video again." in complaint
 
 
 def test_video_leaves_out_frames_predicted_from_one_that_is_missing(tmp_path):

@@ -68,7 +68,7 @@ def test_repair_keeps_a_place_whose_landmarks_alone_are_damaged_without_them(pos
     found = check_map(posed)
     assert (found.places, found.total, len(found.damaged)) == (2, 2, 1)
     repair_map(posed)
-    assert check_map(posed).is_whole
+    assert check_map(posed).is_intact
     with PlaceMap.open(posed) as place_map:
         assert [place.place_id for place in place_map.read_places()] == [1, 2]
         assert place_map.read_landmarks(1) is None

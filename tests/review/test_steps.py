@@ -55,7 +55,7 @@ def test_slider_moves_texts_pictures_and_marks_by_keyboard(page, made):
         seen.add(page.get_attribute(".spot.found", "d") + page.get_attribute(".square", "transform"))
         page.keyboard.press("ArrowRight")
     assert len(seen) == 3, "the marks move"
-    assert "missed" in steps[2]["points"], "a refused query is shown where GPS says it was"
+    assert "refused_at" in steps[2]["points"], "a refused query is shown where GPS says it was"
     assert page.locator("image.layer-ground").count() == 12, "the map's own pictures"
     assert page.inner_text(".ruler") == "20 m"
 

@@ -3,14 +3,14 @@ import pytest
 from pictures import seen_from_above, textured
 
 from edgevpr.techniques import placecode
-from edgevpr.techniques.gradients import normalise_blocks, orient_cells
+from edgevpr.techniques.gradients import compute_histograms, normalise_blocks
 
 _CELL_PX = 512 / 12
 ALL = np.ones((31, 31), bool)
 
 
 def _blocks(image: np.ndarray) -> np.ndarray:
-    return normalise_blocks(orient_cells(np.ascontiguousarray(image), 16, 8, signed=True))
+    return normalise_blocks(compute_histograms(np.ascontiguousarray(image), 16, 8, signed=True))
 
 
 @pytest.fixture(scope="module")

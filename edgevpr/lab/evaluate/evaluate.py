@@ -39,7 +39,7 @@ from edgevpr.runtime.preflight.probe import compute_disk_bytes, compute_ram_byte
 from edgevpr.runtime.recognise.calibration import read_calibration_for
 from edgevpr.runtime.recognise.decide import Matcher, MatchSettings
 from edgevpr.runtime.recognise.encoder import FrameEncoder
-from edgevpr.runtime.recognise.hints import RecordedPrior, explain_useless, parse_known_fields
+from edgevpr.runtime.recognise.hints import RecordedPrior, explain_why_unusable, parse_known_fields
 from edgevpr.runtime.recognise.judge import make_accept_rule
 from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -217,12 +217,12 @@ def read_prior(
     text: str | None, dataset: Dataset, spec: TechniqueSpec, sequence: int | None
 ) -> tuple[RecordedPrior | None, dict[Path, GeoTag]]:
     """Return the prior that narrows the search for each query of a data set, and the tags of the queries by path.
-    `text` lists what is known ("heading,height"; None: nothing). The height of the map is the median over its pictures.
+    `text` lists what is known ("heading,height"; None: nothing). The map height is the median height of its pictures.
     `sequence`: see `MatchOptions`. Raises UsageError if `text` is invalid, or if no query has what it lists."""
     if not (parts := parse_known_fields(text)):
         return None, {}
     queries, places = read_tags(dataset.queries[0].path.parent), read_tags(dataset.ref_dir)
-    if why := explain_useless(parts, queries.values(), places.values(), sequence or spec.sequence):
+    if why := explain_why_unusable(parts, queries.values(), places.values(), sequence or spec.sequence):
         raise UsageError(why)
     query_heights_m, map_heights_m = (
         [tag.height_m for tag in tags.values() if tag.height_m is not None and tag.height_m > 0]

@@ -1,12 +1,13 @@
 """The agreement of two pictures: how many of their landmarks coincide after one rotation, one scaling and one shift.
 
-Ahead, near and far landmarks shift by different amounts, so fewer agree, and they only speak for a match. Points are
-complex numbers here, x + iy (to the right, down), as shares of the longest side from the picture's middle. A similarity
-of query and place is two of them: a point is multiplied by the first (rotation and scale), then the second (the shift)
-is added.
+Ahead, near and far landmarks shift by different amounts, so fewer agree, and they can only support a match. Points are
+complex numbers here, x + iy (right, down), as shares of the longest side from the picture's centre. A similarity from
+query to place is two complex numbers: a point is multiplied by the first (rotation and scale), then the second (the
+shift) is added.
 
-Two landmarks match if each is the most similar one of the other picture. Every two of the best matches define one
-similarity, and the one that fits most matches is taken. Nothing is random: the same pictures give the same result.
+Two landmarks match if each is the one most similar to the other (mutual nearest neighbours). Each pair of the best
+matches defines a similarity, and the one that fits the most matches is used. Nothing is random: the same pictures give
+the same result.
 """
 
 from dataclasses import dataclass, field, replace
@@ -18,28 +19,28 @@ from edgevpr.core.arrays import Array, Bools, Bytes, Covariance, Singles
 from edgevpr.core.geodesy import fit_similarity, wrap_deg
 from edgevpr.runtime.recognise.landmarks import Landmarks
 
-# Inliers with which an agreement is confirmed, and proven. Of 14,799 pairs of a query and a place of another site,
-# expected as their match says, 31 had four inliers, 7 five, 3 six and none more. Of
-# 50,940 expected at random, 111 had four, 22 five and 2 six. So fewer than one in 10,000 has eight by chance. Where
-# nothing is expected, 3 of 2500 had seven.
+# Inliers that confirm and prove an agreement. Of 14,799 pairs of a query and a place of another site, expected on the
+# overlay of their match, 31 had four inliers, 7 five, 3 six and none more. Of 50,940 expected on a random overlay, 111
+# had four, 22 five and 2 six. So fewer than one in 10,000 has eight by chance. Without an expectation, 3 of 2500 had
+# seven.
 MIN_CONFIRMED_INLIERS = 8
 MIN_PROVEN_INLIERS = 10
 # Largest deviations from the expected shift (share of the longest side), rotation (degrees) and scale (a factor).
 _MAX_SHIFT_SHARE = 3.5 / 32
 _MAX_TURN_DEG = 25.0
 _MAX_SCALE = 1.35
-_MAX_UNKNOWN_SCALE = 1.9  # the same factor where no ratio of heights is expected
-_SCALE_LIMITS = (0.4, 2.5)  # limits of the scale where nothing is expected
+_MAX_UNKNOWN_SCALE = 1.9  # the same factor if no ratio of heights is expected
+_SCALE_LIMITS = (0.4, 2.5)  # limits of the scale without an expectation
 _MAX_ANGLE_DEG = 30.0  # between the directions of two matching landmarks; those of ORB err by a few degrees
 _SIZE_TOLERANCE = 1.2  # one level of the image pyramid: sizes are not known more exactly
 
-_MAX_DIFFERENT_BITS = 64  # of 256 may differ; one in some thousand pairs of unrelated landmarks differs in so few
-_TOLERANCE_SHARE = 10 / 640  # of the longest side: relief and tilt move landmarks of the same spot by about so much
-_BEST_MATCHES = 60  # every two of so many best matches define a similarity that is tried
-_MIN_DISTANCE_SHARE = 0.06  # of the longest side; two landmarks nearer to each other say little about the rotation
+_MAX_DIFFERENT_BITS = 64  # of 256 may differ; among unrelated landmarks about one pair in a thousand differs in so few
+_TOLERANCE_SHARE = 10 / 640  # of the longest side: about how far relief and tilt move a landmark
+_BEST_MATCHES = 60  # number of best matches whose pairs each define a similarity to try
+_MIN_DISTANCE_SHARE = 0.06  # of the longest side; closer landmarks hardly constrain the rotation
 _MIN_INLIERS = 3
-# Relief and tilt move neighbouring landmarks alike: so many of them count as one independent landmark. With this, half
-# of the errors on aerial_caliterra and aerial_garfield28 are within the bound that the covariance gives for half.
+# Relief and tilt move neighbouring landmarks alike, so this many count as one independent landmark. With this value,
+# half of the errors on aerial_caliterra and aerial_garfield28 are within the 50 % bound of the covariance.
 _DEPENDENT_LANDMARKS = 40.0
 
 
@@ -67,7 +68,7 @@ class Overlay:
 
 
 def compose_overlays(one: Overlay, other: Overlay) -> Overlay:
-    """Return how one place lies on another, given the overlays `one` and `other` of the same query on these places."""
+    """Return the overlay of place `one` on place `other`, given the overlays of the same query on each."""
     turn_scale = other.turn_scale / one.turn_scale
     shift = complex(*other.shift_share) - turn_scale * complex(*one.shift_share)
     scale = None if None in (one.scale, other.scale) else float(abs(turn_scale))
@@ -80,11 +81,11 @@ class Agreement:
     """Result of comparing the landmarks of query and place. `matched` is the number of landmarks that match, `inliers`
     the number of those that coincide, and `possible` the number of landmarks of the picture that has fewer.
 
-    The query is turned by `rotation_deg` (clockwise, 0..360) about its middle, scaled by `scale` (above 1 if it was
-    taken from higher up), and its middle is moved from the place's middle by `shift_share` (dx to the right, dy down),
-    as shares of the place's longest side. It then lies over the place. `covariance_share2` (var x, cov xy, var y) is
-    that of the shift. All four are None without inliers. `is_expected` is False if the landmarks agree, but on another
-    overlay than the one that was expected. `inlier_points`: those of query and place, complex (n,).
+    To overlay the query on the place, rotate it by `rotation_deg` (clockwise, 0..360) about its centre, scale it by
+    `scale` (above 1 if it was taken from higher up), and shift its centre from the place's centre by `shift_share` (dx
+    right, dy down), as shares of the place's longest side. `covariance_share2` (var x, cov xy, var y) is the covariance
+    of the shift. All four are None without inliers. `is_expected` is False if the landmarks agree on an overlay other
+    than the expected one. `inlier_points`: inliers in query and place, complex (n,).
     """
 
     inliers: int
@@ -99,7 +100,7 @@ class Agreement:
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the pictures coincide without shift, turn or scaling, as a display drawn over all pictures does."""
+        """True if the pictures coincide without shift, rotation or scaling, as an on-screen display does."""
         if self.shift_share is None or self.rotation_deg is None or self.scale is None:
             return False
         turned_deg = min(self.rotation_deg, 360 - self.rotation_deg)
@@ -114,25 +115,25 @@ def compare_near(query: Landmarks, place: Landmarks, expected: Overlay) -> Agree
         return agreement
     other = measure_agreement(query, place)
     if other.inliers < MIN_PROVEN_INLIERS or other.is_at_rest or other.shift_share is None:
-        return agreement  # an agreement at rest may come from a display, not from the ground
+        return agreement  # landmarks at rest may belong to an on-screen display, not to the ground
     similarity = Overlay(other.shift_share, other.rotation_deg or 0.0, other.scale)
     is_near = _is_near(similarity.turn_scale, complex(*similarity.shift_share), expected)
     return agreement if is_near else replace(other, is_expected=False)
 
 
 def measure_agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = None) -> Agreement:
-    """Compare the landmarks of two pictures, near the `expected` overlay only (None: on any overlay)."""
+    """Compare the landmarks of two pictures, only near the `expected` overlay (None: on any overlay)."""
     possible = min(len(query), len(place))
     nothing = Agreement(inliers=0, matched=0, possible=possible)
     if possible < _MIN_INLIERS:
         return nothing
     query_points, place_points = _to_complex(query), _to_complex(place)
-    differing = _count_differing_bits(query.bits, place.bits)
+    bit_counts = _count_differing_bits(query.bits, place.bits)
     if expected is not None:
-        differing[~_find_pairs(query, place, query_points, place_points, expected)] = np.inf
-    best = differing.argmin(axis=1)
-    least = differing[np.arange(len(query_points)), best]
-    is_mutual = differing.argmin(axis=0)[best] == np.arange(len(query_points))
+        bit_counts[~_find_pairs(query, place, query_points, place_points, expected)] = np.inf
+    best = bit_counts.argmin(axis=1)
+    least = bit_counts[np.arange(len(query_points)), best]
+    is_mutual = bit_counts.argmin(axis=0)[best] == np.arange(len(query_points))
     mutual = np.flatnonzero(is_mutual & (least <= _MAX_DIFFERENT_BITS))
     mutual = mutual[np.argsort(least[mutual], kind="stable")]
     query_points, place_points = query_points[mutual].astype(complex), place_points[best[mutual]].astype(complex)
@@ -168,7 +169,7 @@ def _to_complex(landmarks: Landmarks) -> Array:
 
 
 def _count_differing_bits(one: Bytes, other: Bytes) -> Singles:
-    """Count the bits in which each pair of descriptions differs: uint8 (N, 32) and (M, 32) -> float32 (N, M)."""
+    """Count the differing bits of each pair of descriptors: uint8 (N, 32) and (M, 32) -> float32 (N, M)."""
     ours, theirs = (2 * np.unpackbits(bits, axis=1).astype(np.float32) - 1 for bits in (one, other))
     return np.asarray((ours.shape[1] - ours @ theirs.T) / 2)
 
@@ -176,14 +177,14 @@ def _count_differing_bits(one: Bytes, other: Bytes) -> Singles:
 def _find_pairs(
     query: Landmarks, place: Landmarks, query_points: Array, place_points: Array, expected: Overlay
 ) -> Bools:
-    """Return bool (N, M): True where a landmark of the query can be that landmark of the place, by position, direction
-    and size, if the query lies on the place about as `expected`. The points are complex (N,) and (M,)."""
+    """Return bool (N, M): True if a landmark of the query can be that landmark of the place, judged by position,
+    direction and size, on an overlay near the `expected` one. The points are complex (N,) and (M,)."""
     factor = _MAX_UNKNOWN_SCALE if expected.scale is None else _MAX_SCALE
     expected_points = expected.turn_scale * query_points + np.complex64(complex(*expected.shift_share))
-    room = _MAX_SHIFT_SHARE + np.abs(query_points) * (factor - 1 + np.radians(_MAX_TURN_DEG) / 2)
-    is_plausible: Bools = np.abs(expected_points[:, None] - place_points) <= room[:, None].astype(np.float32)
-    turned = np.radians(query.angle_deg + expected.rotation_deg)[:, None] - np.radians(place.angle_deg)
-    is_plausible &= np.cos(turned) >= np.cos(np.radians(_MAX_ANGLE_DEG))
+    tolerance = _MAX_SHIFT_SHARE + np.abs(query_points) * (factor - 1 + np.radians(_MAX_TURN_DEG) / 2)
+    is_plausible: Bools = np.abs(expected_points[:, None] - place_points) <= tolerance[:, None].astype(np.float32)
+    rotation = np.radians(query.angle_deg + expected.rotation_deg)[:, None] - np.radians(place.angle_deg)
+    is_plausible &= np.cos(rotation) >= np.cos(np.radians(_MAX_ANGLE_DEG))
     size, max_ratio = query.size[:, None] * np.float32(expected.scale or 1.0), np.float32(factor * _SIZE_TOLERANCE)
     return is_plausible & (size <= place.size * max_ratio) & (size * max_ratio >= place.size)
 
@@ -202,18 +203,18 @@ def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
 
 
 def _find_best(query_points: Array, place_points: Array, expected: Overlay | None) -> tuple[complex, complex] | None:
-    """Return the similarity that fits most matches, of those that two matches define; None if none is near the expected
-    overlay. The points are complex (n,), best matches first."""
+    """Return the similarity that fits the most matches, among those defined by two matches; None if none is near the
+    expected overlay. The points are complex (n,), best matches first."""
     one, other = np.triu_indices(min(_BEST_MATCHES, len(query_points)), 1)
-    apart = np.abs(query_points[other] - query_points[one]) > _MIN_DISTANCE_SHARE
-    one, other = one[apart], other[apart]
+    is_apart = np.abs(query_points[other] - query_points[one]) > _MIN_DISTANCE_SHARE
+    one, other = one[is_apart], other[is_apart]
     turn_scale = (place_points[other] - place_points[one]) / (query_points[other] - query_points[one])
-    turn_scale = np.where(turn_scale == 0, np.finfo(float).tiny, turn_scale)  # two landmarks on one spot: avoid zero
+    turn_scale = np.where(turn_scale == 0, np.finfo(float).tiny, turn_scale)  # two landmarks at one point: avoid zero
     shift = place_points[one] - turn_scale * query_points[one]
-    near = _is_near(turn_scale, shift, expected)
-    if not near.any():
+    is_near = _is_near(turn_scale, shift, expected)
+    if not is_near.any():
         return None
-    turn_scale, shift = turn_scale[near], shift[near]
+    turn_scale, shift = turn_scale[is_near], shift[is_near]
     residual = np.abs(turn_scale[:, None] * query_points + shift[:, None] - place_points)
     support = np.maximum(0, 1 - (residual / _TOLERANCE_SHARE) ** 2).sum(axis=1)
     best = int(support.argmax())
@@ -224,7 +225,7 @@ def _estimate_variance(query_points: Array, place_points: Array, turn_scale: com
     """Return the variance of the shift along each axis, in squares of the picture's longest side, from the inliers."""
     residual2 = np.abs(turn_scale * query_points + shift - place_points) ** 2
     per_axis = max(float(residual2.sum()) / (2 * len(query_points) - 4), (_TOLERANCE_SHARE / 10) ** 2)
-    middle = query_points.mean()
-    spread = float((np.abs(query_points - middle) ** 2).mean())
-    # The farther the inliers are from the picture's middle, the more a wrong rotation moves the middle.
-    return float(per_axis * _DEPENDENT_LANDMARKS / len(query_points) * (1 + abs(middle) ** 2 / max(spread, 1e-9)))
+    centre = query_points.mean()
+    spread = float((np.abs(query_points - centre) ** 2).mean())
+    # The farther the inliers are from the picture's centre, the more a rotation error moves the centre.
+    return float(per_axis * _DEPENDENT_LANDMARKS / len(query_points) * (1 + abs(centre) ** 2 / max(spread, 1e-9)))

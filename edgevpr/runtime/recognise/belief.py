@@ -278,7 +278,8 @@ class Belief:
         return hypotheses, likelihood, staleness, odds_factor
 
     def _make_posterior(self, p: Doubles) -> Posterior:
-        """Return the belief with an estimate: the mean of the hypotheses around the one with most weight near it."""
+        """Return the belief with an estimate: the weighted mean of the hypotheses around the one with the
+        most weight in its neighbourhood."""
         now = self._now
         if not len(now.w):
             return Posterior(lost=self._lost, p=p)
@@ -316,7 +317,8 @@ def _compute_density(move: _Prediction, at: Doubles, covariance: Doubles, is_ord
 
 
 def _select_usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposals]:
-    """Return the indices of the likeliest finite proposals, and these, made invertible and with a sum of 1 at most."""
+    """Return the indices of the likeliest finite proposals, and those proposals, with covariances made invertible and
+    probabilities scaled to sum to at most 1."""
     is_near = (np.abs(proposed.at) < _MAX_DISTANCE).all(1) & (np.abs(proposed.covariance) < _MAX_DISTANCE**2).all(
         (1, 2)
     )

@@ -1,4 +1,4 @@
-"""The first stage of recognition: from a frame to what is searched for. Maps are made and calibrated by it, too."""
+"""The first stage of recognition: encodes a frame as a query. Building and calibrating a map use it too."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -25,7 +25,7 @@ from edgevpr.runtime.recognise.salience_gate import SalienceGate, SalienceVerdic
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EncodedFrame:
-    """A frame that was prepared and described. `vehicle`: the autopilot's report when it was taken (None: unknown).
+    """A frame that was prepared and encoded. `vehicle`: the autopilot's report when it was taken (None: unknown).
     `salience`: judgement of the salience gate (None: there is no gate)."""
 
     frame: Frame
@@ -36,14 +36,14 @@ class EncodedFrame:
 
     @property
     def view(self) -> View:
-        """The way in which the picture lies on the ground."""
+        """View of the picture: how it lies on the ground."""
         return self.picture.view
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameEncoder:
-    """Levels or straightens the picture of a frame (`levelling`), leaves parts of it out (`mask`), judges whether it is
-    memorable (`gate`; None: each is not done), and describes it by the `technique`."""
+    """Levels or undistorts the picture of a frame (`levelling`), masks parts of it (`mask`), judges whether it is
+    memorable (`gate`), and encodes it with the `technique`. A step that is None is skipped."""
 
     technique: Technique
     levelling: Levelling | Undistortion | None = None
@@ -53,7 +53,7 @@ class FrameEncoder:
     def prepare(
         self, frame: Frame, vehicle: Vehicle | None = None, *, layers: Layers | None = None, scale: float = 1.0
     ) -> LevelledImage:
-        """Return the levelled picture of a frame, with its mask and view. See `Levelling.prepare` for the rest."""
+        """Return the levelled picture of a frame, with mask and view. Other arguments: see `Levelling.prepare`."""
         mask = self.mask.fit_to(frame.image) if self.mask else None
         if self.levelling is None:
             return enlarge_image(LevelledImage(frame.image, mask, UNKNOWN_VIEW), scale)
@@ -68,8 +68,8 @@ class FrameEncoder:
         scale: float = 1.0,
         metered: Callable[[str], AbstractContextManager[None]] = lambda step: nullcontext(),
     ) -> EncodedFrame:
-        """Prepare, judge and describe a frame; `metered` is entered with the name of each step. Raises what the
-        technique and the gate raise."""
+        """Prepare, judge and encode a frame. `metered` makes the context in which the step of a given name is run.
+        Raises the errors of the technique and the gate."""
         with metered("prepare"):
             picture = self.prepare(frame, vehicle, layers=layers, scale=scale)
         with metered("gate"):
@@ -79,24 +79,24 @@ class FrameEncoder:
         return EncodedFrame(frame=frame, vehicle=vehicle, picture=picture, salience=salience, descriptor=descriptor)
 
     def detect_landmarks(self, picture: LevelledImage, count: int = PLACE_LANDMARKS) -> Landmarks:
-        """Find the `count` best landmarks of a picture, of the size at which those of places are found."""
+        """Find the `count` best landmarks of a picture, scaled to the size used for the landmarks of places."""
         longest_px = DOWN_PX if self.technique.spec.looks_down else AHEAD_PX
         return detect_landmarks(picture.image, picture.mask, count, longest_px)
 
     def pack_landmarks(self, picture: LevelledImage) -> bytes | None:
-        """Return the landmarks to store for a place; None if the technique has no use for them."""
+        """Return the encoded landmarks to store for a place; None if the technique does not use them."""
         return pack_bytes(self.detect_landmarks(picture)) if self.technique.spec.cells else None
 
     def replace_mount(self, mount: Mount) -> "FrameEncoder":
-        """Return the same for a camera that looks straight down but for `mount`."""
+        """Return this encoder for a camera that is mounted at the angles `mount` from straight down."""
         if not isinstance(self.levelling, Levelling):
             return self
         return replace(self, levelling=self.levelling.replace_mount(mount))
 
 
 def explain_failure(error: Exception | None) -> Reason:
-    """Return why a frame failed (None: it did not, and was not searched for). An error that is not edgevpr's own is a
-    fault of a technique or of a library."""
+    """Return why a frame failed. None: there was no error, and no search. An error that is not edgevpr's own comes from
+    a fault in a technique or a library."""
     match error:
         case None:
             return NOT_SEARCHED

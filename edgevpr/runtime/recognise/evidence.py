@@ -1,22 +1,22 @@
-"""Evidence of a match: the figures that its confidence is computed from (see `confidence`).
+"""Evidence for a match: the figures from which its confidence is computed (see `confidence`).
 
 There are four kinds: for a camera that looks straight down, with landmarks (DOWN) or without (DOWN_BARE), and for one
 that looks ahead (AHEAD, and AHEAD_PROVEN where landmarks support the match). A place *elsewhere* is outside the best
 place's neighbourhood. Regions *agree* if they show the same shift between query and place. A larger figure supports the
 match, except `rank_gap`.
 
-* agree: logarithm of what `compute_share` returns, the share of regions that agree
+* agree: logarithm of the share of regions that agree (see `compute_share`)
 * lead: `agree` minus the largest `agree` of a place elsewhere
 * coverage: logarithm of the share of the place's regions that agree, each counted once
 * structure: `FineMatch.structure`
 * likeness: `Support.likeness` (ahead)
 * rank_gap: mean logarithm of the rank of the regions (see `Support`), minus the least of all places compared (ahead)
-* landmarks: logarithm of one more than the number of landmarks that agree as expected (ahead, no model weighs it)
-* proof: what `log_inlier_ratio` returns, of the landmarks (ahead)
-* twin: agreement of the place, in the map, with the one that looks most like it (see `LookAlike`), minus that of
-  pictures of its own ground; from 0 on the two are *twins* (ahead). No model weighs it, nor the next one
+* landmarks: logarithm of one plus the number of landmarks that agree as expected (ahead, no model uses it)
+* proof: result of `log_inlier_ratio` (ahead)
+* twin: agreement of the place with the place of the map that looks most like it (see `LookAlike`), minus the agreement
+  of pictures of its own ground; if it is 0 or more, the two are *twins* (ahead). No model uses `twin` or `apart`
 * apart: `agree` minus the agreement of these two places with each other (ahead, in a map of single views)
-* tried: `Ranking.tried`, which no model weighs (see `Model.chance`)
+* tried: `Ranking.tried`, which is no input of a regression (see `Model.chance`)
 """
 
 import math
@@ -38,18 +38,18 @@ _FIGURES_DOWN = ("lead", "coverage", "structure")
 _DOWN_FIGURES = {DOWN: (*_FIGURES_DOWN, "landmarks"), DOWN_BARE: _FIGURES_DOWN}
 _MAP_FIGURES_AHEAD = ("coverage", "likeness", "structure")
 _PLACE_FIGURES_AHEAD = ("lead", "coverage", "rank_gap", "structure")
-# Names of the evidence that tells whether a query shows ground of the map, and which of its places.
+# Names of the figures that decide whether a query shows ground of the map, and which of its places it shows.
 MAP_FIGURES = {AHEAD: _MAP_FIGURES_AHEAD, AHEAD_PROVEN: _MAP_FIGURES_AHEAD, **_DOWN_FIGURES}
 PLACE_FIGURES = {AHEAD: _PLACE_FIGURES_AHEAD, AHEAD_PROVEN: (*_PLACE_FIGURES_AHEAD, "proof"), **_DOWN_FIGURES}
 _MIN_SHARE = 1e-3  # so that its logarithm exists
-# So many landmarks agree with a place that only looks alike. Smaller numbers count as this one, since they scatter.
+# As many landmarks may agree with a place that only looks alike. Smaller numbers are noise, and count as this one.
 CHANCE_INLIERS = 8
-CHANCE_SHARE = 0.07  # reached by pictures of foreign ground; stands for a place elsewhere if there is none
+CHANCE_SHARE = 0.07  # reached by pictures of ground outside the map; used if there is no place elsewhere
 # If a place leads by a smaller factor, its landmarks must distinguish it from the best one elsewhere.
 SMALL_LEAD = math.log(1.5)
 _MIN_LEAD = math.log(1.05)
-# Ahead, the most by which the regions of another place may rank better. Chosen on corridor, where one match next to the
-# right places was accepted.
+# Ahead, the largest advantage in rank that the regions of another place may have. Chosen on corridor, where one match
+# next to the right places was accepted.
 _MAX_RANK_GAP = 0.1
 _MIN_PROOF = math.log(2)
 # A place that has a twin must lead by this factor. In thumbs_essex, the lift door of another floor led by 2 when it was
@@ -59,8 +59,8 @@ _MIN_LEAD_OVER_TWIN = math.log(4)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """Evidence of a match, as the module describes it. None: this kind of evidence has no such figure, or it was not
-    measured. `rival` is, like `landmarks`, the number of those that agree with the best place elsewhere."""
+    """Evidence for a match, as described in the module docstring. None: this kind of evidence lacks the figure, or it
+    was not measured. `rival` is like `landmarks`, for the best place elsewhere."""
 
     agree: float
     lead: float
@@ -76,12 +76,12 @@ class Evidence:
     apart: float | None = None
 
     def figures(self) -> dict[str, float]:
-        """Return the figures that are known, by their names."""
+        """Return the known figures by name."""
         return {name: value for name in self.__slots__ if (value := getattr(self, name)) is not None}
 
     @property
     def kind(self) -> str:
-        """Kind of this evidence, by the figures it has."""
+        """Kind of this evidence, derived from the figures it has."""
         if self.likeness is not None:
             return AHEAD_PROVEN if self.proof else AHEAD
         return DOWN if self.landmarks is not None else DOWN_BARE
@@ -89,23 +89,23 @@ class Evidence:
     @property
     def has_twin(self) -> bool:
         """True if the match may show another place that looks alike: at least half as many landmarks agree with a place
-        elsewhere, or the map knows a twin and the lead is not large."""
+        elsewhere, or the place has a twin in the map and the lead is not large."""
         is_alike = self.rival is not None and _to_count(self.landmarks or 0.0) < 2 * _to_count(self.rival)
         return is_alike or (self.twin is not None and self.twin >= 0 and self.lead < _MIN_LEAD_OVER_TWIN)
 
     @property
     def is_unambiguous(self) -> bool:
-        """True if no place elsewhere agrees about as well, by the regions, the landmarks, and what the map knows."""
+        """True if no place elsewhere agrees about as well, judged by regions, landmarks and known look-alikes."""
         return self.lead >= _MIN_LEAD and not self.has_twin
 
     @property
     def needs_landmarks(self) -> bool:
-        """True if the landmarks of a match, ahead, do not prove it, and the regions alone cannot:
+        """True if the regions alone cannot prove a match (ahead), and its landmarks do not either:
 
         * The place has a small lead: ground outside the map may look like the map.
         * It has a small lead, and the regions of another place rank better: twice as many landmarks must agree.
-        * It is a single view (see `LookAlikes`), and the query agrees with it hardly better than the place that looks
-          most like it does: from another spot, each of the two may look more like the other."""
+        * It is a single view (see `LookAlikes`), and the query agrees with it hardly better than the most similar
+          place does: from another spot, each of the two may look more like the other."""
         if self.likeness is None:
             return False
         if self.has_small_lead and (self.rank_gap or 0.0) > _MAX_RANK_GAP:
@@ -120,7 +120,7 @@ class Evidence:
         return self.lead < SMALL_LEAD
 
     def describe(self) -> dict[str, float | None]:
-        """Return this evidence as parameters of a `Reason` of the judge, without logarithms."""
+        """Return this evidence as parameters of a `Reason` of the judge, converted back from logarithms."""
         is_down = self.landmarks is not None and self.likeness is None
         return {
             "regions_ratio": math.exp(self.lead),
@@ -134,8 +134,8 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class LookAlike:
-    """The place elsewhere that looks most like a place: its number, and the logarithm of how well both agree. `own`:
-    that of pictures of the place's own ground with each other, or by chance where there are none."""
+    """The place elsewhere that looks most like a place: its number, and the logarithm of the share of regions of both
+    that agree. `own`: the same for pictures of the place's own ground, or by chance if there are none."""
 
     other_id: int
     agree: float
@@ -144,9 +144,9 @@ class LookAlike:
 
 @dataclass(frozen=True, slots=True)
 class LookAlikes:
-    """The `places` of a map, made looking ahead, that look alike, by their numbers. `overlap`: pictures that were
-    mapped one after the other show the same ground, as along a road. Else each place is a single view: those before and
-    after it in the file are other places."""
+    """The `places` that look alike, by number, in a map of a camera that looks ahead. `overlap`: successive pictures
+    show the same ground, as along a road. Otherwise each place is a single view: the places before and after it in the
+    file show other ground."""
 
     overlap: bool
     places: Mapping[int, LookAlike]
@@ -158,7 +158,7 @@ class LookAlikes:
 
 
 def list_evidence_kinds(spec: TechniqueSpec) -> tuple[str, ...]:
-    """Return the kinds of evidence that a technique gives; an empty tuple if its matches are judged by fixed limits."""
+    """Return the kinds of evidence that a technique provides; none if its matches are judged by fixed limits."""
     if spec.looks_down:
         return DOWN, DOWN_BARE
     return (AHEAD, AHEAD_PROVEN) if spec.scan_counts else ()
@@ -214,27 +214,27 @@ def gather_evidence(
 
 
 def count_neighbours(look_alikes: LookAlikes | None) -> int:
-    """Return how many places before and after one without a position, in the order of mapping, are its neighbours."""
+    """Return the number of neighbours before and after a place without a position, in mapping order."""
     return MAX_NEIGHBOUR_SLOTS if look_alikes is None or look_alikes.overlap else 0
 
 
 def log_inlier_ratio(inliers: int, rival: int) -> float:
-    """Return the evidence of the landmarks, ahead: the logarithm of the ratio of `inliers`, those that agree with the
-    best place, to `rival`, those that agree with the best place elsewhere, both at least the number by chance. It is 0
-    at least, so it never counts against a match."""
+    """Return the evidence from landmarks (ahead): the logarithm of the ratio of `inliers`, the number that agree with
+    the best place, to `rival`, the number that agree with the best place elsewhere. Both are raised to the number
+    expected by chance. The result is at least 0, so it never counts against a match."""
     return max(0.0, math.log(max(inliers, CHANCE_INLIERS) / max(rival, CHANCE_INLIERS)))
 
 
 def compute_share(match: FineMatch) -> float:
     """Return the share of regions that agree on a shift: ahead, the geometric mean of the shares of the query's and of
-    the place's regions; down, `FineMatch.votes`, which counts how well the layouts agree, too."""
+    the place's regions; down, `FineMatch.votes`, which also counts how well the layouts agree."""
     if match.support is not None:
         return math.sqrt(match.score * match.support.back)
     return match.score if match.votes is None else match.votes
 
 
 def log_count(landmarks: int) -> float:
-    """Return a number of landmarks as it stands in the evidence."""
+    """Convert a number of landmarks to its form in the evidence."""
     return math.log1p(landmarks)
 
 

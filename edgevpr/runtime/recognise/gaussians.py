@@ -1,4 +1,4 @@
-"""Gaussian positions in a plane: distances, fusion and mixtures of many at once. `belief` uses them."""
+"""Gaussian positions in a plane: distances, fusion and mixtures, for many at once. `belief` uses them."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ def compute_distances(one: Doubles, other: Doubles) -> Doubles:
 
 
 def regularize_covariance(covariance: Doubles, least: float) -> Doubles:
-    """Make covariances (K, 2, 2) invertible: add the variance `least`, and a small share of their own, to each axis."""
+    """Make covariances (K, 2, 2) invertible: add the variance `least` and a small share of their trace to each axis."""
     more: Doubles = least + MIN_VARIANCE_RATIO * np.abs(np.trace(covariance, axis1=1, axis2=2))
     return covariance + more[:, None, None] * np.eye(2)
 
@@ -25,16 +25,16 @@ def fuse_positions(one: Doubles, cov: Doubles, other: Doubles, other_cov: Double
     share = (other_trace / (trace + other_trace))[:, None, None]
     information, other_information = share * np.linalg.inv(cov), (1 - share) * np.linalg.inv(other_cov)
     covariance = np.linalg.inv(information + other_information)
-    at = covariance @ (information @ one[..., None] + other_information @ other[..., None])
-    return at[..., 0], covariance
+    mean = covariance @ (information @ one[..., None] + other_information @ other[..., None])
+    return mean[..., 0], covariance
 
 
-def mix_gaussians(share: Doubles, at: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
-    """Return the means (K, 2) and covariances (K, 2, 2) of K mixtures of M Gaussians with means `at` (M, 2) and
-    `covariance` (M, 2, 2), weighted by `share` (K, M)."""
-    middle = at.mean(0) if len(at) else np.zeros(2)  # coordinates far from zero would lose digits in their squares
-    off = at - middle
-    second = covariance + off[:, :, None] * off[:, None]
-    mean = share @ off
-    spread = (share @ second.reshape(-1, 4)).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None]
+def mix_gaussians(weights: Doubles, means: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
+    """Return the means (K, 2) and covariances (K, 2, 2) of K mixtures of M Gaussians with `means` (M, 2) and
+    `covariance` (M, 2, 2), weighted by `weights` (K, M)."""
+    middle = means.mean(0) if len(means) else np.zeros(2)  # far from zero, squared coordinates would lose digits
+    offsets = means - middle
+    second = covariance + offsets[:, :, None] * offsets[:, None]
+    mean = weights @ offsets
+    spread = (weights @ second.reshape(-1, 4)).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None]
     return middle + mean, regularize_covariance(spread, _ROUNDING * float(np.abs(second).max(initial=1)))

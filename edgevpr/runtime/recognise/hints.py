@@ -255,7 +255,7 @@ def parse_known_fields(text: str | None) -> tuple[str, ...]:
     return tuple(name for name in KNOWN_FIELDS if name in names)
 
 
-def explain_useless(
+def explain_why_unusable(
     known: Collection[str],
     queries: Collection[GeoTag],
     places: Collection[GeoTag] | Collection[Place],

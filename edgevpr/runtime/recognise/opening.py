@@ -165,7 +165,8 @@ def warn_of_mismatch(place_map: PlaceMap, mask: OverlayMask | None, lens: str | 
         _log.warning("%s was built %s; more is recognised where map and frames have the same", path, how)
     if built_lens and not lens:
         _log.warning(
-            "%s was built with `source.lens` (%s): name the calibration of this camera too, unless it distorts nothing",
+            "%s was built with `source.lens` (%s): set `source.lens` to the calibration of this camera too, unless its "
+            "lens has no distortion",
             path,
             built_lens,
         )

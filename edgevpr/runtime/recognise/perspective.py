@@ -136,8 +136,8 @@ class CommonTilt:
         if self.shown.is_clear and not self._has_warned:
             self._has_warned = True
             _log.warning(
-                "the camera is tilted by about %.0f degrees more than is reported: set source.mount_ahead_deg and "
-                "source.mount_right_deg (positions claim this error)",
+                "the camera is tilted by about %.0f degrees more than reported: set source.mount_ahead_deg and "
+                "source.mount_right_deg (until then the reported position accuracy includes this error)",
                 self.shown.deg,
             )
 

@@ -173,8 +173,8 @@ class PlaceFilter:
         return make_motion(self._elapsed_s, self._max_speed_m_s, self._velocity_m_s)
 
     def _limit_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:
-        """Return `confidence`; over the same ground as the query before, where more pictures prove nothing new, at most
-        that after the first picture there, or that of this pass alone (`by_itself`)."""
+        """Cap `confidence` while successive queries show the same ground: more pictures of it are no independent
+        evidence. The cap is the confidence after the first of them, or of this query alone (`by_itself`) if higher."""
         first = self._first_view
         if first is None or self._geometry is None or np.hypot(*(at - first[0])) >= self._geometry.scale.spacing:
             self._next_first_view = at, confidence

@@ -73,8 +73,8 @@ class Recognition:
 
 
 def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
-    """Return the event as a dict for the flight log (kind "query"), or with an `exact` confidence, of which six digits
-    would make 1 where it is nearly certain. `edgevpr match` and the status of a flight use it too.
+    """Return the event as a dict for the flight log (kind "query"), `edgevpr match` and the status of a flight.
+    `exact`: do not round the confidence (rounded to six digits, a nearly certain one would become 1).
 
     Always there: query, place (number), reference_image, score, position (of the place), shift, covariance and rotation
     of the match (all null if no place was found), accepted, reason, accuracy_m, located (the aircraft's position; null

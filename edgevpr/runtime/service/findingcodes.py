@@ -68,7 +68,7 @@ class FindingCode(Code):
     LINK_ANSWERS = _AUTOPILOT, "; round trip {trip_ms:.0f} ms"
     LINK_SLOW = _AUTOPILOT, "; round trip {trip_ms:.0f} ms, so every fix arrives late: use a faster link"
     LINK_DAMAGED = _AUTOPILOT, "; {bad_bytes:.0f} corrupt bytes received: check ground wire, cable and baud rate"
-    LINK_ONE_WAY = _AUTOPILOT, ", answers no request: check the wire to its RX, the signing key, and this board's clock"
+    LINK_ONE_WAY = _AUTOPILOT, ", does not answer requests: check its RX wire, the signing key and this board's clock"
     SYSTEM_NOT_NAMED = "system {systems} is also on this link: configure the system ID of this aircraft"
     MAVLINK_2 = "MAVLink 2"
     MAVLINK_1 = "the autopilot sends MAVLink 1, which supports neither signing nor the position messages"

@@ -73,7 +73,7 @@ def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
         (4, "edgevpr: map cannot be read, see the log"),
         (4, "edgevpr: 10 frames in a row have failed"),
         (6, "edgevpr: map can be read again"),
-        (6, "edgevpr: frames no longer fail"),
+        (6, "edgevpr: frames are being processed again"),
     ]
     assert flight.end["unusable"] == MAX_FAILURES_IN_A_ROW + 1
     assert flight.end["left_out"] == 0, "where all are damaged the file is at fault, and may come back"
