@@ -1,5 +1,5 @@
-"""The calibration of a map, which is stored in it as text: the models of confidence that were adapted to it (see
-`mapmaking.calibrate`), what to expect of it, and which of its places look alike."""
+"""The calibration of a map, stored in the map as text: the confidence models adapted to it (see `mapmaking.calibrate`),
+the expected recognition rates, and the places that look alike."""
 
 import json
 import logging
@@ -14,7 +14,7 @@ from edgevpr.runtime.recognise.confidence import Model, parse_model
 from edgevpr.runtime.recognise.evidence import MAP_FIGURES, PLACE_FIGURES, LookAlike, LookAlikes
 
 MIN_PLACES = 30  # a map with fewer is not calibrated
-_MIN_CONFIDENCE = 0.5  # mean confidence below which a place is hardly recognisable
+_MIN_CONFIDENCE = 0.5  # mean confidence below which a place is hard to recognise
 _CHECKSUM_DIGITS = 8
 
 _log = logging.getLogger(__name__)
@@ -22,11 +22,11 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapCalibration:
-    """Calibration of a map: the result of looking for a number (`asked`) of altered pictures of its own places.
-    `models` maps kinds of evidence to the models adapted to the map, and `made` is the date. At the `precision` that
-    the calibration was made for, the share `accepted` of the pictures is accepted. `accepted_wrong` of the accepted
-    matches are wrong, among them those of places that were left out of the map for the test. `recognisable` maps the
-    number of each place tested to the mean confidence (0..1) of its right matches. `look_alikes`: None looking down."""
+    """Calibration of a map: the result of querying it with `asked` altered pictures of its own places. `models` maps
+    kinds of evidence to the models adapted to the map, and `made` is the date. At the `precision` for which the map
+    was calibrated, the share `accepted` of the pictures is accepted. `accepted_wrong` of these matches are wrong,
+    including queries of places that were left out of the map for the test. `recognisable` maps the number of each
+    tested place to the mean confidence (0..1) of its correct matches. `look_alikes`: None for a camera looking down."""
 
     models: Mapping[str, Model]
     made: str
@@ -39,12 +39,12 @@ class MapCalibration:
 
     @property
     def hardly_recognisable(self) -> float:
-        """Share of the tested places that are hardly recognisable."""
-        return sum(each < _MIN_CONFIDENCE for each in self.recognisable.values()) / max(len(self.recognisable), 1)
+        """Share of the tested places that are hard to recognise."""
+        return sum(mean < _MIN_CONFIDENCE for mean in self.recognisable.values()) / max(len(self.recognisable), 1)
 
     @property
     def looks_alike(self) -> bool:
-        """True if more than half of the tested places are hardly recognisable."""
+        """True if more than half of the tested places are hard to recognise."""
         return self.hardly_recognisable > 0.5
 
     def figures(self) -> dict[str, Any]:
@@ -59,7 +59,7 @@ class MapCalibration:
         }
 
     def described(self) -> str:
-        """Describe the calibration in one sentence: matches accepted, wrong matches, and hardly recognisable places."""
+        """Describe the calibration in one sentence: accepted and wrong matches, and places hard to recognise."""
         wrong = f"{self.accepted_wrong or 'no'} wrong match{'es were' if self.accepted_wrong > 1 else ' was'} accepted"
         alike = "; most of this map looks alike: expect few fixes over it" if self.looks_alike else ""
         return (
@@ -70,10 +70,10 @@ class MapCalibration:
 
 
 def require_usable(kind: str, model: Model) -> None:
-    """Check a model read from a map. Raises ValueError for an unknown kind or name of evidence, as another version of
-    edgevpr may have, and ValueError or ArithmeticError for figures with which no confidence can be computed."""
+    """Check a model read from a map. Raises ValueError for an unknown kind or name of evidence, which another version
+    of edgevpr may use, and ValueError or ArithmeticError for figures that give no confidence."""
     known = MAP_FIGURES.get(kind, ()) + PLACE_FIGURES.get(kind, ())
-    names = {name for each in (model.of_map, model.of_place) for name in each.names}
+    names = {*model.of_map.names, *model.of_place.names}
     if unknown := names.difference(known):
         raise ValueError(f"unknown evidence {min(unknown)!r:.40} for kind {kind!r:.40}")
     for value in (-1.0, 0.0, 1.0):
@@ -82,7 +82,7 @@ def require_usable(kind: str, model: Model) -> None:
 
 
 def read_calibration_for(place_map: PlaceMap) -> MapCalibration | None:
-    """Return the calibration of a map; None if it has none, or, after a warning in the log, if it is unusable."""
+    """Return the calibration of a map; None if it has none or, with a warning in the log, if it is unusable."""
     try:
         text = place_map.calibration
         if text is None:
@@ -92,7 +92,7 @@ def read_calibration_for(place_map: PlaceMap) -> MapCalibration | None:
             require_usable(kind, model)
     except (ValueError, ArithmeticError, KeyError, TypeError, AttributeError, MapError) as error:
         _log.warning(
-            "%s: its calibration cannot be used (%s): the shipped one is used; `edgevpr map calibrate` makes it anew",
+            "%s: the calibration cannot be used (%s), so the shipped one is: run `edgevpr map calibrate`",
             place_map.path,
             error,
         )
@@ -101,27 +101,27 @@ def read_calibration_for(place_map: PlaceMap) -> MapCalibration | None:
 
 
 def explain_not_calibrated(places: int) -> str:
-    """Return a sentence for a map with so many places: it is not calibrated, and why."""
+    """Return a sentence on why a map with this number of places is not calibrated."""
     if places < MIN_PLACES:
         return f"not calibrated ({places} places: fewer than {MIN_PLACES}): the shipped confidence is used"
-    return "not calibrated: the shipped confidence is used; `edgevpr map calibrate` makes its own of its pictures"
+    return "not calibrated: the shipped confidence is used; `edgevpr map calibrate` adapts it to the map"
 
 
 def format_calibration(calibration: MapCalibration) -> str:
-    """Write a calibration as text for `read_calibration`: the CRC-32 of the JSON that follows, then the JSON."""
+    """Format a calibration as text for `read_calibration`: the CRC-32 of the JSON, then the JSON."""
     body = json.dumps(asdict(calibration))
     return _checksum(body) + body
 
 
 def read_calibration(text: str) -> MapCalibration:
     """Read a calibration from the text in a map. Raises ValueError if it is damaged, KeyError, TypeError or
-    AttributeError if another version has written it in another form."""
+    AttributeError if another version wrote it in another format."""
     body = text[_CHECKSUM_DIGITS:]
     if text != _checksum(body) + body:
         raise ValueError("its checksum is wrong")
     found = json.loads(body)
     found["models"] = {kind: parse_model(model) for kind, model in found["models"].items()}
-    found["recognisable"] = {int(place_id): each for place_id, each in found["recognisable"].items()}
+    found["recognisable"] = {int(place_id): mean for place_id, mean in found["recognisable"].items()}
     if (alike := found.get("look_alikes")) is not None:
         places = {int(place_id): LookAlike(**each) for place_id, each in alike["places"].items()}
         found["look_alikes"] = LookAlikes(bool(alike["overlap"]), places)

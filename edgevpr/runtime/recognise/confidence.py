@@ -1,14 +1,14 @@
-"""The model of confidence: turns the evidence of a match (see `evidence`) into the probability that it is right.
+"""The confidence model: converts the evidence for a match (see `evidence`) to the probability that it is correct.
 
-A match can be wrong in two ways: the query shows no ground of the map at all, or it does, and the best place is not the
-right one. Pictures agree by chance to much the same degree in every map, but maps differ in how much their places look
-alike. So there is one logistic regression for each way. Both are shipped, and are adapted to a map that is large enough
-(see `calibrate`).
+A match can be wrong in two ways: the query shows ground outside the map, or it shows the map but the best place is not
+the right one. Chance agreement is much the same in every map, but maps differ in how much their places look alike. So
+there is one logistic regression for each of the two errors. Both are shipped, and are adapted to a map that is large
+enough (see `calibrate`).
 
-The distribution of the logits of wrong matches was measured on many sites: the highest are distributed exponentially
-(peaks over a threshold: Pickands 1975). The *chance* of a match is the probability that a wrong match has logits as
-high, summed over both ways. For a precision p, matches with a chance of at most 1 - p are accepted. The confidence is a
-logistic function of the logarithm of the chance (Platt 1999).
+The distribution of the logits of wrong matches was measured on many sites: the highest follow an exponential
+distribution (peaks over threshold: Pickands 1975). The *chance* of a match is the probability that a wrong match has
+logits as high, summed over both errors. For a precision p, matches with a chance of at most 1 - p are accepted. The
+confidence is a logistic function of the logarithm of the chance (Platt 1999).
 """
 
 import json
@@ -21,29 +21,29 @@ from typing import Any
 from edgevpr.core.errors import ModelError
 from edgevpr.core.files import find_shipped, read_file
 
-Figures = Mapping[str, float]  # the figures of the evidence of a match, by their names
+Figures = Mapping[str, float]  # figures of the evidence for a match, by name
 
 _MAX_FILE_BYTES = 100_000
 _MAX_LOGIT = 40.0  # limit of a logit: beyond it, a probability is 0 or 1 in float64
-# Factors to the share of matches that may be wrong: a chance is an estimate. Without them one tunnel of nordland_tiny
-# was taken for another, and a foreign picture for a place of aerial_swindale; and where a model is not adapted to its
-# map, foreign pictures for places of grief_michigan_monthly, of which there are five.
+# Safety factors on the share of matches that may be wrong, because a chance is an estimate. Without them one tunnel of
+# nordland_tiny was mistaken for another, and a foreign picture for a place of aerial_swindale; with a model that is not
+# adapted to its map, also foreign pictures for the five places of grief_michigan_monthly.
 _ADAPTED_FACTOR = 0.5
 _SHIPPED_FACTOR = 0.1
-# Matches that a model was fitted to, where a map was calibrated before they were stored.
+# Number of matches that a model was fitted to, if its map was calibrated before this number was stored.
 _UNKNOWN_MATCHES = 1000
 _MIN_CHANCE = 1e-15  # least chance, so that its logarithm exists
-# Power of the share of rotations tried, as a factor of a chance: 1 if rotations were independent, but streets and
-# furrows have directions. Of 2,015 foreign and mirrored pictures, asked with random headings in the maps of sat_marash
-# and aerial_garfield28, 3 had a chance below 1 % without this factor, and 12 one below 30 %.
+# A chance is multiplied by the share of rotations tried to this power. It would be 1 if rotations were independent, but
+# streets and furrows have directions. Of 2,015 foreign and mirrored pictures, queried with random headings in the maps
+# of sat_marash and aerial_garfield28, 3 had a chance below 1 % without this factor, and 12 one below 30 %.
 _ROTATIONS_EXPONENT = 2 / 3
 
 
 @dataclass(frozen=True, slots=True)
 class Logistic:
-    """A logistic regression on the evidence of a match. Its logit is `bias` plus the sum of each figure of the evidence
-    in `names` times the weight at the same position in `weights`. `scales` are the standard deviations of these figures
-    over many sites; an adaptation to a map uses them."""
+    """A logistic regression on the evidence for a match. Its logit is `bias` plus the sum of the figures in `names`,
+    each times its weight in `weights`. `scales` are the standard deviations of these figures over many sites, used to
+    adapt the regression to a map."""
 
     names: tuple[str, ...]
     weights: tuple[float, ...]
@@ -65,14 +65,14 @@ class Tail:
     scale: float
 
     def compute_exceedance(self, logit: float) -> float:
-        """Return the share of all matches that are wrong and have a logit above this one; 1 at most."""
+        """Return the share of all matches that are wrong and have a logit above this one; at most 1."""
         return math.exp(min(0.0, math.log(self.share) + (self.start - logit) / self.scale))
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
     """Conversion of the logits of a model to a confidence. `off_map` and `off_place` are the tails of the matches that
-    are wrong because the query is off the map, or at another place. The logit of the confidence is a straight line over
+    are wrong because the query is off the map, or at another place. The logit of the confidence is linear in
     -log(chance), with `slope` and `offset`."""
 
     off_map: Tail
@@ -81,18 +81,18 @@ class Scale:
     offset: float
 
     def confidence(self, chance: float) -> float:
-        """Return the probability that a match is right, given its chance (see the module)."""
+        """Return the probability that a match is correct, given its chance (see the module docstring)."""
         logit = self.offset - self.slope * math.log(max(chance, _MIN_CHANCE))
         return 1 / (1 + math.exp(-max(-_MAX_LOGIT, min(_MAX_LOGIT, logit))))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Model:
-    """Computes the confidence of the matches of one technique and kind of evidence. `of_map` is the regression that
-    tells whether the query shows ground of the map, `of_place` whether the best place is the right one, and `scale`
+    """Computes the confidence of the matches of one technique and kind of evidence. `of_map` is the regression on
+    whether the query shows ground of the map, `of_place` on whether the best place is the right one, and `scale`
     converts their logits. `adapted_scale` replaces `scale` once the model is adapted to a map (None: this model is
-    adapted). `made` is its date, `made_of` describes in words the data it was fitted to, and `matches` is the number of
-    matches of many sites that the scale was fitted to."""
+    adapted). `made` is its date, `made_of` describes the data it was fitted to in words, and `matches` is the number of
+    matches from many sites that the scale was fitted to."""
 
     of_map: Logistic
     of_place: Logistic
@@ -103,8 +103,8 @@ class Model:
     matches: int = _UNKNOWN_MATCHES
 
     def chance(self, evidence: Figures) -> float:
-        """Return the probability (0..1) that a wrong match offers as much evidence; 1 if any of it is not finite. If
-        the heading is known, `tried` says that fewer rotations than a map was measured with had the chance to match."""
+        """Return the probability (0..1) that a wrong match has as much evidence; 1 if any figure is not finite. If the
+        heading is known, fewer rotations are tried than in calibration, and `tried` lowers the chance accordingly."""
         of_map, of_place = self.of_map.logit(evidence), self.of_place.logit(evidence)
         if not (math.isfinite(of_map) and math.isfinite(of_place)):
             return 1.0
@@ -112,12 +112,12 @@ class Model:
         return min(1.0, chance * math.pow(evidence.get("tried", 1.0), _ROTATIONS_EXPONENT))
 
     def confidence(self, evidence: Figures) -> float:
-        """Return the probability that the match is right, 0..1."""
+        """Return the probability that the match is correct, 0..1."""
         return self.scale.confidence(self.chance(evidence))
 
     @property
     def max_reported(self) -> float:
-        """Return the highest confidence that the data support: how seldom a match is wrong that none of so many was."""
+        """Return the highest confidence that the data support: if none of n matches was wrong, 1 - 1/n."""
         return 1 - 1 / max(self.matches, 1)
 
     def map_confidence(self, evidence: Figures) -> float:
@@ -126,15 +126,15 @@ class Model:
         return self.scale.confidence(self.scale.off_map.compute_exceedance(logit) if math.isfinite(logit) else 1.0)
 
     def threshold(self, precision: float) -> float:
-        """Return the confidence at and above which the share `precision` (below 1) of the matches is right. A model
-        that is not adapted to its map does not know how alike places look there, so its threshold is higher."""
+        """Return the confidence at and above which the share `precision` (below 1) of the matches is correct. A model
+        that is not adapted to its map does not reflect how alike its places look, so its threshold is higher."""
         wrong = 1 - precision
         return self.scale.confidence(wrong * (_ADAPTED_FACTOR if self.adapted_scale is None else _SHIPPED_FACTOR))
 
 
 def parse_model(stored: Mapping[str, Any]) -> Model:
     """Make a model from decoded JSON. Raises KeyError or TypeError for other contents, and ValueError for a model that
-    was joined from those of several maps."""
+    was merged from several maps."""
     if stored.get("of_other_places"):  # earlier builds joined the models of several maps
         raise ValueError("it was joined from several maps")
     stored = {name: value for name, value in stored.items() if name != "of_other_places"}

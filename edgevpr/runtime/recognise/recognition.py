@@ -1,4 +1,4 @@
-"""The event of one frame: everything that happened to it, in one value. Made by the recogniser, written to the log."""
+"""The event of one frame: the results of all stages in one value, made by the recogniser and written to the log."""
 
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -16,35 +16,34 @@ from edgevpr.runtime.recognise.odometry import OdometryStep
 from edgevpr.runtime.recognise.place_filter import TrackEstimate
 from edgevpr.runtime.recognise.salience_gate import SalienceVerdict
 
-_OF_THE_BEST = ("place", "reference_image", "score", "position", "shift_cells", "covariance_cells2", "rotation_deg")
+_BEST_FIELDS = ("place", "reference_image", "score", "position", "shift_cells", "covariance_cells2", "rotation_deg")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recognition:
     """Result of one frame. A field is None if its stage was not reached.
-
-    `fix` is what became of the position (None: the event was not yet given to the channel to the autopilot).
+    `fix` reports how the position was sent (None: the event was not yet passed to the channel to the autopilot).
     """
 
     frame: Frame | None
     vehicle: Vehicle | None = None  # the autopilot's report when the frame was taken
-    picture: LevelledImage | None = None  # that was encoded, and how it lies on the ground
+    picture: LevelledImage | None = None  # as encoded, with its view of the ground
     salience: SalienceVerdict | None = None  # judgement of the salience gate
     descriptor: Descriptor | None = None
-    odometry: OdometryStep | None = None  # since the frame before
-    hints: Hints | None = None  # that narrowed the search
+    odometry: OdometryStep | None = None  # since the previous frame
+    hints: Hints | None = None  # used to narrow the search
     ranking: Ranking | None = None
     best: Candidate | None = None  # the first of the ranking
     agreement: Agreement | None = None  # of the landmarks
     evidence: Evidence | None = None
-    confidence: float | None = None  # probability, by the evidence, that the match is right (None: judged by limits)
-    track: TrackEstimate | None = None  # the result together with the flight so far
-    accepted: bool = False  # `best` is taken for the place
+    confidence: float | None = None  # that the match is correct, from the evidence (None: judged by limits)
+    track: TrackEstimate | None = None  # result of the place filter
+    accepted: bool = False  # `best` is accepted as the place
     reason: Reason = NOT_SEARCHED  # why or why not
-    lacks_texture: bool = False  # too little to be recognised; a search was only made to continue a sequence
+    lacks_texture: bool = False  # too little to recognise; searched only to continue a sequence
     failed: bool = False  # the frame, a place or the technique was unusable
     map_lost: bool = False  # the whole map cannot be read
-    left_out: tuple[tuple[int, str], ...] = ()  # places unreadable since the last event: number, and what is wrong
+    left_out: tuple[tuple[int, str], ...] = ()  # places found unreadable since the last event: number and problem
     located: Located | None = None  # position of the aircraft, only if the match is accepted and the place has one
     accuracy_m: float | None = None  # the 1-sigma to send with it
     steps: StepCosts = field(default_factory=StepCosts)
@@ -63,12 +62,12 @@ class Recognition:
 
     @property
     def name(self) -> str:
-        """Name of the frame, "" if there is none."""
+        """Name of the frame; "" without a frame."""
         return self.frame.name if self.frame else ""
 
     @property
     def is_query(self) -> bool:
-        """True if the frame became a query: it could be read and encoded."""
+        """True if the frame was read and encoded, so that it is a query."""
         return self.descriptor is not None
 
 
@@ -76,20 +75,20 @@ def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
     """Return the event as a dict for the flight log (kind "query"), `edgevpr match` and the status of a flight.
     `exact`: do not round the confidence (rounded to six digits, a nearly certain one would become 1).
 
-    Always there: query, place (number), reference_image, score, position (of the place), shift, covariance and rotation
+    Always present: query, place (number), reference_image, score, position (of the place), shift, covariance, rotation
     of the match (all null if no place was found), accepted, reason, accuracy_m, located (the aircraft's position; null
-    if nothing was accepted), costs. Only if known: view (how the picture lies on the ground), salience, stride,
-    landmarks, confidence, evidence, followed.
+    if nothing was accepted), costs. Present if known: view (how the picture lies on the ground), salience, stride,
+    landmarks, confidence, evidence, followed (track).
     """
     evidence = event.evidence and {key: round(value, 3) for key, value in event.evidence.figures().items()}
     known: dict[str, Any] = {
         "view": event.view.fields() if event.view != UNKNOWN_VIEW else None,
         "salience": event.salience and event.salience.scores.rounded(),
         "stride": event.odometry and event.odometry.fields(),
-        "landmarks": event.agreement and _landmarks(event.agreement),
+        "landmarks": event.agreement and _landmark_fields(event.agreement),
         "confidence": event.confidence if exact else _round(event.confidence, 6),
         "evidence": evidence,
-        "followed": event.track and _followed_fields(event.track),
+        "followed": event.track and _track_fields(event.track),
     }
     return {
         "query": event.frame and event.frame.name,
@@ -105,15 +104,15 @@ def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
 
 def _best_fields(candidate: Candidate | None) -> dict[str, Any]:
     if candidate is None:
-        return dict.fromkeys(_OF_THE_BEST)
+        return dict.fromkeys(_BEST_FIELDS)
     place, match = candidate.place, candidate.match
     position = asdict(place.position) if place.position else None
-    named = (place.place_id, place.source_image, round(match.score, 5), position)
-    step = (match.shift_cells, match.covariance_cells2, match.rotation_deg)
-    return dict(zip(_OF_THE_BEST, (*named, *step), strict=True))
+    identity = (place.place_id, place.source_image, round(match.score, 5), position)
+    alignment = (match.shift_cells, match.covariance_cells2, match.rotation_deg)
+    return dict(zip(_BEST_FIELDS, (*identity, *alignment), strict=True))
 
 
-def _landmarks(agreement: Agreement) -> dict[str, Any]:
+def _landmark_fields(agreement: Agreement) -> dict[str, Any]:
     fields: dict[str, Any] = {"inliers": agreement.inliers, "matched": agreement.matched}
     if agreement.shift_share is not None:
         fields["shift_share"] = [round(share, 4) for share in agreement.shift_share]
@@ -121,26 +120,27 @@ def _landmarks(agreement: Agreement) -> dict[str, Any]:
     return fields
 
 
-def _followed_fields(followed: TrackEstimate) -> dict[str, Any]:
-    fields = {"confidence": round(followed.confidence, 6), "lost": round(followed.lost, 6)}
-    return fields | (_where(followed.estimate) if followed.estimate else {})
+def _track_fields(track: TrackEstimate) -> dict[str, Any]:
+    fields = {"confidence": round(track.confidence, 6), "lost": round(track.lost, 6)}
+    return fields | (_pose_fields(track.estimate) if track.estimate else {})
 
 
-def _located_fields(where: Located) -> dict[str, Any]:
-    fields = _where(where) | {"height_ratio": _round(where.height_ratio, 3), "places": list(where.places)}
-    if where.height_m is not None:
-        fields["height_m"] = round(where.height_m, 1)
-    if error := where.attitude_error:
+def _located_fields(located: Located) -> dict[str, Any]:
+    fields = _pose_fields(located)
+    fields |= {"height_ratio": _round(located.height_ratio, 3), "places": list(located.places)}
+    if located.height_m is not None:
+        fields["height_m"] = round(located.height_m, 1)
+    if error := located.attitude_error:
         fields["attitude_error"] = [round(value, 4) for value in (*error.over_height, error.sd)]
     return fields
 
 
-def _where(where: Located) -> dict[str, Any]:
+def _pose_fields(located: Located) -> dict[str, Any]:
     return {
-        "lat_deg": round(where.position.lat_deg, 8),
-        "lon_deg": round(where.position.lon_deg, 8),
-        "covariance_m2": [round(value, 3) for value in where.covariance_m2],
-        "heading_deg": _round(where.heading_deg, 1),
+        "lat_deg": round(located.position.lat_deg, 8),
+        "lon_deg": round(located.position.lon_deg, 8),
+        "covariance_m2": [round(value, 3) for value in located.covariance_m2],
+        "heading_deg": _round(located.heading_deg, 1),
     }
 
 

@@ -1,7 +1,7 @@
-"""The perspective of a query over its place, measured again of the picture laid over the place.
+"""Second measurement of a query's perspective over its place, from the picture warped onto the place.
 
-Of a picture that is tilted by far, few regions agree, as each is seen from another side. Laid over the place by the
-homography of these, more of them do, and show the tilt more exactly. It costs one picture to encode.
+If a picture is strongly tilted, few regions agree, because each is seen from a different side. After the picture is
+warped by their homography, more of them agree and show the tilt more accurately. One more picture must be encoded.
 """
 
 import math
@@ -14,15 +14,15 @@ from edgevpr.frames.homography import Homography, clip_polygon
 from edgevpr.frames.level import LevelledImage
 
 _MAX_SIDE_PX = 512
-_MIN_SCALE = 0.1  # of that at the middle: nearer to the horizon of the homography, nothing is shown
-# Share of the regions that agreed before. Of views of 45 degrees 0.8 or more are left, over changed ground too.
-_MIN_LEFT = 2 / 3
+_MIN_SCALE = 0.1  # of the scale at the centre: pixels nearer to the horizon are masked
+# Share of the regions that agreed before. In views of 45 degrees 0.8 or more remain, over changed ground too.
+_MIN_REGIONS_SHARE = 2 / 3
 _AT_REST = FineMatch(1.0, shift_cells=(0.0, 0.0), rotation_deg=0.0, height_ratio=1.0)
 
 
 def measure_again(picture: LevelledImage, technique: Technique, fine: Array, found: Perspective) -> Perspective | None:
-    """Measure the perspective of a picture over a place, whose fine part is `fine`, again, beginning with the one that
-    was `found`. Returns None if that was a chance: fewer regions agree now."""
+    """Measure the perspective of a picture over the place with the fine part `fine` again, starting from `found`.
+    Return None if `found` was a coincidence: fewer regions agree now."""
     height, width = picture.image.shape[:2]
     longest, side = max(height, width), min(max(height, width), _MAX_SIDE_PX)
     share_from_pixel = np.array([[1, 0, (1 - width) / 2], [0, 1, (1 - height) / 2], [0, 0, longest]]) / longest
@@ -33,9 +33,9 @@ def measure_again(picture: LevelledImage, technique: Technique, fine: Array, fou
     scale = math.sqrt(math.prod(found.scales))
     warp = Homography(out_from_pixel, corners, side, longest / (side * scale))
     mask = warp.shown if picture.mask is None else warp.shown & warp.warp_mask(picture.mask)
-    laid = technique.encode(warp.warp_image(picture.image), mask)
-    again = technique.measure_perspective(laid, fine, _AT_REST)
-    if again is None or again.regions < _MIN_LEFT * found.regions:
+    warped = technique.encode(warp.warp_image(picture.image), mask)
+    again = technique.measure_perspective(warped, fine, _AT_REST)
+    if again is None or again.regions < _MIN_REGIONS_SHARE * found.regions:
         return None
     over_place = again.over_place @ found.over_place
     return Perspective(over_place / over_place[2, 2], scale * again.slope_sd, again.regions)
