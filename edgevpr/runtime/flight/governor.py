@@ -1,8 +1,8 @@
 """The governor keeps CPU share, memory and temperature within the board's profile. It first compares fewer candidates,
-which find nearly as much for less, then makes fewer queries per second, and returns step by step when there is room.
+which costs few matches, then makes fewer queries per second, and steps back up when resources are free.
 
-It goes back up only if the load, scaled to the higher setting, stays clearly below every limit. After a step up that
-soon had to be undone, it waits twice as long before the next one.
+It steps up only if the load, scaled to the higher setting, stays clearly below every limit. If a step up soon had to be
+undone, it waits twice as long before the next one.
 """
 
 import math
@@ -17,24 +17,24 @@ from edgevpr.runtime.flight.flightio import FlightParts
 from edgevpr.runtime.flight.metering import LoadReading
 
 GOVERN_INTERVAL_S = 1.0
-_MIN_EXCEEDED_S = 3.0  # a limit must be exceeded for so long before anything changes
-_MIN_HEAT_WAIT_S = 20.0  # after a change: a hot board cools slowly, so its effect shows late
-_MIN_WAIT_S = 6.0  # with room below all limits, before a step up
+_MIN_EXCEEDED_S = 3.0  # how long a limit must be exceeded before anything changes
+_MIN_HEAT_WAIT_S = 20.0  # after a change: a hot board cools slowly, so the effect shows late
+_MIN_WAIT_S = 6.0  # how long the load must be below all limits before a step up
 _MAX_WAIT_S = 600.0
-_STEP_UP_TRIAL_S = 300.0  # a step up was right if it lasts so long
-_MAX_EXPECTED_SHARE = 0.85  # share of a limit that the load expected at the higher setting may reach
+_STEP_UP_TRIAL_S = 300.0  # a step up that lasts this long was right
+_MAX_EXPECTED_SHARE = 0.85  # largest share of a limit for the load expected at the higher setting
 _MAX_LATE_SHARE = 0.95
 _TEMPERATURE_MARGIN_C = 5.0
 _MAX_MEMORY_SHARE = 0.95
 _MEMORY_ROOM_SHARE = 0.9
-_MAX_RATE_DIVISOR = 8  # times fewer queries per second than asked for, at most
-_COMPARE_SHARE = 0.6  # share of a query's time for comparing candidates, in a large map (benchmarks/results/arm64.md)
+_MAX_RATE_DIVISOR = 8  # the rate falls to no less than the configured one divided by this
+_COMPARE_SHARE = 0.6  # share of a query's time spent comparing candidates, in a large map (benchmarks/results/arm64.md)
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Settings of recognition: `rate_hz`, queries per second; `candidates`, places compared per query; and `form`, that
-    of descriptors in RAM, which never changes (None: the technique has no forms)."""
+    """Settings of recognition: `rate_hz`, queries per second; `candidates`, places compared per query; and `form`, the
+    form of descriptors in RAM, which never changes (None: the technique has none)."""
 
     rate_hz: float
     candidates: int
@@ -43,8 +43,8 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Change from the setting `before` to `after`, and why. `back`: it is a change up. Both are the same if a limit is
-    exceeded and nothing is left to lower."""
+    """Change from the setting `before` to `after`, and why. `back`: the change is upwards. The settings are equal if a
+    limit is exceeded and no setting is left to lower."""
 
     before: Setting
     after: Setting
@@ -53,9 +53,9 @@ class Change:
 
 
 def list_settings(asked: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[Setting, ...]:
-    """Return the settings from the one `asked` for down to the lowest. First the candidates are lowered to the numbers
-    in `fewer`, largest first, which accept no wrong place; then the rate is halved, down to an eighth, unless it
-    `keeps_rate`."""
+    """Return the settings from the configured one (`asked`) down to the lowest. First the candidates are lowered to the
+    numbers in `fewer`, largest first, with which no wrong place is accepted; then the rate is halved, down to an
+    eighth, unless `keeps_rate`."""
     settings = [asked]
     settings += [replace(asked, candidates=count) for count in fewer if count < asked.candidates]
     while not keeps_rate and settings[-1].rate_hz > asked.rate_hz / _MAX_RATE_DIVISOR:
@@ -64,12 +64,12 @@ def list_settings(asked: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -
 
 
 class Governor:
-    """Decides which of the `settings` (highest first) is in force: it goes down when a limit of the `board`, or its
-    temperature `limit_c` (degrees Celsius), is exceeded, and up when there is room again."""
+    """Decides which of the `settings` (highest first) is in force: it steps down when a limit of the `board`, or the
+    temperature `limit_c` (degrees Celsius), is exceeded, and up when resources are free again."""
 
     def __init__(self, board: Board, limit_c: float, settings: Sequence[Setting]) -> None:
         self._board, self._limit_c, self._settings, self._index = board, limit_c, list(settings), 0
-        self._since_s: dict[str, float] = {}  # when each condition that holds has begun to hold
+        self._since_s: dict[str, float] = {}  # start of each condition that holds
         self._changed_s = self._raised_s = -math.inf
         self._wait_s = _MIN_WAIT_S
         self._reported: set[str] = set()
@@ -81,7 +81,7 @@ class Governor:
 
     @property
     def held(self) -> str | None:
-        """Lowered settings, in a few words; None if nothing is lowered."""
+        """Lowered settings, in a few words; None if none is lowered."""
         now, asked = self.setting, self._settings[0]
         parts = (
             f"{now.rate_hz:g} of {asked.rate_hz:g} Hz" if now.rate_hz != asked.rate_hz else "",
@@ -90,21 +90,21 @@ class Governor:
         return f"held to {', '.join(filter(None, parts))}" if now != asked else None
 
     def update(self, now_s: float, reading: LoadReading) -> Change | None:
-        """Judge the measurement of a second, which must cover a whole number of queries; return the change to be
-        made."""
+        """Process the measurement of one second, which must cover a whole number of queries; return the change to
+        make."""
         hot, over = self._check_load(reading)
-        most_mb = self._board.memory_max_mb
+        max_mb = self._board.memory_max_mb
         has_room = self._has_room(reading, self._settings[max(0, self._index - 1)])
         over_s = self._measure_held_s("over", now_s, over is not None)
         room_s = self._measure_held_s("room", now_s, has_room)
-        full_s = self._measure_held_s("full", now_s, reading.rss_mb >= _MAX_MEMORY_SHARE * most_mb)
+        full_s = self._measure_held_s("full", now_s, reading.rss_mb >= _MAX_MEMORY_SHARE * max_mb)
         if has_room:
             self._reported.discard("load")
-        if reading.rss_mb <= _MEMORY_ROOM_SHARE * most_mb:
+        if reading.rss_mb <= _MEMORY_ROOM_SHARE * max_mb:
             self._reported.discard("memory")
         if full_s >= _MIN_EXCEEDED_S and "memory" not in self._reported:
             return self._report_limit(
-                "memory", Reason(ReasonCode.MEMORY_TAKEN, {"taken_mb": reading.rss_mb, "allowed_mb": most_mb})
+                "memory", Reason(ReasonCode.MEMORY_TAKEN, {"taken_mb": reading.rss_mb, "allowed_mb": max_mb})
             )
         if over is not None and over_s >= _MIN_EXCEEDED_S and not (hot and now_s - self._changed_s < _MIN_HEAT_WAIT_S):
             if hot:
@@ -119,20 +119,20 @@ class Governor:
         return None
 
     def _measure_held_s(self, what: str, now_s: float, holds: bool) -> float:
-        """Note whether the condition `what` holds now. Return for how many seconds it has held without a break."""
+        """Record whether the condition `what` holds now; return for how many seconds it has held without a break."""
         if not holds:
             self._since_s.pop(what, None)
             return 0.0
         return now_s - self._since_s.setdefault(what, now_s)
 
     def _find_lower(self, hot: bool) -> int | None:
-        """Return the index of the next lower setting; for a `hot` board, one of a lower rate, which cools sooner."""
+        """Return the index of the next lower setting; if `hot`, of the next with a lower rate, which cools sooner."""
         below = range(self._index + 1, len(self._settings))
-        slower = [at for at in below if self._settings[at].rate_hz < self.setting.rate_hz]
+        slower = [index for index in below if self._settings[index].rate_hz < self.setting.rate_hz]
         return next(iter(slower if hot and slower else below), None)
 
     def _check_load(self, reading: LoadReading) -> tuple[bool, Reason | None]:
-        """Return True if the board is too hot, and the limit that is exceeded (None: none is)."""
+        """Return whether the board is too hot, and the exceeded limit (None: none)."""
         allowed, temperature_c = self._board.cpu_share, reading.temperature_c
         if temperature_c is not None and temperature_c >= self._limit_c:
             return True, Reason(ReasonCode.BOARD_HOT, {"temperature_c": temperature_c, "limit_c": self._limit_c})
@@ -144,42 +144,42 @@ class Governor:
             return False, Reason(ReasonCode.QUERIES_LATE)
         return False, None
 
-    def _has_room(self, reading: LoadReading, then: Setting) -> bool:
-        """Return True if the load would stay clearly below all limits with the setting `then`."""
+    def _has_room(self, reading: LoadReading, higher: Setting) -> bool:
+        """Return True if the load would stay clearly below all limits with the setting `higher`."""
         now, board = self.setting, self._board
-        more = 1 + _COMPARE_SHARE * (then.candidates / now.candidates - 1)
-        more *= then.rate_hz / now.rate_hz
+        factor = 1 + _COMPARE_SHARE * (higher.candidates / now.candidates - 1)
+        factor *= higher.rate_hz / now.rate_hz
         return (
-            reading.cpu_share * more <= _MAX_EXPECTED_SHARE * board.cpu_share
-            and reading.late_share * more <= _MAX_EXPECTED_SHARE
+            reading.cpu_share * factor <= _MAX_EXPECTED_SHARE * board.cpu_share
+            and reading.late_share * factor <= _MAX_EXPECTED_SHARE
             and not reading.throttled
             and (reading.temperature_c is None or reading.temperature_c <= self._limit_c - _TEMPERATURE_MARGIN_C)
             and reading.rss_mb <= _MEMORY_ROOM_SHARE * board.memory_max_mb
         )
 
     def _report_limit(self, what: str, why: Reason) -> Change:
-        """Return a change between equal settings: a limit ("memory" or "load") is exceeded, and nothing is lowered."""
+        """Return a change between equal settings: a limit ("memory" or "load") is exceeded, but none is lowered."""
         self._reported.add(what)
         return Change(self.setting, self.setting, why)
 
-    def _step_down(self, now_s: float, at: int, why: Reason) -> Change:
+    def _step_down(self, now_s: float, index: int, why: Reason) -> Change:
         if now_s - self._raised_s < _STEP_UP_TRIAL_S:
             self._wait_s = min(2 * self._wait_s, _MAX_WAIT_S)
-            self._raised_s = -math.inf  # further steps down for the same reason are no new failure
+            self._raised_s = -math.inf  # further steps down for the same reason are not a new failure
         elif now_s - self._changed_s >= max(_STEP_UP_TRIAL_S, 2 * self._wait_s):
             self._wait_s = _MIN_WAIT_S
-        return self._change(now_s, at, why, back=False)
+        return self._change(now_s, index, why, back=False)
 
-    def _change(self, now_s: float, at: int, why: Reason, back: bool) -> Change:
+    def _change(self, now_s: float, index: int, why: Reason, back: bool) -> Change:
         before = self.setting
-        self._index, self._changed_s = at, now_s
-        self._since_s.clear()  # readings before a change say nothing of the time after it
+        self._index, self._changed_s = index, now_s
+        self._since_s.clear()  # readings before a change do not describe the time after it
         return Change(before, self.setting, why, back)
 
 
 class GovernorActuator:
-    """Applies a `Governor` to a recogniser and its `pace`, and reports each change. In a sequence neither rate nor
-    candidates are lowered: it needs queries as often as the map was made, and compares all candidates."""
+    """Applies a `Governor` to a recogniser and its `pace`, and reports each change. With sequence matching neither
+    rate nor candidates are lowered: it needs queries at the map's rate, and compares all candidates."""
 
     def __init__(self, parts: FlightParts, pace: Pace, fewer_candidates: tuple[int, ...]) -> None:
         self._parts, self._pace = parts, pace

@@ -25,8 +25,8 @@ from edgevpr.runtime.recognise.recognition import Recognition, to_fields
 _REPORT_INTERVAL_S = 1.0
 _MINUTE_S = 60.0
 _CAMERA_START_TIMEOUT_S = 10.0
-# Something hangs if a live camera gives no query for so long: more than one takes on the slowest board, and than so
-# many intervals between queries.
+# If a live camera gives no query for this long, something hangs: longer than a query takes on the slowest board, and
+# than this many intervals between queries.
 _QUERY_TIMEOUT_S = 45.0
 _QUERY_TIMEOUT_INTERVALS = 3
 _FAULTS = {Condition.LOST: "lost", Condition.FROZEN: "frozen", Condition.DAMAGED: "damaged", Condition.LATE: "late"}
@@ -35,10 +35,10 @@ _log = logging.getLogger(__name__)
 
 
 class Vitals:
-    """Pings the watchdog of systemd while queries come, or their absence is explained by something that is reported.
-    Reports the state once a second, and once a minute also to a terminal. It notifies once when the camera is lost,
-    frozen, damaged or blank, when recognition keeps failing, when this computer is hot, throttled or short of voltage,
-    and when each of these is over. `problems` returns sentences for the status (None: left out)."""
+    """Pings the systemd watchdog while queries arrive, or a reported condition explains why none does. Reports the
+    state once a second, and once a minute also to a terminal. It notifies once when the camera is lost, frozen, damaged
+    or blank, when recognition keeps failing, when this computer is hot, throttled or under-voltage, and when each of
+    these is over. `remarks` returns sentences for the status (None: omitted)."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class Vitals:
         self._watchdog_s = systemd.watchdog_interval_s()
         self._watchdog_due_s = self._report_due_s = parts.io.clock.mono_s()
         self._minute_due_s = self._report_due_s + _MINUTE_S if sys.stderr.isatty() else math.inf
-        self._source_trouble: str | None = None
+        self._source_fault: str | None = None
         self._start_s = self._last_explained_s = self._report_due_s
         self._has_log = True
         failing = Reason(ReasonCode.FAILING, {"count": MAX_FAILURES_IN_A_ROW})
@@ -67,7 +67,7 @@ class Vitals:
         self._match: dict[str, Any] | None = None
 
     def update(self, event: Recognition) -> None:
-        """Keep an event for the status, if it is a query."""
+        """Store an event for the status if it is a query."""
         self._has_event = True
         if event.frame and event.is_query:
             self._newest = {"t_frame_s": event.frame.t_mono_s, **_summarise(event)}
@@ -87,8 +87,8 @@ class Vitals:
             self._report()
 
     def _is_silence_explained(self, now_s: float) -> bool:
-        """Return True if queries come, or a reported condition explains why none does."""
-        is_awaited = self._parts.source.is_live and not (self._source_trouble or self._commands.is_paused)
+        """Return True if queries arrive, or a reported condition explains why none does."""
+        is_awaited = self._parts.source.is_live and not (self._source_fault or self._commands.is_paused)
         if self._has_event or not is_awaited:
             self._last_explained_s, self._has_event = now_s, False
         return now_s - self._last_explained_s < max(_QUERY_TIMEOUT_S, _QUERY_TIMEOUT_INTERVALS / self._pace.rate_hz)
@@ -115,20 +115,20 @@ class Vitals:
     def _check_source(self) -> None:
         source = self._parts.source
         condition = source.condition
-        trouble = _FAULTS.get(condition)
+        fault = _FAULTS.get(condition)
         if condition is Condition.OPENING and self._report_due_s - self._start_s > _CAMERA_START_TIMEOUT_S:
-            trouble = "gives no picture yet"
-        if trouble == self._source_trouble:
+            fault = "gives no picture yet"
+        if fault == self._source_fault:
             return
-        self._source_trouble = trouble
-        is_unopened = source.condition is Condition.LOST and not self._tally.queries  # then its state has the cause
+        self._source_fault = fault
+        is_unopened = source.condition is Condition.LOST and not self._tally.queries  # then its state gives the cause
         self._parts.notifier.log("source", condition=condition.name, state=source.state, refused=source.refused)
-        severity = Severity.WARNING if trouble else Severity.INFO
-        ground = f"camera {trouble or 'is back'}{f': {source.state}' if is_unopened else ''}"
+        severity = Severity.WARNING if fault else Severity.INFO
+        ground = f"camera {fault or 'is back'}{f': {source.state}' if is_unopened else ''}"
         self._parts.notifier.announce(severity, f"source: {source.state}", ground=ground, topic="source")
 
     def _check_log(self) -> None:
-        """Report to the ground station if the log cannot be written, and when it can; the journal has the reason."""
+        """Report to the ground station if the log cannot be written, and when it can; the journal has the cause."""
         has_log = self._parts.io.machine.is_written(self._parts.flight_log)
         if has_log != self._has_log:
             self._has_log = has_log
@@ -137,7 +137,7 @@ class Vitals:
                 self._parts.link.announce(Severity.INFO if has_log else Severity.WARNING, text, "log")
 
     def _assess_health(self) -> Health:
-        if self._source_trouble or self._frozen.is_frozen:
+        if self._source_fault or self._frozen.is_frozen:
             return Health.CRITICAL
         if self._commands.is_paused:
             return Health.STANDBY
@@ -145,11 +145,11 @@ class Vitals:
 
     def _make_status(self, health: Health, load: MachineLoad) -> dict[str, Any]:
         """Return the status of the flight. Keys that are not obvious (null: unknown):
-        - `t_mono_s`: the `time` on the clock of the frames; `latency_s`: age of the newest picture
-        - `asked_rate_hz`: queries per second that the flight tries to keep
+        - `t_mono_s`: `time` on the clock of the frames; `latency_s`: age of the newest picture
+        - `asked_rate_hz`: queries per second that the flight aims for
         - `machine_cpu_share` (0..1), `machine_ram_mb` (of `machine_ram_total_mb`): those of all programs
         - `newest`: the last query; `match`: the last accepted one; `link`: see `AutopilotOutput.state` (null: no link)
-        - `problems`: further sentences for operators; `summary`: the most important values in one line.
+        - `remarks`: further sentences for operators; `summary`: the most important values in one line.
         """
         parts, tally, thermal = self._parts, self._tally, self._parts.meter.thermal
         totals, now_s = parts.meter.totals(), parts.io.clock.mono_s()
@@ -187,7 +187,7 @@ class Vitals:
 
 
 def _summarise(event: Recognition) -> dict[str, Any]:
-    """Return the fields of the status about a query (None: unknown)."""
+    """Return the status fields of a query (None: unknown)."""
     fields = to_fields(event)
     names = ("query", "accepted", "reason", "place", "reference_image", "score", "accuracy_m")
     return {name: fields[name] for name in names} | {"confidence": combine_confidence(event)}

@@ -1,6 +1,6 @@
-"""Observers of the events of a flight (each the `Recognition` of a frame): they count events, and report the start and
-the end of problems. The loop of `flight` calls `update` of each class with every event; an exception in it does not
-end the flight."""
+"""Observers of a flight's events (each the `Recognition` of a frame): they count events, and report when problems begin
+and end. The loop of `flight` calls `update` of each class with every event; an exception in it does not end the
+flight."""
 
 import logging
 from collections.abc import Callable
@@ -20,22 +20,22 @@ MAX_FAILURES_IN_A_ROW = 10  # a single one may be a bad frame
 MAX_BLANK_IN_A_ROW = 10  # pictures with too little texture
 
 _MIN_ON_MAP = 3  # accepted matches before the aircraft counts as over the map, and can leave it
-_MAX_MISSES = 30  # queries in a row that are not accepted; ten are usual over poor ground
+_MAX_MISSES = 30  # queries in a row that are not accepted; ten are common over poor ground
 _LOST_PROBABILITY = 0.9
-_MAX_LOST_MISSES = 10  # the same, if the place filter says in each that the aircraft is lost
-_MIN_TO_RETURN = 2  # accepted matches by which the aircraft is over the map again
-_MAX_MISSES_BETWEEN = 10  # between two of these
-_MIN_TILT_S = 5.0  # longer than a gust, and than the change from one turn to the next
+_MAX_LOST_MISSES = 10  # the same, if the place filter considers the aircraft lost in each of them
+_MIN_TO_RETURN = 2  # accepted matches after which the aircraft counts as over the map again
+_MAX_MISSES_BETWEEN = 10  # between two such matches
+_MIN_TILT_S = 5.0  # longer than a gust, and than a reversal from one turn to the next
 _SURVEY_INTERVAL = 6  # samples between two evaluations of the survey
 _MOUNT_NAMES = "ahead_deg", "right_deg"
-_REPEAT_FACTOR = 3.0  # a result is reported again when it has changed by so many times the least difference
+_REPEAT_FACTOR = 3.0  # times `min_difference`: a reported result that has changed by more is reported again
 
 _log = logging.getLogger(__name__)
 
 
 class Tally:
-    """Counts `queries`, of them `accepted` and `failed` ones; `unusable` frames, which failed before they became
-    queries; failures in a row; and pictures in a row with too little texture."""
+    """Counts `queries`, including `accepted` and `failed` ones; `unusable` frames, which failed before they became
+    queries; consecutive failures; and consecutive pictures with too little texture."""
 
     def __init__(self) -> None:
         self._last_failure: Reason | None = None
@@ -43,7 +43,7 @@ class Tally:
         self.failed_in_a_row = self.blank_in_a_row = 0
 
     def update(self, event: Recognition) -> None:
-        """Count an event. A failure is logged, but only once for failures in a row with the same reason."""
+        """Count an event. A failure is logged, but only once for consecutive failures with the same reason."""
         failure = event.reason if event.failed else None
         if failure and failure != self._last_failure:
             _log.warning("%s", failure)
@@ -57,7 +57,7 @@ class Tally:
 
 
 class MapWatch:
-    """Reports damage of the map: each unreadable place in the flight log, but only the first to people; and when the
+    """Reports damage to the map: each unreadable place to the flight log, only the first to operators; and when the
     file becomes unreadable, or readable again. `left_out` is the number of places left out."""
 
     def __init__(self, notifier: Notifier) -> None:
@@ -66,7 +66,7 @@ class MapWatch:
 
     @property
     def summary(self) -> str | None:
-        """Phrase with the number of places left out; None if there are none."""
+        """Text with the number of places left out; None if there are none."""
         return f"{self.left_out} places of the map left out" if self.left_out else None
 
     def update(self, event: Recognition) -> None:
@@ -88,8 +88,8 @@ class MapWatch:
 
 class MapCoverageWatch:
     """Reports once when the aircraft leaves the map or the camera is tilted too far, and once when that is over. The
-    map counts as left after many queries in a row that are not accepted; pictures that cannot be recognised do not
-    count."""
+    map counts as left after many consecutive queries that are not accepted, not counting pictures that cannot be
+    recognised."""
 
     def __init__(self, notifier: Notifier) -> None:
         self._map = Alert(notifier, "sight", Reason(ReasonCode.MAP_LEFT), ReasonCode.MAP_FOUND)
@@ -130,9 +130,9 @@ class MapCoverageWatch:
 
 
 class SurveyReporter:
-    """Reports the results of `survey`: each when it is known and not as expected, again when it has clearly changed,
-    and all at the end. Results for the map are withdrawn if GPS turns out to be wrong. `set_mount` is called with the
-    mount by which the next pictures are to be levelled."""
+    """Reports the results of `survey`: each when it is known and deviates from what is expected, again when it has
+    clearly changed, and all at the end. Results for the map are withdrawn if GPS turns out to be wrong. `set_mount` is
+    called with the mount by which to level the next pictures."""
 
     def __init__(
         self, notifier: Notifier, gps: GpsWatch, source: SourceConfig, set_mount: Callable[[Mount], None]
@@ -174,7 +174,7 @@ class SurveyReporter:
             self._apply_mount()
 
     def _report(self, survey: SurveyResult, names: set[str]) -> None:
-        """Log all results, and announce those of `names` that deviate from what is expected."""
+        """Log all results, and announce those of `names` that deviate from the expected values."""
         sentences = {
             name: _format_result(name, measure)
             for name, measure in survey.measures.items()
@@ -188,7 +188,7 @@ class SurveyReporter:
                 self._notifier.announce(Severity.INFO, sentence, ground=ground, topic=f"survey {name}")
 
     def _apply_mount(self) -> None:
-        """Level the next pictures by the mount found; comparisons with GPS so far are void."""
+        """Level the next pictures by the estimated mount, and discard the comparisons with GPS so far."""
         mount = Mount(*(self._reported.get(name, self._expected[name])[0] for name in _MOUNT_NAMES))
         self._survey.set_mount(mount)
         self._gps.reset()
@@ -196,7 +196,7 @@ class SurveyReporter:
 
 
 def _format_result(name: str, measure: SurveyMeasure) -> tuple[str, str]:
-    """Return a result of the survey as a sentence, and a shorter one for the ground station."""
+    """Return a survey result as a sentence, and a shorter one for the ground station."""
     value = measure.value[0]
     if name == "off_m":
         offset = f"{format_offset(*measure.value)} of GPS"
