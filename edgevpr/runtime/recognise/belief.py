@@ -1,17 +1,17 @@
 """Belief about the aircraft's position: a Bayes filter over the places of a map, updated by each query.
 
 Positions are in the plane of the map: metres east and north of a fixed origin or, in a map without positions (an
-*ordinal* one), the number of the place and 0. The aircraft is *lost* (off the map, or on it where no query has
-recognised it), or near one of at most 64 hypotheses: Gaussian positions. Being lost has a probability of its own.
+*ordinal* one), the number of the place and 0. The aircraft is *lost* (off the map, or at a position on it that no query
+has recognised), or near one of at most 64 hypotheses: Gaussian positions. Being lost has its own probability.
 
-The probabilities of a query alone are divided by the prior they were made with, which gives likelihoods. Without
-history the result is thus that of the query. Three things limit the influence of a history:
+The probabilities from a single query are divided by the prior they were computed with, which gives likelihoods. So
+without history, the result is that of the query. Three rules limit the influence of history:
 
-* Between two queries the aircraft may have left the map or be anywhere, so the newest query must always support it.
-* Pictures of the same ground are no new evidence. A hypothesis stores the evidence it was already given (`credited`)
-  for the ground where it is (`anchor`), and the next query there replaces it. In a hover only the newest query counts.
-* Ground outside the map that was mistaken for a place may well resemble the next places, too. So a place that fits the
-  history raises the odds of being on the map by a limited factor only.
+* Between two queries the aircraft may have left the map or be anywhere, so the newest query must always agree.
+* Pictures of the same ground are no new evidence. A hypothesis stores the evidence already counted (`credited`) for
+  the ground below it (`anchor`), and the next query there replaces it. In a hover only the newest query counts.
+* Ground outside the map that was mistaken for a place may also resemble the next places. So a place that fits the
+  history raises the odds of being on the map only by a limited factor.
 """
 
 import math
@@ -29,13 +29,13 @@ from edgevpr.runtime.recognise.gaussians import (
 )
 
 _MAX_HYPOTHESES = 64
-# Chances between two queries to leave the map, to jump to any place on it, and to enter it. A history can raise the
-# odds to 1 over the sum of the first two at most.
+# Probabilities, between two queries, of leaving the map, jumping to any place on it, and entering it. History can raise
+# the odds to at most 1 over the sum of the first two.
 _LEAVE_CHANCE = 0.01
 _JUMP_CHANCE = 0.01
 _ENTER_CHANCE = 0.02
-_MISS_LIKELIHOOD = 0.2  # of a query that misses the place below it, over that of one off the map
-_RESEMBLANCE = 0.1  # how likely ground outside the map, once mistaken for a place, resembles the next places as well
+_MISS_LIKELIHOOD = 0.2  # of a query that misses the place below the aircraft, relative to one off the map
+_RESEMBLANCE = 0.1  # probability that ground outside the map, once mistaken for a place, also resembles the next ones
 _MIN_NONE_PROBABILITY = 1e-4  # least probability that no candidate is right
 _CV_PROBABILITY = 0.75  # of constant velocity
 _CV_SD = 0.5  # in spacings of the map, and as a share of the displacement
@@ -45,20 +45,20 @@ _REPORTED_ODOMETRY = (0.6, 0.25, 0.15)
 _VISUAL_ODOMETRY = (0.98, 0.05, 0.05)
 _REACH_SIGMAS = 1.5  # the reach in standard deviations
 _NEWEST_WEIGHT = 0.2  # weight of the newest displacement in the mean velocity
-_SAME_POSITION_SIGMAS = 2.0  # of a position: a shorter displacement may be none
-_MIN_WEIGHT = 1e-9  # a hypothesis of less weight is dropped
+_SAME_POSITION_SIGMAS = 2.0  # of a position: a shorter displacement may be zero
+_MIN_WEIGHT = 1e-9  # a hypothesis with less weight is dropped
 _MIN_DIVISOR = 1e-300  # instead of zero
 _MAX_DISTANCE = 1e8  # metres or places: farther than any two points on the Earth
 _MIN_SD = 0.25  # least standard deviation of a position, in spacings of the map
 _UNIT_VARIANCE = 1 / (2 * np.pi)  # of a Gaussian with the density 1 in its middle: second axis of ordinal maps
-DEFAULT_MAX_SPEED_M_S = 30.0  # unless the configuration says another speed
+DEFAULT_MAX_SPEED_M_S = 30.0  # unless the configuration sets another speed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """Motion of the aircraft since the previous query, in metres or places: `reach` is how far it can have moved in
-    `elapsed_s` seconds, and `displacement` (2,) that by odometry (None: unknown), which `is_visual`, by the camera
-    itself, or reported by the autopilot."""
+    """Motion of the aircraft since the previous query, in metres or places: `reach` is the farthest it can have moved
+    in `elapsed_s` seconds, and `displacement` (2,) the motion measured by odometry (None: unknown): that of the camera
+    (`is_visual`) or of the autopilot."""
 
     reach: float
     elapsed_s: float
@@ -66,15 +66,15 @@ class Motion:
     is_visual: bool = False
 
     def new_ground_share(self, spacing: float) -> float:
-        """Return the share (0..1) of the ground in the picture that is new; 1 if visual odometry does not tell."""
+        """Return the share (0..1) of the ground in the picture that is new; 1 without visual odometry."""
         moved = self.displacement
         return min(1.0, float(np.hypot(*moved)) / spacing) if self.is_visual and moved is not None else 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Hypotheses:
-    """M positions where the aircraft may be: weights `w` (M,), positions `at` (M, 2) with `covariance` (M, 2, 2),
-    `velocity` (M, 2) in units of the map a second (NaN: unknown), and `heading` (M, 2), a vector north and east (0:
+    """M possible positions of the aircraft: weights `w` (M,), positions `at` (M, 2) with `covariance` (M, 2, 2),
+    `velocity` (M, 2) in map units per second (NaN: unknown), and `heading` (M, 2), a vector north and east (0:
     unknown). `credited` (M,): logarithm of the likelihood ratio already counted around `anchor` (M, 2)."""
 
     w: Doubles
@@ -92,7 +92,7 @@ class _Hypotheses:
 @dataclass(frozen=True, slots=True)
 class _Prediction:
     """One possible motion of each of M hypotheses: its probability `share` (M,), and the new position `at` (M, 2) with
-    its `covariance` (M, 2, 2). The density is nowhere below `least`."""
+    its `covariance` (M, 2, 2). The density is at least `least` everywhere."""
 
     share: Doubles
     at: Doubles
@@ -102,7 +102,7 @@ class _Prediction:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapScale:
-    """Distances that count in a map. `spacing` is the distance after which a picture is new evidence: about half a
+    """Characteristic distances of a map. `spacing` is the distance after which a picture is new evidence: about half a
     footprint, or 1 in an ordinal map (`is_ordinal`). Hypotheses within `near` of each other count as one position."""
 
     spacing: float
@@ -117,8 +117,8 @@ class MapScale:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proposals:
-    """Positions that one query proposes by itself, K of them. `p` (K,) is the probability of each; the rest up to 1 is
-    that of none. Their prior: the aircraft is off the map with probability 1/2, else equally likely at any place.
+    """The K positions proposed by one query alone. `p` (K,) is the probability of each; the remainder to 1 is that of
+    none. Their prior: the aircraft is off the map with probability 1/2, otherwise equally likely at any place.
     `at` (K, 2) is the position with its `covariance` (K, 2, 2), and `heading_deg` (K,) the heading (NaN: unknown)."""
 
     p: Doubles
@@ -142,7 +142,7 @@ class Posterior:
 
 
 class Belief:
-    """Belief of one flight over one map. It begins as lost; `update` is called once for each query."""
+    """Belief of one flight over one map. It starts out lost; `update` is called once for each query."""
 
     def __init__(self, scale: MapScale) -> None:
         self._scale = scale
@@ -153,21 +153,21 @@ class Belief:
 
     def update(self, proposed: Proposals | None, motion: Motion, places: int) -> Posterior:
         """Update the belief with the candidates that a query proposes (None: its picture shows too little; those that
-        are not finite do not count), the motion since the previous query, and the number of places in the map now."""
+        are not finite are ignored), the motion since the previous query, and the number of places in the map."""
         odds = (1 - self._lost) / max(self._lost, _MIN_WEIGHT)
         now, lost, appears = self._apply_transitions()
         moves = self._predict_motions(now, motion, places)
         p = np.zeros(0 if proposed is None else len(proposed.p))
         numbers: Ints = np.zeros(0, int)
         if proposed is None:
-            lost += appears  # whoever enters the map now is at an unknown place
+            lost += appears  # an aircraft that enters the map now is at an unknown place
             updated = _keep_missed(now, moves, 1.0)
         else:
             self._enters = _ENTER_CHANCE
             numbers, proposed = _select_usable(proposed, self._scale)
             found, likelihood, staleness, factor = self._weigh(proposed, now, moves, motion.elapsed_s, appears, places)
             lost *= likelihood
-            # Repeated misses over the same ground are no new evidence either.
+            # Nor are repeated misses over the same ground new evidence.
             missed = _keep_missed(now, moves, _MISS_LIKELIHOOD ** motion.new_ground_share(self._scale.spacing))
             # A lost aircraft that sees the same ground again has not moved either, so staying is no evidence for it.
             kept = (factor * odds * lost - float(missed.w.sum())) / max(float(found.w.sum()), _MIN_WEIGHT)
@@ -182,16 +182,16 @@ class Belief:
         return self._make_posterior(p)
 
     def _apply_transitions(self) -> tuple[_Hypotheses, float, float]:
-        """Return the hypotheses after the chances of leaving, entering and jumping between two queries, the probability
-        of being lost, and that of having entered or jumped to any place."""
-        held = float(self._now.w.sum())
-        lost = (1 - self._enters) * self._lost + _LEAVE_CHANCE * held
+        """Apply the probabilities of leaving, entering and jumping between two queries. Return the hypotheses, the
+        probability of being lost, and that of having entered or jumped to any place."""
+        on_map = float(self._now.w.sum())
+        lost = (1 - self._enters) * self._lost + _LEAVE_CHANCE * on_map
         stays = 1 - _LEAVE_CHANCE - _JUMP_CHANCE
         leaked = max(0.0, math.log(max(lost, _MIN_DIVISOR) / max(stays * self._lost, _MIN_DIVISOR)))
         self._strongest = max(0.0, self._strongest - leaked)
         credited = np.maximum(self._now.credited - leaked, 0)
         now = replace(self._now, w=stays * self._now.w, credited=credited)
-        return now, lost, self._enters * self._lost + _JUMP_CHANCE * held
+        return now, lost, self._enters * self._lost + _JUMP_CHANCE * on_map
 
     def _predict_motions(self, now: _Hypotheses, motion: Motion, places: int) -> list[_Prediction]:
         """Return the possible motions of each hypothesis: by odometry, at constant velocity, or anywhere in reach."""
@@ -203,18 +203,18 @@ class Belief:
         has_velocity = ~np.isnan(now.velocity[:, 0])
         step = np.where(has_velocity[:, None], now.velocity, 0) * motion.elapsed_s
         step *= (motion.reach / np.maximum(np.hypot(*step.T), max(motion.reach, _MIN_DIVISOR)))[:, None]
-        left, middle, sd = np.ones(len(now.w)), np.zeros(2), max(reach / _REACH_SIGMAS, _CV_SD * scale.spacing)
+        left, mean_move, sd = np.ones(len(now.w)), np.zeros(2), max(reach / _REACH_SIGMAS, _CV_SD * scale.spacing)
         if (moved := motion.displacement) is not None:
             share, least_sd, sd_share = _VISUAL_ODOMETRY if motion.is_visual else _REPORTED_ODOMETRY
             spread = (sd_share**2 * moved @ moved + (least_sd * scale.spacing) ** 2) * np.eye(2)
             moves.append(_Prediction(share * left, now.at + moved, now.covariance + spread))
-            # Odometry that is wrong by a factor of two is wrong by as much as its length.
-            left, middle, sd = (1 - share) * left, moved, min(sd, scale.spacing + math.hypot(*moved))
+            # Odometry wrong by a factor of two has an error as large as the displacement itself.
+            left, mean_move, sd = (1 - share) * left, moved, min(sd, scale.spacing + math.hypot(*moved))
         variance = (_CV_SD * scale.spacing) ** 2 + (_CV_SD * np.hypot(*step.T)) ** 2 / 2
-        going = now.covariance + variance[:, None, None] * np.eye(2)
-        moves.append(_Prediction(_CV_PROBABILITY * has_velocity * left, now.at + step, going))
+        cv_covariance = now.covariance + variance[:, None, None] * np.eye(2)
+        moves.append(_Prediction(_CV_PROBABILITY * has_velocity * left, now.at + step, cv_covariance))
         left, anywhere = (1 - _CV_PROBABILITY * has_velocity) * left, now.covariance + sd**2 * np.eye(2)
-        moves.append(_Prediction(left, now.at + middle, anywhere, is_everywhere / area))
+        moves.append(_Prediction(left, now.at + mean_move, anywhere, is_everywhere / area))
         return moves
 
     def _weigh(
@@ -226,28 +226,28 @@ class Belief:
         appears: float,
         places: int,
     ) -> tuple[_Hypotheses, float, float, float]:
-        """Weigh the candidates by the hypotheses that can have moved to them. Returns
+        """Weight the candidates by the hypotheses that can have moved to them. Returns
 
         * one hypothesis for each candidate,
         * the likelihood of the query if lost, relative to that on ground that never resembles the map,
-        * the share (0..1) of the weight that comes from pictures of the same ground as the query before,
-        * the factor, 1 at most, by which the odds of not being lost shrink if this query is weaker evidence there.
+        * the share (0..1) of the weight that comes from pictures of the same ground as the previous query,
+        * the factor, at most 1, by which the odds of not being lost shrink if this query is weaker evidence there.
         """
         scale, at, cov = self._scale, proposed.at, proposed.covariance
         rest = max(_MIN_NONE_PROBABILITY, 1 - float(proposed.p.sum()))
         ratio = np.log(np.maximum(proposed.p, _MIN_DIVISOR) * places / rest)
         appeared = appears / places * np.exp(ratio)
 
-        # A picture of the same ground repeats the evidence of the one before. This holds for a lost aircraft as well.
+        # A picture of the same ground repeats the previous evidence. This holds for a lost aircraft as well.
         strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
         repeated, self._strongest = min(before, strongest), strongest
         sd = np.sqrt(cov[:, 0, 0] if scale.is_ordinal else np.trace(cov, axis1=1, axis2=2) / 2)
         fresh = np.clip((compute_distances(now.anchor, at) - _SAME_POSITION_SIGMAS * sd) / scale.spacing, 0, 1)
         evidence = np.exp(ratio + (1 - fresh) * (repeated - now.credited[:, None])) * (scale.cell * now.w[:, None])
-        # Of each motion: the weight (M, K) that each hypothesis gives to each candidate.
+        # For each motion, the weight (M, K) that each hypothesis gives each candidate.
         weights = [move.share[:, None] * evidence * _compute_density(move, at, cov, scale.is_ordinal) for move in moves]
         weight = sum(moved.sum(0) for moved in weights)
-        origin = sum(weights) / np.maximum(weight, _MIN_DIVISOR)  # (M, K): share of each hypothesis in a candidate
+        origin = sum(weights) / np.maximum(weight, _MIN_DIVISOR)  # (M, K): part of a candidate's weight
         stale = origin * (1 - fresh)
         staleness = float(weight @ stale.sum(0)) / max(_MIN_DIVISOR, float((weight + appeared).sum()))
         newest = float(ratio[stale.sum(0) > 0.5].max(initial=-math.inf))
@@ -278,8 +278,8 @@ class Belief:
         return hypotheses, likelihood, staleness, odds_factor
 
     def _make_posterior(self, p: Doubles) -> Posterior:
-        """Return the belief with an estimate: the weighted mean of the hypotheses around the one with the
-        most weight in its neighbourhood."""
+        """Return the belief with an estimate: the weighted mean of the hypotheses around the one whose
+        neighbourhood has the most weight."""
         now = self._now
         if not len(now.w):
             return Posterior(lost=self._lost, p=p)
@@ -294,13 +294,13 @@ class Belief:
 
 
 def _keep_missed(now: _Hypotheses, moves: list[_Prediction], likelihood: float) -> _Hypotheses:
-    """Return the hypotheses after their motion, if the query proposes none of them: `w` times this likelihood."""
+    """Return the moved hypotheses for the case that the query proposes none of them: `w` times this likelihood."""
     share = np.stack([move.share for move in moves], 1)[..., None]
     at = np.stack([move.at for move in moves], 1)
     covariance = np.stack([move.covariance for move in moves], 1)
     mean = (share * at).sum(1)
-    off = at - mean[:, None]
-    spread = (share[..., None] * (covariance + off[..., :, None] * off[..., None, :])).sum(1)
+    offsets = at - mean[:, None]
+    spread = (share[..., None] * (covariance + offsets[..., :, None] * offsets[..., None, :])).sum(1)
     return replace(now, w=likelihood * now.w, at=mean, covariance=spread)
 
 

@@ -1,7 +1,7 @@
 """Tracks a flight over the places of a map: converts the result of each query to proposals for a `belief`.
 
-The best place of a *search pass*, one search of the map for one query, has a confidence. The rest of the probability
-that the query shows ground of the map at all is spread over the other places compared.
+The best place of a *search pass*, one search of the map for one query, has a confidence. The remaining probability that
+the query shows ground of the map is distributed over the other places compared.
 """
 
 import copy
@@ -29,12 +29,12 @@ from edgevpr.runtime.recognise.judge import ConfidenceRule
 from edgevpr.runtime.recognise.locate import Located, covariance_matrix, to_triple
 from edgevpr.runtime.recognise.odometry import OdometryStep
 
-_TWIN_SHARE = 0.5  # of the best place's votes: its twins are as likely from there on, as in `Evidence.has_twin`
+_TWIN_SHARE = 0.5  # of the best place's votes: from here on a twin is as likely as it, as in `Evidence.has_twin`
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
 _SHARPNESS = 10.0  # the odds of two places are the ratio of their votes to this power
-_OTHERS_RIGHT_SHARE = 0.7  # how often the right place is among the others, if the best one is wrong
+_OTHERS_RIGHT_SHARE = 0.7  # how often the correct place is among the others if the best one is wrong
 _MAX_PROPOSED = 20  # most places that one query proposes
-# Distances that count as one position, in places and in footprints; and the probability that is more likely than not.
+# Largest distance that counts as one position, in places and in footprints; and what counts as more likely than not.
 _NEAR_PLACES = 3.0
 _NEAR_FOOTPRINT = 0.25
 _MIN_MAJORITY = 0.5
@@ -45,10 +45,10 @@ _MIN_SPACING_M = 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackEstimate:
-    """Result of a query together with the flight so far. `slot` is the place most likely now, by its row in the index
-    (None: no place), and `confidence` the probability that the aircraft is there. `lost` is the probability that it is
-    at no position of the belief. `estimate` is its most likely position (None: unknown, or the map has no positions),
-    and `mass` the probability that it is near this position."""
+    """Result of a query combined with the flight so far. `slot` is the index row of the most likely place (None: no
+    place), and `confidence` the probability that the aircraft is there. `lost` is the probability that it is at no
+    position of the belief. `estimate` is its most likely position (None: unknown, or the map has no positions), and
+    `mass` the probability that it is near this position."""
 
     slot: int | None
     confidence: float
@@ -81,7 +81,7 @@ class _MapGeometry:
             )
 
     def positions(self, slots: Ints, index: PlaceIndex) -> Doubles:
-        """Return positions in the plane of the belief, float (K, 2), NaN if unknown."""
+        """Return positions in the plane of the belief, float (K, 2); NaN if unknown."""
         if self.origin is None:
             return np.stack([index.place_ids[slots].astype(float), np.zeros(len(slots))], 1)
         lat_deg, lon_deg = index.lat_deg[slots], index.lon_deg[slots]
@@ -101,7 +101,7 @@ class PlaceFilter:
         self._geometry: _MapGeometry | None = None
         self._belief: Belief | None = None
         self._next: Belief | None = None  # the belief after the last pass, until `commit`
-        self._first_view: tuple[Doubles, float] | None = None  # of the newest ground: position, first confidence
+        self._first_view: tuple[Doubles, float] | None = None  # of the ground seen last: position, first confidence
         self._next_first_view: tuple[Doubles, float] | None = None
         self._t_now_s: float | None = None
         self._t_committed_s: float | None = None
@@ -110,8 +110,8 @@ class PlaceFilter:
         self._odometry: OdometryStep | None = None
 
     def predict(self, frame: Frame, vehicle: Vehicle | None, odometry: OdometryStep | None = None) -> None:
-        """Set the time and the motion since the last committed pass, if known: the motion by `odometry` from the frame
-        before or, without it, by the velocity that the autopilot reports."""
+        """Set the time and the motion since the last committed pass, if known: the motion measured by `odometry` since
+        the previous frame or, without it, derived from the velocity reported by the autopilot."""
         now_s = frame.t_mono_s if self._is_live else frame.t_utc_s
         before_s, self._t_now_s = self._t_committed_s, now_s
         self._elapsed_s = None if before_s is None or now_s is None else now_s - before_s
@@ -122,8 +122,8 @@ class PlaceFilter:
     def update(
         self, ranking: Ranking, index: PlaceIndex, evidence: Evidence, rule: ConfidenceRule, located: Located | None
     ) -> TrackEstimate:
-        """Return the result of one pass together with the flight so far; nothing is kept before `commit`. `evidence` is
-        that of the best place of the `ranking`, and `rule` converts it to probabilities. `located` is the position of
+        """Return the result of one pass combined with the flight so far; nothing is kept until `commit`. `evidence` is
+        that of the best place in the `ranking`, and `rule` converts it to probabilities. `located` is the position of
         the aircraft computed from the best place (None: the position of the place itself is used)."""
         if self._geometry is None or self._belief is None:
             self._geometry = _MapGeometry(self._map, index)
@@ -152,14 +152,14 @@ class PlaceFilter:
         )
 
     def update_without_match(self, index: PlaceIndex) -> None:
-        """Process a picture with too little texture: it does not show whether the aircraft is over the map."""
+        """Process a picture with too little texture, which does not show whether the aircraft is over the map."""
         if self._geometry and self._belief:
             self._next = copy.copy(self._belief)
             self._next.update(None, self._motion(self._geometry), len(index))
             self.commit()
 
     def commit(self) -> None:
-        """Keep the belief of the last pass; without a pass since the last call the belief stays as it is."""
+        """Keep the belief of the last pass; without a pass since the last call, the belief is unchanged."""
         self._belief, self._next = self._next or self._belief, None
         self._first_view, self._t_committed_s = self._next_first_view, self._t_now_s
 
@@ -186,13 +186,13 @@ class PlaceFilter:
 def make_motion(
     elapsed_s: float | None, speed_max: float, velocity: tuple[float, float] | None = None, is_visual: bool = False
 ) -> Motion:
-    """Return the motion in `elapsed_s` seconds, one second if they are unknown (None) or the clock was set back.
-    `speed_max` is the highest speed, in units of the map a second, and `velocity` (east, north) that of odometry (None:
-    unknown), which is not used without a time or if it is too high to be true; for `is_visual` see `Motion`."""
+    """Return the motion in `elapsed_s` seconds, taken as one second if unknown (None) or if the clock was set back.
+    `speed_max` is the highest speed in map units per second, and `velocity` (east, north) comes from odometry (None:
+    unknown); it is ignored without a time or if it is implausibly high. For `is_visual` see `Motion`."""
     if elapsed_s is None or not elapsed_s > 0:
         return Motion(reach=speed_max, elapsed_s=1.0)
     elapsed_s, moved = min(elapsed_s, _MAX_ELAPSED_S), None
-    if velocity is not None and math.hypot(*velocity) <= 2 * speed_max:  # no NaN, and possible if twice the truth
+    if velocity is not None and math.hypot(*velocity) <= 2 * speed_max:  # excludes NaN; may be twice the true speed
         moved = elapsed_s * np.asarray(velocity, float)
     return Motion(reach=speed_max * elapsed_s, elapsed_s=elapsed_s, displacement=moved, is_visual=is_visual)
 
@@ -205,10 +205,10 @@ def _make_proposals(
     evidence: Evidence,
     located: Located | None,
 ) -> tuple[Ints, Proposals]:
-    """Return what the query proposes to the belief, as in `PlaceFilter.update`: the slots, int (K,), and these."""
+    """Return the index rows, int (K,), of the places that a query proposes, and the proposals for the belief."""
     slots: Ints = np.array(ranking.compared_slots[:_MAX_PROPOSED])
     at = geometry.positions(slots, index)
-    # If the match was not located, only its place is known, not where in its picture the aircraft is.
+    # Without a located match only the place is known, not where in its picture the aircraft is.
     spread = geometry.spread if located else max(geometry.spread, geometry.scale.near)
     covariance = np.tile((1.0 if geometry.origin is None else spread**2) * np.eye(2), (len(slots), 1, 1))
     heading_deg = np.full(len(slots), np.nan)
@@ -216,7 +216,7 @@ def _make_proposals(
     if located and geometry.origin:
         origin, position = geometry.origin, located.position
         at[0] = offset_m(origin.lat_deg, origin.lon_deg, position.lat_deg, position.lon_deg)
-        if not evidence.has_twin:  # of places that are equally likely none may be known better than the others
+        if not evidence.has_twin:  # equally likely places must have equal covariances
             covariance[0] = covariance_matrix(located.covariance_m2)
         heading_deg[0] = np.nan if located.heading_deg is None else located.heading_deg
         same = np.isin(index.place_ids[slots], located.places) & (slots != slots[0])
@@ -226,13 +226,13 @@ def _make_proposals(
     confidence = rule.confidence(evidence)
     left = max(0.0, rule.compute_map_confidence(evidence) - confidence)
     p = np.zeros(len(slots))
-    if evidence.has_twin:  # more votes only mean that its picture was taken from nearer
+    if evidence.has_twin:  # more votes only mean that the picture was taken closer to that place
         votes = np.minimum(votes, _TWIN_SHARE * votes.max(initial=0))
         p[~same] = (confidence + _OTHERS_RIGHT_SHARE * left) * _compute_shares(votes[~same])
     else:
         p[near & ~same] = confidence * _compute_shares(votes[near & ~same])
         p[~near & ~same] = _OTHERS_RIGHT_SHARE * left * _compute_shares(votes[~near & ~same])
-    # The probability of a place without a position is given to no other place.
+    # The probability of a place without a position is not given to other places.
     is_placed = ~np.isnan(at[:, 0]) & ~same
     return slots[is_placed], Proposals(
         p=p[is_placed], at=at[is_placed], covariance=covariance[is_placed], heading_deg=heading_deg[is_placed]
@@ -240,7 +240,7 @@ def _make_proposals(
 
 
 def _compute_shares(votes: Doubles) -> Doubles:
-    """Return the share (K,) of each of K places in a probability. `votes` (K,): `compute_share` of each."""
+    """Return the share (K,) of a probability for each of K places. `votes` (K,): `compute_share` of each."""
     if not len(votes):
         return votes
     weight: Doubles = (np.maximum(votes, 1e-6) / max(float(votes.max()), 1e-6)) ** _SHARPNESS
