@@ -227,6 +227,9 @@ class Decider:
         if verdict.accepted and self.technique.spec.looks_down and search is None:
             heading_deg = best.place.heading_deg
             is_heading_known = hints is not None and hints.heading_deg is not None and heading_deg is not None
+            at_rest_elsewhere = self._share_at_rest_elsewhere(best, ranking, query)
+            lead_over_rotated = None if is_heading_known else self._lead_over_rotated(best, found.evidence, query)
+            # Last: it encodes another image, and a technique caches the views of its latest image only.
             perspective = self._measure_perspective(best, query)
             tilt = convert_to_tilt(perspective, query.view.focal)
             if query.view.is_tilt_known and self.common_tilt.shown.is_clear:
@@ -236,8 +239,8 @@ class Decider:
                 # A recorded tilt is not refused for what a few regions show; a contradiction adds to the claimed error.
                 tilt=None if query.view.is_tilt_known else tilt,
                 located=add_tilt_covariance(found.located, tilt, query.view) if found.located else None,
-                at_rest_elsewhere=self._share_at_rest_elsewhere(best, ranking, query),
-                lead_over_rotated=None if is_heading_known else self._lead_over_rotated(best, found.evidence, query),
+                at_rest_elsewhere=at_rest_elsewhere,
+                lead_over_rotated=lead_over_rotated,
             )
             verdict = judge(found, index, rule, search)
             if verdict.accepted and perspective:
