@@ -1,8 +1,8 @@
 """Hints narrow the search of the map for a query: where the aircraft can be, its heading, and its height.
 
-In flight no hint is ever the only way to find a place: a compass may be wrong, and GPS may be spoofed. So a query that
-is not accepted with hints is followed by one without (`Prior`). Recorded queries are measured one by one, each with
-what is known of it (`RecordedPrior`).
+In flight, finding a place never depends on hints alone: a compass may be wrong, and GPS may be spoofed. So a query that
+is not accepted with hints is followed by one without (`Prior`). Recorded queries are evaluated one by one, each with
+its own known data (`RecordedPrior`).
 """
 
 import math
@@ -22,26 +22,26 @@ from edgevpr.places.retrieve import Expectation
 from edgevpr.runtime.recognise.belief import DEFAULT_MAX_SPEED_M_S
 from edgevpr.runtime.recognise.locate import Located
 
-KNOWN_FIELDS = ("heading", "height", "reach")  # what can be known of a recorded query
-RECORDED_REACH_M = 300.0  # as far as an aircraft flies in 15 s at 20 m/s
+KNOWN_FIELDS = ("heading", "height", "reach")  # what may be known about a recorded query
+RECORDED_REACH_M = 300.0  # distance that an aircraft flies in 15 s at 20 m/s
 _MAX_FIX_AGE_S = 60.0
 _TRUST_ALL = (True, True)
 _SCALE_ERROR = 1.08  # two heights whose ratio is larger differ by more than the error of a match
 _MIN_SCALE = 0.5
-_MIN_HEIGHTS = 3  # matches that agree on a small error of the recorded heights
-_MAX_HEIGHTS = 5  # matches whose heights are compared with the recorded ones
+_MIN_HEIGHTS = 3  # matches needed to confirm a small error of the recorded heights
+_MAX_HEIGHTS = 5  # newest matches whose heights are compared with the recorded ones
 # The place filter narrows the search if its position has at least this probability. The area is large enough to contain
-# rivals of the best place: at least that of recorded queries, and so many times the distance of places.
+# rivals of the best place: at least that of recorded queries, and at least this many distances between places.
 _MIN_MASS = 0.99
 _AREA_SD = 4.0
 _AREA_PLACES = 5.0
-# Field of a tag, and columns of positions.csv, that a known field needs. Without any height, it is the map's.
+# Tag field and positions.csv columns required by each known field. Without any height, the map's is used.
 _REQUIRED_FIELDS = {"heading": ("heading_deg", "yaw_deg"), "reach": ("position", "lat and lon")}
 
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """Area in which the aircraft is: within `radius_m` metres of `position`."""
+    """Area that contains the aircraft: within `radius_m` metres of `position`."""
 
     position: Position
     radius_m: float
@@ -49,7 +49,7 @@ class Reach:
 
 @dataclass(frozen=True, slots=True)
 class Hints:
-    """Hints for one query: the area in which the aircraft is, and its heading, degrees. None: unknown."""
+    """Hints for one query: the area that contains the aircraft, and its heading in degrees. None: unknown."""
 
     reach: Reach | None = None
     heading_deg: float | None = None
@@ -61,33 +61,32 @@ class Hints:
         return {"reach_m": radius_m, "heading": self.heading_deg is not None}
 
     def agree_with(self, match: Candidate, heading_within_deg: float | None) -> tuple[bool, bool]:
-        """Return whether a match agrees with the area, and whether with the heading, as far as both are known.
-        `heading_within_deg` is the largest error of a heading (None: headings are not compared)."""
+        """Return whether a match agrees with the area and whether it agrees with the heading; True if either is
+        unknown. `heading_within_deg` is the largest heading error (None: headings are not compared)."""
         place, rotation_deg = match.place, match.match.rotation_deg
         in_reach = heading_agrees = True
         if self.reach and place.position:
-            middle, position = self.reach.position, place.position
-            off_m = distance_m(middle.lat_deg, middle.lon_deg, position.lat_deg, position.lon_deg)
-            in_reach = bool(off_m <= self.reach.radius_m)
+            centre, position = self.reach.position, place.position
+            apart_m = distance_m(centre.lat_deg, centre.lon_deg, position.lat_deg, position.lon_deg)
+            in_reach = bool(apart_m <= self.reach.radius_m)
         if self.heading_deg is not None and place.heading_deg is not None and rotation_deg is not None:
-            off_deg = wrap_deg(rotation_deg - (self.heading_deg - place.heading_deg))
-            heading_agrees = heading_within_deg is None or abs(off_deg) <= heading_within_deg
+            error_deg = wrap_deg(rotation_deg - (self.heading_deg - place.heading_deg))
+            heading_agrees = heading_within_deg is None or abs(error_deg) <= heading_within_deg
         return in_reach, heading_agrees
 
     def select(self, trusts_reach: bool, trusts_heading: bool) -> "Hints | None":
-        """Return those of these hints that are trusted; None if nothing is left."""
+        """Return only the trusted hints; None if there are none."""
         reach, heading_deg = self.reach if trusts_reach else None, self.heading_deg if trusts_heading else None
         return None if reach is None and heading_deg is None else Hints(reach, heading_deg)
 
 
 class RecordedPrior:
-    """Makes the hints for each recorded query from its own frame. `known`: the members of `KNOWN_FIELDS` to use, as far
-    as a frame has them. The rest is as in `Prior`. `map_height_m` is the height at which the map was made (None: it or
-    those of the queries are unknown; `height` means the map's).
+    """Makes the hints for each recorded query from its own frame. `known`: the members of `KNOWN_FIELDS` to use if a
+    frame has them. For the other attributes see `Prior`. `map_height_m` is the height from which the map was made
+    (None: it or the height of the queries is unknown; `height` then means the map's).
 
-    Earlier queries are used for one thing: recorded heights may all be wrong by one factor, as by a barometer over
-    sloping ground or a wrong field of view. Until a match has confirmed them, all heights are searched. From then on
-    they are corrected by the matches.
+    Earlier queries serve only to correct heights: all recorded heights may be wrong by one factor, because of a
+    barometer over sloping ground or a wrong field of view. Until matches have confirmed them, all heights are searched.
     """
 
     def __init__(
@@ -101,7 +100,7 @@ class RecordedPrior:
         self.searches_heights = True
 
     def make_hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
-        """Return the hints for a frame; `vehicle` and `margin_m`, of a flight, are not used."""
+        """Return the hints for a frame; `vehicle` and `margin_m` are used only in a flight (`Prior`)."""
         ratio: float | None = self._height_error
         if self._map_height_m is not None:
             recorded_m = frame.height_m if frame.height_m and frame.height_m > 0 else None
@@ -115,14 +114,14 @@ class RecordedPrior:
 
     @property
     def _height_error(self) -> float:
-        """Median ratio of the heights by the last matches to those recorded; 1.0 if they are about the same."""
+        """Median ratio of the heights of the last matches to the recorded ones; 1.0 if they are about equal."""
         error = statistics.median(self._height_errors) if self._height_errors else 1.0
         # The height of one match may be wrong by 8 %, so a few matches correct only a clear error.
         tolerance = _SCALE_ERROR if len(self._height_errors) >= _MIN_HEIGHTS else _SCALE_ERROR**2
         return error if abs(math.log(error)) > math.log(tolerance) else 1.0
 
     def scale(self, height_ratios: Sequence[float]) -> float:
-        """Return the ratio of the ground that a picture shows to that by its recorded height."""
+        """Return the ratio of the ground that a picture shows to the ground expected at its recorded height."""
         return self._height_error if self._map_height_m is None else 1.0
 
     def update(
@@ -134,7 +133,7 @@ class RecordedPrior:
         footprint_m: float | None = None,
         layers: Layers | None = None,
     ) -> None:
-        """Record the error of the recorded height by an accepted match. The arguments are as in `Prior.update`."""
+        """Store the error of the recorded height against an accepted match. For the arguments see `Prior.update`."""
         ratio, pose = match.match.height_ratio, match.place.pose
         if not (accepted and ratio):
             return
@@ -148,21 +147,21 @@ class RecordedPrior:
 
 
 class Prior(RecordedPrior):
-    """Makes the hints for each query of a flight, and decides whether hints are to be trusted.
+    """Makes the hints for each query of a flight, and decides whether to trust them.
 
-    `height_ratio` is the height of the camera over that of the map's pictures, by the last accepted match; if pictures
-    are scaled by known heights, the error of these. `footprint_m` is that of the layer in which the last match was
-    (None: unknown, or given by its height); the height ratio is relative to it. `searches_heights`: a query that is not
-    accepted there is searched at other heights too. `reach_m_s` is the highest speed (None: positions are no hint),
-    `heading_within_deg` the largest error of a known heading (None: headings are no hint). `is_live` is False for
-    recorded frames, to which the autopilot's reports do not belong.
+    `height_ratio` is the height of the camera relative to that of the map's pictures, from the last accepted match; if
+    pictures are scaled by known heights, it is the error of these heights. `footprint_m` is the footprint of the layer
+    of the last match (None: unknown, or given by its height); the height ratio is relative to it. `searches_heights`:
+    also search at other heights if a query is not accepted. `reach_m_s` is the highest speed (None: positions are not
+    used as hints), `heading_within_deg` the largest error of a known heading (None: headings are not used as hints).
+    `is_live` is False for recorded frames, for which the autopilot's reports do not apply.
     """
 
     def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
         super().__init__((), heading_within_deg)
         self._reach_m_s, self._is_live = reach_m_s, is_live
         self._uses_hints = True
-        self._trusted = _TRUST_ALL  # area and heading, by the last accepted match
+        self._trusted = _TRUST_ALL  # area and heading, according to the last accepted match
         self._last_fix: tuple[Position, float] | None = None  # with its time
         self._estimate: tuple[Reach, float] | None = None  # of the place filter, with its time
         self._all_hints: Hints | None = None
@@ -170,10 +169,10 @@ class Prior(RecordedPrior):
     def make_hints(self, frame: Frame, vehicle: Vehicle | None, index: PlaceIndex, margin_m: float) -> Hints | None:
         """Return the hints for a frame; None if there are none, or if hints are not trusted now.
 
-        `vehicle` is the autopilot's last report. The area is as far as the aircraft can have flown, and `margin_m`,
-        from the autopilot's position if that has GPS (else it drifts, and our own fix is better), or from our last fix
-        if that is at most a minute old. Without a highest speed, it is around the position by the place filter, if that
-        is certain.
+        `vehicle` is the autopilot's last report. The radius of the area is the farthest that the aircraft can have
+        flown plus `margin_m`. Its centre is the autopilot's position if that has GPS (otherwise it drifts, and our own
+        fix is better), or else our last fix if at most a minute old. Without a highest speed, the area is around the
+        position from the place filter, if that is certain.
         """
         if not self._is_live or (vehicle and not vehicle.is_fresh(frame.t_mono_s)):
             vehicle = None
@@ -195,7 +194,7 @@ class Prior(RecordedPrior):
 
     def scale(self, height_ratios: Sequence[float]) -> float:
         """Return the factor to scale the next picture by, so that it looks as if taken at one of the `height_ratios`:
-        between two of them fewer matches are found. One from higher up goes to the nearest, as it needs its edges."""
+        between them fewer matches are found. A picture from higher up is scaled to the nearest, to keep its edges."""
         ratio = self.height_ratio
         if not height_ratios or abs(math.log(ratio)) <= math.log(_SCALE_ERROR):
             return 1.0
@@ -210,7 +209,7 @@ class Prior(RecordedPrior):
         footprint_m: float | None = None,
         layers: Layers | None = None,
     ) -> None:
-        """Record position and height of an accepted match; the next query uses the hints that it agrees with. Until
+        """Store position and height of an accepted match; the next query uses the hints that agree with it. Until
         there is one, queries with and without hints alternate. The query's picture was enlarged by `scale`, so by its
         height it shows `footprint_m` of ground (None: its height is unknown). `layers` are those of the map (None: it
         has one).
@@ -239,7 +238,7 @@ class Prior(RecordedPrior):
             self._last_fix = match.place.position, t_mono_s
 
     def update_area(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
-        """Record the position by the place filter (None: unknown), with the probability `mass` that the aircraft is
+        """Store the position from the place filter (None: unknown), with the probability `mass` that the aircraft is
         near it. It is used until the next certain one, or for a minute."""
         if estimate and mass >= _MIN_MASS:
             east_m2, _, north_m2 = estimate.covariance_m2
@@ -247,8 +246,8 @@ class Prior(RecordedPrior):
 
 
 def parse_known_fields(text: str | None) -> tuple[str, ...]:
-    """Read "height,heading" as members of `KNOWN_FIELDS`, in their order; None as none. Raises UsageError for another
-    text."""
+    """Parse a list such as "height,heading" into members of `KNOWN_FIELDS`, in their order (None: no members). Raises
+    UsageError for any other text."""
     names = [] if text is None else [name.strip() for name in text.split(",")]
     if unknown := [name for name in names if name not in KNOWN_FIELDS]:
         raise UsageError(f"`known` names `{unknown[0]}`: use some of {', '.join(KNOWN_FIELDS)}, with commas between.")
@@ -261,7 +260,7 @@ def explain_why_unusable(
     places: Collection[GeoTag] | Collection[Place],
     sequence: int,
 ) -> str | None:
-    """Return a sentence on why no query can use the hints in `known` (see `RecordedPrior`); None if some can.
+    """Return a sentence on why no query can use the hints in `known` (see `RecordedPrior`); None if some query can.
     `sequence` is the number of queries that are matched together."""
     if known and sequence > 1:
         return f"{sequence} queries are matched together, but `known` narrows single ones: leave one option out."
@@ -273,7 +272,7 @@ def explain_why_unusable(
 
 
 def _drop_useless(reach: Reach | None, heading_deg: float | None, index: PlaceIndex) -> Hints | None:
-    """Return the hints that narrow a search of the index; None: none does. An area of all places or none does not."""
+    """Return the hints that narrow a search of the index (None: none). An area with all places or none does not."""
     if reach and not 0 < index.find_within(reach.position, reach.radius_m).sum() < len(index):
         reach = None
     if not index.has_headings:

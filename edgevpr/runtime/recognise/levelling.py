@@ -1,5 +1,5 @@
-"""Levelling: takes the distortion of a lens away, and warps the picture of a camera that looks straight down as if the
-aircraft flew level. A wrong height scales a picture wrongly; a technique with `height_ratios` recognises it anyway.
+"""Levelling: removes lens distortion, and warps the picture of a camera that looks straight down as if the aircraft
+flew level. A wrong height gives a wrong scale; a technique with `height_ratios` still recognises the picture.
 """
 
 import logging
@@ -29,24 +29,24 @@ from edgevpr.frames.level import (
 from edgevpr.frames.source import is_live
 from edgevpr.places.layers import Layers
 
-GPS_SD_M = 5.0  # standard deviation along one axis of a recorded position, unless a better one is known
+GPS_SD_M = 5.0  # standard deviation of a recorded position along one axis, unless a better one is known
 # Distance, as a share of the footprint, from the picture's middle to the point below an aircraft tilted by 3 degrees.
 # Chosen on generated flights and aerial_swindale.
 TILT_SD_WITHOUT_ATTITUDE = 0.04
-_MAX_OFFSET_WITHOUT_HEADING = 0.25  # of the longest side: farther from the aircraft, the picture shows other ground
-_MAX_FIELD_DIFFERENCE_DEG = 5.0  # that of a data sheet is rounded
+_MAX_OFFSET_WITHOUT_HEADING = 0.25  # of the longest side: farther away, the picture shows other ground
+_MAX_FIELD_DIFFERENCE_DEG = 5.0  # data sheets round it
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True, kw_only=True)
 class Levelling:
-    """Levels the pictures of a camera that looks straight down, see `frames.level`. Without a `lens` they stay as they
-    are, and only the distance on the ground from the point below the camera to the picture's middle is computed, by the
-    `mount` of the camera; a `lens` has its own.
+    """Levels the pictures of a camera that looks straight down, see `frames.level`. Without a `lens` they are not
+    warped, and only the distance on the ground from the point below the camera to the picture's centre is computed,
+    from the `mount` of the camera; a `lens` has its own mount.
 
-    With `below`, for places, the point below the camera becomes the middle. `on_gimbal`: a gimbal keeps the camera
-    level. `is_live` is False for recorded frames, for which the autopilot's reports do not hold.
+    With `below`, for places, the point below the camera becomes the centre. `on_gimbal`: a gimbal keeps the camera
+    level. `is_live` is False for recorded frames, for which the autopilot's reports do not apply.
     """
 
     lens: Lens | None = field(kw_only=False)
@@ -57,7 +57,7 @@ class Levelling:
     _has_warned: bool = field(default=False, init=False)
 
     def replace_mount(self, mount: Mount) -> "Levelling":
-        """Return the same for a camera that is mounted otherwise."""
+        """Return the same levelling for a camera with another `mount`."""
         return replace(self, lens=self.lens and replace(self.lens, mount=mount), mount=mount)
 
     def prepare(
@@ -70,9 +70,9 @@ class Levelling:
         scale: float = 1.0,
     ) -> LevelledImage:
         """Level the picture of a frame. `vehicle` is the autopilot's report (None: unknown). `overlay`, bool (H, W), is
-        False where the picture shows no ground (None: nowhere). Its longest side is scaled to a length on the ground,
-        that of the places to look among by their `layers` (None: no scaling). It shows `scale` times as much ground as
-        its height tells or, where that is unknown, as those of the map."""
+        False where the picture shows no ground (None: nowhere). Its longest side is scaled to the length on the ground
+        of the places to search, chosen from their `layers` (None: no scaling). It shows `scale` times as much ground as
+        expected at its height or, if that is unknown, as the pictures of the map."""
         if vehicle and not (self.is_live and vehicle.is_fresh(frame.t_mono_s)):
             vehicle = None
         if vehicle and self.on_gimbal:
@@ -86,27 +86,27 @@ class Levelling:
         picture = level_image(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self.below, scale=scale)
         if picture.view.reason and not self._has_warned:
             self._has_warned = True
-            _log.warning("%s: %s; no more of these are reported", frame.name, picture.view.reason)
+            _log.warning("%s: %s (further frames are not reported)", frame.name, picture.view.reason)
         return picture
 
 
 @dataclass(frozen=True, slots=True)
 class Undistortion:
-    """Takes the distortion of a lens from the pictures of a camera that looks ahead, which are not levelled."""
+    """Removes lens distortion from the pictures of a camera that looks ahead, which are not levelled."""
 
     lens: CalibratedLens
 
     def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, **_: object) -> LevelledImage:
-        """Straighten the picture of a frame, which has no scale; as `Levelling.prepare`."""
+        """Undistort the picture of a frame, which has no scale. Arguments as in `Levelling.prepare`."""
         return undistort_frame(frame.image, overlay, UNKNOWN_VIEW, self.lens)
 
 
 def make_levelling(
     config: SourceConfig, technique: Technique, *, below: bool = False
 ) -> Levelling | Undistortion | None:
-    """Make what comes before encoding for a configuration. None: nothing, for a camera that looks ahead, or on a gimbal
-    with unknown lens. Raises ConfigError for a calibration of the lens that cannot be used, and UsageError for a field
-    of view that contradicts it."""
+    """Make the preparation of pictures for a configuration. None: there is none, for a camera without a known lens that
+    looks ahead or is on a gimbal. Raises ConfigError for an unusable lens calibration, and UsageError for a field of
+    view that contradicts it."""
     if technique.spec.parameters.get("camera") != "nadir":
         calibrated = load_calibrated_lens(config)
         return Undistortion(calibrated) if calibrated else None
@@ -119,19 +119,19 @@ def make_levelling(
 
 
 def read_camera_lens(config: SourceConfig) -> Lens | None:
-    """Return the lens of a configuration's camera; None if it is unknown. Raises as `make_levelling`."""
+    """Return the lens of the configured camera; None if unknown. Raises the errors of `make_levelling`."""
     calibrated = load_calibrated_lens(config)
     fov_deg = compute_lens_view(calibrated, calibrated.size_px).fov_deg if calibrated else config.fov_deg
     return None if fov_deg is None else Lens(fov_deg, config.up_deg, calibrated, read_mount(config))
 
 
 def read_mount(config: SourceConfig) -> Mount:
-    """Return where a configuration's camera looks beside straight down."""
+    """Return the mounting angles of the configured camera, relative to straight down."""
     return Mount(config.mount_ahead_deg, config.mount_right_deg)
 
 
 def load_calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
-    """Read the calibration that the configuration names (None: it names none); raises as `make_levelling`."""
+    """Read the configured lens calibration (None: there is none). Raises the errors of `make_levelling`."""
     if config.lens is None:
         return None
     lens = read_lens(config.lens)
@@ -145,30 +145,30 @@ def load_calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
 
 
 def set_picture_heading(frame: Frame, view: View) -> Frame:
-    """Return the frame with the heading of the top of its levelled picture, for the hints, if that is known."""
+    """Return the frame with the heading of the top of its levelled picture, if known. The hints use it."""
     return frame if view.up_deg is None else replace(frame, heading_deg=view.up_deg)
 
 
 def centre_place(frame: Frame, view: View) -> Frame:
-    """Change a frame to what a place stores. Its heading becomes that of the levelled picture. If it has a position,
-    this becomes the position of the picture's middle instead of the aircraft's, as far as that can be computed, and
-    with a known height and heading it gets a pose."""
+    """Convert a frame to the form that a place stores. Its heading becomes that of the levelled picture. Its position,
+    if any, becomes that of the picture's centre instead of the aircraft's, if that can be computed. With a known
+    height and heading it gets a pose."""
     frame = set_picture_heading(frame, view)
     if view.nadir_offset and view.up_deg is None and math.hypot(*view.nadir_offset) > _MAX_OFFSET_WITHOUT_HEADING:
         return replace(frame, position=None)
     if frame.position and view.nadir_offset_m:
         east_m, north_m = view.nadir_offset_m
-        middle = offset_position(frame.position.lat_deg, frame.position.lon_deg, -east_m, -north_m)
-        return replace(frame, position=Position(*middle, frame.position.alt_m))
+        centre = offset_position(frame.position.lat_deg, frame.position.lon_deg, -east_m, -north_m)
+        return replace(frame, position=Position(*centre, frame.position.alt_m))
     if frame.pose is not None or frame.position is None or view.up_deg is None or view.footprint_m is None:
         return frame
     variance_m2, position = GPS_SD_M**2, frame.position
     if view.nadir_offset is None:
         variance_m2 += (TILT_SD_WITHOUT_ATTITUDE * view.footprint_m) ** 2
     else:
-        # The nadir is below the aircraft, and the picture's middle as far from it in the opposite direction.
+        # The nadir is below the aircraft; seen from there, the picture's centre is in the opposite direction.
         variance_m2 += (view.nadir_offset_sd * view.footprint_m) ** 2
-        off_m = -view.footprint_m * picture_axes(view.up_deg) @ view.nadir_offset
-        position = Position(*offset_position(position.lat_deg, position.lon_deg, *off_m.tolist()), position.alt_m)
+        offset_m = -view.footprint_m * picture_axes(view.up_deg) @ view.nadir_offset
+        position = Position(*offset_position(position.lat_deg, position.lon_deg, *offset_m.tolist()), position.alt_m)
     pose = Pose(up_deg=view.up_deg, footprint_m=view.footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2))
     return replace(frame, position=position, pose=pose)

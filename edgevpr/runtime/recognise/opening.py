@@ -1,4 +1,4 @@
-"""Makes a recogniser from a map, the technique it was made with, and its index in RAM. All programs start here."""
+"""Makes a recogniser from a map, the technique it was built with, and its index in RAM. Every program starts here."""
 
 import logging
 from collections.abc import Collection, Mapping
@@ -29,9 +29,9 @@ from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.runtime.recognise.salience_gate import MAX_ENTROPY, SalienceGate
 from edgevpr.techniques.card import load_card
 
-_MAX_WAIT_S = 0.05  # longest wait in flight for another program that writes to the map: a query must not be late
+_MAX_WAIT_S = 0.05  # longest wait in flight while another program writes to the map: queries must not be late
 _log = logging.getLogger(__name__)
-Settings = Mapping[str, int | float | str]  # parameters of a technique, by their names
+Settings = Mapping[str, int | float | str]  # parameters of a technique, by name
 
 
 def open_recogniser(
@@ -47,11 +47,11 @@ def open_recogniser(
 
     With `uses_hints`, for a flight, hints narrow each query (see `hints`); otherwise only what is `known` of recorded
     queries does (see `RecordedPrior`). With `tracks_flight`, the queries are those of one flight, in order (see
-    `place_filter`). `meter` measures the queries (None: by the clocks of this computer). Raises an EdgevprError that
-    names what does not fit together, such as a setting that the map was not built with.
+    `place_filter`). `meter` measures the queries (None: use the clocks of this computer). Raises an EdgevprError
+    that explains the mismatch, such as a setting that the map was not built with.
     """
     if config.map is None:
-        raise UsageError("There is no map to recognise places in: name one with --map, or `map:` in the configuration.")
+        raise UsageError("There is no map to recognise places in: give one with --map, or `map:` in the configuration.")
     source, match = config.source, config.match
     place_map = PlaceMap.open(config.map)
     with ExitStack() as on_error:
@@ -69,7 +69,7 @@ def open_recogniser(
         if uses_hints:
             prior = Prior(match.reach_m_s, technique.spec.heading_within_deg, is_live(source.uri))
         place_filter = None
-        # Only matches that have a confidence can be followed, and only where no sequence is asked for.
+        # Only matches with a confidence can be tracked, and only if no sequence is configured.
         if tracks_flight and match.sequence is None and list_evidence_kinds(technique.spec):
             place_filter = PlaceFilter(place_map, max_speed_m_s=match.reach_m_s, is_live=is_live(source.uri))
         rule = make_accept_rule(technique, match, length, read_calibration_for(place_map))
@@ -82,7 +82,7 @@ def open_recogniser(
             meter or QueryMeter(board, config.battery),
             settings=settings,
             odometry=VisualOdometry() if uses_hints and knows_scale else None,
-            # In a sequence, a place that a wrong hint kept out of one query would count as compared and unlike it.
+            # In a sequence, a place that a wrong hint excluded from one query would count as compared and dissimilar.
             prior=prior if length == 1 else None,
             place_filter=place_filter,
         )
@@ -93,9 +93,8 @@ def open_recogniser(
 
 
 def open_salience_gate(config: SalienceConfig, threads: int = 1) -> SalienceGate | None:
-    """Make the salience gate, None if the configuration asks for none. A criterion whose network is not named is off,
-    with a warning. Raises ConfigError if nothing can pass or all criteria are off, ModelError for an unusable
-    network."""
+    """Make the salience gate; None if the configuration does not enable it. A criterion without a network is off, with
+    a warning. Raises ConfigError if nothing can pass or all criteria are off, ModelError for an unusable network."""
     if not config.use:
         return None
     if config.entropy > MAX_ENTROPY:
@@ -107,19 +106,19 @@ def open_salience_gate(config: SalienceConfig, threads: int = 1) -> SalienceGate
         if config.network:
             memorability = Memorability(load_card(config.network), threads)
         else:
-            _log.warning("no `salience.network` is named: how memorable a picture is does not count")
+            _log.warning("`salience.network` is not set: memorability is not checked")
     if config.staticity > 0:
         if config.detector:
             detector = Detector(load_card(config.detector), threads)
         else:
-            _log.warning("no `salience.detector` is named: what moves in a picture does not count")
+            _log.warning("`salience.detector` is not set: moving objects are not checked")
     if not (memorability or detector or config.entropy > 0):
-        raise ConfigError("`salience.use` is true, and every criterion is off: raise a threshold, or use no salience.")
+        raise ConfigError("`salience.use` is true, but every criterion is off: raise a threshold, or set it to false.")
     return SalienceGate(config, memorability, detector)
 
 
 def make_technique(threads: int | None, name: str, settings: Settings | None = None) -> Technique:
-    """Make the technique `name`; its network gets `threads` (None: one) unless `settings` give a number."""
+    """Make the technique `name`; its network runs on `threads` threads (None: one) unless `settings` give a number."""
     own = {"threads": threads} if threads and "threads" in techniques.read_parameters(name) else {}
     return techniques.create(name, {**own, **(settings or {})})
 
@@ -129,8 +128,8 @@ def create_technique(
 ) -> Technique:
     """Make the technique that a map was built with, for `board`.
 
-    Raises MapError if `name` or `settings` belong to another technique, UsageError for a setting that it does not have,
-    and ModelError for an unusable network.
+    Raises MapError if `name` or `settings` belong to another technique, UsageError for a setting that it lacks, and
+    ModelError for an unusable network.
     """
     built_with, settings, threads = place_map.spec, settings or {}, board.threads if board else None
     if not techniques.is_known(built_with.name):
@@ -156,13 +155,13 @@ def create_technique(
 
 def warn_of_mismatch(place_map: PlaceMap, mask: OverlayMask | None, lens: str | None) -> None:
     """Warn if the places of a map, which remain usable, were made with another `mask`, or if their pictures were
-    straightened by a calibration and those to come are not (`lens` None)."""
+    undistorted with a calibration and those of the queries will not be (`lens` None)."""
     if not len(place_map):
         return
     path, built_mask, built_lens = place_map.path, place_map.mask_sha256, place_map.lens
     if built_mask != (mask.sha256 if mask else None):
         how = "without a mask" if built_mask is None else "with another mask"
-        _log.warning("%s was built %s; more is recognised where map and frames have the same", path, how)
+        _log.warning("%s was built %s: use the same mask for map and frames, to recognise more", path, how)
     if built_lens and not lens:
         _log.warning(
             "%s was built with `source.lens` (%s): set `source.lens` to the calibration of this camera too, unless its "

@@ -1,9 +1,9 @@
-"""The salience gate: lets through the frames that are memorable, static and full of information (thesis 3.2.4).
+"""The salience gate: passes the frames that are memorable, static and rich in information (thesis 3.2.4).
 
-The threshold of entropy is meant for daylight. At night or in fog all frames have less, yet the best of them are still
-worth keeping. So a frame lacks entropy only if it has less than the threshold *and* less than is usual in the present
-light (the thesis's threshold is constant), by the upper half of the frames before: a long stretch of sky or water
-changes only the lower half. Until enough frames are known, half of the threshold suffices.
+The entropy threshold is meant for daylight. At night or in fog all frames have less entropy, but the best of them are
+still worth keeping. So a frame lacks entropy only if it has less than the threshold *and* less than usual in this light
+(the thesis has a constant threshold). The usual entropy is computed from the upper half of the previous frames,
+since a long stretch of sky or water changes only the lower half. Until there are enough, half the threshold applies.
 
 If none of 20 frames passes, all thresholds are lowered (thesis 3.4.8).
 """
@@ -22,20 +22,20 @@ from edgevpr.runtime.recognise.gate_networks import Detector, Memorability, inte
 from edgevpr.techniques.entropy import compute_filled_bins
 
 MAX_ENTROPY = float(np.log2(81) / 8)  # entropy / 8 bits of a disc of 81 pixels, all different
-GAP_FRAMES = 20  # if none of so many frames passes, the thresholds are lowered
-THRESHOLD_STEP = 0.03  # by which they are lowered at a time
-_MIN_FRAMES = 8  # for the usual entropy
+GAP_FRAMES = 20  # if none of this many frames passes, the thresholds are lowered
+THRESHOLD_STEP = 0.03  # by which they are lowered in each step
+_MIN_FRAMES = 8  # needed to compute the usual entropy
 _MAX_FRAMES = 100
-# A tenth of a normal distribution lies more than so many differences of its 90th and 75th percentiles below the 75th.
+# A tenth of a normal distribution is more than this many differences of its 90th and 75th percentiles below the 75th.
 _USUAL_LIMIT_STEPS = 3.2
 _MIN_STEP = 0.005
-_MAX_PX = 320  # of the copy on which entropy is computed: a larger one costs more and gives the same
+_MAX_PX = 320  # of the copy used for entropy: a larger one costs more and gives the same result
 
 
 @dataclass(frozen=True, slots=True)
 class SalienceVerdict:
     """Judgement of a frame by its `scores`. `shortfall` is how far the worst one is below its threshold,
-    `criterion` its name, and `reason` says so (0 and None: the frame passes)."""
+    `criterion` is its name, and `reason` the refusal (0 and None: the frame passes)."""
 
     scores: Salience
     shortfall: float = 0.0
@@ -44,7 +44,7 @@ class SalienceVerdict:
 
 
 class SalienceGate:
-    """Judges the frames of a flight, one after the other.
+    """Judges the frames of a flight in order.
 
     `memorability` and `detector` are None if their criterion is off. The detector runs on every k-th frame only (k =
     `detect_every` of the configuration), and its result is used until the next.
@@ -57,7 +57,7 @@ class SalienceGate:
         self.reset()
 
     def reset(self) -> None:
-        """Prepare for another flight: forget the usual entropy and the last result of the detector."""
+        """Prepare for another flight: discard the usual entropy and the last result of the detector."""
         self._entropies: deque[float] = deque(maxlen=_MAX_FRAMES)
         self._until_detection = 0
         self._static: Mask | None = None
@@ -66,7 +66,7 @@ class SalienceGate:
         """Judge a frame, uint8 (H, W[, 3]). Raises ModelError for an unusable network."""
         scores = self.scores(image)
         self._entropies.append(scores.entropy or 0.0)
-        # In the first frames of a flight the light is not known; half of the threshold still rejects an empty picture.
+        # At the start of a flight the light is unknown; half of the threshold still rejects an empty picture.
         usual = self.config.entropy / 2
         if len(self._entropies) >= _MIN_FRAMES:
             middle, high = np.percentile(self._entropies, (75, 90))
@@ -84,27 +84,27 @@ class SalienceGate:
 
 
 def judge_scores(salience: Salience, config: SalienceConfig, usual: float = 1.0) -> SalienceVerdict:
-    """Compare the scores of a frame (None: not) with their thresholds, entropy with `usual` if that is lower."""
+    """Compare the scores of a frame (None: skipped) with their thresholds, entropy with `usual` if that is lower."""
     known = salience.scores
     least = {name: getattr(config, name) for name in known} | {"entropy": min(config.entropy, usual)}
-    short = {name: least[name] - score for name, score in known.items() if least[name] > 0 and score is not None}
-    worst = max(short, key=lambda name: short[name], default=None)
-    if worst is None or short[worst] <= 0:
+    shortfalls = {name: least[name] - score for name, score in known.items() if least[name] > 0 and score is not None}
+    worst = max(shortfalls, key=lambda name: shortfalls[name], default=None)
+    if worst is None or shortfalls[worst] <= 0:
         return SalienceVerdict(salience)
     figures = {"measure": worst, "score": known[worst], "needed": least[worst]}
-    return SalienceVerdict(salience, short[worst], worst, Reason(ReasonCode.NOT_MEMORABLE, figures))
+    return SalienceVerdict(salience, shortfalls[worst], worst, Reason(ReasonCode.NOT_MEMORABLE, figures))
 
 
 def select_best(shortfalls: list[float]) -> list[bool]:
-    """Find the best of some frames: lower all thresholds in steps of 0.03 until at least one frame passes. Returns for
-    each frame whether it passes then; `shortfalls` are the frames' `SalienceVerdict.shortfall`."""
+    """Select the best of several frames: lower all thresholds in steps of 0.03 until at least one frame passes. Return
+    for each frame whether it then passes; `shortfalls` are the frames' `SalienceVerdict.shortfall`."""
     steps = np.ceil(np.round(np.array(shortfalls) / THRESHOLD_STEP, 6))
     return [bool(step == steps.min()) for step in steps]
 
 
 def compute_scores(image: Image, memorability: Memorability | None = None, is_static: Mask | None = None) -> Salience:
-    """Return the scores of uint8 (H, W[, 3]): the means over its pixels, of a copy whose longer side has 320 at most.
-    Pixels that are not static count as 0 in the other two scores, because a picture with many of them is worth less.
+    """Return the scores of uint8 (H, W[, 3]): means over the pixels of a copy whose longer side has at most 320.
+    Pixels that are not static count as 0 in the other two scores, because a picture with many of them is less useful.
 
     `is_static`, bool (H, W), is the detector's result for the picture (None: no detector). Raises ModelError.
     """

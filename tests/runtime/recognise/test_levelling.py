@@ -153,7 +153,7 @@ def test_a_tilt_that_a_picture_does_not_bear_is_refused_and_said_once(walk, grou
     assert [(event.accepted, event.reason.code) for event in events] == [(False, ReasonCode.TILTED)] * 3
     assert reasons[0].code is ReasonCode.TILTED
     assert reasons[0].parameters["tilt_deg"] == pytest.approx(65.0)
-    assert [record.message for record in caplog.records] == [f"1: {reasons[0]}; no more of these are reported"]
+    assert [record.message for record in caplog.records] == [f"1: {reasons[0]} (further frames are not reported)"]
 
 
 def test_a_place_has_the_position_of_the_middle_of_its_picture():
