@@ -1,5 +1,5 @@
-"""Exchange of a flight with its autopilot: sends fixes and messages over the link, logs the answers, and gives the
-state of the link. An event is the `Recognition` of one frame. The loop of `flight` uses it."""
+"""Communication of a flight with its autopilot: sends fixes and messages over the link, logs the answers, and returns
+the state of the link. An event is the `Recognition` of one frame. The loop of `flight` uses it."""
 
 import logging
 import math
@@ -29,16 +29,16 @@ DRY_RUN = Reason(ReasonCode.DRY_RUN)
 _UNKNOWN_AGE = Reason(ReasonCode.AGE_UNKNOWN)
 _MIN_REPORTED_DELAY_S = 0.3
 
-_SOURCE_SET_RETRY_S = 2.0  # for a source set, while that is not answered
-_MIN_GPS_GOOD_S = 10.0  # so long GPS must be good before the source set with GPS is asked for again
+_SOURCE_SET_RETRY_S = 2.0  # between two requests for a source set, until one is answered
+_MIN_GPS_GOOD_S = 10.0  # how long GPS must be good before the source set with GPS is requested again
 
 _log = logging.getLogger(__name__)
 
 
 class AutopilotOutput:
-    """Sends fixes and other messages over an open link: a match as a fix if the `navigator` advises so; in a dry run
-    only the sending is left out. `cores` is the number of the board's cores. What the link's thread uses too is
-    accessed in turns only (`Link.turn`)."""
+    """Sends fixes and other messages over an open link: a match as a fix if the `navigator` advises so; a dry run
+    omits only the sending. `cores` is the number of the board's cores. State shared with the link's thread is accessed
+    in turns only (`Link.turn`)."""
 
     def __init__(
         self, link: Link, navigator: Navigator, notifier: Notifier, *, settings: MavlinkConfig, cores: int, clock: Clock
@@ -47,13 +47,13 @@ class AutopilotOutput:
         self._send_fixes, self._source_sets = settings.send_fixes, SourceSets(settings.source_sets)
         self._unanswered: list[tuple[str, FixTransmission]] = []
         self._held, self._is_holding = 0, False
-        self._output = Output.STARTING  # as it was last reported
+        self._output = Output.STARTING  # as last reported
         self._unknown_age = Alert(notifier, "age", _UNKNOWN_AGE, ReasonCode.AGE_KNOWN)
         self._delay_s = 0.0  # as last reported
 
     @property
     def summary(self) -> str:
-        """Counts of fixes so far, and of refused messages from other systems, in a few words."""
+        """Counts of fixes and of refused messages from other systems so far, in a few words."""
         stats = self._link.stats()
         taken = f"{stats.fixes_sent} fixes sent, {stats.acks.get('ACCEPTED', 0)} accepted"
         if stats.positions_sent:
@@ -74,8 +74,8 @@ class AutopilotOutput:
 
     def state(self) -> dict[str, Any]:
         """Return the state of the link for the status: `trouble`, why the port could not be opened or was lost (None:
-        data arrives); `autopilot`, the system id of the one that is alive (None: none); the name of the `channel` of
-        positions; `fixes`, a summary; and `accuracy_m` of our position."""
+        data arrives); `autopilot`, the system id of the live autopilot (None: none); `channel`, the name of the
+        position channel; `fixes`, a summary; and `accuracy_m` of our position."""
         with self._link.turn("state"):
             stats = self._link.stats()
             return {
@@ -87,13 +87,13 @@ class AutopilotOutput:
             }
 
     def log_answers(self) -> None:
-        """Write a log line "answer" for each fix that, since the last call, was answered, was not answered in time, or
-        was given up before it was sent; and a line "between" for each fix that was sent between two matches."""
+        """Write a log line "answer" for each fix that was answered, timed out, or was given up before it was sent,
+        since the last call; and a line "between" for each fix that was sent between two matches."""
         with self._link.turn("answers"):
             for sending in self._link.take_interim_fixes():
                 self._notifier.log("between", t_sent_s=sending.t_sent_s, **_position_fields(sending.fix))
-            # An answer can arrive a moment before the link has noted that the fix was sent.
-            settled = [each for each in self._unanswered if each[1].sent is False or (each[1].sent and each[1].outcome)]
+            # An answer can arrive a moment before the link has recorded that the fix was sent.
+            settled = [item for item in self._unanswered if item[1].sent is False or (item[1].sent and item[1].outcome)]
             for query, sending in settled:
                 self._unanswered.remove((query, sending))
                 outcome = sending.outcome
@@ -109,7 +109,7 @@ class AutopilotOutput:
                 )
 
     def report_match(self, event: Recognition, used_mah: float) -> Recognition:
-        """Send the fix of an event, if there is one to send, and its figures. Return the event with the report of this
+        """Send the fix of an event, if there is one to send, and its figures. Return the event with the report of its
         fix. `used_mah` is the charge that the board has drawn so far."""
         with self._link.turn("use"):
             fix, sending = None, None
@@ -122,7 +122,7 @@ class AutopilotOutput:
             sending.wait(_MAX_SEND_WAIT_S)
         with self._link.turn("use of its fix"):
             if sending:
-                if sending.sent is not False:  # a fix that was not sent gets no answer; the line of its query says why
+                if sending.sent is not False:  # an unsent fix gets no answer; the line of its query has the reason
                     self._unanswered.append((event.name, sending))
                 fields = _position_fields(sending.fix)
                 fix = FixReport(query=event.name, sent=sending.sent, why=sending.why, answer=sending.answer, **fields)
@@ -130,13 +130,13 @@ class AutopilotOutput:
         return replace(event, fix=fix)
 
     def correct_age(self, frame: Frame) -> Frame:
-        """Return a frame with the hidden delay of the camera's pictures taken out of its time."""
+        """Return a frame with the hidden delay of the camera subtracted from its time."""
         with self._link.turn("age of a frame"):
             return self._navigator.age.correct(frame)
 
     def check_age(self, event: Recognition) -> Recognition:
-        """Return an event with a match, or without it if the age of its picture is unknown. Report when that begins and
-        ends, and the delay that is corrected."""
+        """Return the event of a match, without the match if the age of its picture is unknown. Report when that begins
+        and ends, and the corrected delay."""
         with self._link.turn("age"):
             age = self._navigator.age
             age.judge(event)
@@ -161,12 +161,12 @@ class AutopilotOutput:
         return Reason(ReasonCode.DELAY_FOUND, {"delay_s": self._delay_s}) if is_late else None
 
     def add_motion(self, event: Recognition) -> None:
-        """Give the navigator the odometry of a picture that is no query."""
+        """Pass the odometry of a picture that is not a query to the navigator."""
         with self._link.turn("saw"):
             self._navigator.handle_frame(event, is_query=False)
 
     def needs_motion_frames(self) -> bool:
-        """Return True if the position depends on matches, so that odometry between two of them is useful."""
+        """Return True if the position depends on matches, so that odometry between them is useful."""
         with self._link.turn("wants strides"):
             return not self._navigator.has_gps
 
@@ -181,27 +181,27 @@ class AutopilotOutput:
             self._link.send(*messages.make_named_values(now_s, vpr_cpu=float(cpu_share), vpr_mah=float(used_mah)))
 
     def compare_gps(self, off_m: float, is_wrong: bool, have_agreed: bool) -> None:
-        """Send the distance `off_m` (metres) from GPS to a match. While GPS `is_wrong`, since it contradicts the map,
-        the navigator does not use it. If they never `have_agreed`, the map is as likely to be wrong: then GPS is used,
-        and no position is sent."""
+        """Send the distance `off_m` (metres) from GPS to a match. While GPS `is_wrong`, because it contradicts the map,
+        the navigator does not use it. Unless they `have_agreed` before, the map is as likely to be wrong: then GPS is
+        used, and no position is sent."""
         with self._link.turn("gps"):
             self._link.send(*messages.make_named_values(self._clock.mono_s(), vpr_gps_m=float(off_m)))
             self._navigator.trust_gps(not is_wrong or not have_agreed)
             self._navigator.distrust_map(is_wrong and not have_agreed)
 
     def correct_height(self, ratio: float, ratio_sd: float) -> None:
-        """Set the height above ground by the pictures over that by the autopilot (1.0: they agree), and its error."""
+        """Set the ratio of visual height to the autopilot's height above ground (1.0: they agree), and its error."""
         with self._link.turn("height"):
             self._navigator.correct_height(ratio, ratio_sd)
 
     def reset_navigation(self) -> None:
-        """Restart the navigation, since fixes from now on have other errors."""
+        """Restart the navigation, since later fixes have different errors."""
         with self._link.turn("anew"):
             self._navigator.reset_navigation()
 
     def report(self, health: messages.Health, load: MachineLoad, temperature_c: float | None) -> None:
-        """Send health, load and temperature (None: unknown) of this computer, and ask for another source set if that is
-        number. Call it once a second."""
+        """Send health, load and temperature (None: unknown) of this computer, and request another source set if needed.
+        Call it once a second."""
         with self._link.turn("report"):
             self._link.set_health(health)
             self._request_source_set()
@@ -225,7 +225,7 @@ class AutopilotOutput:
             self._link.send(messages.make_source_set(number, stats.autopilot_system_id or 0))
 
     def _report_output(self) -> None:
-        """Report what a continuous channel sends, if that has changed."""
+        """Report what a continuous channel sends if it has changed."""
         output = self._navigator.output
         if self._link.channel.is_continuous and output is not self._output:
             self._output = output
@@ -233,7 +233,7 @@ class AutopilotOutput:
             self._notifier.announce(output.severity, output.text, topic="output")
 
     def _send_match(self, event: Recognition) -> tuple[FixReport | None, FixTransmission | None]:
-        """Send the fix of an accepted match. Return (None, the sending), or (a report of why it is not sent, None)."""
+        """Send the fix of an accepted match. Return (None, transmission), or (report why it is not sent, None)."""
         try:
             advice = self._navigator.advise(event, self._clock.mono_s())
         except ValueError as error:  # another program wrote an invalid position
@@ -245,7 +245,7 @@ class AutopilotOutput:
         return None, self._link.send_fix(advice.fix)
 
     def _report_held(self, objection: Reason | None) -> None:
-        """Count a fix that is held back because of `objection`, and report when a row of them begins and ends."""
+        """Count a fix that is held back because of `objection`, and report when a run of them begins and ends."""
         before, self._is_holding = self._is_holding, objection is not None
         self._held += self._is_holding
         if self._is_holding and not before:
@@ -258,9 +258,9 @@ class AutopilotOutput:
 
 
 class SourceSets:
-    """Decides which numbered set of sensors the autopilot is asked to navigate by: `no_gps` when GPS is lost or wrong
-    and we know the position, after that `gps` once GPS has been good for ten seconds, each until it is answered. Unless
-    both numbers are configured, nothing is asked for."""
+    """Decides which source set to request from the autopilot: `no_gps` when GPS is lost or wrong and we know the
+    position, then `gps` once GPS has been good for ten seconds, each until it is answered. Unless both numbers are
+    configured, none is requested."""
 
     def __init__(self, settings: SourceSetsConfig) -> None:
         self._with_gps, self._without = settings.gps, settings.no_gps
@@ -270,12 +270,12 @@ class SourceSets:
 
     @property
     def are_set(self) -> bool:
-        """True if both numbers are configured; `choose_set` is asked for only then."""
+        """True if both numbers are configured; `choose_set` may be called only then."""
         return self._with_gps is not None and self._without is not None
 
     def choose_set(self, now_s: float, has_gps: bool, has_own: bool, answered_s: float) -> int | None:
-        """Return the number of the set to ask for now (None: none). `has_gps`: there is a trusted GPS; `has_own`:
-        our own position is known well enough; `answered_s`: when such a request was last answered."""
+        """Return the number of the set to request now (None: none). `has_gps`: there is a trusted GPS; `has_own`: our
+        own position is known well enough; `answered_s`: when such a request was last answered."""
         if not has_gps:
             self._bad_s = now_s
         number = self._without if not has_gps and has_own else None
@@ -289,8 +289,8 @@ class SourceSets:
 
 
 def _position_fields(fix: Fix) -> dict[str, float]:
-    at = {"lat_deg": round(fix.lat_deg, 7), "lon_deg": round(fix.lon_deg, 7)}
-    return {**at, "accuracy_m": round(fix.accuracy_m, 2)}
+    position = {"lat_deg": round(fix.lat_deg, 7), "lon_deg": round(fix.lon_deg, 7)}
+    return {**position, "accuracy_m": round(fix.accuracy_m, 2)}
 
 
 def report_unsent(event: Recognition, why: Reason) -> FixReport:
@@ -299,7 +299,7 @@ def report_unsent(event: Recognition, why: Reason) -> FixReport:
 
 
 def combine_confidence(event: Recognition) -> float | None:
-    """Return the higher confidence of a match, alone or by the flight so far (None: unknown)."""
+    """Return the higher confidence of a match: alone, or given the flight so far (None: unknown)."""
     if event.confidence is None:
         return None
     return max(event.confidence, event.track.confidence if event.track else 0.0)

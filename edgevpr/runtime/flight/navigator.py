@@ -1,4 +1,4 @@
-"""Decides which positions are sent to the autopilot, by the vehicle's motion from the link and the matches from the
+"""Decides which positions to send to the autopilot, given the vehicle's motion from the link and the matches from the
 loop. Through a continuous channel (GPS_INPUT, ODOMETRY) a position is sent many times a second, otherwise single fixes.
 The link calls it in its own thread, the loop of `flight` (through `autopilot`) in the main one, each within a turn
 (`mavlink/turns.py`), so it needs no lock."""
@@ -32,15 +32,15 @@ from edgevpr.runtime.flight.slew import Slew
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _MAX_ERROR_M = 50.0  # a position with a larger error is not sent
-_MAX_INTERIM_S = 60.0  # single fixes without a match are sent for so long after the last match, odometry or GPS
-# By accelerations alone we know no more than the autopilot, which has them too. So a continuous position ends so long
-# after the last picture that gave a match or odometry or, until there is one, so long after GPS: sent for half a
-# minute, it led a PX4 copter 246 m away, and for ten seconds 46 m (alone: 25 m).
+_MAX_INTERIM_S = 60.0  # how long single fixes are sent without a match after the last match, odometry or GPS
+# From accelerations alone we know no more than the autopilot, which has them too. So a continuous position ends this
+# long after the last picture with a match or odometry or, until there is one, this long after GPS: sent for half a
+# minute, it led a PX4 copter 246 m away, and for ten seconds 46 m (without our positions: 25 m).
 _MAX_BLIND_S = 10.0
-_PX4_MAX_BLIND_S = 5.0  # PX4 dead-reckons for as long again: by 10 s of tilted accelerations it was led 70 m away
+_PX4_MAX_BLIND_S = 5.0  # PX4 then dead-reckons as long again: 10 s of tilted accelerations led it 70 m away
 _MAX_SINCE_GPS_S = 3.0
 _ALT_SD_M = 3.0
-# An autopilot takes the ten positions of a second as independent. Their errors are correlated for about five seconds:
+# An autopilot treats the ten positions of a second as independent. Their errors are correlated for about five seconds:
 # fifty of them carry the information of one, so each claims its error times this. Without it, they outweighed the
 # gyros: an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
 # A smaller factor would be closer to the true error, but lets the loop run away: benchmarks/results/loop.md.
@@ -57,8 +57,8 @@ _REPORT_TIMEOUT_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """Advice on an accepted match: the `fix` to send or, if it is None, the reason `why` not. `is_held`: the fix is
-    held back, since it contradicts the predicted position."""
+    """Advice on an accepted match: the `fix` to send or, if None, the reason `why` not. `is_held`: the fix is held back
+    because it contradicts the predicted position."""
 
     fix: Fix | None
     why: Reason | None = None
@@ -72,8 +72,8 @@ def _withhold(code: ReasonCode) -> Advice:
 class Navigator(Listener):
     """Navigates for one autopilot: estimates the aircraft's position, and decides what is sent. `map_sd_m` is the
     standard deviation of the error that all fixes share, `every_s` the time between two queries. With `is_muted`, in a
-    dry run, it only gives advice. `is_level`: the camera hangs in a gimbal and stays level at any attitude. `age`
-    estimates the hidden delay of the pictures by the reported motion."""
+    dry run, it only gives advice. `is_level`: the camera is on a gimbal and stays level at any attitude. `age`
+    estimates the hidden delay of the pictures from the reported motion."""
 
     def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False, is_level: bool = False) -> None:
         self._is_muted, self._is_level = is_muted, is_level
@@ -88,11 +88,11 @@ class Navigator(Listener):
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch, self._sent_s = OutputWatch(), -math.inf
         self._height_ratio, self._height_ratio_sd = 1.0, 0.0
-        self._shared_sd_m = map_sd_m  # of the error that the last fixes share
+        self._shared_sd_m = map_sd_m  # standard deviation of the error that the last fixes share
 
     @property
     def has_gps(self) -> bool:
-        """True if the autopilot's position rests on a trusted GPS."""
+        """True if the autopilot's position is based on a trusted GPS."""
         return self._navigation.has_gps
 
     def trust_gps(self, is_trusted: bool) -> None:
@@ -100,7 +100,7 @@ class Navigator(Listener):
         self._trusts_gps = is_trusted
 
     def distrust_map(self, is_distrusted: bool) -> None:
-        """Set whether the map has contradicted GPS from the first match on. One of them is wrong, and nothing shows
+        """Set whether the map has contradicted GPS since the first match. One of them is wrong, and nothing shows
         which: no position is sent, even after GPS is lost."""
         self._distrusts_map = is_distrusted
 
@@ -108,25 +108,25 @@ class Navigator(Listener):
         return self._trusts_gps
 
     def correct_height(self, ratio: float, ratio_sd: float = 0.0) -> None:
-        """Set the ratio of the height above ground by the pictures to that by the autopilot (1.0: they agree).
-        Odometry is scaled by it. The ground may change back at any time, so the claimed error contains the deviation
-        from 1.0 or `ratio_sd`, the relative error of the ratio, if that is larger."""
+        """Set the ratio of visual height to the autopilot's height above ground (1.0: they agree). Odometry
+        is scaled by it. The ground may change back at any time, so the claimed error contains the deviation from 1.0
+        or `ratio_sd`, the relative error of the ratio, if that is larger."""
         self._height_ratio, self._height_ratio_sd = ratio, ratio_sd
 
     def handle_channel(self, channel: Channel) -> None:
-        """Set the channel by which positions are sent. With a continuous one, the autopilot's velocity comes from our
-        positions and must not be used: the path is then integrated from accelerations."""
+        """Set the channel through which positions are sent. With a continuous one, the autopilot's velocity comes from
+        our positions and must not be used: the path is then integrated from accelerations."""
         old_channel, self._channel = self._channel, channel
         if _choose_drift(channel) is not _choose_drift(old_channel):
             self.reset_navigation()
 
     def reset_navigation(self) -> None:
-        """Restart at the autopilot's position, since the fixes from now on have other errors than those before."""
+        """Restart at the autopilot's position, since later fixes have different errors than earlier ones."""
         self._navigation, self._consistency = Navigation(_choose_drift(self._channel), self._map_sd_m), Consistency()
         self._watch = OutputWatch()
 
     def handle_autopilot(self, t_s: float) -> None:
-        """Process the first message of an autopilot, or of one that has replaced it, at `t_s`."""
+        """Process the first message of an autopilot, or of its replacement, at `t_s`."""
         self._autopilot_since_s, self._vehicle = t_s, None
 
     def handle_vehicle(self, vehicle: Vehicle) -> None:
@@ -148,7 +148,7 @@ class Navigator(Listener):
         self._navigation.add_acceleration(t_s, acceleration_m_s2)
 
     def handle_frame(self, event: Recognition, is_query: bool = True) -> None:
-        """Process the frame of an event without an accepted match, or one that is no query and only gives odometry."""
+        """Process the frame of an event without an accepted match, or one that only provides odometry (not a query)."""
         if frame := self._measure(event):
             self._navigation.add_frame(frame, is_query)
 
@@ -181,7 +181,7 @@ class Navigator(Listener):
         return self._advise_improvement(vehicle, vehicle.velocity_m_s, now_s)
 
     def make_interim_fix(self, now_s: float) -> Fix | None:
-        """Return a fix predicted from earlier matches, for the time in which none is accepted; None if it would not
+        """Return a fix predicted from earlier matches, for times when none is accepted; None if it would not
         improve the autopilot's position, or the last match contradicts the prediction."""
         vehicle = self._vehicle
         if self._is_muted or self._channel is not Channel.COMMAND or self.age.is_unknown:
@@ -223,7 +223,7 @@ class Navigator(Listener):
             t_mono_s=t_s,
             lat_deg=lat_deg,
             lon_deg=lon_deg,
-            # The autopilot's own altitude may come from us, so beside a receiver that of the receiver is sent.
+            # The autopilot's own altitude may come from us, so with a receiver its altitude is sent.
             alt_m=receiver.alt_m if is_reserve and receiver and receiver.alt_m is not None else vehicle.alt_m,
             velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
             accuracy_m=factor * math.hypot(self._claimed_m(estimate), lag_m),
@@ -234,7 +234,7 @@ class Navigator(Listener):
         )
 
     def _next_output(self, vehicle: Vehicle | None, estimate: NavState | None) -> Output:
-        """Decide what is sent now."""
+        """Decide what to send now."""
         if vehicle is None:
             return Output.STARTING
         uses_gps = is_gps_aided(vehicle)
@@ -257,7 +257,7 @@ class Navigator(Listener):
         return Output.RESERVE
 
     def _advise_without_report(self, fix: Fix, now_s: float) -> Advice:
-        """Advise on a fix without a recent report: the autopilot has no position, or its report is still to come."""
+        """Advise on a fix without a recent report: the autopilot has no position, or has not reported it yet."""
         if self._channel.is_continuous:
             return _withhold(ReasonCode.NO_TELEMETRY)
         since_s = max(self._autopilot_since_s, self._vehicle.t_received_s if self._vehicle else -math.inf)
@@ -274,7 +274,7 @@ class Navigator(Listener):
             return None
         last_vision_s, last_gps_s = self._navigation.last_vision_s, self._navigation.last_gps_s
         if self._channel.is_continuous:
-            # A channel beside GPS was sending before GPS was lost: it goes on without a gap. On PX4 it only starts now.
+            # A channel beside GPS was sending before GPS was lost, and continues without a gap. PX4's starts now.
             is_gps_recent = self._channel.is_beside_gps and t_s - last_gps_s <= _MAX_SINCE_GPS_S
             max_blind_s = _PX4_MAX_BLIND_S if self._channel in _PX4_CHANNELS else _MAX_BLIND_S
             is_known = t_s - last_vision_s <= max_blind_s or is_gps_recent
@@ -286,7 +286,7 @@ class Navigator(Listener):
         """Advise what to send to an autopilot that reports a position of its own: a fix only if ours is better."""
         if self._channel.is_continuous:
             return _withhold(ReasonCode.CONTINUOUS)
-        if is_gps_aided(vehicle):  # ArduPilot refuses a fix then, and PX4's velocity jumps by the gain that it has
+        if is_gps_aided(vehicle):  # ArduPilot then refuses a fix, and PX4's velocity jumps by its gain
             return _withhold(ReasonCode.HAS_GPS if self._trusts_gps else ReasonCode.HAS_WRONG_GPS)
         if self._distrusts_map:
             return _withhold(ReasonCode.MAP_CONTRADICTS_GPS)
@@ -298,7 +298,7 @@ class Navigator(Listener):
         age_s = now_s - vehicle.t_received_s
         theirs_deg = offset_position(vehicle.lat_deg, vehicle.lon_deg, age_s * east_m_s, age_s * north_m_s)
         off_m = float(distance_m(*theirs_deg, ours.lat_deg, ours.lon_deg))
-        # Mean square errors: of our estimate 2 * accuracy_m**2 (two axes), of the autopilot's position off_m**2 more.
+        # Mean square errors: our estimate's is 2 * accuracy_m**2 (two axes), the autopilot's is larger by off_m**2.
         if off_m**2 <= 2 * estimate.accuracy_m**2:
             figures = {"off_m": off_m, "accuracy_m": estimate.accuracy_m}
             return Advice(None, Reason(ReasonCode.NOT_BETTER, figures))
@@ -310,7 +310,7 @@ class Navigator(Listener):
 
     def _correlation_factor(self, t_s: float) -> float:
         """Return the factor for the claimed errors of a continuous position. For PX4 it is small while pictures measure
-        the error of its attitude, or need no attitude: then our positions do not feed back into our own errors."""
+        its attitude error, or need no attitude: then our positions do not feed back into our own errors."""
         is_independent = self._is_level or t_s - self._attitude_error_s <= _ATTITUDE_ERROR_VALID_S
         return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_independent else CORRELATION_FACTOR
 
@@ -320,7 +320,7 @@ class Navigator(Listener):
 
 
 def _choose_drift(channel: Channel) -> Drift:
-    """Return the errors of the path of an autopilot that gets positions by a channel."""
+    """Return the path errors for an autopilot that gets positions through a channel."""
     if channel in _PX4_CHANNELS:
         return INERTIAL_PX4
     return INERTIAL if channel.is_continuous else DEAD_RECKONING
