@@ -1,5 +1,5 @@
-"""A flight from start to end. Each pass of the loop takes the newest frame, recognises it, and reports the event, the
-`Recognition` of this frame, to the autopilot and to observers: functions that count, watch and log."""
+"""A flight from start to end. Each pass of the loop reads the newest frame, recognises it, and reports the event, the
+`Recognition` of this frame, to the autopilot and to observers: functions that count, monitor and log."""
 
 import logging
 from collections.abc import Callable
@@ -59,7 +59,7 @@ def fly(config: Config, positions: Path | None = None) -> int:
 
 
 class Flight:
-    """A flight whose parts are open. `open` makes it; close it after `run`."""
+    """A flight whose parts are open. Create it with `open`; close it after `run`."""
 
     def __init__(
         self,
@@ -150,7 +150,7 @@ class Flight:
 
     def totals(self) -> dict[str, Any]:
         """Return the counts and costs of the flight so far: those of `FlightMeter.totals` and of the `Source`, the
-        number of `queries`, and `left_out`, that of places that cannot be read."""
+        number of `queries`, and `left_out`, the number of unreadable places."""
         source = self._parts.source
         return {
             "queries": self._tally.queries,
@@ -162,7 +162,7 @@ class Flight:
         }
 
     def _remarks(self) -> tuple[str | None, ...]:
-        """Return remarks for the status beside the counts, each in a few words (None: nothing)."""
+        """Return remarks for the status in addition to the counts, each in a few words (None: nothing to report)."""
         held = self._governing.governor.held
         age = self._parts.autopilot.age_summary if self._parts.autopilot else None
         return self._commands.summary, age, held, self._map_watch.summary, self._parts.flight_log.state
@@ -181,7 +181,7 @@ class Flight:
                 frame: Frame | ImageError | None = source.read(_MAX_WAIT_S)
             except ImageError as error:
                 frame = error
-        if not source.is_live:  # of a live source, reading is mostly waiting
+        if not source.is_live:  # reading from a live source is mostly waiting
             meter.load.add_work(reading.cost)
         if frame is None:
             return
@@ -199,10 +199,10 @@ class Flight:
                 meter.count(event)
                 self._parts.autopilot.add_motion(event)
         meter.load.add_work(work.cost)
-        self._governing.update()  # here, so that each reading covers a whole number of queries
+        self._governing.update()  # here, so each measurement covers a whole number of queries
 
     def _recognise(self, frame: Frame | ImageError, is_query: bool) -> Recognition:
-        """Recognise a frame or, unless it `is_query`, measure its motion only; refuse frozen pictures."""
+        """Recognise a frame or, unless `is_query`, only measure its motion; refuse frozen pictures."""
         if isinstance(frame, ImageError):
             return self._parts.recogniser.report_unread(frame)
         parts, is_live = self._parts, self._parts.source.is_live
@@ -223,7 +223,7 @@ class Flight:
         return not self._commands.is_paused and self._pace.is_odometry_due() and parts.autopilot.needs_motion_frames()
 
     def _publish(self, event: Recognition) -> None:
-        """Report an event to the autopilot, then to all observers, with the report of its fix. An exception is logged:
+        """Report an event to the autopilot, then, with the report of its fix, to all observers. An exception is logged:
         it must not end the flight."""
         meter = self._parts.meter
         meter.count(event)
@@ -259,7 +259,7 @@ class Flight:
         )
 
     def _set_mount(self, mount: Mount) -> None:
-        """Level the pictures to come as those of a camera that looks there, and navigate by their fixes only."""
+        """Level later pictures with this mount, and navigate by their fixes only."""
         self._parts.recogniser.change(mount=mount)
         if self._parts.autopilot:
             self._parts.autopilot.reset_navigation()
@@ -272,7 +272,7 @@ class Flight:
         except Exception:
             _log.exception("the end of the survey could not be reported")
         if parts.link and parts.autopilot:
-            parts.link.close()  # sends waiting messages first, so that the log's last line counts them
+            parts.link.close()  # sends queued messages first, so that the log's last line counts them
             parts.autopilot.log_answers()
         parts.flight_log.write(
             "end",

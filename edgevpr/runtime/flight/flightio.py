@@ -1,5 +1,5 @@
-"""All that a flight reads from outside and sends outside. In the air (`open_real_io`) these are real cameras, clocks
-and a link, with a recording if one is configured; in a replay they come from the recording."""
+"""All inputs and outputs of a flight. In the air (`open_real_io`) these are real cameras, clocks and a link, with a
+recording if one is configured; in a replay they come from the recording."""
 
 import ctypes
 import logging
@@ -47,8 +47,8 @@ T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
-# Parameters of `mallopt` (glibc's malloc.h), bytes: how much freed memory is kept, and from which size on it is given
-# back at once. Left alone, glibc raises both, and a flight over many places holds more than it uses. Half is slower.
+# Parameters of `mallopt` (glibc's malloc.h), bytes: how much freed memory is kept, and the size from which it is
+# returned at once. By default glibc raises both, and a flight over many places holds more than it uses. Half is slower.
 _MALLOC_OPTIONS = {-1: 8_000_000, -3: 4_000_000}
 _MAX_WARNING_S = 0.3
 _MAX_END_S = 4.0  # from a signal to the end of the process, if it does not end by itself: systemd waits five seconds
@@ -56,10 +56,10 @@ _MAX_END_S = 4.0  # from a signal to the end of the process, if it does not end 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightIO:
-    """Inputs and outputs of a flight: `place_map`, the path of its map; settings of its `log`; `open_source`, given the
-    seconds between two frames; the `turns` of the link, what makes its driver (`drive`), `signing` of its
-    packets; the `status` file; and the folder of the `recording`. None: there is none. All that comes in passes here;
-    where it is recorded or played back, `boundary` does so."""
+    """Inputs and outputs of a flight. `place_map`: path of the map; `log`: settings of the flight log; `open_source`:
+    opens the source, given the seconds between two frames; `turns`, `drive` and `signing`: the link's turns, maker of
+    its driver, and packet signing; `status`: the status file; `recording`: its folder. None: there is none. All input
+    passes here; `boundary` records it or plays it back."""
 
     board: Board
     place_map: str | None
@@ -77,7 +77,7 @@ class FlightIO:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightParts:
-    """All opened parts of a flight (None: it has no such part)."""
+    """All opened parts of a flight (None: there is no such part)."""
 
     recogniser: Recogniser
     source: Source
@@ -91,9 +91,9 @@ class FlightParts:
 
 @contextmanager
 def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequence[float] = ()) -> Iterator[FlightIO]:
-    """Open the inputs and outputs of a real flight, yield and close them; meanwhile SIGTERM and SIGINT end the flight.
-    Of a source that is a recording, `positions` is the file with those of its frames, and `steps_s` the seconds between
-    them (empty: they come at the rate). Raises EdgevprError."""
+    """Open the inputs and outputs of a real flight, yield them and close them; meanwhile SIGTERM and SIGINT end the
+    flight. If the source is a recording, `positions` is the file with the positions of its frames, and `steps_s` the
+    seconds between them (empty: they are read at the configured rate). Raises EdgevprError."""
     source = config.source
     if (uri := source.uri) is None:
         raise UsageError("There is no source of frames: name one with --source, or `source: {uri: ...}`.")
@@ -110,7 +110,7 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
         status_path = config.status.file or find_default_path()
         status = _open_optional(lambda: stack.enter_context(StatusFile(status_path))) if status_path else None
 
-        def open_own(step_s: float) -> Source:
+        def open_paced(step_s: float) -> Source:
             source = open_source(uri, step_s=step_s, positions=positions, live=True, steps_s=steps_s)
             if steps_s:
                 _log.info("%d pictures are played at their recorded times, over %.0f s", source.total, sum(steps_s))
@@ -124,7 +124,7 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
             log=config.log,
             clock=Clock(),
             machine=Machine(board),
-            open_source=open_own,
+            open_source=open_paced,
             turns=Turns(Clock().mono_s),
             drive=PortDriver,
             signing=open_signing(config.mavlink),
@@ -141,7 +141,7 @@ def open_real_io(config: Config, positions: Path | None = None, steps_s: Sequenc
 
 
 def record_io(io: FlightIO, recording: Recording) -> FlightIO:
-    """Return the same inputs and outputs, with all that comes in recorded."""
+    """Return the same inputs and outputs, with all input recorded."""
     turns = TapedTurns(io.clock.mono_s, recording)
     return replace(
         io,
@@ -154,10 +154,10 @@ def record_io(io: FlightIO, recording: Recording) -> FlightIO:
     )
 
 
-def _open_optional(opened: Callable[[], T]) -> T | None:
-    """Return the result of `opened`; None, with a warning, if that fails in a service, which flies on without."""
+def _open_optional(open_part: Callable[[], T]) -> T | None:
+    """Return the result of `open_part`; None, with a warning, if it fails in a service, which flies without it."""
     try:
-        return opened()
+        return open_part()
     except EdgevprError as error:
         if not systemd.is_service():
             raise
@@ -167,14 +167,14 @@ def _open_optional(opened: Callable[[], T]) -> T | None:
 
 @contextmanager
 def _handle_signals(stop: Stop) -> Iterator[None]:
-    """Context manager: SIGTERM and SIGINT call `stop`, and end the process after four seconds. SIGHUP is ignored: a
-    closed terminal ends no flight."""
+    """Context manager: SIGTERM and SIGINT call `stop`, and end the process after four seconds. SIGHUP is ignored:
+    closing a terminal must not end a flight."""
     handlers: dict[signal.Signals, Stop | signal.Handlers] = {signal.SIGTERM: stop, signal.SIGINT: stop}
     handlers[signal.SIGHUP] = signal.SIG_IGN
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
-    # Python calls `stop` in the main thread, which may hang. The number of the signal is written here at once.
+    # Python calls `stop` in the main thread, which may hang. The signal number is written to the pipe at once.
     before_writer = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     has_ended = threading.Event()
     watch = threading.Thread(target=_end_in_time, args=(reader, has_ended), name="end", daemon=True)
@@ -192,12 +192,12 @@ def _handle_signals(stop: Stop) -> Iterator[None]:
 
 
 def _end_in_time(reader: int, has_ended: threading.Event) -> None:
-    """End the process if a signal comes from the pipe `reader`, and `has_ended` not soon after. The lines of the flight
-    log are in its file by then."""
+    """End the process if a signal arrives through the pipe `reader` and `has_ended` is not set soon after. The flight
+    log is in its file by then."""
     while number := os.read(reader, 1):
         if number[0] in (signal.SIGTERM, signal.SIGINT) and not has_ended.wait(_MAX_END_S):
             text = "the flight does not end by itself: ending its process"
-            # In a thread, as the one that hangs may be within a message.
+            # In a thread, since the hanging thread may be inside a log call.
             warning = threading.Thread(target=_log.warning, args=(text,), daemon=True)
             warning.start()
             warning.join(_MAX_WARNING_S)

@@ -1,5 +1,5 @@
-"""The flight log: one JSON object per line. `flight` writes it; all programs that read a flight after its end use
-`select_last_flight`. A full disk or a pulled memory card loses lines, but never ends the flight."""
+"""The flight log: one JSON object per line. `flight` writes it; all programs that read a finished flight use
+`select_last_flight`. A full disk or a removed memory card loses lines, but never ends the flight."""
 
 import errno
 import json
@@ -33,24 +33,24 @@ from edgevpr.core.text import format_json_line
 Line = dict[str, Any]
 
 _log = logging.getLogger(__name__)
-_MAX_FILES = 4  # of `max_mb`: one for the file that is written, three for the numbered files
+_MAX_FILES = 4  # share `max_mb`: the current file and three numbered ones
 _SYNC_INTERVAL_S = 1.0
 
 
 class FlightLog:
     """Writer of a flight log (a context manager); with `path` None nothing is written.
 
-    `path` is the log of the newest flight. The file of an earlier one is set aside: renamed to the next number (see
-    `core.appending`), and so is a file that reaches a quarter of `max_mb` (None: no limit). The numbered files share
-    the rest: the oldest are deleted. Each further file of a flight begins with a copy of the start line and two more
+    `path` is the log of the newest flight. The file of an earlier flight is rotated: renamed to the next number (see
+    `core.appending`), as is a file that reaches a quarter of `max_mb` (None: no limit). The numbered files share the
+    rest; the oldest are deleted. Each further file of a flight begins with a copy of the start line and two more
     fields: `repeated` (true) and `part`, the number of the file within the flight.
 
     Each line is passed to the operating system at once: if this process ends, no line is lost. Lines are synced at most
-    once a second: a pulled battery costs the lines of the last two seconds.
+    once a second: a power cut loses the lines of the last two seconds.
 
-    `state` is None while lines are written, else a sentence that says why not; `lost_lines` could not be written. Every
-    write tries again, and the first one that succeeds is preceded by a line of kind "gap". A log that is deleted or
-    moved in flight goes on in a new file.
+    `state` is None while lines are written, else a sentence with the reason; `lost_lines` counts lines that could not
+    be written. Every write tries again, and the first that succeeds is preceded by a line of kind "gap". A log that is
+    deleted or moved in flight continues in a new file.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class FlightLog:
         max_mb: float | None = None,
     ) -> None:
         """Open the file. Raises EdgevprError if that fails; with `wait`, for a service that may be restarted in the
-        air, every line tries again. `clock` gives monotonic seconds."""
+        air, every line tries again instead. `clock` returns monotonic seconds."""
         self.path = path
         self.state: str | None = None
         self.lost_lines = 0
@@ -71,7 +71,7 @@ class FlightLog:
         self._path = Path(path or "")
         self._part_bytes = math.inf if max_mb is None else 1e6 * max_mb / _MAX_FILES
         self._file: FileIO | None = None
-        self._own_identity: tuple[int, int] | None = None  # device and inode of the file that has lines of this flight
+        self._own_identity: tuple[int, int] | None = None  # device and inode of the file with lines of this flight
         self._synced_s, self._is_synced = -math.inf, True
         self._start: dict[str, Any] = {}  # the start line, for the copies in later files
         self._part = 0  # start lines written so far
@@ -147,10 +147,10 @@ class FlightLog:
         self._file = None
 
     def _prepare_file(self, more_bytes: int) -> FileIO:
-        """Return the open file; one without room for `more_bytes`, or of an earlier flight, is set aside first. If that
-        fails, it is written further: lines matter more than the limit. Raises OSError."""
+        """Return the open file; one without room for `more_bytes`, or of an earlier flight, is rotated first. If that
+        fails, it is appended to: lines matter more than the limit. Raises OSError."""
         file = self._file or self._open()
-        size, is_ours = _size_of(file), _read_identity(file) == self._own_identity
+        size, is_ours = _read_size(file), _read_identity(file) == self._own_identity
         if not size or (is_ours and size + more_bytes <= self._part_bytes):
             return file
         try:
@@ -175,7 +175,7 @@ class FlightLog:
             file.close()
             raise OSError(errno.EBUSY, "another edgevpr writes it", str(self._path))
         self._file = file
-        if not _size_of(file):  # on another medium it may have the numbers of a file before it
+        if not _read_size(file):  # on another medium it may have the same numbers as an earlier file
             self._own_identity = None
             sync_folder(self._path)
         return file
@@ -185,7 +185,7 @@ class FlightLog:
         self._is_synced, self._synced_s = True, now_s
 
     def _record_error(self, error: OSError) -> None:
-        """Note that the file cannot be written. The next line opens it anew: the card may be another one."""
+        """Record that the file cannot be written. The next line reopens it, since the card may have been replaced."""
         if self.state is None:
             self.state = (
                 f"The flight log {self.path} cannot be written ({error.strerror}): make room or put the medium back; "
@@ -201,7 +201,7 @@ class FlightLog:
             self._file = None
 
     def _warn(self, sentence: str) -> None:
-        """Log a warning, once in a flight."""
+        """Log a warning once per flight."""
         if sentence not in self._warned:
             self._warned.add(sentence)
             _log.warning("%s", sentence)
@@ -211,7 +211,7 @@ def _append(file: FileIO, lines: bytes) -> None:
     end = file.seek(0, os.SEEK_END)
     if end:
         file.seek(end - 1)
-        if file.read(1) != b"\n":  # cut by a pulled battery, or by a failure that could not be undone
+        if file.read(1) != b"\n":  # truncated by a power cut, or by a failure that could not be undone
             lines = b"\n" + lines
     append_bytes(file, lines)
 
@@ -223,27 +223,27 @@ def _make_line(kind: str, utc_s: float, fields: dict[str, Any]) -> bytes:
 
 def _read_identity(file: FileIO) -> tuple[int, int]:
     """Return the device and inode numbers of an open file, which no other existing file has."""
-    found = os.fstat(file.fileno())
-    return found.st_dev, found.st_ino
+    status = os.fstat(file.fileno())
+    return status.st_dev, status.st_ino
 
 
-def _size_of(file: FileIO) -> int:
+def _read_size(file: FileIO) -> int:
     """Return the size of an open file in bytes, 0 for a device."""
-    found = os.fstat(file.fileno())
-    return found.st_size if stat.S_ISREG(found.st_mode) else 0
+    status = os.fstat(file.fileno())
+    return status.st_size if stat.S_ISREG(status.st_mode) else 0
 
 
 def read_log(path: str | Path) -> Iterator[Line]:
-    """Yield the lines of one log file as dicts, in order. A line that was cut (battery pulled) is left out."""
+    """Yield the lines of one log file as dicts, in order. A truncated line (power cut) is skipped."""
     with open(path, "rb") as handle:
         for line in handle:
-            record = _record_of(line)
+            record = _parse_line(line)
             if record is not None:
                 yield record
 
 
-def _record_of(line: bytes) -> Line | None:
-    """Parse one line of a log. None: the line was cut, or is no JSON object."""
+def _parse_line(line: bytes) -> Line | None:
+    """Parse one line of a log; None if it is truncated or not a JSON object."""
     try:
         record = json.loads(line)
     except (ValueError, RecursionError):
@@ -254,8 +254,8 @@ def _record_of(line: bytes) -> Line | None:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightLines:
     """The lines of one flight, read from its `files`; iterate over them as often as needed. `flight` identifies it by
-    its start line: (time in UTC, time on the monotonic clock), None without one. `missing` is a sentence about files
-    that are missing (None: none are)."""
+    its start line: (time in UTC, time on the monotonic clock), None without one. `missing` is a sentence about missing
+    files (None: none is missing)."""
 
     files: tuple[Path, ...]
     flight: tuple[object, object] | None
@@ -278,7 +278,7 @@ class FlightLines:
 
 def select_last_flight(path: str | Path) -> FlightLines:
     """Find the lines of the last flight in a file of a log, from its start in earlier files to the end of this one.
-    Raises UsageError if there is no such file, and EdgevprError if it has no line of a flight."""
+    Raises UsageError if there is no such file, and EdgevprError if it contains no flight-log lines."""
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"{path}: there is no such flight log: give the file that `log.path` names.")
@@ -292,20 +292,20 @@ def select_last_flight(path: str | Path) -> FlightLines:
     if min(parts[path]) > 1:
         with suppress(OSError):
             for other in list_related(path):
-                with suppress(OSError):  # a file that may not be read counts as missing
-                    found = _find_parts(_read_starts(other), flight)
-                    if found and min(found) < min(parts[path]):
-                        parts[other] = found
-    lacking = max(parts[path]) - sum(map(len, parts.values()))
-    missing = f"Files of the flight that are missing before {path}: {lacking}. The flight is read without them."
+                with suppress(OSError):  # an unreadable file counts as missing
+                    numbers = _find_parts(_read_starts(other), flight)
+                    if numbers and min(numbers) < min(parts[path]):
+                        parts[other] = numbers
+    missing_count = max(parts[path]) - sum(map(len, parts.values()))
+    missing = f"Files of the flight that are missing before {path}: {missing_count}. The flight is read without them."
     files = tuple(sorted(parts, key=lambda file: min(parts[file])))
-    return FlightLines(files=files, flight=flight, missing=missing if lacking > 0 else None)
+    return FlightLines(files=files, flight=flight, missing=missing if missing_count > 0 else None)
 
 
 def _read_starts(path: Path) -> list[Line]:
     """Return the start lines in a file, in order. Raises OSError."""
     with open(path, "rb") as handle:
-        lines = [_record_of(line) or {} for line in handle if b'"start"' in line]
+        lines = [_parse_line(line) or {} for line in handle if b'"start"' in line]
     return [line for line in lines if line.get("kind") == "start"]
 
 

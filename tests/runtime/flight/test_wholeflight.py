@@ -90,7 +90,7 @@ def test_a_file_repeats_its_own_start_line_where_the_medium_came_back_as_another
 
 def test_what_is_no_log_is_refused_in_a_sentence(tmp_path):
     (tmp_path / "empty").touch()
-    with pytest.raises(EdgevprError, match="no line"):
+    with pytest.raises(EdgevprError, match="no flight-log lines"):
         select_last_flight(tmp_path / "empty")
     for missing in (tmp_path, tmp_path / "nothing", "/dev/zero"):
         with pytest.raises(UsageError, match="no such"):
