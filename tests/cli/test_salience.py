@@ -103,7 +103,7 @@ def test_match_skips_a_query_that_is_not_memorable(recording, tmp_path, capsys):
         ({"entropy": 0.8}, 2, "no picture has more than 0.792: lower it"),
         ({"entropy": 0}, 2, "every criterion is off"),
         ({"memorability": 0.5, "network": "tiny"}, 1, "has no `outputs.memorability`"),
-        ({"staticity": 0.5, "detector": "bright"}, 1, "is of no detector"),
+        ({"staticity": 0.5, "detector": "bright"}, 1, "is not a detector"),
     ],
 )
 def test_salience_refuses_wrong_settings(networks, keys, code, complaint, tmp_path, capsys):

@@ -1,5 +1,5 @@
 """The last stages of recognition: verify the best place of a ranking by landmarks, which were not used to find it,
-locate the aircraft by it, and decide."""
+locate the aircraft from it, and decide."""
 
 from collections.abc import Collection
 from contextlib import suppress
@@ -51,16 +51,16 @@ from edgevpr.runtime.recognise.perspective import CommonTilt, convert_to_tilt
 from edgevpr.runtime.recognise.place_filter import PlaceFilter, TrackEstimate
 from edgevpr.runtime.recognise.tilted import measure_again
 
-_MAX_SAME_GROUND = 12  # places that may show the same ground: so many overlap on kite_ochota, which has no positions
-# Share of the best place's votes from which on a place elsewhere counts as at rest. With a display in the pictures,
-# nearly all places have 0.15 to 0.9 of them; on smooth ground some are at rest by chance with up to 0.065.
+_MAX_SAME_GROUND = 12  # places that may show the same ground: as many overlap on kite_ochota, which has no positions
+# Least share of the best place's votes for a place elsewhere to count as at rest. With an on-screen display, nearly all
+# places have 0.15 to 0.9 of them; on smooth ground some are at rest by chance with up to 0.065.
 _MIN_REST_VOTES_SHARE = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matcher:
     """An index to search, the rule for accepting its matches, and the search over sequences of queries (None: each
-    query is ranked alone). They belong together: another form of the vectors in RAM gives other scores, and so needs
+    query is ranked alone). They belong together: another form of the vectors in RAM gives other scores, so it needs
     other limits. `layers` are those of the index (None: those of the map)."""
 
     index: PlaceIndex = field(kw_only=False)
@@ -72,8 +72,8 @@ class Matcher:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchSettings:
     """Settings of the recogniser. `candidates` places are compared (None: all in full, see `places.retrieve.compare`).
-    `verify` turns the check by landmarks on; with `all_evidence` they are also compared where they decide nothing, to
-    fit a model. The accuracy of a position is never below `min_accuracy_m` (1-sigma)."""
+    `verify` enables the check of landmarks; with `all_evidence` they are also compared if they decide nothing, to fit
+    a model. The accuracy of a position is never below `min_accuracy_m` (1-sigma)."""
 
     candidates: int | None = None
     verify: bool = True
@@ -82,8 +82,8 @@ class MatchSettings:
 
 
 class Verifier:
-    """Compares the landmarks of one query, which are computed when first needed, with those of places. All methods
-    raise PlaceError if the landmarks of a place cannot be read; the place is then left out."""
+    """Compares the landmarks of one query, computed when first needed, with those of places. All methods raise
+    PlaceError if the landmarks of a place cannot be read; the place is then left out."""
 
     def __init__(self, encoder: FrameEncoder, picture: LevelledImage, index: PlaceIndex, place_map: PlaceMap) -> None:
         self._encoder, self._spec = encoder, encoder.technique.spec
@@ -96,14 +96,14 @@ class Verifier:
         return self._encoder.detect_landmarks(self._picture, count)
 
     def compare_best(self, ranking: Ranking) -> Agreement | None:
-        """Compare the landmarks of the query with those of the best place, near the overlay that its match gives. None
-        if the place has no landmarks, or its match no shift or rotation."""
+        """Compare the landmarks of the query with those of the best place, near the overlay given by its match. None if
+        the place has no landmarks, or its match no shift or rotation."""
         expected, landmarks = self._load_place(ranking, int(ranking.slots[0]))
         return compare_near(self.landmarks, landmarks, expected) if expected and landmarks is not None else None
 
     def count_inliers(self, ranking: Ranking) -> int:
-        """Return the number of landmarks of the query and of the best place that agree on the overlay of its match: 0
-        if those of the place are unknown, or if they are at rest, as a display is."""
+        """Return the number of landmarks of the query and the best place that agree on the overlay of its match: 0 if
+        those of the place are unknown, or if they are at rest, as an on-screen display is."""
         expected, landmarks = self._load_place(ranking, int(ranking.slots[0]))
         agreement = None if landmarks is None else measure_agreement(self.landmarks, landmarks, expected)
         return 0 if agreement is None or agreement.is_at_rest else agreement.inliers
@@ -128,7 +128,7 @@ class Verifier:
     def find_same_ground(self, ranking: Ranking) -> tuple[int, ...]:
         """Return the numbers of the compared places that show the same ground as the best one: the landmarks of both
         agree on the overlay that follows from their matches. Only the first few places are tried. Empty if the best
-        place has a position, since distances then tell the same."""
+        place has a position, since distances then show this."""
         slots = ranking.compared_slots[:_MAX_SAME_GROUND]
         if not slots or not np.isnan(self._index.lat_deg[slots[0]]):
             return ()
@@ -144,7 +144,7 @@ class Verifier:
         return tuple(place_id for place_id, found in agreements.items() if found.inliers >= MIN_CONFIRMED_INLIERS)
 
     def _load_place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
-        """Return the overlay of the query on the place in row `slot`, by its match, and the place's landmarks (None:
+        """Return the overlay of the query on the place in row `slot`, from its match, and the place's landmarks (None:
         unknown). Both are None if the match has no shift."""
         match, cells = ranking.compared.get(slot), self._spec.cells
         if match is None or match.shift_cells is None or cells is None:
@@ -174,7 +174,7 @@ class Verifier:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
     """Verdict on a query, and its basis: the `hints` that narrowed the search, the `best` place with its `findings`,
-    the probability by its evidence that the match is right (`confidence`), and the result of the place filter
+    the probability from its evidence that the match is correct (`confidence`), and the result of the place filter
     (`track`). None: there was no search, the match is judged by limits, or there is no filter."""
 
     verdict: Verdict
@@ -187,8 +187,8 @@ class Decision:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decider:
-    """Decides on rankings of the places of a `matcher`. `accuracy_m` is that of a place's position as a fix;
-    `common_tilt` is of the matches accepted so far."""
+    """Decides on rankings of the places of a `matcher`. `accuracy_m` is that of a place's position used as
+    a fix; `common_tilt` is measured from the matches accepted so far."""
 
     place_map: PlaceMap
     technique: Technique
@@ -199,7 +199,7 @@ class Decider:
     common_tilt: CommonTilt = field(default_factory=CommonTilt)
 
     def make_query(self, descriptor: Descriptor, expected: Expectation) -> Query:
-        """Return the query of a descriptor to the places of the matcher."""
+        """Return the query for a descriptor over the places of the matcher."""
         technique, place_map, index = self.technique, self.place_map, self.matcher.index
         return Query(technique=technique, descriptor=descriptor, place_map=place_map, index=index, expected=expected)
 
@@ -233,10 +233,10 @@ class Decider:
             perspective = self._measure_perspective(best, query)
             tilt = convert_to_tilt(perspective, query.view.focal)
             if query.view.is_tilt_known and self.common_tilt.shown.is_clear:
-                tilt = max(tilt, self.common_tilt.shown, key=lambda each: each.tangent * each.is_clear)
+                tilt = max(tilt, self.common_tilt.shown, key=lambda shown: shown.tangent * shown.is_clear)
             found = replace(
                 found,
-                # A recorded tilt is not refused for what a few regions show; a contradiction adds to the claimed error.
+                # A few regions are no reason to refuse a recorded tilt; a contradiction adds to the reported error.
                 tilt=None if query.view.is_tilt_known else tilt,
                 located=add_tilt_covariance(found.located, tilt, query.view) if found.located else None,
                 at_rest_elsewhere=at_rest_elsewhere,
@@ -249,7 +249,7 @@ class Decider:
         return Decision(verdict=verdict, hints=hints, best=best, findings=found, confidence=confidence, track=track)
 
     def _gather_findings(self, ranking: Ranking, query: EncodedFrame, verifier: Verifier) -> tuple[Candidate, Findings]:
-        """Verify the best place of a ranking by landmarks, locate the aircraft by it, and gather the evidence."""
+        """Verify the best place of a ranking by landmarks, locate the aircraft from it, and gather the evidence."""
         index, spec, step, rule = self.matcher.index, self.technique.spec, self.meter.step, self.matcher.rule
         with step("compare"):
             (best,) = load_candidates(ranking, index, self.place_map, first=1)
@@ -278,7 +278,7 @@ class Decider:
             evidence = gather_evidence(
                 ranking, index, near_m, agreement, same_ground, looks_down=spec.looks_down, look_alikes=rule.look_alikes
             )
-        is_ahead = verifies and not spec.looks_down  # landmarks then only support a match, so compare them if undecided
+        is_ahead = verifies and not spec.looks_down  # landmarks then only support a match: compare if undecided
         if is_ahead and by_confidence and evidence and (all_evidence or by_confidence.is_undecided(evidence)):
             with step("verify"):
                 inliers = verifier.count_inliers(ranking)
@@ -291,8 +291,8 @@ class Decider:
         return best, Findings(ranking, agreement=agreement, located=located, evidence=evidence)
 
     def _lead_over_rotated(self, best: Candidate, evidence: Evidence | None, query: EncodedFrame) -> float | None:
-        """Return the lead, as in the evidence, over the same place with the picture at another rotation (None: no
-        evidence is needed)."""
+        """Return the lead, as in the evidence, over the same place with the picture at another rotation (None: there
+        is no evidence)."""
         if evidence is None:
             return None
         with self.meter.step("compare"):
@@ -302,7 +302,7 @@ class Decider:
             )
 
     def _measure_perspective(self, best: Candidate, query: EncodedFrame) -> Perspective | None:
-        """Return the perspective of the query over the place (None: too few regions agree)."""
+        """Measure the perspective of the query over the place (None: too few regions agree)."""
         with self.meter.step("compare"):
             fine, _ = self.place_map.read_fine_part(best.place.place_id)
             found = self.technique.measure_perspective(query.descriptor, fine, best.match)

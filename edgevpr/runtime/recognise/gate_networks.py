@@ -1,11 +1,11 @@
-"""Networks of the gate, each with a card: one tells how well the parts of a frame can be remembered (thesis 3.2.1), the
-other, an object detector, which of its pixels show nothing movable (thesis 3.2.2).
+"""Networks of the gate, each with a card: one predicts the memorability of the parts of a frame (thesis 3.2.1), the
+other, an object detector, finds the pixels that show nothing movable (thesis 3.2.2).
 
-`models/recipes/train_matchability.py` fits a network of memorability of another meaning: how likely a crop is to be
-found again in another picture.
+`models/recipes/train_matchability.py` trains a network with another definition of memorability: how likely a crop is to
+be found again in another picture.
 
-Each family of detectors has a decoder here. It takes the outputs in the order of the card and the input's (height,
-width) in pixels, and returns
+Each family of detectors has a decoder here. Its arguments are the outputs in the order of the card and the input's
+(height, width) in pixels, and it returns
 
 * `boxes`, float32 (N, 4): left, top, right, bottom as shares of the input; they may reach beyond it,
 * `scores`, float32 (N, C): the score of each class, 0..1.
@@ -24,10 +24,10 @@ from edgevpr.techniques.card import Card, InputRule
 from edgevpr.techniques.session import compute_fill_shares, open_session, prepare_input, run_outputs
 
 _CAR_M = 4.5
-_CAR_PX = 24  # least length of a car on the input: small detectors find little that is smaller
-_MAX_MOVING_M = 25.0  # no vehicle or boat that moves about is longer
+_CAR_PX = 24  # least length of a car in the input: small detectors miss most smaller objects
+_MAX_MOVING_M = 25.0  # no moving vehicle or boat is longer
 _MAX_TILES = 4  # along each side; each tile is a run of the network
-_OVERLAP = 0.1  # of a tile's side, so that what lies across a border is whole in one of them
+_OVERLAP = 0.1  # of a tile's side, so that an object on a border is complete in one tile
 CROPS = 5  # along each side; the thesis's C is 5x5
 _TEST_SEED = 7
 _STRIDES_PX = (8, 16, 32)  # of the grids of yolox
@@ -37,12 +37,12 @@ Decoded = tuple[Floats, Floats]
 
 
 class Memorability:
-    """The network of memorability that a card describes; the constructor runs it once as a test. Raises ModelError for
-    a card without memorability, and for an unusable network."""
+    """The memorability network described by a card; the constructor runs it once as a test. Raises ModelError for a
+    card without memorability, and for an unusable network."""
 
     def __init__(self, card: Card, threads: int = 1) -> None:
         if card.outputs.memorability is None:
-            raise ModelError(f"{card.path} has no `outputs.memorability`: name the card of a network that has.")
+            raise ModelError(f"{card.path} has no `outputs.memorability`: use the card of a network that has it.")
         self.card, self._output = card, card.outputs.memorability
         self._session = open_session(card, threads)
         self._has_batches = type(self._session.get_inputs()[0].shape[0]) is not int
@@ -57,7 +57,7 @@ class Memorability:
         batches = [crops] if self._has_batches else np.split(crops, len(crops))
         results = [run_outputs(self.card, self._session, [name], batch)[0] for batch in batches]
         if any(part.size != len(batch) for part, batch in zip(results, batches, strict=True)):
-            raise ModelError(f"{self.card.path}: `{name}` must be one number a picture: correct `outputs`.")
+            raise ModelError(f"{self.card.path}: `{name}` must be one number per picture: correct `outputs`.")
         values = np.concatenate([part.ravel() for part in results]).astype(np.float32)
         if values.min() < 0 or values.max() > 1:
             raise ModelError(f"{self.card.path}: `{name}` is {values.max():g} for a picture: it must be from 0 to 1.")
@@ -79,23 +79,23 @@ def interpolate_map(matrix: Singles, size_px: tuple[int, int]) -> Singles:
 
 
 class Detector:
-    """The detector that a card describes; the constructor runs it once as a test. Raises ModelError for a card without
+    """The detector described by a card; the constructor runs it once as a test. Raises ModelError for a card without
     a section `detector`, and for an unusable network."""
 
     def __init__(self, card: Card, threads: int = 1) -> None:
         if card.detector is None or card.outputs.boxes is None:
-            raise ModelError(f"{card.path} is of no detector: name one with a section `detector` (models/README.md).")
+            raise ModelError(f"{card.path} is not a detector: use one with a section `detector` (models/README.md).")
         self.card, self._rule, self._outputs = card, card.detector, card.outputs.boxes
         self._session = open_session(card, threads)
         size = card.input.height, card.input.width
         self.is_static(np.random.default_rng(_TEST_SEED).integers(0, 256, (*size, 3), np.uint8))
 
     def is_static(self, image: Image, footprint_m: float | None = None) -> Mask:
-        """Return bool (H, W): True for the pixels of uint8 (H, W[, 3]) that lie in no box of a dynamic class.
+        """Return bool (H, W): True for the pixels of uint8 (H, W[, 3]) outside all boxes of dynamic classes.
 
         `footprint_m` is the width of the ground in the picture, metres (None: unknown). If it is wide, the picture is
         cut into tiles, so that a car has enough pixels. A box too long for anything that moves is ignored. Raises
-        ModelError for numbers that are not finite, and for outputs of another form than the family's.
+        ModelError for numbers that are not finite, and for outputs that do not fit the family.
         """
         height, width = image.shape[:2]
         static = np.ones((height, width), bool)

@@ -1,4 +1,4 @@
-"""Decides whether a match is accepted. No other code does, and a match that is not accepted has no position.
+"""Decides whether a match is accepted. Only this code does, and a match that is not accepted has no position.
 
 A place *elsewhere* is outside the neighbourhood of the best place (see `outside_neighbourhood`). The *lead* of
 the best place is how far its score is above that of the best place elsewhere.
@@ -24,43 +24,43 @@ from edgevpr.runtime.recognise.evidence import Evidence, LookAlikes, list_eviden
 from edgevpr.runtime.recognise.locate import Located
 from edgevpr.runtime.recognise.perspective import ShownTilt
 
-# Trajectories at other speeds are many, so one of them scores well by chance: half the margin over them is enough. With
-# it, no wrong sequence of the corridor set was accepted from hog, seqslam or cohog, flown as it was mapped, twice as
-# fast, or in the opposite direction. At half the speed cohog accepted places three away from the right one.
+# There are many trajectories at other speeds, so one of them scores well by chance: half the margin over them suffices.
+# With it, no wrong sequence of the corridor set was accepted with hog, seqslam or cohog, flown as mapped, twice as fast
+# or in the opposite direction. At half the speed cohog accepted places three away from the right one.
 _MARGIN_SHARE_AT_OTHER_SPEEDS = 0.5
 _MAX_INDEPENDENT = 10
 
-# Looking down, if more than this share of a few places elsewhere agree without any shift or rotation, as the best one
-# does, they agree by a display that is drawn over every frame.
+# Looking down: if the best place and more than this share of a few places elsewhere agree without shift or rotation,
+# what agrees is an on-screen display drawn over every frame.
 _MAX_AT_REST_SHARE = 0.4
 _MAX_REST_CELLS = 0.75
 _MAX_REST_DEG = 7.5
 _MAX_REST_HEIGHT = 0.2
 
-# A right match with such a score has landmarks that agree: all 413 of them, in all sets from the air, had six or more.
-# Weaker ones, of grass under other light, may have none. Applied if both pictures have enough landmarks.
+# A correct match with at least this score has agreeing landmarks: all 413 of them, in all aerial sets, had six or more.
+# Weaker matches, such as of grass in other light, may have none. Applied if both pictures have enough landmarks.
 _MIN_CLEAR_SCORE = 0.2
 _MIN_INLIERS = 5
 _MIN_LANDMARKS = 100
 # Agreeing landmarks make up for a score below the technique's limit, down to this share of it.
 _MIN_SCORE_SHARE_WITH_LANDMARKS = 0.5
-# The least lead over the same place with the picture at another rotation. Over sat_marash's ground, heading unknown,
-# 273 of 276 right matches have more, and two of three wrong ones less: a bridge mistaken for its other end.
+# The least lead over the same place with the picture at another rotation. On sat_marash, with unknown heading, 273 of
+# 276 correct matches have more, and two of three wrong ones less: a bridge mistaken for its other end.
 _MIN_LEAD_OVER_ROTATED = math.log(1.75)
-_MAX_TWIN_CONFIDENCE = 0.5  # most, if a place elsewhere agrees as well
-# Most, looking ahead, if needed landmarks do not agree: of 111 queries of corridor, in a map without their part of it,
-# 12 were accepted by regions alone.
+_MAX_TWIN_CONFIDENCE = 0.5  # highest confidence if a place elsewhere agrees as well
+# Highest confidence, looking ahead, if required landmarks do not agree: of 111 queries of corridor in a map without
+# their part of it, 12 were accepted from regions alone.
 _MAX_UNPROVEN_CONFIDENCE = 0.9
-# Least probabilities for accepting, at any precision: by the match alone, and by the flight so far.
+# Least probability for acceptance, at any precision: from the match alone, and from the flight so far.
 _MIN_CONFIDENCE = 0.9
 _MIN_TRACK_CONFIDENCE = 0.99
-# If the flight so far raises the odds of a match by this factor, the precision is enough. A match alone often needs
-# more, since of many wrong matches the one that looks best by chance must be refused; earlier queries do not share this
-# chance. In seven ways of flying along corridor, the seasons and nordland_tiny, and over some 200 foreign pictures
+# If the flight so far raises the odds of a match by this factor, a confidence of the precision suffices. A match alone
+# often needs more, because the wrong match that looks best by chance must be refused; earlier queries are independent
+# of that chance. In seven flights along corridor, the seasons and nordland_tiny, and over some 200 foreign pictures for
 # each, this accepted no more wrong matches; of nordland_tiny's queries 0.59 instead of 0.47 are accepted.
 _MIN_ODDS_RAISED = 10.0
-_MAX_TILT_SHOWN_DEG = 60.0  # if it is not recorded; a smaller tilt adds to the claimed error (kite_ochota sways by 20)
-_MIN_TRACK_SUPPORT = 0.5  # least probability by the flight so far, for a match with enough confidence
+_MAX_TILT_SHOWN_DEG = 60.0  # if not recorded; a smaller tilt adds to the reported error (kite_ochota sways by 20)
+_MIN_TRACK_SUPPORT = 0.5  # least probability from the flight so far, for a confident match
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,15 +72,15 @@ class ConfidenceRule:
     precision: float
 
     def confidence(self, evidence: Evidence) -> float:
-        """Return the probability that the match is right: at most 0.5 if another place agrees about as well, and 0.9
-        if landmarks are needed and do not agree."""
+        """Return the probability that the match is correct: at most 0.5 if another place agrees about as well, and at
+        most 0.9 if landmarks are required but do not agree."""
         confidence = self.models[evidence.kind].confidence(evidence.figures())
         if not evidence.is_unambiguous:
             return min(confidence, _MAX_TWIN_CONFIDENCE)
         return min(confidence, _MAX_UNPROVEN_CONFIDENCE) if evidence.needs_landmarks else confidence
 
     def cap_confidence(self, evidence: Evidence) -> float:
-        """Return the confidence to report: no higher than the data support that its model was fitted to."""
+        """Return the confidence to report: at most what the data that its model was fitted to support."""
         return min(self.confidence(evidence), self.models[evidence.kind].max_reported)
 
     def compute_map_confidence(self, evidence: Evidence) -> float:
@@ -105,7 +105,7 @@ class AcceptRule:
     * `min_score`: the least score
     * `min_margin`: the least lead over the best place elsewhere, which is more than `neighbour_m` metres away
     * `min_quality`: the least quality of the query's picture
-    * `confidence_rule`: the confidence that is needed too (None: score and lead alone decide)
+    * `confidence_rule`: the confidence that is also required (None: score and lead alone decide)
     * `min_verify_score`: the least score to compare landmarks and, with a `confidence_rule`, to accept a match
     * `look_alikes`: places of the map that look alike (None: unknown)
     """
@@ -121,15 +121,15 @@ class AcceptRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """All that is known of the best place of a `ranking` when it is judged.
+    """Everything known about the best place of a `ranking` when it is judged.
 
     `agreement`: that of the landmarks of query and place (None: not compared). `located`: the position computed from
     the best places (None: only that of the best place is known); the places it was computed from are not elsewhere.
-    `evidence`: that of the match (None: the rule needs none). `track_confidence`: probability of the place by the
+    `evidence`: that of the match (None: the rule needs none). `track_confidence`: probability of the place from the
     flight so far (None: the query is judged alone). `lead_over_rotated`: the lead, as in the evidence, over the same
     place with the picture at another rotation (None: not compared). `at_rest_elsewhere`: the share of a few places
-    elsewhere that agree at rest, if the best one does too (else 0). `tilt`: that of the query against the place (None:
-    not measured).
+    elsewhere that agree at rest, if the best one does too (else 0). `tilt`: tilt of the query relative to the place
+    (None: not measured).
     """
 
     ranking: Ranking = field(kw_only=False)
@@ -153,14 +153,14 @@ class Verdict:
 def make_accept_rule(
     technique: Technique, config: MatchConfig, length: int = 1, calibration: MapCalibration | None = None
 ) -> AcceptRule:
-    """Return the rule for a technique: by confidence if a model of its evidence exists, else by its own limits. Limits
-    in the configuration come first. `calibration` is that of the map (None: the shipped models are used). A sequence of
-    `length` queries is judged by limits; its margin is that of one query, over the root of its length (10 at most:
-    queries that show the same ground are not independent)."""
+    """Return the rule for a technique: by confidence if there is a model for its evidence, otherwise by its own limits.
+    Limits in the configuration take precedence. `calibration` is that of the map (None: use the shipped models). A
+    sequence of `length` queries is judged by limits; its margin is that of one query over the square root of its length
+    (at most 10, because queries of the same ground are not independent)."""
     kinds = list_evidence_kinds(technique.spec) if length == 1 else ()
-    # With a confidence no lead is needed: the flight so far may tell which of two similar places it is.
+    # With a confidence no lead is needed: the flight so far may decide between two similar places.
     min_score, min_margin = (0.0, -math.inf) if kinds else (technique.min_score, technique.min_margin)
-    if min_margin < 1:  # a margin of 1 or more accepts nothing, not in sequences either
+    if min_margin < 1:  # a margin of 1 or more accepts nothing, even in sequences
         min_margin /= math.sqrt(min(length, _MAX_INDEPENDENT))
     map_models = calibration.models if calibration else {}
     models = {kind: map_models.get(kind) or read_shipped_model(kind) for kind in kinds}
@@ -176,8 +176,8 @@ def make_accept_rule(
 
 
 def check_texture(query: Descriptor, min_quality: float) -> Reason | None:
-    """Return the reason to refuse a picture with too little texture, as of a covered lens or bare sky; None if its
-    quality is at least `min_quality`. A few regions with texture can agree on a place by chance."""
+    """Return the reason to refuse a picture with too little texture, such as of a covered lens or bare sky; None if its
+    quality is at least `min_quality`. A few textured regions can agree on a place by chance."""
     if query.quality >= min_quality:  # False for NaN
         return None
     return Reason(ReasonCode.LOW_TEXTURE, {"usable": query.quality, "needed": min_quality})
@@ -234,7 +234,7 @@ def _check_limits(score: float, lead: float | None, rule: AcceptRule) -> Reason 
 
 
 def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
-    """Decide by the confidence of the match or, if it is known, by the place's probability by the flight so far."""
+    """Decide by the confidence of the match or, if known, by the probability of the place from the flight so far."""
     evidence, track = findings.evidence, findings.track_confidence
     if evidence is None:
         return _refuse(ReasonCode.NOT_CALIBRATED)
@@ -254,8 +254,8 @@ def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
 
 
 def _is_track_confident(track: float, confidence: float, needed: float, precision: float) -> bool:
-    """Return True if `track`, a place's probability by the flight so far, is high enough. `confidence` is that of its
-    match alone, `needed` the confidence that a match alone needs."""
+    """Return True if `track`, the probability of a place from the flight so far, is high enough. `confidence` is that
+    of its match alone, `needed` the confidence required of a match alone."""
     is_raised = track * (1 - confidence) >= _MIN_ODDS_RAISED * confidence * (1 - track)
     return track >= max(_MIN_TRACK_CONFIDENCE, min(needed, precision) if is_raised else needed)
 
@@ -270,7 +270,7 @@ def _check_landmarks(agreement: Agreement, score: float) -> Reason | None:
 
 
 def is_at_rest(match: FineMatch) -> bool:
-    """Return True if a match has hardly any shift, rotation or change of height."""
+    """Return True if a match has hardly any shift, rotation or height difference."""
     if match.rotation_deg is None or match.shift_cells is None:
         return False
     off_deg = abs(wrap_deg(match.rotation_deg))

@@ -15,14 +15,14 @@ from edgevpr.core.arrays import Bytes, Image, Ints, Mask, Singles
 
 PLACE_LANDMARKS = 250
 QUERY_LANDMARKS = 1000
-# Ahead, smaller pictures are as good: of right matches across seasons more agree than at 640 pixels.
+# Ahead, smaller pictures work as well: across seasons, more correct matches agree than at 640 pixels.
 DOWN_PX = 640  # longest side
 AHEAD_PX = 320
 _MIN_CORNERS = 4 * PLACE_LANDMARKS  # least number of corners to choose from
 _LEVELS = 8  # of the pyramid
 _LEVEL_FACTOR = 1.2
 _MIN_CONTRAST = 5  # grey levels between a corner and its surroundings; low, so that dark pictures have corners
-_PATCH_PX = 31  # width of the patch that a point is described by, on its level of the pyramid
+_PATCH_PX = 31  # width of the patch that describes a point, on its level of the pyramid
 _CELLS = 8  # along the longest side; each has about the same number of points
 _MIN_DISTANCE_PX = 3.0  # a corner found on several levels of the pyramid is one landmark
 
@@ -50,7 +50,7 @@ class Landmarks:
         return len(self.points)
 
     def best(self, most: int) -> "Landmarks":
-        """Return the `most` best of them."""
+        """Return the `most` best landmarks."""
         return Landmarks(self.points[:most], self.angle_deg[:most], self.size[:most], self.bits[:most])
 
 
@@ -90,25 +90,25 @@ def detect_landmarks(
 
 
 def _select_spread(points_px: Singles, most: int, cell_px: float) -> Ints:
-    """Return the indices of at most `most` of the points (K, 2), given best first, spread over the picture: the best of
-    every cell of a grid, then the second best, and so on."""
-    # Keep only the best of the points of one corner.
+    """Return the indices of at most `most` of the points (K, 2), given best first, spread over the picture: the best
+    one in every cell of a grid, then the second best, and so on."""
+    # Keep only the best of several points at one corner.
     _, first = np.unique(np.rint(points_px / _MIN_DISTANCE_PX).astype(int), axis=0, return_index=True)
     kept = np.sort(first)
     _, cell = np.unique((points_px[kept] // cell_px).astype(int), axis=0, return_inverse=True)
     by_cell = np.argsort(cell.ravel(), kind="stable")
     ordered = cell.ravel()[by_cell]
     starts = np.searchsorted(ordered, ordered)
-    turn = np.empty(len(kept), int)
-    turn[by_cell] = np.arange(len(kept)) - starts
-    return kept[np.argsort(turn, kind="stable")[:most]]
+    rank = np.empty(len(kept), int)
+    rank[by_cell] = np.arange(len(kept)) - starts
+    return kept[np.argsort(rank, kind="stable")[:most]]
 
 
 def pack_bytes(landmarks: Landmarks) -> bytes:
-    """Convert landmarks to the form of map files: a header of 3 bytes, then 38 bytes for each."""
+    """Encode landmarks for map files: a header of 3 bytes, then 38 bytes for each."""
     stored = np.empty(len(landmarks), _STORED_DTYPE)
-    at = np.rint((landmarks.points.astype(np.float64) + 0.5) * 65535).clip(0, 65535)
-    stored["x"], stored["y"] = at[:, 0], at[:, 1]
+    coordinates = np.rint((landmarks.points.astype(np.float64) + 0.5) * 65535).clip(0, 65535)
+    stored["x"], stored["y"] = coordinates[:, 0], coordinates[:, 1]
     stored["angle"] = np.rint(landmarks.angle_deg * (256 / 360)).astype(int) % 256
     stored["size"] = np.rint(landmarks.size / _SIZE_RESOLUTION).clip(0, 255)
     stored["bits"] = landmarks.bits
@@ -116,14 +116,14 @@ def pack_bytes(landmarks: Landmarks) -> bytes:
 
 
 def unpack_bytes(blob: bytes) -> Landmarks:
-    """Convert bytes made by `pack_bytes` back to landmarks. Raises ValueError for anything else."""
+    """Decode landmarks from the bytes of `pack_bytes`. Raises ValueError for anything else."""
     version, count = _HEADER.unpack(blob[: _HEADER.size].ljust(_HEADER.size, b"\0"))
     if version != _VERSION or len(blob) != _HEADER.size + count * _STORED_DTYPE.itemsize:
         raise ValueError("its landmarks have a form that this edgevpr does not know")
     stored = np.frombuffer(blob, _STORED_DTYPE, offset=_HEADER.size)
-    at = np.stack([stored["x"], stored["y"]], axis=1).astype(np.float64) / 65535 - 0.5
+    points = np.stack([stored["x"], stored["y"]], axis=1).astype(np.float64) / 65535 - 0.5
     return Landmarks(
-        at.astype(np.float32),
+        points.astype(np.float32),
         stored["angle"].astype(np.float32) * np.float32(360 / 256),
         stored["size"].astype(np.float32) * np.float32(_SIZE_RESOLUTION),
         stored["bits"],

@@ -1,8 +1,8 @@
 """Computes the position of the aircraft, with a covariance, from the recognised places. The recogniser uses it.
 
-A match gives the shift between the middles of the pictures of query and place. If the `Pose` of the place is known (how
+A match gives the shift between the centres of the pictures of query and place. If the `Pose` of the place is known (how
 its picture lies on the ground), the shift gives a position. Several places that show the same ground must give about
-the same position, and their mean is more exact. Without a pose, as ahead, the position is that of the place.
+the same position, and their mean is more accurate. Without a pose, as ahead, the position is that of the place.
 """
 
 import math
@@ -24,13 +24,13 @@ from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, AttitudeError, 
 # longest side, added to the covariance of a match: tilt and relief shift the parts of a picture differently.
 _VOTE_SD_SHARE = 0.016
 _LANDMARK_SD_SHARE = 0.008
-_POSE_SD = 0.03  # of the scale and the rotation of a place's pose, as a share of the length of a shift
-_MEAN_VARIANCE_SHARE = 0.25  # of the covariance of single votes, which their mean has
-_MIN_SCORE_SHARE = 0.5  # of the best score: matches with at least that score are used too
+_POSE_SD = 0.03  # from the scale and rotation of a place's pose, as a share of the length of a shift
+_MEAN_VARIANCE_SHARE = 0.25  # variance of the mean of the votes, relative to that of a single vote
+_MIN_SCORE_SHARE = 0.5  # of the best score: matches with at least this score are also used
 _MAX_DIFFERENCE_SD = 4.0  # places that differ by more are not used
 _CONTRADICTION_SHARE = 0.2  # of the footprint: if two positions are farther apart, one of the places is wrong
-_MAX_CONTRADICTION = 0.4  # scores of contradicting places, over those of agreeing ones
-MAX_PLACES_CHECKED = 12  # in a dense map so many show the same ground
+_MAX_CONTRADICTION = 0.4  # sum of the scores of contradicting places, relative to agreeing ones
+MAX_PLACES_CHECKED = 12  # in a dense map, as many show the same ground
 _MAX_PLACES_AVERAGED = 5  # of these determine the position
 
 
@@ -38,11 +38,11 @@ _MAX_PLACES_AVERAGED = 5  # of these determine the position
 class Located:
     """Position of the aircraft, with `covariance_m2` (variance east, covariance, variance north). `heading_deg` is the
     compass direction of the top of the picture. `height_ratio` is the height of the camera divided by that of the map's
-    pictures, `footprint_m` the length on the ground of the longest side, and `height_m` the height above the ground
-    that follows from it, whatever was reported (None: unknown). `places` are the numbers of the places that agree on
-    it. `objection` is the reason not to trust the position (None: no reason). `attitude_error` is the error of the
-    reported attitude that the picture shows; the position contains its effect. `tilt_m2` is the part of both variances
-    by a tilt that is not reported."""
+    pictures, `footprint_m` the length of the longest side on the ground, and `height_m` the resulting height above the
+    ground, independent of any reported one (None: unknown). `places` are the numbers of the places that agree on the
+    position. `objection` is the reason not to trust it (None: no reason). `attitude_error` is the error of the reported
+    attitude that the picture shows; the position includes its effect. `tilt_m2` is the part of both variances due to an
+    unreported tilt."""
 
     position: Position
     covariance_m2: Covariance
@@ -57,14 +57,14 @@ class Located:
 
     @property
     def accuracy_m(self) -> float:
-        """Standard deviation in the direction where it is largest, metres."""
+        """Standard deviation in the direction of the largest one, metres."""
         var_east, cov, var_north = self.covariance_m2
         middle, half = (var_east + var_north) / 2, math.hypot((var_east - var_north) / 2, cov)
         return math.sqrt(middle + half)
 
     @property
     def sd_m(self) -> float:
-        """Standard deviation along one axis, as a mean of all directions, metres."""
+        """Standard deviation along one axis, averaged over all directions, metres."""
         return math.sqrt((self.covariance_m2[0] + self.covariance_m2[2]) / 2)
 
 
@@ -84,7 +84,7 @@ class _PlaceEstimate:
 
     def agrees_with(self, other: "_PlaceEstimate") -> bool:
         """Return True if both positions are about the same. Relative to each other, poses are known far better than on
-        the Earth, so only half of the variance of each counts."""
+        the Earth, so only half of each variance counts."""
         covariance = self.match_covariance + other.match_covariance + (self.pose_covariance + other.pose_covariance) / 2
         return mahalanobis(self.position_m - other.position_m, covariance) <= _MAX_DIFFERENCE_SD
 
@@ -97,14 +97,14 @@ def locate_at_place(position: Position, accuracy_m: float) -> Located:
 def locate(
     places: Sequence[Candidate], cells: int | None, view: View = UNKNOWN_VIEW, agreement: Agreement | None = None
 ) -> Located | None:
-    """Return the position of the aircraft by the `places` found, best first; None if the best has no pose or its match
-    no shift. `cells` is the number of cells along the longest side of a picture (None: shifts cannot be converted to
-    metres). `view` is how the query's picture lies on the ground; if the point below the aircraft is unknown, it is
-    about the middle. `agreement` is the agreement of the landmarks of the best place, which gives another shift.
+    """Return the position of the aircraft from the `places` found, best first; None if the best has no pose or its
+    match no shift. `cells` is the number of cells along the longest side of a picture (None: unknown, so shifts cannot
+    be converted to metres). `view` is how the query's picture lies on the ground; if the point below the aircraft is
+    unknown, the centre is used. `agreement` is that of the landmarks of the best place, which gives another shift.
 
-    Of the places that show the same ground, those whose position agrees with the first are used: all of them are named,
-    and the first five with at least half of the best one's score determine the position. Those with such a score whose
-    position is far from the first contradict it. If together they weigh too much, the position is not to be trusted.
+    Of the places that show the same ground, those whose positions agree with the first are listed in the result. The
+    first five of these with at least half of the best score determine the position. Places with such a score and a
+    position far from the first contradict it; if the sum of their scores is too large, the position is not trusted.
     """
     best, pose, nadir, error = places[0].place, places[0].place.pose, view.nadir_offset or (0.0, 0.0), None
     first = _estimate(places[0], best, cells, nadir)
@@ -118,38 +118,38 @@ def locate(
             error = fit_attitude_error(*agreement.inlier_points, view, pose.up_deg + first.rotation_deg)
     least = _MIN_SCORE_SHARE * first.score
     agreeing = [estimate for estimate in estimates if first.agrees_with(estimate)]
-    position_m, covariance = _average([each for each in agreeing if each.score >= least][:_MAX_PLACES_AVERAGED])
+    position_m, covariance = _average([other for other in agreeing if other.score >= least][:_MAX_PLACES_AVERAGED])
     if view.nadir_offset_m is not None:
         position_m = position_m + view.nadir_offset_m
     else:
         tilt_sd = TILT_SD_WITHOUT_ATTITUDE if view.nadir_offset is None else view.nadir_offset_sd
         covariance += (tilt_sd * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
     objection, far_m = None, _CONTRADICTION_SHARE * pose.footprint_m
-    against = []
+    contradicting = []
     for estimate in estimates:
         apart_m = float(np.hypot(*(estimate.position_m - first.position_m)))
         if estimate.score >= least and apart_m > far_m:
-            against.append((estimate.score, apart_m))
-    if sum(score for score, _ in against) > _MAX_CONTRADICTION * sum(each.score for each in agreeing):
-        objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"apart_m": max(against)[1]})
+            contradicting.append((estimate.score, apart_m))
+    if sum(score for score, _ in contradicting) > _MAX_CONTRADICTION * sum(estimate.score for estimate in agreeing):
+        objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"apart_m": max(contradicting)[1]})
     footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
-    here = offset_position(best.position.lat_deg, best.position.lon_deg, *position_m.tolist())
+    lat_lon = offset_position(best.position.lat_deg, best.position.lon_deg, *position_m.tolist())
     return Located(
-        position=Position(*here, best.position.alt_m),
+        position=Position(*lat_lon, best.position.alt_m),
         covariance_m2=to_triple(covariance),
         heading_deg=(pose.up_deg + first.rotation_deg) % 360,
         height_ratio=first.height_ratio and first.height_ratio * view.zoom,
         footprint_m=footprint_m,
         height_m=view.focal and view.focal * footprint_m,
-        places=tuple(dict.fromkeys(each.place_id for each in agreeing)),
+        places=tuple(dict.fromkeys(estimate.place_id for estimate in agreeing)),
         objection=objection,
         attitude_error=error,
     )
 
 
 def add_tilt_covariance(where: Located, tilt: ShownTilt, view: View) -> Located:
-    """Return a position with the covariance that it has if the query is tilted as `tilt` shows beyond what its `view`
-    has been levelled by."""
+    """Return the position with its covariance increased for `tilt`, the tilt of the query that levelling by its `view`
+    has not removed."""
     tangent_sd = tilt.get_sd(view.is_tilt_known)
     tilt_m2 = (tangent_sd * (where.height_m or TYPICAL_FOCAL * (where.footprint_m or 0.0))) ** 2
     east_m2, cross_m2, north_m2 = where.covariance_m2
@@ -162,7 +162,7 @@ def covariance_matrix(covariance: Covariance) -> Doubles:
 
 
 def mahalanobis(step: Doubles, covariance: Doubles) -> float:
-    """Return the length of a shift (2,) in standard deviations: its Mahalanobis distance, by a covariance (2, 2)."""
+    """Return the Mahalanobis distance of a shift (2,): its length in standard deviations of a covariance (2, 2)."""
     return math.sqrt(step @ np.linalg.solve(covariance, step))
 
 
@@ -171,27 +171,27 @@ def _average(estimates: list[_PlaceEstimate]) -> tuple[Doubles, Doubles]:
     match_covariance = np.linalg.inv(sum(np.linalg.inv(each.match_covariance) for each in estimates))
     position_m = match_covariance @ sum(np.linalg.inv(each.match_covariance) @ each.position_m for each in estimates)
     if len(estimates) > 1:
-        # If places differ by more than their covariances allow, these are scaled up (Birge 1932).
+        # If places differ by more than their covariances allow, the covariances are scaled up (Birge 1932).
         errors_m = [(each.position_m - position_m, each.match_covariance) for each in estimates]
-        off = sum(error_m @ np.linalg.solve(covariance, error_m) for error_m, covariance in errors_m)
-        match_covariance = match_covariance * max(1.0, float(off) / (2 * (len(estimates) - 1)))
-    # Errors of the poses are common to neighbours: using several makes them no smaller.
+        chi2 = sum(error_m @ np.linalg.solve(covariance, error_m) for error_m, covariance in errors_m)
+        match_covariance = match_covariance * max(1.0, float(chi2) / (2 * (len(estimates) - 1)))
+    # Neighbours share the errors of their poses, so averaging does not reduce these.
     return position_m, match_covariance + np.mean([each.pose_covariance for each in estimates], axis=0)
 
 
 def _estimate(
     found: Candidate, best: Place, cells: int | None, nadir: tuple[float, float], agreement: Agreement | None = None
 ) -> _PlaceEstimate | None:
-    """Compute the position of the aircraft from one place, by its shift or, with `agreement`, by the landmarks
-    that agree. None if the match has no shift or rotation, the place no pose, or the `best` place's picture is too far
-    away to show the same ground. `cells` is as in `locate`, and `nadir` is `View.nadir_offset`."""
+    """Compute the position of the aircraft from one place, by the shift of its match or, with `agreement`, of the
+    landmarks that agree. None if the match has no shift or rotation, the place no pose, or the `best` place's picture
+    is too far away to show the same ground. `cells` is as in `locate`, and `nadir` is `View.nadir_offset`."""
     match, place, pose = found.match, found.place, found.place.pose
     if cells is None or match.shift_cells is None or match.rotation_deg is None:
         return None
     if place.position is None or pose is None or best.position is None or best.pose is None:
         return None
-    off_m = _offset_m(best.position, place.position)
-    if float(np.hypot(*off_m)) > (pose.footprint_m + best.pose.footprint_m) / 2:
+    place_offset_m = _offset_m(best.position, place.position)
+    if float(np.hypot(*place_offset_m)) > (pose.footprint_m + best.pose.footprint_m) / 2:
         return None
     if agreement:
         rotation_deg, height_ratio = agreement.rotation_deg or 0.0, agreement.scale
@@ -199,23 +199,23 @@ def _estimate(
         covariance = covariance_matrix(agreement.covariance_share2 or (0.0, 0.0, 0.0)) + landmark_share2
     else:
         rotation_deg, height_ratio, step = match.rotation_deg, match.height_ratio, np.array(match.shift_cells) / cells
-        # The match's covariance is that of single votes; their mean has a fraction of it.
+        # The covariance of the match is that of a single vote; the mean has a fraction of it.
         covariance = covariance_matrix(match.covariance_cells2 or (0.0, 0.0, 0.0)) / cells**2
         covariance = covariance * _MEAN_VARIANCE_SHARE + _VOTE_SD_SHARE**2 * np.eye(2)
-    # The point below the aircraft, in the place's picture: that of the query's picture, turned, scaled and shifted.
+    # The point below the aircraft in the place's picture: that in the query's picture, rotated, scaled and shifted.
     ratio, turn = height_ratio or 1.0, math.radians(rotation_deg)
     right, up = nadir
     dx = step[0] + ratio * (right * math.cos(turn) + up * math.sin(turn))
     dy = step[1] + ratio * (right * math.sin(turn) - up * math.cos(turn))
     axes = picture_axes(pose.up_deg)
     step_m = pose.footprint_m * (axes @ (dx, -dy))
-    by_length = (_POSE_SD * float(np.hypot(*step_m))) ** 2 * np.eye(2)
-    upwards = covariance * [[1, -1], [-1, 1]]  # y up instead of down
+    pose_error = (_POSE_SD * float(np.hypot(*step_m))) ** 2 * np.eye(2)
+    covariance_up = covariance * [[1, -1], [-1, 1]]  # y up instead of down
     return _PlaceEstimate(
         place_id=place.place_id,
         score=match.score,
-        position_m=off_m + step_m,
-        match_covariance=pose.footprint_m**2 * (axes @ upwards @ axes.T) + by_length,
+        position_m=place_offset_m + step_m,
+        match_covariance=pose.footprint_m**2 * (axes @ covariance_up @ axes.T) + pose_error,
         pose_covariance=covariance_matrix(pose.covariance_m2),
         rotation_deg=rotation_deg,
         height_ratio=height_ratio,
@@ -223,7 +223,7 @@ def _estimate(
 
 
 def _offset_m(origin: Position, position: Position) -> Doubles:
-    """Return how far east and north of `origin` a position is (2,), metres."""
+    """Return the offset of a position east and north of `origin` (2,), metres."""
     return np.array(offset_m(origin.lat_deg, origin.lon_deg, position.lat_deg, position.lon_deg))
 
 

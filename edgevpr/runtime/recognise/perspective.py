@@ -1,9 +1,9 @@
-"""The tilt of a camera that its pictures show, beyond the one that the autopilot reports.
+"""The tilt of a camera that its pictures show, beyond the tilt reported by the autopilot.
 
-A picture is levelled by the reported attitude. If that is wrong, the picture is still tilted by the error, and its
-landmarks do not lie on those of the place by one rotation, scaling and shift alone: a tilt moves a landmark by a part
-that grows with the square of its distance from the point under the camera. That part is fitted here. The rest of it,
-the same for all landmarks, cannot be told from a shift: it is what a wrong attitude does to a position.
+A picture is levelled with the reported attitude. If that is wrong, the picture remains tilted by the error, and one
+rotation, scaling and shift cannot align its landmarks with those of the place: a tilt moves a landmark by a term that
+grows with the square of its distance from the point below the camera. This term is fitted here. The constant term is
+indistinguishable from a shift: it is the effect of a wrong attitude on the position.
 """
 
 import cmath
@@ -23,12 +23,12 @@ _MIN_LANDMARKS = 12  # landmarks
 _POINT_SD = 2.5 / 640  # of a landmark, as a share of the longest side
 _SHEAR_SD = 0.01
 TYPICAL_FOCAL = 0.77  # 66 degrees across
-_UNKNOWN_TILT_SD = math.tan(math.radians(30.0))  # where too little agrees to show a tilt
+_UNKNOWN_TILT_SD = math.tan(math.radians(30.0))  # if too little agrees to show a tilt
 _CLEAR_SD = 3.0  # of a tilt beyond the reported one
 _CLEAR_TILT = math.tan(math.radians(5.0))
-# Of a slope: the pictures of places are tilted by some degrees, and relief looks like a tilt, too.
+# Of a slope: the pictures of places are tilted by a few degrees, and relief also looks like a tilt.
 _PLACE_SLOPE_SD = 0.1
-# Share by which scales differ by direction. Level views of aerial_garfield28 and aerial_caliterra have 0.07 at most,
+# Share by which scales differ with direction. Level views of aerial_garfield28 and aerial_caliterra have 0.07 at most,
 # those of 45 degrees 0.08 to 0.25; it is the square of the tangent of half the tilt.
 _CLEAR_STRETCH = 0.075
 _TILT_SD_SHARE = 0.3  # of a tilt: clear enough for what a match may claim, too little to refuse 30 degrees
@@ -46,8 +46,8 @@ _PLACE_TILT_SD = math.tan(math.radians(0.5))
 
 @dataclass(frozen=True, slots=True)
 class AttitudeError:
-    """By how much the camera leans more than was reported. `over_height` (east, north) is a share of the height above
-    the ground: the point under the camera is that far from where the reported attitude puts it. `sd` is the standard
+    """Tilt of the camera beyond the reported attitude. `over_height` (east, north) is a share of the height above the
+    ground: the distance of the point below the camera from where the reported attitude puts it. `sd` is the standard
     deviation of each axis."""
 
     over_height: tuple[float, float]
@@ -56,8 +56,8 @@ class AttitudeError:
 
 @dataclass(frozen=True, slots=True)
 class ShownTilt:
-    """Tilt of a levelled picture against that of a place, as both show it: `tangent`, and the standard deviation `sd`
-    of each of its two axes, by the regions compared; `place_sd` is that by tilt and relief of the place."""
+    """Tilt of a levelled picture relative to that of a place, measured from both: its `tangent`, and the standard
+    deviation of each axis due to the regions compared (`sd`) and to tilt and relief of the place (`place_sd`)."""
 
     tangent: float
     sd: float
@@ -79,17 +79,17 @@ class ShownTilt:
         return self.tangent > max(_CLEAR_SD * math.hypot(self.sd, self.place_sd), _CLEAR_TILT)
 
     def get_sd(self, is_reported: bool) -> float:
-        """Return what it says of the error of a tilt, as a tangent. One that `is_reported` is taken to be right unless
-        the pictures clearly contradict it. Of one that is not reported all may be missing, and its error comes on top:
-        where few regions agree, those that do lie near each other, and show too small a tilt (tilt_ariel)."""
+        """Return the standard deviation of the tilt used for levelling, as a tangent. A reported tilt is trusted unless
+        the pictures clearly contradict it. Without a report the whole tilt is missing, plus the error of this
+        measurement: if few regions agree, they lie close together and show too small a tilt (tilt_ariel)."""
         if is_reported:
             return math.hypot(self.tangent, self.sd) if self.is_clear else 0.0
         return self.tangent + self.sd
 
 
 def convert_to_tilt(found: Perspective | None, focal: float | None) -> ShownTilt:
-    """Convert a perspective (None: unknown) to a tilt by the focal length of the picture, in shares of its longest side
-    (None: unknown, that of a usual camera)."""
+    """Convert a perspective (None: unknown) to a tilt. `focal` is the focal length, in shares of the longest side
+    (None: unknown, use that of a typical camera)."""
     if found is None:
         return ShownTilt(0.0, _UNKNOWN_TILT_SD)
     focal = focal or TYPICAL_FOCAL
@@ -103,9 +103,9 @@ def convert_to_tilt(found: Perspective | None, focal: float | None) -> ShownTilt
 
 
 class CommonTilt:
-    """The tilt beyond the reported one that all images have alike, in the axes of the camera: that of a mount which
-    nobody told. It is the mean of what accepted matches show: few of them show a tilt clearly, in the image of a narrow
-    lens none, and tilts by the ground or by the images of places have another direction each time."""
+    """The tilt beyond the reported one that all images share, in camera axes: that of a mount that is not configured.
+    It is the mean over accepted matches, because few of them show a tilt clearly (none with a narrow lens), and tilts
+    due to the ground or to the images of places have a different direction each time."""
 
     def __init__(self) -> None:
         self._weighted = 0j
@@ -143,7 +143,7 @@ class CommonTilt:
 
 
 def fit_attitude_error(asked: Array, known: Array, view: View, up_deg: float) -> AttitudeError | None:
-    """Return the lean that landmarks show; None if they are too few, or the view has no attitude or focal length.
+    """Fit the attitude error to landmarks; None if there are too few, or the view has no attitude or focal length.
 
     `asked` and `known`, complex (n,), are the landmarks of query and place that agree, as in `agreement`. `up_deg` is
     the compass direction of the top of the query's levelled picture.
@@ -152,27 +152,27 @@ def fit_attitude_error(asked: Array, known: Array, view: View, up_deg: float) ->
     if count < _MIN_LANDMARKS or view.nadir_offset is None or view.focal is None:
         return None
     # A ray at x + iy (focal lengths right and down of straight down) moves by t + (x Re t + y Im t)(x + iy) when the
-    # camera turns by the small angle t = right + i down. Of the picture's own scale and turn, t is in the same units.
+    # camera turns by the small angle t = right + i down. t is in units of the picture's own scale and rotation.
     ray = (asked - complex(view.nadir_offset[0], -view.nadir_offset[1])) / view.focal
     turn_scale, _ = fit_similarity(asked, known)
     by_right, by_down = (turn_scale * view.focal * part * ray for part in (ray.real, ray.imag))
-    # A slope of the ground stretches and shears the picture too, by a few per cent.
+    # A slope of the ground also stretches and shears the picture, by a few per cent.
     linear = (asked, 1j * asked, asked.conj(), 1j * asked.conj())
     columns = (*linear, np.ones(count), 1j * np.ones(count), by_right, by_down)
-    looks = np.concatenate([np.real(columns), np.imag(columns)], axis=1).T
-    seen = np.concatenate([known.real, known.imag])
-    normal = looks.T @ looks
+    design = np.concatenate([np.real(columns), np.imag(columns)], axis=1).T
+    observed = np.concatenate([known.real, known.imag])
+    normal = design.T @ design
     normal[2, 2] += _POINT_SD**2 / _SHEAR_SD**2
     normal[3, 3] += _POINT_SD**2 / _SHEAR_SD**2
     try:
         inverse = np.linalg.inv(normal)
     except np.linalg.LinAlgError:
         return None  # all landmarks on a line
-    way = inverse @ looks.T @ seen
-    left = seen - looks @ way
+    fit = inverse @ design.T @ observed
+    rest = observed - design @ fit
     variance = (
-        float(left @ left) / (2 * count - len(way)) * _CORRELATED_LANDMARKS * float(inverse[6, 6] + inverse[7, 7]) / 2
+        float(rest @ rest) / (2 * count - len(fit)) * _CORRELATED_LANDMARKS * float(inverse[6, 6] + inverse[7, 7]) / 2
     )
-    right, down = way[6:]
+    right, down = fit[6:]
     east, north = picture_axes(up_deg) @ (-right, down)
     return AttitudeError((float(east), float(north)), math.hypot(math.sqrt(variance), _PLACE_TILT_SD))

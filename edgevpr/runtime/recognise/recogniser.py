@@ -1,7 +1,7 @@
 """Recognition of one frame, stage by stage: encode, search, verify, locate, decide, and track the flight.
 
-A flight, `match`, `eval` and the probe recognise by it. There is no link, flight log, thread or clock in here: the
-result depends only on what is passed in. A *search pass* is one search of the map for the query of a frame. A query may
+Flights, `match`, `eval` and the probe use it. There is no link, flight log, thread or clock in here: the result
+depends only on the arguments. A *search pass* is one search of the map for the query of a frame. A query may
 take several, at different heights.
 """
 
@@ -29,7 +29,7 @@ from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _log = logging.getLogger(__name__)
-_LATER_PASS_SHARE = 0.4  # of the candidates, compared at each height but the first
+_LATER_PASS_SHARE = 0.4  # of the candidates, compared at each height except the first
 
 
 class Recogniser:
@@ -37,7 +37,7 @@ class Recogniser:
 
     `odometry` measures the motion between frames (None: it is not measured). `prior` makes hints that narrow each query
     (None: the whole map is searched). `place_filter` tracks the flight from query to query (None: each is judged
-    alone). Between two frames, `change` sets what the next is recognised with.
+    alone). Between two frames, `change` sets candidates and mount for the next.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class Recogniser:
         self._left_out_reported = 0  # places
         self._layers = matcher.layers or read_layers(place_map)
         self.matcher, self.index, self.rule = matcher, matcher.index, matcher.rule
-        # Places nearer to each other show the same ground: neither is a rival of the other.
+        # Places closer together than this show the same ground: neither is a rival of the other.
         self._footprint_m = max(self._layers.footprints_m, default=0.0)
         # 1-sigma accuracy of a place's position as a fix: the aircraft may be anywhere between two places.
         self.accuracy_m = max(settings.min_accuracy_m, matcher.index.spacing_m() or 0.0)
@@ -73,8 +73,8 @@ class Recogniser:
         )
 
     def change(self, *, candidates: int | None = None, mount: Mount | None = None) -> None:
-        """Recognise with another number of candidates or mount of the camera from the next frame on (None: it stays).
-        Call it between two frames, from the thread that recognises."""
+        """Change the number of candidates or the camera mount from the next frame on (None: unchanged). Call this
+        between two frames, from the recognition thread."""
         if candidates is not None:
             self.candidates = candidates
         if mount is not None:
@@ -110,7 +110,7 @@ class Recogniser:
         return self._make_event(frame, vehicle, query, odometry_step, decision, failure)
 
     def measure_motion(self, frame: Frame, vehicle: Vehicle | None = None) -> Recognition:
-        """Measure the motion from the frame before to this one, and nothing else. Never raises an Exception."""
+        """Measure only the motion from the previous frame to this one. Never raises an Exception."""
         self.meter.begin()
         picture = odometry_step = failure = None
         try:
@@ -171,18 +171,18 @@ class Recogniser:
 
     @property
     def _scale(self) -> float:
-        """The factor to enlarge the next picture by."""
+        """The factor by which to enlarge the next picture."""
         return self._prior.scale(self.technique.spec.height_ratios)
 
     def _measure_odometry(self, frame: Frame, view: View, verifier: Verifier) -> OdometryStep | None:
-        """Measure the motion of a frame from the one before, if its picture is georeferenced."""
+        """Measure the motion from the previous frame to this one, if its picture is georeferenced."""
         if self._odometry is None or not view.is_georeferenced:
             return None
         with self.meter.step("stride"):
             return self._odometry.measure(frame.t_mono_s, view, verifier.landmarks)
 
     def _decide(self, query: EncodedFrame, verifier: Verifier, odometry_step: OdometryStep | None) -> Decision:
-        """Search the map for an encoded frame, and update the hints for the next query by the decision."""
+        """Search the map for an encoded frame, and update the hints for the next query with the decision."""
         place_filter = self._place_filter
         objection = check_texture(query.descriptor, self.rule.min_quality)
         objection = objection or query.view.reason or (query.salience.reason if query.salience else None)
@@ -227,7 +227,7 @@ class Recogniser:
         return self._decider.decide(ranking, query, hints, verifier, place_filter)
 
     def _search(self, descriptor: Descriptor, expected: Expectation, share: float = 1.0) -> Ranking:
-        """Search the map once for a query, with this `share` of the candidates. Raises as `compare_places` does."""
+        """Search the map once for a query, with this `share` of the candidates. Raises what `compare_places` raises."""
         query = self._decider.make_query(descriptor, expected)
         with self.meter.step("scan"):
             self.place_map.require_unchanged()
