@@ -1,5 +1,5 @@
-"""The boundary of a flight, where recording and replay stand: what comes in from clocks, machine, source, link and
-signals passes these classes, if a flight is recorded or replayed. Nothing inside knows of it.
+"""The boundary of a flight, for recording and replay: if a flight is recorded or replayed, all input from clocks,
+machine, source, link and signals passes through these classes. The flight itself does not know.
 
 A line of the tape is a note: the answer to a question of some kind, or a turn of the link with its time and its steps,
 such as bytes received or a packet sent.
@@ -28,7 +28,7 @@ from edgevpr.runtime.flight.stop import Stop
 
 T = TypeVar("T")
 
-# The attributes of a source that change, and what a replay takes them for where the tape has none.
+# The attributes of a source that change, and their values in a replay where the tape has none.
 SOURCE_STATE_DEFAULTS = {
     "ended": False,
     "dropped": 0,
@@ -37,7 +37,7 @@ SOURCE_STATE_DEFAULTS = {
     "condition": Condition.RUNNING.name,
     "state": "replayed",
 }
-# The calls by which a driver uses its conversation, and their names on the tape.
+# The methods of a conversation that a driver calls, and their names on the tape.
 _STEPS = {
     Conversation.drop_stale.__name__: "waits",
     Conversation.announce_changes.__name__: "answers",
@@ -48,7 +48,7 @@ _STEPS = {
     Conversation.end.__name__: "closed",
 }
 LINK = "link"  # the kind of the turns of the link
-_UNRECORDED_FIELDS = "image", "position", "pose"  # of a frame, not on the tape as they are
+_UNRECORDED_FIELDS = "image", "position", "pose"  # of a frame, not written to the tape as they are
 
 
 class Tape:
@@ -65,11 +65,11 @@ class Tape:
 
 def tape_clock(clock: Clock, tape: Tape) -> Clock:
     """Return the same clocks with each reading recorded on the `tape`, or played back from it."""
-    names = [each.name for each in fields(clock) if each.name != "sleep"]
+    names = [field.name for field in fields(clock) if field.name != "sleep"]
     return replace(clock, **{name: partial(tape.read, name, getattr(clock, name)) for name in names})
 
 
-# The questions to a machine: their names on the tape, and the types of the answers that are no JSON.
+# Measurements of a machine: their names on the tape, and the types of those that are not JSON.
 _QUESTIONS: dict[str, tuple[str, type[Any] | None]] = {
     "limit_c": ("limit_c", None),
     "measure_heat": ("heat", ThermalState),

@@ -1,7 +1,7 @@
-"""The recording of a flight, with which `review` can fly it again: a folder with `tape.jsonl`, one line for each input,
-and `frames/`, the pictures as JPEG.
+"""The recording of a flight, from which `review` can replay it: a folder with `tape.jsonl`, one line per input, and
+`frames/`, the pictures as JPEG.
 
-A thread of its own writes, so that a slow disk delays no query. A recording with a gap cannot be replayed: if the disk
+A separate thread writes, so a slow disk does not delay queries. A recording with a gap cannot be replayed: if the disk
 is too slow or full, or the recording too large, it ends and the flight goes on.
 """
 
@@ -27,8 +27,8 @@ from edgevpr.runtime.flight.flightlog import Line, select_last_flight
 
 TAPE = "tape.jsonl"
 FRAMES = "frames"
-MIN_FREE_BYTES = 100_000_000  # free bytes of the disk that are left to logs and map
-MAX_QUEUED_BYTES = 32_000_000  # most bytes of pictures that may wait for a slow disk: minutes of a small camera
+MIN_FREE_BYTES = 100_000_000  # left free on the disk for logs and map
+MAX_QUEUED_BYTES = 32_000_000  # limit of queued pictures while the disk is slow: minutes of a small camera
 MAX_QUEUED_NOTES = 100_000
 _WRITE_INTERVAL_S = 0.5  # a power cut loses the input since the last write
 _CLOSE_TIMEOUT_S = 1.5  # longest wait for the thread: the end of a flight takes two seconds at most
@@ -40,11 +40,11 @@ _log = logging.getLogger(__name__)
 
 class Recording(Tape):
     """An open recording (a context manager) in the folder `path`: the `Tape` of all input, and frames. `state` is None
-    while it goes on, else a sentence that says why it has ended."""
+    while recording, else a sentence with the reason for its end."""
 
     def __init__(self, folder: str | Path, max_mb: float) -> None:
-        """Make a folder for this flight in `folder`. Recordings there take at most half of `max_mb`, the oldest are
-        deleted; the new one may take the other half. Raises EdgevprError."""
+        """Create a folder for this flight in `folder`. Earlier recordings there may use half of `max_mb`, the oldest
+        are deleted; the new one may use the other half. Raises EdgevprError."""
         self.state: str | None = None
         self._max_bytes = 1e6 * max_mb / 2
         self._queue: deque[bytes | tuple[int, bytes]] = deque()  # a note, or a frame with its number
@@ -92,7 +92,7 @@ class Recording(Tape):
         return self._frames
 
     def close(self) -> None:
-        """Write what still waits, and close the tape. Gives up after 1.5 seconds, with a warning."""
+        """Write the queue and close the tape. Gives up after 1.5 seconds, with a warning."""
         self._closing.set()
         self._thread.join(_CLOSE_TIMEOUT_S)
         if self._thread.is_alive():
@@ -118,7 +118,7 @@ class Recording(Tape):
                 self._tape.close()
 
     def _write(self) -> None:
-        """Write the queue, frames before the lines that name them. Raises OSError if the recording must end."""
+        """Write the queue, frames before the lines that refer to them. Raises OSError if the recording must end."""
         if self._bytes_queued - self._bytes_written > MAX_QUEUED_BYTES or len(self._queue) > MAX_QUEUED_NOTES:
             raise OSError(errno.EIO, "the disk is too slow for it")
         notes = []
@@ -159,8 +159,8 @@ def frame_path(folder: Path, number: int) -> Path:
 
 
 def find_recording(folder_name: str | None, log: str | Path) -> Path | None:
-    """Return the folder of the recording that the file `log` names (None: it names none): at that path, or in a folder
-    of that name next to the log; None if it is at neither."""
+    """Return the folder of the recording `folder_name` of a `log` (None: not recorded): at that path, or in a folder of
+    that name next to the log; None if it is in neither."""
     if not folder_name:
         return None
     path = Path(folder_name)
@@ -170,7 +170,7 @@ def find_recording(folder_name: str | None, log: str | Path) -> Path | None:
 
 def read_recorded(log: str | Path) -> tuple[list[Line], Path]:
     """Return the lines of the last flight of `log`, and the folder of its recording (see `find_recording`). Raises
-    UsageError if there is none, and EdgevprError if the file holds no flight."""
+    UsageError if there is none, and EdgevprError if the file contains no flight."""
     flight = select_last_flight(log)
     if flight.missing:
         _log.warning("%s", flight.missing)
@@ -189,7 +189,7 @@ def list_frames(folder: Path) -> dict[str, Path]:
     paths = {}
     with open(folder / TAPE, "rb") as tape:
         for line in tape:
-            with suppress(ValueError, LookupError, TypeError):  # a line that was cut, or no frame
+            with suppress(ValueError, LookupError, TypeError):  # a truncated line, or no frame
                 if line.startswith(b'["frame", {'):
                     frame = json.loads(line)[1]
                     paths[frame["name"]] = frame_path(folder, frame["number"])
@@ -197,7 +197,7 @@ def list_frames(folder: Path) -> dict[str, Path]:
 
 
 def has_live_source(folder: Path) -> bool:
-    """Return True if the pictures of the recording in `folder` came from a camera or stream as they were taken."""
+    """Return True if the pictures of the recording in `folder` came live from a camera or stream."""
     with open(folder / TAPE, "rb") as tape:
         return any(line.startswith(b'["is_live", true') for line in tape)
 

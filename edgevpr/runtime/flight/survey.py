@@ -1,11 +1,11 @@
-"""The survey of map and camera: while GPS is good, a flight estimates the offset of the map from GPS, the error of its
-scale, and the mount of the camera.
+"""The survey of map and camera: while GPS is good, a flight estimates the offset of the map from GPS, the map's scale
+error, and the camera mount.
 
-The offset of a match from the receiver is the sum of all three. They differ in how they vary: the map's offset is
-constant, that of a mount turns with the heading and grows with the height, that of a scale grows across the map. If a
+The offset of a match from the receiver is the sum of all three. They vary differently: the map's offset is
+constant, the mount's turns with the heading and grows with the height, the scale's grows across the map. If a
 flight cannot separate two of them, the standard deviations of both are large, and neither is reported.
 
-A wrong mount makes receiver and map contradict each other as soon as the aircraft turns. So matches are also used while
+With a wrong mount, receiver and map contradict each other as soon as the aircraft turns. So matches are also used while
 GPS is distrusted, provided that the two halves of the flight agree."""
 
 import math
@@ -27,10 +27,10 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 _MIN_INTERVAL_S = 5.0  # between two samples
 _MAX_SAMPLES = 720  # the newest hour of matches
-# Errors of GPS are correlated: matches within this time share one error, and count as one sample of it.
+# GPS errors are correlated: matches within this time share one error, and count as one sample of it.
 _GPS_CORRELATION_S = 180.0
 _MAX_GPS_SD_M = 5.0  # a receiver that claims more is too inaccurate to survey a map by
-_FIX_INFLUENCE_S = 60.0  # so long after a fix of ours it may determine the autopilot's position: the receiver is used
+_FIX_INFLUENCE_S = 60.0  # how long a fix of ours may affect the autopilot's position: the receiver is used then
 _COMMON_TILT_SD_DEG = 0.3  # of a mount: shared by all pictures of a flight
 # Prior standard deviations of offset (2, metres), mount (2, tangents), scale, and of the time between frames and
 # positions (s), which on a straight line has the effect of a camera that looks ahead.
@@ -43,7 +43,7 @@ _MAX_RESIDUAL_SD = 4.0  # of an inlier
 _MIN_TRUSTED_SHARE = 0.1
 _MAX_HALF_SD_M = 2.0
 _MAX_HALVES_SD = 4.0
-_MAX_TRUSTED_M = 12.0  # a match that is nearer to GPS, given the mount, is no reason to distrust it
+_MAX_TRUSTED_M = 12.0  # a match closer to GPS, given the mount, is no reason to distrust GPS
 _SOFT_ROUNDS = 6
 _HARD_ROUNDS = 3
 _SOFT_LIMIT_SD = 2.0
@@ -85,8 +85,8 @@ class SurveyMeasure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyResult:
-    """The result of so many `matches`. Its `measures` by name: `off_m`, the offset of the map from GPS (east, north) at
-    the `middle` of the ground that they cover; `scale`, the share by which the map is too large, around there;
+    """The result of `matches` matches. Its `measures` by name: `off_m`, the offset of the map from GPS (east, north) at
+    the `middle` of the ground that they cover; `scale`, the fraction by which the map is too large around there;
     `ahead_deg` and `right_deg`, by how much the camera looks ahead and to the right of straight down."""
 
     matches: int
@@ -98,14 +98,14 @@ class SurveyResult:
         fields: dict[str, Any] = {"matches": self.matches}
         fields["middle"] = {"lat_deg": round(self.middle.lat_deg, 7), "lon_deg": round(self.middle.lon_deg, 7)}
         for name, measure in self.measures.items():
-            value = [round(each, 4) for each in measure.value]
+            value = [round(number, 4) for number in measure.value]
             fields[name] = None if not measure.is_known else value if name == "off_m" else value[0]
             fields[f"{name.partition('_')[0]}_sd"] = round(measure.sd, 4) if measure.is_known else None
         return fields
 
 
 class MapSurvey:
-    """Collects samples. `mount` is the one by which pictures are levelled. `is_level`: the camera hangs in a gimbal."""
+    """Collects samples. `mount`: mount by which pictures are levelled. `is_level`: the camera is on a gimbal."""
 
     def __init__(self, mount: Mount, is_level: bool) -> None:
         self._mount, self._is_level = mount, is_level
@@ -114,14 +114,14 @@ class MapSurvey:
         self._last_s = -math.inf
 
     def add_match(self, event: Recognition, is_doubted: bool = False) -> bool:
-        """Add the match of an event as a sample; return False if it has none that is usable, or the last sample is too
+        """Add the match of an event as a sample; return False if it has no usable match, or the last sample is too
         recent. `is_doubted`: GPS is distrusted now."""
         vehicle, located, view = event.vehicle, event.located, event.view
         if event.frame is None or event.frame.t_mono_s - self._last_s < _MIN_INTERVAL_S:
             return False
         if vehicle is None or vehicle.gps is None or vehicle.gps.sd_m > _MAX_GPS_SD_M or not is_gps_aided(vehicle):
             return False
-        # Without a view or a pose, the point under the camera is not known within metres.
+        # Without a view or a pose, the point under the camera is not known to within metres.
         if located is None or located.heading_deg is None or view.reason:
             return False
         if view.nadir_offset is None and view.nadir_offset_m is None:
@@ -162,15 +162,15 @@ class MapSurvey:
         self._mount, self._samples = mount, deque(shifted, maxlen=_MAX_SAMPLES)
 
     def _compute_jacobian(self, vehicle: Vehicle, height_m: float | None, heading_error_deg: float) -> Doubles | None:
-        """Return the derivative (2, 6) of a match by offset, mount, scale (left at 0) and time; None if it is unknown.
-        `heading_error_deg` is the error of the compass that the picture shows."""
+        """Return the Jacobian (2, 6) of a match in offset, mount, scale (left at 0) and time; None if unknown.
+        `heading_error_deg` is the compass error measured in the picture."""
         roll_deg, pitch_deg = (0.0, 0.0) if self._is_level else (vehicle.roll_deg, vehicle.pitch_deg)
         inputs = vehicle.heading_deg, height_m, roll_deg, pitch_deg, *(vehicle.velocity_m_s or (None,))
-        if not all(each is not None and math.isfinite(each) for each in inputs) or not height_m or height_m <= 0:
+        if not all(value is not None and math.isfinite(value) for value in inputs) or not height_m or height_m <= 0:
             return None
-        heading, roll, pitch = (math.radians(each or 0.0) for each in (vehicle.heading_deg, roll_deg, pitch_deg))
+        heading, roll, pitch = (math.radians(angle or 0.0) for angle in (vehicle.heading_deg, roll_deg, pitch_deg))
         heading += math.radians(heading_error_deg)
-        ahead_m, right_m = height_m * math.cos(roll), height_m * math.cos(pitch)  # an airframe that banks turns it too
+        ahead_m, right_m = height_m * math.cos(roll), height_m * math.cos(pitch)  # a banking airframe turns it too
         east, north = vehicle.velocity_m_s or (0.0, 0.0)
         return np.array(
             [
@@ -180,7 +180,7 @@ class MapSurvey:
         )
 
     def compute_result(self) -> SurveyResult | None:
-        """Return the result; None if the samples are too few, or do not agree."""
+        """Return the result; None if there are too few samples, or they disagree."""
         samples = list(self._samples)
         if len(samples) < _MIN_SAMPLES or self._origin is None:
             return None
@@ -207,8 +207,8 @@ class MapSurvey:
 def fit_samples(samples: list[SurveySample]) -> tuple[Doubles, Doubles, Bools]:
     """Fit samples: return the parameters (6,), their covariance (6, 6), and bool (n,), False for outliers.
 
-    The first rounds limit the weight of outliers (Huber), the last leave them out. Scatter beyond what the matches
-    claim inflates the covariance.
+    The first rounds limit the weight of outliers (Huber), the last reject them. Scatter beyond the claimed accuracy of
+    the matches inflates the covariance.
     """
     jacobian = np.array([sample.jacobian for sample in samples])
     off_m = np.array([sample.off_m for sample in samples])
