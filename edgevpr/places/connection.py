@@ -117,7 +117,7 @@ class MapConnection:
             fresh = mapfiles.connect(self.path, "ro" if self._lock is None else "rw", self._wait_s)
             try:
                 if read_stored(self.path, fresh) != self.stored:
-                    raise MapError(f"{self.path} was replaced by another map after it was opened: restore the first.")
+                    raise MapError(f"{self.path} was replaced by another map: restore the original.")
             except BaseException:
                 fresh.close()
                 raise
