@@ -5,8 +5,15 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from edgevpr.cli.shared import add_command, add_group, parse_count, parse_positive
+from edgevpr.cli.shared import add_command, add_group
 from edgevpr.core.errors import UsageError
+
+# Number flags of a flight over an orthophoto: (default, minimum, maximum, help text).
+_NUMBER_FLAGS: dict[str, tuple[float | None, float, float, str]] = {
+    "height_m": (None, 1.0, 10_000.0, "height above ground in metres (default: that of the track)"),
+    "every_m": (20.0, 1.0, 1e6, "distance between images of a mission in metres (default: 20)"),
+    "fov_deg": (66.0, 5.0, 120.0, "field of view across the image in degrees (default: 66)"),
+}
 
 
 def add(commands: Any) -> None:
@@ -17,27 +24,29 @@ def add(commands: Any) -> None:
     flight.add_argument("out", metavar="DIR")
     flight.add_argument("--which", choices=("map", "query"), help="map (default): mapping flight; query: later flight")
     text = "random seed of landscape and motion (default: 1)"
-    flight.add_argument("--seed", type=parse_count, default=1, metavar="N", help=text)
+    flight.add_argument("--seed", type=_parse_seed, default=1, metavar="N", help=text)
     over = flight.add_argument_group("over an orthophoto")
     over.add_argument("--orthophoto", metavar="FILE", help="orthophoto, as for `map build` (needs rasterio)")
     over.add_argument(
         "--track", metavar="FILE", help="mission, or positions.csv with height_m[, yaw_deg, roll_deg, pitch_deg]"
     )
-    text = "height above ground in metres (default: that of the track)"
-    over.add_argument("--height-m", type=parse_positive, metavar="M", help=text)
-    text = "distance between images of a mission in metres (default: 20)"
-    over.add_argument("--every-m", type=parse_positive, default=20.0, metavar="M", help=text)
-    text = "field of view across the image in degrees (default: 66)"
-    over.add_argument("--fov-deg", type=parse_positive, default=66.0, metavar="DEG", help=text)
+    for name, (*_, text) in _NUMBER_FLAGS.items():
+        over.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X", help=text)
     demo = add_command(commands, "demo", run_demo, "map a generated flight, match a later one, and draw the result")
     demo.add_argument("--out", default="demo_out", metavar="DIR", help="folder to write (default: demo_out)")
+
+
+def _parse_seed(text: str) -> int:
+    if (value := int(text)) < 0:
+        raise ValueError
+    return value
 
 
 def run_simulate_flight(args: Namespace) -> int:
     """Run `simulate flight`: write images and positions.csv of a flight over generated ground or an orthophoto."""
     if args.orthophoto is None:
-        if args.track is not None:
-            raise UsageError("--track applies only to --orthophoto: leave it out.")
+        if flags := [name for name in ("track", *_NUMBER_FLAGS) if getattr(args, name) is not None]:
+            raise UsageError(f"--{flags[0].replace('_', '-')} applies only to --orthophoto: leave it out.")
         from edgevpr.lab.simulate.generated import write_generated_flight
 
         print(write_generated_flight(Path(args.out), args.which or "map", args.seed))
@@ -48,8 +57,13 @@ def run_simulate_flight(args: Namespace) -> int:
     from edgevpr.lab.simulate.overflight import read_shots, write_overflight
     from edgevpr.mapmaking.orthophoto import Orthophoto  # loads GDAL, or raises if it is missing
 
-    shots = read_shots(args.track, args.height_m, args.every_m)
-    taken = write_overflight(Path(args.out), Orthophoto(args.orthophoto), shots, args.fov_deg, args.seed)
+    numbers: dict[str, Any] = {}
+    for name, (default, low, high, _) in _NUMBER_FLAGS.items():
+        numbers[name] = value = default if getattr(args, name) is None else getattr(args, name)
+        if value is not None and not low <= value <= high:  # false for NaN
+            raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {low:g} to {high:g}.")
+    shots = read_shots(args.track, numbers["height_m"], numbers["every_m"])
+    taken = write_overflight(Path(args.out), Orthophoto(args.orthophoto), shots, numbers["fov_deg"], args.seed)
     if not (written := sum(1 for _ in progress(taken, len(shots), "flying"))):
         raise UsageError(f"{args.orthophoto} does not cover any whole image along {args.track}: none was written.")
     print(f"{args.out}: {written} images in images/, their positions in positions.csv")

@@ -74,7 +74,7 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
 )
 def test_map_build_refuses_a_wrong_request(tmp_path, ground, capsys, flags, code, said):
     flags = [ground if flag == "GROUND" else flag for flag in flags]
-    assert said in refused(capsys, "map", "build", tmp_path / "m.gpkg", *flags, code=code)
+    assert said in refused(capsys, "map", "build", tmp_path / "m.gpkg", *flags, code=code, is_alone=True)
     assert not (tmp_path / "m.gpkg").exists()
 
 
@@ -84,12 +84,14 @@ def test_map_build_refuses_a_wrong_request(tmp_path, ground, capsys, flags, code
         (["--track", "t"], "--track applies only to --orthophoto"),
         (["--orthophoto", "GROUND"], "needs --track"),
         (["--orthophoto", "GROUND", "--track", "TRACK"], "give --height-m"),
+        (["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "0"], "--height-m is 0: give 1 to 10000."),
         (["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "900"], "none was written"),
+        (["--fov-deg", "66"], "--fov-deg applies only to --orthophoto"),
     ],
 )
 def test_simulate_flight_refuses_a_wrong_request(tmp_path, ground, track, capsys, flags, said):
     flags = [{"GROUND": ground, "TRACK": track}.get(flag, flag) for flag in flags]
-    assert said in refused(capsys, "simulate", "flight", tmp_path / "flight", *flags)
+    assert said in refused(capsys, "simulate", "flight", tmp_path / "flight", *flags, is_alone=True)
 
 
 @pytest.mark.slow
