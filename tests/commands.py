@@ -17,13 +17,14 @@ def run_json(capsys, *argv):
     return json.loads(capsys.readouterr().out)
 
 
-def refused(capsys, *argv, code=2) -> str:
-    """Return the one sentence with which a command fails."""
+def refused(capsys, *argv, code=2, is_alone=False) -> str:
+    """Return the one sentence with which a command fails. `is_alone`: nothing else is shown, not even progress."""
     capsys.readouterr()
     assert run(*argv) == code
     said = capsys.readouterr().err
     sentence = said.splitlines()[-1]
     assert sentence.startswith("edgevpr: ")
     assert said.count(sentence) == 1
+    assert not is_alone or said == f"{sentence}\n"
     assert "Traceback" not in said
     return sentence

@@ -109,7 +109,8 @@ def test_match_skips_a_query_that_is_not_memorable(recording, tmp_path, capsys):
 def test_salience_refuses_wrong_settings(networks, keys, code, complaint, tmp_path, capsys):
     picture = tmp_path / "p.png"
     cv2.imwrite(str(picture), texture(1))
-    assert complaint in refused(capsys, "salience", picture, "--config", config(tmp_path, **keys), code=code)
+    settings = config(tmp_path, **keys)
+    assert complaint in refused(capsys, "salience", picture, "--config", settings, code=code, is_alone=True)
 
 
 def test_salience_without_a_network_turns_its_criterion_off(tmp_path, capsys, caplog):

@@ -56,7 +56,7 @@ def test_measure_refuses_what_does_not_fit_in_one_sentence(tmp_path, truth, caps
         path.write_bytes(content)
     else:
         np.save(path, content, allow_pickle=True)
-    assert said in refused(capsys, "eval", "--similarity", path, "--ground-truth", truth)
+    assert said in refused(capsys, "eval", "--similarity", path, "--ground-truth", truth, is_alone=True)
 
 
 def test_measure_counts_queries_off_the_map_and_takes_the_first_of_equal_scores(tmp_path, truth, capsys):
