@@ -127,8 +127,8 @@ def _parse_waypoint(command: int, frame: int, location: Sequence[float | str | N
 
 
 def _read_plan(items: list[dict[str, Any]]) -> list[Waypoint]:
-    """Read the items of a plan: simple items, and surveys and corridor scans, which store the waypoints computed from
-    their polygon. Numbers left to the autopilot are null."""
+    """Read the items of a plan: simple items, surveys and corridor scans, which store the waypoints computed from their
+    polygon, and structure scans, which have a polygon only. Numbers left to the autopilot are null."""
     path: list[Waypoint] = []
     for item in items:
         if item["type"] == "SimpleItem":
@@ -136,7 +136,8 @@ def _read_plan(items: list[dict[str, Any]]) -> list[Waypoint]:
             continue
         style = item.get("TransectStyleComplexItem", {})
         height_m = style.get("CameraCalc", {}).get("DistanceToSurface")
-        points = style.get("VisualTransectPoints", ())
+        outline = item.get("polygon", ())  # which a structure scan flies along
+        points = style.get("VisualTransectPoints") or (*outline, *outline[:1])
         path += [Waypoint(_parse_finite(lat_deg), _parse_finite(lon_deg), height_m) for lat_deg, lon_deg, *_ in points]
     return path
 

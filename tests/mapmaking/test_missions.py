@@ -49,6 +49,12 @@ def test_a_plan_gives_its_waypoints_and_its_survey(tmp_path):
     assert area.path == (Waypoint(50.0, 11.9, 50.0), Waypoint(50.001, 11.9, 80), Waypoint(50.009, 11.9, 80))
 
 
+def test_a_plan_gives_the_outline_of_a_structure_scan(tmp_path):
+    scan = {"type": "ComplexItem", "complexItemType": "StructureScan", "polygon": [[50.0, 11.9], [50.01, 11.9]]}
+    area = read_area(written(tmp_path, {"fileType": "Plan", "mission": {"items": [scan]}}))
+    assert area.path == (Waypoint(50.0, 11.9), Waypoint(50.01, 11.9), Waypoint(50.0, 11.9))
+
+
 def _plan_of(point):
     """A plan with a survey of one point."""
     survey = '{"type": "ComplexItem", "TransectStyleComplexItem": {"VisualTransectPoints": [POINT]}}'
