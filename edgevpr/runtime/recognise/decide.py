@@ -243,7 +243,7 @@ class Decider:
                 lead_over_rotated=lead_over_rotated,
             )
             verdict = judge(found, index, rule, search)
-            if verdict.accepted and perspective:
+            if verdict.accepted and perspective and query.view.is_tilt_known:
                 self.common_tilt.add(perspective, query.view, best.place.place_id)
         confidence = by_confidence.cap_confidence(found.evidence) if by_confidence and found.evidence else None
         return Decision(verdict=verdict, hints=hints, best=best, findings=found, confidence=confidence, track=track)
