@@ -3,8 +3,17 @@
 import json
 import re
 import sys
-from argparse import SUPPRESS, Action, ArgumentError, ArgumentParser, Namespace, RawDescriptionHelpFormatter
+from argparse import (
+    SUPPRESS,
+    Action,
+    ArgumentError,
+    ArgumentParser,
+    ArgumentTypeError,
+    Namespace,
+    RawDescriptionHelpFormatter,
+)
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from textwrap import wrap
@@ -209,19 +218,19 @@ def print_notes(*sentences: str) -> None:
 
 
 def parse_positive(text: str) -> float:
-    """Parse a finite number above zero; the `type` of a flag. Raises ValueError for any other text."""
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise ValueError
-    return value
+    """Parse a finite number above zero; the `type` of a flag. Raises ArgumentTypeError for any other text."""
+    with suppress(ValueError):
+        if 0 < (value := float(text)) < float("inf"):
+            return value
+    raise ArgumentTypeError(f"`{text}` is not a number above 0")
 
 
 def parse_count(text: str) -> int:
-    """Parse a whole number above zero; the `type` of a flag. Raises ValueError for any other text."""
-    value = int(text)
-    if value < 1:
-        raise ValueError
-    return value
+    """Parse a whole number above zero; the `type` of a flag. Raises ArgumentTypeError for any other text."""
+    with suppress(ValueError):
+        if (value := int(text)) > 0:
+            return value
+    raise ArgumentTypeError(f"`{text}` is not a whole number above 0")
 
 
 def check_output(target: str, source: str) -> Path:

@@ -1,7 +1,7 @@
 """`edgevpr simulate` writes the images of a simulated flight; `edgevpr demo` demonstrates all steps from map to
 match."""
 
-from argparse import Namespace
+from argparse import ArgumentTypeError, Namespace
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +37,9 @@ def add(commands: Any) -> None:
 
 
 def _parse_seed(text: str) -> int:
-    if (value := int(text)) < 0:
-        raise ValueError
-    return value
+    if not text.isdecimal():
+        raise ArgumentTypeError(f"`{text}` is not a whole number from 0 on")
+    return int(text)
 
 
 def run_simulate_flight(args: Namespace) -> int:
