@@ -207,7 +207,7 @@ Thresholds: memorability {FULL.memorability:g}, staticity {FULL.staticity:g}, en
 
 {base.table(speed, {"what": "{what}", "ms": "{ms:.1f}"})}
 
-## Is it told which frames are found again? On sites that were left out; .50 is chance
+## Is it told which frames are found again? On sites that were left out; 0.50 is chance
 
 {base.table(told, columns)}
 

@@ -5,9 +5,9 @@ over `after`, months later and after an earthquake: 96 pictures of half a metre 
 swaying by 2 degrees, nose anywhere. Each is asked alone, as `edgevpr match` does: with heading and height, as an
 autopilot tells them, and without. As a flight they are asked in the order of the grid, its rows to and fro, and nothing
 is told: all that is known of place and scale is by the matches before. Maps are cut at five scales, the footprint told
-being too small or too large, and of rasters of four resolutions; and at three footprints each, .62, .88 and 1.25 times
-the one told. Foreign: pictures of other ground (all other sites of the set, both days, and all other sets from the air,
-each turned by eight angles), told heading and height.
+being too small or too large, and of rasters of four resolutions; and at three footprints each, 0.62, 0.88 and 1.25
+times the one told. Foreign: pictures of other ground (all other sites of the set, both days, and all other sets from
+the air, each turned by eight angles), told heading and height.
 
 Wrong: accepted, and the fix is off by more than a quarter of the footprint, or the ground is foreign. The constants of
 edgevpr were chosen on pictures of this set, too; on these pictures only the shares of three footprints, and which of
@@ -44,7 +44,7 @@ SPACING_M = 40.0
 _GRID, _SEED, _TURNS = (12, 8), 7, 8
 _SITE = "Hatay_Mimar_Sinan"  # that the rasters show
 TOLD, RESOLUTIONS_M, _SHARP = (1.0, 0.65, 0.8, 1.25, 1.5), (0.5, 1.0, 2.0, 4.0), "0.5 m"
-_ONE, _THREE = (1.0,), (0.62, 0.88, 1.25)
+_FOOTPRINT_SHARES = (0.62, 0.88, 1.25)
 _NOTHING, _KNOWN, _FLOWN = "nothing", "heading, height", "the flight so far"
 _STEP_S = 7.0  # from picture to picture, at 15 m/s
 _LIGHT = Light(sun_azimuth_deg=0, sun_elevation_deg=90)
@@ -202,8 +202,8 @@ def measured(cutting: Cutting, folder: Path, work: Path, frames: list[Frame]) ->
 def measure(folder: Path, work: Path) -> list[Row]:
     frames, before = list(flown(folder / "raster" / "after.vrt")), folder / "raster" / "before.vrt"
     rasters = [coarser(before, work / f"{pixel_m:g} m.tif", pixel_m) for pixel_m in RESOLUTIONS_M]
-    cuttings = [Cutting(rasters[0], told, at) for at in (_ONE, _THREE) for told in TOLD]
-    cuttings += [Cutting(raster, 1.0, _ONE) for raster in rasters[1:]]
+    cuttings = [Cutting(rasters[0], told, at) for at in ((1.0,), _FOOTPRINT_SHARES) for told in TOLD]
+    cuttings += [Cutting(raster, 1.0, (1.0,)) for raster in rasters[1:]]
     with ProcessPoolExecutor() as pool:
         waiting = [pool.submit(measured, cutting, folder, work, frames) for cutting in cuttings]
         return [row for each in waiting for row in each.result()]

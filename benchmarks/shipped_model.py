@@ -12,7 +12,7 @@ from edgevpr.runtime.recognise.confidence import Logistic, Model, Scale, Tail
 from edgevpr.runtime.recognise.evidence import MAP_FIGURES, PLACE_FIGURES, Evidence
 
 _PULL = 0.3
-# Parts of the wrong matches that are the tail. With .3 of those of a site itself, the draw of the pictures that a map
+# Parts of the wrong matches that are the tail. With 0.3 of those of a site itself, the draw of the pictures that a map
 # is adapted with decided whether one tunnel of nordland_tiny was taken for another.
 _OFF_MAP, _OFF_PLACE, _STAND_IN = 0.02, 0.4, 0.2
 _MIN_WRONG = 20

@@ -18,7 +18,7 @@ _APART_S = 0.03  # between two states whose rates are compared
 
 class Truth:
     """Listens for SIM_STATE (ArduPilot) or HIL_STATE_QUATERNION (PX4), and tells the pose `at` a time: the state before
-    it, carried on with its rates, which change as they did before it: at steady ones, a picture rendered .1 s ahead
+    it, carried on with its rates, which change as they did before it: at steady ones, a picture rendered 0.1 s ahead
     was 10 degrees off as a plane rolled. Kept of a state are metres east, north and up, and roll, pitch and yaw
     (radians); then the rates of these six a second."""
 
