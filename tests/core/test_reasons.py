@@ -94,3 +94,33 @@ def test_reasons_are_given_the_parameters_of_their_sentences():
                         wrong.append((path.name, node.lineno, name, names))
     assert wrong == []
     assert {code.name for code in CODES} - used == {"NOT_SEARCHED"}, "which `reasons` itself uses"
+
+
+def test_no_module_takes_a_sentence_apart():
+    """Neither a pattern nor a method of text is applied to a reason, nor is one compared with text."""
+    methods = {"startswith", "endswith", "split", "partition", "replace", "find", "match", "search", "sub", "count"}
+    found = []
+    for path, tree in parse_package():
+        for node in ast.walk(tree):
+            match node:
+                case ast.Call(func=ast.Attribute(value=of, attr=name), args=given) if name in methods:
+                    parts = [of, *given]
+                case ast.Compare(left=left, comparators=others) if any(
+                    isinstance(each, ast.Constant) and isinstance(each.value, str) for each in (left, *others)
+                ):
+                    parts = [left, *others]
+                case _:
+                    continue
+            if any(_is_reason(part) for part in parts):
+                found.append((path.name, node.lineno))
+    assert found == []
+
+
+def _is_reason(node):
+    """Tell whether an expression is a reason, or its sentence, by its name."""
+    match node:
+        case ast.Name(id=name) | ast.Attribute(attr=name) | ast.Subscript(slice=ast.Constant(value=name)):
+            return name in ("reason", "why", "objection", "problem", "note", "texts", "warnings")
+        case ast.Call(func=ast.Name(id="str"), args=[inner]):
+            return _is_reason(inner)
+    return False

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_matrix, identity
 
-from edgevpr.mapmaking.graph import Ties, solve_graph
+from edgevpr.mapmaking.graph import Ties, _invert_diagonal, solve_graph
 
 FOOTPRINT_M = 60.0
 SPACING_M = 15.0
@@ -83,3 +84,15 @@ def test_solve_graph_gives_covariances_that_are_those_of_the_errors():
         one_axis = np.concatenate([np.real(each).ravel(), np.imag(each).ravel()])
         assert np.mean(abs(one_axis) < 1) == pytest.approx(0.68, abs=0.08)
         assert np.mean(abs(one_axis) < 2) == pytest.approx(0.95, abs=0.03)
+
+
+def test_variances_are_those_of_the_whole_inverse_also_where_entries_cancel():
+    rng = np.random.default_rng(1)
+    for _ in range(400):  # with so few different values, entries of the factor are zero by chance in one of 400
+        places, ties = int(rng.integers(5, 60)), int(rng.integers(60, 200))
+        values, columns = rng.choice([-1, 0, 0, 1, 1j, -1], (2, ties)), rng.integers(0, places, (2, ties))
+        rows = np.tile(np.arange(ties), (2, 1))
+        jacobian = coo_matrix((values.ravel().astype(complex), (rows.ravel(), columns.ravel())), (ties, places)).tocsc()
+        normal = (jacobian.conj().T @ jacobian + identity(places)).tocsc()
+        expected = np.linalg.inv(normal.toarray()).diagonal().real
+        np.testing.assert_allclose(_invert_diagonal(normal), expected, rtol=1e-4)

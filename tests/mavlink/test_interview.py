@@ -80,6 +80,14 @@ def test_questions_are_ten_at_most_and_come_after_growing_pauses_while_nothing_i
     assert set(pauses[8:]) == {30}
 
 
+def test_answers_after_eight_seconds_of_silence_choose_the_channel():
+    autopilot = Asked(COPTER)
+    autopilot.link["is_lost"] = lambda message: autopilot.clock.now_s - autopilot.begin_s < 8
+    autopilot.answer_for(8)
+    assert autopilot.conversation.channel is Channel.NONE
+    assert autopilot.answer_for(30, Channel.GPS_INPUT) < 10
+
+
 @pytest.mark.parametrize("firmware", ["old", "without vision"])
 def test_parameters_that_it_does_not_have_are_absent_after_some_rounds(firmware):
     parameters = {name: value for name, value in COPTER.items() if not name.startswith("VISO")}

@@ -52,6 +52,14 @@ def test_cohog_finds_a_query_from_another_height_with_its_height_rotation_and_sh
     assert match.shift_cells == pytest.approx((24 / 12, 0), abs=0.4)
 
 
+@pytest.mark.parametrize("height_ratio", [0.5, 1.0, 2.0])
+def test_no_height_lets_other_ground_be_accepted(town, height_ratio):
+    technique, places, _ = town
+    query = technique.encode(seen(11, height_ratio))
+    for place in places[:2]:
+        assert technique.match(query, place.fine).score < technique.min_score
+
+
 def test_one_height_is_looked_from_and_the_others_left_out(town):
     technique, _, rows = town
     query = technique.encode(seen(2, 0.7))

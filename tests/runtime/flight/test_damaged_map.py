@@ -1,9 +1,11 @@
-"""A map that is damaged in flight: one place of it or all, and the flight goes on.
+"""A map that is damaged in flight: every BLOB and every column of it, one after another, and the flight goes on.
 
 What is damaged may be compared or not; what must not be is an end of the flight, and a position that the map does not
 have.
 """
 
+import contextlib
+import sqlite3
 from functools import partial
 
 import pytest
@@ -14,6 +16,9 @@ from pictures import textured
 
 from edgevpr.mavlink.messages import Health
 from edgevpr.runtime.flight.watching import MAX_FAILURES_IN_A_ROW
+
+DAMAGE = (None, b"", b"\xff", b"\x00" * 7, "text", 10**18, -1.5, float("inf"), b"\xa5" * 40_000)
+COLUMNS = ("geom", "time", "alt_m", "heading_deg", "source_image", "quality", "coarse", "fine")
 
 
 def mapped(line):
@@ -46,6 +51,31 @@ def test_a_damaged_fine_part_of_any_place_costs_one_query_and_then_only_where_it
     ]
     assert flight.link.texts() == [(4, "edgevpr: map damaged, 1 place left out")]
     assert flight.end["left_out"] == queries[-1]["totals"]["left_out"] == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("column", COLUMNS)
+def test_whatever_stands_in_a_column_the_flight_goes_on_and_sends_nothing_that_is_not_in_the_map(
+    place_map, tmp_path, column
+):
+    """Each kind of damage at every place at once, so that candidates and the best place have it."""
+
+    def damage(value):
+        """Write as another program that minds no rule of the map; the schema refuses some of it, which is as well."""
+        with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(place_map)) as db, db:
+            for kind in ("geom", "time"):
+                db.create_function(f"ST_{kind}", 1, lambda each: each)
+            db.execute("PRAGMA ignore_check_constraints = ON")
+            db.execute(f"UPDATE places SET {column} = ?", (value,))
+
+    queries, _, flight = fly_acts(place_map, tmp_path / "log", [partial(damage, value) for value in DAMAGE])
+    assert len(queries) == len(DAMAGE)
+    assert flight.end["queries"] == len(DAMAGE)
+    sent = flight.link.stats().fixes_sent
+    assert sent == sum(line["accepted"] and bool(line["fix"]["sent"]) for line in queries)
+    for line in queries:
+        if line["fix"] and line["fix"]["sent"]:
+            assert mapped(line)
 
 
 def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(

@@ -1,7 +1,9 @@
 """`edgevpr doctor`: the rules, on what might be read of a flight controller; and the command over a real link."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -18,6 +20,7 @@ from edgevpr.mavlink.signing import UNSIGNED, WRONG
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.service.doctor import check_autopilot, explain_silence
 from edgevpr.runtime.service.findingcodes import FindingCode
+from edgevpr.runtime.service.rules import RULES
 
 UDP = parse_link("udpin:127.0.0.1:14550")
 SERIAL = parse_link("serial:/dev/ttyAMA0:57600")
@@ -102,9 +105,7 @@ def test_check_autopilot_wants_a_second_receiver_where_nothing_carries_the_posit
 
 def test_check_autopilot_names_parameters_as_the_firmware_does():
     assert wrong(BARE) == {"channel": ("GPS2_TYPE=14",)}
-    manual = with_parameters(BARE, GPS_AUTO_SWITCH=0)
-    assert wrong(manual) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
-    assert wrong(manual, plan=DRY) == wrong(replace(manual, vehicle="rover"), plan=DRY) == {}
+    assert wrong(with_parameters(BARE, GPS_AUTO_SWITCH=0)) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
     older = replace(COPTER, parameters={"GPS_TYPE": 1, "GPS_TYPE2": 0, "GPS_AUTO_SWITCH": 1})
     assert wrong(older) == {"channel": ("GPS_TYPE2=14",)}
     assert wrong(replace(older, parameters=older.parameters | {"GPS_TYPE": 14})) == {}
@@ -166,6 +167,13 @@ def test_check_autopilot_finds_only_the_link_where_nothing_answers():
     assert set(wrong(MUTE)) == set(wrong(SIGNED)) == {"link"}
     assert set(wrong(replace(MUTE, signs=True))) == {"link", "signing"}
     assert wrong(replace(COPTER, signs=True)) == {}
+
+
+@pytest.mark.parametrize("vehicle", ["copter", "rover"])
+def test_check_autopilot_wants_no_second_receiver_for_a_dry_run(vehicle):
+    bare = replace(COPTER, vehicle=vehicle, parameters=PLAIN | {"GPS_AUTO_SWITCH": 0})
+    assert wrong(bare) == {"channel": ("GPS2_TYPE=14", "GPS_AUTO_SWITCH=1")}
+    assert wrong(bare, plan=DRY) == {}
 
 
 @pytest.mark.parametrize(
@@ -232,6 +240,23 @@ def test_explain_silence_names_the_cause(link, bad_bytes, others, refused, code,
     finding = explain_silence(link, SimpleNamespace(signing=signing, reader=reader, others=set(others)))
     assert (finding.ok, finding.reason.code) == (False, code)
     assert finding.reason.parameters.items() >= {"address": str(link), **cause}.items()
+
+
+def test_how_to_pages_name_the_changes_that_doctor_wants():
+    docs = Path(__file__).parents[3] / "docs/how-to"
+    copter, px4_page = (docs / "ardupilot-copter.md").read_text(), (docs / "px4.md").read_text()
+    bare = with_parameters(replace(COPTER, parameters=PLAIN), GPS_AUTO_SWITCH=0)
+    for parameter, value in (change.split("=") for change in wrong(bare)["channel"]):
+        assert re.search(rf"`{parameter}`.*\| {value} \|", copter)
+    for change in (*wrong(VISUAL)["EK3_SRCn_POSXY"], "VISO_TYPE=1"):
+        assert f"`{change}`" in copter
+    assert "EK3_SRC2_VELXY=6" not in copter
+    unset = with_parameters(PX4, EKF2_AGP0_CTRL=0, EKF2_AGP0_ID=0, EKF2_AGP0_DELAY=300.0)
+    changes = [
+        change for each in (unset, replace(PX4, parameters={})) for found in wrong(each).values() for change in found
+    ]
+    for parameter, value in (change.split("=") for change in (*changes, *RULES["px4"].port_changes(921_600))):
+        assert re.search(rf"`{parameter}` \| {value}[ |]", px4_page)
 
 
 @pytest.fixture

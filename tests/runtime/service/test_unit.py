@@ -85,6 +85,18 @@ def test_render_unit_escapes_the_name_of_the_board():
     assert directives(unit)["ExecStartPre"] == directives(UNIT.read_text())["ExecStartPre"]
 
 
+def test_unit_finds_what_the_commands_of_the_page_install():
+    said, page = directives(UNIT.read_text()), (DEPLOY / "README.md").read_text()
+    commands = "".join(re.findall(r"(?ms)^```sh$(.*?)^```$", page))
+    program, config = said["ExecStart"].split()[0], said["ExecStart"].split()[-1]
+    assert f"venv {program.removesuffix('/bin/edgevpr')}\n" in commands
+    assert f" {config}\n" in commands
+    assert f"--groups {said['SupplementaryGroups'].replace(' ', ',')} " in commands
+    user = said["User"]
+    assert re.search(f"useradd .* {user}\n", commands)
+    assert f"install -d -o {user} -g {user} {said['ReadWritePaths'].replace('-/', '/')}\n" in commands
+
+
 def test_unit_keeps_trying_in_flight_but_not_after_a_usage_error():
     unit = directives(UNIT.read_text())
     assert unit["Restart"] == "always"
