@@ -42,7 +42,7 @@ class Orthophoto:
         """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads, or a folder of map tiles. Raises SourceError."""
         path, self._links = Path(source), TemporaryDirectory(prefix="edgevpr-tiles-")
         if not path.exists():
-            raise SourceError(f"{source} does not exist: give the path of an orthophoto.")
+            raise SourceError(f"{source} does not exist: give an orthophoto (GDAL makes one of a server's tiles).")
         raster = describe_folder(path, Path(self._links.name)) if path.is_dir() else path
         self.name, self.short_name = str(path), path.name
         self._raster = GeoRaster(raster, self.name)
