@@ -146,7 +146,7 @@ def _asked(recogniser: Recogniser) -> int:
         event = recogniser.step(_frame(number))
         here = event.position  # set for an accepted match only; a fix carries no altitude
         wrong += here is not None and (here.lat_deg, here.lon_deg) != _where(number)
-        if event.reason.code is ReasonCode.UNFORESEEN:
+        if event.reason.code is ReasonCode.UNEXPECTED_ERROR:
             raise AssertionError(str(event.reason))
     return wrong
 

@@ -124,7 +124,7 @@ class MatchConfig:
     )
     min_score: float | None = key(None, "--min-score S", "minimum score of an accepted match", within=(0, 1))
     min_margin: float | None = key(
-        None, "--min-margin M", "minimum lead of an accepted match over the best place elsewhere", within=(0, 1)
+        None, "--min-margin M", "minimum margin of an accepted match over the best place elsewhere", within=(0, 1)
     )
     verify: bool = True
     neighbour_m: float = bounded_key(0, 10_000, default=50.0)

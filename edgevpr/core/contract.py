@@ -176,7 +176,7 @@ class Technique(Protocol):
     spec: TechniqueSpec
     candidates: int  # default number of places compared after the scan
     min_score: float  # default minimum score of an accepted match
-    min_margin: float  # default minimum lead of an accepted match over the best place elsewhere
+    min_margin: float  # default minimum margin of an accepted match over the best place elsewhere
     min_quality: float  # minimum `Descriptor.quality` of a query that can be recognised
 
     def encode(self, image: np.ndarray, mask: np.ndarray | None = None) -> Descriptor:

@@ -13,8 +13,8 @@ from edgevpr.core.text import format_probability
 
 Parameters = Mapping[str, float | str | None]
 _FIGURES = (
-    "track filter {track:probability}; ",
-    "confidence {confidence:probability}, {needed:probability} needed: ",
+    "track filter {track_confidence:probability}; ",
+    "confidence {confidence:probability}, {min_confidence:probability} needed: ",
     "{regions_ratio:.1f} times as many regions agree as for the runner-up ({regions_share:.0%})",
     ", {landmarks:.0f} landmarks agree",
     ", against {rival_landmarks:.0f} for a place elsewhere",
@@ -41,54 +41,54 @@ class ReasonCode(Code):
 
     # Match accepted
     ACCEPTED_BY_CONFIDENCE = "accepted", *_FIGURES
-    ACCEPTED_BY_SCORE = "accepted", "score {score:.3f}, {lead:.3f} ahead of the best place elsewhere"
+    ACCEPTED_BY_SCORE = "accepted", "score {score:.3f}, {margin:.3f} ahead of the best place elsewhere"
     ACCEPTED_WITHOUT_RIVAL = "accepted", "score {score:.3f}; there is no place elsewhere to compare with"
 
     # Image not searched
     NOT_SEARCHED = "not searched"
-    PICTURES_STAY = "camera frozen: images do not change"
-    PICTURES_REPEAT = "camera frozen: images repeat"
+    IMAGES_UNCHANGED = "camera frozen: images do not change"
+    IMAGES_REPEATED = "camera frozen: images repeat"
     AGE_UNKNOWN = "age of images unknown", "{summary}: they do not fit the aircraft's motion, so none is used"
-    LOW_TEXTURE = "too little texture in the image", "{summary}: {usable:.0%} usable, {needed:.0%} needed"
+    LOW_TEXTURE = "too little texture in the image", "{summary}: {usable_share:.0%} usable, {min_share:.0%} needed"
     TILTED = "the image is not levelled", "{summary}: it is tilted {tilt_deg:.0f} degrees"
     TILTED_WITHOUT_HEADING = "the image is not levelled", "{summary}: tilted {tilt_deg:.0f} degrees, heading unknown"
     TILTED_OFF_GROUND = (
         "the image is not levelled",
-        "{summary}: tilted {tilt_deg:.0f} degrees, it shows {shown:.0%} of the ground below the camera",
+        "{summary}: tilted {tilt_deg:.0f} degrees, it shows {visible_share:.0%} of the ground below the camera",
     )
-    NOT_MEMORABLE = "not memorable", "{summary}: {measure} {score:.2f}, {needed:.2f} needed"
+    NOT_MEMORABLE = "not memorable", "{summary}: {measure} {score:.2f}, {min_score:.2f} needed"
     UNUSABLE = "unusable", "{problem}"
     MAP_UNREADABLE = "the map cannot be read", "{problem}"
     PLACE_UNREADABLE = "a place cannot be read", "{problem}"
-    UNFORESEEN = "unexpected error", "unexpected {error} ({problem}): report it with the output of --debug"
+    UNEXPECTED_ERROR = "unexpected error", "unexpected {error} ({problem}): report it with the output of --debug"
 
     # Match refused
-    LOW_SCORE = "not similar enough to any place", "{summary}: score {score:.3f}, {needed:.3f} needed"
-    LOW_LEAD = "lead over the best place elsewhere too small", "{summary}: {lead:.3f}, {needed:.3f} needed"
+    LOW_SCORE = "not similar enough to any place", "{summary}: score {score:.3f}, {min_score:.3f} needed"
+    LOW_MARGIN = "margin over the best place elsewhere too small", "{summary}: {margin:.3f}, {min_margin:.3f} needed"
     NO_RIVAL = "no place elsewhere to compare with", "{summary}: the score alone is not enough"
     PLACE_UNREAD = "an unreadable place may be the correct one"
     NOT_CALIBRATED = "map is not calibrated", "{summary}: no confidence available"
     LOW_CONFIDENCE = "confidence too low", "{summary}: ", *_FIGURES
     ELSEWHERE_AGREES_BETTER = "a place elsewhere matches better", "{summary}: ", *_FIGURES
     TRACK_CONTRADICTS = "the track filter contradicts the match", "{summary}: ", *_FIGURES
-    TURNED_AGREES = "the same place matches nearly as well at another rotation", "{summary}: ", *_FIGURES
+    ROTATION_AMBIGUOUS = "the same place matches nearly as well at another rotation", "{summary}: ", *_FIGURES
     ELSEWHERE_AT_REST = (
         "places elsewhere match without any shift too",
         "{summary}, as an overlay in the image would make them: mask the overlay (`source.mask`)",
     )
     LANDMARKS_DISAGREE = "landmarks and regions disagree on the offset", "{summary}: {landmarks:.0f} support another"
-    FEW_LANDMARKS = "too few landmarks agree", "{summary}: {landmarks:.0f}, {needed:.0f} needed at this score"
+    FEW_LANDMARKS = "too few landmarks agree", "{summary}: {landmarks:.0f}, {min_landmarks:.0f} needed at this score"
     TILT_SHOWN = (
         "the image looks tilted, but its tilt is unknown",
         "{summary}: about {tilt_deg:.0f} degrees; set `source.mount_ahead_deg`, or record roll and pitch",
     )
     POSITIONS_DISAGREE = "places that show the same ground disagree on the position", "{summary} by {apart_m:.0f} m"
-    SEQUENCE_INCOMPLETE = "the sequence is not complete yet", "{summary}: {queries:.0f} queries of {needed:.0f}"
+    SEQUENCE_INCOMPLETE = "the sequence is not complete yet", "{summary}: {queries:.0f} queries of {min_queries:.0f}"
     NEWEST_DISAGREES = "the newest query resembles other places more"
-    NEWEST_LEFT = "the newest queries show different ground from the earlier ones"
-    LOW_LEAD_SPEED = (
-        "lead over the best match at another assumed speed too small",
-        "{summary}: {lead:.3f}, {needed:.3f} needed",
+    NEWEST_ELSEWHERE = "the newest queries show different ground from the earlier ones"
+    LOW_MARGIN_AT_OTHER_SPEED = (
+        "margin over the best match at another assumed speed too small",
+        "{summary}: {margin:.3f}, {min_margin:.3f} needed",
     )
 
     # Fix not sent
@@ -106,17 +106,17 @@ class ReasonCode(Code):
         "not needed: the autopilot's position is as good",
         "not needed: the autopilot is {off_m:.1f} m from our position, which is accurate to {accuracy_m:.1f} m",
     )
-    HELD_TURNED = "held back: contradicts compass", "held back: rotated {turn_deg:.0f} degrees from the compass heading"
-    HELD_OFF_GPS = "held back: far from GPS", "held back: {off_m:.0f} m from the position by GPS and earlier fixes"
+    HELD_ROTATED = "held back: contradicts compass", "held back: rotated {rotation_deg:.0f} degrees from the compass"
+    HELD_OFF_GPS = "held back: far from GPS", "held back: {distance_m:.0f} m from the position by GPS and earlier fixes"
     HELD_OFF_PATH = (
         "held back: far from the predicted position",
-        "held back: {off_m:.0f} m from the predicted position, accurate to {accuracy_m:.0f} m: another fix must agree",
+        "held back: {distance_m:.0f} m from the prediction, accurate to {accuracy_m:.0f} m: another fix must agree",
     )
     PAUSED = "not sent: paused by the ground station"
     PARAMETER_DANGEROUS = "not sent: a parameter is dangerous", "not sent: set {changes}. {why}"
     PARAMETERS_UNANSWERED = "not sent: parameters not reported", "not sent: the autopilot has not reported {names}"
     FIXES_UNANSWERED = "not sent: the autopilot has not answered five fixes in a row"
-    ANSWERS_BEGIN_AGAIN = "not sent: the autopilot has only just resumed answering"
+    ANSWERS_RESUMED = "not sent: the autopilot has only just resumed answering"
     FRAME_TOO_OLD = "its frame is too old", "its frame is {age_s:.1f} s old, and the limit is {limit_s:g} s"
     SUPERSEDED = "replaced by a newer fix"
     NO_AUTOPILOT = "no autopilot to receive it", "{summary} within {limit_s:g} s"
@@ -132,15 +132,15 @@ class ReasonCode(Code):
     AUTOPILOT_RESTARTED = "the autopilot has restarted"
 
     # The autopilot's answer to fixes, or its silence: "it" is the autopilot, and a summary has at most 26 bytes
-    TAKEN = "accepted", "it accepts them"
+    FIX_ACCEPTED = "accepted", "it accepts them"
     GPS_IN_USE = "GPS in use", "one of its GPS receivers has a fix, and with GPS it accepts no other position"
     NOT_STARTED = "filter not started", "its position filter has not started: on a plane it starts only with GPS"
     NO_ORIGIN = "no origin", "it has no origin, so it accepts no position: it needs GPS once, or an origin sent to it"
     NOT_ARMED = "not armed", "it is not armed: on the ground it has no dead-reckoned position to correct"
-    NOT_RECKONING = "no source of position", "it estimates no position: it has no GPS, airspeed, optical flow or vision"
+    NO_ESTIMATE = "no source of position", "it estimates no position: it has no GPS, airspeed, optical flow or vision"
     OTHER_AID = "not dead reckoning", "it accepts a fix only while it dead-reckons without any other aiding"
     NOT_PLAUSIBLE = "fix not plausible", "it is dead-reckoning, but the fix is not plausible or it has no origin"
-    NOT_SAID = "see its log", "it gives no reason: perhaps it just regained GPS, or has no origin or position source"
+    NO_CAUSE = "see its log", "it gives no reason: perhaps it just regained GPS, or has no origin or position source"
     OTHER_ANSWER = "see its log", "it answers {result}"
     WRONG_FORM = "wrong format", "it rejects their format"
     NO_COMMAND = (
@@ -159,29 +159,29 @@ class ReasonCode(Code):
     )
 
     # Notes of a flight. The ground station gets the summary if the sentence is too long for a STATUSTEXT.
-    FAILING = "frames keep failing", "{count:.0f} frames in a row have failed"
-    NOT_FAILING = "frames are being processed again"
-    NOTHING_SHOWN = "camera image is blank"
-    GROUND_SHOWN = "camera sees the ground again"
+    FRAMES_FAILING = "frames keep failing", "{frames:.0f} frames in a row have failed"
+    FRAMES_RECOVERED = "frames are being processed again"
+    IMAGE_BLANK = "camera image is blank"
+    GROUND_VISIBLE = "camera sees the ground again"
     MAP_LEFT = "aircraft has left the map"
     MAP_FOUND = "aircraft is back on the map"
     TILT_TOO_LARGE = "tilt too large"
     TILT_FINE = "tilt is acceptable again"
     MAP_LOST = "map cannot be read, see the log"
     MAP_BACK = "map can be read again"
-    PICTURES_MOVE = "camera works again: images change"
+    IMAGES_CHANGE_AGAIN = "camera works again: images change"
     AGE_KNOWN = "age of images known again"
     DELAY_FOUND = "images are late: corrected", "images are {delay_s:.1f} s older than their timestamps: corrected"
     DELAY_GONE = "images are as old as their timestamps say"
-    PICTURES_TURNED = (
+    IMAGES_ROTATED = (
         "images are rotated",
-        "images are rotated {turn_deg:.0f} degrees from the heading: if the compass is right, ",
+        "images are rotated {rotation_deg:.0f} degrees from the heading: if the compass is right, ",
         "set source.up_deg: {up_deg:.0f}",
     )
-    PICTURES_MIRRORED = "images are mirrored", "{summary}, so none can match: switch off mirror or flip in the camera"
-    HEIGHT_DIFFERS = "height differs", "height: autopilot {by_autopilot_m:.0f} m, pictures {by_pictures_m:.0f} m"
-    HEIGHT_AGREES = "height agrees with pictures again"
-    GPS_DIFFERS = "GPS is far from the map", "GPS is {off_m:.0f} m from the map's position"
+    IMAGES_MIRRORED = "images are mirrored", "{summary}, so none can match: switch off mirror or flip in the camera"
+    HEIGHT_DIFFERS = "height differs", "height: autopilot {autopilot_height_m:.0f} m, images {image_height_m:.0f} m"
+    HEIGHT_AGREES = "height agrees with images again"
+    GPS_DIFFERS = "GPS is far from the map", "GPS is {distance_m:.0f} m from the map's position"
     GPS_AGREES = "GPS agrees with the map again"
     SURVEY_WITHDRAWN = "map offset unknown again", "{summary}: GPS contradicts the reported one"
     PAUSED_BY_COMMAND = "paused by command"
@@ -212,11 +212,11 @@ class ReasonCode(Code):
 
     # Change by the governor
     BOARD_HOT = "the board is too hot", "{temperature_c:.0f} °C, and the limit is {limit_c:.0f} °C"
-    BOARD_SLOW = "the board throttles itself"
-    CORES_TAKEN = "too much CPU used", "{taken:.0%} of all cores used, {allowed:.0%} allowed"
+    BOARD_THROTTLED = "the board throttles itself"
+    CPU_OVER_LIMIT = "too much CPU used", "{cpu_share:.0%} of all cores used, {max_share:.0%} allowed"
     QUERIES_LATE = "queries are late: other programs or the disk delay them"
-    MEMORY_TAKEN = "too much memory used", "{taken_mb:.0f} MB of memory used, {allowed_mb:.0f} MB allowed"
-    ROOM_AGAIN = "resources are free again"
+    MEMORY_OVER_LIMIT = "too much memory used", "{used_mb:.0f} MB of memory used, {max_mb:.0f} MB allowed"
+    RESOURCES_FREE = "resources are free again"
 
 
 @dataclass(frozen=True, slots=True)

@@ -177,7 +177,7 @@ def level_image(
 
     width, height = (min(1.0, zoom * px / camera.longest_px) for px in camera.size_px)
     if (filled := warp.shown.mean() / (height * width)) < _MIN_FILLED_SHARE:
-        reason = Reason(ReasonCode.TILTED_OFF_GROUND, {"shown": float(filled), "tilt_deg": camera.tilt_deg})
+        reason = Reason(ReasonCode.TILTED_OFF_GROUND, {"visible_share": float(filled), "tilt_deg": camera.tilt_deg})
         view = View(up_deg=camera.top_deg, reason=reason)
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     view = View(

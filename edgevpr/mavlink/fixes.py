@@ -130,7 +130,7 @@ class Fixes:
         if self._unanswered_row >= MAX_UNANSWERED and now_s - self._sent_s < RETRY_INTERVAL_S:
             return Reason(ReasonCode.FIXES_UNANSWERED)
         if now_s < self._resumes_s:
-            return Reason(ReasonCode.ANSWERS_BEGIN_AGAIN)
+            return Reason(ReasonCode.ANSWERS_RESUMED)
         return None
 
     def record_sent(self, transmission: FixTransmission, now_s: float) -> None:

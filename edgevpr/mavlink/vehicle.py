@@ -120,9 +120,9 @@ class Readiness(NamedTuple):
 
     def explain(self, result: str) -> Reason:
         """Return the likely reason for an answer to a fix; `result` is the name of a MAV_RESULT."""
-        rejected = ReasonCode.OTHER_AID if self.is_px4 else ReasonCode.NOT_SAID
+        rejected = ReasonCode.OTHER_AID if self.is_px4 else ReasonCode.NO_CAUSE
         codes = {
-            "ACCEPTED": ReasonCode.TAKEN,
+            "ACCEPTED": ReasonCode.FIX_ACCEPTED,
             "DENIED": ReasonCode.WRONG_FORM,
             "FAILED": self._explain_failure(),
             "TEMPORARILY_REJECTED": ReasonCode.GPS_IN_USE if self.has_gps else rejected,
@@ -140,6 +140,6 @@ class Readiness(NamedTuple):
             ReasonCode.NOT_STARTED: self.flags & mavlink.EKF_UNINITIALIZED,
             ReasonCode.GPS_IN_USE: self.has_gps,
             ReasonCode.NOT_ARMED: self.is_armed is False,
-            ReasonCode.NOT_RECKONING: self.flags & mavlink.EKF_CONST_POS_MODE,
+            ReasonCode.NO_ESTIMATE: self.flags & mavlink.EKF_CONST_POS_MODE,
         }
-        return next((code for code, applies in causes.items() if applies), ReasonCode.NOT_SAID)
+        return next((code for code, applies in causes.items() if applies), ReasonCode.NO_CAUSE)

@@ -24,22 +24,22 @@ def parse_package():
 @pytest.mark.parametrize(
     ("code", "parameters", "sentence"),
     [
-        ("LOW_SCORE", {"score": 0.05, "needed": 0.1}, "not similar enough to any place: score 0.050, 0.100 needed"),
+        ("LOW_SCORE", {"score": 0.05, "min_score": 0.1}, "not similar enough to any place: score 0.050, 0.100 needed"),
         ("UNUSABLE", {"problem": "1.png is truncated."}, "1.png is truncated."),
         (
             "LOW_CONFIDENCE",
             {
                 "confidence": 0.5,
-                "needed": 0.9995,
+                "min_confidence": 0.9995,
                 "regions_ratio": 2.0,
                 "regions_share": 0.25,
                 "landmarks": 7,
-                "track": None,
+                "track_confidence": None,
             },
             "confidence too low: confidence 50.0 %, 1 in 2,000 wrong needed: 2.0 times as many regions agree as for "
             "the runner-up (25%), 7 landmarks agree",
         ),
-        ("LOW_SCORE", {"score": "damaged", "needed": 0.1}, "not similar enough to any place"),
+        ("LOW_SCORE", {"score": "damaged", "min_score": 0.1}, "not similar enough to any place"),
         ("FILTER_READY", {"flags": 0x33F}, "has attitude and position (flags 0x33f)"),
         ("LOG_NOT_A_FILE", {"path": "/"}, "/ is not a file in an existing folder: correct `log: {path: ...}`"),
         (
@@ -60,11 +60,11 @@ def test_codes_are_all_different():
 
 
 def test_read_reason_gives_what_was_written_and_nothing_else():
-    reason = Reason(ReasonCode.NOT_MEMORABLE, {"measure": "entropy", "score": 0.25, "needed": None})
+    reason = Reason(ReasonCode.NOT_MEMORABLE, {"measure": "entropy", "score": 0.25, "min_score": None})
     assert read_reason(reason.fields()) == Reason(reason.code, {"measure": "entropy", "score": 0.25})
     for damaged in (None, "not memorable", 7, {"code": "GONE", "parameters": {}}, {"code": "LOW_SCORE"}):
         assert read_reason(damaged) is None
-    nested = {"code": "LOW_SCORE", "parameters": {"score": [1], "needed": True}}
+    nested = {"code": "LOW_SCORE", "parameters": {"score": [1], "min_score": True}}
     assert read_reason(nested) == Reason(ReasonCode.LOW_SCORE, {})
 
 

@@ -125,7 +125,7 @@ def test_late_answers_to_the_fixes_of_before_do_not_pass_for_one_to_a_new_fix(au
     autopilot.wait(0.1)
     autopilot.answer(ACCEPTED)
     (held,) = fly(autopilot, 1, every_s=0.4)
-    assert (held.sent, held.why.code) == (False, ReasonCode.ANSWERS_BEGIN_AGAIN)
+    assert (held.sent, held.why.code) == (False, ReasonCode.ANSWERS_RESUMED)
     for _ in range(4):
         autopilot.answer(DENIED)
     (new,) = fly(autopilot, 1, every_s=0.6)
@@ -148,7 +148,7 @@ def test_a_refused_fix_says_why_by_what_the_autopilot_has_said(autopilot):
     assert refused() == FixAnswer("FAILED", GPS_IN_USE, pytest.approx(0.03))
     autopilot.wait(2)
     autopilot.gps(fix_type=1)
-    assert refused().why.code is ReasonCode.NOT_SAID
+    assert refused().why.code is ReasonCode.NO_CAUSE
     (request,) = autopilot.questions()
     assert (request.command, request.param1) == (512, 49), "it is asked for its origin"
     codes = [refused(after_s=3.0).why.code] + [refused().why.code for _ in range(20)]
@@ -156,10 +156,10 @@ def test_a_refused_fix_says_why_by_what_the_autopilot_has_said(autopilot):
     assert len(autopilot.questions()) == 2
     autopilot.say(mavlink.MAVLink_gps_global_origin_message(1, 1, 1))
     autopilot.filter(mavlink.EKF_CONST_POS_MODE)
-    assert refused().why.code is ReasonCode.NOT_RECKONING
+    assert refused().why.code is ReasonCode.NO_ESTIMATE
     assert refused(ACCEPTED).why is None
     assert autopilot.conversation.autopilot.acks == {"FAILED": 24, "ACCEPTED": 1}
-    assert autopilot.conversation.fixes.refusal.code is ReasonCode.NOT_RECKONING
+    assert autopilot.conversation.fixes.refusal.code is ReasonCode.NO_ESTIMATE
 
 
 def test_the_ground_station_hears_each_reason_once_and_that_fixes_are_taken_again(autopilot, caplog):
@@ -205,22 +205,22 @@ REJECTED = "TEMPORARILY_REJECTED"
 @pytest.mark.parametrize(
     ("result", "state", "code"),
     [
-        ("FAILED", {}, ReasonCode.NOT_SAID),
+        ("FAILED", {}, ReasonCode.NO_CAUSE),
         ("FAILED", {"has_gps": True, "is_armed": False}, ReasonCode.GPS_IN_USE),
         ("FAILED", {"lacks_origin": True, "is_armed": False}, ReasonCode.NO_ORIGIN),
         ("FAILED", {"is_armed": False, **CONST}, ReasonCode.NOT_ARMED),
-        ("FAILED", {"is_armed": True, **CONST}, ReasonCode.NOT_RECKONING),
+        ("FAILED", {"is_armed": True, **CONST}, ReasonCode.NO_ESTIMATE),
         ("FAILED", {"has_gps": True, **UNINITIALIZED}, ReasonCode.NOT_STARTED),
         ("FAILED", {"lacks_origin": True, **UNINITIALIZED}, ReasonCode.NO_ORIGIN),
         ("FAILED", {"lacks_origin": True, "has_gps": True}, ReasonCode.GPS_IN_USE),
         ("FAILED", {"is_px4": True, **UNINITIALIZED}, ReasonCode.NOT_PLAUSIBLE),
         ("FAILED", {"is_px4": True, "lacks_origin": True}, ReasonCode.NO_ORIGIN),
-        ("ACCEPTED", {}, ReasonCode.TAKEN),
+        ("ACCEPTED", {}, ReasonCode.FIX_ACCEPTED),
         ("DENIED", {"has_gps": True}, ReasonCode.WRONG_FORM),
         ("UNSUPPORTED", {}, ReasonCode.NO_COMMAND),
         (REJECTED, {"is_px4": True, "has_gps": True}, ReasonCode.GPS_IN_USE),
         (REJECTED, {"is_px4": True}, ReasonCode.OTHER_AID),
-        (REJECTED, {}, ReasonCode.NOT_SAID),
+        (REJECTED, {}, ReasonCode.NO_CAUSE),
         ("99", {}, ReasonCode.OTHER_ANSWER),
     ],
 )
@@ -230,6 +230,6 @@ def test_explain_returns_the_first_reason_that_applies(result, state, code):
 
 def test_every_answer_of_an_autopilot_fits_a_status_text():
     codes = list(ReasonCode)
-    answers = codes[codes.index(ReasonCode.TAKEN) : codes.index(ReasonCode.FIXES_NOT_ANSWERED) + 1]
+    answers = codes[codes.index(ReasonCode.FIX_ACCEPTED) : codes.index(ReasonCode.FIXES_NOT_ANSWERED) + 1]
     assert len(answers) > 10
     assert all(len(f"edgevpr: fixes unanswered: {code.summary}".encode()) <= MAX_TEXT_BYTES for code in answers)

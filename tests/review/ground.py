@@ -17,8 +17,8 @@ ROWS = 3
 COLUMNS = 4
 STEP_M = 20.0
 
-LOW_REASON = {"code": "LOW_SCORE", "parameters": {"score": 0.004, "needed": 0.01}}
-UNSURE = {"code": "LOW_CONFIDENCE", "parameters": {"confidence": 0.99, "needed": 0.999, "landmarks": 30}}
+LOW_REASON = {"code": "LOW_SCORE", "parameters": {"score": 0.004, "min_score": 0.01}}
+UNSURE = {"code": "LOW_CONFIDENCE", "parameters": {"confidence": 0.99, "min_confidence": 0.999, "landmarks": 30}}
 
 
 def landscape() -> np.ndarray:

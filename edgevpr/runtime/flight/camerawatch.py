@@ -46,7 +46,7 @@ class TurnWatch:
         if len(self._turns) < _TURN_MATCHES or abs(mean) < _MIN_MEAN_LENGTH or abs(turn_deg) < _MIN_TURN_DEG:
             return
         self._has_reported, up_deg = True, (self._up_deg + turn_deg) % 360
-        note = Reason(ReasonCode.PICTURES_TURNED, {"turn_deg": turn_deg, "up_deg": up_deg})
+        note = Reason(ReasonCode.IMAGES_ROTATED, {"rotation_deg": turn_deg, "up_deg": up_deg})
         ground = f"pictures turned {turn_deg:.0f} degrees"
         self._notifier.report("camera", Severity.WARNING, note, ground=ground, topic="turn")
 
@@ -77,7 +77,7 @@ class MirrorWatch:
         self._next_try = self._misses + (1 if is_mirrored else _MISSES_TO_TRY_AGAIN)
         if self._matches == _MIRRORED_TO_REPORT:
             self._tries = _MAX_TRIES
-            note = Reason(ReasonCode.PICTURES_MIRRORED)
+            note = Reason(ReasonCode.IMAGES_MIRRORED)
             self._notifier.report("camera", Severity.WARNING, note, topic="mirror")
 
     def _matches_mirrored(self, event: Recognition, axis: int) -> bool:

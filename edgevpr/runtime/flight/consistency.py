@@ -61,8 +61,7 @@ class Consistency:
     The path drifts slowly, so only another fix can show whether a distant fix or the path is wrong. Two correct fixes
     have the same offset from the path; two wrong ones hardly ever do. If the path error exceeds drift, correct fixes
     disagree too: then four fixes at different places are accepted, if an aircraft could have flown from each to the
-    next. Four are also needed where visual odometry has tracked the path, since repetitive ground can give the
-    same wrong fix twice."""
+    next. Four are also needed where visual odometry tracks the path: repetitive ground can repeat a wrong fix."""
 
     def __init__(self) -> None:
         self._agreeing: list[PredictedFix] = []  # held fixes: one, and later ones that agree with it
@@ -84,10 +83,11 @@ class Consistency:
         if sigmas <= _MAX_INNOVATION_SIGMA and heading_agrees:
             return self._accept(fix, ACCEPTED)
         error_m, predicted_sd_m = math.hypot(*innovation_m), math.sqrt(np.trace(fix.covariance_m2) / 2)
-        wrong_heading = Reason(ReasonCode.HELD_TURNED, {"turn_deg": match.heading_error_deg or 0.0})
+        wrong_heading = Reason(ReasonCode.HELD_ROTATED, {"rotation_deg": match.heading_error_deg or 0.0})
         if has_gps:
             self._agreeing, self._flyable = [], []
-            return GateResult(Reason(ReasonCode.HELD_OFF_GPS, {"off_m": error_m}) if heading_agrees else wrong_heading)
+            off_gps = Reason(ReasonCode.HELD_OFF_GPS, {"distance_m": error_m})
+            return GateResult(off_gps if heading_agrees else wrong_heading)
         self._flyable = [held for held in self._flyable if _is_flyable(held, fix)]
         if all(match.shares_no_place_with(held.match) for held in self._flyable):  # neighbours share places
             self._flyable.append(fix)
@@ -103,7 +103,7 @@ class Consistency:
                 return self._accept(fix, GateResult(overrules_path=True))
         else:
             self._agreeing = [fix]
-        return GateResult(Reason(ReasonCode.HELD_OFF_PATH, {"off_m": error_m, "accuracy_m": predicted_sd_m}))
+        return GateResult(Reason(ReasonCode.HELD_OFF_PATH, {"distance_m": error_m, "accuracy_m": predicted_sd_m}))
 
     def _accept(self, fix: PredictedFix, verdict: GateResult) -> GateResult:
         self._agreeing, self._flyable = [], []

@@ -131,7 +131,7 @@ class FrozenWatch:
         if not self.is_frozen:
             return None
         is_repeating = self._new_needed == _NEW_AFTER_REPEATS
-        return Reason(ReasonCode.PICTURES_REPEAT if is_repeating else ReasonCode.PICTURES_STAY)
+        return Reason(ReasonCode.IMAGES_REPEATED if is_repeating else ReasonCode.IMAGES_UNCHANGED)
 
     def judge(self, frame: Frame, vehicle: Vehicle | None) -> Reason | None:
         """Judge the next picture, with the autopilot's report at its time. Return why it is refused, or None."""
@@ -233,7 +233,7 @@ class FrozenWatch:
             self._report(_NEW_AFTER_REPEATS)
         elif self.is_frozen and self._new_in_a_row >= self._new_needed:
             self.is_frozen = False
-            note = Reason(ReasonCode.PICTURES_MOVE)
+            note = Reason(ReasonCode.IMAGES_CHANGE_AGAIN)
             self._notifier.report("source", Severity.INFO, note, topic="frozen", state=str(note))
 
     def _report(self, new_needed: int) -> None:

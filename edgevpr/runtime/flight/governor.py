@@ -104,7 +104,7 @@ class Governor:
             self._reported.discard("memory")
         if full_s >= _MIN_EXCEEDED_S and "memory" not in self._reported:
             return self._report_limit(
-                "memory", Reason(ReasonCode.MEMORY_TAKEN, {"taken_mb": reading.rss_mb, "allowed_mb": max_mb})
+                "memory", Reason(ReasonCode.MEMORY_OVER_LIMIT, {"used_mb": reading.rss_mb, "max_mb": max_mb})
             )
         if over is not None and over_s >= _MIN_EXCEEDED_S and not (hot and now_s - self._changed_s < _MIN_HEAT_WAIT_S):
             if hot:
@@ -115,7 +115,7 @@ class Governor:
             return None if "load" in self._reported else self._report_limit("load", over)
         if self._index > 0 and room_s >= self._wait_s:
             self._raised_s = now_s
-            return self._change(now_s, self._index - 1, Reason(ReasonCode.ROOM_AGAIN), back=True)
+            return self._change(now_s, self._index - 1, Reason(ReasonCode.RESOURCES_FREE), back=True)
         return None
 
     def _measure_held_s(self, what: str, now_s: float, holds: bool) -> float:
@@ -133,13 +133,13 @@ class Governor:
 
     def _check_load(self, reading: LoadReading) -> tuple[bool, Reason | None]:
         """Return whether the board is too hot, and the exceeded limit (None: none)."""
-        allowed, temperature_c = self._board.cpu_share, reading.temperature_c
+        max_share, temperature_c = self._board.cpu_share, reading.temperature_c
         if temperature_c is not None and temperature_c >= self._limit_c:
             return True, Reason(ReasonCode.BOARD_HOT, {"temperature_c": temperature_c, "limit_c": self._limit_c})
         if reading.throttled:
-            return True, Reason(ReasonCode.BOARD_SLOW)
-        if reading.cpu_share > allowed:
-            return False, Reason(ReasonCode.CORES_TAKEN, {"taken": reading.cpu_share, "allowed": allowed})
+            return True, Reason(ReasonCode.BOARD_THROTTLED)
+        if reading.cpu_share > max_share:
+            return False, Reason(ReasonCode.CPU_OVER_LIMIT, {"cpu_share": reading.cpu_share, "max_share": max_share})
         if reading.late_share > _MAX_LATE_SHARE:
             return False, Reason(ReasonCode.QUERIES_LATE)
         return False, None

@@ -82,7 +82,7 @@ class GpsWatch:
             severity = Severity.WARNING if self.is_wrong else Severity.INFO
             note = Reason(ReasonCode.GPS_AGREES)
             if self.is_wrong:
-                note = Reason(ReasonCode.GPS_DIFFERS, {"off_m": distance_m})
+                note = Reason(ReasonCode.GPS_DIFFERS, {"distance_m": distance_m})
             self._notifier.report("gps", severity, note, off_m=round(distance_m, 1), is_wrong=self.is_wrong)
 
     def _judge(self, match: PositionedMatch, off_m: Doubles, sd_m: float) -> None:

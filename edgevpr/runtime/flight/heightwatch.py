@@ -21,11 +21,11 @@ class HeightWatch:
     """Reports once when the heights of five matches in a row contradict the reported one, and once when five agree
     again. A match gives a height only if the lens is known. The `autopilot` (None: there is no link) gets the ratio.
 
-    `by_pictures_m`, `by_autopilot_m`: medians of the last five matches (None: they do not contradict each other)."""
+    `image_height_m`, `autopilot_height_m`: medians of the last five matches (None: they do not contradict)."""
 
     def __init__(self, notifier: Notifier, autopilot: AutopilotOutput | None = None) -> None:
-        self.by_pictures_m: float | None = None
-        self.by_autopilot_m: float | None = None
+        self.image_height_m: float | None = None
+        self.autopilot_height_m: float | None = None
         self._notifier, self._autopilot = notifier, autopilot
         self._heights_m: deque[tuple[float, float]] = deque(maxlen=MATCHES_IN_A_ROW)  # by pictures, by the autopilot
         self._last_s: float | None = None
@@ -51,7 +51,7 @@ class HeightWatch:
 
     @property
     def _ratios(self) -> list[float]:
-        return [by_pictures_m / by_autopilot_m for by_pictures_m, by_autopilot_m in self._heights_m]
+        return [image_height_m / autopilot_height_m for image_height_m, autopilot_height_m in self._heights_m]
 
     def update(self, event: Recognition) -> None:
         """Compare the height of an event's match, if it has one, with the reported height."""
@@ -71,19 +71,19 @@ class HeightWatch:
         ratios = self._ratios
         if len(ratios) < MATCHES_IN_A_ROW:
             return
-        was_contradicted = self.by_pictures_m is not None
+        was_contradicted = self.image_height_m is not None
         if all(1 / MIN_CONTRADICTION_RATIO <= ratio <= MIN_CONTRADICTION_RATIO for ratio in ratios):
-            self.by_pictures_m = self.by_autopilot_m = None
+            self.image_height_m = self.autopilot_height_m = None
         elif was_contradicted or _are_beyond(MIN_CONTRADICTION_RATIO, ratios):
-            self.by_pictures_m, self.by_autopilot_m = map(statistics.median, zip(*self._heights_m, strict=True))
-        if was_contradicted != (self.by_pictures_m is not None):
+            self.image_height_m, self.autopilot_height_m = map(statistics.median, zip(*self._heights_m, strict=True))
+        if was_contradicted != (self.image_height_m is not None):
             self._report()
 
     def _report(self) -> None:
-        if self.by_pictures_m is None or self.by_autopilot_m is None:
+        if self.image_height_m is None or self.autopilot_height_m is None:
             self._notifier.report("height", Severity.INFO, Reason(ReasonCode.HEIGHT_AGREES))
             return
-        heights_m = {"by_autopilot_m": self.by_autopilot_m, "by_pictures_m": self.by_pictures_m}
+        heights_m = {"autopilot_height_m": self.autopilot_height_m, "image_height_m": self.image_height_m}
         note = Reason(ReasonCode.HEIGHT_DIFFERS, heights_m)
         self._notifier.report("height", Severity.WARNING, note, ratio=round(self.ratio, 2))
 

@@ -58,9 +58,9 @@ class Vitals:
         self._source_fault: str | None = None
         self._start_s = self._last_explained_s = self._report_due_s
         self._has_log = True
-        failing = Reason(ReasonCode.FAILING, {"count": MAX_FAILURES_IN_A_ROW})
-        self._failing = Alert(parts.notifier, "failing", failing, ReasonCode.NOT_FAILING)
-        self._no_texture = Alert(parts.notifier, "camera", Reason(ReasonCode.NOTHING_SHOWN), ReasonCode.GROUND_SHOWN)
+        failing = Reason(ReasonCode.FRAMES_FAILING, {"frames": MAX_FAILURES_IN_A_ROW})
+        self._failing = Alert(parts.notifier, "failing", failing, ReasonCode.FRAMES_RECOVERED)
+        self._no_texture = Alert(parts.notifier, "camera", Reason(ReasonCode.IMAGE_BLANK), ReasonCode.GROUND_VISIBLE)
         self._companion = CompanionWatch(parts.notifier)
         self._has_event = False
         self._newest: dict[str, Any] | None = None

@@ -106,4 +106,4 @@ def explain_failure(error: Exception | None) -> Reason:
             return Reason(ReasonCode.MAP_UNREADABLE, {"problem": str(error)})
         case EdgevprError():
             return Reason(ReasonCode.UNUSABLE, {"problem": str(error)})
-    return Reason(ReasonCode.UNFORESEEN, {"error": type(error).__name__, "problem": str(error)})
+    return Reason(ReasonCode.UNEXPECTED_ERROR, {"error": type(error).__name__, "problem": str(error)})

@@ -103,7 +103,7 @@ class AcceptRule:
     """Conditions under which `judge` accepts a match.
 
     * `min_score`: the least score
-    * `min_margin`: the least lead over the best place elsewhere, which is more than `neighbour_m` metres away
+    * `min_margin`: the least margin over the best place elsewhere, which is more than `neighbour_m` metres away
     * `min_quality`: the least quality of the query's picture
     * `confidence_rule`: the confidence that is also required (None: score and lead alone decide)
     * `min_verify_score`: the least score to compare landmarks and, with a `confidence_rule`, to accept a match
@@ -180,14 +180,14 @@ def check_texture(query: Descriptor, min_quality: float) -> Reason | None:
     quality is at least `min_quality`. A few textured regions can agree on a place by chance."""
     if query.quality >= min_quality:  # False for NaN
         return None
-    return Reason(ReasonCode.LOW_TEXTURE, {"usable": query.quality, "needed": min_quality})
+    return Reason(ReasonCode.LOW_TEXTURE, {"usable_share": query.quality, "min_share": min_quality})
 
 
 def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch | None = None) -> Verdict:
     """Decide whether the best place of a ranking is accepted. `search` is the search over sequences that made the
     ranking (None: the query was ranked alone)."""
     if search and search.frames < search.length:
-        return _refuse(ReasonCode.SEQUENCE_INCOMPLETE, queries=search.frames, needed=search.length)
+        return _refuse(ReasonCode.SEQUENCE_INCOMPLETE, queries=search.frames, min_queries=search.length)
     ranking, agreement, located = findings.ranking, findings.agreement, findings.located
     score = float(ranking.scores[0])
     lead = margin(ranking, index, rule.neighbour_m, located.places if located else ())
@@ -202,7 +202,7 @@ def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: Seque
     elif lead is None:
         verdict = Verdict(True, Reason(ReasonCode.ACCEPTED_WITHOUT_RIVAL, {"score": score}))
     else:
-        verdict = Verdict(True, Reason(ReasonCode.ACCEPTED_BY_SCORE, {"score": score, "lead": lead}))
+        verdict = Verdict(True, Reason(ReasonCode.ACCEPTED_BY_SCORE, {"score": score, "margin": lead}))
     if not verdict.accepted:
         return verdict
     if findings.at_rest_elsewhere > _MAX_AT_REST_SHARE:
@@ -225,11 +225,11 @@ def _check_limits(score: float, lead: float | None, rule: AcceptRule) -> Reason 
     there is no place elsewhere."""
     least = max(rule.min_score, rule.min_verify_score if rule.confidence_rule else 0.0)
     if not score >= least:  # `not >=` refuses NaN as well
-        return Reason(ReasonCode.LOW_SCORE, {"score": score, "needed": least})
+        return Reason(ReasonCode.LOW_SCORE, {"score": score, "min_score": least})
     if lead is None and rule.min_score == 0 and rule.confidence_rule is None:
         return Reason(ReasonCode.NO_RIVAL)
     if lead is not None and not lead >= rule.min_margin:
-        return Reason(ReasonCode.LOW_LEAD, {"lead": lead, "needed": rule.min_margin})
+        return Reason(ReasonCode.LOW_MARGIN, {"margin": lead, "min_margin": rule.min_margin})
     return None
 
 
@@ -239,7 +239,7 @@ def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
     if evidence is None:
         return _refuse(ReasonCode.NOT_CALIBRATED)
     confidence, needed, reported = rule.confidence(evidence), rule.threshold(evidence), rule.cap_confidence(evidence)
-    figures = {"track": track, "confidence": reported, "needed": needed, **evidence.describe()}
+    figures = {"track_confidence": track, "confidence": reported, "min_confidence": needed, **evidence.describe()}
     is_confident = confidence >= needed
     code = ReasonCode.ACCEPTED_BY_CONFIDENCE
     if not (is_confident or (track is not None and _is_track_confident(track, confidence, needed, rule.precision))):
@@ -249,7 +249,7 @@ def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
     elif track is not None and track < _MIN_TRACK_SUPPORT:
         code = ReasonCode.TRACK_CONTRADICTS
     elif findings.lead_over_rotated is not None and findings.lead_over_rotated < _MIN_LEAD_OVER_ROTATED:
-        code = ReasonCode.TURNED_AGREES
+        code = ReasonCode.ROTATION_AMBIGUOUS
     return Verdict(code is ReasonCode.ACCEPTED_BY_CONFIDENCE, Reason(code, figures))
 
 
@@ -265,7 +265,7 @@ def _check_landmarks(agreement: Agreement, score: float) -> Reason | None:
     if not agreement.is_expected:
         return Reason(ReasonCode.LANDMARKS_DISAGREE, {"landmarks": agreement.inliers})
     if score >= _MIN_CLEAR_SCORE and agreement.inliers < _MIN_INLIERS and agreement.possible >= _MIN_LANDMARKS:
-        return Reason(ReasonCode.FEW_LANDMARKS, {"landmarks": agreement.inliers, "needed": _MIN_INLIERS})
+        return Reason(ReasonCode.FEW_LANDMARKS, {"landmarks": agreement.inliers, "min_landmarks": _MIN_INLIERS})
     return None
 
 
@@ -286,9 +286,9 @@ def _check_sequence(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, searc
         return Reason(ReasonCode.NEWEST_DISAGREES)
     is_elsewhere = outside_neighbourhood(index, int(ranking.slots[0]), np.arange(len(index)), rule.neighbour_m)
     if not search.is_continued(~is_elsewhere, rule.min_score):
-        return Reason(ReasonCode.NEWEST_LEFT)
+        return Reason(ReasonCode.NEWEST_ELSEWHERE)
     lead = float(ranking.scores[0]) - float(search.rivals[is_elsewhere].max(initial=0))
     needed = _MARGIN_SHARE_AT_OTHER_SPEEDS * rule.min_margin
     if not lead >= needed:
-        return Reason(ReasonCode.LOW_LEAD_SPEED, {"lead": lead, "needed": needed})
+        return Reason(ReasonCode.LOW_MARGIN_AT_OTHER_SPEED, {"margin": lead, "min_margin": needed})
     return None

@@ -91,7 +91,7 @@ def judge_scores(salience: Salience, config: SalienceConfig, usual: float = 1.0)
     worst = max(shortfalls, key=lambda name: shortfalls[name], default=None)
     if worst is None or shortfalls[worst] <= 0:
         return SalienceVerdict(salience)
-    figures = {"measure": worst, "score": known[worst], "needed": least[worst]}
+    figures = {"measure": worst, "score": known[worst], "min_score": least[worst]}
     return SalienceVerdict(salience, shortfalls[worst], worst, Reason(ReasonCode.NOT_MEMORABLE, figures))
 
 

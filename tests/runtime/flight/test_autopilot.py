@@ -120,7 +120,7 @@ def test_ten_pictures_of_nothing_are_reported_once_and_so_is_the_ground_after_th
     assert all(line["reason"]["code"] == "LOW_TEXTURE" for line in queries[1:16])
     assert queries[1]["fix"] is queries[1]["place"] is None
     assert [severity for severity, _ in link.texts()] == [4, 6]
-    assert [line["note"]["code"] for line in of_kind(lines, "camera")] == ["NOTHING_SHOWN", "GROUND_SHOWN"]
+    assert [line["note"]["code"] for line in of_kind(lines, "camera")] == ["IMAGE_BLANK", "GROUND_VISIBLE"]
     assert [health[number] for number in (MAX_BLANK_IN_A_ROW, 15, -1)] == [
         Health.ACTIVE,
         Health.CRITICAL,

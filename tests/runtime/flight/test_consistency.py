@@ -37,7 +37,7 @@ def test_in_flight_a_fix_held_back_is_in_the_log_and_the_ground_is_told_once(rec
     assert all(line["accepted"] for line in queries), "held back or not, the match stays accepted"
     assert [line["fix"]["sent"] for line in queries] == [False, False, False, True, True]
     assert queries[0]["fix"]["why"]["code"] == "HELD_OFF_PATH"
-    assert queries[0]["fix"]["why"]["parameters"]["off_m"] == pytest.approx(3574.0, abs=0.5)
+    assert queries[0]["fix"]["why"]["parameters"]["distance_m"] == pytest.approx(3574.0, abs=0.5)
     assert link.stats().fixes_sent == 2
     assert link.texts() == [
         (4, "edgevpr: fix held back, contradicts autopilot"),
@@ -110,7 +110,7 @@ def test_consistency_believes_no_fix_against_gps():
     judge = Consistency()
     for second in range(6):
         reason = judge.judge(compared(500.0, second, second), has_gps=True, is_tracked=False).reason
-        assert reason == Reason(ReasonCode.HELD_OFF_GPS, {"off_m": 500.0})
+        assert reason == Reason(ReasonCode.HELD_OFF_GPS, {"distance_m": 500.0})
     assert not judge.is_contradicted(START_S + 5, is_tracked=False)
 
 
@@ -120,7 +120,7 @@ def test_consistency_is_in_doubt_until_another_should_have_agreed(is_tracked, go
     assert not judge.is_contradicted(START_S, is_tracked)
     for t_s in range(8):
         reason = judge.judge(compared(-100, t_s), has_gps=False, is_tracked=is_tracked).reason
-        assert reason == Reason(ReasonCode.HELD_OFF_PATH, {"off_m": 100.0, "accuracy_m": math.sqrt(30.5)})
+        assert reason == Reason(ReasonCode.HELD_OFF_PATH, {"distance_m": 100.0, "accuracy_m": math.sqrt(30.5)})
     assert judge.is_contradicted(START_S + 7 + good_for_s, is_tracked)
     assert not judge.is_contradicted(START_S + 7.1 + good_for_s, is_tracked), "no other has agreed"
     assert judge.judge(compared(0.0, 9), has_gps=False, is_tracked=is_tracked).reason is None
@@ -133,4 +133,4 @@ def test_consistency_reports_by_how_much_a_picture_is_turned(before_deg, error_d
     judge.judge(compared(0.0, 0, error_deg=before_deg), has_gps=True, is_tracked=False)
     for has_gps in (True, False):
         reason = judge.judge(compared(0.0, 1, error_deg=error_deg), has_gps=has_gps, is_tracked=False).reason
-        assert reason == Reason(ReasonCode.HELD_TURNED, {"turn_deg": error_deg})
+        assert reason == Reason(ReasonCode.HELD_ROTATED, {"rotation_deg": error_deg})

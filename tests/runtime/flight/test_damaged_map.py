@@ -98,7 +98,7 @@ def test_ten_failures_in_a_row_are_critical_and_said_once_until_it_works_again(
     assert [line["accepted"] for line in queries] == [True, *[False] * (MAX_FAILURES_IN_A_ROW + 1), *[True] * 4]
     assert health[-4] is Health.CRITICAL
     assert health[0] is health[-1] is Health.ACTIVE
-    assert [line["note"]["code"] for line in of_kind(lines, "failing")] == ["FAILING", "NOT_FAILING"]
+    assert [line["note"]["code"] for line in of_kind(lines, "failing")] == ["FRAMES_FAILING", "FRAMES_RECOVERED"]
     assert link.texts() == [
         (4, "edgevpr: map cannot be read, see the log"),
         (4, "edgevpr: 10 frames in a row have failed"),

@@ -15,8 +15,8 @@ from edgevpr.runtime.flight.frozenwatch import Optics
 pytestmark = pytest.mark.slow
 
 AHEAD = Optics(focal_share=0.77, looks_down=False, is_level=False)
-STAY = Reason(ReasonCode.PICTURES_STAY)
-MOVE = Reason(ReasonCode.PICTURES_MOVE)
+STAY = Reason(ReasonCode.IMAGES_UNCHANGED)
+MOVE = Reason(ReasonCode.IMAGES_CHANGE_AGAIN)
 GIMBAL = Optics(focal_share=0.77, looks_down=True, is_level=True)
 
 
@@ -81,7 +81,7 @@ def test_a_clip_that_is_played_again_in_flight_is_refused(ground, is_in_order):
         flown.see(compressed(shown, flown.rng), velocity_m_s=(5.0, 0.0))
     assert flown.refused[:20] == [None] * 20
     assert all(flown.refused[30:])
-    assert flown.notes == [str(Reason(ReasonCode.PICTURES_REPEAT))]
+    assert flown.notes == [str(Reason(ReasonCode.IMAGES_REPEATED))]
 
 
 def test_a_clip_whose_turns_the_aircraft_does_not_fly_is_refused(ground):
@@ -196,10 +196,10 @@ def test_a_flight_refuses_frozen_pictures_and_says_so(make_flight, clock, link):
     accepted = [line["accepted"] for line in of_kind(lines, "query")]
     refused = of_kind(lines, "unusable")
     assert 7 <= len(refused) <= 11
-    assert {line["reason"]["code"] for line in refused} == {"PICTURES_STAY"}
+    assert {line["reason"]["code"] for line in refused} == {"IMAGES_UNCHANGED"}
     assert accepted == [True] * (len(shown) - len(refused))
     assert flight.end["unusable"] == 0, "the camera has failed, and no picture"
-    assert [line["note"]["code"] for line in of_kind(lines, "source")] == ["PICTURES_STAY", "PICTURES_MOVE"]
+    assert [line["note"]["code"] for line in of_kind(lines, "source")] == ["IMAGES_UNCHANGED", "IMAGES_CHANGE_AGAIN"]
     assert link.texts() == [(4, f"edgevpr: {STAY}"), (6, f"edgevpr: {MOVE}")]
     assert str(STAY) in seen
     assert Health.CRITICAL in health

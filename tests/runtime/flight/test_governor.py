@@ -58,7 +58,7 @@ def test_the_candidates_are_lowered_first_then_the_rate():
     assert [change.after for change in changes[:-1]] == list(settings[1:])
     assert [change.before for change in changes[:-1]] == list(settings[:-1])
     assert {b - a for (a, _), (b, _) in itertools.pairwise(flight.changes)} == {4.0}, "each step is given time to tell"
-    taken = Reason(ReasonCode.CORES_TAKEN, {"taken": 0.9, "allowed": 0.5})
+    taken = Reason(ReasonCode.CPU_OVER_LIMIT, {"cpu_share": 0.9, "max_share": 0.5})
     assert changes[-1] == Change(settings[-1], settings[-1], taken)
 
 
@@ -132,7 +132,7 @@ def test_without_a_temperature_a_board_that_throttles_is_believed():
     assert flight.fly(600) == []
     flight.reading = lambda setting, now_s: measured(throttled=True)
     (change,) = flight.fly(10)
-    assert (change.after.rate_hz, change.why.code) == (1.0, ReasonCode.BOARD_SLOW)
+    assert (change.after.rate_hz, change.why.code) == (1.0, ReasonCode.BOARD_THROTTLED)
 
 
 def test_queries_that_others_make_late_are_asked_less_often_until_the_others_are_gone():
@@ -151,4 +151,4 @@ def test_memory_that_runs_short_is_said_once():
     flight = Flight(lambda setting, now_s: measured(rss_mb=500.0))
     (change,) = flight.fly(600)
     assert change.before == change.after == ASKED
-    assert change.why.code is ReasonCode.MEMORY_TAKEN
+    assert change.why.code is ReasonCode.MEMORY_OVER_LIMIT

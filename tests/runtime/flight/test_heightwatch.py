@@ -42,14 +42,14 @@ def watch(notifier, clock, link):
 def test_heightwatch_reports_a_contradiction_once_and_its_end(watch, tmp_path):
     assert watch.see(150, 160, 158, 162) == []
     assert watch.watch.ratio == 1.0
-    assert watch.see(155) == ["height: autopilot 100 m, pictures 158 m"]
+    assert watch.see(155) == ["height: autopilot 100 m, images 158 m"]
     assert watch.watch.ratio == pytest.approx(1.58)
     watch.see(*[200] * 5, 100, 100, 100, 100)
     assert len(watch.link.texts()) == 1
-    assert watch.see(100)[1:] == ["height agrees with pictures again"]
+    assert watch.see(100)[1:] == ["height agrees with images again"]
     assert watch.watch.ratio == 1.0
     assert [(line["kind"], line["note"]) for line in read_log(tmp_path / "log")] == [
-        ("height", {"code": "HEIGHT_DIFFERS", "parameters": {"by_autopilot_m": 100.0, "by_pictures_m": 158.0}}),
+        ("height", {"code": "HEIGHT_DIFFERS", "parameters": {"autopilot_height_m": 100.0, "image_height_m": 158.0}}),
         ("height", {"code": "HEIGHT_AGREES", "parameters": {}}),
     ]
 
@@ -74,7 +74,7 @@ def test_measure_frame_claims_what_the_height_may_be_wrong_by():
 
 
 def test_heightwatch_bears_a_reported_height_of_zero(watch):
-    assert watch.see(*[100] * 5, reported_m=0.0) == ["height: autopilot 1 m, pictures 100 m"]
+    assert watch.see(*[100] * 5, reported_m=0.0) == ["height: autopilot 1 m, images 100 m"]
     assert watch.watch.ratio == 100.0
 
 

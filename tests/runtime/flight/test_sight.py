@@ -125,7 +125,7 @@ def test_mirrored_pictures_are_reported_once_and_only_where_none_matches(make_fl
     assert not any(line["accepted"] for line in of_kind(lines, "query"))
     assert link.texts() == [(4, "edgevpr: images are mirrored")]
     (line,) = of_kind(lines, "camera")
-    assert line["note"]["code"] == "PICTURES_MIRRORED"
+    assert line["note"]["code"] == "IMAGES_MIRRORED"
 
 
 def test_pictures_of_other_ground_are_not_reported_as_mirrored(make_flight, clock, link):

@@ -42,7 +42,7 @@ def test_what_says_nothing_is_not_searched_for(walk):
     assert (event.lacks_texture, event.accepted, event.failed, event.is_query) == (True, False, False, True)
     assert (event.position, event.best, event.ranking) == (None, None, None)
     assert event.reason.code is ReasonCode.LOW_TEXTURE
-    assert event.reason.parameters["needed"] == 0.4
+    assert event.reason.parameters["min_share"] == 0.4
     assert event.steps.scan == event.steps.compare == NO_COST, "the search is saved"
     after = walk.step(frame(textured(3, 240, 320)))
     assert (after.accepted, after.lacks_texture, after.best.place.source_image) == (True, False, "3.png")

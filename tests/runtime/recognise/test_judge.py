@@ -50,7 +50,7 @@ def test_a_match_is_accepted_from_the_needed_confidence_on(confidence, accepted)
     verdict = judged(rule=rule, evidence=CLEAR)
     assert verdict.accepted is accepted
     assert verdict.reason.code is (ReasonCode.ACCEPTED_BY_CONFIDENCE if accepted else ReasonCode.LOW_CONFIDENCE)
-    figures = {"confidence": confidence, "needed": 0.9, "regions_ratio": math.exp(CLEAR.lead)}
+    figures = {"confidence": confidence, "min_confidence": 0.9, "regions_ratio": math.exp(CLEAR.lead)}
     assert {name: verdict.reason.parameters[name] for name in figures} == pytest.approx(figures, nan_ok=True)
     assert judged((0.2,), sure_rule(lambda evidence: confidence), evidence=CLEAR).accepted is accepted, (
         "no place elsewhere"
@@ -109,7 +109,7 @@ def test_a_flight_that_decides_is_sure_itself_however_little_is_asked(followed, 
     assert judged(rule=rule, evidence=CLEAR, track_confidence=followed).accepted is accepted
 
 
-@pytest.mark.parametrize(("lead", "code"), [(math.log(1.75), None), (math.log(1.74), ReasonCode.TURNED_AGREES)])
+@pytest.mark.parametrize(("lead", "code"), [(math.log(1.75), None), (math.log(1.74), ReasonCode.ROTATION_AMBIGUOUS)])
 def test_a_match_must_lead_over_the_picture_turned_otherwise(lead, code):
     verdict = judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR, lead_over_rotated=lead)
     assert verdict.reason.code is (code or ReasonCode.ACCEPTED_BY_CONFIDENCE)
@@ -134,7 +134,7 @@ def test_a_match_is_refused_by_its_tilt_and_its_position(known, code):
     [
         ((0.25, 0.125), {"min_score": 0.25, "min_margin": 0.125}, ReasonCode.ACCEPTED_BY_SCORE),
         ((0.25, 0.125), {"min_score": 0.26}, ReasonCode.LOW_SCORE),
-        ((0.25, 0.126), {"min_margin": 0.125}, ReasonCode.LOW_LEAD),
+        ((0.25, 0.126), {"min_margin": 0.125}, ReasonCode.LOW_MARGIN),
         ((0.25,), {"min_score": 0.25}, ReasonCode.ACCEPTED_WITHOUT_RIVAL),
         ((0.25,), {"min_score": 0.26}, ReasonCode.LOW_SCORE),  # no place elsewhere makes it sure
         ((0.25,), {"min_score": 0.0}, ReasonCode.NO_RIVAL),
@@ -150,7 +150,7 @@ def test_limits_are_met_by_what_equals_them(scores, limits, code):
 @pytest.mark.parametrize(("quality", "needed"), [(0.3, None), (0.29, 0.3), (math.nan, 0.3)])
 def test_says_nothing_of_a_picture_of_enough_quality(quality, needed):
     reason = check_texture(SimpleNamespace(quality=quality), 0.3)
-    assert (reason and reason.parameters["needed"]) == needed
+    assert (reason and reason.parameters["min_share"]) == needed
 
 
 def test_a_flight_may_know_better_than_the_scores_which_place_it_is():
@@ -219,7 +219,7 @@ def test_a_sequence_leads_over_those_at_other_speeds_by_half_the_margin(rival, a
     ranking = Ranking(slots=np.array([20, 10]), scores=np.array([0.5, 0.0], np.float32), compared={})
     verdict = judge(Findings(ranking), bare_index(30), replace(RULE, min_margin=0.5), search)
     assert verdict.accepted is accepted
-    assert accepted or verdict.reason.code is ReasonCode.LOW_LEAD_SPEED
+    assert accepted or verdict.reason.code is ReasonCode.LOW_MARGIN_AT_OTHER_SPEED
 
 
 @pytest.mark.parametrize(("share", "accepted"), [(0.0, True), (0.4, True), (4 / 9, False)])
@@ -323,7 +323,7 @@ def test_an_aircraft_that_leaves_the_mapped_way_is_not_followed_beyond_it(seed):
     assert found[10][0]
     # The mean would bear it for some queries yet: it is far ahead of all other places.
     assert not any(yes for yes, _, _ in found[13:])
-    assert any(code is ReasonCode.NEWEST_LEFT for _, code, _ in found[11:14])
+    assert any(code is ReasonCode.NEWEST_ELSEWHERE for _, code, _ in found[11:14])
 
 
 def test_the_margin_of_a_mean_is_that_of_one_query_over_the_root_of_their_number():

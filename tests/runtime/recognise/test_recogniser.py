@@ -86,7 +86,7 @@ def test_whatever_a_technique_raises_is_a_refusal_with_its_reason(walk, error, w
     assert (event.failed, event.accepted, event.position) == (True, False, None)
     assert event.is_query == (where != "encode")
     expected = {ModelError: ReasonCode.UNUSABLE, MapError: ReasonCode.MAP_UNREADABLE}
-    assert event.reason.code is expected.get(type(error), ReasonCode.UNFORESEEN)
+    assert event.reason.code is expected.get(type(error), ReasonCode.UNEXPECTED_ERROR)
     assert event.reason.parameters["problem"] == str(error)
     setattr(walk.technique, where, whole)
     assert walk.step(frame(1)).accepted, "the next frame is recognised"
@@ -107,7 +107,7 @@ def test_a_stop_is_no_exception_of_a_frame(walk):
 def test_a_frame_that_could_not_be_read_is_an_event_too(walk):
     event = walk.report_unread(ValueError("cut"))
     assert (event.frame, event.failed, event.is_query) == (None, True, False)
-    assert event.reason == Reason(ReasonCode.UNFORESEEN, {"error": "ValueError", "problem": "cut"})
+    assert event.reason == Reason(ReasonCode.UNEXPECTED_ERROR, {"error": "ValueError", "problem": "cut"})
 
 
 def test_the_accuracy_of_a_map_is_never_below_what_is_claimed_at_least(walk):

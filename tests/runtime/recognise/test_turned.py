@@ -41,7 +41,7 @@ def walk(turned_walk):
 def test_a_place_that_looks_the_same_from_the_other_side_is_accepted_with_a_heading_only(walk):
     unknown, known = (walk.step(frame(LIKE_A_BRIDGE, 40, heading_deg)) for heading_deg in (None, 0.0))
     assert not unknown.accepted
-    assert unknown.reason.code is ReasonCode.TURNED_AGREES
+    assert unknown.reason.code is ReasonCode.ROTATION_AMBIGUOUS
     assert known.accepted, known.reason
 
 
