@@ -139,7 +139,7 @@ def _read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
     has_link = _is_fresh(get_number(line, "vehicle", "t_received_s"), t_frame_s)
     autopilot_position = get_point(line, "vehicle") if has_link else None
     # The confidence by which a match was judged: its own or, if higher, that of the flight so far.
-    confidences = get_number(line, "confidence"), get_number(line, "followed", "confidence")
+    confidences = get_number(line, "confidence"), get_number(line, "track", "confidence")
     place, fix = get_number(line, "place"), get_value(line, "fix")
     has_gps = get_value(line, "vehicle", "has_gps") is True
     return LoggedQuery(

@@ -77,18 +77,18 @@ def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
 
     Always present: query, place (number), reference_image, score, position (of the place), shift, covariance, rotation
     of the match (all null if no place was found), accepted, reason, accuracy_m, located (the aircraft's position; null
-    if nothing was accepted), costs. Present if known: view (how the picture lies on the ground), salience, stride,
-    landmarks, confidence, evidence, followed (track).
+    if nothing was accepted), costs. Present if known: view (how the picture lies on the ground), salience, odometry,
+    landmarks, confidence, evidence, track (of the track filter).
     """
     evidence = event.evidence and {key: round(value, 3) for key, value in event.evidence.figures().items()}
     known: dict[str, Any] = {
         "view": event.view.fields() if event.view != UNKNOWN_VIEW else None,
         "salience": event.salience and event.salience.scores.rounded(),
-        "stride": event.odometry and event.odometry.fields(),
+        "odometry": event.odometry and event.odometry.fields(),
         "landmarks": event.agreement and _landmark_fields(event.agreement),
         "confidence": event.confidence if exact else _round(event.confidence, 6),
         "evidence": evidence,
-        "followed": event.track and _track_fields(event.track),
+        "track": event.track and _track_fields(event.track),
     }
     return {
         "query": event.frame and event.frame.name,

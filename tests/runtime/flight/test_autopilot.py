@@ -82,7 +82,7 @@ def test_how_sure_an_accepted_match_is_is_told_where_it_is_known(make_flight, cl
     assert [line["accepted"] for line in queries] == [True, True, False]
     told = [each.value for each in link.sent if getattr(each, "name", "") == "vpr_conf"]
     known = [
-        max(line["confidence"], line.get("followed", line)["confidence"])
+        max(line["confidence"], line.get("track", line)["confidence"])
         for line in queries
         if line["accepted"] and "confidence" in line
     ]

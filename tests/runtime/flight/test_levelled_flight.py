@@ -85,8 +85,8 @@ def test_between_rare_queries_without_gps_pictures_are_taken_for_their_strides(
     flown = Flight(place_map, tmp_path / "f.jsonl", clock, FakeLink(clock, vehicle=vehicle), **FAR_APART)
     lines = flown.fly(source)
     queries = of_kind(lines, "query")
-    strides = [query["stride"]["from_s"] - query["t_frame_s"] for query in queries[1:]]
-    assert strides == [pytest.approx(-before_s, abs=0.25)] * (len(queries) - 1)
+    starts_s = [query["odometry"]["from_s"] - query["t_frame_s"] for query in queries[1:]]
+    assert starts_s == [pytest.approx(-before_s, abs=0.25)] * (len(queries) - 1)
     assert len(queries) == (3 if before_s < 10.0 else 11), "the others are no queries"
     assert not of_kind(lines, "unusable")
     assert flown.end["queries"] == len(queries)

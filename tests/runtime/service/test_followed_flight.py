@@ -25,4 +25,4 @@ def test_run_follows_with_confidence_and_without_a_sequence(recording, tmp_path,
         f"match: {match}\nlog: {{path: {log}}}\n"
     )
     assert main(["run", "--config", str(config)]) == 0
-    assert {"followed" in line for line in of_kind(read_log(log), "query")} == {follows}
+    assert {"track" in line for line in of_kind(read_log(log), "query")} == {follows}
