@@ -121,13 +121,13 @@ def query_rows() -> Iterator[Row]:
         index = large[2]
         # A map as it is flown, on parallel legs to and fro, with some sway.
         rng = np.random.default_rng(0)
-        turned_deg = (rng.choice([0, 180], len(index)) + rng.normal(0, 5, len(index))) % 360
+        rotation_deg = (rng.choice([0, 180], len(index)) + rng.normal(0, 5, len(index))) % 360
         near = index.find_within(Position(float(index.lat_deg.mean()), float(index.lon_deg.mean())), REACH_M)
         in_reach = f"{np.count_nonzero(near)} places within {REACH_M:.0f} m"
         yield _query(large, "nadir", "24 rotations", NO_EXPECTATION)
-        yield _query(large, "nadir, heading known", "3 rotations", Expectation(turned_deg=turned_deg))
+        yield _query(large, "nadir, heading known", "3 rotations", Expectation(rotation_deg=rotation_deg))
         yield _query(large, "nadir, in reach", in_reach, Expectation(in_reach=near))
-        yield _query(large, "nadir, both", f"{in_reach}, 3 rotations", Expectation(near, turned_deg))
+        yield _query(large, "nadir, both", f"{in_reach}, 3 rotations", Expectation(near, rotation_deg))
 
 
 def _query(large: tuple[Technique, PlaceMap, PlaceIndex], camera: str, beside: str, expected: Expectation) -> Row:

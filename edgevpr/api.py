@@ -48,7 +48,7 @@ class Match:
     `str(reason)` is a sentence. `confidence`: probability that the picture shows the place. `position`: position of the
     aircraft, if accepted. `accuracy_m`: its standard deviation in metres. `covariance_m2`: (variance east, covariance,
     variance north). `of_place`: `position` is simply that of the place, because the offset from it is unknown.
-    `heading_deg`: compass direction of the top of the picture. `turned_deg`: rotation of the picture relative to the
+    `heading_deg`: compass direction of the top of the picture. `rotation_deg`: rotation of the picture relative to the
     place's picture, clockwise. `t_query_s`: processing time in seconds.
     """
 
@@ -62,7 +62,7 @@ class Match:
     covariance_m2: Covariance | None
     of_place: bool
     heading_deg: float | None
-    turned_deg: float | None
+    rotation_deg: float | None
     t_query_s: float
 
     def geojson(self) -> dict[str, Any]:
@@ -188,7 +188,7 @@ def _to_match(event: Recognition) -> Match:
         covariance_m2=located.covariance_m2 if located else None,
         of_place=bool(located and not located.places),
         heading_deg=located.heading_deg if located else None,
-        turned_deg=best.match.rotation_deg if best else None,
+        rotation_deg=best.match.rotation_deg if best else None,
         t_query_s=cost.t_encode_s + cost.t_match_s,
     )
 

@@ -43,11 +43,11 @@ def from_height(seed: int, height_ratio: float) -> np.ndarray:
     return cv2.resize(seen, (384, 384), interpolation=cv2.INTER_AREA if height_ratio > 1 else cv2.INTER_LINEAR)
 
 
-def seen_from_above(ground, side_px, turned_deg=0.0, right_px=0.0, down_px=0.0, height=1.0) -> np.ndarray:
+def seen_from_above(ground, side_px, rotation_deg=0.0, right_px=0.0, down_px=0.0, height=1.0) -> np.ndarray:
     """What a square camera sees over the middle of `ground`, that has turned clockwise, moved and risen so many times
     as high."""
     middle = (np.array(ground.shape[1::-1]) - 1) / 2 + (right_px, down_px)
-    view = cv2.getRotationMatrix2D(middle.tolist(), turned_deg, 1 / height)
+    view = cv2.getRotationMatrix2D(middle.tolist(), rotation_deg, 1 / height)
     view[:, 2] += (side_px - 1) / 2 - middle
     return cv2.warpAffine(ground, view, (side_px, side_px))
 

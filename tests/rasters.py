@@ -41,7 +41,7 @@ def marked(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
     return bright
 
 
-def grid(crs: str, pixel_m: float, side_px: int, turned_deg: float = 0.0):
+def grid(crs: str, pixel_m: float, side_px: int, rotation_deg: float = 0.0):
     """The geo-reference of a square picture around HOME, and where its pixels are: metres east and north."""
     from rasterio import Affine
     from rasterio.warp import transform
@@ -49,7 +49,7 @@ def grid(crs: str, pixel_m: float, side_px: int, turned_deg: float = 0.0):
     (x, x_north), (y, y_north) = transform("EPSG:4326", crs, [HOME.lon_deg] * 2, [HOME.lat_deg, HOME.lat_deg + 1e-3])
     metres = ground_m(HOME.lat_deg + 1e-3, HOME.lon_deg)[1]
     pixel = pixel_m * math.hypot(x_north - x, y_north - y) / metres
-    across, along = pixel * math.cos(math.radians(turned_deg)), pixel * math.sin(math.radians(turned_deg))
+    across, along = pixel * math.cos(math.radians(rotation_deg)), pixel * math.sin(math.radians(rotation_deg))
     half = side_px / 2
     to_crs = Affine(across, along, x - half * (across + along), along, -across, y - half * (along - across))
     columns, rows = np.meshgrid(np.arange(side_px) + 0.5, np.arange(side_px) + 0.5)
@@ -77,10 +77,10 @@ def write_raster(path: Path, bands: np.ndarray, crs: str | None, to_crs, **profi
 
 
 def marked_raster(
-    path: Path, crs: str = "EPSG:32632", pixel_m: float = 0.25, side_px: int = 640, turned_deg: float = 0.0
+    path: Path, crs: str = "EPSG:32632", pixel_m: float = 0.25, side_px: int = 640, rotation_deg: float = 0.0
 ) -> Path:
     """Write the marks as a picture of three bands, whose red is brighter than its blue."""
-    to_crs, east_m, north_m = grid(crs, pixel_m, side_px, turned_deg)
+    to_crs, east_m, north_m = grid(crs, pixel_m, side_px, rotation_deg)
     bright = marked(east_m, north_m)
     return write_raster(path, np.stack((bright, 0.9 * bright, 0.8 * bright)).astype(np.uint8), crs, to_crs)
 

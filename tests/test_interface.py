@@ -23,9 +23,9 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 PLACES = 6
 
 
-def seen(place, turned_deg=0.0):
+def seen(place, rotation_deg=0.0):
     """The ground at a place, seen from straight above."""
-    return seen_from_above(textured(place, 800, 800), 320, turned_deg)
+    return seen_from_above(textured(place, 800, 800), 320, rotation_deg)
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +65,8 @@ def test_map_match_returns_position_and_confidence(flight, valley):
         assert match.position.lat_deg == pytest.approx(50.006, abs=1e-4)
         assert match.confidence > 0.999
         assert (
-            abs((match.turned_deg - 315 + 180) % 360 - 180) <= 15
-            or abs((match.turned_deg - 45 + 180) % 360 - 180) <= 15
+            abs((match.rotation_deg - 315 + 180) % 360 - 180) <= 15
+            or abs((match.rotation_deg - 45 + 180) % 360 - 180) <= 15
         )
         assert match.t_query_s > 0
         feature = json.loads(json.dumps(match.geojson()))
@@ -79,9 +79,9 @@ def test_map_match_returns_position_and_confidence(flight, valley):
 def test_map_match_uses_what_is_known(flight, valley):
     picture = cv2.imread(str(flight / "later" / "3.jpg"))
     with edgevpr.Map(valley) as ground:
-        turned_deg = ground.match(picture).turned_deg
-        assert ground.match(picture, heading_deg=turned_deg).accepted
-        assert not ground.match(picture, heading_deg=turned_deg + 90).accepted
+        rotation_deg = ground.match(picture).rotation_deg
+        assert ground.match(picture, heading_deg=rotation_deg).accepted
+        assert not ground.match(picture, heading_deg=rotation_deg + 90).accepted
         assert ground.match(picture, near=Position(50.006, 8.0)).accepted
 
 

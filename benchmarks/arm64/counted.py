@@ -19,7 +19,7 @@ def figures(parts: Mapping[str, float]) -> dict[str, Any]:
         small, large = (parts[f"{name}: encode, and scan {places} places"] - encode for places in (SMALL, LARGE))
         scan_per_place = (large - small) / (LARGE - SMALL)
         technique = create("cohog", {"camera": camera})
-        full = technique.spec.in_full * (parts[f"{name}: read a place"] + parts[f"{name}: compare a place in full"])
+        full = technique.spec.max_matches * (parts[f"{name}: read a place"] + parts[f"{name}: compare a place in full"])
         landmarks = 0.0
         if camera == "nadir":  # those of the frame, held against the best place's and the last frame's
             landmarks = parts["flight: landmarks of a frame"] + 2 * parts["flight: the stride since the frame before"]

@@ -49,7 +49,7 @@ def of_camera(name: str, camera: str, path: str) -> Iterator[tuple[str, Callable
     with PlaceMap.open(path) as place_map:
         index = load_index(place_map, technique, 100_000_000)
         small = replace(index, **{each: getattr(index, each)[:SMALL] for each in PER_PLACE})
-        known = Expectation(turned_deg=rng.choice([0.0, 180.0], len(index)))
+        known = Expectation(rotation_deg=rng.choice([0.0, 180.0], len(index)))
         fine, _ = place_map.read_fine_part(index.place_ids[0])
         asked, one = technique.encode(picture), [0] if camera == "nadir" else None
 

@@ -47,7 +47,7 @@ class TechniqueSpec:
     `cells`: number of cells of `FineMatch.shift_cells` along a picture's side. None: matches have no such shift.
     `looks_down`: pictures show the ground below the camera, so shifts can be converted to metres.
     `height_ratios`: camera heights, relative to that of the map, at which a query can be recognised.
-    `in_full`: maximum number of candidates compared by `match`. If there are more, those with the best
+    `max_matches`: maximum number of candidates compared by `match`. If there are more, those with the best
     `Technique.score_quickly` estimates are chosen. None: all candidates are compared by `match`.
     """
 
@@ -65,7 +65,7 @@ class TechniqueSpec:
     cells: int | None = field(default=None, compare=False)
     looks_down: bool = field(default=False, compare=False)
     height_ratios: tuple[float, ...] = field(default=(), compare=False)
-    in_full: int | None = field(default=None, compare=False)
+    max_matches: int | None = field(default=None, compare=False)
 
     @property
     def row(self) -> PartSpec:
@@ -170,7 +170,7 @@ class Perspective:
 class Technique(Protocol):
     """A place recognition technique. It encodes pictures (`encode`), compares a query with all places by their coarse
     parts (`score_places`), then with some by their fine parts (`match`). Some methods are needed only with an ability:
-    `match` with `spec.fine`, `pack` with `spec.packed`, `score_quickly` with `spec.in_full`, and `match_rotated`,
+    `match` with `spec.fine`, `pack` with `spec.packed`, `score_quickly` with `spec.max_matches`, and `match_rotated`,
     `match_at_rest` and `measure_perspective` with `spec.looks_down`."""
 
     spec: TechniqueSpec
@@ -191,7 +191,7 @@ class Technique(Protocol):
         query: Descriptor,
         rows: np.ndarray,
         mean: np.ndarray | None,
-        turned_deg: np.ndarray | None = None,
+        rotation_deg: np.ndarray | None = None,
         height_ratio: float | None = None,
         in_reach: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
@@ -200,7 +200,7 @@ class Technique(Protocol):
         instead of the latter if there is only one hypothesis.
 
         `mean`: mean of the map's coarse parts, for techniques that pack them (else None).
-        `turned_deg`: expected `FineMatch.rotation_deg` at each place, float (N,), NaN: unknown. Other rotations are
+        `rotation_deg`: expected `FineMatch.rotation_deg` at each place, float (N,), NaN: unknown. Other rotations are
         ruled out. None: no expectation. Given only to a technique with `spec.heading_within_deg`.
         `height_ratio`: expected `FineMatch.height_ratio` (None: 1). `in_reach`: bool (N,), places to examine more
         closely (None: all). Both are given only to a technique with `spec.height_ratios`."""

@@ -29,7 +29,7 @@ QuickScore = tuple[float, Choice]  # approximate score, and the slot with its be
 # Scan scores of each place, float32 (N,), and each hypothesis, float32 (N, H), -inf if ruled out (None: no hypotheses).
 Scan = tuple[Singles, Singles | None]
 
-_ELSEWHERE_PLACES = 5
+_RIVAL_PLACES = 5
 _MAX_HYPOTHESES = 3  # per place
 _MAX_UNMOVED_PLACES = 9
 # Factor on the candidates in a map of at least this many places, without a known heading: on the aerial sets it finds
@@ -45,11 +45,11 @@ _LIKELY_PLACES = 3
 @dataclass(frozen=True, slots=True)
 class Expectation:
     """What is known about the place of a query before the search (None: unknown). `in_reach` bool (N,), at least one
-    True: the places where the aircraft can be. `turned_deg` float (N,): rotation of the camera, in degrees, since each
+    True: the places where the aircraft can be. `rotation_deg` float (N,): rotation of the camera, in degrees, since a
     place was mapped. `height_ratio`: the camera's height above the ground, divided by the height when mapping."""
 
     in_reach: Bools | None = None
-    turned_deg: Doubles | None = None
+    rotation_deg: Doubles | None = None
     height_ratio: float | None = None
 
 
@@ -70,7 +70,7 @@ class Query:
 def scan_index(query: Query) -> Scan:
     """Scan the index: compare the query with the rows of all places, which are in RAM."""
     technique, index, expected = query.technique, query.index, query.expected
-    hints: dict[str, Any] = {} if expected.turned_deg is None else {"turned_deg": expected.turned_deg}
+    hints: dict[str, Any] = {} if expected.rotation_deg is None else {"rotation_deg": expected.rotation_deg}
     if technique.spec.height_ratios:
         hints |= {"height_ratio": expected.height_ratio, "in_reach": expected.in_reach}
     return technique.score_places(query.descriptor, index.rows, index.mean, **hints)
@@ -79,7 +79,7 @@ def scan_index(query: Query) -> Scan:
 def compare_places(query: Query, scanned: Scan, candidates: int | None, apart_m: float) -> Ranking:
     """Compare the `candidates` places that have the best scan scores with the query, and rank them.
 
-    If there are more candidates than the technique's `in_full`, only those with the best quick scores are compared in
+    If there are more than the technique's `max_matches`, only those with the best quick scores are compared in
     full. With a nadir camera, no heading and at least 2,000 places, `candidates` is multiplied by 1.6. All places are
     compared if `candidates` is None, or at least the number of places and more than the technique's own number. If all
     candidates are within `apart_m` metres of the best one, those elsewhere with the best scan scores are compared too,
@@ -95,10 +95,10 @@ def compare_places(query: Query, scanned: Scan, candidates: int | None, apart_m:
     count = candidates
     if count is None or spec.fine is None or comparison.is_exact:
         count = len(index)
-    elif query.expected.turned_deg is None:
+    elif query.expected.rotation_deg is None:
         count = round(count * compute_candidate_factor(bool(spec.height_ratios), int(np.count_nonzero(likely))))
-    chosen = comparison.choose_candidates(likely, count, spec.in_full)
-    chosen += comparison.choose_candidates(readable & ~likely, _ELSEWHERE_PLACES, spec.in_full and _ELSEWHERE_PLACES)
+    chosen = comparison.choose_candidates(likely, count, spec.max_matches)
+    chosen += comparison.choose_candidates(readable & ~likely, _RIVAL_PLACES, spec.max_matches and _RIVAL_PLACES)
     if not chosen:
         raise MapError(f"{query.place_map.path}: none of its places can be read: restore a copy or build it again.")
     comparison.compare_places(chosen)
@@ -107,9 +107,9 @@ def compare_places(query: Query, scanned: Scan, candidates: int | None, apart_m:
         best = max(compared, key=comparison.scores.__getitem__)
         others = outside_neighbourhood(index, best, np.arange(len(index)), apart_m)
         rivals = np.count_nonzero(others[compared])
-        if rivals < (1 if in_reach is None else _ELSEWHERE_PLACES):
+        if rivals < (1 if in_reach is None else _RIVAL_PLACES):
             others[compared] = False
-            comparison.compare_places(comparison.choose_more(others & readable, int(_ELSEWHERE_PLACES - rivals)))
+            comparison.compare_places(comparison.choose_more(others & readable, int(_RIVAL_PLACES - rivals)))
     return comparison.make_ranking()
 
 
@@ -128,7 +128,7 @@ class _Comparison:
         self._query, (self._scanned, self._every_hypothesis) = query, scanned
         self._has_one_stage = technique.spec.fine is None
         self.is_exact = candidates is None or technique.candidates < candidates >= len(index)
-        self._tries_all = self.is_exact and expected.in_reach is None and expected.turned_deg is None
+        self._tries_all = self.is_exact and expected.in_reach is None and expected.rotation_deg is None
         self._by_hypothesis = None if self._tries_all and not technique.spec.height_ratios else self._every_hypothesis
         self.readable = np.ones(len(index), bool)
         if not self._has_one_stage and query.place_map.left_out:
@@ -137,21 +137,21 @@ class _Comparison:
         self.matches: dict[int, FineMatch] = {}
         self._skipped: list[QuickScore] = []
 
-    def choose_candidates(self, among: Bools, count: int, in_full: int | None) -> list[Choice]:
+    def choose_candidates(self, among: Bools, count: int, max_matches: int | None) -> list[Choice]:
         """Choose up to `count` places where `among` bool (N,) is True, by scan score. If together they have more than
-        `in_full` hypotheses to try, keep only the `in_full` places with the best quick scores (None: keep all)."""
+        `max_matches` hypotheses to try, keep only that many places, by their best quick scores (None: keep all)."""
         if self._tries_all and self._by_hypothesis is not None:
             count = self._by_hypothesis.size
         chosen = choose_best(self._scanned, self._by_hypothesis, among, count)
-        if self.is_exact or in_full is None or sum(len(tried or [None]) for _, tried in chosen) <= in_full:
+        if self.is_exact or max_matches is None or sum(len(tried or [None]) for _, tried in chosen) <= max_matches:
             return chosen
         quick_scores: list[QuickScore] = []
         for slot, fine, hypotheses in _read_fine_parts(self._query, chosen):
             score, likely = self._query.technique.score_quickly(self._query.descriptor, fine, hypotheses)
             quick_scores.append((self._weigh_by_scan(slot, score), (slot, likely)))
         quick_scores.sort(key=lambda quick_score: -quick_score[0])
-        self._skipped += quick_scores[in_full:]
-        return [choice for _, choice in quick_scores[:in_full]]
+        self._skipped += quick_scores[max_matches:]
+        return [choice for _, choice in quick_scores[:max_matches]]
 
     def choose_more(self, among: Bools, count: int) -> list[Choice]:
         """Choose up to `count` more places where `among` is True: skipped ones or, if there are none, those with the

@@ -101,7 +101,7 @@ class CoHog:
             cells=self.w1 // self.w2 if self._votes else None,
             looks_down=finds_height,
             height_ratios=HEIGHT_RATIOS if finds_height else (),
-            in_full=tuning.MAX_FULL_MATCHES[self.camera] if self._votes else None,
+            max_matches=tuning.MAX_MATCHES[self.camera] if self._votes else None,
         )
 
     def _require_parameters(self) -> None:
@@ -174,7 +174,7 @@ class CoHog:
         query: Descriptor,
         rows: Array,
         mean: Singles | None,
-        turned_deg: Doubles | None = None,
+        rotation_deg: Doubles | None = None,
         height_ratio: float | None = None,
         in_reach: Bools | None = None,
     ) -> tuple[Singles, Singles | None]:
@@ -192,7 +192,7 @@ class CoHog:
         self._make_views(query).discard_other_heights(ratio)
         first = HEIGHT_RATIOS.index(ratio) * ROTATIONS
         ratio_scores = layout.scan_places(
-            lambda turn, grid: self._make_field(query, first + turn, grid), rows, turned_deg, in_reach
+            lambda turn, grid: self._make_field(query, first + turn, grid), rows, rotation_deg, in_reach
         )
         scores = np.full((len(rows), len(HEIGHT_RATIOS) * ROTATIONS), -np.inf, np.float32)
         scores[:, first : first + ROTATIONS] = ratio_scores

@@ -25,7 +25,7 @@ CANDIDATES = {"forward": 42, "nadir": 30}
 # Places compared in full: those with the best quick scores (forward: from every fourth good region). On corridor, the
 # seasons and nordland_tiny, 12 of 42 compared in full find as many places as all (four fewer of the 994 of
 # nordland_tiny). With a nadir camera, 6 of 30 find as many as 10 on sat_marash, aerial_swindale and kite_ochota.
-MAX_FULL_MATCHES = {"forward": 12, "nadir": 6}
+MAX_MATCHES = {"forward": 12, "nadir": 6}
 QUICK_STEP = 4
 NADIR_BINS = 8  # orientations of the regions whose patterns form a layout
 # Agreement of the layouts of query and place at which the score equals the share of votes. Correct matches on

@@ -94,9 +94,9 @@ def encode_place(patterns: Array, good: Bools, side: int) -> Bytes:
     return packed
 
 
-def scan_places(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely: Bools | None) -> Singles:
+def scan_places(fields: Fields, rows: Bytes, rotation_deg: Doubles | None, likely: Bools | None) -> Singles:
     """Score all places by their coarse parts, `rows` uint8 (N, PLACE_BYTES), under each rotation: float32 (N, 24).
-    `turned_deg` (N,) is the expected rotation of each place: only the nearest step and its two neighbours are scored,
+    `rotation_deg` (N,) is the expected rotation of each place: only the nearest step and its two neighbours are scored,
     and the others are -inf (NaN or None: all are scored). `likely` bool (N,): places that may be compared on the fine
     grid (None: all). A pair compared there scores 0 to 1; any other has its coarse score minus 1. Of the places that
     are not likely, about two thousand, evenly chosen, are scored as rivals."""
@@ -104,15 +104,15 @@ def scan_places(fields: Fields, rows: Bytes, turned_deg: Doubles | None, likely:
     if likely is not None and (step := np.count_nonzero(~likely) // _RIVAL_PLACES) > 1:
         sample = likely.copy()
         sample[np.flatnonzero(~likely)[::step]] = True
-        sample_deg = None if turned_deg is None else turned_deg[sample]
+        sample_deg = None if rotation_deg is None else rotation_deg[sample]
         scores[sample] = scan_places(fields, rows[sample], sample_deg, likely[sample])
         return scores
     turns = np.full(len(rows), -1)
-    if turned_deg is not None:
-        turns = np.nan_to_num(np.rint(turned_deg * (ROTATIONS / 360)) % ROTATIONS, nan=-1).astype(np.intp)
+    if rotation_deg is not None:
+        turns = np.nan_to_num(np.rint(rotation_deg * (ROTATIONS / 360)) % ROTATIONS, nan=-1).astype(np.intp)
     coarse = rows[:, : COARSE.size // 2]
     for turn in np.unique(turns):
-        group = slice(None) if turned_deg is None else np.flatnonzero(turns == turn)
+        group = slice(None) if rotation_deg is None else np.flatnonzero(turns == turn)
         tried = np.arange(0, ROTATIONS, 2) if turn < 0 else np.arange(turn - 1, turn + 2) % ROTATIONS
         pairs = _compare_fields(COARSE, [fields(int(number), COARSE) for number in tried], coarse[group])
         if turn < 0:

@@ -13,8 +13,8 @@ PLACES = 6
 A_METRE_DEG = 1 / 111_195  # of latitude
 
 
-def make(folder, turned_deg=(None,) * PLACES, places_known=True):
-    """A set of places 200 m apart, mapped from 100 m, and a query over each. `turned_deg` is what positions.csv says
+def make(folder, rotation_deg=(None,) * PLACES, places_known=True):
+    """A set of places 200 m apart, mapped from 100 m, and a query over each. `rotation_deg` is what positions.csv says
     of the heading of each query, truly that of its place, less that of the place; None: nothing."""
     rows, truth = ["file,lat,lon,yaw_deg,height_m"], ["query_file,ref_files"]
     for side in ("query", "ref"):
@@ -24,7 +24,7 @@ def make(folder, turned_deg=(None,) * PLACES, places_known=True):
         cv2.imwrite(str(folder / "ref" / f"r{place}.png"), from_height(place, 1.0))
         cv2.imwrite(str(folder / "query" / f"q{place}.png"), cv2.convertScaleAbs(from_height(place, 1.0), alpha=0.8))
         rows.append(f"r{place}.png,{where},{50 * place},100" if places_known else f"r{place}.png,,,,")
-        turned = turned_deg[place]
+        turned = rotation_deg[place]
         rows.append(f"q{place}.png,{where},{'' if turned is None else 50 * place + turned},")
         truth.append(f"q{place}.png,r{place}.png")
     (folder / "positions.csv").write_text("\n".join(rows) + "\n")
@@ -38,7 +38,7 @@ def evaluated(capsys, folder, *argv):
 
 
 def test_eval_with_known_headings_rules_out_other_rotations(capsys, tmp_path):
-    folder = make(tmp_path / "set", turned_deg=(90, 90, 90, 0, 0, None))
+    folder = make(tmp_path / "set", rotation_deg=(90, 90, 90, 0, 0, None))
     without = evaluated(capsys, folder)
     assert (without["known"], without["accepted"]) == (None, PLACES)
     told = evaluated(capsys, folder, "--known", "heading")
@@ -46,7 +46,7 @@ def test_eval_with_known_headings_rules_out_other_rotations(capsys, tmp_path):
 
 
 def test_match_reports_what_has_narrowed_each_query(capsys, tmp_path):
-    folder = make(tmp_path / "set", turned_deg=(0, 0, 0, 90, 90, None))
+    folder = make(tmp_path / "set", rotation_deg=(0, 0, 0, 90, 90, None))
     path = tmp_path / "m.gpkg"
     build = ("map", "build", path, "--images", folder / "ref", "--technique", "cohog", "--camera", "nadir")
     assert run(*build) == 0

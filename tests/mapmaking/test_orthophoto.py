@@ -43,7 +43,7 @@ def require_marks(picture: np.ndarray, footprint_m: float = FOOTPRINT_M, within_
 
 
 @pytest.mark.parametrize(
-    ("crs", "turned_deg"),
+    ("crs", "rotation_deg"),
     [
         ("EPSG:32632", 0),
         ("EPSG:32632", 37),
@@ -54,8 +54,8 @@ def require_marks(picture: np.ndarray, footprint_m: float = FOOTPRINT_M, within_
         ("+proj=tmerc +lat_0=50 +lon_0=9 +datum=WGS84 +units=us-ft", 0),
     ],
 )
-def test_a_place_is_where_it_must_be_with_true_north_up(tmp_path, crs, turned_deg):
-    picture, valid = cut(marked_raster(tmp_path / "o.tif", crs, turned_deg=turned_deg, side_px=720))
+def test_a_place_is_where_it_must_be_with_true_north_up(tmp_path, crs, rotation_deg):
+    picture, valid = cut(marked_raster(tmp_path / "o.tif", crs, rotation_deg=rotation_deg, side_px=720))
     assert picture.shape == (SIDE_PX, SIDE_PX, 3)
     assert picture.dtype == np.uint8
     assert valid.all()

@@ -80,7 +80,7 @@ def test_places_without_data_are_left_out_and_counted(tmp_path):
     east_m = [ground_m(frame.position.lat_deg, frame.position.lon_deg)[0] for frame in kept]
     assert min(east_m) >= -25 + 30 - 6 - 3  # the data begins 25 m west; a tenth of 60 m may lie beyond, and grid north
 
-    turned = source_of(marked_raster(tmp_path / "turned.tif", turned_deg=45), 40.0, 40.0)
+    turned = source_of(marked_raster(tmp_path / "turned.tif", rotation_deg=45), 40.0, 40.0)
     assert 0.3 < len(frames_of(turned)) / turned.total < 0.7
 
 

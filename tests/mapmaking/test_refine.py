@@ -79,14 +79,14 @@ def map_path(built, tmp_path):
 
 def errors_m(place_map, poses):
     """How far each place is from where it was taken, and its direction from that of the camera, in degrees."""
-    off_m, turned_deg = [], []
+    off_m, rotation_deg = [], []
     for place, pose in zip(place_map.read_places(), poses, strict=True):
         true = to_position(pose)
         here = place.position
         off_m.append(float(distance_m(here.lat_deg, here.lon_deg, true.lat_deg, true.lon_deg)))
         if place.pose:
-            turned_deg.append((place.pose.up_deg - pose.heading_deg + 180) % 360 - 180)
-    return np.array(off_m), np.array(turned_deg)
+            rotation_deg.append((place.pose.up_deg - pose.heading_deg + 180) % 360 - 180)
+    return np.array(off_m), np.array(rotation_deg)
 
 
 def test_refine_moves_places_to_where_their_pictures_lie(flown, map_path, capsys):
@@ -99,13 +99,13 @@ def test_refine_moves_places_to_where_their_pictures_lie(flown, map_path, capsys
     assert (place_id, image) == (10, "009.jpg")
     assert off_m == pytest.approx(GLITCH_M, abs=25)
     with PlaceMap.open(map_path) as place_map:
-        after_m, turned_deg = errors_m(place_map, poses)
+        after_m, rotation_deg = errors_m(place_map, poses)
         footprints_m = np.array([place.pose.footprint_m for place in place_map.read_places()])
         info = describe_map(place_map)
         recorded = [place.pose.recorded for place in place_map.read_places()]
     assert np.median(after_m) < np.median(before_m) / 2
     assert after_m.max() < 10
-    assert abs(turned_deg).max() < 8
+    assert abs(rotation_deg).max() < 8
     assert abs(footprints_m / FOOTPRINT_M - 1).max() < 0.15
     assert (info.with_pose, info.footprints_m) == (len(poses), (pytest.approx(FOOTPRINT_M, rel=0.1),))
     assert 0.5 < info.position_sd_m < 6

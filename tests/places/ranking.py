@@ -27,9 +27,9 @@ class Ruler:
         return FineMatch(1 / (1 + abs(float(fine[0] - query.fine[0]))))
 
 
-def rank(technique, query, place_map, index, candidates=None, apart_m=0.0, in_reach=None, turned_deg=None) -> Ranking:
+def rank(technique, query, place_map, index, candidates=None, apart_m=0.0, in_reach=None, rotation_deg=None) -> Ranking:
     """Scan all places, and compare `candidates` of them in full."""
-    expected = Expectation(in_reach, turned_deg)
+    expected = Expectation(in_reach, rotation_deg)
     asked = Query(technique=technique, descriptor=query, place_map=place_map, index=index, expected=expected)
     return compare_places(asked, scan_index(asked), candidates, apart_m)
 

@@ -184,7 +184,7 @@ def test_a_match_is_asked_for_the_hypotheses_chosen_and_for_all_where_all_is_com
     [
         (25, {}, 22),
         (26, {}, 14),
-        (25, {"turned_deg": np.zeros(25)}, 14),
+        (25, {"rotation_deg": np.zeros(25)}, 14),
         (25, {"in_reach": np.arange(25) < 24}, 14 + 3),
     ],
     ids=["a large map", "a small map", "known headings", "few in reach"],
@@ -235,7 +235,7 @@ def test_a_ranking_says_how_many_rotations_were_not_ruled_out(ruler_map):
 class Hasty(Ruler):
     """A ruler with wrong first impressions: at a glance each number is five larger than it is."""
 
-    spec = dataclasses.replace(Ruler.spec, in_full=3)
+    spec = dataclasses.replace(Ruler.spec, max_matches=3)
 
     def __init__(self):
         self.glanced = []

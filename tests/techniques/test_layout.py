@@ -14,9 +14,9 @@ SHIFTS_PX = ((0, 0), (40, 0), (-30, 30), (0, -60))
 NOTHING = 0x88
 
 
-def view(seed, turned_deg=0.0, right_px=0, down_px=0):
+def view(seed, rotation_deg=0.0, right_px=0, down_px=0):
     """The ground of a place."""
-    return seen_from_above(textured(seed, 3 * SIDE_PX, 3 * SIDE_PX), SIDE_PX, turned_deg, right_px, down_px)
+    return seen_from_above(textured(seed, 3 * SIDE_PX, 3 * SIDE_PX), SIDE_PX, rotation_deg, right_px, down_px)
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +64,10 @@ def test_in_a_large_map_the_places_in_reach_are_all_scored_and_of_the_others_som
     technique, rows = town
     query = technique.encode(view(1))
     large = np.repeat(rows, 12_000 // PLACES, axis=0)
-    turned_deg = np.where(np.arange(len(large)) % 3, 0.0, np.nan) if headings else None
+    rotation_deg = np.where(np.arange(len(large)) % 3, 0.0, np.nan) if headings else None
     likely = np.arange(len(large)) % 100 == 7
-    scores, of_some = technique.score_places(query, large, None, turned_deg, in_reach=likely)
-    _, of_all = technique.score_places(query, large, None, turned_deg)
+    scores, of_some = technique.score_places(query, large, None, rotation_deg, in_reach=likely)
+    _, of_all = technique.score_places(query, large, None, rotation_deg)
     np.testing.assert_array_equal(np.isfinite(of_some[likely]), np.isfinite(of_all[likely]))
     rivals = np.isfinite(of_some[~likely]).any(axis=1)
     assert 2048 <= rivals.sum() <= 4096
@@ -108,8 +108,8 @@ def possible(by_hypothesis):
 def test_only_the_rotation_expected_and_those_beside_it_are_possible(town):
     technique, rows = town
     query, rows = technique.encode(view(0)), np.resize(rows, (8, PLACE_BYTES))
-    turned_deg = np.array([0, 7, 8, 100, 352, 353, 359.9, np.nan])
-    scores, by_rotation = technique.score_places(query, rows, None, turned_deg)
+    rotation_deg = np.array([0, 7, 8, 100, 352, 353, 359.9, np.nan])
+    scores, by_rotation = technique.score_places(query, rows, None, rotation_deg)
     sets = possible(by_rotation)
     assert sets[:3] == [[0, 15, 345], [0, 15, 345], [0, 15, 30]]
     assert sets[3:7] == [[90, 105, 120], [0, 330, 345], [0, 15, 345], [0, 15, 345]]

@@ -34,16 +34,16 @@ def patterns(seed):
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize(("turned_deg", "right_px", "down_px", "height"), [(0, 24, -16, 1), (40, 8, 30, 1.2)])
-def test_a_query_is_laid_as_its_match_says(turned_deg, right_px, down_px, height):
+@pytest.mark.parametrize(("rotation_deg", "right_px", "down_px", "height"), [(0, 24, -16, 1), (40, 8, 30, 1.2)])
+def test_a_query_is_laid_as_its_match_says(rotation_deg, right_px, down_px, height):
     ground = make_ground(1)
     match = FineMatch(
         0.1,
         shift_cells=(right_px * CELLS / SIDE_PX, down_px * CELLS / SIDE_PX),
-        rotation_deg=turned_deg,
+        rotation_deg=rotation_deg,
         height_ratio=height,
     )
-    laid, seen = overlay.overlay_query(view(ground, turned_deg, right_px, down_px, height), ALLOWED, match, CELLS)
+    laid, seen = overlay.overlay_query(view(ground, rotation_deg, right_px, down_px, height), ALLOWED, match, CELLS)
     assert 0.4 < seen.mean() < 1
     inside = cv2.erode(seen.astype(np.uint8), np.ones((5, 5))).astype(bool)
     assert np.corrcoef(laid[inside], view(ground)[inside])[0, 1] > 0.98

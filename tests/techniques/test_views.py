@@ -13,8 +13,8 @@ pytestmark = pytest.mark.slow
 SIDE_PX = 384
 
 
-def seen(seed, height_ratio=1.0, turned_deg=0.0, right_px=0.0):
-    return seen_from_above(rough_ground(1100, seed), SIDE_PX, turned_deg, right_px, height=height_ratio)
+def seen(seed, height_ratio=1.0, rotation_deg=0.0, right_px=0.0):
+    return seen_from_above(rough_ground(1100, seed), SIDE_PX, rotation_deg, right_px, height=height_ratio)
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +32,12 @@ def test_decode_hypothesis_gives_a_height_and_a_rotation():
 
 
 @pytest.mark.parametrize(
-    ("height_ratio", "turned_deg"),
+    ("height_ratio", "rotation_deg"),
     list(zip([0.5, 0.6, 0.7, 0.84, 1.0, 1.0, 1.19, 1.42, 1.7, 2.0], [0, 130] * 5, strict=True)),
 )
-def test_cohog_finds_a_query_from_another_height_with_its_height_rotation_and_shift(town, height_ratio, turned_deg):
+def test_cohog_finds_a_query_from_another_height_with_its_height_rotation_and_shift(town, height_ratio, rotation_deg):
     technique, places, rows = town
-    query = technique.encode(seen(3, height_ratio, turned_deg, right_px=24))
+    query = technique.encode(seen(3, height_ratio, rotation_deg, right_px=24))
     matches = {}
     for ratio in technique.spec.height_ratios:
         _, by_hypothesis = technique.score_places(query, rows, None, height_ratio=ratio)
@@ -48,7 +48,7 @@ def test_cohog_finds_a_query_from_another_height_with_its_height_rotation_and_sh
     assert slot == 3
     assert match.score > technique.min_score
     assert match.height_ratio == pytest.approx(height_ratio, rel=0.04)
-    assert abs((match.rotation_deg - turned_deg + 180) % 360 - 180) < 2
+    assert abs((match.rotation_deg - rotation_deg + 180) % 360 - 180) < 2
     assert match.shift_cells == pytest.approx((24 / 12, 0), abs=0.4)
 
 

@@ -269,5 +269,5 @@ def _has_jumped(before: TimedPicture, vehicle: Vehicle | None, t_s: float) -> bo
     """Return True if the heading has changed faster than an aircraft turns."""
     if before.vehicle is None or vehicle is None:
         return False
-    turned_deg = abs(_compute_change_deg(before.vehicle, vehicle, "heading_deg"))
-    return turned_deg > _HEADING_JUMP_DEG + _HEADING_JUMP_DEG_S * max(0.0, t_s - before.t_s)
+    rotation_deg = abs(_compute_change_deg(before.vehicle, vehicle, "heading_deg"))
+    return rotation_deg > _HEADING_JUMP_DEG + _HEADING_JUMP_DEG_S * max(0.0, t_s - before.t_s)

@@ -111,7 +111,7 @@ def _make_label(spec: TechniqueSpec) -> str:
 def _uses_vote(spec: TechniqueSpec) -> bool:
     """Return True if a technique is `cohog` with the vote, whose costs and accuracy were measured. Only the vote has
     quick scores (forward camera) or several height ratios (downward camera)."""
-    return bool(spec.in_full or spec.height_ratios)
+    return bool(spec.max_matches or spec.height_ratios)
 
 
 def _read_camera(spec: TechniqueSpec) -> str | None:

@@ -43,8 +43,8 @@ class TechniqueCosts:
     """Costs of a technique on one machine, measured or converted. A `StageCost` is wall time and CPU time.
 
     `encode`: cost of encoding one frame. `match_per_place`: cost of comparing a query with one place, read from the map
-    file. `compare_once`: part of the comparison that does not grow with the number of places; if fewer than `in_full`
-    places are compared, only a proportional share of it is paid.
+    file. `compare_once`: part of the comparison that does not grow with the number of places; if fewer than
+    `max_matches` places are compared, only a proportional share of it is paid.
     `candidates`: number of places compared after all places of the map are scanned in RAM (None: the technique has one
     stage, and compares all places). `scan_per_place`: cost of scanning one place. `scan_once`: cost of preparing a
     query for the scan.
@@ -62,7 +62,7 @@ class TechniqueCosts:
     scan_per_place: StageCost = NO_COST
     scan_once: StageCost = NO_COST
     compare_once: StageCost = NO_COST
-    in_full: int = 1
+    max_matches: int = 1
     tries_rotations: bool = False
     is_network: bool = False
     sequence: int = 1
@@ -72,7 +72,7 @@ class TechniqueCosts:
         if self.candidates is None:
             return self.match_per_place * places
         compared = min(places, self.candidates * compute_candidate_factor(self.tries_rotations, places))
-        full = self.compare_once * min(1.0, compared / self.in_full)
+        full = self.compare_once * min(1.0, compared / self.max_matches)
         return self.scan_once + full + self.match_per_place * compared + self.scan_per_place * places
 
 
@@ -105,15 +105,15 @@ def measure_costs(technique: Technique, *, repeat_s: float = 0.0, meter: QueryMe
         process_mb = machine.read_peak_mb() if peak_is_new else machine.read_rss_mb()
         large_index = _repeat_places(technique, index)
         factor = compute_candidate_factor(bool(spec.height_ratios), len(large_index))
-        most, fewer = round(candidates / factor), round(max(spec.in_full or 1, candidates // 2) / factor)
+        most, fewer = round(candidates / factor), round(max(spec.max_matches or 1, candidates // 2) / factor)
         large = bench.try_map(trial_map, large_index, most)
-        half = bench.try_map(trial_map, large_index, fewer) if spec.in_full else large
+        half = bench.try_map(trial_map, large_index, fewer) if spec.max_matches else large
     scan_once = _find_least([steps.scan for steps in small]) if spec.fine else NO_COST
     # With six places, the time of a scan is query preparation and call overhead only.
     scan_per_place = _subtract(_find_least([steps.scan if spec.fine else steps.match for steps in large]), scan_once)
     scan_per_place *= 1 / len(large_index)
     full_compare, half_compare = (_find_least([steps.compare for steps in tries]) for tries in (large, half))
-    if spec.in_full:
+    if spec.max_matches:
         match_per_place = _subtract(full_compare, half_compare) * (1 / max(1, factor * (most - fewer)))
         # Only an accepted query is verified: here, the noise image that is in the map.
         verify = max((steps.verify for steps in large), key=lambda cost: cost.wall_s)
@@ -124,7 +124,7 @@ def measure_costs(technique: Technique, *, repeat_s: float = 0.0, meter: QueryMe
         encode=_find_least([steps.encode for steps in [*small, *large]]),
         match_per_place=match_per_place,
         compare_once=compare_once,
-        in_full=spec.in_full or 1,
+        max_matches=spec.max_matches or 1,
         tries_rotations=bool(spec.height_ratios),
         ram_bytes_per_place=compute_ram_bytes(spec, bench.sequence),
         disk_bytes_per_place=compute_disk_bytes(spec),

@@ -103,8 +103,8 @@ class Agreement:
         """True if the pictures coincide without shift, rotation or scaling, as an on-screen display does."""
         if self.shift_share is None or self.rotation_deg is None or self.scale is None:
             return False
-        turned_deg = min(self.rotation_deg, 360 - self.rotation_deg)
-        return max(map(abs, self.shift_share)) <= _TOLERANCE_SHARE and turned_deg <= 2 and abs(self.scale - 1) <= 0.03
+        rotation_deg = min(self.rotation_deg, 360 - self.rotation_deg)
+        return max(map(abs, self.shift_share)) <= _TOLERANCE_SHARE and rotation_deg <= 2 and abs(self.scale - 1) <= 0.03
 
 
 def compare_near(query: Landmarks, place: Landmarks, expected: Overlay) -> Agreement:
@@ -196,10 +196,10 @@ def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
         least, most = _SCALE_LIMITS
         return np.asarray((np.abs(turn_scale) >= least) & (np.abs(turn_scale) <= most))
     difference = turn_scale / expected.turn_scale
-    turned_deg, stretched = np.abs(np.angle(difference, deg=True)), np.abs(np.log(np.abs(difference)))
+    rotation_deg, stretched = np.abs(np.angle(difference, deg=True)), np.abs(np.log(np.abs(difference)))
     most = np.log(_MAX_UNKNOWN_SCALE if expected.scale is None else _MAX_SCALE)
     is_shift_near = np.abs(shift - complex(*expected.shift_share)) <= _MAX_SHIFT_SHARE
-    return np.asarray((turned_deg <= _MAX_TURN_DEG) & (stretched <= most) & is_shift_near)
+    return np.asarray((rotation_deg <= _MAX_TURN_DEG) & (stretched <= most) & is_shift_near)
 
 
 def _find_best(query_points: Array, place_points: Array, expected: Overlay | None) -> tuple[complex, complex] | None:

@@ -28,7 +28,7 @@ LEVEL = CameraPose(east_m=0, north_m=0, height_m=80, heading_deg=0)
 def orthophoto(tmp_path_factory):
     """Marked ground of 300 m, in Web Mercator and turned: the flight must not show it."""
     path = marked_raster(
-        tmp_path_factory.mktemp("ground") / "o.tif", "EPSG:3857", pixel_m=0.4, side_px=750, turned_deg=30
+        tmp_path_factory.mktemp("ground") / "o.tif", "EPSG:3857", pixel_m=0.4, side_px=750, rotation_deg=30
     )
     return Orthophoto(path)
 

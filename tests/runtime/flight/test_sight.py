@@ -94,7 +94,7 @@ def test_a_flight_that_leaves_its_map_and_comes_back_says_so(make_flight, clock,
 
 
 @pytest.mark.parametrize(
-    ("turned_deg", "said"),
+    ("rotation_deg", "said"),
     [
         ([88, 92], ["pictures turned 90 degrees"]),
         ([-179, 179], ["pictures turned 180 degrees"]),
@@ -104,11 +104,11 @@ def test_a_flight_that_leaves_its_map_and_comes_back_says_so(make_flight, clock,
         ([20, 80], []),
     ],
 )
-def test_pictures_that_are_turned_against_the_heading_are_said_once(notifier, link, turned_deg, said):
+def test_pictures_that_are_turned_against_the_heading_are_said_once(notifier, link, rotation_deg, said):
     source = load_config(None, {"source.up_deg": 300.0}).source
     watch = TurnWatch(notifier, source)
     view = SimpleNamespace(up_deg=350.0, reason=None)
-    events = [SimpleNamespace(located=SimpleNamespace(heading_deg=350.0 + turn), view=view) for turn in turned_deg]
+    events = [SimpleNamespace(located=SimpleNamespace(heading_deg=350.0 + turn), view=view) for turn in rotation_deg]
     missed = SimpleNamespace(located=None, view=view)
     for event in [events[0], missed, events[1]] * 4:
         watch.update(event)

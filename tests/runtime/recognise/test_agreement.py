@@ -48,22 +48,22 @@ def kept(image):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("right_px", "down_px", "turned_deg", "scale"),
+    ("right_px", "down_px", "rotation_deg", "scale"),
     [(80, 0, 0, 1.0), (0, -60, 0, 1.0), (40, 30, 30, 1.0), (-50, 20, 315, 1.15), (10, -40, 180, 0.85)],
 )
-def test_the_signs_are_those_of_a_match_of_cohog(landscape, right_px, down_px, turned_deg, scale):
+def test_the_signs_are_those_of_a_match_of_cohog(landscape, right_px, down_px, rotation_deg, scale):
     """The query's middle lies right of the place's by `right_px`, and below it by `down_px`."""
     place = cut(landscape, 800, 600)
-    query = cut(landscape, 800 + right_px, 600 + down_px, turned_deg, scale)
+    query = cut(landscape, 800 + right_px, 600 + down_px, rotation_deg, scale)
     found = measure_agreement(asked(query), kept(place))
     assert found.inliers >= MIN_PROVEN_INLIERS
     assert np.array(found.shift_share) * WIDE == pytest.approx((right_px, down_px), abs=2)
-    assert abs((found.rotation_deg - turned_deg + 180) % 360 - 180) < 1
+    assert abs((found.rotation_deg - rotation_deg + 180) % 360 - 180) < 1
     assert found.scale == pytest.approx(scale, rel=0.02)
 
     cohog = create("cohog", {"camera": "nadir"})
     match = cohog.match(cohog.encode(query), cohog.encode(place).fine)
-    assert abs((match.rotation_deg - turned_deg + 180) % 360 - 180) < 1
+    assert abs((match.rotation_deg - rotation_deg + 180) % 360 - 180) < 1
     assert np.array(match.shift_cells) / 32 == pytest.approx(found.shift_share, abs=1.5 / 32)
 
     expected = Overlay((match.shift_cells[0] / 32, match.shift_cells[1] / 32), match.rotation_deg)

@@ -83,16 +83,16 @@ def test_a_fresh_autopilot_goes_before_our_own_fix_and_both_grow_old(index):
 def test_only_places_in_reach_are_allowed_and_none_without_a_position(index):
     expected = to_expectation(Hints(Reach(north(120), 90.0)), 1.0, index)
     assert expected.in_reach.tolist() == [False, True, True, False, False]
-    assert expected.turned_deg is None
+    assert expected.rotation_deg is None
     assert hints_at(10.0, index, vehicle(north(5000), 10.0)) is None, "no place is in reach: all are searched"
     everywhere = to_expectation(None, 1.0, index)
-    assert (everywhere.in_reach, everywhere.turned_deg) == (None, None)
+    assert (everywhere.in_reach, everywhere.rotation_deg) == (None, None)
 
 
 def test_a_heading_says_how_far_each_place_is_turned_where_one_is_known(index):
     hints = hints_at(10.0, index, heading_deg=5.0)
     assert to_expectation(hints, 1.0, index).in_reach is None
-    np.testing.assert_array_equal(to_expectation(hints, 1.0, index).turned_deg, [5, 355, 345, np.nan, 15])
+    np.testing.assert_array_equal(to_expectation(hints, 1.0, index).rotation_deg, [5, 355, 345, np.nan, 15])
     index.heading_deg[:] = np.nan
     assert hints_at(10.0, index, heading_deg=5.0) is None
     assert hints_at(10.0, index, vehicle(HOME, 10.0), heading_deg=5.0) == Hints(Reach(HOME, 50.0))
@@ -136,8 +136,8 @@ def test_a_compass_that_is_wrong_leaves_the_area_believed_and_a_false_position_l
         frame = Frame(image=np.zeros((1, 1), np.uint8), name="", t_mono_s=float(number), heading_deg=0.0)
         hints = prior.make_hints(frame, vehicle(near, float(number)), index, 100.0)
         seen.append(hints and (hints.reach is not None, hints.heading_deg is not None))
-        metres, turned_deg = answer or (50, 0.0)
-        prior.update(found(metres, 0.0, turned_deg), answer is not None, float(number))
+        metres, rotation_deg = answer or (50, 0.0)
+        prior.update(found(metres, 0.0, rotation_deg), answer is not None, float(number))
     both, area, heading = (True, True), (True, False), (False, True)
     assert seen == [both, area, None, area, area, heading, None, both, None, both]
 
