@@ -58,7 +58,7 @@ def run_eval(args: Namespace) -> int:
     if args.similarity:
         return _measure_similarities(args)
     from edgevpr.lab.evaluate.evaluate import MatchOptions
-    from edgevpr.lab.evaluate.runs import Plan, measure
+    from edgevpr.lab.evaluate.runs import measure
     from edgevpr.lab.evaluate.tables import format_results
 
     config, rows, sets = make_config(args, args.config), _list_rows(args), _open_sets(args)
@@ -69,8 +69,7 @@ def run_eval(args: Namespace) -> int:
         follow=args.follow,
         known=args.known,
     )
-    plan = Plan(sets=sets, rows=rows, options=options, salience=config.salience)
-    outcome = measure(plan, progress)
+    outcome = measure(sets, rows, options, config.salience, progress)
     content = outcome.as_json()
     if not content["results"]:
         raise next(iter(outcome.failed.values()))
@@ -123,7 +122,7 @@ def _open_sets(args: Namespace) -> "dict[str, Dataset]":
 
 
 def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
-    """Return the rows requested by the flags, as in `runs.Plan`: each technique in each form. Raises UsageError for an
+    """Return the rows requested by the flags, for `runs.measure`: each technique in each form. Raises UsageError for an
     unknown form, and for a --param of a technique that is not in --techniques."""
     from edgevpr import techniques
     from edgevpr.runtime.preflight.pick import make_camera_setting

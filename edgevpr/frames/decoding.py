@@ -154,8 +154,6 @@ class VideoDecoder:
         """The stream's own description of its pictures; available once one has been decoded."""
         aspect, rate = self._codec.sample_aspect_ratio, self.stream.average_rate
         return StreamFacts(
-            width_px=self._codec.width,
-            height_px=self._codec.height,
             codec=self._codec.name,
             bits=self._codec.format.components[0].bits if self._codec.format else 8,
             pixel_aspect=float(aspect or 1),

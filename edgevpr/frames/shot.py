@@ -79,8 +79,6 @@ class StreamFacts:
     """A stream's own description of its pictures. `pixel_aspect`: width of a pixel divided by its height. `rate_hz`:
     None if not stated."""
 
-    width_px: int
-    height_px: int
     codec: str
     bits: int
     pixel_aspect: float

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from edgevpr.core.config import BatteryConfig, MatchConfig, SourceConfig, bounded_key
+from edgevpr.core.config import BatteryConfig, MatchConfig, SourceConfig
 from edgevpr.core.contract import Technique, TechniqueSpec
 from edgevpr.core.errors import ModelError, UsageError
 from edgevpr.core.text import Progress, iterate_silently
@@ -59,8 +59,8 @@ class MatchOptions:
     filter, as frames of one flight. `known`: what is known about each query besides its image, such as "heading,height"
     (see `hints.RecordedPrior`; None: nothing)."""
 
-    candidates: int | None = bounded_key(1, 1_000_000, default=None)
-    sequence: int | None = bounded_key(1, 100, default=None)
+    candidates: int | None = None
+    sequence: int | None = None
     exact: bool = False
     follow: bool = False
     known: str | None = None

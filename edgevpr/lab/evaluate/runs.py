@@ -16,17 +16,6 @@ from edgevpr.runtime.recognise.opening import open_salience_gate
 from edgevpr.techniques import create
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """A plan of measurements: every row on every set. `sets`: data sets by name. `rows`: (technique, its settings) by
-    the label of the row. `options` and `salience` apply to all of them."""
-
-    sets: Mapping[str, Dataset]
-    rows: Mapping[str, tuple[str, dict[str, Any]]]
-    options: MatchOptions
-    salience: SalienceConfig
-
-
 @dataclass(frozen=True, slots=True)
 class Measurements:
     """Outcome of a run. `measured`: results of the rows, by set. `answers`: judged answers to their queries, by set and
@@ -60,20 +49,27 @@ def _serialise_answer(answer: QueryAnswer) -> dict[str, Any]:
     return fields | {name: None for name in ("score", "first_right") if not math.isfinite(fields[name])}
 
 
-def measure(plan: Plan, progress: Progress) -> Measurements:
-    """Measure every row on every set. Raises UsageError for an unknown technique or parameter. If a network or picture
-    cannot be used, only its row fails."""
+def measure(
+    sets: Mapping[str, Dataset],
+    rows: Mapping[str, tuple[str, dict[str, Any]]],
+    options: MatchOptions,
+    salience: SalienceConfig,
+    progress: Progress,
+) -> Measurements:
+    """Measure every row on every set. `sets`: data sets by name. `rows`: (technique, its settings) by the label of the
+    row. Raises UsageError for an unknown technique or parameter. If a network or picture cannot be used, only its row
+    fails."""
     outcome = Measurements({}, {}, {})
-    for name, dataset in plan.sets.items():
+    for name, dataset in sets.items():
         results = []
-        for label, (technique_name, settings) in plan.rows.items():
-            technique, gate = create(technique_name, settings), open_salience_gate(plan.salience)
+        for label, (technique_name, settings) in rows.items():
+            technique, gate = create(technique_name, settings), open_salience_gate(salience)
             try:
-                answers, not_done = answer_queries(technique, dataset, plan.options, progress, gate)
+                answers, not_done = answer_queries(technique, dataset, options, progress, gate)
             except (ModelError, ImageError) as error:  # the other rows continue
                 outcome.failed[name, label] = error
             else:
-                result = summarise(technique, dataset, answers, plan.options, not_done)
+                result = summarise(technique, dataset, answers, options, not_done)
                 results.append(replace(result, technique=label))
                 outcome.answers[name, label] = answers
         outcome.measured[name] = add_pcu(results)
