@@ -226,15 +226,11 @@ class FakeLink:
             acks=dict(self._acks),
             dropped_stale_fixes=self._waiting.dropped,
             withheld_fixes=self._waiting.withheld,
-            commands={},
-            ignored_requests=0,
             unanswered_fixes=self._waiting.unanswered,
             refused_why=self._waiting.refusal and self._waiting.refusal.code.summary,
             foreign_messages=0,
             refused_signatures={},
-            dropped_queue_full=0,
             bad_bytes=0,
-            reopened=0,
         )
 
     def texts(self) -> list[tuple[int, str]]:

@@ -60,7 +60,6 @@ class Conversation:
         self.reader = PacketReader(settings.signing.admits)
         self.interim_fixes: deque[FixTransmission] = deque(maxlen=MAX_MESSAGES)
         self.sent: Counter[str] = Counter()
-        self.dropped_queue_full = 0
         self._reports: list[tuple[Severity, str, str]] = []
         self._messages: deque[Message] = deque(maxlen=MAX_MESSAGES)
         self._clock = clock
@@ -86,10 +85,8 @@ class Conversation:
         return bool(self._messages or self.texts or self.fixes)
 
     def send(self, *outgoing: Message) -> None:
-        """Queue messages. If the queue is full, the oldest messages are dropped and counted."""
-        for message in outgoing:
-            self.dropped_queue_full += len(self._messages) == MAX_MESSAGES
-            self._messages.append(message)
+        """Queue messages. If the queue is full, the oldest messages are dropped."""
+        self._messages.extend(outgoing)
 
     def send_fix(self, fix: Fix) -> FixTransmission:
         """Queue a position fix. It is sent within `max_fix_age_s` seconds if the autopilot is alive, or never."""

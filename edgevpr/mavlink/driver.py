@@ -22,7 +22,7 @@ MAX_RETRY_S = 2.0
 DEPARTURE_CHECK_S = 0.01  # interval of checks whether a fix has left the operating system
 FLUSH_TIMEOUT_S = 0.5
 
-PortState = tuple[bool, str | None, int]  # connected?, why not (or None), number of times it was reopened
+PortState = tuple[bool, str | None]  # connected?, why not (or None)
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +54,6 @@ class PortDriver:
         self._address, self._conversation, self._turns = address, conversation, turns
         self._settings = conversation.settings
         self._writer: PacketWriter | None = None
-        self._reopened = 0
         self._retry_s = FIRST_RETRY_S
         self._trouble: str | None = None
         self._closing = threading.Event()
@@ -78,7 +77,7 @@ class PortDriver:
 
     def state(self) -> PortState:
         writer = self._writer
-        return writer is not None and writer.port.connected, self._trouble, self._reopened
+        return writer is not None and writer.port.connected, self._trouble
 
     def close(self) -> None:
         self._closing.set()
@@ -115,7 +114,6 @@ class PortDriver:
         with self._turns.take_link_turn():
             self._conversation.drop_stale()
         self._writer = self._open()
-        self._reopened += 1
 
     def _work(self, writer: PacketWriter, timeout_s: float) -> None:
         """Write as much as the port accepts, wait up to `timeout_s` for something to do, then read."""

@@ -2,7 +2,6 @@
 can carry out, such as a pause. Used by `conversation` and the flight."""
 
 import math
-from collections import Counter
 from collections.abc import Callable
 from enum import IntEnum
 from typing import NamedTuple
@@ -32,13 +31,11 @@ class CommandRequest(NamedTuple):
 
 class Requests:
     """Answers requests received over the link, and keeps the newest command until the flight's main loop takes it.
-    Commands are rejected until `is_flying` is set. `results` counts commands by the name of their result. `ignored`
-    counts other messages to us: of an unknown kind, or above the rate limit. While `is_paused`, no fix may be sent."""
+    Commands are rejected until `is_flying` is set. Other messages to us, of an unknown kind or above the rate limit,
+    are ignored. While `is_paused`, no fix may be sent."""
 
     def __init__(self) -> None:
         self.is_flying = False
-        self.results: Counter[str] = Counter()
-        self.ignored = 0
         self.is_paused = False
         self._waiting: CommandRequest | None = None
         self._second_s, self._answered = 0.0, 0
@@ -55,13 +52,11 @@ class Requests:
             return ()
         kind = message.get_type()
         if kind not in ("TIMESYNC", "COMMAND_LONG", "COMMAND_INT") or not self._may_answer(now_s):
-            self.ignored += 1
             return ()
         if kind == "TIMESYNC":
             return (mavlink.MAVLink_timesync_message(tc1=round(now_s * 1e9), ts1=message.ts1),)
         is_command = message.command == mavlink.MAV_CMD_USER_1
         result = self._keep_command(message.param1, sender) if is_command else int(mavlink.MAV_RESULT_UNSUPPORTED)
-        self.results[mavlink.enums["MAV_RESULT"][result].name.removeprefix("MAV_RESULT_")] += 1
         to = {"target_system": sender[0], "target_component": sender[1]}
         return (mavlink.MAVLink_command_ack_message(message.command, result, **to),)
 

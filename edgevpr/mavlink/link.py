@@ -22,8 +22,8 @@ class LinkStats:
 
     `trouble`: why the port could not be opened or was lost; None once data arrives again. `foreign_messages`: messages
     from another autopilot or address. `withheld_fixes`: fixes not sent because of unanswered ones or a pause.
-    `refused_why`: reason of the last refused fix. `commands`, `ignored_requests`: counts of requests received.
-    `bad_bytes`: bytes that belong to no message. `answered_s`: time of the last answer to our commands, by number."""
+    `refused_why`: reason of the last refused fix. `bad_bytes`: bytes that belong to no message. `answered_s`: time of
+    the last answer to our commands, by number."""
 
     connected: bool
     trouble: str | None
@@ -34,15 +34,11 @@ class LinkStats:
     acks: dict[str, int]
     dropped_stale_fixes: int
     withheld_fixes: int
-    commands: dict[str, int]
-    ignored_requests: int
     unanswered_fixes: int
     refused_why: str | None
     foreign_messages: int
     refused_signatures: dict[str, int]
-    dropped_queue_full: int
     bad_bytes: int
-    reopened: int
     used_share: float | None = None
     answered_s: dict[int, float] = field(default_factory=dict)
 
@@ -138,7 +134,7 @@ class Link:
     def stats(self) -> LinkStats:
         with self.turn("stats"):
             conversation, autopilot, fixes = self.conversation, self.conversation.autopilot, self.conversation.fixes
-            connected, trouble, reopened = self._driver.state()
+            connected, trouble = self._driver.state()
             return LinkStats(
                 connected=connected,
                 trouble=trouble,
@@ -149,15 +145,11 @@ class Link:
                 acks=dict(autopilot.acks),
                 dropped_stale_fixes=fixes.dropped,
                 withheld_fixes=fixes.withheld,
-                commands=dict(conversation.requests.results),
-                ignored_requests=conversation.requests.ignored,
                 unanswered_fixes=fixes.unanswered,
                 refused_why=fixes.refusal.code.summary if fixes.refusal else None,
                 foreign_messages=autopilot.identity.foreign_messages,
                 refused_signatures=dict(conversation.settings.signing.refused),
-                dropped_queue_full=conversation.dropped_queue_full,
                 bad_bytes=conversation.reader.bad_bytes,
-                reopened=reopened,
                 used_share=autopilot.px4.used_share,
                 answered_s=dict(autopilot.answered_s),
             )

@@ -115,20 +115,19 @@ def compute_query_cost(
 
 
 class FlightEnergy:
-    """Sums the stages of a flight from the creation of this object: `marginal_j`, the energy that they added, in joules
-    at the board's input, and `stages_cpu_s`, their CPU-seconds. `cpu_clock` counts all threads."""
+    """Sums the stages of a flight from the creation of this object: `marginal_j` is the energy that they added, in
+    joules at the board's input. `cpu_clock` counts all threads."""
 
     def __init__(self, board: Board, clock: Clock = time.monotonic, cpu_clock: Clock = time.process_time) -> None:
         self._board, self._clock, self._cpu_clock = board, clock, cpu_clock
         self._start_s, self._cpu_start_s = clock(), cpu_clock()
-        self.marginal_j = self.stages_cpu_s = 0.0
+        self.marginal_j = 0.0
 
     def add(self, *stages: StageCost) -> None:
         """Add stages that have ended."""
         for stage in stages:
             u = stage.utilisation(self._board.cores)
             self.marginal_j += marginal_energy_j(self._board.idle_w, self._board.full_w, u, stage.wall_s)
-            self.stages_cpu_s += stage.cpu_s
 
     def measure_process(self) -> StageCost:
         """Return the wall seconds and the CPU-seconds of the whole process since the creation of this object."""

