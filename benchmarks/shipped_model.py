@@ -54,11 +54,11 @@ def shipped_model(kind: str, sites: Sequence[FittedSite], made_of: str) -> Model
     )
     unknown = Scale(Tail(0.0, 1.0, 1.0), Tail(0.0, 1.0, 1.0), 1.0, 0.0)
     today = date.today().isoformat()
-    model = Model(of_map=of_map, of_place=of_place, scale=unknown, made=today, made_of=made_of)
+    matches = sum(len(site.own) + len(site.foreign) for site in sites)
+    model = Model(of_map=of_map, of_place=of_place, scale=unknown, made=today, made_of=made_of, matches=matches)
     bare = [(site, model) for site in sites]
     own = [(site, adapt_model(model, kind, site.answers, site.name)) for site in sites if site.answers]
-    matches = sum(len(site.own) + len(site.foreign) for site in sites)
-    return replace(model, matches=matches, scale=_scale(bare), adapted_scale=_scale(own) if own else None)
+    return replace(model, scale=_scale(bare), adapted_scale=_scale(own) if own else None)
 
 
 def _regression(names: Sequence[str], groups: Iterable[tuple[Sequence[Evidence], bool]]) -> Logistic:

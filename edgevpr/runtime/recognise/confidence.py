@@ -30,8 +30,6 @@ _MAX_LOGIT = 40.0  # limit of a logit: beyond it, a probability is 0 or 1 in flo
 # adapted to its map, also foreign pictures for the five places of grief_michigan_monthly.
 _ADAPTED_FACTOR = 0.5
 _SHIPPED_FACTOR = 0.1
-# Number of matches that a model was fitted to, if its map was calibrated before this number was stored.
-_UNKNOWN_MATCHES = 1000
 _MIN_CHANCE = 1e-15  # least chance, so that its logarithm exists
 # A chance is multiplied by the share of rotations tried to this power. It would be 1 if rotations were independent, but
 # streets and furrows have directions. Of 2,015 foreign and mirrored pictures, queried with random headings in the maps
@@ -100,7 +98,7 @@ class Model:
     adapted_scale: Scale | None = None
     made: str
     made_of: str
-    matches: int = _UNKNOWN_MATCHES
+    matches: int
 
     def chance(self, evidence: Figures) -> float:
         """Return the probability (0..1) that a wrong match has as much evidence; 1 if any figure is not finite. If the
@@ -133,11 +131,7 @@ class Model:
 
 
 def parse_model(stored: Mapping[str, Any]) -> Model:
-    """Make a model from decoded JSON. Raises KeyError or TypeError for other contents, and ValueError for a model that
-    was merged from several maps."""
-    if stored.get("of_other_places"):  # earlier builds joined the models of several maps
-        raise ValueError("it was joined from several maps")
-    stored = {name: value for name, value in stored.items() if name != "of_other_places"}
+    """Make a model from decoded JSON. Raises KeyError or TypeError for other contents."""
     scales = {name: stored[name] and _make_scale(**stored[name]) for name in ("scale", "adapted_scale")}
     regressions = {name: _make_logistic(**stored[name]) for name in ("of_map", "of_place")}
     return Model(**{**stored, **regressions, **scales})

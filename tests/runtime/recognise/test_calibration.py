@@ -80,10 +80,10 @@ def test_a_flight_decides_by_the_models_of_its_map(path, caplog):
     assert not caplog.records
 
 
-def changed(of_other_places=(), **figures):
-    """The text of the calibration as an earlier build wrote it, with other figures of its model, and its checksum."""
+def changed(more=(), **figures):
+    """The text of the calibration with `more` fields or other figures of its model, and its checksum."""
     stored = json.loads(format_calibration(FOUND)[8:])
-    stored["models"]["ahead"]["of_other_places"] = of_other_places
+    stored["models"]["ahead"].update(more)
     stored["models"]["ahead"]["of_map"].update(figures)
     body = json.dumps(stored)
     return f"{zlib.crc32(body.encode()):08x}{body}"
@@ -96,7 +96,7 @@ DAMAGED = {
     "evidence that there is not": changed(names=["colour", *OWN.of_map.names[1:]]),
     "a kind that there is not": format_calibration(replace(FOUND, models={"sideways": OWN})),
     "a weight too few": changed(weights=OWN.of_map.weights[1:]),
-    "joined from several maps": changed(of_other_places=[asdict(OWN.of_place)]),
+    "a field of another version": changed({"of_other_places": []}),
     "a place that is no number": format_calibration(replace(FOUND, recognisable={"x": 0.5})),
     "no places": format_calibration(replace(FOUND, recognisable=None)),
     "a wrong surrogate": "\ud800" * 9,
