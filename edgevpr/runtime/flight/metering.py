@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from edgevpr.core.config import BatteryConfig
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import marginal_energy_j, pack_ah, parse_pack
-from edgevpr.power.meter import FlightEnergy, MachineLoad, ProcessLoad, Stage, meter_stage
+from edgevpr.power.meter import FlightEnergy, ProcessLoad, Stage, meter_stage
 from edgevpr.runtime.flight.clock import Clock
 from edgevpr.runtime.flight.machine import Machine
 from edgevpr.runtime.recognise.recognition import Recognition
@@ -69,21 +69,13 @@ class FlightMeter:
         """Measure the temperature and supply of the board. Call it about once a second."""
         self.thermal = self._machine.measure_heat()
 
-    def machine_load(self) -> MachineLoad:
-        """Return the load of the whole machine since the last call. Call it once a second."""
-        return self._machine.measure_load()
-
-    def rss_mb(self) -> float:
-        """Return the memory that this process uses, MB."""
-        return self._machine.rss_mb()
-
     def reading(self) -> LoadReading:
         """Return a measurement for the governor: load since the last one, and current memory and temperature."""
         cpu_share, late_share = self.load.measure()
         return LoadReading(
             cpu_share=cpu_share,
             late_share=late_share,
-            rss_mb=self.rss_mb(),
+            rss_mb=self._machine.rss_mb(),
             temperature_c=self.thermal.temperature_c,
             throttled=self.thermal.throttled,
         )

@@ -101,7 +101,7 @@ class Vitals:
         self._failing.update(self._tally.failed_in_a_row >= MAX_FAILURES_IN_A_ROW)
         self._check_log()
         self._no_texture.update(self._tally.blank_in_a_row >= MAX_BLANK_IN_A_ROW)
-        health, load = self._assess_health(), parts.meter.machine_load()
+        health, load = self._assess_health(), parts.io.machine.measure_load()
         status = self._make_status(health, load)
         systemd.notify(STATUS=status["summary"])
         if status["t_mono_s"] >= self._minute_due_s:
@@ -167,7 +167,7 @@ class Vitals:
             "accepted": tally.accepted,
             "failed": tally.failed + tally.unusable,
             "asked_rate_hz": self._pace.rate_hz,
-            "rss_mb": parts.meter.rss_mb(),
+            "rss_mb": parts.io.machine.rss_mb(),
             "machine_cpu_share": sum(load.core_shares) / max(1, len(load.core_shares)),
             "machine_ram_mb": load.ram_used_bytes / 1e6,
             "machine_ram_total_mb": load.ram_total_bytes / 1e6,
