@@ -37,7 +37,7 @@ _INITIAL_TIE_FACTOR = 3.0
 _MIN_TIE_FACTOR = 0.5
 _MIN_RECORDED_SD_M = 0.5
 _INITIAL_RECORDED_SD_M = 10.0
-_MIN_AGREEMENT = 0.1  # a tie or position with a smaller weight contradicts the others
+_MIN_AGREEMENT = 0.1  # a tie with a smaller weight contradicts the others
 _MEDIAN_LENGTH = 1.832  # median length of a vector of four standard normal numbers
 _DIAGONAL_DAMPING = 1e-6  # added to the diagonal, so that places without ties can be solved for
 
@@ -66,7 +66,7 @@ class GraphSolution:
     `position_var` (m^2) and `log_var`, float (N,): variances of `position` and `log`, summed over both axes.
     `component`, int (N,): number of each place's group; the places of a group are connected by ties.
     `recorded_sd_m`: estimated standard deviation of recorded positions along one axis.
-    `recorded_agree` (N,), `ties_agree` (T,): bool, False for positions and ties that contradict the others."""
+    `ties_agree`, bool (T,): False for ties that contradict the others."""
 
     position: np.ndarray
     log: np.ndarray
@@ -74,7 +74,6 @@ class GraphSolution:
     log_var: np.ndarray
     component: np.ndarray
     recorded_sd_m: float
-    recorded_agree: np.ndarray
     ties_agree: np.ndarray
 
 
@@ -108,7 +107,6 @@ def solve_graph(recorded: np.ndarray, ties: Ties) -> GraphSolution:
         log_var=variance[count:],
         component=component,
         recorded_sd_m=recorded_sd_m,
-        recorded_agree=_weigh_residuals(residual_m / sd_m) >= _MIN_AGREEMENT,
         ties_agree=agree >= _MIN_AGREEMENT,
     )
 

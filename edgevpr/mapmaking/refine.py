@@ -31,6 +31,7 @@ from edgevpr.core.types import Place, Pose, Position
 from edgevpr.frames.images import list_images, read_image
 from edgevpr.mapmaking.graph import GraphSolution, Ties, solve_graph
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.places.mapinfo import find_inconsistent_tags
 from edgevpr.runtime.recognise.agreement import MIN_CONFIRMED_INLIERS, MIN_PROVEN_INLIERS, Overlay, measure_agreement
 from edgevpr.runtime.recognise.landmarks import Landmarks, unpack_bytes
 
@@ -43,7 +44,6 @@ _MAX_LOG_SD = 0.15  # largest standard deviation of a log (see `graph`): 9 degre
 _MIN_MISFIT = 0.15
 _MAX_MIRRORED_RATIO = 0.75
 _MAX_MIRROR_PLACES = 300  # places that the mirror image is fitted to
-_INCONSISTENT_SDS = 4.0  # beyond this many standard deviations, the pictures contradict a recorded position
 _NEAREST_PLACES = 8  # each place is compared with this many of the places recorded nearest to it
 _PREVIOUS_PLACES = 2  # and with this many of the places mapped just before it
 _MAX_OVERLAP_DISTANCE = 0.6  # between centres, in longest sides: within it, pictures share at least a third
@@ -84,7 +84,8 @@ class Refinement:
     number of ties that agree with the solution. `recorded_sd_m`: standard deviation of recorded positions along one
     axis. `moved_m`, `position_sd_m`, `footprint_m`: medians of how far places moved, of the standard deviations of
     refined positions, and of footprints (None: no place).
-    `contradictory`: places whose recorded position contradicts the pictures: (number, image, metres between the two).
+    `contradictory`: places whose recorded position contradicts the pictures (see `find_inconsistent_tags`): (number,
+    image, metres between the two).
     `is_mirrored`: the ties fit the mirror image of the recorded positions, so nothing was refined."""
 
     places: int
@@ -134,20 +135,19 @@ def refine(
     is_mirrored = _is_mirrored(positions, recorded, _to_ties(ties), solved)
     refined = _is_determined(solved) & (not is_mirrored)
     _write_poses(place_map, placed, positions, solved, refined)
-    moved_m = abs(solved.position - recorded)
-    inconsistent = refined & ~solved.recorded_agree & (moved_m > _INCONSISTENT_SDS * solved.recorded_sd_m)
+    moved_m = abs(solved.position - recorded)[refined]
+    members = np.flatnonzero(refined)
     return replace(
         result,
         refined=int(refined.sum()),
         ties=int(solved.ties_agree.sum()),
         recorded_sd_m=solved.recorded_sd_m,
-        moved_m=_find_median(moved_m[refined]),
+        moved_m=_find_median(moved_m),
         position_sd_m=_find_median(np.sqrt(solved.position_var[refined] / 2)),
         footprint_m=_find_median(np.exp(solved.log.real[refined])),
         contradictory=tuple(
-            (place.place_id, place.source_image, float(moved_m[index]))
-            for index, place in enumerate(placed)
-            if inconsistent[index]
+            (placed[members[row]].place_id, placed[members[row]].source_image, float(moved_m[row]))
+            for row in np.flatnonzero(find_inconsistent_tags(moved_m))
         ),
         is_mirrored=is_mirrored,
     )

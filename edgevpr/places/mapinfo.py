@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edgevpr.core.arrays import Bools, Floats
 from edgevpr.core.contract import TechniqueSpec
 from edgevpr.core.errors import PlaceError
 from edgevpr.core.geodesy import Extent, offset_m
@@ -24,6 +25,9 @@ FROM places
 _MIN_COURSES = 10
 _MAX_PASS_STEPS = 3.0  # longest time from one place to the next of the same pass, in median steps
 _MIN_COURSE_LENGTH = 0.9  # of the mean of unit vectors along the courses, for courses in one direction
+_MAX_TAG_SIGMA = 4.0  # times the usual distance of a tag from the true position of its picture
+_MEDIAN_PER_SIGMA = 1.1774  # median length of a normally distributed 2D vector over the standard deviation per axis
+_MIN_TAG_OFF_M = 5.0  # smaller distances are receiver error
 _EXTENT = "SELECT min_y, min_x, max_y, max_x FROM gpkg_contents WHERE table_name = 'places'"
 
 
@@ -139,3 +143,12 @@ def read_identity(place_map: PlaceMap) -> MapIdentity:
         places += 1
     map_id = place_map.stored.get("map_id")
     return MapIdentity(map_id if isinstance(map_id, str) else None, places, digest.hexdigest())
+
+
+def find_inconsistent_tags(moved_m: Floats) -> Bools:
+    """Return bool (N,), True for places whose recorded position is more than four standard deviations per axis from the
+    refined one. `moved_m`, float (N,): the distances in metres between the two, from whose median the standard
+    deviation is estimated."""
+    far_m = max(_MIN_TAG_OFF_M, _MAX_TAG_SIGMA * float(np.median(moved_m)) / _MEDIAN_PER_SIGMA) if len(moved_m) else 0.0
+    is_inconsistent: Bools = moved_m > far_m
+    return is_inconsistent

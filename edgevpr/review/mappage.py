@@ -2,6 +2,7 @@
 them, inconsistent GPS tags, and places that look alike."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ from edgevpr.core.geodesy import distance_m, offset_m, offset_position, picture_
 from edgevpr.core.text import format_probability
 from edgevpr.core.types import Place
 from edgevpr.mapmaking.look_alikes import FoundLookAlike
+from edgevpr.places.mapinfo import find_inconsistent_tags
 from edgevpr.review.album import Album
 from edgevpr.review.logged import Point
 from edgevpr.review.webpage import UNKNOWN, Layer, Section, Step, format_number, make_layer, make_page, to_point
@@ -20,9 +22,6 @@ if TYPE_CHECKING:
 MAX_QUERIES = 100  # images of a map that are matched against the places elsewhere; each takes half a second
 _QUALITY_CLASSES = {"low": 0.4, "fair": 0.6, "good": 0.8, "best": 1.01}  # upper limits of the classes
 _MAX_HARD_CONFIDENCE = 0.5  # maximum mean confidence of a place that is hard to recognise
-_MAX_TAG_SIGMA = 4.0  # times the usual distance of a tag from the true position of its picture, as in refinement
-_MEDIAN_PER_SIGMA = 1.1774  # median length of a normally distributed 2D vector over the standard deviation per axis
-_MIN_TAG_OFF_M = 5.0  # smaller distances are receiver error
 _CELLS_PER_FOOTPRINT = 24  # resolution of the coverage grid
 _MAX_CELLS = 4_000_000  # of the coverage grid
 _COVERED_SHARE = 0.75  # of a footprint: the short side of a 4:3 picture
@@ -54,7 +53,7 @@ def make_map_page(
     its camera (None: unknown)."""
     ground = [place for place in places if place.position]
     points = {place.place_id: to_point(place) for place in ground}
-    tags_off_m, twins = find_inconsistent_tags(ground), {twin.place_id: twin for twin in look_alikes if twin}
+    tags_off_m, twins = measure_inconsistent_tags(ground), {twin.place_id: twin for twin in look_alikes if twin}
     hard = {place_id for place_id, confidence in mean_confidences.items() if confidence < _MAX_HARD_CONFIDENCE}
     gaps, covered_m2, gaps_m2 = find_gaps(ground)
     steps = list(_make_steps(places, mean_confidences, tags_off_m, twins, points))
@@ -146,16 +145,16 @@ def read_recorded_position(place: Place) -> Point:
     return (recorded.lat_deg, recorded.lon_deg) if recorded else to_point(place)
 
 
-def find_inconsistent_tags(ground: Sequence[Place]) -> dict[int, float]:
-    """Return the distance in metres, by place number, from the recorded position of a place to its refined one, for
-    places where it is more than four standard deviations per axis, estimated from the median of all."""
+def measure_inconsistent_tags(ground: Sequence[Place]) -> dict[int, float]:
+    """Return the distance in metres, by place number, from the recorded position of a place to its refined one, for the
+    places with an inconsistent tag (see `find_inconsistent_tags`)."""
     moved_m = {
         place.place_id: float(distance_m(*read_recorded_position(place), *to_point(place)))
         for place in ground
         if place.pose and place.pose.recorded
     }
-    far_m = max(_MIN_TAG_OFF_M, _MAX_TAG_SIGMA * float(np.median(list(moved_m.values()) or [0.0])) / _MEDIAN_PER_SIGMA)
-    return {place_id: off_m for place_id, off_m in moved_m.items() if off_m > far_m}
+    inconsistent = find_inconsistent_tags(np.array(list(moved_m.values())))
+    return {place_id: moved_m[place_id] for place_id in compress(moved_m, inconsistent)}
 
 
 def find_gaps(ground: Sequence[Place]) -> tuple[list[list[Point]], float, float]:

@@ -201,6 +201,5 @@ def to_bytes(vectors: Singles) -> Array:
 
 def from_bytes(stored: Array) -> Singles:
     """Restore the rows of `to_bytes`, L2-normalised: int8 (N, D) to float32 (N, D); a zero row stays zero."""
-    vectors: Singles = stored.astype(np.float32)
-    vectors /= np.maximum(np.sqrt(np.einsum("nd,nd->n", vectors, vectors)), _TINY)[:, None]
+    vectors: Singles = normalise_rows(stored.astype(np.float32))
     return vectors

@@ -14,7 +14,7 @@ from edgevpr.cli.main import main
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, write_positions
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.review.mappage import find_gaps, find_inconsistent_tags
+from edgevpr.review.mappage import find_gaps, measure_inconsistent_tags
 
 TWIN = "twin.png"
 
@@ -91,10 +91,10 @@ def test_find_gaps_where_a_picture_is_missing_between_others(tmp_path):
     assert find_gaps([replace(place, pose=None) for place in places]) == ([], 0.0, 0.0)
 
 
-def test_find_inconsistent_tags_names_those_far_from_their_pictures(tmp_path):
+def test_measure_inconsistent_tags_names_those_far_from_their_pictures(tmp_path):
     places = [
         replace(place, pose=replace(place.pose, recorded=Position(*position(0.1 * at, 400.0 if at == 4 else 0.0))))
         for at, place in enumerate(places_in(tmp_path))
     ]
     places = [replace(place, position=Position(*position(0.0, 0.0))) for place in places]
-    assert list(find_inconsistent_tags(places)) == [5]
+    assert list(measure_inconsistent_tags(places)) == [5]
