@@ -14,7 +14,7 @@ import numpy as np
 import rasterio
 from mosaics import Ground, ground_of, laid, make_mosaic, write_tif
 
-from edgevpr.core.geodesy import offset_m, offset_position
+from edgevpr.core.geodesy import move_position, offset_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light
 from edgevpr.lab.simulate.overflight import photograph_ground
@@ -125,7 +125,7 @@ def _rows(of: Path, folder: Path) -> Site:
     for lane, north_m in enumerate(lanes):
         east_m = np.arange(-half_m[0], half_m[0], step_m)
         for east in east_m if lane % 2 == 0 else east_m[::-1]:
-            at = Position(*offset_position(photo.middle.lat_deg, photo.middle.lon_deg, float(east), float(north_m)))
+            at = move_position(photo.middle, float(east), float(north_m))
             up_deg = 90.0 if lane % 2 == 0 else 270.0
             pose = CameraPose(east_m=0, north_m=0, height_m=_height_m(_ROWS_FOOTPRINT_M), heading_deg=up_deg)
             image = photograph_ground(photo, at, pose, camera, light, rng)

@@ -7,6 +7,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from edgevpr.core.arrays import Array, Degrees, Doubles, Floats, LatLon
+from edgevpr.core.types import Position
 
 Extent = tuple[float, float, float, float]  # south, west, north, east in degrees
 D = TypeVar("D", float, Doubles, Floats)
@@ -53,6 +54,17 @@ def offset_position(lat_deg: float, lon_deg: float, east_m: float, north_m: floa
     north_deg = math.degrees(north_m / EARTH_RADIUS_M)
     east_deg = math.degrees(east_m / (EARTH_RADIUS_M * max(math.cos(math.radians(lat_deg)), 1e-9)))
     return lat_deg + north_deg, wrap_deg(lon_deg + east_deg)
+
+
+def offset_between_m(origin: Position, position: Position) -> tuple[float, float]:
+    """Return the offset (east, north) in metres from `origin` to `position`, on the tangent plane at `origin`."""
+    return offset_m(origin.lat_deg, origin.lon_deg, position.lat_deg, position.lon_deg)
+
+
+def move_position(origin: Position, east_m: float, north_m: float, alt_m: float | None = None) -> Position:
+    """Return the position, at `alt_m`, that lies `east_m` and `north_m` metres from `origin`: the inverse of
+    `offset_between_m`."""
+    return Position(*offset_position(origin.lat_deg, origin.lon_deg, east_m, north_m), alt_m)
 
 
 def compute_extent(points: Iterable[LatLon]) -> Extent:

@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 from edgevpr.core.arrays import Array, Bools, Complexes, Floats
 from edgevpr.core.contract import Descriptor, Technique
 from edgevpr.core.errors import EdgevprError, PlaceError
-from edgevpr.core.geodesy import offset_position, project_to_metres
+from edgevpr.core.geodesy import move_position, project_to_metres
 from edgevpr.core.text import Progress, decode_name
 from edgevpr.core.types import Place, Pose, Position
 from edgevpr.frames.images import list_images, read_image
@@ -215,7 +215,7 @@ def _write_poses(
             position, pose = positions[index], None
             if refined[index]:
                 var_m2, offset_m = float(solved.position_var[index]) / 2, solved.position[index]
-                position = Position(*offset_position(origin.lat_deg, origin.lon_deg, offset_m.real, offset_m.imag))
+                position = move_position(origin, offset_m.real, offset_m.imag)
                 pose = Pose(
                     up_deg=float(-np.degrees(solved.log[index].imag)) % 360,
                     footprint_m=float(np.exp(solved.log[index].real)),

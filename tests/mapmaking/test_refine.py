@@ -14,7 +14,7 @@ from commands import refused, run_json
 from map_writer import write_sql
 
 from edgevpr.cli.main import main
-from edgevpr.core.geodesy import distance_m, offset_position
+from edgevpr.core.geodesy import distance_m, move_position, offset_position
 from edgevpr.core.text import iterate_silently
 from edgevpr.core.types import Frame, Position
 from edgevpr.frames.images import read_image
@@ -57,7 +57,7 @@ def flown(tmp_path_factory):
         cv2.imwrite(str(folder / "images" / f"{number:03d}.jpg"), shot_of(pose))
         true, (east_m, north_m) = to_position(pose), rng.normal(0, NOISE_M, 2)
         east_m += GLITCH_M if number == 9 else 0.0
-        at = Position(*offset_position(true.lat_deg, true.lon_deg, east_m, north_m))
+        at = move_position(true, east_m, north_m)
         tags[f"{number:03d}.jpg"] = GeoTag(position=at)
     write_positions(folder / "positions.csv", tags)
     return folder, poses

@@ -16,7 +16,7 @@ from enum import Enum, auto
 import numpy as np
 
 from edgevpr.core.arrays import Doubles
-from edgevpr.core.geodesy import offset_m, wrap_deg
+from edgevpr.core.geodesy import offset_between_m, wrap_deg
 from edgevpr.core.types import FRAME_TIME_SD_S, Frame, Position
 from edgevpr.runtime.recognise.recognition import Recognition
 
@@ -220,7 +220,7 @@ class AgeWatch:
         if not self._motion[0][0] <= t_s - DELAYS_S[-1] <= t_s <= self._motion[-1][0] + _MAX_MOTION_GAP_S:
             return None
         self._origin = self._origin or position
-        east_m, north_m = offset_m(self._origin.lat_deg, self._origin.lon_deg, position.lat_deg, position.lon_deg)
+        east_m, north_m = offset_between_m(self._origin, position)
         heading_deg = math.nan
         if located.heading_deg is not None and event.view.up_deg is not None:
             times_s, _, _, headings_deg, *_ = np.array(self._motion).T

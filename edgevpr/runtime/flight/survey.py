@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from edgevpr.core.arrays import Bools, Doubles
-from edgevpr.core.geodesy import offset_m, offset_position
+from edgevpr.core.geodesy import move_position, offset_between_m
 from edgevpr.core.types import Position, Vehicle
 from edgevpr.frames.level import Mount
 from edgevpr.mavlink.receivers import extrapolate
@@ -138,8 +138,8 @@ class MapSurvey:
             reference = Position(*extrapolate(vehicle.gps, t_s, vehicle.velocity_m_s or (0.0, 0.0)))
         correlation = max(1.0, _GPS_CORRELATION_S / min(t_s - self._last_s, _GPS_CORRELATION_S))
         self._origin = self._origin or reference
-        jacobian[:, 4] = offset_m(self._origin.lat_deg, self._origin.lon_deg, reference.lat_deg, reference.lon_deg)
-        off_m = np.array(offset_m(reference.lat_deg, reference.lon_deg, match.position.lat_deg, match.position.lon_deg))
+        jacobian[:, 4] = offset_between_m(self._origin, reference)
+        off_m = np.array(offset_between_m(reference, match.position))
         own_m2 = float(np.trace(match.scatter_m2)) / 2 - located.tilt_m2  # the tilt is a parameter
         shared_m2 = vehicle.gps.sd_m**2
         self._samples.append(
@@ -200,7 +200,7 @@ class MapSurvey:
             "ahead_deg": SurveyMeasure((ahead_deg,), ahead_sd_deg, 1.5, 1.0),
             "right_deg": SurveyMeasure((right_deg,), right_sd_deg, 1.5, 1.0),
         }
-        middle = Position(*offset_position(self._origin.lat_deg, self._origin.lon_deg, *middle_m.tolist()))
+        middle = move_position(self._origin, *middle_m.tolist())
         return SurveyResult(matches=int(is_inlier.sum()), middle=middle, measures=measures)
 
 

@@ -10,8 +10,8 @@ from edgevpr.core.arrays import Mask
 from edgevpr.core.config import SourceConfig
 from edgevpr.core.contract import Technique
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import offset_position, picture_axes
-from edgevpr.core.types import Frame, Pose, Position, Vehicle
+from edgevpr.core.geodesy import move_position, picture_axes
+from edgevpr.core.types import Frame, Pose, Vehicle
 from edgevpr.frames.lens import CalibratedLens, compute_lens_view, read_lens
 from edgevpr.frames.level import (
     STRAIGHT_DOWN,
@@ -158,8 +158,7 @@ def centre_place(frame: Frame, view: View) -> Frame:
         return replace(frame, position=None)
     if frame.position and view.nadir_offset_m:
         east_m, north_m = view.nadir_offset_m
-        centre = offset_position(frame.position.lat_deg, frame.position.lon_deg, -east_m, -north_m)
-        return replace(frame, position=Position(*centre, frame.position.alt_m))
+        return replace(frame, position=move_position(frame.position, -east_m, -north_m, frame.position.alt_m))
     if frame.pose is not None or frame.position is None or view.up_deg is None or view.footprint_m is None:
         return frame
     variance_m2, position = GPS_SD_M**2, frame.position
@@ -168,7 +167,7 @@ def centre_place(frame: Frame, view: View) -> Frame:
     else:
         # The nadir is below the aircraft; seen from there, the picture's centre is in the opposite direction.
         variance_m2 += (view.nadir_offset_sd * view.footprint_m) ** 2
-        offset_m = -view.footprint_m * picture_axes(view.up_deg) @ view.nadir_offset
-        position = Position(*offset_position(position.lat_deg, position.lon_deg, *offset_m.tolist()), position.alt_m)
+        east_m, north_m = (-view.footprint_m * picture_axes(view.up_deg) @ view.nadir_offset).tolist()
+        position = move_position(position, east_m, north_m, position.alt_m)
     pose = Pose(up_deg=view.up_deg, footprint_m=view.footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2))
     return replace(frame, position=position, pose=pose)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgevpr.core.arrays import Doubles, Ints
-from edgevpr.core.geodesy import offset_m, offset_position
+from edgevpr.core.geodesy import move_position, offset_between_m, offset_m
 from edgevpr.core.types import Frame, Position, Vehicle
 from edgevpr.places.index import PlaceIndex
 from edgevpr.places.layers import read_layers
@@ -143,8 +143,7 @@ class PlaceFilter:
             confidence = self._limit_repetition(at, confidence, float(proposed.p[is_near].sum()))
         estimate = None
         if geometry.origin and posterior.mass:
-            lat_deg, lon_deg = geometry.origin.lat_deg, geometry.origin.lon_deg
-            position = Position(*offset_position(lat_deg, lon_deg, *posterior.at.tolist()))
+            position = move_position(geometry.origin, *posterior.at.tolist())
             covariance_m2, heading_deg = to_triple(posterior.covariance), posterior.heading_deg
             estimate = Located(position=position, covariance_m2=covariance_m2, heading_deg=heading_deg)
         return TrackEstimate(
@@ -214,8 +213,7 @@ def _make_proposals(
     heading_deg = np.full(len(slots), np.nan)
     same = np.zeros(len(slots), bool)
     if located and geometry.origin:
-        origin, position = geometry.origin, located.position
-        at[0] = offset_m(origin.lat_deg, origin.lon_deg, position.lat_deg, position.lon_deg)
+        at[0] = offset_between_m(geometry.origin, located.position)
         if not evidence.has_twin:  # equally likely places must have equal covariances
             covariance[0] = covariance_matrix(located.covariance_m2)
         heading_deg[0] = np.nan if located.heading_deg is None else located.heading_deg

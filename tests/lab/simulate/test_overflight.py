@@ -10,7 +10,7 @@ pytest.importorskip("rasterio", reason="rasterio is not installed (pip install '
 from rasters import HOME, MARKS_M, marked_raster, write_mission
 
 from edgevpr.core.errors import UsageError
-from edgevpr.core.geodesy import distance_m, offset_position
+from edgevpr.core.geodesy import distance_m, move_position, offset_position
 from edgevpr.core.types import Position
 from edgevpr.frames.positions import GeoTag, read_positions
 from edgevpr.lab.simulate.camera import Camera, CameraPose, Light, ground_to_pixel
@@ -43,7 +43,7 @@ def orthophoto(tmp_path_factory):
     ],
 )
 def test_seen_from_shows_a_mark_where_the_pinhole_camera_does(orthophoto, change, off_m):
-    at = Position(*offset_position(HOME.lat_deg, HOME.lon_deg, *off_m))
+    at = move_position(HOME, *off_m)
     pose = replace(LEVEL, **change)
     picture = photograph_ground(orthophoto, at, pose, CAMERA, CLEAR, np.random.default_rng(0))
     assert picture.shape == (480, 640, 3)
@@ -63,7 +63,7 @@ def test_seen_from_shows_a_mark_where_the_pinhole_camera_does(orthophoto, change
 
 def test_seen_from_takes_none_beyond_the_orthophoto_and_refuses_the_horizon(orthophoto):
     rng = np.random.default_rng(0)
-    edge = Position(*offset_position(HOME.lat_deg, HOME.lon_deg, 300, 0))
+    edge = move_position(HOME, 300, 0)
     assert photograph_ground(orthophoto, edge, LEVEL, CAMERA, CLEAR, rng) is None
     for angle_deg in (58, 75):
         with pytest.raises(UsageError, match="horizon"):

@@ -10,7 +10,7 @@ from air import HOME, match_at
 from fakes import FakeClock, FakeLink, receiver_at, vehicle_at
 
 from edgevpr.core.config import load_config
-from edgevpr.core.geodesy import offset_m, offset_position
+from edgevpr.core.geodesy import move_position, offset_m, offset_position
 from edgevpr.core.types import Position
 from edgevpr.frames.level import STRAIGHT_DOWN, View
 from edgevpr.runtime.flight.flightlog import FlightLog, read_log
@@ -182,8 +182,7 @@ def levelled(event, mount, was):
     )
     east_m = ahead_m * math.sin(heading) + right_m * math.cos(heading)
     north_m = ahead_m * math.cos(heading) - right_m * math.sin(heading)
-    at = event.located.position
-    return Position(*offset_position(at.lat_deg, at.lon_deg, -east_m, -north_m))
+    return move_position(event.located.position, -east_m, -north_m)
 
 
 class Flown:

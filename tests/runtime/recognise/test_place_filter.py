@@ -8,7 +8,7 @@ from fakes import vehicle_at
 from sureness import told
 
 from edgevpr.core.contract import Descriptor, FineMatch, PartSpec, TechniqueSpec
-from edgevpr.core.geodesy import distance_m, offset_m, offset_position
+from edgevpr.core.geodesy import distance_m, offset_between_m, offset_position
 from edgevpr.core.types import Frame, Pose, Position
 from edgevpr.places.index import PlaceIndex, allocate_index
 from edgevpr.places.layers import read_layers
@@ -219,8 +219,7 @@ def test_a_place_without_position_lends_its_confidence_to_no_other(posed_map, ba
 
 def along(places):
     """Metres east and north by so many places."""
-    here, there = at(0), at(places)
-    return offset_m(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg)
+    return offset_between_m(at(0), at(places))
 
 
 def after_a_gap(place_map, moved_m, away=60, p=0.5):
