@@ -53,7 +53,7 @@ def test_profile_tries_the_real_techniques(capsys, monkeypatch):
     found = run_json(capsys, "profile", "--board", "rpi-zero-2w", "--places", 10_000)
     rows = {row["option"]["label"]: row for row in found["techniques"]}
     assert list(rows) == ["cohog", "hog", "hog 8bit", "hog 1bit"]
-    assert "RAM" in rows["hog"]["option"]["fit"]["misfit"], "286 KB a place is 2.9 GB"
+    assert "RAM" in rows["hog"]["option"]["misfit"], "286 KB a place is 2.9 GB"
     assert found["times"] == "scaled"
     assert 0 < rows["cohog"]["flight_marginal_mah"] < rows["cohog"]["flight_mah"]
     assert rows["cohog"]["query"]["u_encode"] <= 1

@@ -72,12 +72,20 @@ class Demand:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fit:
-    """Whether a technique fits a board, and its cost there. `t_query_s`: wall seconds per query. `cpu_s`: CPU-seconds
-    per query, summed over all cores. `map_ram_mb`, `map_disk_mb`: size of the map's index in RAM, and of the map file.
-    `process_ram_mb`: RAM of the process with the index. `reachable_hz`: maximum queries per second. `misfit`: reason
-    why it does not fit, worded to follow a name (None: it fits)."""
+class Option:
+    """A technique in one form, its cost on a board, and whether it fits the board. `label`: unique name of the option.
+    `name`: name of the technique. `accuracy`: None if it was not measured.
 
+    `t_query_s`: wall seconds per query. `cpu_s`: CPU-seconds per query, summed over all cores. `map_ram_mb`,
+    `map_disk_mb`: size of the map's index in RAM, and of the map file. `process_ram_mb`: RAM of the process with the
+    index. `reachable_hz`: maximum queries per second. `misfit`: reason why it does not fit, worded to follow a name
+    (None: it fits).
+    """
+
+    label: str
+    name: str
+    costs: TechniqueCosts
+    accuracy: Accuracy | None
     t_query_s: float
     cpu_s: float
     map_ram_mb: float
@@ -86,23 +94,11 @@ class Fit:
     reachable_hz: float
     misfit: str | None
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Option:
-    """A technique in one form, with its costs on the board and its `fit`. `label`: unique name of the option. `name`:
-    name of the technique. `accuracy`: None if it was not measured."""
-
-    label: str
-    name: str
-    costs: TechniqueCosts
-    fit: Fit
-    accuracy: Accuracy | None
-
     @property
     def objection(self) -> str | None:
         """Reason not to choose the option automatically, worded to follow its label; None if there is none."""
-        if self.fit.misfit:
-            return self.fit.misfit
+        if self.misfit:
+            return self.misfit
         if self.accuracy is None:
             return "was never measured: name it to use it"
         if self.accuracy.accepted_elsewhere:
@@ -113,13 +109,39 @@ class Option:
 
 
 def make_option(board: Board, label: str, name: str, costs: TechniqueCosts, demand: Demand) -> Option:
-    """Make the option of the technique `name`. `label`: technique and form. `costs`: costs on `board`."""
+    """Make the option of the technique `name` and check whether it fits the board: its index within the RAM budget of
+    the map, its process within the board's memory, and its queries within the CPU time. `label`: technique and form.
+    `costs`: costs on `board`.
+
+    A query must end before the next one begins, and before its fix is too old to send. Together, queries may use the
+    share `cpu_share` of the cores.
+    """
+    map_ram_mb = costs.ram_bytes_per_place * demand.places / 1e6
+    process_ram_mb = costs.process_mb + map_ram_mb
+    query = costs.encode + costs.match(demand.places)
+    reachable_hz = min(1 / query.wall_s, board.cores * board.cpu_share / query.cpu_s)
+    shortfalls = []
+    if map_ram_mb > demand.budget_mb:
+        shortfalls.append(f"its map needs {map_ram_mb:.1f} MB of RAM ({demand.budget_mb:.1f} MB allowed)")
+    if process_ram_mb > board.memory_max_mb:
+        shortfalls.append(f"the process needs {process_ram_mb:.0f} MB ({board.memory_max_mb:.0f} MB allowed)")
+    if reachable_hz < demand.rate_hz:
+        shortfalls.append(f"it reaches {_round_down(reachable_hz):g} Hz ({demand.rate_hz:g} Hz needed)")
+    if query.wall_s > MAX_FIX_AGE_S:
+        limit = f"fixes from frames older than {MAX_FIX_AGE_S:g} s are never sent"
+        shortfalls.append(f"a query takes {query.wall_s:.1f} s, but {limit}")
     return Option(
         label=label,
         name=name,
         costs=costs,
-        fit=check_fit(board, costs, demand),
         accuracy=find_accuracy(label, demand.camera),
+        t_query_s=query.wall_s,
+        cpu_s=query.cpu_s,
+        map_ram_mb=map_ram_mb,
+        map_disk_mb=costs.disk_bytes_per_place * demand.places / 1e6,
+        process_ram_mb=process_ram_mb,
+        reachable_hz=reachable_hz,
+        misfit=f"does not fit: {' and '.join(shortfalls)}" if shortfalls else None,
     )
 
 
@@ -147,48 +169,16 @@ def choose_best(options: Sequence[Option], board: Board) -> Option | None:
     was measured. Returns None if no option is suitable."""
     suitable = [option for option in options if option.objection is None]
     preferred = [option for option in suitable if option.name == board.technique]
-    unmeasured = (option for option in options if not (option.accuracy or option.fit.misfit))
+    unmeasured = (option for option in options if not (option.accuracy or option.misfit))
     if not preferred and (default := next((option for option in unmeasured if option.name == board.technique), None)):
         return default
-    return max(preferred or suitable, key=lambda option: (_get_recall(option), -option.fit.cpu_s), default=None)
+    return max(preferred or suitable, key=lambda option: (_get_recall(option), -option.cpu_s), default=None)
 
 
 def explain_no_choice(options: Sequence[Option], board: Board) -> str:
     """Return a sentence that explains why `choose_best` returned None."""
     objections = (f"{option.label} {option.objection}" for option in options[:_MAX_OBJECTIONS])
     return f"no technique suits {board.title}: {', and '.join(objections)}"
-
-
-def check_fit(board: Board, costs: TechniqueCosts, demand: Demand) -> Fit:
-    """Check whether a technique fits a board: its index within the RAM budget of the map, its process within the
-    board's memory, and its queries within the CPU time.
-
-    A query must end before the next one begins, and before its fix is too old to send. Together, queries may use the
-    share `cpu_share` of the cores.
-    """
-    map_ram_mb = costs.ram_bytes_per_place * demand.places / 1e6
-    process_ram_mb = costs.process_mb + map_ram_mb
-    query = costs.encode + costs.match(demand.places)
-    reachable_hz = min(1 / query.wall_s, board.cores * board.cpu_share / query.cpu_s)
-    shortfalls = []
-    if map_ram_mb > demand.budget_mb:
-        shortfalls.append(f"its map needs {map_ram_mb:.1f} MB of RAM ({demand.budget_mb:.1f} MB allowed)")
-    if process_ram_mb > board.memory_max_mb:
-        shortfalls.append(f"the process needs {process_ram_mb:.0f} MB ({board.memory_max_mb:.0f} MB allowed)")
-    if reachable_hz < demand.rate_hz:
-        shortfalls.append(f"it reaches {_round_down(reachable_hz):g} Hz ({demand.rate_hz:g} Hz needed)")
-    if query.wall_s > MAX_FIX_AGE_S:
-        limit = f"fixes from frames older than {MAX_FIX_AGE_S:g} s are never sent"
-        shortfalls.append(f"a query takes {query.wall_s:.1f} s, but {limit}")
-    return Fit(
-        t_query_s=query.wall_s,
-        cpu_s=query.cpu_s,
-        map_ram_mb=map_ram_mb,
-        map_disk_mb=costs.disk_bytes_per_place * demand.places / 1e6,
-        process_ram_mb=process_ram_mb,
-        reachable_hz=reachable_hz,
-        misfit=f"does not fit: {' and '.join(shortfalls)}" if shortfalls else None,
-    )
 
 
 def list_preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
@@ -207,14 +197,14 @@ def list_preferred(board: Board, camera: str | None = None) -> tuple[str, ...]:
 
 
 def describe_option(board: Board, option: Option, demand: Demand) -> str:
-    """Return the accuracy of an option, the figures of its fit and, if it does not fit, the reason."""
-    fit = option.fit
+    """Return the accuracy of an option, its cost and, if it does not fit, the reason."""
     figures = (
-        f"{option.accuracy or 'never measured'}; {demand} need {fit.map_ram_mb:.1f} of {demand.budget_mb:.1f} MB, the "
-        f"process {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, and {_round_down(fit.reachable_hz):g} Hz "
-        f"with {board.cores * board.cpu_share:.2g} of {board.cores} cores ({demand.rate_hz:g} Hz needed)"
+        f"{option.accuracy or 'never measured'}; {demand} need {option.map_ram_mb:.1f} of {demand.budget_mb:.1f} MB, "
+        f"the process {option.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, and "
+        f"{_round_down(option.reachable_hz):g} Hz with {board.cores * board.cpu_share:.2g} of {board.cores} cores "
+        f"({demand.rate_hz:g} Hz needed)"
     )
-    return f"{figures}; it {fit.misfit}" if fit.misfit else figures
+    return f"{figures}; it {option.misfit}" if option.misfit else figures
 
 
 def _get_recall(option: Option) -> float:

@@ -32,7 +32,7 @@ class FlightPlan(Demand):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TechniqueEstimate:
-    """Estimate of one technique, in one form, on the board. `option`: its costs on the board, its fit and its accuracy.
+    """Estimate of one technique, in one form, on the board. `option`: its accuracy and cost, and whether it fits.
 
     `query`: time, utilisation and charge of a query (symbols and equations: see `power.equations`).
     `flight_mah`: charge that the board draws during the flight. `flight_marginal_mah`: the part that the queries add to
@@ -100,7 +100,7 @@ def _estimate_option(option: Option, board: Board, plan: FlightPlan) -> Techniqu
         costs.encode, match, board, plan.pack, plan.regulator_efficiency, rss_mb=costs.process_mb
     )
     flight_s = 60 * plan.flight_min
-    marginal_mah = queries_ah(min(plan.rate_hz, option.fit.reachable_hz) * flight_s, query.marginal_mah)
+    marginal_mah = queries_ah(min(plan.rate_hz, option.reachable_hz) * flight_s, query.marginal_mah)
     # Equation 5.7 omits the idle power between queries, which the pack also supplies.
     idle_mah = 1000 * pack_ah(board.idle_w * flight_s, plan.pack, plan.regulator_efficiency)
     return TechniqueEstimate(
@@ -120,14 +120,15 @@ def _recommend(rows: list[TechniqueEstimate], board: Board, plan: FlightPlan) ->
     chosen = choose_best(options, board)
     if chosen is None:
         return None, f"None: {explain_no_choice(options, board)}."
-    row, fit = rows[options.index(chosen)], chosen.fit
+    row = rows[options.index(chosen)]
     reason = "the board's profile names it, and it was never measured"
     if chosen.accuracy:
         reason = f"the most accurate that fits: {chosen.accuracy}"
     return chosen.label, (
-        f"{chosen.label}: {reason}; {fit.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
-        f"{fit.reachable_hz:.3g} Hz ({plan.rate_hz:g} needed), {fit.cpu_s / fit.t_query_s / board.cores:.0%} of "
-        f"the CPU during a query, and {row.flight_marginal_mah:.3g} mAh per flight in addition to the "
+        f"{chosen.label}: {reason}; {chosen.process_ram_mb:.0f} of {board.memory_max_mb:.0f} MB, "
+        f"{chosen.reachable_hz:.3g} Hz ({plan.rate_hz:g} needed), "
+        f"{chosen.cpu_s / chosen.t_query_s / board.cores:.0%} of the CPU during a query, and "
+        f"{row.flight_marginal_mah:.3g} mAh per flight in addition to the "
         f"{row.flight_mah - row.flight_marginal_mah:.3g} mAh of the idle board."
     )
 

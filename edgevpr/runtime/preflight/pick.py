@@ -84,7 +84,7 @@ def measure_flight(recogniser: Recogniser) -> tuple[float, str]:
         camera=_read_camera(spec),
     )
     option = make_option(board, _make_label(spec), spec.name, costs, demand)
-    return option.fit.t_query_s, describe_option(board, option, demand)
+    return option.t_query_s, describe_option(board, option, demand)
 
 
 def list_safe_candidates(technique: Technique) -> tuple[int, ...]:

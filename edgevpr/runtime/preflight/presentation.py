@@ -21,7 +21,7 @@ def format_table(estimate: FlightEstimate) -> str:
     unusable = ([name, "n/a"] for name in estimate.unusable)
     costs = align_table([_RESOURCE_COLUMNS + _CHARGE_COLUMNS, *map(_make_cost_row, rows), *unusable], left=2)
     accuracies = align_table([_ACCURACY_COLUMNS, *(_make_accuracy_row(row, estimate.recommended) for row in rows)])
-    notes = [f"{row.option.label} {row.option.fit.misfit}." for row in rows if row.option.fit.misfit]
+    notes = [f"{row.option.label} {row.option.misfit}." for row in rows if row.option.misfit]
     for reason in dict.fromkeys(estimate.unusable.values()):
         names = [name for name, problem in estimate.unusable.items() if problem == reason]
         notes.append(f"{', '.join(names)} cannot be used: {reason}")
@@ -32,17 +32,17 @@ def format_table(estimate: FlightEstimate) -> str:
 
 
 def _make_cost_row(row: TechniqueEstimate) -> list[str]:
-    option, fit, query = row.option, row.option.fit, row.query
+    option, query = row.option, row.query
     return [
         option.label,
-        "no" if fit.misfit else "yes",
-        f"{fit.map_ram_mb:.1f}",
-        f"{fit.process_ram_mb:.0f}",
+        "no" if option.misfit else "yes",
+        f"{option.map_ram_mb:.1f}",
+        f"{option.process_ram_mb:.0f}",
         f"{query.t_encode_s:.3f}",
         f"{query.t_match_s:.3f}",
         f"{query.u_encode:.2f}",
         f"{query.u_match:.2f}",
-        f"{fit.reachable_hz:.3g}",
+        f"{option.reachable_hz:.3g}",
         f"{query.used_mah:.4f}",
         f"{row.flight_mah:.1f}",
         f"{row.flight_marginal_mah:.2f}",
@@ -55,7 +55,7 @@ def _make_accuracy_row(row: TechniqueEstimate, recommended: str | None) -> list[
     if accuracy is None:
         return [option.label, "?", "?", "?", "", "", "never measured"]
     chosen = "needs a sequence" if option.objection else "another is better"
-    if option.fit.misfit:
+    if option.misfit:
         chosen = ""
     elif option.label == recommended:
         chosen = "yes"

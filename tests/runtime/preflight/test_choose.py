@@ -19,7 +19,6 @@ from edgevpr.runtime.preflight import choose as choosing
 from edgevpr.runtime.preflight import pick
 from edgevpr.runtime.preflight.choose import (
     Demand,
-    check_fit,
     choose_best,
     explain_no_choice,
     find_accuracy,
@@ -46,7 +45,7 @@ def options_of(board, costs, places):
 
 
 def fit(board, costs, places, rate_hz=1.0):
-    return check_fit(board, costs, Demand(places=places, rate_hz=rate_hz, budget_mb=100))
+    return make_option(board, "regions", "regions", costs, Demand(places=places, rate_hz=rate_hz, budget_mb=100))
 
 
 def chosen(board, costs, places):
@@ -144,7 +143,7 @@ def test_match_scans_a_large_map_whole_and_compares_a_part_of_it():
         assert turned.match(places).wall_s == pytest.approx(0.03 + 0.004 * compared + 1e-6 * places)
 
 
-def test_check_fit_counts_the_whole_map_in_ram_and_its_candidates_in_time():
+def test_make_option_counts_the_whole_map_in_ram_and_its_candidates_in_time():
     two_stages = dataclasses.replace(REGIONS, candidates=20)
     fitting = fit(board(), two_stages, places=50_000)
     assert not fitting.misfit
@@ -154,13 +153,13 @@ def test_check_fit_counts_the_whole_map_in_ram_and_its_candidates_in_time():
     assert "RAM" in fit(board(), two_stages, 100_100).misfit
 
 
-def test_check_fit_limits_a_technique_that_keeps_all_cores_busy_by_the_cpu_share():
+def test_make_option_limits_a_technique_that_keeps_all_cores_busy_by_the_cpu_share():
     four_threads = dataclasses.replace(REGIONS, encode=StageCost(0.1, 0.4), match_per_place=StageCost(0.001, 0.004))
     assert fit(board(cpu_share=1.0), four_threads, 100).reachable_hz == pytest.approx(1 / 0.2)
     assert fit(board(cpu_share=0.25), four_threads, 100).reachable_hz == pytest.approx(1 / 0.8)
 
 
-def test_check_fit_refuses_any_rate_where_no_fix_could_be_sent_in_time():
+def test_make_option_refuses_any_rate_where_no_fix_could_be_sent_in_time():
     slow = fit(board(), REGIONS, places=1300, rate_hz=0.1)
     assert slow.t_query_s == pytest.approx(5.3)
     assert "takes 5.3 s" in slow.misfit

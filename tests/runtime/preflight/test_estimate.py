@@ -43,13 +43,13 @@ def estimate(costs, plan=PLAN, board=PI, ratio=SAME_MACHINE):
 
 def test_estimate_of_a_flight_on_the_board_itself_by_hand():
     regions, vector = estimate(COSTS).techniques
-    fit, query = regions.option.fit, regions.query
-    assert (regions.option.label, fit.misfit, vector.option.fit.misfit) == ("regions", None, None)
-    assert (fit.map_ram_mb, fit.map_disk_mb, fit.process_ram_mb) == pytest.approx((0.1, 12.4, 90.1))
+    option, query = regions.option, regions.query
+    assert (option.label, option.misfit, vector.option.misfit) == ("regions", None, None)
+    assert (option.map_ram_mb, option.map_disk_mb, option.process_ram_mb) == pytest.approx((0.1, 12.4, 90.1))
     assert (query.t_encode_s, query.t_match_s) == pytest.approx((0.1, 0.4))
     assert (query.u_encode, query.u_match) == pytest.approx((0.25, 0.25))  # one of four cores
     assert (vector.query.u_encode, vector.query.u_match) == pytest.approx((0.5, 0.5))
-    assert fit.reachable_hz == pytest.approx(2.0)
+    assert option.reachable_hz == pytest.approx(2.0)
     volt_hours = 14.8 * 0.85 * 3600
     assert query.used_mah == pytest.approx(1000 * (2.29 + 4.53 * 0.25) * 0.5 / volt_hours, abs=1e-9)
     assert query.marginal_mah == pytest.approx(1000 * 4.53 * 0.25 * 0.5 / volt_hours, abs=1e-9)
@@ -63,7 +63,7 @@ def test_estimate_of_a_flight_on_the_board_itself_by_hand():
 def test_estimate_charges_no_rate_that_is_out_of_reach():
     fast = estimate(COSTS, replace(PLAN, rate_hz=50.0)).techniques[0]
     reached = estimate(COSTS, replace(PLAN, rate_hz=2.0)).techniques[0]
-    assert fast.option.fit.misfit
+    assert fast.option.misfit
     assert fast.flight_mah == pytest.approx(reached.flight_mah)
 
 
