@@ -249,9 +249,9 @@ class AutopilotOutput:
         before, self._is_holding = self._is_holding, objection is not None
         self._held += self._is_holding
         if self._is_holding and not before:
-            ground = "fix held back, contradicts autopilot"
+            gcs_text = "fix held back, contradicts autopilot"
             self._notifier.announce(
-                messages.Severity.WARNING, f"a fix is {objection}", ground=ground, topic="held back"
+                messages.Severity.WARNING, f"a fix is {objection}", gcs_text=gcs_text, topic="held back"
             )
         elif before and not self._is_holding:
             self._notifier.announce(messages.Severity.INFO, "fixes agree again", topic="held back")

@@ -47,8 +47,8 @@ class TurnWatch:
             return
         self._has_reported, up_deg = True, (self._up_deg + turn_deg) % 360
         note = Reason(ReasonCode.IMAGES_ROTATED, {"rotation_deg": turn_deg, "up_deg": up_deg})
-        ground = f"pictures turned {turn_deg:.0f} degrees"
-        self._notifier.report("camera", Severity.WARNING, note, ground=ground, topic="turn")
+        gcs_text = f"images rotated {turn_deg:.0f} degrees"
+        self._notifier.report("camera", Severity.WARNING, note, gcs_text=gcs_text, topic="turn")
 
 
 class MirrorWatch:

@@ -26,7 +26,7 @@ _MAX_EXPECTED_SHARE = 0.85  # largest share of a limit for the load expected at 
 _MAX_LATE_SHARE = 0.95
 _TEMPERATURE_MARGIN_C = 5.0
 _MAX_MEMORY_SHARE = 0.95
-_MEMORY_ROOM_SHARE = 0.9
+_MAX_HEADROOM_MEMORY_SHARE = 0.9
 _MAX_RATE_DIVISOR = 8  # the rate falls to no less than the configured one divided by this
 _COMPARE_SHARE = 0.6  # share of a query's time spent comparing candidates, in a large map (benchmarks/results/arm64.md)
 
@@ -52,13 +52,13 @@ class Change:
     back: bool = False
 
 
-def list_settings(asked: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[Setting, ...]:
-    """Return the settings from the configured one (`asked`) down to the lowest. First the candidates are lowered to the
-    numbers in `fewer`, largest first, with which no wrong place is accepted; then the rate is halved, down to an
-    eighth, unless `keeps_rate`."""
-    settings = [asked]
-    settings += [replace(asked, candidates=count) for count in fewer if count < asked.candidates]
-    while not keeps_rate and settings[-1].rate_hz > asked.rate_hz / _MAX_RATE_DIVISOR:
+def list_settings(configured: Setting, keeps_rate: bool, fewer: Sequence[int] = ()) -> tuple[Setting, ...]:
+    """Return the settings from `configured` down to the lowest. First the candidates are lowered to the numbers in
+    `fewer`, largest first, with which no wrong place is accepted; then the rate is halved, down to an eighth, unless
+    `keeps_rate`."""
+    settings = [configured]
+    settings += [replace(configured, candidates=count) for count in fewer if count < configured.candidates]
+    while not keeps_rate and settings[-1].rate_hz > configured.rate_hz / _MAX_RATE_DIVISOR:
         settings.append(replace(settings[-1], rate_hz=settings[-1].rate_hz / 2))
     return tuple(settings)
 
@@ -70,8 +70,8 @@ class Governor:
     def __init__(self, board: Board, limit_c: float, settings: Sequence[Setting]) -> None:
         self._board, self._limit_c, self._settings, self._index = board, limit_c, list(settings), 0
         self._since_s: dict[str, float] = {}  # start of each condition that holds
-        self._changed_s = self._raised_s = -math.inf
-        self._wait_s = _MIN_WAIT_S
+        self._changed_s = self._stepped_up_s = -math.inf
+        self._step_up_wait_s = _MIN_WAIT_S
         self._reported: set[str] = set()
 
     @property
@@ -82,39 +82,39 @@ class Governor:
     @property
     def held(self) -> str | None:
         """Lowered settings, in a few words; None if none is lowered."""
-        now, asked = self.setting, self._settings[0]
+        now, full = self.setting, self._settings[0]
         parts = (
-            f"{now.rate_hz:g} of {asked.rate_hz:g} Hz" if now.rate_hz != asked.rate_hz else "",
-            f"{now.candidates} of {asked.candidates} candidates" if now.candidates != asked.candidates else "",
+            f"{now.rate_hz:g} of {full.rate_hz:g} Hz" if now.rate_hz != full.rate_hz else "",
+            f"{now.candidates} of {full.candidates} candidates" if now.candidates != full.candidates else "",
         )
-        return f"held to {', '.join(filter(None, parts))}" if now != asked else None
+        return f"held to {', '.join(filter(None, parts))}" if now != full else None
 
     def update(self, now_s: float, reading: LoadReading) -> Change | None:
         """Process the measurement of one second, which must cover a whole number of queries; return the change to
         make."""
-        hot, over = self._check_load(reading)
+        hot, exceeded = self._check_load(reading)
         max_mb = self._board.memory_max_mb
-        has_room = self._has_room(reading, self._settings[max(0, self._index - 1)])
-        over_s = self._measure_held_s("over", now_s, over is not None)
-        room_s = self._measure_held_s("room", now_s, has_room)
+        has_headroom = self._has_headroom(reading, self._settings[max(0, self._index - 1)])
+        exceeded_s = self._measure_held_s("exceeded", now_s, exceeded is not None)
+        headroom_s = self._measure_held_s("headroom", now_s, has_headroom)
         full_s = self._measure_held_s("full", now_s, reading.rss_mb >= _MAX_MEMORY_SHARE * max_mb)
-        if has_room:
+        if has_headroom:
             self._reported.discard("load")
-        if reading.rss_mb <= _MEMORY_ROOM_SHARE * max_mb:
+        if reading.rss_mb <= _MAX_HEADROOM_MEMORY_SHARE * max_mb:
             self._reported.discard("memory")
         if full_s >= _MIN_EXCEEDED_S and "memory" not in self._reported:
             return self._report_limit(
                 "memory", Reason(ReasonCode.MEMORY_OVER_LIMIT, {"used_mb": reading.rss_mb, "max_mb": max_mb})
             )
-        if over is not None and over_s >= _MIN_EXCEEDED_S and not (hot and now_s - self._changed_s < _MIN_HEAT_WAIT_S):
+        is_cooling = hot and now_s - self._changed_s < _MIN_HEAT_WAIT_S
+        if exceeded is not None and exceeded_s >= _MIN_EXCEEDED_S and not is_cooling:
             if hot:
-                self._wait_s = max(self._wait_s, _MIN_HEAT_WAIT_S)
-            below = self._find_lower(hot)
-            if below is not None:
-                return self._step_down(now_s, below, over)
-            return None if "load" in self._reported else self._report_limit("load", over)
-        if self._index > 0 and room_s >= self._wait_s:
-            self._raised_s = now_s
+                self._step_up_wait_s = max(self._step_up_wait_s, _MIN_HEAT_WAIT_S)
+            if (lower_index := self._find_lower(hot)) is not None:
+                return self._step_down(now_s, lower_index, exceeded)
+            return None if "load" in self._reported else self._report_limit("load", exceeded)
+        if self._index > 0 and headroom_s >= self._step_up_wait_s:
+            self._stepped_up_s = now_s
             return self._change(now_s, self._index - 1, Reason(ReasonCode.RESOURCES_FREE), back=True)
         return None
 
@@ -127,9 +127,9 @@ class Governor:
 
     def _find_lower(self, hot: bool) -> int | None:
         """Return the index of the next lower setting; if `hot`, of the next with a lower rate, which cools sooner."""
-        below = range(self._index + 1, len(self._settings))
-        slower = [index for index in below if self._settings[index].rate_hz < self.setting.rate_hz]
-        return next(iter(slower if hot and slower else below), None)
+        lower = range(self._index + 1, len(self._settings))
+        slower = [index for index in lower if self._settings[index].rate_hz < self.setting.rate_hz]
+        return next(iter(slower if hot and slower else lower), None)
 
     def _check_load(self, reading: LoadReading) -> tuple[bool, Reason | None]:
         """Return whether the board is too hot, and the exceeded limit (None: none)."""
@@ -144,17 +144,17 @@ class Governor:
             return False, Reason(ReasonCode.QUERIES_LATE)
         return False, None
 
-    def _has_room(self, reading: LoadReading, higher: Setting) -> bool:
+    def _has_headroom(self, reading: LoadReading, higher: Setting) -> bool:
         """Return True if the load would stay clearly below all limits with the setting `higher`."""
-        now, board = self.setting, self._board
-        factor = 1 + _COMPARE_SHARE * (higher.candidates / now.candidates - 1)
-        factor *= higher.rate_hz / now.rate_hz
+        current, board = self.setting, self._board
+        factor = 1 + _COMPARE_SHARE * (higher.candidates / current.candidates - 1)
+        factor *= higher.rate_hz / current.rate_hz
         return (
             reading.cpu_share * factor <= _MAX_EXPECTED_SHARE * board.cpu_share
             and reading.late_share * factor <= _MAX_EXPECTED_SHARE
             and not reading.throttled
             and (reading.temperature_c is None or reading.temperature_c <= self._limit_c - _TEMPERATURE_MARGIN_C)
-            and reading.rss_mb <= _MEMORY_ROOM_SHARE * board.memory_max_mb
+            and reading.rss_mb <= _MAX_HEADROOM_MEMORY_SHARE * board.memory_max_mb
         )
 
     def _report_limit(self, what: str, why: Reason) -> Change:
@@ -163,11 +163,11 @@ class Governor:
         return Change(self.setting, self.setting, why)
 
     def _step_down(self, now_s: float, index: int, why: Reason) -> Change:
-        if now_s - self._raised_s < _STEP_UP_TRIAL_S:
-            self._wait_s = min(2 * self._wait_s, _MAX_WAIT_S)
-            self._raised_s = -math.inf  # further steps down for the same reason are not a new failure
-        elif now_s - self._changed_s >= max(_STEP_UP_TRIAL_S, 2 * self._wait_s):
-            self._wait_s = _MIN_WAIT_S
+        if now_s - self._stepped_up_s < _STEP_UP_TRIAL_S:
+            self._step_up_wait_s = min(2 * self._step_up_wait_s, _MAX_WAIT_S)
+            self._stepped_up_s = -math.inf  # further steps down for the same reason are not a new failure
+        elif now_s - self._changed_s >= max(_STEP_UP_TRIAL_S, 2 * self._step_up_wait_s):
+            self._step_up_wait_s = _MIN_WAIT_S
         return self._change(now_s, index, why, back=False)
 
     def _change(self, now_s: float, index: int, why: Reason, back: bool) -> Change:
@@ -184,9 +184,9 @@ class GovernorActuator:
     def __init__(self, parts: FlightParts, pace: Pace, fewer_candidates: tuple[int, ...]) -> None:
         self._parts, self._pace = parts, pace
         recogniser, technique = parts.recogniser, parts.recogniser.technique
-        in_sequence = recogniser.sequence > 1
-        asked = Setting(pace.rate_hz, recogniser.candidates or technique.candidates, technique.spec.form)
-        settings = list_settings(asked, in_sequence, () if in_sequence else fewer_candidates)
+        matches_sequences = recogniser.sequence > 1
+        configured = Setting(pace.rate_hz, recogniser.candidates or technique.candidates, technique.spec.form)
+        settings = list_settings(configured, matches_sequences, () if matches_sequences else fewer_candidates)
         self.governor = Governor(recogniser.meter.board, parts.meter.limit_c, settings)
 
     def update(self) -> None:
@@ -197,13 +197,13 @@ class GovernorActuator:
         change = self.governor.update(parts.io.clock.mono_s(), parts.meter.reading())
         if change is None:
             return
-        text = ground = self.governor.held or "back to what was asked"
+        text = gcs_text = self.governor.held or "back to the configured settings"
         severity = Severity.INFO if change.back else Severity.NOTICE
         if change.before == change.after:
             text = "over a limit of the board, and nothing is left to lower"
-            ground, severity = "over a limit of its board, see its log", Severity.WARNING
+            gcs_text, severity = "over a limit of its board, see its log", Severity.WARNING
         fields = {"from": asdict(change.before), "to": asdict(change.after), "why": change.why}
         parts.notifier.log("governor", **fields)
-        parts.notifier.announce(severity, f"{text}: {change.why}", ground=ground, topic="limits")
+        parts.notifier.announce(severity, f"{text}: {change.why}", gcs_text=gcs_text, topic="limits")
         self._pace.rate_hz = change.after.rate_hz
         parts.recogniser.change(candidates=change.after.candidates)

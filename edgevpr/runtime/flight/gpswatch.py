@@ -19,15 +19,15 @@ from edgevpr.runtime.recognise.recognition import Recognition
 # the limit is 23 m for good matches and a good receiver.
 _MAX_GPS_SIGMA = 4.0
 _MIN_GPS_ERROR_M = 15.0  # a smaller error is harmless, and may be a few bad seconds of the receiver
-# Deviation from the usual offset between matches and GPS, which cancels lasting errors of map and receiver.
+# Deviation from the mean offset between matches and GPS, which cancels lasting errors of map and receiver.
 _MAX_MOVE_SIGMA = 3.5
 _MIN_MOVE_M = 7.0
-_MIN_USUAL_MATCHES = 10
-_MAX_USUAL_MATCHES = 60
+_MIN_MEAN_MATCHES = 10
+_MAX_MEAN_MATCHES = 60
 _MIN_MATCHES_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; takes 3 s at 1 Hz
 _MAX_MATCH_AGE_S = 30.0  # of the matches in a row
-_MIN_DOUBTS = 5  # contradicting matches, with or without agreeing ones between them
-_DOUBT_WINDOW_S = 20.0
+_MIN_RECENT_MATCHES = 5  # contradicting matches, with or without agreeing ones between them
+_RECENT_WINDOW_S = 20.0
 _MAX_DRIFT_M_S = 10.0  # how fast the offset from GPS may change while a spoofer leads the receiver away
 _REPORT_FACTOR = 2.0  # times the distance that was last reported
 
@@ -38,27 +38,27 @@ class GpsWatch:
 
     GPS `is_wrong` after three matches in a row contradict it, at different places and with about the same offset from
     GPS; it is right again after three matches in a row agree with it. A match contradicts GPS if its offset
-    from GPS is large, or differs from the usual one of earlier matches. While the aircraft hovers, the same place
+    from GPS is large, or differs from the mean of earlier matches. While the aircraft hovers, the same place
     counts again if it agreed with GPS before. Intermittent jamming is detected by five contradicting matches
     within twenty seconds, and GPS stays wrong until there are fewer. `map_sd_m` is the standard deviation of
     the error that all matches share."""
 
     def __init__(self, map_sd_m: float, notifier: Notifier, autopilot: AutopilotOutput | None) -> None:
         self._map_sd_m, self._notifier, self._autopilot = map_sd_m, notifier, autopilot
-        self._against: list[tuple[PositionedMatch, Doubles]] = []  # contradicting matches, with offsets (2,) from GPS
-        self._doubts: list[PositionedMatch] = []  # contradicting matches of the last seconds
-        self._agreeing = 0
-        self._usual_m, self._usual_count = np.zeros(2), 0  # mean offset of the matches that agreed, and their number
-        self._agreed: set[int] = set()  # places of the last match that agreed
+        self._opposing: list[tuple[PositionedMatch, Doubles]] = []  # contradicting matches, with offsets (2,) from GPS
+        self._recent: list[PositionedMatch] = []  # contradicting matches of the last seconds
+        self._agreements = 0
+        self._mean_error_m, self._mean_count = np.zeros(2), 0  # of the matches that agreed, and their number
+        self._agreed_places: set[int] = set()  # places of the last match that agreed
         self._reported_m = math.inf  # the distance that was last reported
         self._have_agreed = False  # whether GPS and map have agreed in this flight
         self.is_wrong = False
 
     def reset(self) -> None:
         """Discard the offsets from GPS so far, since later matches have different errors."""
-        self._against.clear()
-        self._doubts.clear()
-        self._usual_m, self._usual_count = np.zeros(2), 0
+        self._opposing.clear()
+        self._recent.clear()
+        self._mean_error_m, self._mean_count = np.zeros(2), 0
 
     def update(self, event: Recognition) -> None:
         """Compare GPS with the match of an event, if that has a position."""
@@ -69,11 +69,11 @@ class GpsWatch:
         if match is None or not vehicle.is_fresh(match.t_s):
             return
         gps_deg = extrapolate(vehicle.gps, match.t_s, vehicle.velocity_m_s or (0.0, 0.0))
-        off_m = np.array(offset_m(*gps_deg, match.position.lat_deg, match.position.lon_deg))
+        error_m = np.array(offset_m(*gps_deg, match.position.lat_deg, match.position.lon_deg))
         was_wrong, tilt_error_m = self.is_wrong, (vehicle.height_m or 0.0) * _compute_attitude_error(match)
         sd_m = math.hypot(worst_sd(match.covariance_m2), vehicle.gps.sd_m, match.frame.sd_m, tilt_error_m)
-        self._judge(match, off_m, sd_m)
-        distance_m = math.hypot(*off_m)
+        self._judge(match, error_m, sd_m)
+        distance_m = math.hypot(*error_m)
         if self._autopilot:
             self._autopilot.compare_gps(distance_m, self.is_wrong, self._have_agreed)
         has_grown = self.is_wrong and distance_m > _REPORT_FACTOR * self._reported_m
@@ -83,41 +83,41 @@ class GpsWatch:
             note = Reason(ReasonCode.GPS_AGREES)
             if self.is_wrong:
                 note = Reason(ReasonCode.GPS_DIFFERS, {"distance_m": distance_m})
-            self._notifier.report("gps", severity, note, off_m=round(distance_m, 1), is_wrong=self.is_wrong)
+            self._notifier.report("gps", severity, note, distance_m=round(distance_m, 1), is_wrong=self.is_wrong)
 
-    def _judge(self, match: PositionedMatch, off_m: Doubles, sd_m: float) -> None:
-        """Update the verdict on GPS with a match that is `off_m` (2,) metres from it. `sd_m` is the standard deviation
+    def _judge(self, match: PositionedMatch, error_m: Doubles, sd_m: float) -> None:
+        """Update the verdict on GPS with a match at `error_m` (2,) metres from it. `sd_m` is the standard deviation
         of this offset, without the error that all matches share."""
-        is_far = _is_beyond(off_m, _MIN_GPS_ERROR_M, _MAX_GPS_SIGMA * math.hypot(sd_m, self._map_sd_m))
-        is_usual_known = self._usual_count >= _MIN_USUAL_MATCHES
-        has_moved = is_usual_known and _is_beyond(off_m - self._usual_m, _MIN_MOVE_M, _MAX_MOVE_SIGMA * sd_m)
-        self._doubts = [other for other in self._doubts if match.t_s - other.t_s <= _DOUBT_WINDOW_S]
+        is_far = _is_beyond(error_m, _MIN_GPS_ERROR_M, _MAX_GPS_SIGMA * math.hypot(sd_m, self._map_sd_m))
+        is_mean_known = self._mean_count >= _MIN_MEAN_MATCHES
+        has_moved = is_mean_known and _is_beyond(error_m - self._mean_error_m, _MIN_MOVE_M, _MAX_MOVE_SIGMA * sd_m)
+        self._recent = [other for other in self._recent if match.t_s - other.t_s <= _RECENT_WINDOW_S]
         if not is_far and not has_moved:
-            self._against.clear()
-            self._agreeing += 1
-            self._usual_count = min(self._usual_count + 1, _MAX_USUAL_MATCHES)
-            self._usual_m = self._usual_m + (off_m - self._usual_m) / self._usual_count
-            self._agreed = set(match.places)
-            if self._agreeing >= _MIN_MATCHES_IN_A_ROW and len(self._doubts) < _MIN_DOUBTS:
+            self._opposing.clear()
+            self._agreements += 1
+            self._mean_count = min(self._mean_count + 1, _MAX_MEAN_MATCHES)
+            self._mean_error_m = self._mean_error_m + (error_m - self._mean_error_m) / self._mean_count
+            self._agreed_places = set(match.places)
+            if self._agreements >= _MIN_MATCHES_IN_A_ROW and len(self._recent) < _MIN_RECENT_MATCHES:
                 self.is_wrong, self._have_agreed = False, True
             return
-        places, has_agreed = set(match.places), bool(self._agreed & set(match.places))
+        places, has_agreed = set(match.places), bool(self._agreed_places & set(match.places))
 
         def is_independent_of(other: PositionedMatch) -> bool:
             return has_agreed or not set(other.places) >= places
 
-        if all(map(is_independent_of, self._doubts)):
-            self._doubts.append(match)
-        self._agreeing = 0
-        self._against = [
+        if all(map(is_independent_of, self._recent)):
+            self._recent.append(match)
+        self._agreements = 0
+        self._opposing = [
             (other, other_m)
-            for other, other_m in self._against
+            for other, other_m in self._opposing
             if match.t_s - other.t_s <= _MAX_MATCH_AGE_S
-            and math.hypot(*(off_m - other_m)) <= 2 * math.hypot(2 * sd_m, _MAX_DRIFT_M_S * (match.t_s - other.t_s))
+            and math.hypot(*(error_m - other_m)) <= 2 * math.hypot(2 * sd_m, _MAX_DRIFT_M_S * (match.t_s - other.t_s))
             and is_independent_of(other)
         ]
-        self._against.append((match, off_m))
-        is_proven = len(self._against) >= _MIN_MATCHES_IN_A_ROW or len(self._doubts) >= _MIN_DOUBTS
+        self._opposing.append((match, error_m))
+        is_proven = len(self._opposing) >= _MIN_MATCHES_IN_A_ROW or len(self._recent) >= _MIN_RECENT_MATCHES
         self.is_wrong = self.is_wrong or is_proven
 
 
@@ -128,5 +128,5 @@ def _compute_attitude_error(match: PositionedMatch) -> float:
     return max(0.0, math.hypot(*error.over_height) - error.sd) if error else 0.0
 
 
-def _is_beyond(off_m: Doubles, *limits_m: float) -> bool:
-    return math.hypot(*off_m) > max(limits_m)
+def _is_beyond(error_m: Doubles, *limits_m: float) -> bool:
+    return math.hypot(*error_m) > max(limits_m)

@@ -29,12 +29,12 @@ class Notifier:
         """Write a line to the flight log only."""
         self._flight_log.write(kind, **fields)
 
-    def announce(self, severity: Severity, text: str, *, ground: str | None = None, topic: str | None = None) -> None:
-        """Write a text to the journal, and queue it for the ground station (the shorter text `ground` instead, if
+    def announce(self, severity: Severity, text: str, *, gcs_text: str | None = None, topic: str | None = None) -> None:
+        """Write a text to the journal, and queue it for the ground station (the shorter text `gcs_text` instead, if
         given). A queued text is replaced by a newer one of the same `topic`."""
         _log.log(logging.INFO if severity is Severity.INFO else logging.WARNING, "%s", text)
         if self._link:
-            self._link.announce(severity, ground or text, topic)
+            self._link.announce(severity, gcs_text or text, topic)
 
     def report(
         self,
@@ -42,17 +42,17 @@ class Notifier:
         severity: Severity,
         note: Reason,
         *,
-        ground: str | None = None,
+        gcs_text: str | None = None,
         topic: str | None = None,
         **fields: Any,
     ) -> None:
         """Report to flight log, journal and ground station: write a line of `kind` with `note` and `fields` to the
-        flight log, and announce the note to the other two. The ground station gets the text `ground` or, if the
+        flight log, and announce the note to the other two. The ground station gets the text `gcs_text` or, if the
         note's sentence is too long, its summary. `topic` defaults to the kind."""
         self.log(kind, note=note, **fields)
         text = str(note)
-        ground = ground or (note.code.summary if len(text.encode()) > _MAX_GCS_BYTES else None)
-        self.announce(severity, text, ground=ground, topic=topic or kind)
+        gcs_text = gcs_text or (note.code.summary if len(text.encode()) > _MAX_GCS_BYTES else None)
+        self.announce(severity, text, gcs_text=gcs_text, topic=topic or kind)
 
 
 class Alert:
@@ -96,7 +96,7 @@ class Commands:
         is_new = self.is_paused != (request.command is UserCommand.PAUSE)
         self.is_paused = request.command is UserCommand.PAUSE
         code, name = _COMMAND_CODES[request.command], request.command.name
-        self._notifier.log("command", wish=name, sender=request.sender, note=Reason(code), is_new=is_new)
+        self._notifier.log("command", command=name, sender=request.sender, note=Reason(code), is_new=is_new)
         if is_new:  # a command repeated because its answer was lost changes nothing
             text = code.summary
-            self._notifier.announce(Severity.INFO, f"{text} by {request.sender}", ground=text, topic="pause")
+            self._notifier.announce(Severity.INFO, f"{text} by {request.sender}", gcs_text=text, topic="pause")

@@ -124,8 +124,8 @@ class Vitals:
         is_unopened = source.condition is Condition.LOST and not self._tally.queries  # then its state gives the cause
         self._parts.notifier.log("source", condition=condition.name, state=source.state, refused=source.refused)
         severity = Severity.WARNING if fault else Severity.INFO
-        ground = f"camera {fault or 'is back'}{f': {source.state}' if is_unopened else ''}"
-        self._parts.notifier.announce(severity, f"source: {source.state}", ground=ground, topic="source")
+        gcs_text = f"camera {fault or 'is back'}{f': {source.state}' if is_unopened else ''}"
+        self._parts.notifier.announce(severity, f"source: {source.state}", gcs_text=gcs_text, topic="source")
 
     def _check_log(self) -> None:
         """Report to the ground station if the log cannot be written, and when it can; the journal has the cause."""

@@ -75,9 +75,9 @@ class MapWatch:
             self._notifier.log("left out", place=place_id, problem=problem)
         if event.left_out and not self.left_out:
             count = len(event.left_out)
-            ground = f"map damaged, {count} place{'' if count == 1 else 's'} left out"
+            gcs_text = f"map damaged, {count} place{'' if count == 1 else 's'} left out"
             text = f"map damaged: place {event.left_out[0][0]} cannot be read and is left out"
-            self._notifier.announce(Severity.WARNING, text, ground=ground, topic="left out")
+            self._notifier.announce(Severity.WARNING, text, gcs_text=gcs_text, topic="left out")
         self.left_out += len(event.left_out)
         if event.is_query and event.map_lost != self._is_lost:
             self._is_lost = event.map_lost
@@ -183,9 +183,9 @@ class SurveyReporter:
         summary = "; ".join(sentence for sentence, _ in sentences.values()) or "map and camera agree with GPS"
         self._notifier.log("survey", said=summary, **survey.fields())
         self._reported |= {name: survey.measures[name].value for name in names}
-        for name, (sentence, ground) in sentences.items():
+        for name, (sentence, gcs_text) in sentences.items():
             if name in names:
-                self._notifier.announce(Severity.INFO, sentence, ground=ground, topic=f"survey {name}")
+                self._notifier.announce(Severity.INFO, sentence, gcs_text=gcs_text, topic=f"survey {name}")
 
     def _apply_mount(self) -> None:
         """Level the next pictures by the estimated mount, and discard the comparisons with GPS so far."""

@@ -26,7 +26,7 @@ def test_a_paused_flight_asks_and_sends_nothing_and_goes_on_with_the_newest_pict
     assert queries(lines) == ["frame 000000", "frame 000001", "frame 000005", "frame 000006"]
     assert health == ["ACTIVE", "ACTIVE", "STANDBY", "STANDBY", "STANDBY", "ACTIVE", "ACTIVE"]
     assert link.stats().fixes_sent == 4
-    assert [(line["wish"], line["sender"], line["note"]["code"]) for line in of_kind(lines, "command")] == [
+    assert [(line["command"], line["sender"], line["note"]["code"]) for line in of_kind(lines, "command")] == [
         ("PAUSE", "255/190", "PAUSED_BY_COMMAND"),
         ("RESUME", "255/190", "RESUMED_BY_COMMAND"),
     ]

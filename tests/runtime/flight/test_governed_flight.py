@@ -44,7 +44,7 @@ def test_a_change_is_logged_and_announced_once_and_taken_back(recording, tmp_pat
     assert (down["from"], down["to"], back["from"], back["to"]) == (asked, half, half, asked)
     assert down["why"]["code"] == "CPU_OVER_LIMIT"
     assert down["why"]["parameters"]["cpu_share"] == pytest.approx(1.0, abs=0.005)
-    assert texts == [(5, "edgevpr: held to 30 of 60 Hz"), (6, "edgevpr: back to what was asked")]
+    assert texts == [(5, "edgevpr: held to 30 of 60 Hz"), (6, "edgevpr: back to the configured settings")]
     assert [record.levelname for record in caplog.records if "held to" in record.message] == ["WARNING"]
     assert any("30 of 60" in status for status in statuses)
     assert "held to" not in statuses[-1]

@@ -98,7 +98,7 @@ def test_a_receiver_that_jumps_or_drifts_away_is_found_within_fifteen_seconds_of
     news = air.news[0]
     assert all(line["is_wrong"] for line in air.news)
     assert news["note"]["code"] == "GPS_DIFFERS"
-    assert news["note"]["parameters"]["distance_m"] == pytest.approx(news["off_m"], abs=0.06)
+    assert news["note"]["parameters"]["distance_m"] == pytest.approx(news["distance_m"], abs=0.06)
     reported = [f"edgevpr: {read_reason(line['note'])}" for line in air.news]
     assert [text for _, text in air.link.texts() if "GPS" in text] == reported
     assert len(air.distances()) == len(air.events)

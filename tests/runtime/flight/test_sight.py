@@ -96,9 +96,9 @@ def test_a_flight_that_leaves_its_map_and_comes_back_says_so(make_flight, clock,
 @pytest.mark.parametrize(
     ("rotation_deg", "said"),
     [
-        ([88, 92], ["pictures turned 90 degrees"]),
-        ([-179, 179], ["pictures turned 180 degrees"]),
-        ([-32, -28], ["pictures turned -30 degrees"]),
+        ([88, 92], ["images rotated 90 degrees"]),
+        ([-179, 179], ["images rotated 180 degrees"]),
+        ([-32, -28], ["images rotated -30 degrees"]),
         ([8, 12], []),
         ([0, 90], []),
         ([20, 80], []),
