@@ -126,7 +126,6 @@ class MatchConfig:
     min_margin: float | None = key(
         None, "--min-margin M", "minimum margin of an accepted match over the best place elsewhere", within=(0, 1)
     )
-    verify: bool = True
     neighbour_m: float = bounded_key(0, 10_000, default=50.0)
     reach_m_s: float | None = key(
         None,

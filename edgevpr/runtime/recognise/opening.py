@@ -74,7 +74,7 @@ def open_recogniser(
             place_filter = PlaceFilter(place_map, max_speed_m_s=match.reach_m_s, is_live=is_live(source.uri))
         rule = make_accept_rule(technique, match, length, read_calibration_for(place_map))
         candidates, min_accuracy_m = match.candidates or technique.candidates, config.mavlink.min_accuracy_m
-        settings = MatchSettings(candidates=candidates, verify=match.verify, min_accuracy_m=min_accuracy_m)
+        settings = MatchSettings(candidates=candidates, min_accuracy_m=min_accuracy_m)
         recogniser = Recogniser(
             FrameEncoder(technique=technique, levelling=levelling, mask=mask, gate=gate),
             place_map,
