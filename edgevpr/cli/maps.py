@@ -98,7 +98,7 @@ def _add_pictures(parser: ArgumentParser) -> None:
     """Add the flags for the pictures of a map: those for a recording and those for an orthophoto."""
     add_recording(parser, required=False)
     flags = parser.add_argument_group("from an orthophoto, instead of --images")
-    flags.add_argument("--orthophoto", metavar="FILE", help="GeoTIFF, VRT, MBTiles, or a folder of tiles (z/x/y.png)")
+    flags.add_argument("--orthophoto", metavar="FILE", help="GeoTIFF, VRT or MBTiles file")
     flags.add_argument(
         "--footprint-m",
         type=_parse_lengths,

@@ -46,18 +46,16 @@ class GeoRaster:
     have integer coordinates) to coordinates of `crs`. `width` and `height` are in pixels. `name` is used in messages.
     """
 
-    def __init__(self, source: str | Path, name: str) -> None:
-        """Open `source`, a file or any data set description that GDAL accepts. Raises SourceError if it is not a
-        picture or has no georeference."""
-        self.name = name
+    def __init__(self, path: Path) -> None:
+        """Open a file. Raises SourceError if it is not a picture or has no georeference."""
+        self.name = str(path)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)
-                self._data = rasterio.open(source)
+                self._data = rasterio.open(path)
         except (RasterioError, OSError) as error:
             raise SourceError(
-                f"{name} cannot be opened as an orthophoto: give a GeoTIFF, VRT or MBTiles file, or a folder of tiles "
-                "(z/x/y.png)."
+                f"{self.name} cannot be opened as an orthophoto: give a GeoTIFF, VRT or MBTiles file."
             ) from error
         self.crs, self.transform = self._data.crs, self._data.transform
         self.width, self.height = self._data.width, self._data.height

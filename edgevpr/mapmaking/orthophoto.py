@@ -3,7 +3,6 @@ makes the frames of a map from them."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TypeVar
 
 import cv2
@@ -25,7 +24,6 @@ from edgevpr.mapmaking.georaster import (
     rasterio,
     transform,
 )
-from edgevpr.mapmaking.tiles import describe_folder
 
 _EDGE_POINTS = 25  # per edge: a straight edge of the file is a curve in another coordinate system
 _MAX_HALVINGS = 8  # of the resolution: reduces a tile of 256 pixels to one
@@ -39,13 +37,17 @@ class Orthophoto:
     the size of a pixel on the ground there, in metres."""
 
     def __init__(self, source: str | Path) -> None:
-        """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads, or a folder of map tiles. Raises SourceError."""
-        path, self._links = Path(source), TemporaryDirectory(prefix="edgevpr-tiles-")
+        """Open a GeoTIFF, VRT, MBTiles or other file that GDAL reads. Raises SourceError."""
+        path = Path(source)
         if not path.exists():
             raise SourceError(f"{source} does not exist: give an orthophoto (GDAL makes one of a server's tiles).")
-        raster = describe_folder(path, Path(self._links.name)) if path.is_dir() else path
+        if path.is_dir():
+            raise SourceError(
+                f"{source} is a folder: give a file. GDAL makes one of a folder of tiles "
+                "(docs/how-to/map-from-an-orthophoto.md)."
+            )
         self.name, self.short_name = str(path), path.name
-        self._raster = GeoRaster(raster, self.name)
+        self._raster = GeoRaster(path)
         is_mercator = self._raster.crs == CRS.from_epsg(3857)
         self._wrap = 360 if self._raster.crs.is_geographic else 2 * HALF_WORLD_M if is_mercator else 0
         try:
@@ -129,7 +131,6 @@ class Orthophoto:
     def close(self) -> None:
         """Close the file."""
         self._raster.close()
-        self._links.cleanup()
 
 
 def _apply_affine(affine: rasterio.Affine, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:

@@ -1,9 +1,5 @@
 """Squares cut out of orthophotos of every kind: what is where, to a fraction of a pixel, and what is refused."""
 
-import shutil
-from itertools import product
-
-import cv2
 import numpy as np
 import pytest
 
@@ -11,7 +7,7 @@ pytest.importorskip("rasterio", reason="rasterio is not installed (pip install '
 
 import rasterio
 from rasterio.warp import transform
-from rasters import HOME, MARKS_M, grid, ground_m, marked, marked_raster, write_raster
+from rasters import HOME, MARKS_M, grid, marked, marked_raster, write_raster
 
 from edgevpr.core.errors import ImageError, SourceError
 from edgevpr.mapmaking.orthophoto import Orthophoto
@@ -134,26 +130,6 @@ def test_every_form_of_file_is_read(tmp_path, kind):
         require_marks(picture)
 
 
-def test_cut_reads_a_folder_of_tiles_at_its_highest_zoom(tmp_path):
-    zoom, side_px = 19, 256
-    half_world_m, tile_m = 20037508.342789244, 2 * 20037508.342789244 / 2**zoom
-    (x,), (y,) = transform("EPSG:4326", "EPSG:3857", [HOME.lon_deg], [HOME.lat_deg])
-    middle = int((x + half_world_m) / tile_m), int((half_world_m - y) / tile_m)
-    inside = (np.arange(side_px) + 0.5) / side_px
-    for column, row in product(*(range(number - 2, number + 3) for number in middle)):
-        x_m, y_m = np.meshgrid((column + inside) * tile_m - half_world_m, half_world_m - (row + inside) * tile_m)
-        lon_deg, lat_deg = transform("EPSG:3857", "EPSG:4326", x_m.ravel(), y_m.ravel())
-        bright = marked(*(each.reshape(x_m.shape) for each in ground_m(lat_deg, lon_deg)))
-        path = tmp_path / str(zoom) / str(column) / f"{row}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), np.dstack((bright * 0.8, bright * 0.9, bright)).astype(np.uint8))
-    (tmp_path / "16" / "1").mkdir(parents=True)
-    shutil.copy(path, tmp_path / "16" / "1" / "1.png")
-    picture, valid = cut(tmp_path)
-    require_marks(picture)
-    assert valid.all()
-
-
 def refused(path) -> str:
     with pytest.raises(SourceError) as caught:
         Orthophoto(path)
@@ -166,7 +142,7 @@ def test_what_is_no_orthophoto_is_refused_in_a_sentence(tmp_path):
     bright = marked(east_m, north_m)
     byte = bright.astype(np.uint8)[None]
     assert "missing.tif" in refused(tmp_path / "missing.tif")
-    assert "tiles" in refused(tmp_path)
+    assert "is a folder" in refused(tmp_path)
     (tmp_path / "notes.tif").write_text("not a raster")
     assert "opened" in refused(tmp_path / "notes.tif")
     no_crs = write_raster(tmp_path / "a.tif", byte, None, to_crs)
