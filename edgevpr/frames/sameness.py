@@ -1,8 +1,8 @@
-"""Detects whether two pictures show the same unmoved scene, regardless of noise and on-screen clock or display.
-(`shot.RepeatDetector` finds exactly equal pictures before they are fully decoded.)
+"""Detects whether two images show the same unmoved scene, regardless of noise and on-screen clock or display.
+(`shot.RepeatDetector` finds exactly equal images before they are fully decoded.)
 
 Coarse copies are compared block by block. The texture of a block determines by how much its correlation drops if the
-picture moves by 1.5 of their pixels in any direction; a block with a smaller drop has not moved. So no threshold
+image moves by 1.5 of their pixels in any direction; a block with a smaller drop has not moved. So no threshold
 depends on the kind of ground or its contrast. Blocks that cannot show every motion, such as furrows, are not used."""
 
 from dataclasses import dataclass
@@ -15,17 +15,17 @@ from edgevpr.core.arrays import Array, Bools, Image, Singles
 
 _SIZE_PX = (128, 96)  # columns and rows of a coarse copy
 _BLOCK_PX = 16
-_MIN_TEXTURE_LEVELS = 2.5  # standard deviation of a block, grey levels; the noise of a dark picture is lower
+_MIN_TEXTURE_LEVELS = 2.5  # standard deviation of a block, grey levels; the noise of a dark image is lower
 _MOTION_PX = 1.5
 _MIN_LOSS = 0.05  # of correlation through that motion: a smaller loss may be compression noise
-_MAX_READ_COLUMNS = 640  # columns to average; a larger picture is subsampled first
+_MAX_READ_COLUMNS = 640  # columns to average; a larger image is subsampled first
 _THUMBNAIL_PX = (16, 12)
 BLOCK_COUNT = _SIZE_PX[0] // _BLOCK_PX * (_SIZE_PX[1] // _BLOCK_PX)
 
 
 @dataclass(frozen=True)
-class CoarsePicture:
-    """A coarse copy of a picture: `grey`, uint8 (96, 128)."""
+class CoarseImage:
+    """A coarse copy of an image: `grey`, uint8 (96, 128)."""
 
     grey: Image
 
@@ -47,7 +47,7 @@ class CoarsePicture:
 
     @cached_property
     def min_loss(self) -> Singles:
-        """Loss of correlation of each block, float32 (48,), if the picture moves by 1.5 pixels in the least visible
+        """Loss of correlation of each block, float32 (48,), if the image moves by 1.5 pixels in the least visible
         direction: from the smallest eigenvalue of the block's structure tensor."""
         dx, dy = (_cut_blocks(cv2.Sobel(self.grey, cv2.CV_32F, 1 - axis, axis, ksize=1) / 2) for axis in (0, 1))
         xx, yy, xy = (dx * dx).sum(axis=1), (dy * dy).sum(axis=1), (dx * dy).sum(axis=1)
@@ -61,17 +61,17 @@ class CoarsePicture:
         """True for each block whose texture reveals any motion, bool (48,)."""
         return np.asarray(self.blocks.any(axis=1) & (self.min_loss > _MIN_LOSS))
 
-    def find_unmoved_blocks(self, other: "CoarsePicture") -> Bools:
-        """Return True for each textured block that is unmoved in the other picture, bool (48,)."""
+    def find_unmoved_blocks(self, other: "CoarseImage") -> Bools:
+        """Return True for each textured block that is unmoved in the other image, bool (48,)."""
         loss = 1 - (self.blocks * other.blocks).sum(axis=1)
         return np.asarray(self.is_textured & (loss < self.min_loss))
 
 
-def make_coarse(image: Image) -> CoarsePicture:
-    """Return the coarse copy of a picture, uint8 (H, W) grey or (H, W, 3) BGR; of BGR, the green channel is used."""
+def make_coarse(image: Image) -> CoarseImage:
+    """Return the coarse copy of an image, uint8 (H, W) grey or (H, W, 3) BGR; of BGR, the green channel is used."""
     step = max(1, image.shape[1] // _MAX_READ_COLUMNS)
     plane = np.ascontiguousarray((image if image.ndim == 2 else image[:, :, 1])[::step, ::step])
-    return CoarsePicture(np.asarray(cv2.resize(plane, _SIZE_PX, interpolation=cv2.INTER_AREA), np.uint8))
+    return CoarseImage(np.asarray(cv2.resize(plane, _SIZE_PX, interpolation=cv2.INTER_AREA), np.uint8))
 
 
 def _cut_blocks(plane: Array) -> Singles:

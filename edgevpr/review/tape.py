@@ -155,9 +155,9 @@ class Playback(Tape):
         self._known: dict[str, Any] = {}
         self._is_stopping = False
 
-    def read(self, kind: str, look: Callable[[], Any]) -> Any:
-        """Return the value of `kind` that the flight read here. `look` reads the real machine; it is called only if the
-        tape has no value. Raises StopNow where the flight was stopped, and TapeEnded."""
+    def read(self, kind: str, measure: Callable[[], Any]) -> Any:
+        """Return the value of `kind` that the flight read here. `measure` reads the real machine; it is called only if
+        the tape has no value. Raises StopNow where the flight was stopped, and TapeEnded."""
         if self._peek_kind() == "stopped":
             self._index += 1
             self._is_stopping = True
@@ -168,7 +168,7 @@ class Playback(Tape):
         if self._peek_kind() != kind:
             self.guessed += 1
             if not self._has_answer(kind):
-                return self._guess(kind, look)
+                return self._guess(kind, measure)
             while self._peek_kind() not in (kind, "stopped"):
                 self._index += 1
         head, *values = self._notes[self._index]
@@ -204,14 +204,14 @@ class Playback(Tape):
         first = next((note[0] for note in islice(self._notes, self._index, None) if note[0] in until), None)
         return first in (kind, "stopped") and kind not in _CLOCKS
 
-    def _guess(self, kind: str, look: Callable[[], Any]) -> Any:
+    def _guess(self, kind: str, measure: Callable[[], Any]) -> Any:
         if kind == "frame":
             raise TapeEnded
         if _is_time(kind):
             return self.t_s
         if kind in _CLOCKS:
             return self._known.get(kind, 0.0)
-        return self._known[kind] if kind in self._known else look()
+        return self._known[kind] if kind in self._known else measure()
 
 
 def _is_time(kind: str) -> bool:

@@ -55,8 +55,8 @@ class Tape:
     """Records all values that enter a flight from outside, or plays a recording back. Values are JSON types or bytes.
     `kind` is the name of the input, such as "frame"."""
 
-    def read(self, kind: str, look: Callable[[], T]) -> T:
-        """Get a value of the input `kind` by `look`, and record it; in a replay return the recorded value instead."""
+    def read(self, kind: str, measure: Callable[[], T]) -> T:
+        """Get a value of the input `kind` by `measure`, and record it; in a replay return the recorded value."""
         raise NotImplementedError
 
     def note(self, kind: str, *values: Any) -> None:
@@ -70,7 +70,7 @@ def tape_clock(clock: Clock, tape: Tape) -> Clock:
 
 
 # Measurements of a machine: their names on the tape, and the types of those that are not JSON.
-_QUESTIONS: dict[str, tuple[str, type[Any] | None]] = {
+_MEASUREMENTS: dict[str, tuple[str, type[Any] | None]] = {
     "limit_c": ("limit_c", None),
     "measure_heat": ("heat", ThermalState),
     "measure_load": ("load", MachineLoad),
@@ -89,15 +89,15 @@ class _TapedMachine:
         self._machine, self._tape = machine, tape
 
     def __getattr__(self, name: str) -> Any:
-        kind, made = _QUESTIONS[name]
-        return partial(self._answer, kind, made, getattr(self._machine, name))
+        kind, value_type = _MEASUREMENTS[name]
+        return partial(self._measure, kind, value_type, getattr(self._machine, name))
 
-    def _answer(self, kind: str, made: type[Any] | None, measure: Callable[..., Any], *args: Any) -> Any:
-        if made is None:
+    def _measure(self, kind: str, value_type: type[Any] | None, measure: Callable[..., Any], *args: Any) -> Any:
+        if value_type is None:
             return self._tape.read(kind, partial(measure, *args))
         values = self._tape.read(kind, lambda: astuple(measure(*args)))
-        names = [field.name for field in fields(made)]
-        return made(**dict(zip(names, values, strict=False)))  # an older tape may have fewer values
+        names = [field.name for field in fields(value_type)]
+        return value_type(**dict(zip(names, values, strict=False)))  # an older tape may have fewer values
 
 
 class TapedStop(Stop):
@@ -123,13 +123,13 @@ class TapedStop(Stop):
 
 
 class RecordedSource(Source):
-    """A source that records the frames of `source`, and its attributes (see `Source`) whenever one is read. `keep`
-    stores the JPEG of a frame and returns the number under which it is stored. The flight works with the picture
-    decoded from that JPEG, so that a replay has the flight's pictures to the last bit."""
+    """A source that records the frames of `source`, and its attributes (see `Source`) whenever one is read.
+    `store_jpeg` stores the JPEG of a frame and returns the number under which it is stored. The flight works with the
+    image decoded from that JPEG, so that a replay has the flight's images to the last bit."""
 
-    def __init__(self, source: Source, tape: Tape, keep: Callable[[bytes], int]) -> None:
+    def __init__(self, source: Source, tape: Tape, store_jpeg: Callable[[bytes], int]) -> None:
         self.is_live, self.total = source.is_live, source.total
-        self._source, self._tape, self._keep = source, tape, keep
+        self._source, self._tape, self._store_jpeg = source, tape, store_jpeg
         tape.note("is_live", self.is_live)
 
     def __getattr__(self, name: str) -> Any:
@@ -143,18 +143,18 @@ class RecordedSource(Source):
         try:
             frame = self._source.read(timeout_s)
         except ImageError as error:
-            self._tape.note("frame", {"problem": str(error)} | self._step())
+            self._tape.note("frame", {"problem": str(error)} | self._read_step())
             raise
         if frame is None:
             self._tape.note("frame", None)
             return None
         jpeg = encode_jpeg(frame.image)
-        known = {name: getattr(frame, name) for name in Frame.__slots__ if name not in _UNRECORDED_FIELDS}
+        values = {name: getattr(frame, name) for name in Frame.__slots__ if name not in _UNRECORDED_FIELDS}
         position = frame.position and asdict(frame.position)
-        self._tape.note("frame", known | {"number": self._keep(jpeg), "position": position} | self._step())
+        self._tape.note("frame", values | {"number": self._store_jpeg(jpeg), "position": position} | self._read_step())
         return replace(frame, image=decode_jpeg(jpeg))
 
-    def _step(self) -> dict[str, float]:
+    def _read_step(self) -> dict[str, float]:
         self.step_s = self._source.step_s
         return {} if self.step_s is None else {"step_s": self.step_s}
 

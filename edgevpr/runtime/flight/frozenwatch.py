@@ -1,9 +1,9 @@
-"""Detects frozen pictures. While the aircraft moves, pictures that stay the same are frozen, whatever noise, clock or
+"""Detects frozen images. While the aircraft moves, images that stay the same are frozen, whatever noise, clock or
 display they show, and so are those that repeat earlier ones of this flight, as from a clip that is played again.
 
-Both equal an earlier picture, although the aircraft has turned or flown so far that they cannot. Rotation is the best
+Both equal an earlier image, although the aircraft has turned or flown so far that they cannot. Rotation is the best
 evidence, since gyroscopes measure it for every camera. Velocity times time over height is the second, for a camera that
-looks down, as far as an autopilot that follows our own positions can be trusted. A picture whose texture cannot show a
+looks down, as far as an autopilot that follows our own positions can be trusted. An image whose texture cannot show a
 motion, as over water, in fog or in the dark, is not judged.
 """
 
@@ -18,21 +18,21 @@ from edgevpr.core.config import SourceConfig
 from edgevpr.core.geodesy import wrap_deg
 from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.core.types import Frame, Vehicle
-from edgevpr.frames.sameness import BLOCK_COUNT, CoarsePicture, make_coarse
+from edgevpr.frames.sameness import BLOCK_COUNT, CoarseImage, make_coarse
 from edgevpr.mavlink.messages import Severity
 from edgevpr.runtime.flight.autopilot import AutopilotOutput
 from edgevpr.runtime.flight.notifier import Notifier
 from edgevpr.runtime.recognise.levelling import read_camera_lens
 from edgevpr.runtime.recognise.recogniser import Recogniser
 
-# Motions are shares of the picture's longest side. A motion of 0.012 is detected.
-MIN_MOTION_SHARE = 0.03  # least motion by the aircraft that contradicts an unmoved picture
-MIN_PROOF_SHARE = 0.09  # sum of such motions that proves pictures frozen: one reset of the heading is no proof
-_MAX_SINGLE_SHARE = 0.04  # most that one rotation, or one repeated picture, counts
+# Motions are shares of the image's longest side. A motion of 0.012 is detected.
+MIN_MOTION_SHARE = 0.03  # least motion by the aircraft that contradicts an unmoved image
+MIN_PROOF_SHARE = 0.09  # sum of such motions that proves images frozen: one reset of the heading is no proof
+_MAX_SINGLE_SHARE = 0.04  # most that one rotation, or one repeated image, counts
 _PROOF_WINDOW_S = 20.0
-_MIN_FROZEN_S = 2.5  # for which pictures stay the same, or between a picture and its repetition
-# So many repeated pictures in a row, in flight, are a proof by themselves: on a route that is flown again, 500 m high
-# with a gimbal, one picture in five equals an earlier one to within the resolution.
+_MIN_FROZEN_S = 2.5  # for which images stay the same, or between an image and its repetition
+# So many repeated images in a row, in flight, are a proof by themselves: on a route that is flown again, 500 m high
+# with a gimbal, one image in five equals an earlier one to within the resolution.
 _MIN_REPEATS = 8
 _ROTATION_ERROR_DEG = 2.0  # attitude, and time of the frame
 _SPEED_ERROR_M_S = 2.0  # less counts as hovering
@@ -42,38 +42,38 @@ _MAX_HEIGHT_RATIO = 1.5  # the ground may be lower than the height says
 _MAX_SPEED_M_S = 100.0  # a larger reported velocity is wrong
 _MAX_HEIGHT_M = 10_000.0  # and so is a height
 _MIN_HEIGHT_M = 5.0  # a smaller height over ground is too uncertain
-_MAX_STEP_S = 5.0  # between pictures; the velocity is not integrated over a longer time
+_MAX_STEP_S = 5.0  # between images; the velocity is not integrated over a longer time
 _HEADING_JUMP_DEG = 30.0  # a larger change of heading, with the next for each second, is a correction by the autopilot
 _HEADING_JUMP_DEG_S = 60.0
-_RMS_RADIUS_SHARE = 0.36  # root mean square distance of a picture's points from its middle
+_RMS_RADIUS_SHARE = 0.36  # root mean square distance of an image's points from its middle
 _MAX_FOV_DEG = 120.0  # assumed of an unknown lens
 _MIN_SAME_SHARE = 0.75  # share of the blocks that must be unmoved
 _MIN_BLOCKS = BLOCK_COUNT // 3  # that can be judged
-_BLOCK_MEMORY = 8  # pictures: time constant of the share of pictures in which a block stays while most others move
-_MAX_STAY_SHARE = 0.5  # of the blocks, in a picture from which the blocks that always stay are learnt
-_MAX_REMEMBERED = 300  # pictures; 4 MB
+_STATIC_MEMORY = 8  # images: time constant of the share of images in which a block stays while most others move
+_MAX_STATIC_SHARE = 0.5  # of the blocks, in an image from which the blocks that always stay are learnt
+_MAX_REMEMBERED = 300  # images; 4 MB
 _REMEMBER_INTERVAL_S = 0.5
 _MIN_THUMB_CORRELATION = 0.97  # least correlation of the coarsest copies
-_MAX_CANDIDATES = 3  # earlier pictures that are compared block by block
-_NEW_AFTER_STAY = 3  # new pictures after which the camera counts as back
+_MAX_CANDIDATES = 3  # earlier images that are compared block by block
+_NEW_AFTER_UNCHANGED = 3  # new images after which the camera counts as back
 _NEW_AFTER_REPEATS = 10  # the same, after a clip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Optics:
-    """The effect of the aircraft's motion on the pictures of its camera. `focal_share`: focal length in shares of the
-    picture's longest side. `looks_down`: else ahead. `is_level`: a gimbal compensates roll and pitch."""
+    """The effect of the aircraft's motion on the images of its camera. `focal_share`: focal length in shares of the
+    image's longest side. `looks_down`: else ahead. `is_level`: a gimbal compensates roll and pitch."""
 
     focal_share: float
     looks_down: bool
     is_level: bool
 
-    def compute_rotation_share(self, then: Vehicle | None, now: Vehicle | None) -> float:
-        """Return the least motion of a picture by the rotation of the aircraft between two reports; 0 if unknown."""
-        if then is None or now is None:
+    def compute_rotation_share(self, earlier: Vehicle | None, now: Vehicle | None) -> float:
+        """Return the least motion of an image by the rotation of the aircraft between two reports; 0 if unknown."""
+        if earlier is None or now is None:
             return 0.0
         names = "roll_deg", "pitch_deg", "heading_deg"
-        roll_deg, pitch_deg, yaw_deg = (_compute_change_deg(then, now, name) for name in names)
+        roll_deg, pitch_deg, yaw_deg = (_compute_change_deg(earlier, now, name) for name in names)
         if self.is_level:
             roll_deg = pitch_deg = 0.0
         across_deg, about_deg = (roll_deg, yaw_deg) if self.looks_down else (yaw_deg, roll_deg)
@@ -81,7 +81,7 @@ class Optics:
         return math.hypot(min(1.0, shift), _RMS_RADIUS_SHARE * _subtract_error(about_deg))
 
     def compute_travel_share(self, moved_m: float, height_m: float | None) -> float:
-        """Return the least motion of a picture if the aircraft has moved by `moved_m`; 0 if the camera does not look
+        """Return the least motion of an image if the aircraft has moved by `moved_m`; 0 if the camera does not look
         down, or the height is unknown."""
         if not self.looks_down or height_m is None or not _MIN_HEIGHT_M <= height_m <= _MAX_HEIGHT_M:
             return 0.0
@@ -97,138 +97,139 @@ def read_optics(source: SourceConfig, recogniser: Recogniser) -> Optics:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TimedPicture:
-    """A picture with the report of the aircraft at its time (`vehicle`; None: none). `path_m` (2,): displacement since
+class TimedImage:
+    """An image with the report of the aircraft at its time (`vehicle`; None: none). `path_m` (2,): displacement since
     the start of the flight, by velocities, metres east and north."""
 
-    picture: CoarsePicture
+    image: CoarseImage
     t_s: float
     vehicle: Vehicle | None
     path_m: Doubles
 
 
 class FrozenWatch:
-    """Judges each picture of a live camera before it is recognised, and reports once when pictures are frozen
+    """Judges each image of a live camera before it is recognised, and reports once when images are frozen
     (`is_frozen`) and once when they move again. Some have been recognised by then, so the navigation of the `autopilot`
     (None: there is no link) is reset, and no position that is sent depends on them."""
 
     def __init__(self, notifier: Notifier, optics: Optics, autopilot: AutopilotOutput | None = None) -> None:
         self.is_frozen = False
         self._notifier, self._optics, self._autopilot = notifier, optics, autopilot
-        self._first: TimedPicture | None = None  # of the pictures in a row that are the same
-        self._newest: TimedPicture | None = None
+        self._run_start: TimedImage | None = None  # first of a run of equal images
+        self._newest: TimedImage | None = None
         self._rotation_start: Vehicle | None = None
-        self._flown_share = 0.0
-        self._rotations: deque[tuple[float, float]] = deque()  # of this row: time and share of each
+        self._travel_share = 0.0
+        self._rotations: deque[tuple[float, float]] = deque()  # of this run: time and share of each
         self._repeats: deque[tuple[float, float]] = deque()
-        self._stays = np.zeros(BLOCK_COUNT)  # share of the latest pictures in which a block stayed while others moved
-        self._remembered: deque[TimedPicture] = deque(maxlen=_MAX_REMEMBERED)
+        self._static_shares = np.zeros(BLOCK_COUNT)  # of the latest images: a block stayed while others moved
+        self._remembered: deque[TimedImage] = deque(maxlen=_MAX_REMEMBERED)
         self._repeats_in_a_row = self._new_in_a_row = self._new_needed = 0
 
     @property
     def reason(self) -> Reason | None:
-        """Why pictures are refused while they are frozen, else None."""
+        """Why images are refused while they are frozen, else None."""
         if not self.is_frozen:
             return None
         is_repeating = self._new_needed == _NEW_AFTER_REPEATS
         return Reason(ReasonCode.IMAGES_REPEATED if is_repeating else ReasonCode.IMAGES_UNCHANGED)
 
     def judge(self, frame: Frame, vehicle: Vehicle | None) -> Reason | None:
-        """Judge the next picture, with the autopilot's report at its time. Return why it is refused, or None."""
+        """Judge the next image, with the autopilot's report at its time. Return why it is refused, or None."""
         if vehicle and not vehicle.is_fresh(frame.t_mono_s):
             vehicle = None
-        now = self._locate_picture(make_coarse(frame.image), frame.t_mono_s, vehicle)
-        is_same = None if self._first is None else self._is_same(self._first.picture, now.picture, learns=True)
-        if self._first and is_same:
-            self._handle_same(self._first, now)
+        now = self._locate_image(make_coarse(frame.image), frame.t_mono_s, vehicle)
+        first = self._run_start
+        is_same = None if first is None else self._is_same(first.image, now.image, updates_static=True)
+        if first and is_same:
+            self._handle_same(first, now)
         else:
             is_repeat = self._find_repeat(now)
             if is_same is False and not is_repeat:
                 self._new_in_a_row += 1
                 self._repeats_in_a_row = 0
-            self._begin_row(now)
+            self._start_run(now)
         self._newest = now
         self._update_verdict(now.t_s)
         return self.reason
 
-    def _locate_picture(self, picture: CoarsePicture, t_s: float, vehicle: Vehicle | None) -> TimedPicture:
-        before, path_m = self._newest, np.zeros(2)
-        if before:
-            path_m = before.path_m
-            was_m_s, is_m_s = _read_velocity(before.vehicle), _read_velocity(vehicle)
-            if was_m_s and is_m_s and 0 < t_s - before.t_s <= _MAX_STEP_S:
-                path_m = path_m + (t_s - before.t_s) * np.mean([was_m_s, is_m_s], axis=0)
-            if _has_jumped(before, vehicle, t_s):
+    def _locate_image(self, image: CoarseImage, t_s: float, vehicle: Vehicle | None) -> TimedImage:
+        last, path_m = self._newest, np.zeros(2)
+        if last:
+            path_m = last.path_m
+            last_velocity_m_s, velocity_m_s = _read_velocity(last.vehicle), _read_velocity(vehicle)
+            if last_velocity_m_s and velocity_m_s and 0 < t_s - last.t_s <= _MAX_STEP_S:
+                path_m = path_m + (t_s - last.t_s) * np.mean([last_velocity_m_s, velocity_m_s], axis=0)
+            if _has_jumped(last, vehicle, t_s):
                 self._remembered.clear()
-        return TimedPicture(picture=picture, t_s=t_s, vehicle=vehicle, path_m=path_m)
+        return TimedImage(image=image, t_s=t_s, vehicle=vehicle, path_m=path_m)
 
-    def _begin_row(self, now: TimedPicture) -> None:
-        self._first, self._rotation_start, self._flown_share = now, now.vehicle, 0.0
+    def _start_run(self, now: TimedImage) -> None:
+        self._run_start, self._rotation_start, self._travel_share = now, now.vehicle, 0.0
         self._rotations.clear()
         last = self._remembered[-1] if self._remembered else None
         if last is None or now.t_s - last.t_s >= _REMEMBER_INTERVAL_S:
-            self._remembered.append(replace(now, picture=CoarsePicture(now.picture.grey)))
+            self._remembered.append(replace(now, image=CoarseImage(now.image.grey)))
 
-    def _handle_same(self, first: TimedPicture, now: TimedPicture) -> None:
-        """Process a picture that equals the first one of its row."""
+    def _handle_same(self, first: TimedImage, now: TimedImage) -> None:
+        """Process an image that equals the first one of its run."""
         self._new_in_a_row = 0
-        self._flown_share = max(self._flown_share, self._compute_flown_share(first, now, _SPEED_ERROR_M_S))
+        self._travel_share = max(self._travel_share, self._compute_travel_share(first, now, _SPEED_ERROR_M_S))
         rotation_share = self._optics.compute_rotation_share(self._rotation_start, now.vehicle)
         if rotation_share >= MIN_MOTION_SHARE:
             self._rotations.append((now.t_s, min(rotation_share, _MAX_SINGLE_SHARE)))
         if rotation_share >= MIN_MOTION_SHARE or self._rotation_start is None:
             self._rotation_start = now.vehicle
 
-    def _find_repeat(self, now: TimedPicture) -> bool:
-        """Return whether a picture equals an earlier one of the flight, and count the motion that contradicts this."""
+    def _find_repeat(self, now: TimedImage) -> bool:
+        """Return whether an image equals an earlier one of the flight, and count the motion that contradicts this."""
         if not self._remembered:
             return False
-        correlations = np.array([each.picture.thumb for each in self._remembered]) @ now.picture.thumb
-        for number in np.argsort(correlations)[: -_MAX_CANDIDATES - 1 : -1].tolist():
-            then = self._remembered[number]
-            # A copy without blocks, here and where it is kept: the blocks of all remembered pictures would take 20 MB.
-            is_similar = correlations[number] >= _MIN_THUMB_CORRELATION
-            if is_similar and self._is_same(CoarsePicture(then.picture.grey), now.picture):
-                self._handle_repeat(then, now)
+        correlations = np.array([remembered.image.thumb for remembered in self._remembered]) @ now.image.thumb
+        for index in np.argsort(correlations)[: -_MAX_CANDIDATES - 1 : -1].tolist():
+            earlier = self._remembered[index]
+            # A copy without blocks, here and where it is kept: the blocks of all remembered images would take 20 MB.
+            is_similar = correlations[index] >= _MIN_THUMB_CORRELATION
+            if is_similar and self._is_same(CoarseImage(earlier.image.grey), now.image):
+                self._handle_repeat(earlier, now)
                 return True
         return False
 
-    def _handle_repeat(self, then: TimedPicture, now: TimedPicture) -> None:
+    def _handle_repeat(self, earlier: TimedImage, now: TimedImage) -> None:
         self._new_in_a_row = 0
-        if now.t_s - then.t_s < _MIN_FROZEN_S:
+        if now.t_s - earlier.t_s < _MIN_FROZEN_S:
             return
         velocity_m_s = _read_velocity(now.vehicle)
-        flies_on = velocity_m_s is not None and math.hypot(*velocity_m_s) >= _MIN_FLIGHT_SPEED_M_S
-        if flies_on and self._optics.looks_down:  # the horizon ahead stays the same for long
+        is_flying = velocity_m_s is not None and math.hypot(*velocity_m_s) >= _MIN_FLIGHT_SPEED_M_S
+        if is_flying and self._optics.looks_down:  # the horizon ahead stays the same for long
             self._repeats_in_a_row += 1
-        rotation_share = self._optics.compute_rotation_share(then.vehicle, now.vehicle)
-        share = max(rotation_share, self._compute_flown_share(then, now, _PATH_DRIFT_M_S))
+        rotation_share = self._optics.compute_rotation_share(earlier.vehicle, now.vehicle)
+        share = max(rotation_share, self._compute_travel_share(earlier, now, _PATH_DRIFT_M_S))
         if share >= MIN_MOTION_SHARE:
             self._repeats.append((now.t_s, min(share, _MAX_SINGLE_SHARE)))
 
-    def _compute_flown_share(self, then: TimedPicture, now: TimedPicture, doubt_m_s: float) -> float:
-        moved_m = float(np.hypot(*(now.path_m - then.path_m))) - doubt_m_s * (now.t_s - then.t_s)
+    def _compute_travel_share(self, earlier: TimedImage, now: TimedImage, speed_error_m_s: float) -> float:
+        moved_m = float(np.hypot(*(now.path_m - earlier.path_m))) - speed_error_m_s * (now.t_s - earlier.t_s)
         return self._optics.compute_travel_share(moved_m, now.vehicle.height_m if now.vehicle else None)
 
-    def _is_same(self, then: CoarsePicture, now: CoarsePicture, learns: bool = False) -> bool | None:
-        """Return True if two pictures show the same, unmoved; None if their texture cannot show a motion. Blocks that
-        always stay, as those of a display or of the airframe, are not used; with `learns`, they are learnt."""
-        textured, unmoved = then.is_textured, then.find_unmoved_blocks(now)
-        judged = textured & (self._stays < _MAX_STAY_SHARE)
-        if learns and unmoved.sum() <= _MAX_STAY_SHARE * textured.sum():
-            self._stays += textured * (unmoved - self._stays) / _BLOCK_MEMORY
+    def _is_same(self, earlier: CoarseImage, now: CoarseImage, updates_static: bool = False) -> bool | None:
+        """Return True if two images show the same, unmoved; None if their texture cannot show a motion. Blocks that
+        always stay, as those of a display or of the airframe, are not used; with `updates_static`, they are learnt."""
+        textured, unmoved = earlier.is_textured, earlier.find_unmoved_blocks(now)
+        judged = textured & (self._static_shares < _MAX_STATIC_SHARE)
+        if updates_static and unmoved.sum() <= _MAX_STATIC_SHARE * textured.sum():
+            self._static_shares += textured * (unmoved - self._static_shares) / _STATIC_MEMORY
         return None if judged.sum() < _MIN_BLOCKS else bool(unmoved[judged].mean() >= _MIN_SAME_SHARE)
 
     def _update_verdict(self, now_s: float) -> None:
-        """Decide, by the motions of the last seconds that the pictures did not show, whether pictures are frozen."""
+        """Decide, by the motions of the last seconds that the images did not show, whether images are frozen."""
         for motions in (self._rotations, self._repeats):
             while motions and now_s - motions[0][0] > _PROOF_WINDOW_S:
                 motions.popleft()
-        unchanged_s = now_s - self._first.t_s if self._first else 0.0
-        motion_share = self._flown_share + sum(share for _, share in self._rotations)
+        unchanged_s = now_s - self._run_start.t_s if self._run_start else 0.0
+        motion_share = self._travel_share + sum(share for _, share in self._rotations)
         is_repeating = sum(share for _, share in self._repeats) >= MIN_PROOF_SHARE
         if motion_share >= MIN_PROOF_SHARE and unchanged_s >= _MIN_FROZEN_S:
-            self._report(_NEW_AFTER_STAY)
+            self._report(_NEW_AFTER_UNCHANGED)
         elif is_repeating or self._repeats_in_a_row >= _MIN_REPEATS:
             self._report(_NEW_AFTER_REPEATS)
         elif self.is_frozen and self._new_in_a_row >= self._new_needed:
@@ -253,9 +254,9 @@ def _read_velocity(vehicle: Vehicle | None) -> tuple[float, float] | None:
     return velocity_m_s if velocity_m_s and math.hypot(*velocity_m_s) <= _MAX_SPEED_M_S else None
 
 
-def _compute_change_deg(then: Vehicle, now: Vehicle, name: str) -> float:
+def _compute_change_deg(earlier: Vehicle, now: Vehicle, name: str) -> float:
     """Return the change of an angle; 0 if it is unknown."""
-    before, after = getattr(then, name), getattr(now, name)
+    before, after = getattr(earlier, name), getattr(now, name)
     if before is None or after is None or not math.isfinite(before + after):
         return 0.0
     return float(wrap_deg(after - before))
@@ -265,9 +266,9 @@ def _subtract_error(angle_deg: float) -> float:
     return math.radians(max(0.0, abs(angle_deg) - _ROTATION_ERROR_DEG))
 
 
-def _has_jumped(before: TimedPicture, vehicle: Vehicle | None, t_s: float) -> bool:
+def _has_jumped(last: TimedImage, vehicle: Vehicle | None, t_s: float) -> bool:
     """Return True if the heading has changed faster than an aircraft turns."""
-    if before.vehicle is None or vehicle is None:
+    if last.vehicle is None or vehicle is None:
         return False
-    rotation_deg = abs(_compute_change_deg(before.vehicle, vehicle, "heading_deg"))
-    return rotation_deg > _HEADING_JUMP_DEG + _HEADING_JUMP_DEG_S * max(0.0, t_s - before.t_s)
+    rotation_deg = abs(_compute_change_deg(last.vehicle, vehicle, "heading_deg"))
+    return rotation_deg > _HEADING_JUMP_DEG + _HEADING_JUMP_DEG_S * max(0.0, t_s - last.t_s)

@@ -71,9 +71,9 @@ class Recording(Tape):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def read(self, kind: str, look: Callable[[], T]) -> T:
-        """Return the result of `look`, and record it on the tape under `kind`."""
-        value = look()
+    def read(self, kind: str, measure: Callable[[], T]) -> T:
+        """Return the result of `measure`, and record it on the tape under `kind`."""
+        value = measure()
         self.note(kind, value)
         return value
 

@@ -44,39 +44,39 @@ _MIN_TRUSTED_SHARE = 0.1
 _MAX_HALF_SD_M = 2.0
 _MAX_HALVES_SD = 4.0
 _MAX_TRUSTED_M = 12.0  # a match closer to GPS, given the mount, is no reason to distrust GPS
-_SOFT_ROUNDS = 6
-_HARD_ROUNDS = 3
-_SOFT_LIMIT_SD = 2.0
+_HUBER_ITERATIONS = 6
+_REJECTION_ITERATIONS = 3
+_HUBER_SIGMA = 2.0
 _RAYLEIGH_MEDIAN = math.sqrt(2 * math.log(2))  # of a Rayleigh distribution with a scale of 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveySample:
     """A match `off_m` (2,) metres east and north of GPS: the product of `jacobian` (2, 6) and the parameters. The
-    variance of each axis, m2, is the sum of `own_m2` and `shared_m2`, an error that `correlation` samples have in
-    common. `is_doubted`: GPS was distrusted then."""
+    variance of each axis, m2, is the sum of `independent_m2` and `correlated_m2`, an error that `correlation` samples
+    have in common. `distrusts_gps`: GPS was distrusted then."""
 
     jacobian: Doubles
     off_m: Doubles
-    own_m2: float
-    shared_m2: float
+    independent_m2: float
+    correlated_m2: float
     correlation: float
-    is_doubted: bool
+    distrusts_gps: bool
 
 
 @dataclass(frozen=True, slots=True)
 class SurveyMeasure:
-    """A result with its standard deviation (of each axis), known if that is at most `worst_sd`. Values that differ by
+    """A result with its standard deviation (of each axis), known if that is at most `max_sd`. Values that differ by
     less than `min_difference` count as the same."""
 
     value: tuple[float, ...]
     sd: float
-    worst_sd: float
+    max_sd: float
     min_difference: float
 
     @property
     def is_known(self) -> bool:
-        return self.sd <= self.worst_sd
+        return self.sd <= self.max_sd
 
     def differs_from(self, other: tuple[float, ...], factor: float = 1.0) -> bool:
         """Return True if the value is known and clearly differs from `other`, by `factor` times `min_difference`."""
@@ -113,9 +113,9 @@ class MapSurvey:
         self._origin: Position | None = None
         self._last_s = -math.inf
 
-    def add_match(self, event: Recognition, is_doubted: bool = False) -> bool:
+    def add_match(self, event: Recognition, distrusts_gps: bool = False) -> bool:
         """Add the match of an event as a sample; return False if it has no usable match, or the last sample is too
-        recent. `is_doubted`: GPS is distrusted now."""
+        recent. `distrusts_gps`: GPS is distrusted now."""
         vehicle, located, view = event.vehicle, event.located, event.view
         if event.frame is None or event.frame.t_mono_s - self._last_s < _MIN_INTERVAL_S:
             return False
@@ -140,16 +140,16 @@ class MapSurvey:
         self._origin = self._origin or reference
         jacobian[:, 4] = offset_between_m(self._origin, reference)
         off_m = np.array(offset_between_m(reference, match.position))
-        own_m2 = float(np.trace(match.scatter_m2)) / 2 - located.tilt_m2  # the tilt is a parameter
-        shared_m2 = vehicle.gps.sd_m**2
+        independent_m2 = float(np.trace(match.scatter_m2)) / 2 - located.tilt_m2  # the tilt is a parameter
+        correlated_m2 = vehicle.gps.sd_m**2
         self._samples.append(
             SurveySample(
                 jacobian=jacobian,
                 off_m=off_m,
-                own_m2=own_m2,
-                shared_m2=shared_m2,
+                independent_m2=independent_m2,
+                correlated_m2=correlated_m2,
                 correlation=correlation,
-                is_doubted=is_doubted,
+                distrusts_gps=distrusts_gps,
             )
         )
         self._last_s = t_s
@@ -188,7 +188,7 @@ class MapSurvey:
         middle_m = np.mean([sample.jacobian[:, 4] for sample in samples], axis=0)
         to_middle = np.eye(6)
         to_middle[:2, 4] = middle_m
-        if is_inlier.mean() < _MIN_INLIER_SHARE or not _explains_doubts(samples, is_inlier, to_middle, solution[2:4]):
+        if is_inlier.mean() < _MIN_INLIER_SHARE or not _is_gps_plausible(samples, is_inlier, to_middle, solution[2:4]):
             return None
         solution, covariance = to_middle @ solution, to_middle @ covariance @ to_middle.T
         sd = np.sqrt(np.diag(covariance))
@@ -212,22 +212,22 @@ def fit_samples(samples: list[SurveySample]) -> tuple[Doubles, Doubles, Bools]:
     """
     jacobian = np.array([sample.jacobian for sample in samples])
     off_m = np.array([sample.off_m for sample in samples])
-    own_m2, shared_m2, correlation = np.array(
-        [(sample.own_m2, sample.shared_m2, sample.correlation) for sample in samples]
+    independent_m2, correlated_m2, correlation = np.array(
+        [(sample.independent_m2, sample.correlated_m2, sample.correlation) for sample in samples]
     ).T
-    counts, scatter = np.ones(len(samples)), 1.0
-    for iteration in range(_SOFT_ROUNDS + _HARD_ROUNDS):
-        weight = counts / (own_m2 + correlation * shared_m2)
+    inlier_weights, scatter = np.ones(len(samples)), 1.0
+    for iteration in range(_HUBER_ITERATIONS + _REJECTION_ITERATIONS):
+        weight = inlier_weights / (independent_m2 + correlation * correlated_m2)
         normal = np.einsum("n,nij,nik->jk", weight, jacobian, jacobian) + _PRIOR_INFORMATION
         solution = np.linalg.solve(normal, np.einsum("n,nij,ni->j", weight, jacobian, off_m))
-        residual_sd = np.linalg.norm(off_m - jacobian @ solution, axis=1) / np.sqrt(own_m2 + shared_m2)
+        residual_sd = np.linalg.norm(off_m - jacobian @ solution, axis=1) / np.sqrt(independent_m2 + correlated_m2)
         scatter = max(1.0, float(np.median(residual_sd)) / _RAYLEIGH_MEDIAN)
-        if iteration < _SOFT_ROUNDS:
-            counts = np.minimum(1.0, _SOFT_LIMIT_SD * scatter / np.maximum(residual_sd, 1e-9))
+        if iteration < _HUBER_ITERATIONS:
+            inlier_weights = np.minimum(1.0, _HUBER_SIGMA * scatter / np.maximum(residual_sd, 1e-9))
         else:
-            counts = (residual_sd <= _MAX_RESIDUAL_SD * scatter).astype(float)
+            inlier_weights = (residual_sd <= _MAX_RESIDUAL_SD * scatter).astype(float)
     covariance: Doubles = scatter**2 * np.linalg.inv(normal)
-    return solution, covariance, counts > 0
+    return solution, covariance, inlier_weights > 0
 
 
 def _compute_tangents(mount: Mount) -> Doubles:
@@ -236,19 +236,19 @@ def _compute_tangents(mount: Mount) -> Doubles:
     return tangents
 
 
-def _explains_doubts(samples: list[SurveySample], is_inlier: Bools, to_middle: Doubles, mount: Doubles) -> bool:
+def _is_gps_plausible(samples: list[SurveySample], is_inlier: Bools, to_middle: Doubles, mount: Doubles) -> bool:
     """Return True if a fit with the inliers `is_inlier` (n,) leaves no reason to distrust GPS: both halves of a flight
-    agree, as do the samples that were not doubted. A spoofed receiver moves between the halves. Samples that the
-    `mount` (2,) explains are no longer doubted. `to_middle` (6, 6) moves parameters to the middle of the ground."""
-    doubted = np.array([sample.is_doubted for sample in samples])
-    if not doubted.any():
+    agree, as do the samples taken while GPS was trusted. A spoofed receiver moves between the halves. Samples that the
+    `mount` (2,) explains do not count against GPS. `to_middle` (6, 6) moves parameters to the middle of the ground."""
+    distrusted = np.array([sample.distrusts_gps for sample in samples])
+    if not distrusted.any():
         return True
     residual_m = np.array([sample.off_m - sample.jacobian[:, 2:4] @ mount for sample in samples])
-    doubted &= np.linalg.norm(residual_m, axis=1) > _MAX_TRUSTED_M
+    distrusted &= np.linalg.norm(residual_m, axis=1) > _MAX_TRUSTED_M
     halves = np.array_split(np.arange(len(samples)), 2)
-    if min(np.mean(~doubted[half]) for half in halves) < _MIN_TRUSTED_SHARE:
+    if min(np.mean(~distrusted[half]) for half in halves) < _MIN_TRUSTED_SHARE:
         return False
-    if is_inlier[~doubted].mean() < _MIN_INLIER_SHARE:
+    if is_inlier[~distrusted].mean() < _MIN_INLIER_SHARE:
         return False
     first, second = (fit_samples([samples[index] for index in half])[:2] for half in halves)
     covariances = [to_middle @ covariance @ to_middle.T for _, covariance in (first, second)]

@@ -106,7 +106,7 @@ def surveyed(monkeypatch):
 @pytest.mark.usefixtures("surveyed")
 def test_pictures_are_levelled_by_it_as_soon_as_it_is_known(place_map, tmp_path, monkeypatch):
     monkeypatch.setattr(watching, "_SURVEY_INTERVAL", 2)
-    monkeypatch.setattr(MapSurvey, "add_match", lambda self, event, is_doubted: True)
+    monkeypatch.setattr(MapSurvey, "add_match", lambda self, event, distrusts_gps: True)
     queries, _ = fly(place_map, tmp_path / "f.jsonl", 0, roll_deg=0.0, pitch_deg=0.0, height_m=80.0)
     _, *of_under = zip(*(query["view"]["nadir_offset"] for query in queries), strict=True)
     behind = -80.0 * np.tan(np.radians(9.0)) / 103.9
