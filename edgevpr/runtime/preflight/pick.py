@@ -1,11 +1,14 @@
-"""Automatic choice of a technique for a new map, and the cost of a flight's technique on its board."""
+"""Automatic choice of a technique for a new map, and the accuracy and cost of a flight's technique."""
 
 import logging
-from dataclasses import replace
+from random import Random
+
+import numpy as np
 
 from edgevpr import techniques
 from edgevpr.core.contract import Technique, TechniqueSpec
-from edgevpr.core.errors import ModelError
+from edgevpr.core.errors import EdgevprError, ModelError
+from edgevpr.core.types import Frame
 from edgevpr.power.boards import Board, load_board
 from edgevpr.runtime.preflight.choose import (
     Demand,
@@ -18,7 +21,7 @@ from edgevpr.runtime.preflight.choose import (
     list_preferred,
     make_option,
 )
-from edgevpr.runtime.preflight.probe import TechniqueCosts, compute_ram_bytes, measure_costs
+from edgevpr.runtime.preflight.probe import TechniqueCosts, measure_costs
 from edgevpr.runtime.preflight.scale import compare_speed, count_work, scale_to_board
 from edgevpr.runtime.recognise.opening import make_technique
 from edgevpr.runtime.recognise.recogniser import Recogniser
@@ -67,24 +70,22 @@ def explain_technique(recogniser: Recogniser, is_named: bool) -> str:
     return f"technique {_make_label(spec)}: {'; '.join(parts)}"
 
 
-def measure_flight(recogniser: Recogniser) -> tuple[float, str]:
-    """Measure the cost of a flight on its board. Returns the seconds per query, and accuracy and cost as text. Raises
-    EdgevprError, and OSError if there is no space for a small temporary map."""
-    board, spec = recogniser.meter.board, recogniser.technique.spec
-    costs = _measure_costs(recogniser.technique, board)
-    costs = replace(
-        costs,
-        ram_bytes_per_place=compute_ram_bytes(spec, recogniser.sequence),
-        candidates=recogniser.candidates if spec.fine else costs.candidates,
-    )
-    demand = Demand(
-        places=len(recogniser.index),
-        rate_hz=board.rate_hz,
-        budget_mb=board.budget_mb,
-        camera=_read_camera(spec),
-    )
-    option = make_option(board, _make_label(spec), spec.name, costs, demand)
-    return option.t_query_s, describe_option(board, option, demand)
+def describe_accuracy(technique: Technique) -> str:
+    """Return the accuracy of a technique on the image sets as text."""
+    return str(find_accuracy(_make_label(technique.spec), _read_camera(technique.spec)) or "never measured")
+
+
+def measure_query(recogniser: Recogniser, size_px: tuple[int, int]) -> float | None:
+    """Return the seconds that a query takes on this machine, with an image of noise of `size_px` (width, height), which
+    costs the most to match because every region has structure; None if the salience gate refuses it before the search.
+    Raises EdgevprError if the query fails."""
+    width_px, height_px = size_px
+    image = np.frombuffer(Random(0).randbytes(height_px * width_px), np.uint8).reshape(height_px, width_px)
+    for number in range(recogniser.sequence + 1):  # until the sequence is complete; the first query warms up
+        event = recogniser.step(Frame(image=image, name="noise", t_mono_s=float(number)))
+    if event.failed:
+        raise EdgevprError(f"A query fails: {event.reason}.")
+    return event.cost.whole.wall_s if event.ranking else None
 
 
 def list_safe_candidates(technique: Technique) -> tuple[int, ...]:

@@ -17,8 +17,9 @@ from edgevpr.mavlink.address import parse_link
 from edgevpr.mavlink.asking import RequestLink
 from edgevpr.mavlink.signing import open_signing
 from edgevpr.power.boards import Board, load_board, resolve_board
+from edgevpr.power.machine import read_model
 from edgevpr.runtime.flight.startup import apply_recorded_rate
-from edgevpr.runtime.preflight.pick import explain_technique, measure_flight
+from edgevpr.runtime.preflight.pick import describe_accuracy, explain_technique, measure_query
 from edgevpr.runtime.recognise.calibration import explain_not_calibrated, read_calibration_for
 from edgevpr.runtime.recognise.levelling import load_calibrated_lens
 from edgevpr.runtime.recognise.opening import open_recogniser
@@ -26,6 +27,8 @@ from edgevpr.runtime.service.camera import FRAME_WAIT_S, check_frame
 from edgevpr.runtime.service.doctor import explain_silence
 from edgevpr.runtime.service.finding import Finding, check_log, report_error, report_fault, report_ok, run_check
 from edgevpr.runtime.service.findingcodes import FindingCode
+
+_FRAME_SIZE_PX = 640, 480  # of the image with which a query is measured, if no lens calibration gives its size
 
 
 def check_configuration(config_path: str | Path, *, offline: bool = False) -> list[Finding]:
@@ -41,7 +44,7 @@ def check_configuration(config_path: str | Path, *, offline: bool = False) -> li
         board = resolve_board(load_board(config.board), source, config.memory)
         findings.append(report_ok("board", FindingCode.BOARD_KNOWN, board=board.title, memory_mb=board.memory_max_mb))
         findings.append(run_check("map", lambda what: _check_map(what, config, board)))
-    except ConfigError as error:  # the cost of a query cannot be estimated without a board
+    except ConfigError as error:  # the map is opened within the limits of the board
         findings.append(report_error("board", error))
     show_wait("opening the source" if offline else f"waiting up to {FRAME_WAIT_S:g} s for a frame from the source")
     findings.append(run_check("source", lambda what: _check_source(what, source, offline)))
@@ -52,18 +55,21 @@ def check_configuration(config_path: str | Path, *, offline: bool = False) -> li
 
 
 def _check_map(what: str, config: Config, board: Board) -> Finding:
+    lens = load_calibrated_lens(config.source)
     recogniser = open_recogniser(config, board, uses_hints=True)
     with closing(recogniser.place_map) as place_map:
-        t_query_s, cost = measure_flight(recogniser)
+        t_query_s = measure_query(recogniser, lens.size_px if lens else _FRAME_SIZE_PX)
         technique, confidence = explain_technique(recogniser, is_named=config.technique is not None), None
         if recogniser.rule.confidence_rule:
             calibration = read_calibration_for(place_map)
             confidence = calibration.described() if calibration else explain_not_calibrated(len(place_map))
-    settings = config.mavlink
-    if settings.link and settings.send_fixes and t_query_s > MAX_FIX_AGE_S:
-        return report_fault(what, FindingCode.QUERY_TOO_SLOW, t_query_s=t_query_s, limit_s=MAX_FIX_AGE_S)
-    facts = {"technique": technique, "cost": cost, "confidence": confidence}
-    return report_ok(what, FindingCode.MAP_READY, path=config.map, t_query_s=t_query_s, **facts)
+    settings, machine = config.mavlink, read_model() or "this machine"
+    if settings.link and settings.send_fixes and t_query_s and t_query_s > MAX_FIX_AGE_S:
+        times = {"t_query_s": t_query_s, "limit_s": MAX_FIX_AGE_S}
+        return report_fault(what, FindingCode.QUERY_TOO_SLOW, machine=machine, **times)
+    accuracy = describe_accuracy(recogniser.technique)
+    facts = {"technique": technique, "accuracy": accuracy, "confidence": confidence, "machine": machine}
+    return report_ok(what, FindingCode.MAP_READY, path=config.map, t_query_s=t_query_s, rate_hz=board.rate_hz, **facts)
 
 
 def _check_source(what: str, settings: SourceConfig, offline: bool) -> Finding:

@@ -17,9 +17,13 @@ class FindingCode(Code):
     FILE_USABLE = "{path}"
     BOARD_KNOWN = "{board}, up to {memory_mb:.0f} MB for edgevpr"
     FILE_UNUSABLE = "{path}: {problem}: check the path and the file's permissions"
-    MAP_READY = "{path}, {technique}; {cost}; a query takes {t_query_s:.2f} s", "; {confidence}"
+    MAP_READY = (
+        "{path}, {technique}; {accuracy}",
+        "; a query takes {t_query_s:.2f} s on {machine} ({rate_hz:g} Hz needed)",
+        "; {confidence}",
+    )
     QUERY_TOO_SLOW = (
-        "a query takes {t_query_s:.1f} s, but fixes from frames older than {limit_s:g} s are never sent: ",
+        "a query takes {t_query_s:.1f} s on {machine}, but fixes from frames older than {limit_s:g} s are never sent: ",
         "use a faster board, fewer places or candidates, or a cheaper technique",
     )
     NO_LOG = "no flight log is configured: the flight is not recorded"

@@ -1,42 +1,54 @@
 """What is said before a flight, and how few candidates its governor may have compared."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
-from example_costs import REGIONS
 
 from edgevpr.core.config import load_config
-from edgevpr.core.types import StageCost
+from edgevpr.core.errors import EdgevprError
+from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.power.boards import load_board
+from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.preflight import pick
-from edgevpr.runtime.preflight.pick import list_safe_candidates, measure_flight
+from edgevpr.runtime.preflight.pick import describe_accuracy, list_safe_candidates, measure_query
 from edgevpr.runtime.recognise.opening import open_recogniser
-
-COSTS = replace(REGIONS, match_per_place=StageCost(0.01, 0.01), candidates=42)
 
 
 @pytest.fixture
-def measure_at(recording, monkeypatch):
-    def found(rate_hz, costs=COSTS, **settings):
-        monkeypatch.setattr(pick, "measure_costs", lambda technique: costs)
-        monkeypatch.setattr(pick, "scale_to_board", lambda costs, *_: costs)
-        config = load_config(None, {"map": str(recording / "cohog.gpkg"), **settings})
-        board = replace(load_board("this"), cores=4, cpu_share=0.5, rate_hz=rate_hz)
-        recogniser = open_recogniser(config, board)
-        # A flight over more places than candidates: this map has few.
-        monkeypatch.setattr(type(recogniser.index), "__len__", lambda index: 1000)
-        with recogniser.place_map:
-            return measure_flight(recogniser)
-
-    return found
+def recogniser(recording, clock):
+    """A recogniser whose queries take the time of the clock."""
+    board, config = load_board("this"), load_config(None, {"map": str(recording / "cohog.gpkg")})
+    meter = QueryMeter(board, wall_clock=clock, cpu_clock=clock.clock.process_cpu_s)
+    recogniser = open_recogniser(config, board, meter=meter)
+    with recogniser.place_map:
+        yield recogniser
 
 
-def test_measure_flight_says_what_a_query_takes_and_finds(measure_at):
-    t_query_s, cost = measure_at(1.0)
-    assert t_query_s == pytest.approx(0.52)
-    assert cost.startswith("recall@1 ")
-    assert measure_at(1.0, **{"match.candidates": 12})[0] == pytest.approx(0.22)
-    assert "0.41 Hz" in measure_at(3.0, replace(COSTS, encode=StageCost(2.0, 2.0)))[1]
+def test_measure_query_leaves_out_the_query_that_warms_up(recogniser, clock):
+    encode, seconds, shapes = recogniser.technique.encode, iter((6.0, 0.5)), []
+
+    def work(image, mask):
+        shapes.append(image.shape)
+        clock.work(next(seconds), 2)
+        return encode(image, mask)
+
+    recogniser.technique.encode = work
+    assert measure_query(recogniser, (320, 240)) == 0.5
+    assert shapes == [(240, 320)] * 2
+
+
+def test_measure_query_tells_a_fault_and_a_refusal_from_a_time(recogniser):
+    refused = SimpleNamespace(judge=lambda image: SimpleNamespace(reason=Reason(ReasonCode.NOT_MEMORABLE)))
+    recogniser.encoder = replace(recogniser.encoder, gate=refused)
+    assert measure_query(recogniser, (320, 240)) is None
+    recogniser.technique.encode = lambda *seen: 1 / 0
+    with pytest.raises(EdgevprError, match="ZeroDivisionError"):
+        measure_query(recogniser, (320, 240))
+
+
+def test_describe_accuracy_is_of_the_technique_and_form(recogniser):
+    assert describe_accuracy(recogniser.technique).startswith("recall@1 ")
 
 
 def test_trusted_candidates_accepted_nothing_wrong(recording, monkeypatch):

@@ -1,7 +1,6 @@
 """`edgevpr check` on a real map, folder, socket and pty; and on each thing that can be wrong."""
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,10 +12,10 @@ from walks import map_of
 
 from edgevpr import techniques
 from edgevpr.cli.main import main
-from edgevpr.core.types import Frame, StageCost
+from edgevpr.core.types import Frame
 from edgevpr.mavlink.address import parse_link
 from edgevpr.places.mapfile import PlaceMap
-from edgevpr.runtime.preflight import pick
+from edgevpr.runtime.service import check
 from edgevpr.runtime.service.check import Finding, check_configuration
 from edgevpr.runtime.service.findingcodes import FindingCode
 
@@ -61,14 +60,10 @@ def wrong(config_file: Path, settings: dict) -> list[Finding]:
 
 
 def test_check_finds_a_query_too_slow_for_any_fix_unless_it_is_a_dry_run(settings, config_file, monkeypatch):
-    measure_costs = pick.measure_costs
-    monkeypatch.setattr(
-        pick, "measure_costs", lambda technique: replace(measure_costs(technique), encode=StageCost(6.0, 6.0))
-    )
-    settings["board"] = "this"
+    monkeypatch.setattr(check, "measure_query", lambda *_: 6.0)
     (finding,) = wrong(config_file, settings)
     assert (finding.what, finding.reason.code) == ("map", FindingCode.QUERY_TOO_SLOW)
-    assert finding.reason.parameters["t_query_s"] > 6
+    assert finding.reason.parameters["t_query_s"] == 6.0
     settings["mavlink"]["send_fixes"] = False
     assert wrong(config_file, settings) == []
 
