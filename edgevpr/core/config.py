@@ -151,7 +151,6 @@ class SalienceConfig:
     network: str | None = "matchability"
     detector: str | None = None
     detect_every: int = bounded_key(1, 1000, default=1)
-    footprint_m: float | None = bounded_key(1, 10_000, default=None)
     gap_frames: int = bounded_key(1, 10_000, default=20)
     gap_m: float = bounded_key(1, 100_000, default=100.0)
 

@@ -11,9 +11,7 @@ Each family of detectors has a decoder here. Its arguments are the outputs in th
 * `scores`, float32 (N, C): the score of each class, 0..1.
 """
 
-import math
 from collections.abc import Callable, Sequence
-from itertools import product
 
 import cv2
 import numpy as np
@@ -23,11 +21,6 @@ from edgevpr.core.errors import ModelError
 from edgevpr.techniques.card import Card, InputRule
 from edgevpr.techniques.session import compute_fill_shares, open_session, prepare_input, run_outputs
 
-_CAR_M = 4.5
-_CAR_PX = 24  # least length of a car in the input: small detectors miss most smaller objects
-_MAX_MOVING_M = 25.0  # no moving vehicle or boat is longer
-_MAX_TILES = 4  # along each side; each tile is a run of the network
-_OVERLAP = 0.1  # of a tile's side, so that an object on a border is complete in one tile
 CROPS = 5  # along each side; the thesis's C is 5x5
 _TEST_SEED = 7
 _STRIDES_PX = (8, 16, 32)  # of the grids of yolox
@@ -90,29 +83,13 @@ class Detector:
         size = card.input.height, card.input.width
         self.is_static(np.random.default_rng(_TEST_SEED).integers(0, 256, (*size, 3), np.uint8))
 
-    def is_static(self, image: Image, footprint_m: float | None = None) -> Mask:
-        """Return bool (H, W): True for the pixels of uint8 (H, W[, 3]) outside all boxes of dynamic classes.
-
-        `footprint_m` is the width of the ground in the picture, metres (None: unknown). If it is wide, the picture is
-        cut into tiles, so that a car has enough pixels. A box too long for anything that moves is ignored. Raises
-        ModelError for numbers that are not finite, and for outputs that do not fit the family.
-        """
-        height, width = image.shape[:2]
-        static = np.ones((height, width), bool)
-        largest_px = math.inf if footprint_m is None else _MAX_MOVING_M / footprint_m * width
-        count = self.count_tiles(footprint_m)
-        for rows, columns in product(_cut_tiles(height, count), _cut_tiles(width, count)):
-            for left, top, right, bottom in self._detect_boxes_px(image[rows, columns]):
-                if max(right - left, bottom - top) <= largest_px:
-                    static[rows, columns][top:bottom, left:right] = False
+    def is_static(self, image: Image) -> Mask:
+        """Return bool (H, W): True for the pixels of uint8 (H, W[, 3]) outside all boxes of dynamic classes. Raises
+        ModelError for numbers that are not finite, and for outputs that do not fit the family."""
+        static = np.ones(image.shape[:2], bool)
+        for left, top, right, bottom in self._detect_boxes_px(image):
+            static[top:bottom, left:right] = False
         return static
-
-    def count_tiles(self, footprint_m: float | None) -> int:
-        """Return the number of tiles along each side of a picture whose ground is `footprint_m` metres wide."""
-        if footprint_m is None:
-            return 1
-        car_px = _CAR_M / footprint_m * self.card.input.width
-        return min(_MAX_TILES, max(1, math.ceil(_CAR_PX / car_px)))
 
     def _detect_boxes_px(self, image: Image) -> Ints:
         """Return the boxes of dynamic classes, int (N, 4): left, top, right, bottom, clipped to the picture."""
@@ -132,13 +109,6 @@ class Detector:
         size = np.array([width / across, height / down] * 2)
         least, most = np.floor(found[:, :2] * size[:2]), np.ceil(found[:, 2:] * size[:2])
         return np.hstack([least, most]).clip(0, [width, height] * 2).astype(int)
-
-
-def _cut_tiles(side: int, count: int) -> list[slice]:
-    """Cut a side of `side` pixels into `count` parts of equal length that overlap; return them as slices of pixels."""
-    part = side / (count - (count - 1) * _OVERLAP)
-    starts = [part * (1 - _OVERLAP) * number for number in range(count)]
-    return [slice(round(start), min(side, round(start + part))) for start in starts]
 
 
 def decode_yolox(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:

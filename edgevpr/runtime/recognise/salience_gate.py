@@ -78,7 +78,7 @@ class SalienceGate:
         if self._detector:
             if self._until_detection == 0 or self._static is None or self._static.shape != image.shape[:2]:
                 self._static, self._until_detection = None, self.config.detect_every  # None, if the detector fails
-                self._static = self._detector.is_static(image, self.config.footprint_m)
+                self._static = self._detector.is_static(image)
             self._until_detection -= 1
         return compute_scores(image, self._memorability, self._static)
 

@@ -42,15 +42,6 @@ def test_a_padded_picture_has_its_boxes_where_they_are(opened):
     assert np.array_equal(static, wanted)
 
 
-def test_a_wide_view_is_looked_at_in_tiles_and_what_is_too_long_to_move_counts_as_ground(opened):
-    detector = opened([(16, 16, 32, 32, 2)])
-    assert [detector.count_tiles(width_m) for width_m in (None, 5, 12, 20, 30, 4000)] == [1, 1, 1, 2, 3, 4]
-    static = detector.is_static(PICTURE, 20.0)
-    assert not static[:64, :128].all()  # found in every tile
-    assert not static[64:, 128:].all()
-    assert detector.is_static(PICTURE, 400.0).all()  # a box would be 30 m long
-
-
 @pytest.mark.parametrize(
     ("raw", "complaint"),
     [

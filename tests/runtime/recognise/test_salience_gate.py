@@ -107,7 +107,7 @@ def test_the_detector_looks_at_every_kth_frame_only():
     class Counting:
         looks = 0
 
-        def is_static(self, image, footprint_m):
+        def is_static(self, image):
             self.looks += 1
             return np.ones(image.shape[:2], bool)
 
