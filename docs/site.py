@@ -22,7 +22,7 @@ from edgevpr.cli.main import EXIT_CODES, make_parser
 from edgevpr.core.config import Config, Key, list_keys
 from edgevpr.core.reasons import Code, ReasonCode
 from edgevpr.mavlink.channel import Channel
-from edgevpr.mavlink.interview import TABLES
+from edgevpr.mavlink.channelselector import TABLES
 from edgevpr.runtime.service.findingcodes import FindingCode
 
 ROOT = Path(__file__).resolve().parents[1]

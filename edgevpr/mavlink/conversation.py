@@ -77,7 +77,7 @@ class Conversation:
     @property
     def channel(self) -> Channel:
         """The channel used to send positions."""
-        return self.autopilot.interview.choice.channel
+        return self.autopilot.selector.choice.channel
 
     @property
     def has_pending(self) -> bool:
@@ -118,10 +118,10 @@ class Conversation:
         t_fix_s = self._clock() if self.channel.is_continuous else self.fixes.t_fix_s
         return vehicle and replace(vehicle, t_fix_s=t_fix_s)
 
-    def wait_s(self, longest_s: float) -> float:
-        """Return how many seconds, at most `longest_s`, the link may sleep until the next message is due."""
-        due_in_s = self._state_due_s - self._clock() if self.channel.is_continuous else longest_s
-        return min(longest_s, max(0.0, due_in_s))
+    def wait_s(self, max_wait_s: float) -> float:
+        """Return how many seconds, at most `max_wait_s`, the link may sleep until the next message is due."""
+        due_in_s = self._state_due_s - self._clock() if self.channel.is_continuous else max_wait_s
+        return min(max_wait_s, max(0.0, due_in_s))
 
     def next_packet(self) -> tuple[bytes, FixTransmission | None] | None:
         """Choose and pack the next message. Returns its packet and the fix in it, if any; None if nothing is due."""
@@ -182,7 +182,7 @@ class Conversation:
         while self._reports:
             self.announce(*self._reports.pop(0))
 
-    def break_off(self, lost_fixes: int) -> None:
+    def handle_port_loss(self, lost_fixes: int) -> None:
         """Reset the state after the port was lost. `lost_fixes`: number of fixes discarded with it."""
         self.fixes.record_lost(lost_fixes)
         self.autopilot.heartbeat_s = -math.inf  # the reopened port may lead to another autopilot
@@ -201,17 +201,17 @@ class Conversation:
         late_s = now_s - self._heartbeat_due_s
         if late_s >= 0:
             self._heartbeat_due_s = now_s + HEARTBEAT_INTERVAL_S - late_s % HEARTBEAT_INTERVAL_S
-            is_stuck = now_s - self._health_set_s > HEALTH_TIMEOUT_S
-            return messages.make_heartbeat(Health.CRITICAL if is_stuck else self._health), None
+            is_hung = now_s - self._health_set_s > HEALTH_TIMEOUT_S
+            return messages.make_heartbeat(Health.CRITICAL if is_hung else self._health), None
         system_id = self.autopilot.system_id
         if system_id is not None and self.autopilot.is_alive(now_s):
             if request := self.autopilot.clock.make_request(now_s):
                 return request, None
             self._request_reports(system_id, now_s)
-            if self.channel.is_continuous and (state := self._make_state(system_id, now_s)):
+            if self.channel.is_continuous and (state := self._make_state_message(system_id, now_s)):
                 return state, None
             pause = Reason(ReasonCode.PAUSED) if self.requests.is_paused else None
-            if objection := pause or self.autopilot.interview.choice.silence_reason or self.fixes.find_objection(now_s):
+            if objection := pause or self.autopilot.selector.choice.silence_reason or self.fixes.find_objection(now_s):
                 self.fixes.withhold(objection)
             elif (stamp_s := self.autopilot.stamp_s(now_s)) is None:
                 self.fixes.drop_stale(now_s, ReasonCode.CLOCK_UNKNOWN)
@@ -234,12 +234,12 @@ class Conversation:
         self.interim_fixes.append(self.send_fix(fix))
         return self.fixes.next(now_s)
 
-    def _make_state(self, system_id: int, now_s: float) -> Message | None:
+    def _make_state_message(self, system_id: int, now_s: float) -> Message | None:
         """Make the next message of a continuous channel, if any: a position, or the origin of its local frame."""
         if now_s < self._state_due_s:
             return None
         self._state_due_s = max(self._state_due_s + STATE_INTERVAL_S, now_s)
-        choice, autopilot = self.autopilot.interview.choice, self.autopilot
+        choice, autopilot = self.autopilot.selector.choice, self.autopilot
         state = self.settings.listener.estimate_state(t_s := now_s - choice.lag_s)
         if self.requests.is_paused:
             state = None
@@ -278,7 +278,7 @@ class Conversation:
         """Request the parameters that are due, and reports that have stopped or arrive at less than half the rate."""
         if self._next_request_s is None:
             return
-        self.send(*self.autopilot.interview.make_requests(now_s, system_id))
+        self.send(*self.autopilot.selector.make_requests(now_s, system_id))
         if self.channel is not self._reported_channel:
             self._reported_channel, self._origin_missing_since_s, self._next_request_s = self.channel, now_s, now_s
             self.settings.listener.handle_channel(self.channel)

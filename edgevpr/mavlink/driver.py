@@ -145,7 +145,7 @@ class PortDriver:
             has_old_clock = OLD in self._settings.signing.verdicts
             is_behind = has_old_clock and not self._conversation.autopilot.is_alive(self._turns.now_s())
         if has_heartbeat or is_behind:
-            writer.port.answer_sender()
+            writer.port.reply_to_sender()
 
     def _transmit(self, writer: PacketWriter) -> None:
         while True:
@@ -166,7 +166,7 @@ class PortDriver:
 
     def _handle_loss(self, error: Exception) -> None:
         with self._turns.take_link_turn():
-            self._conversation.break_off(self._close_writer())
+            self._conversation.handle_port_loss(self._close_writer())
         self._record_trouble(error)
 
     def _close_writer(self) -> int:

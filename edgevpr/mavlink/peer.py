@@ -10,10 +10,10 @@ from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.types import Receiver, Vehicle
 from edgevpr.mavlink.address import Sender
 from edgevpr.mavlink.channel import Channel
+from edgevpr.mavlink.channelselector import ChannelSelector
 from edgevpr.mavlink.clock import HEARTBEAT_TIMEOUT_S, AutopilotClock, ForeignStamps, ReportDelay
 from edgevpr.mavlink.ground import Announce
 from edgevpr.mavlink.heights import Altitudes, Heights
-from edgevpr.mavlink.interview import Interview
 from edgevpr.mavlink.messages import AUTOPILOT, POSITION_FIX, Fix, MotionState
 from edgevpr.mavlink.px4 import Px4Fusion
 from edgevpr.mavlink.receivers import GPS_REPORTS, GPS_TIMEOUT_S, Receivers
@@ -141,11 +141,11 @@ class Autopilot:
         self._reset()
 
     def _reset(self) -> None:
-        self.interview = Interview(self._announce)
+        self.selector = ChannelSelector(self._announce)
         self.is_armed: bool | None = None  # None: no heartbeat yet
         self.origin: tuple[float, float, float] | None = None  # of its local frame: degrees, metres above sea level
-        self._origin_s = self._asked_origin_s = self._gps_s = self._flags_s = -math.inf  # times of the last messages
-        self._lacked_origin, self._flags = False, 0
+        self._origin_s = self._origin_request_s = self._gps_s = self._flags_s = -math.inf  # times of the last messages
+        self._was_origin_missing, self._flags = False, 0
         self.pressure_alt_m: float | None = None  # barometric altitude in the standard atmosphere
         self.vehicle: Vehicle | None = None  # the last report, of any age, without attitude
         self.attitudes, self.heights, self.accuracy = Attitudes(), Heights(self._announce), PositionAccuracy()
@@ -169,9 +169,9 @@ class Autopilot:
 
     def is_origin_request_due(self, now_s: float) -> bool:
         """Return True, and record the time, if the origin should be requested now: a restart may have lost it."""
-        if now_s - self._gps_s <= GPS_TIMEOUT_S or now_s - self._asked_origin_s < _ORIGIN_REQUEST_INTERVAL_S:
+        if now_s - self._gps_s <= GPS_TIMEOUT_S or now_s - self._origin_request_s < _ORIGIN_REQUEST_INTERVAL_S:
             return False
-        self._lacked_origin, self._asked_origin_s = self._lacks_origin(now_s), now_s
+        self._was_origin_missing, self._origin_request_s = self._is_origin_missing(now_s), now_s
         return True
 
     def assess_readiness(self, now_s: float) -> Readiness:
@@ -180,15 +180,15 @@ class Autopilot:
             is_px4=self.firmware == mavlink.MAV_AUTOPILOT_PX4,
             is_armed=self.is_armed,
             has_gps=now_s - self._gps_s <= GPS_TIMEOUT_S,
-            lacks_origin=self._lacks_origin(now_s),
+            lacks_origin=self._is_origin_missing(now_s),
             flags=self._flags if now_s - self._flags_s <= MAX_FILTER_REPORT_AGE_S else 0,
-            answers_others=bool(self.answered_s.keys() - {POSITION_FIX}),
+            answers_commands=bool(self.answered_s.keys() - {POSITION_FIX}),
         )
 
-    def _lacks_origin(self, now_s: float) -> bool:
+    def _is_origin_missing(self, now_s: float) -> bool:
         """Return True if its origin was requested and not received in time; during a request, the previous result."""
-        is_late = self._lacked_origin or now_s - self._asked_origin_s > _ORIGIN_TIMEOUT_S
-        return self._origin_s < self._asked_origin_s and is_late
+        is_late = self._was_origin_missing or now_s - self._origin_request_s > _ORIGIN_TIMEOUT_S
+        return self._origin_s < self._origin_request_s and is_late
 
     def predict_vehicle(self, t_mono_s: float) -> Vehicle | None:
         """Return the last report, extrapolated to `t_mono_s`: see `Conversation.predict_vehicle`."""
@@ -222,7 +222,7 @@ class Autopilot:
             self._reset()
             self.clock.handle(message, now_s)
             self._listener.handle_autopilot(now_s)
-        self.interview.handle(message)
+        self.selector.handle(message)
         if kind == "COMMAND_ACK" and message.target_component not in (0, self._component_id):  # 0: broadcast
             return False
         if kind == "COMMAND_ACK":
@@ -275,7 +275,7 @@ class Autopilot:
         gps, lat_deg, lon_deg = self._choose_receiver(now_s), message.lat / 1e7, message.lon / 1e7
         is_near = bool(gps and distance_m(gps.lat_deg, gps.lon_deg, lat_deg, lon_deg) <= MAX_GPS_DISAGREEMENT_M)
         # On a continuous channel the estimate may derive from our own positions, so it proves nothing about GPS.
-        has_gps = bool(gps) and (is_near or self.interview.choice.channel.is_continuous) and self.px4.uses_gps
+        has_gps = bool(gps) and (is_near or self.selector.choice.channel.is_continuous) and self.px4.uses_gps
         if gps and has_gps:
             self.accuracy.record_accuracy(gps.sd_m, now_s)
         has_no_position = (message.lat == 0 and message.lon == 0) or abs(message.lat) > 90e7 or abs(message.lon) > 180e7
@@ -305,6 +305,6 @@ class Autopilot:
 
     def _choose_receiver(self, now_s: float) -> Receiver | None:
         """Return the last report of the best GPS receiver except the one that we simulate; None if none has a fix."""
-        choice = self.interview.choice
+        choice = self.selector.choice
         own_report = GPS_REPORTS[choice.receiver] if choice.channel is Channel.GPS_INPUT else None
         return self.receivers.choose_best(now_s, own_report)

@@ -32,7 +32,7 @@ class Port:
 
     connected = True
     sender: Sender | None = None
-    _loss = "the other end closed the connection"
+    _loss_message = "the other end closed the connection"
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
@@ -47,7 +47,7 @@ class Port:
         with suppress(BlockingIOError):
             data = os.read(self.fileno(), READ_BYTES)
             if not data:
-                raise ConnectionError(self._loss)
+                raise ConnectionError(self._loss_message)
             return data
         return b""
 
@@ -57,7 +57,7 @@ class Port:
             return os.write(self.fileno(), data)
         return 0
 
-    def answer_sender(self) -> None:
+    def reply_to_sender(self) -> None:
         """Send to the sender of the last bytes read from now on. No effect if there can be only one sender."""
 
     def unsent(self) -> int:
@@ -71,12 +71,12 @@ class Port:
         self._sock.close()
 
 
-def _open_udp(attach: Callable[[socket.socket, tuple[str, int]], None], host: str, port: int) -> socket.socket:
-    """Return a UDP socket attached to an address by `attach`: `bind` or `connect`. Closes the socket if that fails."""
-    with ExitStack() as closes:
-        sock = closes.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        attach(sock, (host, port))
-        closes.pop_all()
+def _open_udp(connect: Callable[[socket.socket, tuple[str, int]], None], host: str, port: int) -> socket.socket:
+    """Return a UDP socket attached to an address by `connect`: `bind` or `connect`. Closes the socket if that fails."""
+    with ExitStack() as stack:
+        sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        connect(sock, (host, port))
+        stack.pop_all()
     return sock
 
 
@@ -101,7 +101,7 @@ class UdpOutPort(Port):
 
 
 class UdpInPort(Port):
-    """A listening UDP socket. It sends to the first sender until `answer_sender` selects another one."""
+    """A listening UDP socket. It sends to the first sender until `reply_to_sender` selects another one."""
 
     def __init__(self, host: str, port: int) -> None:
         # No SO_REUSEADDR: with it, a second program on the port would silently receive the first one's datagrams.
@@ -113,7 +113,7 @@ class UdpInPort(Port):
         with suppress(BlockingIOError):
             data, self.sender = self._sock.recvfrom(READ_BYTES)
             if self._peer is None:
-                self.answer_sender()
+                self.reply_to_sender()
             return data
         return b""
 
@@ -122,7 +122,7 @@ class UdpInPort(Port):
             return self._sock.sendto(data, self._peer) if self._peer else 0
         return 0
 
-    def answer_sender(self) -> None:
+    def reply_to_sender(self) -> None:
         self._peer, self.connected = self.sender, self.sender is not None
 
 
@@ -146,7 +146,7 @@ class TcpPort(Port):
 class SerialPort(Port):
     """A serial port, written through its file descriptor: pyserial's own write spins when the buffer is full."""
 
-    _loss = "the device is gone"
+    _loss_message = "the device is gone"
 
     def __init__(self, device: str, baud: int) -> None:
         import serial  # not at the top: no other kind of link needs it

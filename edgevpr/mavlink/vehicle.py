@@ -111,12 +111,12 @@ class Readiness(NamedTuple):
     has_gps: bool = False
     lacks_origin: bool = False
     flags: int = 0
-    answers_others: bool = False  # it answers our commands other than fixes
+    answers_commands: bool = False  # it answers our commands other than fixes
 
     @property
     def silence_reason(self) -> Reason:
         """The likely reason why the autopilot does not answer fixes."""
-        return Reason(ReasonCode.FIXES_NOT_ANSWERED if self.answers_others else ReasonCode.NO_COMMAND_ANSWERED)
+        return Reason(ReasonCode.FIXES_NOT_ANSWERED if self.answers_commands else ReasonCode.NO_COMMAND_ANSWERED)
 
     def explain(self, result: str) -> Reason:
         """Return the likely reason for an answer to a fix; `result` is the name of a MAV_RESULT."""

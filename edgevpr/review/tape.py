@@ -94,7 +94,7 @@ class ReplayedDriver:
                 for transmission in self._leaving:
                     transmission.settle(False, LOST)
                 self._leaving.clear()
-                conversation.break_off(*count) if event == "lost" else conversation.end()
+                conversation.handle_port_loss(*count) if event == "lost" else conversation.end()
             case _:
                 raise EdgevprError(f"The tape has an unknown link event, {step}: replay it with the version that flew.")
 

@@ -18,7 +18,7 @@ WRAP_MS = 2**32
 def streaming(channel, firmware=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, lag_s=0.0):
     """An autopilot that booted 400 s ago, when our clock stood at 600 s, and that a channel has been chosen for."""
     autopilot = Autopilot(firmware, booted_s=600.0, listener=Ear())
-    autopilot.conversation.autopilot.interview._decision = Decision(ChannelChoice(channel, "for a test", 1, lag_s))
+    autopilot.conversation.autopilot.selector._decision = Decision(ChannelChoice(channel, "for a test", 1, lag_s))
     autopilot.conversation.autopilot.origin = 47.0, 8.0, 500.0
     return autopilot
 
@@ -65,7 +65,7 @@ def test_nothing_with_a_stamp_is_sent_before_the_time_is_known_or_not_answered_f
     autopilot = Autopilot(booted_s=600.0, timesync_s=None, listener=Ear())
     sent_after_s = []
     for step in range(80):
-        autopilot.conversation.autopilot.interview._decision = Decision(ChannelChoice(channel, "for a test", 1))
+        autopilot.conversation.autopilot.selector._decision = Decision(ChannelChoice(channel, "for a test", 1))
         autopilot.conversation.autopilot.origin = 47.0, 8.0, 500.0
         autopilot.wait(0.1)
         autopilot.put_fix()

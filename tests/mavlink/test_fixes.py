@@ -188,10 +188,10 @@ def test_only_answers_of_our_autopilot_to_our_fixes_are_counted(autopilot):
     assert autopilot.conversation.autopilot.acks == {"99": 1}
 
 
-@pytest.mark.parametrize(("answers_others", "text"), [(False, "signing? system id?"), (True, "no command 43003?")])
-def test_silence_to_five_fixes_says_whether_other_commands_are_answered(autopilot, answers_others, text):
+@pytest.mark.parametrize(("answers_commands", "text"), [(False, "signing? system id?"), (True, "no command 43003?")])
+def test_silence_to_five_fixes_says_whether_other_commands_are_answered(autopilot, answers_commands, text):
     autopilot.answer(ACCEPTED, command=511, to=191)
-    if answers_others:
+    if answers_commands:
         autopilot.answer(ACCEPTED, command=511)
     fly(autopilot, 7)
     assert autopilot.texts() == [(4, f"edgevpr: fixes unanswered: {text}")]

@@ -77,7 +77,7 @@ def test_second_sender_with_our_autopilots_number_is_neither_believed_nor_obeyed
 
 @pytest.mark.parametrize(("system_id", "sent"), [(2, None), (7, True)])
 def test_after_a_reconnection_no_fix_leaves_before_ours_has_spoken(autopilot, system_id, sent):
-    autopilot.conversation.break_off(0)
+    autopilot.conversation.handle_port_loss(0)
     autopilot.beat(system_id=system_id)
     sending = autopilot.conversation.send_fix(Fix(50.0, 8.0, 20.0, autopilot.clock.now_s))
     autopilot.take_sent()

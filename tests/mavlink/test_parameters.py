@@ -5,7 +5,7 @@ from simulated.firmware import ARDUPILOT, PX4
 
 from edgevpr.core.reasons import ReasonCode
 from edgevpr.mavlink.channel import OLD_NAMES, Channel, VehicleKind
-from edgevpr.mavlink.interview import TABLES
+from edgevpr.mavlink.channelselector import TABLES
 from edgevpr.mavlink.wire import mavlink
 
 ARDUPILOT_TABLE = TABLES[mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA]

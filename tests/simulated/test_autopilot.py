@@ -11,8 +11,8 @@ from mavlink_peers import AutopilotThread, Peer, UdpPort, link_to
 
 from edgevpr.mavlink import messages
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.asking import RequestLink, read_autopilot
 from edgevpr.mavlink.messages import Fix, Health
+from edgevpr.mavlink.requestlink import RequestLink, read_autopilot
 from edgevpr.mavlink.wire import mavlink
 from simulated import autopilot
 from simulated.motion import TrueState, read_track
@@ -61,7 +61,7 @@ def test_run_autopilot_answers_and_counts():
 
 @pytest.mark.slow
 def test_track_starts_with_a_flight_and_not_with_questions(monkeypatch):
-    monkeypatch.setattr("edgevpr.mavlink.asking.LISTEN_S", 0.2)
+    monkeypatch.setattr("edgevpr.mavlink.requestlink.LISTEN_S", 0.2)
     track = [TrueState(lat_deg=50.0 + t_s, lon_deg=8.0, alt_m=0.0, t_s=t_s) for t_s in (0.0, 0.1)]
     link = f"127.0.0.1:{free_port()}"
     autopilot = AutopilotThread(f"udpin:{link}", track=track, vehicle="px4-copter", gps=True)

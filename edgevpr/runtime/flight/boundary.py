@@ -44,7 +44,7 @@ _STEPS = {
     Conversation.next_packet.__name__: "said",
     Conversation.count_sent_fixes.__name__: "departed",
     Conversation.handle.__name__: "heard",
-    Conversation.break_off.__name__: "lost",
+    Conversation.handle_port_loss.__name__: "lost",
     Conversation.end.__name__: "closed",
 }
 LINK = "link"  # the kind of the turns of the link

@@ -14,7 +14,7 @@ from edgevpr.core.types import MAX_FIX_AGE_S
 from edgevpr.frames.shot import Condition
 from edgevpr.frames.source import find_missing_cause, is_live, open_source, read_intervals
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.asking import RequestLink
+from edgevpr.mavlink.requestlink import RequestLink
 from edgevpr.mavlink.signing import open_signing
 from edgevpr.power.boards import Board, load_board, resolve_board
 from edgevpr.power.machine import read_model

@@ -8,7 +8,7 @@ from edgevpr.core.reasons import ReasonCode
 from edgevpr.core.text import show_wait
 from edgevpr.frames.source import is_live
 from edgevpr.mavlink.address import LinkAddress
-from edgevpr.mavlink.asking import HEARTBEAT_TIMEOUT_S, AutopilotReading, RequestLink, read_autopilot
+from edgevpr.mavlink.requestlink import HEARTBEAT_TIMEOUT_S, AutopilotReading, RequestLink, read_autopilot
 from edgevpr.mavlink.signing import REFUSAL_MEANINGS, open_signing
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.power.boards import load_board
@@ -60,10 +60,10 @@ def explain_silence(address: LinkAddress, link: RequestLink) -> Finding:
         return report_fault(
             "link", FindingCode.MESSAGES_REFUSED, address=where, cause=cause, meaning=REFUSAL_MEANINGS[cause]
         )
-    if link.others:
-        change = f"mavlink: {{system_id: {min(link.others)}}}"
+    if link.other_systems:
+        change = f"mavlink: {{system_id: {min(link.other_systems)}}}"
         return report_fault(
-            "link", FindingCode.OTHER_SYSTEM, change, address=where, systems=_join_numbers(sorted(link.others))
+            "link", FindingCode.OTHER_SYSTEM, change, address=where, systems=_join_numbers(sorted(link.other_systems))
         )
     if address.kind != "serial":
         return report_fault("link", FindingCode.NO_HEARTBEAT, address=where, waited_s=HEARTBEAT_TIMEOUT_S)
@@ -121,7 +121,7 @@ def _check_link(reading: AutopilotReading, address: LinkAddress) -> Finding:
 
 
 def _check_signing(reading: AutopilotReading) -> Finding:
-    if reading.is_signed_to:
+    if reading.signs_requests:
         return report_ok("signing", FindingCode.SIGNED)
     if reading.signs and not reading.answers:
         return report_fault("signing", FindingCode.KEY_NEEDED)

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from edgevpr.mavlink.ardupilot_parameters import ADVISED_RECEIVER, ARDUPILOT_TABLE, MAVLINK_GPS, RECEIVERS
-from edgevpr.mavlink.asking import AutopilotReading
 from edgevpr.mavlink.channel import Channel, ChannelChoice, VehicleKind, resolve_name
 from edgevpr.mavlink.parameters import ParameterTable
 from edgevpr.mavlink.px4_parameters import AGP_CONTROL, POSITION_BIT, PX4_TABLE, VISION_CONTROL
+from edgevpr.mavlink.requestlink import AutopilotReading
 from edgevpr.runtime.service.finding import Finding, report_fault, report_ok
 from edgevpr.runtime.service.findingcodes import FindingCode
 
@@ -112,7 +112,7 @@ def _check_px4(reading: AutopilotReading, _sends_fixes: bool) -> Iterator[Findin
 
 
 def _check_port(reading: AutopilotReading, change: str) -> Finding:
-    if reading.says_version_1:
+    if reading.sends_mavlink1:
         return report_fault("port", FindingCode.MAVLINK_1, change)
     return report_ok("port", FindingCode.MAVLINK_2)
 

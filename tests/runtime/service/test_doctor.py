@@ -12,10 +12,10 @@ from loopback import free_port
 from mavlink_peers import AutopilotThread
 
 from edgevpr.cli.main import main
-from edgevpr.mavlink import asking as module
+from edgevpr.mavlink import requestlink as module
 from edgevpr.mavlink.address import parse_link
-from edgevpr.mavlink.asking import AutopilotReading
 from edgevpr.mavlink.messages import SENSOR_ID
+from edgevpr.mavlink.requestlink import AutopilotReading
 from edgevpr.mavlink.signing import UNSIGNED, WRONG
 from edgevpr.mavlink.wire import mavlink
 from edgevpr.runtime.service.doctor import check_autopilot, explain_silence
@@ -41,9 +41,9 @@ COPTER = AutopilotReading(
     filter_flags=READY,
     origin=(50.0, 14.0),
     signs=False,
-    is_signed_to=False,
+    signs_requests=False,
     answers=True,
-    says_version_1=False,
+    sends_mavlink1=False,
     other_systems=(),
     bad_bytes=0,
     round_trip_s=0.02,
@@ -71,7 +71,7 @@ BARE = replace(COPTER, parameters=PLAIN)
 VISUAL = replace(COPTER, parameters=PLAIN | {"VISO_TYPE": 1})
 HOVERING = replace(COPTER, vehicle="plane", parameters=PLAIN | {"Q_ENABLE": 1})
 MUTE = replace(COPTER, answers=False, version=None, parameters={}, received=(), filter_flags=None, origin=None)
-SIGNED = replace(MUTE, signs=True, is_signed_to=True)
+SIGNED = replace(MUTE, signs=True, signs_requests=True)
 
 
 def test_check_autopilot_finds_nothing_wrong_with_a_copter_and_a_px4_that_are_set_up():
@@ -134,7 +134,7 @@ def test_check_autopilot_wants_a_source_set_and_an_origin_for_odometry():
         ({"version": (4, 4, 4), "version_text": "4.4.4"}, "firmware", ()),
         ({"version": None, "version_text": None}, "firmware", ()),
         ({"firmware": "other"}, "firmware", ("mavlink: {send_fixes: false}",)),
-        ({"says_version_1": True}, "port", ("SERIALn_PROTOCOL=2",)),
+        ({"sends_mavlink1": True}, "port", ("SERIALn_PROTOCOL=2",)),
         ({"bad_bytes": 5000}, "link", ()),
         ({"other_systems": (2, 3)}, "vehicles", ("mavlink: {system_id: 1}",)),
         ({"filter_flags": None}, "filter", ()),
@@ -222,7 +222,7 @@ def test_check_autopilot_finds_an_old_px4():
         "firmware": ()
     }
     assert set(wrong(replace(PX4, version=None))) == {"firmware"}
-    assert wrong(replace(PX4, says_version_1=True)) == {"port": ("MAV_PROTO_VER=2",)}
+    assert wrong(replace(PX4, sends_mavlink1=True)) == {"port": ("MAV_PROTO_VER=2",)}
 
 
 @pytest.mark.parametrize(
@@ -237,7 +237,7 @@ def test_check_autopilot_finds_an_old_px4():
 )
 def test_explain_silence_names_the_cause(link, bad_bytes, others, refused, code, cause):
     signing, reader = SimpleNamespace(refused=refused), SimpleNamespace(bad_bytes=bad_bytes)
-    finding = explain_silence(link, SimpleNamespace(signing=signing, reader=reader, others=set(others)))
+    finding = explain_silence(link, SimpleNamespace(signing=signing, reader=reader, other_systems=set(others)))
     assert (finding.ok, finding.reason.code) == (False, code)
     assert finding.reason.parameters.items() >= {"address": str(link), **cause}.items()
 

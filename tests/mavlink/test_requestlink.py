@@ -6,9 +6,9 @@ from loopback import free_port
 from mavlink_peers import SerialCable
 
 from edgevpr.core.errors import LinkError
-from edgevpr.mavlink import asking as module
+from edgevpr.mavlink import requestlink as module
 from edgevpr.mavlink.address import LinkAddress
-from edgevpr.mavlink.asking import RequestLink, read_autopilot
+from edgevpr.mavlink.requestlink import RequestLink, read_autopilot
 from edgevpr.mavlink.wire import mavlink
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -27,8 +27,8 @@ def _listens_briefly(monkeypatch):
 
 
 def read(address, names=(), **autopilot):
-    with AnsweringAutopilot(address.number, **autopilot) as peer, RequestLink(address) as asking:
-        return read_autopilot(asking, {"ardupilot": names, "px4": names}), peer
+    with AnsweringAutopilot(address.number, **autopilot) as peer, RequestLink(address) as link:
+        return read_autopilot(link, {"ardupilot": names, "px4": names}), peer
 
 
 def test_all_that_an_autopilot_says_is_read(address):
@@ -41,7 +41,7 @@ def test_all_that_an_autopilot_says_is_read(address):
     assert said.filter_flags & mavlink.EKF_POS_HORIZ_ABS
     assert abs(said.clock_ahead_s) < 60
     assert said.round_trip_s > 0
-    assert (said.answers, said.signs, said.says_version_1, said.other_systems) == (True, False, False, ())
+    assert (said.answers, said.signs, said.sends_mavlink1, said.other_systems) == (True, False, False, ())
     assert {"GLOBAL_POSITION_INT", "ATTITUDE", "GPS_RAW_INT"} <= set(said.received)
     assert peer.names() == READ_ONLY, "nothing is ever set"
     assert {message.command for message in peer.heard if message.get_type() == "COMMAND_LONG"} == {512}
@@ -51,20 +51,20 @@ def test_all_that_an_autopilot_says_is_read(address):
 def test_questions_that_are_lost_are_asked_again(address):
     names = [f"P{number}" for number in range(12)]
     answers = {"messages": healthy_messages(), "parameters": dict.fromkeys(names, 3)}
-    with AnsweringAutopilot(address.number, loses=1, **answers), RequestLink(address) as asking:
-        assert asking.wait_for_heartbeat(60)
-        assert asking.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-        assert asking.request_parameters(names, bytewise=False) == dict.fromkeys(names, 3)
+    with AnsweringAutopilot(address.number, loses=1, **answers), RequestLink(address) as link:
+        assert link.wait_for_heartbeat(60)
+        assert link.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+        assert link.request_parameters(names, bytewise=False) == dict.fromkeys(names, 3)
 
 
 def test_a_message_that_is_denied_since_it_was_just_streamed_is_taken_from_the_stream(address):
     """As a PX4 does with GPS_RAW_INT."""
     fix = mavlink.MAVLink_gps_raw_int_message(0, 3, 500_000_000, 140_000_000, 0, 80, 120, 0, 0, 14)
     streamed = fix.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
-    with AnsweringAutopilot(address.number, noise=streamed), RequestLink(address) as asking:
-        assert asking.wait_for_heartbeat(60)
-        assert asking.request_message(mavlink.MAVLINK_MSG_ID_GPS_RAW_INT).fix_type == 3
-        assert asking.request_message(mavlink.MAVLINK_MSG_ID_GPS2_RAW) is None
+    with AnsweringAutopilot(address.number, noise=streamed), RequestLink(address) as link:
+        assert link.wait_for_heartbeat(60)
+        assert link.request_message(mavlink.MAVLINK_MSG_ID_GPS_RAW_INT).fix_type == 3
+        assert link.request_message(mavlink.MAVLINK_MSG_ID_GPS2_RAW) is None
 
 
 def test_a_parameter_that_older_firmware_is_silent_about_is_left_out(address, monkeypatch):
@@ -83,24 +83,24 @@ def test_an_autopilot_that_is_heard_and_answers_nothing_is_told_from_one_that_si
 
 def test_mavlink_1_and_damaged_bytes_are_seen(address):
     said, _ = read(address, messages=healthy_messages(), version_1=True, noise=bytes(50))
-    assert said.says_version_1
+    assert said.sends_mavlink1
     assert said.bad_bytes >= 50
 
 
 def test_a_second_autopilot_is_named_and_not_listened_to(address):
     with AnsweringAutopilot(address.number, system_id=3), AnsweringAutopilot(address.number, system_id=4) as other:
-        with RequestLink(address, system_id=4) as asking:
-            assert asking.wait_for_heartbeat(60).get_srcSystem() == 4
-            asking.listen(0.3)
-        assert asking.others == {3}
-        assert asking.received.keys() == {"HEARTBEAT"}
+        with RequestLink(address, system_id=4) as link:
+            assert link.wait_for_heartbeat(60).get_srcSystem() == 4
+            link.listen(0.3)
+        assert link.other_systems == {3}
+        assert link.received.keys() == {"HEARTBEAT"}
     assert {message.get_srcSystem() for message in other.heard} <= {4}
 
 
 def test_a_cable_that_is_pulled_is_a_sentence(tmp_path):
     cable = SerialCable(tmp_path)
     cable.plug()
-    asking = RequestLink(LinkAddress("serial", str(tmp_path / "a"), 115_200))
+    link = RequestLink(LinkAddress("serial", str(tmp_path / "a"), 115_200))
     cable.unplug()
-    with pytest.raises(LinkError, match="link lost"), asking:
-        asking.listen(60)
+    with pytest.raises(LinkError, match="link lost"), link:
+        link.listen(60)

@@ -1,4 +1,4 @@
-"""The interview: requests an autopilot's version and parameters in flight, and chooses the channel from them."""
+"""Requests an autopilot's version and parameters in flight, and chooses the channel for positions by them."""
 
 import logging
 import math
@@ -33,7 +33,7 @@ _DEFAULT_CHOICE = ChannelChoice(Channel.COMMAND, Reason(ReasonCode.COMMAND_TO_AN
 log = logging.getLogger(__name__)
 
 
-class Interview:
+class ChannelSelector:
     """Requests an autopilot's version and the parameters of its table, and chooses the channel.
 
     Unanswered requests are repeated after a second or, while nothing at all is answered, after growing pauses. Known
@@ -55,11 +55,11 @@ class Interview:
         self._absent: set[str] = set()
         self._requests: Counter[str] = Counter()
         self._unanswered: Counter[str] = Counter()  # rounds in which another name was answered, but not this one
-        self._waiting: set[str] = set()  # names requested in the last round, and not yet answered
+        self._pending: set[str] = set()  # names requested in the last round, and not yet answered
         self._answers = 0
         self._silent_rounds = self._refresh_index = 0
-        self._asked_s = self._due_s = -math.inf
-        self._has_begun = self._is_asking = False  # the first requests were made; answers are still missing
+        self._requested_s = self._due_s = -math.inf
+        self._has_begun = self._is_incomplete = False  # the first requests were made; answers are still missing
         self._missing_since_s: float | None = None
         self._has_reported_missing = False
 
@@ -95,20 +95,20 @@ class Interview:
         self._report_missing(now_s)
         if now_s < self._due_s:
             return
-        if self._silent_rounds == 0 and self._waiting:
-            self._unanswered.update(self._waiting)
+        if self._silent_rounds == 0 and self._pending:
+            self._unanswered.update(self._pending)
             self._mark_absent()
         missing = self._find_missing()
         names = missing[: MAX_PARALLEL_REQUESTS - 1]
-        names += self._choose_refresh(is_alone=not missing)
+        names += self._choose_refresh(is_only_request=not missing)
         wants_version = self._version is None and self._version_requests < MAX_VERSION_REQUESTS
-        self._is_asking = bool(missing) or wants_version
-        self._waiting, self._asked_s = set(names), now_s
+        self._is_incomplete = bool(missing) or wants_version
+        self._pending, self._requested_s = set(names), now_s
         self._requests.update(names)
         self._silent_rounds += 1
         doublings = min(8, max(0, self._silent_rounds - MAX_SILENT_ROUNDS))
         pause_s = min(MAX_PAUSE_S, ROUND_INTERVAL_S * 2**doublings)
-        self._due_s = now_s + (pause_s if self._is_asking else REFRESH_INTERVAL_S)
+        self._due_s = now_s + (pause_s if self._is_incomplete else REFRESH_INTERVAL_S)
         if wants_version:
             self._version_requests += 1
             yield messages.make_message_request(target_system, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
@@ -127,19 +127,19 @@ class Interview:
         """Record an answer for one parameter: it shows that the autopilot receives our requests."""
         self._version_requests *= bool(self._values)
         self._silent_rounds = 0
-        self._answers += name in self._waiting
-        self._waiting.discard(name)
-        if self._is_asking:
-            interval_s = ROUND_INTERVAL_S if self._waiting else MIN_ROUND_INTERVAL_S
-            self._due_s = min(self._due_s, self._asked_s + interval_s)
+        self._answers += name in self._pending
+        self._pending.discard(name)
+        if self._is_incomplete:
+            interval_s = ROUND_INTERVAL_S if self._pending else MIN_ROUND_INTERVAL_S
+            self._due_s = min(self._due_s, self._requested_s + interval_s)
 
     def _mark_absent(self) -> None:
         """Mark parameters as absent if, given the share of answers that arrive, it is almost impossible that all their
         answers were lost. Each other parameter that may be absent counts as one lost answer."""
         unknown = {name for name in self._unanswered.keys() - self._values.keys() if not self._is_known(name)}
-        lost = sum(self._unanswered[name] for name in self._values) + len(unknown - self._absent)
-        arrives = (self._answers + 1) / (self._answers + lost + 2)
-        rounds = max(MIN_ROUNDS_TO_ABSENT, math.log(MAX_LOSS_PROBABILITY) / math.log(1 - arrives))
+        lost_answers = sum(self._unanswered[name] for name in self._values) + len(unknown - self._absent)
+        answer_probability = (self._answers + 1) / (self._answers + lost_answers + 2)
+        rounds = max(MIN_ROUNDS_TO_ABSENT, math.log(MAX_LOSS_PROBABILITY) / math.log(1 - answer_probability))
         absent = {name for name in unknown - self._absent if self._unanswered[name] >= rounds}
         if absent:
             self._absent |= absent
@@ -171,11 +171,11 @@ class Interview:
                 missing += [(rank.get(name, 2), self._requests[key], key) for key in names if key not in self._absent]
         return [name for *_, name in sorted(missing)]
 
-    def _choose_refresh(self, is_alone: bool) -> list[str]:
-        """Return the name to request again, if any: a known one or, if the request `is_alone`, also an absent one, as
+    def _choose_refresh(self, is_only_request: bool) -> list[str]:
+        """Return the name to request again, if any: a known one or, if it is the only request, also an absent one, as
         all its answers may have been lost."""
         names = list(self._values)
-        if is_alone:
+        if is_only_request:
             names += [name for name in self._absent if ALTERNATIVES.get(name) not in self._values]
         self._refresh_index += 1
         return [sorted(names)[self._refresh_index % len(names)]] if names else []

@@ -51,8 +51,8 @@ class Asked(Autopilot):
         return [(each.severity, each.text) for each in sent if each.get_type() == "STATUSTEXT"]
 
     @property
-    def interview(self):
-        return self.conversation.autopilot.interview
+    def selector(self):
+        return self.conversation.autopilot.selector
 
 
 def loses(share, seed=1):
@@ -112,7 +112,7 @@ def test_a_parameter_whose_answers_are_lost_is_not_absent(share):
         autopilot = Asked(COPTER | {"GPS_PRIMARY": 1, "GPS_AUTO_SWITCH": 4}, is_lost=loses(share, seed))
         autopilot.answer_for(40)
         assert autopilot.conversation.channel is Channel.NONE
-        assert autopilot.interview.choice.reason.parameters["changes"] == "GPS_PRIMARY=0"
+        assert autopilot.selector.choice.reason.parameters["changes"] == "GPS_PRIMARY=0"
         assert not [message for message in autopilot.sent if message.get_type() == "GPS_INPUT"]
 
 

@@ -37,8 +37,8 @@ class RequestLink(AbstractContextManager["RequestLink"]):
 
     - `system_id`: system id of the autopilot; None until its first heartbeat, unless one was given.
     - `received`: number of messages from the autopilot, by name; `signed`: number of signed messages among them.
-    - `says_version_1`: its last message was MAVLink 1; `round_trips_s`: seconds from each request to its answer.
-    - `others`: system ids of other autopilots on the link; `reader` counts bytes that belong to no message."""
+    - `sends_mavlink1`: its last message was MAVLink 1; `round_trips_s`: seconds from each request to its answer.
+    - `other_systems`: system ids of other autopilots on the link; `reader` counts bytes that belong to no message."""
 
     def __init__(
         self, address: LinkAddress, own_id: int = 197, system_id: int | None = None, signing: Signing = NOT_SIGNING
@@ -48,8 +48,8 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         self.system_id = system_id
         self.received: Counter[str] = Counter()
         self.signed = 0
-        self.others: set[int] = set()
-        self.says_version_1 = False
+        self.other_systems: set[int] = set()
+        self.sends_mavlink1 = False
         self.round_trips_s: list[float] = []
         self.signing, self.reader = signing, PacketReader(signing.admits)
         self._address = address
@@ -102,9 +102,9 @@ class RequestLink(AbstractContextManager["RequestLink"]):
                 batch = missing[start : start + MAX_PARALLEL_REQUESTS]
                 for name in batch:
                     self._send(messages.make_parameter_request(self.system_id or 0, name))
-                waiting = set(batch)
-                while waiting and (answer := self._wait_for(ANSWER_TIMEOUT_S, _match_parameters(waiting))):
-                    waiting.remove(answer.param_id)
+                pending = set(batch)
+                while pending and (answer := self._wait_for(ANSWER_TIMEOUT_S, _match_parameters(pending))):
+                    pending.remove(answer.param_id)
                     if (
                         answer.get_type() == "PARAM_VALUE"
                         and (value := read_parameter_value(answer, bytewise)) is not None
@@ -115,15 +115,15 @@ class RequestLink(AbstractContextManager["RequestLink"]):
 
     def _wait_for(self, wait_s: float, is_wanted: Callable[[Message], bool]) -> Message | None:
         """Return the first wanted message among the unread ones and those that arrive within `wait_s` seconds."""
-        end_s = time.monotonic() + wait_s
+        deadline_s = time.monotonic() + wait_s
         while True:
             while self._unread:
                 if is_wanted(message := self._unread.popleft()):
                     return message
             now_s = time.monotonic()
-            if now_s >= end_s:
+            if now_s >= deadline_s:
                 return None
-            self._receive(now_s, min(end_s - now_s, 0.25))
+            self._receive(now_s, min(deadline_s - now_s, 0.25))
 
     def _receive(self, now_s: float, wait_s: float) -> None:
         """Send a heartbeat if one is due, then receive for up to `wait_s` seconds."""
@@ -145,15 +145,15 @@ class RequestLink(AbstractContextManager["RequestLink"]):
         if is_heartbeat and self.system_id is None:
             self.system_id = self._packer.srcSystem = message.get_srcSystem()
         if message.get_srcSystem() != self.system_id:
-            self.others |= {message.get_srcSystem()} if is_heartbeat else set()
+            self.other_systems |= {message.get_srcSystem()} if is_heartbeat else set()
             return False
         if is_heartbeat:
-            self._port.answer_sender()
+            self._port.reply_to_sender()
         elif not self.received:
             return False
         self.received[message.get_type()] += 1
         self.signed += bool(message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
-        self.says_version_1 = message.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V1
+        self.sends_mavlink1 = message.get_msgbuf()[0] == mavlink.PROTOCOL_MARKER_V1
         return True
 
     def _send(self, message: Message) -> None:
@@ -179,9 +179,9 @@ class AutopilotReading:
     filter_flags: int | None  # of EKF_STATUS_REPORT or ESTIMATOR_STATUS
     origin: tuple[float, float] | None  # of its local frame: latitude, longitude in degrees
     signs: bool  # its messages are signed
-    is_signed_to: bool  # our messages to it are signed
+    signs_requests: bool  # our messages to it are signed
     answers: bool  # it has answered a request
-    says_version_1: bool  # it sends MAVLink 1
+    sends_mavlink1: bool  # it sends MAVLink 1
     other_systems: tuple[int, ...]  # system ids of other autopilots on the link
     bad_bytes: int  # bytes that belong to no valid message
     round_trip_s: float | None  # median round trip of requests
@@ -233,10 +233,10 @@ def read_autopilot(link: RequestLink, wanted: Mapping[str, Iterable[str]]) -> Au
         filter_flags=filter_state and filter_state.flags,
         origin=(origin.latitude / 1e7, origin.longitude / 1e7) if origin else None,
         signs=link.signed > 0,
-        is_signed_to=link.signing is not NOT_SIGNING,
+        signs_requests=link.signing is not NOT_SIGNING,
         answers=answers,
-        says_version_1=link.says_version_1,
-        other_systems=tuple(sorted(link.others)),
+        sends_mavlink1=link.sends_mavlink1,
+        other_systems=tuple(sorted(link.other_systems)),
         bad_bytes=link.reader.bad_bytes,
         round_trip_s=statistics.median(link.round_trips_s) if link.round_trips_s else None,
         clock_ahead_s=clock.time_unix_usec / 1e6 - time.time() if clock and clock.time_unix_usec else None,
