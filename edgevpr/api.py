@@ -1,4 +1,4 @@
-"""The Python interface: `edgevpr.build` builds a map, `edgevpr.Map` matches pictures with it. This interface is stable;
+"""The Python interface: `edgevpr.build` builds a map, `edgevpr.Map` matches images with it. This interface is stable;
 everything else in the package may change from version to version.
 
     import cv2, edgevpr
@@ -42,14 +42,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Match:
-    """Result of matching one picture. None: unknown, or no place was found.
+    """Result of matching one image. None: unknown, or no place was found.
 
     `accepted`: the match with `place` was accepted. `reason`: why it was or was not, as a code with parameters;
-    `str(reason)` is a sentence. `confidence`: probability that the picture shows the place. `position`: position of the
+    `str(reason)` is a sentence. `confidence`: probability that the image shows the place. `position`: position of the
     aircraft, if accepted. `accuracy_m`: its standard deviation in metres. `covariance_m2`: (variance east, covariance,
     variance north). `of_place`: `position` is simply that of the place, because the offset from it is unknown.
-    `heading_deg`: compass direction of the top of the picture. `rotation_deg`: rotation of the picture relative to the
-    place's picture, clockwise. `t_query_s`: processing time in seconds.
+    `heading_deg`: compass direction of the top of the image. `rotation_deg`: rotation of the image relative to the
+    place's image, clockwise. `t_query_s`: processing time in seconds.
     """
 
     accepted: bool
@@ -83,8 +83,8 @@ class Map:
     """A map file, opened for matching.
 
     `config`: flight configuration file (None: the defaults). `fov_deg`: field of view across the longest side of the
-    pictures; if given, they are levelled and scaled by attitude and height. `accept_precision`: confidence that a match
-    must reach. `follow`: the pictures are those of one flight, in order. Raises EdgevprError for a map that cannot be
+    images; if given, they are levelled and scaled by attitude and height. `accept_precision`: confidence that a match
+    must reach. `follow`: the images are those of one flight, in order. Raises EdgevprError for a map that cannot be
     used. Not thread-safe.
     """
 
@@ -124,7 +124,7 @@ class Map:
         self._recogniser.place_map.close()
 
     def places(self) -> Iterator[Place]:
-        """Yield the places while reading the file: number, picture, position, heading and pose of each."""
+        """Yield the places while reading the file: number, image, position, heading and pose of each."""
         yield from self._recogniser.place_map.read_places()
 
     def match(
@@ -138,12 +138,12 @@ class Map:
         near: Position | None = None,
         t_s: float | None = None,
     ) -> Match:
-        """Find the place of a picture, uint8 (H, W) grey or (H, W, 3) blue, green, red.
+        """Find the place of an image, uint8 (H, W) grey or (H, W, 3) blue, green, red.
 
         `heading_deg`: compass direction of the nose. `height_m`: above ground; used, and then required, only with
         `fov_deg` or a `lens` in the configuration. `roll_deg`, `pitch_deg`: as in `Frame`. `near`: assumed position;
         places within 300 m are searched, and a few others in case it is wrong. `t_s`: capture time, seconds on any
-        clock (None: now); used only with `follow`. Raises ImageError for a picture that cannot be used, UsageError for
+        clock (None: now); used only with `follow`. Raises ImageError for an image that cannot be used, UsageError for
         a missing height or an invalid value.
         """
         if not self._is_open:
@@ -204,11 +204,11 @@ def build(
     calibrate: bool = True,
     progress: Progress | None = None,
 ) -> BuiltMap:
-    """Build a map as `edgevpr map build` does. `progress` is called after each picture (None: it is shown on stderr).
+    """Build a map as `edgevpr map build` does. `progress` is called after each image (None: it is shown on stderr).
 
-    `images`: a folder of pictures or a video, `FlightPictures` to specify more, or `OrthophotoGrid` for an orthophoto.
+    `images`: a folder of images or a video, `FlightPictures` to specify more, or `OrthophotoGrid` for an orthophoto.
     `camera`: "nadir" or "forward". `technique`: name (None: chosen automatically). `config`: flight configuration file
-    (None: the defaults). Pictures that cannot be used are left out with a warning; a refinement or calibration that is
+    (None: the defaults). Images that cannot be used are left out with a warning; a refinement or calibration that is
     not possible causes a warning too. Raises EdgevprError.
     """
     source = images if isinstance(images, FlightPictures | OrthophotoGrid) else FlightPictures(source=_to_path(images))
@@ -240,7 +240,7 @@ def _to_path(path: object) -> str:
 
 
 def _check_image(image: object) -> None:
-    """Raise ImageError for anything that is not a picture."""
+    """Raise ImageError for anything that is not an image."""
     hint = "give a NumPy array of uint8, (H, W) grey or (H, W, 3) blue, green, red, as cv2.imread returns"
     if not isinstance(image, np.ndarray):
         cause = " (cv2.imread returns None for an unreadable file)" if image is None else ""

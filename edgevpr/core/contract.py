@@ -44,8 +44,8 @@ class TechniqueSpec:
     `scan_counts`: the score of the scan is part of the final score (see `places.retrieve`).
     `heading_within_deg`: if headings are known, only rotations of the query within this many degrees of the expected
     one are tried. None: headings are not used.
-    `cells`: number of cells of `FineMatch.shift_cells` along a picture's side. None: matches have no such shift.
-    `looks_down`: pictures show the ground below the camera, so shifts can be converted to metres.
+    `cells`: number of cells of `FineMatch.shift_cells` along an image's side. None: matches have no such shift.
+    `looks_down`: images show the ground below the camera, so shifts can be converted to metres.
     `height_ratios`: camera heights, relative to that of the map, at which a query can be recognised.
     `max_matches`: maximum number of candidates compared by `match`. If there are more, those with the best
     `Technique.score_quickly` estimates are chosen. None: all candidates are compared by `match`.
@@ -93,7 +93,7 @@ class Descriptor:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The prepared picture from which a descriptor was made. `grey`: float32 (side, side), None if the picture is never
+    """The prepared image from which a descriptor was made. `grey`: float32 (side, side), None if the image is never
     rotated. `allowed`: bool (side, side), True for pixels that may be used (None: all). `seen`: bool, one for each
     block of cells, True if all of its pixels are allowed."""
 
@@ -121,13 +121,13 @@ class Support:
 class FineMatch:
     """Result of comparing the query with one place: `score`, 0..1. The other fields are None for some techniques.
 
-    `shift_cells`: offset (dx right, dy down) from the centre of the place's picture to the centre of the query's, in
+    `shift_cells`: offset (dx right, dy down) from the centre of the place's image to the centre of the query's, in
     cells of the place. `covariance_cells2`: covariance (var x, cov xy, var y) of this offset.
     `rotation_deg`: rotation of the camera since the place was mapped, clockwise, 0..360.
     `height_ratio`: height of the camera above ground, divided by its height when the place was mapped.
     `coverage`: share (0..1) of the place's regions that agree with this shift, each counted once.
     `support`: further measures of the agreement with this shift.
-    `structure`: how well the structures in both pictures agree at this shift; for a camera that looks straight down,
+    `structure`: how well the structures in both images agree at this shift; for a camera that looks straight down,
     how much better than at other shifts, in standard deviations (see `techniques.overlay`).
     `votes`: `score` before the structures were included."""
 
@@ -144,7 +144,7 @@ class FineMatch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Perspective:
-    """Perspective of a query relative to a place. `over_place`: homography (3, 3) from points in the query's picture to
+    """Perspective of a query relative to a place. `over_place`: homography (3, 3) from points in the query's image to
     points in the place's: (right, down, 1) from the centre, in longest sides; its last element is 1. `regions`: number
     of regions that agree with it. `slope_sd`: standard deviation of `slope` along each axis."""
 
@@ -154,13 +154,13 @@ class Perspective:
 
     @property
     def slope(self) -> float:
-        """Relative change of scale across the query's picture, per longest side: the tangent of its tilt divided by the
+        """Relative change of scale across the query's image, per longest side: the tangent of its tilt divided by the
         focal length."""
         return float(np.hypot(*self.over_place[2, :2]))
 
     @property
     def scales(self) -> tuple[float, float]:
-        """Largest and smallest scale over all directions at the centre of the query's picture. If it is tilted, their
+        """Largest and smallest scale over all directions at the centre of the query's image. If it is tilted, their
         ratio is the cosine of the tilt, whatever the lens."""
         derivative = self.over_place[:2, :2] - np.outer(self.over_place[:2, 2], self.over_place[2, :2])
         largest, smallest = np.linalg.svd(derivative, compute_uv=False)
@@ -168,7 +168,7 @@ class Perspective:
 
 
 class Technique(Protocol):
-    """A place recognition technique. It encodes pictures (`encode`), compares a query with all places by their coarse
+    """A place recognition technique. It encodes images (`encode`), compares a query with all places by their coarse
     parts (`score_places`), then with some by their fine parts (`match`). Some methods are needed only with an ability:
     `match` with `spec.fine`, `pack` with `spec.packed`, `score_quickly` with `spec.max_matches`, and `match_rotated`,
     `match_at_rest` and `measure_perspective` with `spec.looks_down`."""

@@ -25,11 +25,11 @@ class Position:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pose:
-    """Orientation and size on the ground of a place's picture, for a camera that looks straight down.
+    """Orientation and size on the ground of a place's image, for a camera that looks straight down.
 
-    `up_deg`: compass direction (0..360) of the picture's top. `footprint_m`: ground length of its longest side.
+    `up_deg`: compass direction (0..360) of the image's top. `footprint_m`: ground length of its longest side.
     `covariance_m2`: covariance (variance east, covariance, variance north) of the place's position, the centre of the
-    picture. `is_surveyed`: the picture was cut from an orthophoto, so the pose needs no refinement. `recorded`: the
+    image. `is_surveyed`: the image was cut from an orthophoto, so the pose needs no refinement. `recorded`: the
     place's position before refinement (None: refinement did not move it).
     """
 
@@ -95,7 +95,7 @@ class Vehicle:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frame:
-    """One picture and its metadata (None: unknown).
+    """One image and its metadata (None: unknown).
 
     `image`: uint8, (H, W) grey or (H, W, 3) BGR. `t_mono_s`: capture time, seconds on the monotonic clock; `t_sd_s`:
     its standard deviation; `delay_sd_s`: standard deviation of a further delay that the timestamps of such a camera
@@ -141,7 +141,7 @@ class Salience:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
     """A place of the map, without its descriptors. Units are as in `Frame`; None: unknown. `place_id`: number in the
-    map; `source_image`: name of its picture; `quality`: `Descriptor.quality` of its picture."""
+    map; `source_image`: name of its image; `quality`: `Descriptor.quality` of its image."""
 
     place_id: int
     source_image: str
@@ -185,7 +185,7 @@ NO_COST = StageCost(0.0, 0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepCosts:
-    """Costs of the steps of a query: `read` the picture, `prepare` it (level it), test its salience (`gate`), `encode`
+    """Costs of the steps of a query: `read` the image, `prepare` it (level it), test its salience (`gate`), `encode`
     it, measure the motion since the previous frame (`stride`), `scan` all places, `compare` the candidates, `verify`
     the best one by landmarks, `locate` the aircraft. A step not reached costs nothing; only flights read and stride."""
 

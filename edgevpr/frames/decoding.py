@@ -1,5 +1,5 @@
 """Decoding of streams and video files with FFmpeg (PyAV), which unlike OpenCV reports lost packets and incomplete
-pictures. Imported only when a stream or video file is opened, because the library uses much memory."""
+images. Imported only when a stream or video file is opened, because the library uses much memory."""
 
 import errno
 import logging
@@ -125,8 +125,8 @@ def _find_cause(uri: str, error: Exception, text: str, timeout_s: float) -> str:
 
 
 class VideoDecoder:
-    """Decodes the complete pictures of one stream or file: `fetch` a packet, then `decode` it. A damaged picture is
-    rejected, and so are all later ones until the next key frame, which depends on no other picture.
+    """Decodes the complete images of one stream or file: `fetch` a packet, then `decode` it. A damaged image is
+    rejected, and so are all later ones until the next key frame, which depends on no other image.
 
     `is_cancelled`: set it to True to end a `fetch` in another thread at the next packet, even an audio packet.
     `is_backlog_doubtful`: FFmpeg reported lost packets while it read ahead during the opening, but not which ones. All
@@ -141,17 +141,17 @@ class VideoDecoder:
         self.is_backlog_doubtful = is_backlog_doubtful
         self.is_cancelled = False
         self._codec = self.stream.codec_context
-        self._codec.thread_count = 1  # parallel decoding delays pictures and uses memory
+        self._codec.thread_count = 1  # parallel decoding delays images and uses memory
         self._codec.options = {"err_detect": "explode"}  # damaged data is an error and not concealed
         self._packets = container.demux()
         self._converter = PixelConverter()
         self._doubtful = 0  # number of the next packets that are doubtful, if above zero
-        self._refusal: Refusal | None = Refusal.LATE  # reason to reject all pictures until the next key frame
+        self._refusal: Refusal | None = Refusal.LATE  # reason to reject all images until the next key frame
         self._has_begun = False
 
     @property
     def facts(self) -> StreamFacts:
-        """The stream's own description of its pictures; available once one has been decoded."""
+        """The stream's own description of its images; available once one has been decoded."""
         aspect, rate = self._codec.sample_aspect_ratio, self.stream.average_rate
         return StreamFacts(
             codec=self._codec.name,
@@ -173,7 +173,7 @@ class VideoDecoder:
         if packet is None or self.is_cancelled:
             return None
         if packet.is_corrupt or _has_loss(logged):
-            # FFmpeg reports a gap while it assembles the picture that follows the one it returns.
+            # FFmpeg reports a gap while it assembles the image that follows the one it returns.
             self._doubtful = _DOUBTFUL_PACKETS
         self._doubtful -= 1
         return TimedPacket(packet, self._doubtful >= 0)
@@ -184,7 +184,7 @@ class VideoDecoder:
         return self._refuse(Refusal.LATE)
 
     def decode(self, fetched: TimedPacket) -> "list[VideoFrame] | Refusal":
-        """Return the pictures that this packet completes (none, one or, at the end, several), or why it is rejected."""
+        """Return the images that this packet completes (none, one or, at the end, several), or why it is rejected."""
         packet = fetched.packet
         if not packet.size:
             return [] if self._refusal else self._decode_packet(packet)
@@ -197,18 +197,18 @@ class VideoDecoder:
                 self._codec.flush_buffers()
             self._refusal, self._has_begun = None, True
         # Corrupted bytes within a JPEG are detected only if they are invalid or the data ends early. Most are valid:
-        # the rest of the picture is shifted or brighter, but contains no parts of an older one.
+        # the rest of the image is shifted or brighter, but contains no parts of an older one.
         if self._codec.name == "mjpeg" and not is_whole_jpeg(bytes(packet)):
             return self._refuse()
         return self._decode_packet(packet)
 
     def make_thumbnail(self, picture: "VideoFrame") -> Image:
-        """Return a coarse grey copy of a picture, see `Shot.thumbnail`."""
+        """Return a coarse grey copy of an image, see `Shot.thumbnail`."""
         return self._converter.make_thumbnail(picture)
 
     def prepare_conversion(self, picture: "VideoFrame") -> Callable[[], Image]:
-        """Return a function that converts a picture to pixels, uint8 (H, W, 3) BGR or (H, W) grey; any thread may call
-        it. Pictures of maps and queries are both converted here, so that equal pictures give equal pixels."""
+        """Return a function that converts an image to pixels, uint8 (H, W, 3) BGR or (H, W) grey; any thread may call
+        it. Images of maps and queries are both converted here, so that equal images give equal pixels."""
         aspect = self._codec.sample_aspect_ratio or self.stream.sample_aspect_ratio
         return self._converter.prepare_conversion(picture, float(aspect or 1))
 

@@ -1,4 +1,4 @@
-"""Pictures of more than 8 bits per channel, such as those of thermal cameras. A scene uses only a small part of their
+"""Images of more than 8 bits per channel, such as those of thermal cameras. A scene uses only a small part of their
 range of counts, somewhere in the middle: the upper 8 bits alone would show nothing. Streams, video files and folders of
 images are all converted here, so that a map and a flight use the same grey levels."""
 
@@ -14,21 +14,21 @@ Counts: TypeAlias = NDArray[np.uint16]
 Limits: TypeAlias = tuple[int, int]  # the counts that become grey levels 0 and 255
 
 _RANGE_PERCENTILES = (1.0, 99.0)  # dead pixels and small hot spots lie outside
-_MIN_SPAN_COUNTS = 64  # so that a picture of mere sensor noise stays flat
+_MIN_SPAN_COUNTS = 64  # so that an image of mere sensor noise stays flat
 _TIME_CONSTANT_PICTURES = 30  # long enough that a passing object does not change the other grey levels
-_MAX_CLIPPED_SHARE = 0.25  # of a picture; if more is outside the range, the camera or the scene has changed
-_MIN_USED_SHARE = 0.25  # of the range; a picture that used less would have too little contrast
+_MAX_CLIPPED_SHARE = 0.25  # of an image; if more is outside the range, the camera or the scene has changed
+_MIN_USED_SHARE = 0.25  # of the range; an image that used less would have too little contrast
 
 
 class DepthRange:
-    """The range of counts of one source. It adapts slowly to the pictures, in the order in which they are passed."""
+    """The range of counts of one source. It adapts slowly to the images, in the order in which they are passed."""
 
     def __init__(self) -> None:
         self._low = 0.0
         self._high = 0.0
 
     def update(self, counts: Counts) -> Limits:
-        """Update the range with this picture, uint16 (H, W[, C]), and return it. The first picture, and any picture
+        """Update the range with this image, uint16 (H, W[, C]), and return it. The first image, and any image
         that does not fit the range, sets the range to its own."""
         sample = make_thumbnail(counts)
         low, high = _find_limits(sample)
@@ -41,19 +41,19 @@ class DepthRange:
         return round(self._low), round(self._high)
 
     def to_8_bits(self, counts: Counts) -> Image:
-        """Return the picture in grey levels, uint8 of the same shape, after updating the range with its counts."""
+        """Return the image in grey levels, uint8 of the same shape, after updating the range with its counts."""
         return to_8_bits(counts, self.update(counts))
 
 
 def make_counts_thumbnail(counts: Counts) -> Image:
-    """Return a coarse copy of a picture (see `shot.make_thumbnail`), scaled to its own range so that copies of a frozen
-    picture are equal."""
+    """Return a coarse copy of an image (see `shot.make_thumbnail`), scaled to its own range so that copies of a frozen
+    image are equal."""
     sample = make_thumbnail(counts)
     return to_8_bits(sample, _find_limits(sample))
 
 
 def to_8_bits(counts: Counts, limits: Limits) -> Image:
-    """Return a picture in grey levels, uint8 of the same shape; counts outside `limits` become black or white."""
+    """Return an image in grey levels, uint8 of the same shape; counts outside `limits` become black or white."""
     low, high = limits
     levels = (np.clip(counts, low, high).astype(np.float32) - low) * (255 / (high - low))
     return np.asarray(np.rint(levels), np.uint8)

@@ -1,4 +1,4 @@
-"""V4L2 cameras: opens one, or explains why that fails, and reads its pictures."""
+"""V4L2 cameras: opens one, or explains why that fails, and reads its images."""
 
 import contextlib
 import errno
@@ -56,7 +56,7 @@ def _find_cause(path: str) -> str:
 
 
 class DeviceCapture:
-    """A V4L2 camera opened with OpenCV: a `Capture`. OpenCV does not report damaged pictures, so none is rejected."""
+    """A V4L2 camera opened with OpenCV: a `Capture`. OpenCV does not report damaged images, so none is rejected."""
 
     def __init__(self, capture: cv2.VideoCapture, clock: Callable[[], float]) -> None:
         self._capture, self._clock = capture, clock
@@ -65,7 +65,7 @@ class DeviceCapture:
             capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # otherwise OpenCV keeps only the upper 8 bits
 
     def read(self) -> Shot | None:
-        with contextlib.suppress(cv2.error):  # a picture that cannot be converted counts as a lost source
+        with contextlib.suppress(cv2.error):  # an image that cannot be converted counts as a lost source
             request_s = self._clock()
             is_read, picture = self._capture.read()
             if is_read:
@@ -76,7 +76,7 @@ class DeviceCapture:
         return None
 
     def _prepare(self, picture: Array) -> tuple[Image, Callable[[], Image]]:
-        """Return the coarse copy of a picture, and a function that converts it to pixels."""
+        """Return the coarse copy of an image, and a function that converts it to pixels."""
         if picture.dtype == np.uint16:
             counts = np.asarray(picture, np.uint16)
             limits = self._depth.update(counts)
@@ -85,7 +85,7 @@ class DeviceCapture:
         return make_thumbnail(image if image.ndim == 2 else image[:, :, 1]), lambda: image
 
     def cancel(self) -> None:
-        """Do nothing: OpenCV's wait for a picture cannot be interrupted, and lasts ten seconds at most."""
+        """Do nothing: OpenCV's wait for an image cannot be interrupted, and lasts ten seconds at most."""
 
     def release(self) -> None:
         self._capture.release()

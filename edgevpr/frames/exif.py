@@ -18,7 +18,7 @@ Tags = Mapping[str, Any]  # values of exifread by their names, such as "GPS GPSL
 
 _FILM_DIAGONAL_MM = 43.27
 _MAX_SIDE_SHARE = 0.82  # of the diagonal
-_HEAD_BYTES = 300_000  # in a JPEG the XMP comes before the picture, after at most 64 KB of EXIF data
+_HEAD_BYTES = 300_000  # in a JPEG the XMP comes before the image, after at most 64 KB of EXIF data
 # An XMP value, as an attribute or an element, by DJI, Parrot, Skydio, Autel (`drone`) or Pix4D (`Camera`).
 _XMP_PATTERN = re.compile(
     rb"""\b((?:drone(?:-dji|-parrot|-skydio)?|Camera):\w+)(?:\s*=\s*["']|>)\s*([-+.\deE]+)\s*["'<]"""
@@ -54,13 +54,13 @@ def read_exif(path: str | Path) -> GeoTag:
 
 
 def read_fov_deg(path: str | Path) -> float | None:
-    """Return the approximate field of view in degrees along the longest side of a picture, from the 35 mm equivalent
+    """Return the approximate field of view in degrees along the longest side of an image, from the 35 mm equivalent
     focal length in its EXIF data, which refers to the diagonal (CIPA DCG-001); None if it has none. Never raises."""
     with contextlib.suppress(Exception):
         tags = _read_tags(path)
         focal_mm = float(tags["EXIF FocalLengthIn35mmFilm"].values[0])
         sides = [float(tags[f"EXIF ExifImage{side}"].values[0]) for side in ("Width", "Length")]
-        # Pictures wider than 4:3 and 3:2 are cropped from the sensor's at full width.
+        # Images wider than 4:3 and 3:2 are cropped from the sensor's at full width.
         longest = min(max(sides) / math.hypot(*sides), _MAX_SIDE_SHARE)
         return _require_range(math.degrees(2 * math.atan(_FILM_DIAGONAL_MM * longest / 2 / focal_mm)), 5, 150)
     return None
@@ -134,7 +134,7 @@ def _parse_time_s(text: str) -> float:
 
 def read_xmp(path: str | Path) -> GeoTag:
     """Read the XMP tags of DJI, Autel, Parrot, Skydio and Pix4D from the first 300 KB of a file. Never raises: a value
-    that is absent, damaged or impossible is None. The heading is that of the picture's top or, if unknown, of the
+    that is absent, damaged or impossible is None. The heading is that of the image's top or, if unknown, of the
     aircraft's nose. Roll and pitch are the camera's deviation from straight down. The height is above the take-off
     point."""
     head = b""
@@ -181,10 +181,10 @@ def _find_number(
 
 
 def to_nadir_angles(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
-    """Convert gimbal angles (a pitch of -90 is straight down) to (heading of the picture's top, roll, pitch), where
+    """Convert gimbal angles (a pitch of -90 is straight down) to (heading of the image's top, roll, pitch), where
     roll and pitch are the camera's deviation from straight down. All in degrees."""
-    # The result is the attitude of an imaginary airframe whose nose points to the picture's top and whose down axis is
-    # the viewing direction. If the camera looks straight down, the gimbal's roll only rotates the picture.
+    # The result is the attitude of an imaginary airframe whose nose points to the image's top and whose down axis is
+    # the viewing direction. If the camera looks straight down, the gimbal's roll only rotates the image.
     yaw, pitch, roll = map(math.radians, (yaw_deg, pitch_deg, roll_deg))
     # The nose before the yaw is applied. Adding or subtracting 0.0 avoids -0.0, for which atan2 is off by 180 degrees.
     forward, right = 0.0 - math.cos(roll) * math.sin(pitch), 0.0 + math.sin(roll)

@@ -1,4 +1,4 @@
-"""Warps pictures by a homography, and clips a picture to the part that can be warped."""
+"""Warps images by a homography, and clips an image to the part that can be warped."""
 
 import cv2
 import numpy as np
@@ -10,8 +10,8 @@ _SUBPIXEL_BITS = 4
 
 
 class Homography:
-    """Warp of an undistorted picture to (side, side) pixels by a homography (3, 3), with the interface of `lens.Remap`.
-    `corners`: corners of the part of the picture that is used, in homogeneous pixels (3, n)."""
+    """Warp of an undistorted image to (side, side) pixels by a homography (3, 3), with the interface of `lens.Remap`.
+    `corners`: corners of the part of the image that is used, in homogeneous pixels (3, n)."""
 
     def __init__(self, out_from_pixel: Doubles, corners: Doubles, side: int, shrink: float) -> None:
         self._out_from_pixel, self._side, self._shrink = out_from_pixel, side, shrink
@@ -30,7 +30,7 @@ class Homography:
         if shrunk is not image:
             fy, fx = (before / after for before, after in zip(image.shape[:2], shrunk.shape[:2], strict=True))
             out_from_pixel = out_from_pixel @ [[fx, 0, (fx - 1) / 2], [0, fy, (fy - 1) / 2], [0, 0, 1]]
-        # Outside the picture, where the mask is False, its edge is replicated, so that no false gradient arises.
+        # Outside the image, where the mask is False, its edge is replicated, so that no false gradient arises.
         return cv2.warpPerspective(  # type: ignore[return-value]  # of the same dtype
             shrunk, out_from_pixel, (self._side, self._side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )

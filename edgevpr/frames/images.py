@@ -25,7 +25,7 @@ os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "3")  # seconds
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 MIN_SIDE_PX = 16
 MAX_PIXELS = int(os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"])
-_MAX_FILE_BYTES = 4 * MAX_PIXELS  # of an uncompressed picture with an alpha channel
+_MAX_FILE_BYTES = 4 * MAX_PIXELS  # of an uncompressed image with an alpha channel
 _SMALL_PX = 640
 _SMALL_QUALITY = 80
 _WEBP_QUALITY = 55
@@ -111,22 +111,22 @@ def decode_jpeg(jpeg: bytes) -> Image:
 
 
 def encode_jpeg(image: Image) -> bytes:
-    """Encode a picture, uint8 (H, W, 3) BGR or (H, W) grey, as a JPEG of the quality used in flight recordings."""
+    """Encode an image, uint8 (H, W, 3) BGR or (H, W) grey, as a JPEG of the quality used in flight recordings."""
     return _encode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _RECORDING_QUALITY))
 
 
 def encode_small_jpeg(image: Image, longest_px: int = _SMALL_PX) -> bytes:
-    """Encode a picture, uint8 (H, W[, 3]), as a JPEG for viewing, its longest side at most `longest_px`."""
+    """Encode an image, uint8 (H, W[, 3]), as a JPEG for viewing, its longest side at most `longest_px`."""
     return _encode(".jpg", limit_size(image, longest_px), (cv2.IMWRITE_JPEG_QUALITY, _SMALL_QUALITY))
 
 
 def encode_small_webp(image: Image, longest_px: int) -> bytes:
-    """Encode a picture, uint8 (H, W[, 3 or 4]), as a WebP, which is half as large and can have an alpha channel."""
+    """Encode an image, uint8 (H, W[, 3 or 4]), as a WebP, which is half as large and can have an alpha channel."""
     return _encode(".webp", limit_size(image, longest_px), (cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY))
 
 
 def limit_size(image: Image, longest_px: int) -> Image:
-    """Scale a picture, uint8 (H, W[, C]), down until its longest side has at most `longest_px` pixels."""
+    """Scale an image, uint8 (H, W[, C]), down until its longest side has at most `longest_px` pixels."""
     if (scale := longest_px / max(image.shape[:2])) >= 1:
         return image
     width, height = (max(1, round(scale * side)) for side in image.shape[1::-1])
@@ -134,13 +134,13 @@ def limit_size(image: Image, longest_px: int) -> Image:
 
 
 def resize(image: Image, size_px: tuple[int, int]) -> Image:
-    """Scale a picture to `size_px` (width, height). When downscaling, each pixel is the mean of those it covers."""
+    """Scale an image to `size_px` (width, height). When downscaling, each pixel is the mean of those it covers."""
     return cv2.resize(image, size_px, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]  # of the same dtype
 
 
 def shrink_image(image: Image, shrink: float) -> Image:
-    """Downscale a picture by the factor `shrink` before a warp, whose interpolation alone would skip most pixels. Up to
-    a factor of 2, the picture is returned unchanged."""
+    """Downscale an image by the factor `shrink` before a warp, whose interpolation alone would skip most pixels. Up to
+    a factor of 2, the image is returned unchanged."""
     if shrink <= 2:
         return image
     height, width = image.shape[:2]

@@ -1,6 +1,6 @@
-"""Lenses with distortion: reads calibrations of OpenCV, ROS and Kalibr, and undistorts pictures.
+"""Lenses with distortion: reads calibrations of OpenCV, ROS and Kalibr, and undistorts images.
 
-An *undistorted* picture is the one that a lens without distortion would take from the same place, along the same axis.
+An *undistorted* image is the one that a lens without distortion would take from the same place, along the same axis.
 Its longest side has the field of view of the calibrated lens (at most `_MAX_UNDISTORTED_FOV_DEG`), so results computed
 from a field of view hold for it. A *ray* is a direction from the lens, given by its tangents to the right and down.
 """
@@ -29,7 +29,7 @@ _FISHEYE = "equidistant"
 _NO_DISTORTION = "none"
 # Names of models in ROS and Kalibr files; "" stands for an OpenCV file.
 _MODELS = ("", "plumb_bob", "rational_polynomial", "radtan", _FISHEYE, _NO_DISTORTION)
-_MAX_UNDISTORTED_FOV_DEG = 100.0  # of an undistorted picture: beyond, its corners would waste many pixels
+_MAX_UNDISTORTED_FOV_DEG = 100.0  # of an undistorted image: beyond, its corners would waste many pixels
 _MAX_SKEW = 0.002  # relative to the focal length; ignored because it shifts points by less than a pixel
 _MIN_FOV_DEG = 5.0  # as of `source.fov_deg`
 _MAX_OFF_AXIS_DEG = 85.0  # up to which a lens is sampled, from its axis
@@ -46,7 +46,7 @@ _OUTSIDE_PX = -1e6  # far enough outside that values interpolated with it are al
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibratedLens:
     """A camera calibration. `path`: its file. `focal_px`, `centre_px`: focal lengths and principal point (x, y) in
-    pictures of `size_px` (width, height); the centre of the first pixel is (0, 0). `coefficients`: distortion
+    images of `size_px` (width, height); the centre of the first pixel is (0, 0). `coefficients`: distortion
     coefficients in the order and number of OpenCV's model (`is_fisheye`: of its fisheye model)."""
 
     path: str
@@ -69,7 +69,7 @@ class CalibratedLens:
         return np.asarray(pixels, np.float64).reshape(-1, 2)
 
     def resize_to(self, size_px: tuple[int, int]) -> "CalibratedLens":
-        """Return the calibration scaled to pictures of another size that cover the same part of the sensor."""
+        """Return the calibration scaled to images of another size that cover the same part of the sensor."""
         scale_x, scale_y = size_px[0] / self.size_px[0], size_px[1] / self.size_px[1]
         (focal_x, focal_y), (column, row) = self.focal_px, self.centre_px
         centre_px = scale_x * (column + 0.5) - 0.5, scale_y * (row + 0.5) - 0.5
@@ -82,9 +82,9 @@ class CalibratedLens:
 
 @dataclass(frozen=True, slots=True)
 class LensView:
-    """The view through a `lens` in pictures of its size. `half`: ray to the lower right corner of the undistorted
-    picture. `max_ray`: ray length up to which the distortion model is valid. `full_fov_deg`: field of view across the
-    longest side of the distorted picture, at most 170."""
+    """The view through a `lens` in images of its size. `half`: ray to the lower right corner of the undistorted
+    image. `max_ray`: ray length up to which the distortion model is valid. `full_fov_deg`: field of view across the
+    longest side of the distorted image, at most 170."""
 
     lens: CalibratedLens
     half: tuple[float, float]
@@ -93,18 +93,18 @@ class LensView:
 
     @property
     def fov_deg(self) -> float:
-        """Field of view of the undistorted picture across its longest side, degrees."""
+        """Field of view of the undistorted image across its longest side, degrees."""
         return math.degrees(2 * math.atan(max(self.half)))
 
     @property
     def undistorted_px(self) -> tuple[int, int]:
-        """Size (width, height) of the undistorted picture; its longest side is as long as that of the distorted one."""
+        """Size (width, height) of the undistorted image; its longest side is as long as that of the distorted one."""
         longest = max(self.lens.size_px)
         width, height = (max(1, round(longest * tangent / max(self.half))) for tangent in self.half)
         return width, height
 
     def make_undistortion(self, longest_px: int) -> "Remap":
-        """Return the remap to an undistorted picture with at most `longest_px` pixels along its longest side."""
+        """Return the remap to an undistorted image with at most `longest_px` pixels along its longest side."""
         longest = max(self.undistorted_px)
         scale = min(1.0, longest_px / longest)
         width, height = (max(1, round(scale * side)) for side in self.undistorted_px)
@@ -113,7 +113,7 @@ class LensView:
         return self.make_remap(out_from_ray, focal_px, (width, height))
 
     def make_remap(self, out_from_ray: Doubles, out_px: float, size_px: tuple[int, int]) -> "Remap":
-        """Return the remap to a picture of `size_px` (width, height) with a focal length of `out_px` pixels;
+        """Return the remap to an image of `size_px` (width, height) with a focal length of `out_px` pixels;
         `out_from_ray` is the homography (3, 3) from rays to its pixels."""
         columns, rows = (np.arange(0, side + _CELL_PX, _CELL_PX) for side in size_px)
         grid_x, grid_y = np.meshgrid(columns, rows)
@@ -132,19 +132,19 @@ class LensView:
 
 @dataclass(frozen=True, slots=True)
 class Remap:
-    """A warp of a camera's picture to (H, W). `pixels` (H, W, 2): source coordinates of each output pixel. `shown` (H,
-    W): False where they lie outside the camera's picture. `shrink`: source pixels per output pixel, along a side."""
+    """A warp of a camera's image to (H, W). `pixels` (H, W, 2): source coordinates of each output pixel. `shown` (H,
+    W): False where they lie outside the camera's image. `shrink`: source pixels per output pixel, along a side."""
 
     pixels: Singles
     shown: Mask
     shrink: float
 
     def warp_mask(self, overlay: Mask) -> Mask:
-        """Warp a mask of the camera's picture, bool."""
+        """Warp a mask of the camera's image, bool."""
         return _remap_image(overlay.view(np.uint8), self.pixels, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT).view(bool)
 
     def warp_image(self, image: Image) -> Image:
-        """Warp the camera's picture. Outside it, its edge is replicated, so that no false gradient arises."""
+        """Warp the camera's image. Outside it, its edge is replicated, so that no false gradient arises."""
         shrunk, pixels = shrink_image(image, self.shrink), self.pixels
         if shrunk is not image:
             pixels = pixels + np.float32(0.5)  # the only copy: boards have little memory
@@ -160,7 +160,7 @@ def _remap_image(image: Image, pixels: Singles, interpolation: int, border: int)
 
 @lru_cache(maxsize=8)
 def compute_lens_view(lens: CalibratedLens, size_px: tuple[int, int]) -> LensView:
-    """Return the view through a lens in pictures of `size_px` (width, height). Raises ImageError if their aspect ratio
+    """Return the view through a lens in images of `size_px` (width, height). Raises ImageError if their aspect ratio
     differs from that of the calibration, and ConfigError for an impossible calibration."""
     (width, height), (lens_width, lens_height), (column, row) = size_px, lens.size_px, lens.centre_px
     if not np.isfinite([*lens.focal_px, column, row, *lens.coefficients]).all():
@@ -184,7 +184,7 @@ def compute_lens_view(lens: CalibratedLens, size_px: tuple[int, int]) -> LensVie
     steady = np.logical_and.accumulate(grows, axis=1).sum(axis=1)  # steps over which each ray's pixel moves outwards
 
     def find_edge(direction: int, axis: int, edge_px: float) -> float:
-        """Return the tangent of the ray that meets the edge of the picture in a direction."""
+        """Return the tangent of the ray that meets the edge of the image in a direction."""
         steps = slice(steady[direction] + 1)
         distances_px, edge_distance_px = np.abs(offset_px[direction, steps, axis]), abs(edge_px - lens.centre_px[axis])
         if distances_px[-1] < edge_distance_px and steady[direction] < len(tangents) - 1:

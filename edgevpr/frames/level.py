@@ -1,6 +1,6 @@
-"""Levelling: warps the picture of a downward camera as if it were taken from straight above, north-up and to scale. The
-ground is assumed flat. "Level" means without roll and pitch. The footprint of a picture is the ground that it shows.
-Recognition and mapping level their pictures through `runtime.recognise.levelling`, which calls this module."""
+"""Levelling: warps the image of a downward camera as if it were taken from straight above, north-up and to scale. The
+ground is assumed flat. "Level" means without roll and pitch. The footprint of an image is the ground that it shows.
+Recognition and mapping level their images through `runtime.recognise.levelling`, which calls this module."""
 
 import math
 from collections.abc import Iterator
@@ -32,12 +32,12 @@ _HEIGHT_SD_SHARE = 0.13
 _MIN_TILT_DEG = 1.0
 _MIN_TURN_DEG = 1.0
 _MIN_ZOOM_CHANGE = 0.03
-# Ratio of a picture's footprint to the requested one. Beyond these limits too few of its pixels are used, or too little
+# Ratio of an image's footprint to the requested one. Beyond these limits too few of its pixels are used, or too little
 # of the output is filled, and the height is more likely wrong than really so different from the map's.
 _ZOOM_LIMITS = (0.3, 4.0)
-_MIN_FILLED_SHARE = 1 / 3  # of the output area that the picture would fill if it were taken straight down
+_MIN_FILLED_SHARE = 1 / 3  # of the output area that the image would fill if it were taken straight down
 _MAX_HEIGHT_M = 10_000.0
-_MAX_SIDE_PX = 1024  # longest side of a warped picture: no technique uses more pixels
+_MAX_SIDE_PX = 1024  # longest side of a warped image: no technique uses more pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +59,8 @@ STRAIGHT_DOWN = Mount()
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """A camera's lens and mount. `fov_deg`: field of view across the longest side of the picture, after undistortion if
-    the calibration `calibrated` is given. `up_deg`: direction of the picture's top, clockwise from the nose."""
+    """A camera's lens and mount. `fov_deg`: field of view across the longest side of the image, after undistortion if
+    the calibration `calibrated` is given. `up_deg`: direction of the image's top, clockwise from the nose."""
 
     fov_deg: float
     up_deg: float = 0.0
@@ -70,15 +70,15 @@ class Lens:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class View:
-    """Direction, size and offset of a picture on the ground (None: unknown).
+    """Direction, size and offset of an image on the ground (None: unknown).
 
-    `up_deg`: compass direction (0..360) of the picture's top. `footprint_m`: ground length of its longest side.
-    `nadir_offset`: from the picture's middle to the nadir, the point below the camera, (right, up) in shares of the
+    `up_deg`: compass direction (0..360) of the image's top. `footprint_m`: ground length of its longest side.
+    `nadir_offset`: from the image's middle to the nadir, the point below the camera, (right, up) in shares of the
     longest side. `nadir_offset_sd`: standard deviation of each component due to errors of a large tilt. `zoom`: factor
-    by which the picture was enlarged; its longest side shows that many times less ground. `nadir_offset_m`: the nadir
-    offset on the ground (east, north), for a picture that was not warped because its lens is unknown. `focal`: focal
-    length in shares of the longest side. `rotation_deg`: clockwise rotation that was applied to the picture.
-    `reason`: why a tilted picture was not warped."""
+    by which the image was enlarged; its longest side shows that many times less ground. `nadir_offset_m`: the nadir
+    offset on the ground (east, north), for an image that was not warped because its lens is unknown. `focal`: focal
+    length in shares of the longest side. `rotation_deg`: clockwise rotation that was applied to the image.
+    `reason`: why a tilted image was not warped."""
 
     up_deg: float | None = None
     footprint_m: float | None = None
@@ -92,12 +92,12 @@ class View:
 
     @property
     def is_georeferenced(self) -> bool:
-        """True if the picture's direction and size and the nadir offset are known."""
+        """True if the image's direction and size and the nadir offset are known."""
         return None not in (self.up_deg, self.footprint_m, self.nadir_offset)
 
     @property
     def is_tilt_known(self) -> bool:
-        """True if the nadir offset is known, in the picture or on the ground."""
+        """True if the nadir offset is known, in the image or on the ground."""
         return self.nadir_offset is not None or self.nadir_offset_m is not None
 
     def fields(self) -> dict[str, Any]:
@@ -116,7 +116,7 @@ UNKNOWN_VIEW = View()
 
 @dataclass(frozen=True, slots=True)
 class LevelledImage:
-    """A picture ready to be encoded: `image` uint8 (H, W[, 3]); `mask` bool (H, W), False where it shows no ground
+    """An image ready to be encoded: `image` uint8 (H, W[, 3]); `mask` bool (H, W), False where it shows no ground
     (None: nowhere); and `view`, its direction, size and offset on the ground."""
 
     image: Image
@@ -134,15 +134,15 @@ def level_image(
     below: bool = False,
     scale: float = 1.0,
 ) -> LevelledImage:
-    """Warp a picture as if it had been taken from straight above. Roll, pitch, heading and height are those of the
+    """Warp an image as if it had been taken from straight above. Roll, pitch, heading and height are those of the
     frame or, if unknown there, of `vehicle` (None: no report).
 
-    The warp removes roll and pitch (unknown: taken as 0), rotates the picture north-up (unless the heading is unknown)
+    The warp removes roll and pitch (unknown: taken as 0), rotates the image north-up (unless the heading is unknown)
     and scales it until its longest side shows `footprint_m` (None, or height unknown: by `scale` only). `scale`: ratio
-    of the ground that the picture really shows to that computed from its height. The middle shows the same point as
-    before or, with `below`, the nadir. `overlay`, bool (H, W), is False where the picture shows no ground (None:
-    nowhere). A picture of known pose is returned unchanged. One that needs no warp, or is tilted too far for one, is
-    only undistorted. Raises ImageError if the picture's aspect ratio differs from that of the lens calibration;
+    of the ground that the image really shows to that computed from its height. The middle shows the same point as
+    before or, with `below`, the nadir. `overlay`, bool (H, W), is False where the image shows no ground (None:
+    nowhere). An image of known pose is returned unchanged. One that needs no warp, or is tilted too far for one, is
+    only undistorted. Raises ImageError if the image's aspect ratio differs from that of the lens calibration;
     impossible values in frame or vehicle never raise."""
     if frame.pose is not None:
         view = View(up_deg=frame.pose.up_deg, footprint_m=frame.pose.footprint_m, nadir_offset=(0.0, 0.0))
@@ -152,7 +152,7 @@ def level_image(
         view = View(up_deg=camera.top_deg, reason=Reason(ReasonCode.TILTED, {"tilt_deg": camera.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     if below and camera.tilt_deg > MAX_TILT_UNLEVELLED_DEG and camera.heading_deg is None:
-        # The picture shows ground far from the aircraft, in a direction that only a match can reveal.
+        # The image shows ground far from the aircraft, in a direction that only a match can reveal.
         view = View(reason=Reason(ReasonCode.TILTED_WITHOUT_HEADING, {"tilt_deg": camera.tilt_deg}))
         return undistort_frame(frame.image, overlay, view, lens.calibrated)
     image_m = camera.footprint_m and scale * camera.footprint_m
@@ -193,13 +193,13 @@ def level_image(
 
 
 def compute_level_rotation(frame: Frame, lens: Lens) -> Doubles:
-    """Return the rotation (3, 3) from the axes of the lens to those of a level picture with the same top, from the roll
+    """Return the rotation (3, 3) from the axes of the lens to those of a level image with the same top, from the roll
     and pitch of a frame (unknown: taken as 0) and the mount of the lens."""
     return _CameraGeometry(frame, None, lens).straight
 
 
 def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> float | None:
-    """Return the ground length in metres of the longest side that a picture would have if it were level, from the
+    """Return the ground length in metres of the longest side that an image would have if it were level, from the
     height of `frame` or, if unknown, of `vehicle`; None if unknown in both."""
     *_, height_m = _choose_attitude(frame, vehicle)
     if height_m is None or not 0 < height_m <= _MAX_HEIGHT_M:
@@ -208,8 +208,8 @@ def compute_footprint(frame: Frame, vehicle: Vehicle | None, lens: Lens) -> floa
 
 
 def undistort_frame(image: Image, overlay: Mask | None, view: View, lens: CalibratedLens | None) -> LevelledImage:
-    """Remove the distortion of `lens` (None: it has none) from a picture that is not warped otherwise. `overlay` is as
-    in `level_image`. Raises ImageError if the picture's aspect ratio differs from that of the calibration."""
+    """Remove the distortion of `lens` (None: it has none) from an image that is not warped otherwise. `overlay` is as
+    in `level_image`. Raises ImageError if the image's aspect ratio differs from that of the calibration."""
     if lens is None:
         return LevelledImage(image, overlay, view)
     height, width = image.shape[:2]
@@ -222,7 +222,7 @@ def _warp_image(image: Image, overlay: Mask | None, warp: Homography | Remap, vi
 
 
 def enlarge_image(picture: LevelledImage, zoom: float) -> LevelledImage:
-    """Enlarge a picture around its middle, at the same size in pixels."""
+    """Enlarge an image around its middle, at the same size in pixels."""
     if zoom == 1:
         return picture
     height_px, width_px = picture.image.shape[:2]
@@ -236,8 +236,8 @@ def enlarge_image(picture: LevelledImage, zoom: float) -> LevelledImage:
 
 
 def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = STRAIGHT_DOWN) -> View:
-    """Return the view of a picture that cannot be warped because its lens is unknown: only with `nadir_offset_m`, or
-    only with `reason` if the picture is tilted too far, or empty if too little is known. Arguments are as in
+    """Return the view of an image that cannot be warped because its lens is unknown: only with `nadir_offset_m`, or
+    only with `reason` if the image is tilted too far, or empty if too little is known. Arguments are as in
     `level_image`; impossible values never raise."""
     roll_deg, pitch_deg, heading_deg, height_m = _choose_attitude(frame, vehicle)
     if roll_deg is None or pitch_deg is None:
@@ -255,14 +255,14 @@ def estimate_tilted_view(frame: Frame, vehicle: Vehicle | None, mount: Mount = S
 
 
 class _CameraGeometry:
-    """Geometry of a picture when it was taken, as far as known; with a calibrated lens, of the undistorted picture.
+    """Geometry of an image when it was taken, as far as known; with a calibrated lens, of the undistorted image.
 
-    Rotation matrices are (3, 3). Their axes are those of the lens (right and down in the picture, viewing direction),
-    of the airframe (nose, right, down), and of the level picture (right, down in the picture, to the ground).
-    `straight`: rotation from lens to level picture without a turn about the vertical. `tilt_deg`: angle between the
+    Rotation matrices are (3, 3). Their axes are those of the lens (right and down in the image, viewing direction),
+    of the airframe (nose, right, down), and of the level image (right, down in the image, to the ground).
+    `straight`: rotation from lens to level image without a turn about the vertical. `tilt_deg`: angle between the
     viewing direction and straight down; `is_too_tilted`: it is too large for a warp. `top_deg`: compass direction of
-    the picture's top. `footprint_m`: ground length of the longest side if the picture were level. `corners` (3, n):
-    corners of the usable part of the picture, whose rays point down enough, in homogeneous pixels. `is_tilt_known`:
+    the image's top. `footprint_m`: ground length of the longest side if the image were level. `corners` (3, n):
+    corners of the usable part of the image, whose rays point down enough, in homogeneous pixels. `is_tilt_known`:
     from a reported attitude or, within a few degrees, from the mount alone."""
 
     def __init__(self, frame: Frame, vehicle: Vehicle | None, lens: Lens) -> None:
@@ -299,7 +299,7 @@ class _CameraGeometry:
         return Homography(out_from_ray @ self.lens_from_pixel, self.corners, side, self.focal_px / out_px)
 
     def level_from_lens(self, up_deg: float) -> Doubles:
-        """Return the rotation from the lens to a level picture whose top is `up_deg` clockwise from the nose."""
+        """Return the rotation from the lens to a level image whose top is `up_deg` clockwise from the nose."""
         return np.asarray(
             _rotate_lens_to_body(up_deg).T @ self._level_from_straight @ _rotate_lens_to_body(self._lens.up_deg)
         )

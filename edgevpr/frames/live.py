@@ -1,9 +1,9 @@
-"""Live sources: cameras and network streams. Only the newest picture counts; a source that delivers none is reopened.
+"""Live sources: cameras and network streams. Only the newest image counts; a source that delivers none is reopened.
 
 A call into a driver or a decoder may never return, and a thread that hangs in one cannot be killed. So one thread opens
-and reads the source, another converts the pictures that are used, and a third, which makes no calls that can hang,
+and reads the source, another converts the images that are used, and a third, which makes no calls that can hang,
 replaces both if they hang; the process exits without them (`cli.main`). A separate process could be killed, but needs
-40 MB more and a copy of every picture, and a driver that hangs in the kernel blocks it too."""
+40 MB more and a copy of every image, and a driver that hangs in the kernel blocks it too."""
 
 import threading
 from collections.abc import Callable
@@ -47,7 +47,7 @@ class _Opening:
 
 
 class _Conversion:
-    """The conversion of a picture, requested at `began_s`. `image`: result once `done` is set; None if it failed."""
+    """The conversion of an image, requested at `began_s`. `image`: result once `done` is set; None if it failed."""
 
     def __init__(self, number: int, shot: Shot, began_s: float) -> None:
         self.number, self.shot, self.began_s = number, shot, began_s
@@ -56,7 +56,7 @@ class _Conversion:
 
 
 class _Converter:
-    """A thread that converts the pictures in `requests` one after the other until it receives None."""
+    """A thread that converts the images in `requests` one after the other until it receives None."""
 
     def __init__(self) -> None:
         self.requests: SimpleQueue[_Conversion | None] = SimpleQueue()
@@ -65,17 +65,17 @@ class _Converter:
 
     def _run(self) -> None:
         while (conversion := self.requests.get()) is not None:
-            with suppress(Exception):  # a picture that cannot be decoded is skipped
+            with suppress(Exception):  # an image that cannot be decoded is skipped
                 conversion.image = conversion.shot.convert()
             conversion.done.set()
-            del conversion  # its picture is large
+            del conversion  # its image is large
 
 
 class LiveSource(Source):
     """Delivers the newest frame of the camera or stream that `open_capture` opens, unless it raises OpeningError.
 
-    `dropped` counts frames that were not read in time, and `refused` pictures that were not new and complete, by
-    reason. `latency_s` grows while no new picture arrives. If none arrives in time (`Liveness`), the source is
+    `dropped` counts frames that were not read in time, and `refused` images that were not new and complete, by
+    reason. `latency_s` grows while no new image arrives. If none arrives in time (`Liveness`), the source is
     reopened, after increasing pauses, until it delivers. `read` and `close` never wait for a call that hangs."""
 
     def __init__(self, open_capture: Callable[[], Capture], clock: Callable[[], float]):
@@ -89,7 +89,7 @@ class LiveSource(Source):
         self._t_start_s = clock()
         self._captured = 0
         self._last_taken_s = float("-inf")
-        self._repeats = RepeatDetector()  # across openings: a server may begin with a stored picture
+        self._repeats = RepeatDetector()  # across openings: a server may begin with a stored image
         self._liveness = Liveness()
         self._newest: tuple[int, Shot] | None = None
         self._conversion: _Conversion | None = None
@@ -192,7 +192,7 @@ class LiveSource(Source):
             self._closing.wait(_FIRST_WAIT_S)
 
     def _read_capture(self, opening: _Opening) -> None:
-        """Open the source, handle its pictures until it is lost or cancelled, and release it. Runs in a thread."""
+        """Open the source, handle its images until it is lost or cancelled, and release it. Runs in a thread."""
         try:
             capture = opening.capture = self._open_capture()
             try:
@@ -226,7 +226,7 @@ class LiveSource(Source):
                 self._liveness.record_refusal(refusal, now_s)
 
     def _store_shot(self, shot: Shot, now_s: float) -> Refusal | None:
-        """Store a picture as the newest one, or return why it is rejected."""
+        """Store an image as the newest one, or return why it is rejected."""
         if refusal := self._repeats.find_repeat(shot.thumbnail):
             return refusal
         if shot.t_mono_s < self._last_taken_s:

@@ -34,16 +34,16 @@ _UNESCAPED_PASSWORD = re.compile(r"\w+://(?!\[)[^\s/?#@:]*:(?!\d*([/?#]|$))[^@]*
 class Source:
     """A source of frames.
 
-    `is_live`: a camera or stream, from which only the newest picture is read; a recording is read to its end. `ended`:
+    `is_live`: a camera or stream, from which only the newest image is read; a recording is read to its end. `ended`:
     there are no more frames. `total`: approximate number of frames, 0 if unknown.
-    `dropped`: number of pictures not read in time; None for a recording.
-    `refused`: number of rejected pictures by reason (values of `Refusal`).
-    `latency_s`: seconds from the capture of the newest picture until it could be read, or until now if none has arrived
+    `dropped`: number of images not read in time; None for a recording.
+    `refused`: number of rejected images by reason (values of `Refusal`).
+    `latency_s`: seconds from the capture of the newest image until it could be read, or until now if none has arrived
     for a while; None if unknown.
     `condition`: see `Condition`. `state`: the condition in words for people ("reading", "lost, reopening in 2 s").
-    `facts`: a stream's description of its pictures, None if unknown.
-    `step_s`: seconds from the last picture read to the next, if a recording is replayed at its original times.
-    `stereo`: rejects stereo pictures, whose halves show the same scene."""
+    `facts`: a stream's description of its images, None if unknown.
+    `step_s`: seconds from the last image read to the next, if a recording is replayed at its original times.
+    `stereo`: rejects stereo images, whose halves show the same scene."""
 
     is_live: bool
     ended: bool
@@ -170,7 +170,7 @@ def open_source(
     """Open the source at `uri`: a path, device or address.
 
     `step_s`: minimum video time in seconds between two frames of a video file (None: every frame); for the address of a
-    single picture, seconds between two requests (None: 0.5). `positions`: table of the positions of a recording (None:
+    single image, seconds between two requests (None: 0.5). `positions`: table of the positions of a recording (None:
     for a folder, the positions.csv in or beside it, else EXIF data; for a video, the .csv of the same name beside it).
     `live`: allow cameras and streams, which never end. A missing one is opened as soon as it appears. `clock`: the
     monotonic clock, seconds. `only`: names of the frames of a recording to read (None: all). `steps_s`: for a folder
@@ -235,7 +235,7 @@ def find_missing_cause(uri: str) -> str | None:
 
 
 def _make_capture(uri: str, clock: Callable[[], float], period_s: float) -> Callable[[], Capture]:
-    """Return a function that opens the camera or stream `uri`. `period_s`: seconds between requests, if each picture
+    """Return a function that opens the camera or stream `uri`. `period_s`: seconds between requests, if each image
     must be requested. Raises SourceError if opening can never succeed; a missing device or file may appear later."""
     if is_program_uri(uri):
         from edgevpr.frames.programs import open_program, require_program  # loads FFmpeg

@@ -1,4 +1,4 @@
-"""Detects stereo pictures, whose two halves show the same scene side by side or one above the other. Such a picture
+"""Detects stereo images, whose two halves show the same scene side by side or one above the other. Such an image
 matches places with only part of its area, which would make positions wrong by tens of metres."""
 
 import numpy as np
@@ -14,18 +14,18 @@ _DETAIL_SIGMA_PX = 3.0  # brightness over longer distances may be similar in hal
 _MAX_SHIFT_SHARE = 0.125  # of the width of a half, between the left and right views
 _MAX_OFFSET_SHARE = 0.04  # of its height, due to the mounting of the lenses
 _PEAK_RADIUS_PX = 4.0
-# Chosen on 975 pictures of 14 sets and on stereo pictures made from them with a different exposure, half a degree of
-# rotation, shifts, scaling and noise: 96 % of these reach both, and no ordinary picture does (closest: 0.46, 0.13).
+# Chosen on 975 images of 14 sets and on stereo images made from them with a different exposure, half a degree of
+# rotation, shifts, scaling and noise: 96 % of these reach both, and no ordinary image does (closest: 0.46, 0.13).
 _MIN_CORRELATION = 0.5
 _MIN_LEAD = 0.15  # over correlations away from the peak; roads and crop rows have no such lead
 _MIN_DETAIL_LEVELS = 1.5  # standard deviation in grey levels; halves with less cannot be compared
-_STEREO_TO_DECIDE = 5  # how many more pictures must be stereo than single
+_STEREO_TO_DECIDE = 5  # how many more images must be stereo than single
 _SINGLES_TO_DECIDE = 10  # how many more must be single before the check stops
 
 
 class StereoCheck:
-    """Compares the halves of the first pictures of one source until it is clear whether they are stereo pictures. Every
-    picture whose halves match is rejected immediately."""
+    """Compares the halves of the first images of one source until it is clear whether they are stereo images. Every
+    image whose halves match is rejected immediately."""
 
     def __init__(self) -> None:
         self._evidence = 0  # above zero: stereo
@@ -33,7 +33,7 @@ class StereoCheck:
         self._matching_halves: list[str] = []  # the halves that last matched
 
     def require_single(self, image: Image) -> Image:
-        """Return the picture, uint8 (H, W[, 3]), unchanged. Raises ImageError if its halves show the same scene."""
+        """Return the image, uint8 (H, W[, 3]), unchanged. Raises ImageError if its halves show the same scene."""
         if self._evidence == -_SINGLES_TO_DECIDE:
             return image
         by_side = {side: correlate_halves(image, side) for side in _HALVES}
@@ -52,7 +52,7 @@ class StereoCheck:
 
 
 def correlate_halves(image: Image, side: str) -> tuple[float, float]:
-    """Return the largest correlation, 0 to 1, between two halves of a picture over the shifts that a stereo camera
+    """Return the largest correlation, 0 to 1, between two halves of an image over the shifts that a stereo camera
     causes, and its lead over all others; 0 and 0 if there is too little detail. `side`: one of `_HALVES`."""
     are_above = side == _HALVES[1]
     copy = resize(image, _COPY_PX)

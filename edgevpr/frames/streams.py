@@ -1,4 +1,4 @@
-"""Network streams, decoded by FFmpeg: complete pictures, each with the time at which it was taken (`frames.age`). One
+"""Network streams, decoded by FFmpeg: complete images, each with the time at which it was taken (`frames.age`). One
 thread receives packets as they arrive (`PacketQueue`); the thread of `frames.live` decodes them (`StreamCapture`)."""
 
 import threading
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
 OPEN_TIMEOUT_S = 5.0
-# `frames.live` closes a stream without pictures earlier; this limit allows for the second picture of a slow camera. A
+# `frames.live` closes a stream without images earlier; this limit allows for the second image of a slow camera. A
 # UDP port cannot be reopened while FFmpeg is still waiting on it, so that wait is short.
 READ_TIMEOUT_S = 15.0
 UDP_READ_TIMEOUT_S = 3.0
 # RTSP over TCP loses no packets, but the camera may lose some before sending. FFmpeg reports that only if it may hold
 # back at least two packets while it waits for a missing one. Probing for the frame rate, which is not needed, would
-# exceed the opening timeout at 1 picture/s. FFmpeg opens addresses in an .sdp file only for whitelisted protocols.
+# exceed the opening timeout at 1 image/s. FFmpeg opens addresses in an .sdp file only for whitelisted protocols.
 _OPTIONS = {"rtsp_transport": "tcp", "reorder_queue_size": "2", "fpsprobesize": "0"}
 # Some cameras send RTSP over UDP only. FFmpeg then waits 0.1 s for a missing packet, and reports it.
 _UDP_OPTIONS = {"rtsp_transport": "udp", "fpsprobesize": "0"}
@@ -37,7 +37,7 @@ _CLOSE_TIMEOUT_S = 0.5
 
 
 def open_address(uri: str, clock: Callable[[], float], period_s: float) -> "StreamCapture | SnapshotCapture":
-    """Open a network stream, an .sdp file, or the address of a single picture, which is requested every `period_s`
+    """Open a network stream, an .sdp file, or the address of a single image, which is requested every `period_s`
     seconds. `clock` is the monotonic clock, in seconds. Raises OpeningError with the cause."""
     opened_s = clock()
     response = try_request(uri, OPEN_TIMEOUT_S) if uri.lower().startswith("http") else None
@@ -62,7 +62,7 @@ def open_raw(
     uri: str, clock: Callable[[], float], form: str, timeout_s: float, delay_sd_s: float = FRAME_TIME_SD_S
 ) -> "StreamCapture":
     """Open a stream in a format without time stamps (`form`: its name in FFmpeg), and wait up to `timeout_s` seconds
-    for its first picture. `delay_sd_s`: see `Shot`. Raises OpeningError with the cause."""
+    for its first image. `delay_sd_s`: see `Shot`. Raises OpeningError with the cause."""
     opened_s = clock()
     decoder = open_decoder(uri, _RAW_OPTIONS, (timeout_s, READ_TIMEOUT_S), form)
     return StreamCapture(decoder, clock, opened_s, delay_sd_s)
@@ -83,7 +83,7 @@ def _open_stream(uri: str) -> VideoDecoder:
 
 
 class StreamCapture:
-    """The pictures of an open stream: a `Capture`. `decoder` decodes it. `clock` is the monotonic clock in seconds, and
+    """The images of an open stream: a `Capture`. `decoder` decodes it. `clock` is the monotonic clock in seconds, and
     `opened_s` its time just before the opening. `delay_sd_s`: see `Shot`."""
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Pictures over HTTP that FFmpeg cannot read as a stream: the address of a single picture, requested repeatedly
+"""Images over HTTP that FFmpeg cannot read as a stream: the address of a single image, requested repeatedly
 (`SnapshotCapture`), and a multipart stream with parts of any image type (`ResponseFile`)."""
 
 import http.client
@@ -17,10 +17,10 @@ from edgevpr.frames.depth import DepthRange
 from edgevpr.frames.images import decode_image, encode_jpeg, is_whole_jpeg
 from edgevpr.frames.shot import OpeningError, Refusal, Shot, make_thumbnail
 
-_MAX_BYTES = 64_000_000  # of one picture
-_MAX_PART_S = 15.0  # for one picture of a multipart stream: a trickling sender must not block a thread for ever
+_MAX_BYTES = 64_000_000  # of one image
+_MAX_PART_S = 15.0  # for one image of a multipart stream: a trickling sender must not block a thread for ever
 _CHUNK_BYTES = 65536
-_MAX_PERIOD_S = 1.0  # from one request for a picture to the next
+_MAX_PERIOD_S = 1.0  # from one request for an image to the next
 _JPEG_START = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
 _REQUEST_ERRORS = (OSError, http.client.HTTPException, ValueError)
@@ -60,8 +60,8 @@ def try_request(uri: str, timeout_s: float) -> http.client.HTTPResponse | None:
 
 
 class SnapshotCapture:
-    """A `Capture` that requests the picture at `uri` every `period_s` seconds. Its time is that of the request, when
-    most cameras take it. A camera that returned the same file twice keeps a picture ready, which may be as old as the
+    """A `Capture` that requests the image at `uri` every `period_s` seconds. Its time is that of the request, when
+    most cameras take it. A camera that returned the same file twice keeps an image ready, which may be as old as the
     previous request."""
 
     def __init__(self, uri: str, period_s: float, timeout_s: float, clock: Callable[[], float]) -> None:
@@ -137,8 +137,8 @@ def _read_parts(response: http.client.HTTPResponse) -> Iterator[bytes]:
 
 
 def _find_end(received: bytearray, part: re.Match[bytes], boundary: bytes) -> int:
-    """Return the end of the picture that begins after the head of a `part`; 0 if it has not arrived. Without a stated
-    length, a JPEG ends at its end marker. FFmpeg would wait for the next part, making each picture one period older."""
+    """Return the end of the image that begins after the head of a `part`; 0 if it has not arrived. Without a stated
+    length, a JPEG ends at its end marker. FFmpeg would wait for the next part, making each image one period older."""
     start = part.end()
     if length := re.search(rb"(?im)^content-length:\s*(\d+)", part[1]):
         end = start + int(length[1])

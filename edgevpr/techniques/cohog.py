@@ -1,9 +1,9 @@
-"""`cohog`: HOG descriptors of the informative regions of a picture, matched by one matrix product (thesis, chapter 6).
+"""`cohog`: HOG descriptors of the informative regions of an image, matched by one matrix product (thesis, chapter 6).
 
 A place is 31x31 overlapping blocks, also called regions, each described by the histograms of its 2x2 cells. A query
 uses only its *good* blocks, those of high entropy. Each of them is matched to its most similar block of the place. In
 the thesis the score is the mean of these cosines (`matching: thesis`). Here, by default, each good block also votes for
-the displacement of the picture. docs/explanation/how-cohog-matches.md explains every step of the score.
+the displacement of the image. docs/explanation/how-cohog-matches.md explains every step of the score.
 
 The blocks are the fine part: 8 bits per value, 31 KB per place, on disk. The coarse part stays in RAM and selects the
 places that are compared in full (see `placecode` and, for a nadir camera, which looks straight down, `layout`).
@@ -54,12 +54,12 @@ from edgevpr.techniques.views import HEIGHT_RATIOS, QueryViews, ViewRegions, com
 
 @dataclass(eq=False, kw_only=True)
 class CoHog:
-    """The technique CoHOG. `w1`: side of the scaled picture in pixels (W1 = H1 of the thesis). `w2`: side of a cell in
+    """The technique CoHOG. `w1`: side of the scaled image in pixels (W1 = H1 of the thesis). `w2`: side of a cell in
     pixels (W2 = H2). `bins`: orientations (L). `gt`: minimum entropy of a good block, 0 to 1 (GT; below 0: the default
     for `entropy`). `entropy`: "shannon" or "filled_bins". `matching`: "displacement" or "thesis", see above; the map
     does not record it.
 
-    With `camera` "nadir" the picture is padded to a square, not stretched, so that a rotated picture shows the same
+    With `camera` "nadir" the image is padded to a square, not stretched, so that a rotated image shows the same
     ground. A query is tried under hypotheses: five heights (one if `matching` is "thesis") with 24 rotations each (see
     `views`)."""
 
@@ -126,7 +126,7 @@ class CoHog:
 
     def encode(self, image: Image, mask: Mask | None = None) -> Descriptor:
         """Encode uint8 (H, W[, 3]); a block that touches a pixel where `mask` bool (H, W) is False is never good. A dim
-        picture is stretched first (see `contrast`).
+        image is stretched first (see `contrast`).
 
         Returns coarse uint8 (12, 12, bins), or uint8 (1120,) with a nadir camera, fine uint8 (blocks, 4 bins), regions
         float32 (blocks, 4 bins) and good bool (blocks,): the rows of matrix A of thesis 6.2.3."""
@@ -151,7 +151,7 @@ class CoHog:
         )
 
     def _make_good_blocks(self, grey: Singles, allowed: Mask | None, cell_px: int) -> tuple[Singles, Bools, Bools]:
-        """Describe a square picture, float32 `grey` with cells of `cell_px` pixels. Returns its blocks, float32 (n, n,
+        """Describe a square image, float32 `grey` with cells of `cell_px` pixels. Returns its blocks, float32 (n, n,
         4 bins); bool (n, n), True for seen blocks, those on `allowed` pixels only; and bool (n, n), True for good
         blocks: seen ones whose entropy is at least `gt`."""
         blocks, seen = self._make_blocks(grey, allowed, cell_px)
@@ -211,7 +211,7 @@ class CoHog:
         regions of the query and B those of the place, then the score according to `matching` (0 without a good region).
         A nadir query is tried under `hypotheses` (None: all); the one with the highest score counts, and
         `fit_alignment` refines its shift, rotation and height. Finally, the score is lowered if the structures of the
-        two pictures agree poorly (see `overlay`)."""
+        two images agree poorly (see `overlay`)."""
         reference = self._restore_regions(fine)
         if self._is_nadir:
             best, match, nearest = self._find_best_hypothesis(query, reference, hypotheses)
@@ -299,7 +299,7 @@ class CoHog:
         return overlay.compute_agreement(views.structure, place, match.shift_cells or (0.0, 0.0))
 
     def _make_structure(self, blocks: Singles, seen: Bools) -> Singles:
-        """Return the structure (see `overlay`) of the picture with these blocks, float32 (n, n, 4 bins)."""
+        """Return the structure (see `overlay`) of the image with these blocks, float32 (n, n, 4 bins)."""
         return overlay.compute_structure(
             self._make_patterns(blocks.reshape(-1, 4 * self.bins)), seen, tuning.SURROUND_SD_CELLS[self.camera]
         )

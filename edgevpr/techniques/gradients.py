@@ -62,8 +62,8 @@ def make_mask_square(mask: Mask | None, side_px: int) -> Mask | None:
 
 
 def pad_to_square(image: Image, mask: Mask | None) -> tuple[Array, Mask]:
-    """Pad a picture to a square by repeating its border on both sides. Returns the square, and bool (side, side), True
-    for pixels of the picture that `mask` allows (None: all)."""
+    """Pad an image to a square by repeating its border on both sides. Returns the square, and bool (side, side), True
+    for pixels of the image that `mask` allows (None: all)."""
     height, width = image.shape[:2]
     side = max(height, width)
     top, left = (side - height) // 2, (side - width) // 2

@@ -1,4 +1,4 @@
-"""Techniques that describe a picture by one vector from a network: its descriptor, or the output of a *head*, such as a
+"""Techniques that describe an image by one vector from a network: its descriptor, or the output of a *head*, such as a
 pooling, on its feature map. A card whose network outputs a descriptor is a technique of the same name.
 
 The techniques of the thesis have parameters: `model` is the name of the network's card, `form` is "float", "8bit" or
@@ -47,9 +47,9 @@ class NetworkVector(VectorTechnique):
 
 
 def calc(model: str = "calc", form: str = "float", threads: int = 1) -> NetworkVector:
-    """Make `calc`: the descriptor of an autoencoder trained to predict the HOG of a picture from a distorted copy of
+    """Make `calc`: the descriptor of an autoencoder trained to predict the HOG of an image from a distorted copy of
     it, compared by cosine (Merrill and Huang, "Lightweight Unsupervised Deep Loop Closure", RSS 2018: 1064 values from
-    a grey, histogram-equalised picture of 160x120)."""
+    a grey, histogram-equalised image of 160x120)."""
     return NetworkVector(
         "calc", open_backbone(model, "descriptor", threads), None, parameters={"model": model}, form=form
     )
@@ -112,7 +112,7 @@ def region_vlad(
     *, model: str = "calc", form: str = "float", threads: int = 1, regions: int = 400, words: int = 256
 ) -> NetworkVector:
     """Make `region_vlad`: VLAD of the `regions` regions of highest energy (see `find_regions`) with `words` learned
-    visual words, compared by cosine. A picture without any region gives zeros.
+    visual words, compared by cosine. An image without any region gives zeros.
 
     Khaliq et al., "A Holistic Visual Place Recognition Approach Using Lightweight CNNs for Significant ViewPoint and
     Appearance Changes", T-RO 2019, as in thesis 4.2.1: 400 regions of `conv4`, 256 words."""

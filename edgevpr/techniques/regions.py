@@ -1,5 +1,5 @@
 """Techniques that match regions of a feature map: `rmac` uses squares, `cross_region_bow` uses active areas. Both scan
-the map with one vector per picture, then compare the best places region by region.
+the map with one vector per image, then compare the best places region by region.
 
 Cross-Region-BoW and Region-VLAD (see `network`) find regions in the same way: the 8-connected components of positive
 activations in each channel. The regions with the highest mean activation (*energy*) over all channels are kept. Each is
@@ -151,7 +151,7 @@ def find_regions(features: Singles, count: int) -> Ints:
     boxes int (N, 4) in its cells: (top, left, bottom, right), bottom and right exclusive, highest energy first. Ties
     are sorted by channel, from the top, then from the left."""
     channels, height, width = features.shape
-    # Stack the channels into one tall picture with empty rows between them: one search instead of one per channel.
+    # Stack the channels into one tall image with empty rows between them: one search instead of one per channel.
     tall = np.zeros((channels, height + 1, width), np.float32)
     np.maximum(features, 0, out=tall[:, :height])
     tall = tall.reshape(-1, width)

@@ -1,7 +1,7 @@
-"""`seqslam`: small patch-normalised pictures, compared by their absolute differences, in sequences (Milford and Wyeth
+"""`seqslam`: small patch-normalised images, compared by their absolute differences, in sequences (Milford and Wyeth
 2012, "SeqSLAM: Visual route-based navigation for sunny summer days and stormy winter nights").
 
-This module computes the difference of one picture from every place and enhances the local contrast. `places.sequence`
+This module computes the difference of one image from every place and enhances the local contrast. `places.sequence`
 searches for trajectories; this technique uses it by default.
 """
 
@@ -22,13 +22,13 @@ _MIN_PATCH_SD_LEVELS = 1.0  # grey levels: a patch with a smaller standard devia
 
 
 class SeqSlam:
-    """SeqSLAM: a place is a small picture of `width` x `height` pixels, a byte each (2 KB by default), normalised in
+    """SeqSLAM: a place is a small image of `width` x `height` pixels, a byte each (2 KB by default), normalised in
     patches of `patch` x `patch` pixels."""
 
     candidates = 1  # it has no fine part to compare
     min_score = 0.0
     min_margin = 0.25  # of one query; wrong matches on corridor and aerial_caliterra (tuning) had less than 0.16
-    min_quality = 0.4  # real pictures have 0.8 or more
+    min_quality = 0.4  # real images have 0.8 or more
 
     def __init__(self, width: int = 64, height: int = 32, patch: int = 8) -> None:
         if not (2 <= patch <= width <= 512 and patch <= height <= 512 and width % patch == height % patch == 0):
@@ -60,7 +60,7 @@ class SeqSlam:
         return Descriptor(coarse=coarse, quality=float(np.mean(spread >= _MIN_PATCH_SD_LEVELS)))
 
     def _cut_patches(self, picture: Array) -> Singles:
-        """Cut a picture into patches: (height, width) to float32 (patches, patch * patch)."""
+        """Cut an image into patches: (height, width) to float32 (patches, patch * patch)."""
         rows, columns = self._height // self._patch, self._width // self._patch
         blocks = picture.astype(np.float32).reshape(rows, self._patch, columns, self._patch).swapaxes(1, 2)
         return blocks.reshape(rows * columns, self._patch * self._patch)

@@ -1,4 +1,4 @@
-"""Runs a network on a picture and returns its outputs. Only this module uses onnxruntime in flight; the first network
+"""Runs a network on an image and returns its outputs. Only this module uses onnxruntime in flight; the first network
 imports it. A model file is not trusted: it is run once before the flight, and every result is checked."""
 
 import os
@@ -39,7 +39,7 @@ class Backbone:
             )
         self.card, self.output, self.sha256 = card, output, card.fingerprint
         self.session = open_session(card, threads)
-        # Use noise: many correct networks output only zeros for a uniform picture.
+        # Use noise: many correct networks output only zeros for a uniform image.
         noise = np.random.default_rng(_NOISE_SEED).integers(0, 256, (card.input.height, card.input.width), np.uint8)
         self.shape = self.run(noise).shape
 
@@ -128,7 +128,7 @@ def import_onnxruntime() -> Any:
 
 
 def run_outputs(card: Card, session: Any, names: list[str], pictures: Singles) -> list[Array]:
-    """Run a session of `open_session` on prepared pictures, float32 (N, ...). Returns the outputs in the order of
+    """Run a session of `open_session` on prepared images, float32 (N, ...). Returns the outputs in the order of
     `names`. Raises ModelError if the run fails, or if a value is not finite or is beyond 1e12."""
     try:
         results: list[Array] = session.run(names, {session.get_inputs()[0].name: pictures})
@@ -154,8 +154,8 @@ def _join_lines(error: Exception) -> str:
 
 
 def prepare_input(image: Array, rule: InputRule) -> Singles:
-    """Convert a picture, uint8 (H, W) grey or (H, W, 3) BGR, to the input that `rule` describes: float32 (1, C, height,
-    width). Histogram equalisation follows CALC: Y of the YUV picture, before conversion to grey and resizing."""
+    """Convert an image, uint8 (H, W) grey or (H, W, 3) BGR, to the input that `rule` describes: float32 (1, C, height,
+    width). Histogram equalisation follows CALC: Y of the YUV image, before conversion to grey and resizing."""
     if rule.equalise and image.ndim == 2:
         image = cv2.equalizeHist(image)
     elif rule.equalise:
@@ -183,7 +183,7 @@ def prepare_input(image: Array, rule: InputRule) -> Singles:
 
 def compute_fill_shares(image: Array, rule: InputRule) -> tuple[float, float]:
     """Return the shares, 0..1, of the width and of the height of the network's input that `prepare_input` fills with
-    the picture; the rest is padding."""
+    the image; the rest is padding."""
     if rule.pad is None:
         return 1.0, 1.0
     height, width = image.shape[:2]

@@ -1,4 +1,4 @@
-"""Base class of the techniques that describe a picture by one vector: the vector's three forms in RAM, and the
+"""Base class of the techniques that describe an image by one vector: the vector's three forms in RAM, and the
 comparison. `hog`, also here, needs no network.
 
 The map file and the form `float` store half precision. `8bit` and `1bit` subtract the mean of all vectors in the map,

@@ -90,7 +90,7 @@ def compute_sharpness(words: Singles) -> float:
 
 def compute_bag_of_words(local: Singles, words: Singles) -> Singles:
     """Return 1 for each of `words` (K, D) that is nearest to any descriptor of `local` (N, D) and 0 for the others,
-    L2-normalised: float32 (K,). Counts find fewer places: many channels respond to the same part of a picture."""
+    L2-normalised: float32 (K,). Counts find fewer places: many channels respond to the same part of an image."""
     present = np.zeros(len(words), np.float32)
     present[find_nearest(local, words)] = 1
     return normalise_rows(present)

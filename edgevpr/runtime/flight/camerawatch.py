@@ -1,4 +1,4 @@
-"""Observers of a flight's events that report rotated or mirrored pictures."""
+"""Observers of a flight's events that report rotated or mirrored images."""
 
 import cmath
 import math
@@ -21,14 +21,14 @@ from edgevpr.runtime.recognise.recognition import Recognition
 _TURN_MATCHES = 10
 _MIN_TURN_DEG = 20.0
 _MIN_MEAN_LENGTH = 0.97
-_MISSES_TO_TRY = 15  # queries without a match before a mirrored picture is tried; ten are common over poor ground
+_MISSES_TO_TRY = 15  # queries without a match before a mirrored image is tried; ten are common over poor ground
 _MISSES_TO_TRY_AGAIN = 30
 _MAX_TRIES = 8  # each costs two queries
 _MIRRORED_TO_REPORT = 2  # matching tries in a row: a single one may be wrong
 
 
 class TurnWatch:
-    """Reports once if pictures are rotated against the autopilot's heading: they are then levelled about the wrong
+    """Reports once if images are rotated against the autopilot's heading: they are then levelled about the wrong
     axes, and the heading prevents matches. Either `source.up_deg` or the compass is wrong."""
 
     def __init__(self, notifier: Notifier, source: SourceConfig) -> None:
@@ -52,8 +52,8 @@ class TurnWatch:
 
 
 class MirrorWatch:
-    """Reports once if pictures are mirrored, for example by a camera setting: they never match. After many queries in a
-    row without a match, and none with one before, a picture is tried flipped left to right, and top to bottom."""
+    """Reports once if images are mirrored, for example by a camera setting: they never match. After many queries in a
+    row without a match, and none with one before, an image is tried flipped left to right, and top to bottom."""
 
     def __init__(self, notifier: Notifier, recogniser: Recogniser) -> None:
         self._notifier, self._recogniser = notifier, recogniser
@@ -62,7 +62,7 @@ class MirrorWatch:
         self._next_try = _MISSES_TO_TRY
 
     def update(self, event: Recognition) -> None:
-        """Count a query without a match, and try its picture mirrored if enough have been counted."""
+        """Count a query without a match, and try its image mirrored if enough have been counted."""
         if event.accepted:
             self._tries = _MAX_TRIES
         has_ground = event.is_query and not (event.failed or event.lacks_texture or event.view.reason)
@@ -81,7 +81,7 @@ class MirrorWatch:
             self._notifier.report("camera", Severity.WARNING, note, topic="mirror")
 
     def _matches_mirrored(self, event: Recognition, axis: int) -> bool:
-        """Search the whole map for the flipped picture, without using any state of the flight."""
+        """Search the whole map for the flipped image, without using any state of the flight."""
         assert event.frame is not None
         base, settings = self._recogniser, MatchSettings(candidates=self._recogniser.candidates)
         fresh = Recogniser(base.encoder, base.place_map, Matcher(base.index, base.rule), self._meter, settings=settings)

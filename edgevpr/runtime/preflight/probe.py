@@ -31,7 +31,7 @@ from edgevpr.runtime.recognise.recognition import Recognition
 
 _TRIAL_PICTURES = 2
 _TRIAL_PLACES = 6
-_MAX_TRIES = 5  # of each picture, at most
+_MAX_TRIES = 5  # of each image, at most
 _STEPS = ("encode", "scan", "compare", "verify")
 _SCANNED_PLACES = 4096
 _MAX_SCANNED_BYTES = 8 << 20  # a small board has no more RAM free before the map is loaded

@@ -1,12 +1,12 @@
-"""The agreement of two pictures: how many of their landmarks coincide after one rotation, one scaling and one shift.
+"""The agreement of two images: how many of their landmarks coincide after one rotation, one scaling and one shift.
 
 Ahead, near and far landmarks shift by different amounts, so fewer agree, and they can only support a match. Points are
-complex numbers here, x + iy (right, down), as shares of the longest side from the picture's centre. A similarity from
+complex numbers here, x + iy (right, down), as shares of the longest side from the image's centre. A similarity from
 query to place is two complex numbers: a point is multiplied by the first (rotation and scale), then the second (the
 shift) is added.
 
 Two landmarks match if each is the one most similar to the other (mutual nearest neighbours). Each pair of the best
-matches defines a similarity, and the one that fits the most matches is used. Nothing is random: the same pictures give
+matches defines a similarity, and the one that fits the most matches is used. Nothing is random: the same images give
 the same result.
 """
 
@@ -46,7 +46,7 @@ _DEPENDENT_LANDMARKS = 40.0
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """Guess of how one picture lies on another, such as the query on a place. `shift_share` (dx, dy), `rotation_deg`
+    """Guess of how one image lies on another, such as the query on a place. `shift_share` (dx, dy), `rotation_deg`
     and `scale` (None: unknown) are as in `Agreement`."""
 
     shift_share: tuple[float, float]
@@ -79,7 +79,7 @@ def compose_overlays(one: Overlay, other: Overlay) -> Overlay:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
     """Result of comparing the landmarks of query and place. `matched` is the number of landmarks that match, `inliers`
-    the number of those that coincide, and `possible` the number of landmarks of the picture that has fewer.
+    the number of those that coincide, and `possible` the number of landmarks of the image that has fewer.
 
     To overlay the query on the place, rotate it by `rotation_deg` (clockwise, 0..360) about its centre, scale it by
     `scale` (above 1 if it was taken from higher up), and shift its centre from the place's centre by `shift_share` (dx
@@ -100,7 +100,7 @@ class Agreement:
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the pictures coincide without shift, rotation or scaling, as an on-screen display does."""
+        """True if the images coincide without shift, rotation or scaling, as an on-screen display does."""
         if self.shift_share is None or self.rotation_deg is None or self.scale is None:
             return False
         rotation_deg = min(self.rotation_deg, 360 - self.rotation_deg)
@@ -108,7 +108,7 @@ class Agreement:
 
 
 def compare_near(query: Landmarks, place: Landmarks, expected: Overlay) -> Agreement:
-    """Compare two pictures near the `expected` overlay. If few landmarks agree there and many on another overlay,
+    """Compare two images near the `expected` overlay. If few landmarks agree there and many on another overlay,
     return the agreement on that one, with `is_expected` False."""
     agreement = measure_agreement(query, place, expected)
     if agreement.inliers >= MIN_CONFIRMED_INLIERS:
@@ -122,7 +122,7 @@ def compare_near(query: Landmarks, place: Landmarks, expected: Overlay) -> Agree
 
 
 def measure_agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = None) -> Agreement:
-    """Compare the landmarks of two pictures, only near the `expected` overlay (None: on any overlay)."""
+    """Compare the landmarks of two images, only near the `expected` overlay (None: on any overlay)."""
     possible = min(len(query), len(place))
     nothing = Agreement(inliers=0, matched=0, possible=possible)
     if possible < _MIN_INLIERS:
@@ -222,10 +222,10 @@ def _find_best(query_points: Array, place_points: Array, expected: Overlay | Non
 
 
 def _estimate_variance(query_points: Array, place_points: Array, turn_scale: complex, shift: complex) -> float:
-    """Return the variance of the shift along each axis, in squares of the picture's longest side, from the inliers."""
+    """Return the variance of the shift along each axis, in squares of the image's longest side, from the inliers."""
     residual2 = np.abs(turn_scale * query_points + shift - place_points) ** 2
     per_axis = max(float(residual2.sum()) / (2 * len(query_points) - 4), (_TOLERANCE_SHARE / 10) ** 2)
     centre = query_points.mean()
     spread = float((np.abs(query_points - centre) ** 2).mean())
-    # The farther the inliers are from the picture's centre, the more a rotation error moves the centre.
+    # The farther the inliers are from the image's centre, the more a rotation error moves the centre.
     return float(per_axis * _DEPENDENT_LANDMARKS / len(query_points) * (1 + abs(centre) ** 2 / max(spread, 1e-9)))

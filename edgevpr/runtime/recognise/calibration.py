@@ -22,9 +22,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapCalibration:
-    """Calibration of a map: the result of querying it with `asked` altered pictures of its own places. `models` maps
+    """Calibration of a map: the result of querying it with `asked` altered images of its own places. `models` maps
     kinds of evidence to the models adapted to the map, and `made` is the date. At the `precision` for which the map
-    was calibrated, the share `accepted` of the pictures is accepted. `accepted_wrong` of these matches are wrong,
+    was calibrated, the share `accepted` of the images is accepted. `accepted_wrong` of these matches are wrong,
     including queries of places that were left out of the map for the test. `recognisable` maps the number of each
     tested place to the mean confidence (0..1) of its correct matches. `look_alikes`: None for a camera looking down."""
 

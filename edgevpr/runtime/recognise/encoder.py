@@ -36,13 +36,13 @@ class EncodedFrame:
 
     @property
     def view(self) -> View:
-        """View of the picture: how it lies on the ground."""
+        """View of the image: how it lies on the ground."""
         return self.picture.view
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameEncoder:
-    """Levels or undistorts the picture of a frame (`levelling`), masks parts of it (`mask`), judges whether it is
+    """Levels or undistorts the image of a frame (`levelling`), masks parts of it (`mask`), judges whether it is
     memorable (`gate`), and encodes it with the `technique`. A step that is None is skipped."""
 
     technique: Technique
@@ -53,7 +53,7 @@ class FrameEncoder:
     def prepare(
         self, frame: Frame, vehicle: Vehicle | None = None, *, layers: Layers | None = None, scale: float = 1.0
     ) -> LevelledImage:
-        """Return the levelled picture of a frame, with mask and view. Other arguments: see `Levelling.prepare`."""
+        """Return the levelled image of a frame, with mask and view. Other arguments: see `Levelling.prepare`."""
         mask = self.mask.fit_to(frame.image) if self.mask else None
         if self.levelling is None:
             return enlarge_image(LevelledImage(frame.image, mask, UNKNOWN_VIEW), scale)
@@ -79,7 +79,7 @@ class FrameEncoder:
         return EncodedFrame(frame=frame, vehicle=vehicle, picture=picture, salience=salience, descriptor=descriptor)
 
     def detect_landmarks(self, picture: LevelledImage, count: int = PLACE_LANDMARKS) -> Landmarks:
-        """Find the `count` best landmarks of a picture, scaled to the size used for the landmarks of places."""
+        """Find the `count` best landmarks of an image, scaled to the size used for the landmarks of places."""
         longest_px = DOWN_PX if self.technique.spec.looks_down else AHEAD_PX
         return detect_landmarks(picture.image, picture.mask, count, longest_px)
 

@@ -2,7 +2,7 @@
 other, an object detector, finds the pixels that show nothing movable (thesis 3.2.2).
 
 `models/recipes/train_matchability.py` trains a network with another definition of memorability: how likely a crop is to
-be found again in another picture.
+be found again in another image.
 
 Each family of detectors has a decoder here. Its arguments are the outputs in the order of the card and the input's
 (height, width) in pixels, and it returns
@@ -92,7 +92,7 @@ class Detector:
         return static
 
     def _detect_boxes_px(self, image: Image) -> Ints:
-        """Return the boxes of dynamic classes, int (N, 4): left, top, right, bottom, clipped to the picture."""
+        """Return the boxes of dynamic classes, int (N, 4): left, top, right, bottom, clipped to the image."""
         rule = self.card.input
         outputs = run_outputs(self.card, self._session, self._outputs, prepare_input(image, rule))
         try:

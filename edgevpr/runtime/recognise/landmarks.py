@@ -1,8 +1,8 @@
-"""Landmarks of a picture: points that can be found again in another picture of the same ground, each described by 256
+"""Landmarks of an image: points that can be found again in another image of the same ground, each described by 256
 bits. `agreement` compares those of query and place.
 
 The points are FAST corners and the bits are ORB descriptions (Rublee et al. 2011). A place keeps few of them, spread
-over the picture. A query has more, so that most of the place's visible points are among them.
+over the image. A query has more, so that most of the place's visible points are among them.
 """
 
 import struct
@@ -15,13 +15,13 @@ from edgevpr.core.arrays import Bytes, Image, Ints, Mask, Singles
 
 PLACE_LANDMARKS = 250
 QUERY_LANDMARKS = 1000
-# Ahead, smaller pictures work as well: across seasons, more correct matches agree than at 640 pixels.
+# Ahead, smaller images work as well: across seasons, more correct matches agree than at 640 pixels.
 DOWN_PX = 640  # longest side
 AHEAD_PX = 320
 _MIN_CORNERS = 4 * PLACE_LANDMARKS  # least number of corners to choose from
 _LEVELS = 8  # of the pyramid
 _LEVEL_FACTOR = 1.2
-_MIN_CONTRAST = 5  # grey levels between a corner and its surroundings; low, so that dark pictures have corners
+_MIN_CONTRAST = 5  # grey levels between a corner and its surroundings; low, so that dark images have corners
 _PATCH_PX = 31  # width of the patch that describes a point, on its level of the pyramid
 _CELLS = 8  # along the longest side; each has about the same number of points
 _MIN_DISTANCE_PX = 3.0  # a corner found on several levels of the pyramid is one landmark
@@ -34,9 +34,9 @@ _SIZE_RESOLUTION = 0.001  # resolution of stored sizes, as a share of the longes
 
 @dataclass(frozen=True, slots=True)
 class Landmarks:
-    """K points of a picture, best first.
+    """K points of an image, best first.
 
-    `points` float32 (K, 2): x to the right and y down from the middle, as shares of the longest side, so that pictures
+    `points` float32 (K, 2): x to the right and y down from the middle, as shares of the longest side, so that images
     of different sizes compare. `angle_deg` float32 (K,): direction of each, clockwise from the right. `size` float32
     (K,): width of the patch that describes it, as a share of the longest side. `bits` uint8 (K, 32): the description.
     """
@@ -58,7 +58,7 @@ def detect_landmarks(
     image: Image, mask: Mask | None = None, most: int = PLACE_LANDMARKS, longest_px: int = DOWN_PX
 ) -> Landmarks:
     """Find the `most` best landmarks of a uint8 image, (H, W) grey or (H, W, 3) BGR, scaled to `longest_px` along its
-    longest side, best first: none without corners, or in a picture smaller than a patch. No patch covers a pixel where
+    longest side, best first: none without corners, or in an image smaller than a patch. No patch covers a pixel where
     `mask`, bool (H, W), is False."""
     height, width = image.shape[:2]
     scale = longest_px / max(height, width)
@@ -90,7 +90,7 @@ def detect_landmarks(
 
 
 def _select_spread(points_px: Singles, most: int, cell_px: float) -> Ints:
-    """Return the indices of at most `most` of the points (K, 2), given best first, spread over the picture: the best
+    """Return the indices of at most `most` of the points (K, 2), given best first, spread over the image: the best
     one in every cell of a grid, then the second best, and so on."""
     # Keep only the best of several points at one corner.
     _, first = np.unique(np.rint(points_px / _MIN_DISTANCE_PX).astype(int), axis=0, return_index=True)

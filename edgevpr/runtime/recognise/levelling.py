@@ -1,5 +1,5 @@
-"""Levelling: removes lens distortion, and warps the picture of a camera that looks straight down as if the aircraft
-flew level. A wrong height gives a wrong scale; a technique with `height_ratios` still recognises the picture.
+"""Levelling: removes lens distortion, and warps the image of a camera that looks straight down as if the aircraft
+flew level. A wrong height gives a wrong scale; a technique with `height_ratios` still recognises the image.
 """
 
 import logging
@@ -30,10 +30,10 @@ from edgevpr.frames.source import is_live
 from edgevpr.places.layers import Layers
 
 GPS_SD_M = 5.0  # standard deviation of a recorded position along one axis, unless a better one is known
-# Distance, as a share of the footprint, from the picture's middle to the point below an aircraft tilted by 3 degrees.
+# Distance, as a share of the footprint, from the image's middle to the point below an aircraft tilted by 3 degrees.
 # Chosen on generated flights and aerial_swindale.
 TILT_SD_WITHOUT_ATTITUDE = 0.04
-_MAX_OFFSET_WITHOUT_HEADING = 0.25  # of the longest side: farther away, the picture shows other ground
+_MAX_OFFSET_WITHOUT_HEADING = 0.25  # of the longest side: farther away, the image shows other ground
 _MAX_FIELD_DIFFERENCE_DEG = 5.0  # data sheets round it
 
 _log = logging.getLogger(__name__)
@@ -41,8 +41,8 @@ _log = logging.getLogger(__name__)
 
 @dataclass(slots=True, kw_only=True)
 class Levelling:
-    """Levels the pictures of a camera that looks straight down, see `frames.level`. Without a `lens` they are not
-    warped, and only the distance on the ground from the point below the camera to the picture's centre is computed,
+    """Levels the images of a camera that looks straight down, see `frames.level`. Without a `lens` they are not
+    warped, and only the distance on the ground from the point below the camera to the image's centre is computed,
     from the `mount` of the camera; a `lens` has its own mount.
 
     With `below`, for places, the point below the camera becomes the centre. `on_gimbal`: a gimbal keeps the camera
@@ -69,10 +69,10 @@ class Levelling:
         layers: Layers | None = None,
         scale: float = 1.0,
     ) -> LevelledImage:
-        """Level the picture of a frame. `vehicle` is the autopilot's report (None: unknown). `overlay`, bool (H, W), is
-        False where the picture shows no ground (None: nowhere). Its longest side is scaled to the length on the ground
+        """Level the image of a frame. `vehicle` is the autopilot's report (None: unknown). `overlay`, bool (H, W), is
+        False where the image shows no ground (None: nowhere). Its longest side is scaled to the length on the ground
         of the places to search, chosen from their `layers` (None: no scaling). It shows `scale` times as much ground as
-        expected at its height or, if that is unknown, as the pictures of the map."""
+        expected at its height or, if that is unknown, as the images of the map."""
         if vehicle and not (self.is_live and vehicle.is_fresh(frame.t_mono_s)):
             vehicle = None
         if vehicle and self.on_gimbal:
@@ -92,19 +92,19 @@ class Levelling:
 
 @dataclass(frozen=True, slots=True)
 class Undistortion:
-    """Removes lens distortion from the pictures of a camera that looks ahead, which are not levelled."""
+    """Removes lens distortion from the images of a camera that looks ahead, which are not levelled."""
 
     lens: CalibratedLens
 
     def prepare(self, frame: Frame, vehicle: Vehicle | None, overlay: Mask | None, **_: object) -> LevelledImage:
-        """Undistort the picture of a frame, which has no scale. Arguments as in `Levelling.prepare`."""
+        """Undistort the image of a frame, which has no scale. Arguments as in `Levelling.prepare`."""
         return undistort_frame(frame.image, overlay, UNKNOWN_VIEW, self.lens)
 
 
 def make_levelling(
     config: SourceConfig, technique: Technique, *, below: bool = False
 ) -> Levelling | Undistortion | None:
-    """Make the preparation of pictures for a configuration. None: there is none, for a camera without a known lens that
+    """Make the preparation of images for a configuration. None: there is none, for a camera without a known lens that
     looks ahead or is on a gimbal. Raises ConfigError for an unusable lens calibration, and UsageError for a field of
     view that contradicts it."""
     if technique.spec.parameters.get("camera") != "nadir":
@@ -145,13 +145,13 @@ def load_calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
 
 
 def set_picture_heading(frame: Frame, view: View) -> Frame:
-    """Return the frame with the heading of the top of its levelled picture, if known. The hints use it."""
+    """Return the frame with the heading of the top of its levelled image, if known. The hints use it."""
     return frame if view.up_deg is None else replace(frame, heading_deg=view.up_deg)
 
 
 def centre_place(frame: Frame, view: View) -> Frame:
-    """Convert a frame to the form that a place stores. Its heading becomes that of the levelled picture. Its position,
-    if any, becomes that of the picture's centre instead of the aircraft's, if that can be computed. With a known
+    """Convert a frame to the form that a place stores. Its heading becomes that of the levelled image. Its position,
+    if any, becomes that of the image's centre instead of the aircraft's, if that can be computed. With a known
     height and heading it gets a pose."""
     frame = set_picture_heading(frame, view)
     if view.nadir_offset and view.up_deg is None and math.hypot(*view.nadir_offset) > _MAX_OFFSET_WITHOUT_HEADING:
@@ -165,7 +165,7 @@ def centre_place(frame: Frame, view: View) -> Frame:
     if view.nadir_offset is None:
         variance_m2 += (TILT_SD_WITHOUT_ATTITUDE * view.footprint_m) ** 2
     else:
-        # The nadir is below the aircraft; seen from there, the picture's centre is in the opposite direction.
+        # The nadir is below the aircraft; seen from there, the image's centre is in the opposite direction.
         variance_m2 += (view.nadir_offset_sd * view.footprint_m) ** 2
         east_m, north_m = (-view.footprint_m * picture_axes(view.up_deg) @ view.nadir_offset).tolist()
         position = move_position(position, east_m, north_m, position.alt_m)

@@ -66,7 +66,7 @@ class SalienceGate:
         """Judge a frame, uint8 (H, W[, 3]). Raises ModelError for an unusable network."""
         scores = self.scores(image)
         self._entropies.append(scores.entropy or 0.0)
-        # At the start of a flight the light is unknown; half of the threshold still rejects an empty picture.
+        # At the start of a flight the light is unknown; half of the threshold still rejects an empty image.
         usual = self.config.entropy / 2
         if len(self._entropies) >= _MIN_FRAMES:
             middle, high = np.percentile(self._entropies, (75, 90))
@@ -104,9 +104,9 @@ def select_best(shortfalls: list[float]) -> list[bool]:
 
 def compute_scores(image: Image, memorability: Memorability | None = None, is_static: Mask | None = None) -> Salience:
     """Return the scores of uint8 (H, W[, 3]): means over the pixels of a copy whose longer side has at most 320.
-    Pixels that are not static count as 0 in the other two scores, because a picture with many of them is less useful.
+    Pixels that are not static count as 0 in the other two scores, because an image with many of them is less useful.
 
-    `is_static`, bool (H, W), is the detector's result for the picture (None: no detector). Raises ModelError.
+    `is_static`, bool (H, W), is the detector's result for the image (None: no detector). Raises ModelError.
     """
     shrink, grey = _MAX_PX / max(image.shape[:2]), image
     if shrink < 1:

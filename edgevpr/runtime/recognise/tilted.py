@@ -1,7 +1,7 @@
-"""Second measurement of a query's perspective over its place, from the picture warped onto the place.
+"""Second measurement of a query's perspective over its place, from the image warped onto the place.
 
-If a picture is strongly tilted, few regions agree, because each is seen from a different side. After the picture is
-warped by their homography, more of them agree and show the tilt more accurately. One more picture must be encoded.
+If an image is strongly tilted, few regions agree, because each is seen from a different side. After the image is
+warped by their homography, more of them agree and show the tilt more accurately. One more image must be encoded.
 """
 
 import math
@@ -21,7 +21,7 @@ _AT_REST = FineMatch(1.0, shift_cells=(0.0, 0.0), rotation_deg=0.0, height_ratio
 
 
 def measure_again(picture: LevelledImage, technique: Technique, fine: Array, found: Perspective) -> Perspective | None:
-    """Measure the perspective of a picture over the place with the fine part `fine` again, starting from `found`.
+    """Measure the perspective of an image over the place with the fine part `fine` again, starting from `found`.
     Return None if `found` was a coincidence: fewer regions agree now."""
     height, width = picture.image.shape[:2]
     longest, side = max(height, width), min(max(height, width), _MAX_SIDE_PX)
