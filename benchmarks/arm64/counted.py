@@ -8,7 +8,6 @@ from edgevpr.techniques import create
 
 SMALL, LARGE = 1_000, 10_000  # places of the two maps whose scans were counted
 _CAMERAS = {"forward": "ahead", "nadir": "down"}
-_ROUNDS = {"products": "micro-benchmark: a round of products", "passes": "micro-benchmark: a round of passes"}
 
 
 def figures(parts: Mapping[str, float]) -> dict[str, Any]:
@@ -31,4 +30,4 @@ def figures(parts: Mapping[str, float]) -> dict[str, Any]:
             "scan_once": small - SMALL * scan_per_place,
         }
         content[camera] = {stage: round(count) for stage, count in work.items()}
-    return {**content, **{kind: round(parts[name]) for kind, name in _ROUNDS.items()}}
+    return content

@@ -18,7 +18,6 @@ from edgevpr.frames.level import View
 from edgevpr.places.index import PlaceIndex, load_index
 from edgevpr.places.mapfile import PlaceMap
 from edgevpr.places.retrieve import NO_EXPECTATION, Expectation, Query, compare_places, scan_index
-from edgevpr.power.speed import make_pass_round, make_product_round
 from edgevpr.runtime.recognise.landmarks import QUERY_LANDMARKS, detect_landmarks
 from edgevpr.runtime.recognise.odometry import VisualOdometry
 from edgevpr.techniques import create
@@ -31,8 +30,6 @@ def parts(ahead: str, down: str) -> Iterator[tuple[str, Callable[[], object]]]:
     yield from of_camera("ahead", "forward", ahead)
     yield from of_camera("down", "nadir", down)
     yield from of_landmarks(_picture(np.random.default_rng(0)))
-    yield "micro-benchmark: a round of products", make_product_round()
-    yield "micro-benchmark: a round of passes", make_pass_round()
 
 
 def _picture(rng: np.random.Generator) -> Image:

@@ -34,7 +34,6 @@ def run_profile(args: Namespace) -> int:
     from edgevpr.runtime.preflight.choose import list_preferred
     from edgevpr.runtime.preflight.estimate import estimate_flight
     from edgevpr.runtime.preflight.presentation import format_table
-    from edgevpr.runtime.preflight.scale import compare_speed
     from edgevpr.runtime.preflight.trial import run_trials
 
     if args.list:
@@ -46,7 +45,7 @@ def run_profile(args: Namespace) -> int:
     list_preferred(board)  # raises if the profile names a technique that does not exist
     plan, trials = _make_plan(args, config, board)
     results = progress(run_trials(trials, board.threads), len(trials), "trying techniques")
-    estimate = estimate_flight(board, compare_speed(board), results, plan)
+    estimate = estimate_flight(board, results, plan)
     print_result(estimate, args.json, format_table(estimate))
     return 0
 

@@ -27,15 +27,9 @@ _FALLBACK_BOARD = "generic-x86"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MachineSpeed:
-    """Speed of a machine relative to one core of the reference machine of `profiles/generic-x86.yaml` (None: unknown).
+    """Speed of a machine. `arm64_mips`: million instructions per second of one thread of an aarch64 board (None:
+    unknown, or another processor). `verified`: True if `source` measured the figure on this very board."""
 
-    `single`: one thread doing integer and byte operations. `products`: one thread doing matrix products.
-    `arm64_mips`: million instructions per second of one thread of an aarch64 board (not relative).
-    `verified`: True if `source` measured the figures on this very board.
-    """
-
-    single: float | None = bounded_key(0.0001, 100, default=None)
-    products: float | None = bounded_key(0.0001, 100, default=None)
     arm64_mips: float | None = bounded_key(1, 1_000_000, default=None)
     verified: bool
     source: str

@@ -1,5 +1,5 @@
 """Estimate of a flight before take-off, shown by `edgevpr profile`: memory, time, charge and accuracy of each technique
-on a board, computed from costs measured on this machine.
+on a board: as measured, if it is this machine; else as far as instruction counts give them (see `instructions`).
 
 `dataclasses.asdict` of a FlightEstimate can be written as JSON.
 """
@@ -11,9 +11,8 @@ from edgevpr.core.types import QueryCost
 from edgevpr.power.boards import Board
 from edgevpr.power.equations import Pack, pack_ah, queries_ah
 from edgevpr.power.meter import compute_query_cost
-from edgevpr.power.speed import Speed
 from edgevpr.runtime.preflight.choose import Demand, Option, choose_best, explain_no_choice, make_option
-from edgevpr.runtime.preflight.scale import SAME_MACHINE, count_work, scale_to_board
+from edgevpr.runtime.preflight.instructions import compute_costs, count_work, explain_unknown_costs
 from edgevpr.runtime.preflight.trial import Trial
 
 
@@ -51,45 +50,51 @@ class TechniqueEstimate:
 class FlightEstimate:
     """Estimates of all techniques on one board.
 
-    `times`: "measured" (the board is this machine), "scaled" (from this machine to the board, by `ratio`) or "unscaled"
-    (this machine's times, because the speed of the board is unknown). `recommended`: label of the recommended option
-    (None: no option is suitable). `reason`: sentence that explains the recommendation, or why there is none. `notes`:
-    remarks on the estimate. `unusable`: the reason for each technique that cannot be used on this machine.
+    `times`: "measured" (the board is this machine), "counted" (computed from instruction counts) or "unknown".
+    `techniques`: those whose costs on the board are known. `unknown`: labels of the others. `recommended`: label of the
+    recommended option (None: no option is suitable). `reason`: sentence that explains the recommendation, or why there
+    is none. `notes`: remarks on the estimate. `unusable`: the reason for each technique that cannot be used on this
+    machine.
     """
 
     board: str
     title: str
     times: str
-    ratio: Speed | None
     plan: FlightPlan
     techniques: tuple[TechniqueEstimate, ...]
+    unknown: tuple[str, ...]
     recommended: str | None
     reason: str
     notes: tuple[str, ...]
     unusable: dict[str, str]
 
 
-def estimate_flight(board: Board, ratio: Speed | None, trials: Iterable[Trial], plan: FlightPlan) -> FlightEstimate:
-    """Estimate every technique of `trials` for a flight with `board`. The trials were run on this machine. `ratio`:
-    speed of the board relative to this machine (see `compare_speed`)."""
-    trials = list(trials)
+def estimate_flight(board: Board, trials: Iterable[Trial], plan: FlightPlan) -> FlightEstimate:
+    """Estimate every technique of `trials` for a flight with `board`. The trials were run on this machine."""
+    trials, is_measured = list(trials), board.is_this_machine()
     rows: list[TechniqueEstimate] = []
+    unknown: list[str] = []
     for trial in trials:
         if trial.costs:
-            costs = scale_to_board(trial.costs, board, ratio, count_work(trial.name, trial.parameters))
-            rows.append(_estimate_option(make_option(board, trial.label, trial.name, costs, plan), board, plan))
-    recommended, reason = _recommend(rows, board, plan)
+            work = count_work(trial.name, trial.parameters)
+            costs = trial.costs if is_measured else compute_costs(trial.costs, board, work)
+            if costs is None:
+                unknown.append(trial.label)
+            else:
+                rows.append(_estimate_option(make_option(board, trial.label, trial.name, costs, plan), board, plan))
+    recommended, reason = _recommend(rows, unknown, board, plan)
+    times = "measured" if is_measured else "counted" if rows else "unknown"
     weights = dict.fromkeys(f"Weights of {trial.weights}." for trial in trials if trial.weights)
     return FlightEstimate(
         board=board.name,
         title=board.title,
-        times="unscaled" if ratio is None else "measured" if ratio == SAME_MACHINE else "scaled",
-        ratio=ratio,
+        times=times,
         plan=plan,
         techniques=tuple(rows),
+        unknown=tuple(unknown),
         recommended=recommended,
         reason=reason,
-        notes=(*weights, *_list_notes(board, ratio)),
+        notes=(*weights, *_list_notes(board, times, unknown)),
         unusable={trial.label: trial.problem for trial in trials if trial.problem},
     )
 
@@ -112,9 +117,13 @@ def _estimate_option(option: Option, board: Board, plan: FlightPlan) -> Techniqu
     )
 
 
-def _recommend(rows: list[TechniqueEstimate], board: Board, plan: FlightPlan) -> tuple[str | None, str]:
-    """Return `recommended` and `reason` as in `FlightEstimate`."""
+def _recommend(
+    rows: list[TechniqueEstimate], unknown: list[str], board: Board, plan: FlightPlan
+) -> tuple[str | None, str]:
+    """Return `recommended` and `reason` as in `FlightEstimate`. `unknown`: see there."""
     options = [row.option for row in rows]
+    if unknown and not options:
+        return None, f"None: the cost of every technique is {explain_unknown_costs(board)}."
     if not options:
         return None, "None: no technique can be used on this machine."
     chosen = choose_best(options, board)
@@ -133,24 +142,15 @@ def _recommend(rows: list[TechniqueEstimate], board: Board, plan: FlightPlan) ->
     )
 
 
-def _list_notes(board: Board, ratio: Speed | None) -> Iterator[str]:
+def _list_notes(board: Board, times: str, unknown: list[str]) -> Iterator[str]:
     score = board.benchmark_score
-    if ratio is None:
-        yield (
-            f"The times are this machine's: they are neither measured on the board nor scaled to it, because its speed "
-            f"is unknown ({score.source})."
-        )
-    elif ratio != SAME_MACHINE:
+    if times == "counted":
         unverified = "" if score.verified else "unverified; "
         yield (
-            f"The times are scaled from this machine, not measured on the board: networks and full comparisons run at "
-            f"{ratio.products:.2g} times this machine's speed, everything else at {ratio.passes:.2g} times "
-            f"({unverified}board speed: {score.source}; this machine's speed: edgevpr's micro-benchmark)."
+            f"The times of cohog are computed from its instruction counts on an ARM core (`make bench-arm64`), at "
+            f"{score.arm64_mips:g} million instructions per second ({unverified}{score.source})."
         )
-        if score.arm64_mips:
-            yield (
-                f"The times of cohog are computed from its instruction counts on an ARM core (`make bench-arm64`), at "
-                f"{score.arm64_mips:g} million instructions per second."
-            )
+    if unknown:
+        yield f"The costs of {', '.join(unknown)} are {explain_unknown_costs(board)}."
     if not board.verified:
         yield f"The power of {board.title} is unverified: {board.source}."

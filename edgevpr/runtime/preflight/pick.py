@@ -21,8 +21,8 @@ from edgevpr.runtime.preflight.choose import (
     list_preferred,
     make_option,
 )
+from edgevpr.runtime.preflight.instructions import compute_costs, count_work, explain_unknown_costs
 from edgevpr.runtime.preflight.probe import TechniqueCosts, measure_costs
-from edgevpr.runtime.preflight.scale import compare_speed, count_work, scale_to_board
 from edgevpr.runtime.recognise.opening import make_technique
 from edgevpr.runtime.recognise.recogniser import Recogniser
 from edgevpr.techniques.card import describe_weights
@@ -34,19 +34,27 @@ def pick_technique(board_name: str, places: int, camera: str | None = None) -> s
     """Choose a technique for a new map of `places` places by its accuracy and its cost on the board, and log the reason
     (see `choose`). `camera`: "nadir" or "forward" (None: forward).
 
-    If none fits the board, choose the first usable technique of `list_preferred` and log why it does not fit: a map is
-    built once, and may be flown on a larger board. Raises ModelError if no technique can be used at all.
+    A technique whose cost on the board is unknown is chosen only if the board's profile names it, or if no cost is
+    known. If none fits the board, choose the first usable technique of `list_preferred` and log why it does not fit: a
+    map is built once, and may be flown on a larger board. Raises ModelError if no technique can be used at all.
     """
     board = load_board(board_name)
     demand = Demand(places=places, rate_hz=board.rate_hz, budget_mb=board.budget_mb, camera=camera)
     options: list[Option] = []
+    unknown: list[str] = []
     for name in list_preferred(board, camera):
         try:
             technique = make_technique(board.threads, name, make_camera_setting(name, camera))
         except ModelError as error:
             _log.warning("technique %s cannot be used: %s", name, error)
             continue
-        options.append(make_option(board, _make_label(technique.spec), name, _measure_costs(technique, board), demand))
+        if costs := _measure_costs(technique, board):
+            options.append(make_option(board, _make_label(technique.spec), name, costs, demand))
+        else:
+            unknown.append(name)
+    if unknown and (unknown[0] == board.technique or not options):
+        _log.warning("technique %s: its cost is %s", unknown[0], explain_unknown_costs(board))
+        return unknown[0]
     if not options:
         raise ModelError("No technique can be used: fix the problems listed above, or name another technique.")
     chosen = choose_best(options, board)
@@ -121,8 +129,10 @@ def _read_camera(spec: TechniqueSpec) -> str | None:
     return None if camera is None else str(camera)
 
 
-def _measure_costs(technique: Technique, board: Board) -> TechniqueCosts:
-    """Measure the costs of a technique on this machine, and convert them to `board`."""
+def _measure_costs(technique: Technique, board: Board) -> TechniqueCosts | None:
+    """Return the costs of a technique on `board`; None if they are unknown."""
+    if board.is_this_machine():
+        return measure_costs(technique)
     spec = technique.spec
     work = count_work(spec.name, spec.parameters) if _uses_vote(spec) else None
-    return scale_to_board(measure_costs(technique), board, compare_speed(board), work)
+    return compute_costs(measure_costs(technique), board, work)

@@ -15,11 +15,10 @@ def format_table(estimate: FlightEstimate) -> str:
     plan, rows = estimate.plan, estimate.techniques
     heading = (
         f"{estimate.title}: {plan}, {plan.rate_hz:g} Hz, {plan.flight_min:g} min, {plan.pack.cells}S"
-        f"{plan.pack.capacity_mah} at {plan.regulator_efficiency:.0%} regulator efficiency; times measured"
-        + {"measured": "", "scaled": ", scaled", "unscaled": " here, unscaled"}[estimate.times]
+        f"{plan.pack.capacity_mah} at {plan.regulator_efficiency:.0%} regulator efficiency; times {estimate.times}"
     )
-    unusable = ([name, "n/a"] for name in estimate.unusable)
-    costs = align_table([_RESOURCE_COLUMNS + _CHARGE_COLUMNS, *map(_make_cost_row, rows), *unusable], left=2)
+    others = [*([name, "?"] for name in estimate.unknown), *([name, "n/a"] for name in estimate.unusable)]
+    costs = align_table([_RESOURCE_COLUMNS + _CHARGE_COLUMNS, *map(_make_cost_row, rows), *others], left=2)
     accuracies = align_table([_ACCURACY_COLUMNS, *(_make_accuracy_row(row, estimate.recommended) for row in rows)])
     notes = [f"{row.option.label} {row.option.misfit}." for row in rows if row.option.misfit]
     for reason in dict.fromkeys(estimate.unusable.values()):

@@ -7,13 +7,10 @@ from example_costs import REGIONS, found
 from example_costs import VECTOR as ONE_CORE_VECTOR
 
 from edgevpr.core.types import StageCost
-from edgevpr.power.boards import load_board
+from edgevpr.power.boards import Board, load_board
 from edgevpr.power.equations import parse_pack
-from edgevpr.power.speed import Speed
 from edgevpr.runtime.preflight import choose
-from edgevpr.runtime.preflight.estimate import FlightPlan
-from edgevpr.runtime.preflight.estimate import estimate_flight as estimate_of
-from edgevpr.runtime.preflight.scale import SAME_MACHINE
+from edgevpr.runtime.preflight.estimate import FlightPlan, estimate_flight
 from edgevpr.runtime.preflight.trial import Trial
 
 VECTOR = replace(ONE_CORE_VECTOR, encode=StageCost(0.05, 0.1), match_per_place=StageCost(0.001, 0.002))
@@ -22,7 +19,6 @@ PLAN = FlightPlan(
     places=100, rate_hz=1.0, flight_min=20.0, pack=parse_pack("4S5200"), regulator_efficiency=0.85, budget_mb=256
 )
 PI = load_board("rpi-4b")
-SLOWER = Speed(products=0.056, passes=0.2)
 
 
 @pytest.fixture(autouse=True)
@@ -37,10 +33,17 @@ def trials(costs):
     return [Trial(label=label, name=label.split()[0], settings={}, costs=each) for label, each in costs.items()]
 
 
-def estimate(costs, plan=PLAN, board=PI, ratio=SAME_MACHINE):
-    return estimate_of(board, ratio, trials(costs), plan)
+@pytest.fixture
+def on_board(monkeypatch):
+    """The estimate is made on the board itself."""
+    monkeypatch.setattr(Board, "is_this_machine", lambda board: True)
 
 
+def estimate(costs, plan=PLAN, board=PI):
+    return estimate_flight(board, trials(costs), plan)
+
+
+@pytest.mark.usefixtures("on_board")
 def test_estimate_of_a_flight_on_the_board_itself_by_hand():
     regions, vector = estimate(COSTS).techniques
     option, query = regions.option, regions.query
@@ -60,6 +63,7 @@ def test_estimate_of_a_flight_on_the_board_itself_by_hand():
     assert regions.flight_pack_frac == pytest.approx(regions.flight_mah / 5200)
 
 
+@pytest.mark.usefixtures("on_board")
 def test_estimate_charges_no_rate_that_is_out_of_reach():
     fast = estimate(COSTS, replace(PLAN, rate_hz=50.0)).techniques[0]
     reached = estimate(COSTS, replace(PLAN, rate_hz=2.0)).techniques[0]
@@ -68,21 +72,36 @@ def test_estimate_charges_no_rate_that_is_out_of_reach():
 
 
 @pytest.mark.parametrize(
-    ("board", "ratio", "times", "notes"),
+    ("board", "times", "recommended", "notes"),
     [
-        ("rpi-4b", SAME_MACHINE, "measured", ()),
-        ("rpi-4b", SLOWER, "scaled", ("0.056 times this machine's speed", "1741 million")),
-        ("odroid-xu4", SLOWER, "scaled", ("networks and full comparisons run at 0.0", "8.5 W")),
-        ("thesis-xeon", None, "unscaled", ("no published figure", "The power of the thesis's server")),
-        ("rpi-zero-2w", SAME_MACHINE, "measured", ("The power of Raspberry Pi Zero 2 W is unverified",)),
+        ("rpi-4b", "counted", "cohog", ("1741 million", "The costs of vector are unknown on Raspberry Pi 4B")),
+        (
+            "rpi-zero-2w",
+            "counted",
+            "cohog",
+            ("838 million", "The costs of vector", "The power of Raspberry Pi Zero 2 W"),
+        ),
+        ("odroid-xu4", "unknown", None, ("The costs of cohog, vector are unknown", "8.5 W")),
+        ("thesis-xeon", "unknown", None, ("run `edgevpr profile` on the board", "The power of the thesis's server")),
     ],
 )
-def test_estimate_notes_how_far_figures_can_be_trusted(board, ratio, times, notes):
-    estimated = estimate(COSTS, PLAN, load_board(board), ratio)
-    assert estimated.times == times
+def test_estimate_of_another_board_has_what_was_counted_and_says_so(board, times, recommended, notes):
+    estimated = estimate({"cohog": REGIONS, "vector": VECTOR}, board=load_board(board))
+    assert (estimated.times, estimated.recommended) == (times, recommended)
+    assert [row.option.label for row in estimated.techniques] == ["cohog"] * (times == "counted")
+    assert estimated.unknown == (("vector",) if times == "counted" else ("cohog", "vector"))
     assert all(part in note for part, note in zip(notes, estimated.notes, strict=True))
 
 
+@pytest.mark.usefixtures("on_board")
+def test_estimate_on_the_board_itself_notes_unverified_power_alone():
+    estimated = estimate(COSTS, board=load_board("rpi-zero-2w"))
+    assert (estimated.times, estimated.unknown) == ("measured", ())
+    (note,) = estimated.notes
+    assert "The power of Raspberry Pi Zero 2 W is unverified" in note
+
+
+@pytest.mark.usefixtures("on_board")
 def test_estimate_recommends_the_most_accurate_that_fits_and_says_why():
     forms = {"cohog": COSTS["regions"], "hog": COSTS["vector"], "hog 1bit": COSTS["vector"]}
     estimated = estimate(forms, board=replace(PI, technique=None))

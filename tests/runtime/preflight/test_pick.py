@@ -4,6 +4,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from example_costs import REGIONS
 
 from edgevpr.core.config import load_config
 from edgevpr.core.errors import EdgevprError
@@ -11,7 +12,7 @@ from edgevpr.core.reasons import Reason, ReasonCode
 from edgevpr.power.boards import load_board
 from edgevpr.power.meter import QueryMeter
 from edgevpr.runtime.preflight import pick
-from edgevpr.runtime.preflight.pick import describe_accuracy, list_safe_candidates, measure_query
+from edgevpr.runtime.preflight.pick import describe_accuracy, list_safe_candidates, measure_query, pick_technique
 from edgevpr.runtime.recognise.opening import open_recogniser
 
 
@@ -49,6 +50,19 @@ def test_measure_query_tells_a_fault_and_a_refusal_from_a_time(recogniser):
 
 def test_describe_accuracy_is_of_the_technique_and_form(recogniser):
     assert describe_accuracy(recogniser.technique).startswith("recall@1 ")
+
+
+@pytest.mark.parametrize(
+    ("board", "named", "chosen"),
+    [("rpi-4b", None, "cohog"), ("rpi-4b", "hog", "hog"), ("odroid-xu4", None, "cohog"), ("odroid-xu4", "hog", "hog")],
+)
+def test_pick_technique_takes_one_of_unknown_cost_only_if_named_or_all_are(monkeypatch, board, named, chosen):
+    monkeypatch.setattr(pick, "measure_costs", lambda technique: REGIONS)
+    monkeypatch.setattr(pick, "load_board", lambda name: replace(load_board(name), technique=named))
+    monkeypatch.setattr(
+        pick.techniques, "DEFAULT_TECHNIQUES", ("hog", "cohog") if board == "rpi-4b" else ("cohog", "hog")
+    )
+    assert pick_technique(board, 100) == chosen
 
 
 def test_trusted_candidates_accepted_nothing_wrong(recording, monkeypatch):
