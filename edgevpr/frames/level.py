@@ -26,8 +26,6 @@ _MIN_RAY_DOWN = 0.1
 # Standard deviations of the tilt, as tangents: of a reported tilt, and of one known only from the camera's mount.
 _REPORTED_TILT_SD = math.tan(math.radians(1.0))
 _MOUNT_TILT_SD = math.tan(math.radians(3.0))
-# Of the height, as a share: a tilted camera shows ground that is higher or lower than that below (tilt_ariel).
-_HEIGHT_SD_SHARE = 0.13
 # Smaller corrections do not affect matches.
 _MIN_TILT_DEG = 1.0
 _MIN_TURN_DEG = 1.0
@@ -74,10 +72,11 @@ class View:
 
     `up_deg`: compass direction (0..360) of the image's top. `footprint_m`: ground length of its longest side.
     `nadir_offset`: from the image's middle to the nadir, the point below the camera, (right, up) in shares of the
-    longest side. `nadir_offset_sd`: standard deviation of each component due to errors of a large tilt. `zoom`: factor
-    by which the image was enlarged; its longest side shows that many times less ground. `nadir_offset_m`: the nadir
-    offset on the ground (east, north), for an image that was not warped because its lens is unknown. `focal`: focal
-    length in shares of the longest side. `rotation_deg`: clockwise rotation that was applied to the image.
+    longest side. `nadir_offset_sd`: standard deviation of each component due to errors of a large tilt (see `relief`
+    for that of the height). `zoom`: factor by which the image was enlarged; its longest side shows that many times
+    less ground. `nadir_offset_m`: the nadir offset on the ground (east, north), for a image that was not warped
+    because its lens is unknown. `focal`: focal length in shares of the longest side. `rotation_deg`: clockwise rotation
+    that was applied to the image.
     `reason`: why a tilted image was not warped."""
 
     up_deg: float | None = None
@@ -316,8 +315,7 @@ class _CameraGeometry:
             return 0.0
         tangent, focal = math.tan(math.radians(self.tilt_deg)), zoom * self.focal_px / self.longest_px
         by_tilt = _REPORTED_TILT_SD * tangent**2 if self._is_attitude_known else _MOUNT_TILT_SD * (1 + tangent**2)
-        by_height = _HEIGHT_SD_SHARE * tangent if self.tilt_deg > MAX_TILT_UNLEVELLED_DEG else 0.0
-        return float(focal * math.hypot(by_tilt, by_height))
+        return float(focal * by_tilt)
 
 
 def _choose_attitude(frame: Frame, vehicle: Vehicle | None) -> Iterator[float | None]:

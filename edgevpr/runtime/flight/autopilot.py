@@ -110,10 +110,11 @@ class AutopilotOutput:
 
     def report_match(self, event: Recognition, used_mah: float) -> Recognition:
         """Send the fix of an event, if there is one to send, and its figures. Return the event with the report of its
-        fix. `used_mah` is the charge that the board has drawn so far."""
+        fix, and its accuracy in flight. `used_mah` is the charge that the board has drawn so far."""
         with self._link.turn("use"):
             fix, sending = None, None
             if event.accepted:
+                event = self._navigator.report_accuracy(event)
                 fix, sending = self._send_match(event)
             else:
                 self._navigator.handle_frame(event)

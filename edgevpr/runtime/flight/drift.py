@@ -18,6 +18,7 @@ _ATTITUDE_ERROR_TIME_S = 20.0
 _MAX_NOISE_FACTOR = 8.0
 _ATTITUDE_ERROR_GAIN = 0.05
 _CALM_ERROR = 0.3
+_TYPICAL_ATTITUDE_ERROR_SD = 0.024
 _ROUGH_ERROR = 0.8
 # An autopilot that starts to dead-reckon mistakes a new wind for a turn: its attitude error wanders this many times
 # faster, for about this long. In simulation, an ArduPilot plane's was 4.5 degrees after ten seconds.
@@ -106,6 +107,7 @@ class DriftFilter:
         self._gps_loss = 0.0  # 1 when GPS is lost, then decaying
         # Mean square of the attitude errors in the last pictures, divided by their variances.
         self._attitude_error = _ROUGH_ERROR if drift.attitude_follows_positions else 0.0
+        self._attitude_error_sd = _TYPICAL_ATTITUDE_ERROR_SD  # mean of the standard deviations of these errors
 
     def start(self, sd_m: float, velocity_sd_m_s: float) -> None:
         """Start with the aircraft on the path. `sd_m` and `velocity_sd_m_s` are the standard deviations, of one axis,
@@ -113,6 +115,12 @@ class DriftFilter:
         self._x = np.zeros(_SIZE)
         sds = sd_m, velocity_sd_m_s, self._drift.acceleration_sd, self._map_sd_m, 0.0, _ODOMETRY_SD
         self._p = np.diag(np.repeat(np.square(sds), 2))
+
+    @property
+    def attitude_error_sd(self) -> float:
+        """Standard deviation of the reported attitude, as a tangent, as the last images show it; 0 if they show no more
+        than their own errors."""
+        return self._attitude_error_sd * math.sqrt(max(0.0, self._attitude_error - _CALM_ERROR))
 
     def predict(self, step_s: float) -> None:
         """Predict the state `step_s` seconds later."""
@@ -192,6 +200,7 @@ class DriftFilter:
         more than their own standard deviation, the gyros are poor and the error wanders faster."""
         normalized = float(np.mean(np.square(over_height))) / sd**2
         self._attitude_error += _ATTITUDE_ERROR_GAIN * (normalized - self._attitude_error)
+        self._attitude_error_sd += _ATTITUDE_ERROR_GAIN * (sd - self._attitude_error_sd)
         matrix = np.zeros((2, _SIZE))
         matrix[:, _B] = _EYE / GRAVITY_M_S2
         self._correct(matrix, over_height, sd**2 * _EYE)

@@ -126,6 +126,15 @@ def picture_error_m(
     return math.hypot(attitude_sd * height_m, t_sd_s * speed_m_s)
 
 
+def flown_accuracy_m(event: Recognition, vehicle: Vehicle, frame: FrameMeasurement, attitude_sd: float) -> float:
+    """Return the accuracy to report for the match of an event: that of the match, and the errors of the attitude (a
+    tangent) and the time of its frame."""
+    height_m, t_sd_s = frame.attitude_gain_s2 * GRAVITY_M_S2, event.frame.t_sd_s if event.frame else 0.0
+    sweep_m_s = height_m * math.radians(vehicle.tilt_rate_deg_s)
+    error_m = picture_error_m(vehicle, height_m, t_sd_s, max(ATTITUDE_SD, attitude_sd), sweep_m_s)
+    return math.hypot(event.accuracy_m or 0.0, error_m)
+
+
 def shared_time_error_m(event: Recognition, vehicle: Vehicle | None) -> float:
     """Return the standard deviation (metres) of the position error that frames share if their times are less accurate
     than usual. It has one direction, so averaging over frames does not reduce it."""

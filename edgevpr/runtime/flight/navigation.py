@@ -86,6 +86,11 @@ class Navigation:
         return self._last_gps_s
 
     @property
+    def attitude_error_sd(self) -> float:
+        """Standard deviation of the reported attitude, as a tangent, as images show it (0: they show no error)."""
+        return self._filter.attitude_error_sd
+
+    @property
     def path_velocity_m_s(self) -> Doubles | None:
         """Current velocity (2,) of the path, not corrected by any match; None if unknown."""
         return self._valid_path.now.velocity_m_s if self._valid_path else None

@@ -4,7 +4,7 @@ The link calls it in its own thread, the loop of `flight` (through `autopilot`) 
 (`mavlink/turns.py`), so it needs no lock."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from edgevpr.core.geodesy import distance_m, offset_position
 from edgevpr.core.reasons import Reason, ReasonCode
@@ -20,6 +20,7 @@ from edgevpr.runtime.flight.consistency import Consistency
 from edgevpr.runtime.flight.drift import DEAD_RECKONING, INERTIAL, INERTIAL_PX4, Drift
 from edgevpr.runtime.flight.measurements import (
     FrameMeasurement,
+    flown_accuracy_m,
     measure_frame,
     position_match,
     shared_time_error_m,
@@ -151,6 +152,14 @@ class Navigator(Listener):
         """Process the frame of an event without an accepted match, or one that only provides odometry (not a query)."""
         if frame := self._measure(event):
             self._navigation.add_frame(frame, is_query)
+
+    def report_accuracy(self, event: Recognition) -> Recognition:
+        """Return an event with the accuracy of its match in flight: it includes the errors of attitude and time."""
+        frame, vehicle = self._measure(event), event.vehicle or self._vehicle
+        if frame is None or vehicle is None or event.accuracy_m is None:
+            return event
+        attitude_sd = self._navigation.attitude_error_sd
+        return replace(event, accuracy_m=flown_accuracy_m(event, vehicle, frame, attitude_sd))
 
     def advise(self, event: Recognition, now_s: float) -> Advice:
         """Process an accepted match, and advise what to send for it. Raises ValueError for a position off the Earth."""

@@ -49,6 +49,7 @@ from edgevpr.runtime.recognise.landmarks import PLACE_LANDMARKS, QUERY_LANDMARKS
 from edgevpr.runtime.recognise.locate import MAX_PLACES_CHECKED, add_tilt_covariance, locate, locate_at_place
 from edgevpr.runtime.recognise.perspective import CommonTilt, convert_to_tilt
 from edgevpr.runtime.recognise.place_filter import PlaceFilter, TrackEstimate
+from edgevpr.runtime.recognise.relief import Relief
 from edgevpr.runtime.recognise.tilted import measure_again
 
 _MAX_SAME_GROUND = 12  # places that may show the same ground: as many overlap on kite_ochota, which has no positions
@@ -188,7 +189,7 @@ class Decision:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decider:
     """Decides on rankings of the places of a `matcher`. `accuracy_m` is that of a place's position used as
-    a fix; `common_tilt` is measured from the matches accepted so far."""
+    a fix; `common_tilt` and `relief` are measured from the matches accepted so far."""
 
     place_map: PlaceMap
     technique: Technique
@@ -197,6 +198,7 @@ class Decider:
     meter: QueryMeter
     accuracy_m: float
     common_tilt: CommonTilt = field(default_factory=CommonTilt)
+    relief: Relief = field(default_factory=Relief)
 
     def make_query(self, descriptor: Descriptor, expected: Expectation) -> Query:
         """Return the query for a descriptor over the places of the matcher."""
@@ -245,6 +247,8 @@ class Decider:
             verdict = judge(found, index, rule, search)
             if verdict.accepted and perspective and query.view.is_tilt_known:
                 self.common_tilt.add(perspective, query.view, best.place.place_id)
+            if verdict.accepted and query.view.footprint_m and found.located and found.located.footprint_m:
+                self.relief.add(found.located.footprint_m / query.view.footprint_m, best.place.place_id)
         confidence = by_confidence.cap_confidence(found.evidence) if by_confidence and found.evidence else None
         return Decision(verdict=verdict, hints=hints, best=best, findings=found, confidence=confidence, track=track)
 
@@ -266,7 +270,7 @@ class Decider:
                 places = load_candidates(
                     ranking, index, self.place_map, first=MAX_PLACES_CHECKED if spec.looks_down else 1
                 )
-                located = locate(places, spec.cells, query.view, agreement)
+                located = locate(places, spec.cells, query.view, agreement, self.relief.height_sd)
                 if located is None and best.place.position:
                     located = locate_at_place(best.place.position, self.accuracy_m)
         same_ground: Collection[int] = located.places if located else ()

@@ -28,6 +28,7 @@ from edgevpr.frames.level import (
 )
 from edgevpr.frames.source import is_live
 from edgevpr.places.layers import Layers
+from edgevpr.runtime.recognise.relief import compute_nadir_sd
 
 GPS_SD_M = 5.0  # standard deviation of a recorded position along one axis, unless a better one is known
 # Distance, as a share of the footprint, from the image's middle to the point below an aircraft tilted by 3 degrees.
@@ -166,7 +167,7 @@ def centre_place(frame: Frame, view: View) -> Frame:
         variance_m2 += (TILT_SD_WITHOUT_ATTITUDE * view.footprint_m) ** 2
     else:
         # The nadir is below the aircraft; seen from there, the image's centre is in the opposite direction.
-        variance_m2 += (view.nadir_offset_sd * view.footprint_m) ** 2
+        variance_m2 += (compute_nadir_sd(view) * view.footprint_m) ** 2
         east_m, north_m = (-view.footprint_m * picture_axes(view.up_deg) @ view.nadir_offset).tolist()
         position = move_position(position, east_m, north_m, position.alt_m)
     pose = Pose(up_deg=view.up_deg, footprint_m=view.footprint_m, covariance_m2=(variance_m2, 0.0, variance_m2))

@@ -19,6 +19,7 @@ from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.runtime.recognise.agreement import MIN_CONFIRMED_INLIERS, Agreement
 from edgevpr.runtime.recognise.levelling import TILT_SD_WITHOUT_ATTITUDE
 from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, AttitudeError, ShownTilt, fit_attitude_error
+from edgevpr.runtime.recognise.relief import UNKNOWN_HEIGHT_SD, compute_nadir_sd
 
 # Chosen on aerial_caliterra and aerial_garfield28. Standard deviations along one axis of a shift, as shares of the
 # longest side, added to the covariance of a match: tilt and relief shift the parts of a picture differently.
@@ -95,12 +96,17 @@ def locate_at_place(position: Position, accuracy_m: float) -> Located:
 
 
 def locate(
-    places: Sequence[Candidate], cells: int | None, view: View = UNKNOWN_VIEW, agreement: Agreement | None = None
+    places: Sequence[Candidate],
+    cells: int | None,
+    view: View = UNKNOWN_VIEW,
+    agreement: Agreement | None = None,
+    height_sd: float = UNKNOWN_HEIGHT_SD,
 ) -> Located | None:
     """Return the position of the aircraft from the `places` found, best first; None if the best has no pose or its
     match no shift. `cells` is the number of cells along the longest side of a picture (None: unknown, so shifts cannot
     be converted to metres). `view` is how the query's picture lies on the ground; if the point below the aircraft is
     unknown, the centre is used. `agreement` is that of the landmarks of the best place, which gives another shift.
+    `height_sd` is `Relief.height_sd`.
 
     Of the places that show the same ground, those whose positions agree with the first are listed in the result. The
     first five of these with at least half of the best score determine the position. Places with such a score and a
@@ -122,7 +128,7 @@ def locate(
     if view.nadir_offset_m is not None:
         position_m = position_m + view.nadir_offset_m
     else:
-        tilt_sd = TILT_SD_WITHOUT_ATTITUDE if view.nadir_offset is None else view.nadir_offset_sd
+        tilt_sd = TILT_SD_WITHOUT_ATTITUDE if view.nadir_offset is None else compute_nadir_sd(view, height_sd)
         covariance += (tilt_sd * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
     objection, far_m = None, _CONTRADICTION_SHARE * pose.footprint_m
     contradicting = []

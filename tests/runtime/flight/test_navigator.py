@@ -5,12 +5,16 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from air import Air, lengths
+from air import HOME, Air, lengths, match_at
+from fakes import vehicle_at
 
 from edgevpr.core.geodesy import distance_m
+from edgevpr.core.types import Position
+from edgevpr.frames.level import View
 from edgevpr.mavlink.channel import Channel
 from edgevpr.runtime.flight import navigator
 from edgevpr.runtime.flight.navigator import Navigator
+from edgevpr.runtime.recognise.perspective import AttitudeError
 
 pytestmark = pytest.mark.slow
 
@@ -201,3 +205,19 @@ def test_what_is_claimed_between_matches_is_met():
     assert len(sigmas) > 300
     assert 0.58 <= (abs(sigmas) < 1).mean() <= 0.85
     assert (abs(sigmas) < 2).mean() >= 0.9
+
+
+@pytest.mark.parametrize(
+    ("shown_sd", "is_level", "attitude_sd"), [(0.01, False, 0.0087), (0.03, False, 0.027), (0.03, True, 0)]
+)
+def test_report_accuracy_contains_the_attitude_error_that_images_show(shown_sd, is_level, attitude_sd):
+    navigator, rng, height_m = Navigator(1.0, 1.0, is_level=is_level), np.random.default_rng(2), 100.0
+    attitude = {"roll_deg": 0.0, "pitch_deg": 0.0, "height_m": height_m, "velocity_m_s": (0.0, 0.0)}
+    for t_s in map(float, range(1, 100)):
+        vehicle = vehicle_at(*HOME, t_s, has_gps=False, position_sd_m=30.0, **attitude)
+        navigator.handle_vehicle(vehicle)
+        shown = AttitudeError(tuple(rng.normal(0.0, shown_sd, 2)), 0.024)
+        event = match_at(Position(*HOME), t_s, vehicle, 1.0, (1,), View(nadir_offset=(0.01, 0.0)), shown)
+        navigator.advise(event, t_s)
+    reported = navigator.report_accuracy(event)
+    assert reported.accuracy_m == pytest.approx(math.hypot(1.0, height_m * attitude_sd), rel=0.25)
