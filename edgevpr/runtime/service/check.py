@@ -64,6 +64,8 @@ def _check_map(what: str, config: Config, board: Board) -> Finding:
             calibration = read_calibration_for(place_map)
             confidence = calibration.described() if calibration else explain_not_calibrated(len(place_map))
     settings, machine = config.mavlink, read_model() or "this machine"
+    if not board.is_this_machine():
+        machine += f", not on {board.title}"
     if settings.link and settings.send_fixes and t_query_s and t_query_s > MAX_FIX_AGE_S:
         times = {"t_query_s": t_query_s, "limit_s": MAX_FIX_AGE_S}
         return report_fault(what, FindingCode.QUERY_TOO_SLOW, machine=machine, **times)

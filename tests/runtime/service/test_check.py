@@ -15,6 +15,7 @@ from edgevpr.cli.main import main
 from edgevpr.core.types import Frame
 from edgevpr.mavlink.address import parse_link
 from edgevpr.places.mapfile import PlaceMap
+from edgevpr.power.boards import load_board
 from edgevpr.runtime.service import check
 from edgevpr.runtime.service.check import Finding, check_configuration
 from edgevpr.runtime.service.findingcodes import FindingCode
@@ -66,6 +67,14 @@ def test_check_finds_a_query_too_slow_for_any_fix_unless_it_is_a_dry_run(setting
     assert finding.reason.parameters["t_query_s"] == 6.0
     settings["mavlink"]["send_fixes"] = False
     assert wrong(config_file, settings) == []
+
+
+@pytest.mark.parametrize(("board", "is_other"), [("this", False), ("thesis-xeon", True)])
+def test_check_says_if_a_query_was_not_measured_on_the_board(settings, config_file, board, is_other):
+    config_file.write_text(yaml.safe_dump(settings | {"board": board}))
+    (finding,) = (each for each in check_configuration(config_file, offline=True) if each.what == "map")
+    assert finding.reason.parameters["t_query_s"] > 0
+    assert finding.reason.parameters["machine"].endswith(f", not on {load_board(board).title}") == is_other
 
 
 def test_check_opens_the_signing_key(settings, config_file, tmp_path):
