@@ -74,7 +74,7 @@ class View:
     `nadir_offset`: from the image's middle to the nadir, the point below the camera, (right, up) in shares of the
     longest side. `nadir_offset_sd`: standard deviation of each component due to errors of a large tilt (see `relief`
     for that of the height). `zoom`: factor by which the image was enlarged; its longest side shows that many times
-    less ground. `nadir_offset_m`: the nadir offset on the ground (east, north), for a image that was not warped
+    less ground. `nadir_offset_m`: the nadir offset on the ground (east, north), for an image that was not warped
     because its lens is unknown. `focal`: focal length in shares of the longest side. `rotation_deg`: clockwise rotation
     that was applied to the image.
     `reason`: why a tilted image was not warped."""
