@@ -219,7 +219,7 @@ def build(
     show = text.progress if progress is None else _wrap_progress(progress)
     with ThreadpoolController().limit(limits=1, user_api="blas"):
         made = make_map(plan, settings, lambda error: _log.warning("%s", error), show)
-    for sentence in made.finished.not_done:
+    for sentence in made.not_done:
         _log.warning("%s", sentence)
     return made
 

@@ -162,12 +162,11 @@ def run_map_build(args: Namespace) -> int:
     )
     unusable: list[ImageError] = []
     made = make_map(order, config, lambda error: skip_image(error, unusable), progress)
-    finished = made.finished
     parts = {
         "covered": made.covered and asdict(made.covered),
-        "refined": finished.refined and asdict(finished.refined),
-        "calibration": finished.calibration and finished.calibration.figures(),
-        "not_done": finished.not_done,
+        "refined": made.refined and asdict(made.refined),
+        "calibration": made.calibration and made.calibration.figures(),
+        "not_done": made.not_done,
     }
     fields = {"map": args.map, "technique": made.technique, "places": made.places, **asdict(made.result)}
     fields |= {name: part for name, part in parts.items() if part}

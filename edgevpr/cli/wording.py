@@ -31,7 +31,7 @@ _MAX_DIFFERENCES = 20  # maximum number of replay differences printed
 
 def format_build(path: str, made: "BuiltMap", is_cut: bool) -> Iterator[str]:
     """Yield what `map build` has made, and what to expect from the map. `is_cut`: it was cut from an orthophoto."""
-    result, finished = made.result, made.finished
+    result = made.result
     yield f"{path}: {result.added} places added ({result.without_position} without a position), {made.places} in total"
     if result.already_here:
         yield f"  {result.already_here} images were already in the map"
@@ -47,13 +47,13 @@ def format_build(path: str, made: "BuiltMap", is_cut: bool) -> Iterator[str]:
         yield f"  {result.white} of the places are at least a third white: clouds and snow do not last"
     if result.of_low_quality:
         yield f"  {result.of_low_quality} of the places are of low quality, kept to limit the gaps"
-    if finished.refined:
-        yield from format_refinement(path, finished.refined)
-    if finished.calibration:
-        yield f"expect: {finished.calibration.described()}"
+    if made.refined:
+        yield from format_refinement(path, made.refined)
+    if made.calibration:
+        yield f"expect: {made.calibration.described()}"
         if is_cut:
             yield f"  {_OTHER_SEASON_NOTE}"
-    yield from (f"  {sentence}" for sentence in finished.not_done)
+    yield from (f"  {sentence}" for sentence in made.not_done)
     if made.places and not made.with_position:
         yield f"{path}: {NO_POSITIONS_NOTE}"
 

@@ -15,7 +15,7 @@ from edgevpr.frames.level import STRAIGHT_DOWN
 from edgevpr.frames.mask import OverlayMask, load_mask
 from edgevpr.frames.source import Source, read_to_end
 from edgevpr.mapmaking import advice
-from edgevpr.mapmaking.finishing import FinishedMap, finish_map, make_encoder
+from edgevpr.mapmaking.finishing import finish_map, make_encoder
 from edgevpr.mapmaking.headings import find_headings
 from edgevpr.mapmaking.mapping import CoveredGround, MappingResult, PlaceSelector, build_map, measure_ground
 from edgevpr.mapmaking.pictures import FlightPictures, OrthophotoGrid
@@ -24,12 +24,14 @@ from edgevpr.places.mapfiles import parse_map_path, remove_map
 from edgevpr.places.mapinfo import describe_map
 from edgevpr.power.boards import load_board
 from edgevpr.runtime.preflight.pick import make_camera_setting, pick_technique
+from edgevpr.runtime.recognise.calibration import MapCalibration
 from edgevpr.runtime.recognise.evidence import list_evidence_kinds
 from edgevpr.runtime.recognise.levelling import read_camera_lens, read_mount
 from edgevpr.runtime.recognise.opening import create_technique, make_technique, open_salience_gate, warn_of_mismatch
 
 if TYPE_CHECKING:
     from edgevpr.mapmaking.orthophoto_source import OrthophotoSource
+    from edgevpr.mapmaking.refine import Refinement
 
 _log = logging.getLogger(__name__)
 _ORTHOPHOTO_TECHNIQUE = "cohog"
@@ -57,14 +59,16 @@ class MapPlan:
 class BuiltMap:
     """Result of `make_map`. `technique`: its name. `places`, `with_position`: number of places in the map, and of
     places with a position. `result`: counts of the frames read. `covered`: the ground that all places cover, by their
-    recorded positions (None: too few). `finished`: results of refining and calibrating."""
+    recorded positions (None: too few). `refined`, `calibration`, `not_done`: see `FinishedMap`."""
 
     technique: str
     places: int
     with_position: int
     result: MappingResult
     covered: CoveredGround | None
-    finished: FinishedMap
+    refined: "Refinement | None"
+    calibration: MapCalibration | None
+    not_done: tuple[str, ...] = ()
 
 
 def make_map(plan: MapPlan, config: Config, on_error: Callable[[ImageError], None], progress: Progress) -> BuiltMap:
@@ -132,7 +136,9 @@ def make_map(plan: MapPlan, config: Config, on_error: Callable[[ImageError], Non
             with_position=info.with_position,
             result=replace(result, **counts),
             covered=ground,
-            finished=finished,
+            refined=finished.refined,
+            calibration=finished.calibration,
+            not_done=finished.not_done,
         )
 
 
