@@ -28,8 +28,8 @@ SOURCE_HELP = (
 )
 
 _MAX_INTEGER = 2**63
-_MAX_VALUE_CHARS = 80  # characters shown of a wrong value in a message
-_NOT_IN_NAMES = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")  # in no file name; other surrogates are raw bytes
+_MAX_VALUE_CHARS = 80  # number of characters of an invalid value that a message quotes
+_NOT_IN_NAMES = re.compile("[\0\ud800-\udc7f\udd00-\udfff]")  # never in file names; other surrogates are raw bytes
 
 T = TypeVar("T", bound="DataclassInstance")
 _TYPE_NAMES = {float: "a number", int: "a whole number", str: "text", bool: "true or false", list: "a list"}
@@ -39,14 +39,14 @@ _TYPE_NAMES |= {dict: "a section"}
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Key:
     """A configuration key. `flags`: command-line options that set it (empty: none); `metavar`: placeholder for their
-    value (None: argparse's default); `text`: their help. A value other than None must lie `within` two numbers (None:
-    any) and be one of `choices` (empty: any). The option of a boolean key has no value: giving it sets the key to
+    value (None: argparse's default); `text`: their help. A value other than None must lie between the `limits` (None:
+    any) and be one of the `choices` (empty: any). The option of a boolean key has no value: it sets the key to
     `sets`. `name`: dotted name, such as "source.rate_hz"; `kind`: type of its value unless it is None."""
 
     flags: tuple[str, ...] = ()
     metavar: str | None = None
     text: str = ""
-    within: tuple[float, float] | None = None
+    limits: tuple[float, float] | None = None
     choices: tuple[str, ...] = ()
     sets: bool = True
     name: str = ""
@@ -64,7 +64,7 @@ def key(default: Any = MISSING, flag: str = "", text: str = "", **rules: Any) ->
 
 def bounded_key(low: float, high: float, default: Any = MISSING) -> Any:
     """Make a `key` whose value must be None or within low..high."""
-    return key(default, within=(low, high))
+    return key(default, limits=(low, high))
 
 
 _ANY = Key()
@@ -76,22 +76,22 @@ class SourceConfig:
     camera: str | None = key(
         None,
         "--camera",
-        "nadir: camera looks straight down; forward: it looks ahead (default: as in the map; forward for a new map)",
+        "nadir: camera faces straight down; forward: it faces ahead (default: as in the map; forward for a new map)",
         choices=("nadir", "forward"),
     )
     rate_hz: float | None = key(
-        None, "--rate-hz HZ", "queries per second (default: the board's)", within=(MIN_RATE_HZ, MAX_RATE_HZ)
+        None, "--rate-hz HZ", "queries per second (default: the board's)", limits=(MIN_RATE_HZ, MAX_RATE_HZ)
     )
     mask: str | None = key(None, "--mask PNG", "mask image, black where frames show an overlay, not the ground")
     lens: str | None = key(None, "--lens FILE", "camera calibration (OpenCV, ROS or Kalibr YAML), to undistort images")
     fov_deg: float | None = key(
-        None, "--fov-deg DEG", "field of view across the longest side of the image, in degrees", within=(5, 150)
+        None, "--fov-deg DEG", "field of view across the longest side of the image, in degrees", limits=(5, 150)
     )
     up_deg: float = key(
         0.0,
         "--up-deg DEG",
         "compass direction of the top of the image when the nose points north, in degrees (default: 0)",
-        within=(0, 360),
+        limits=(0, 360),
     )
     mount_ahead_deg: float = bounded_key(-45, 45, default=0.0)
     mount_right_deg: float = bounded_key(-45, 45, default=0.0)
@@ -110,35 +110,35 @@ class MatchConfig:
         choices=FORMS,
     )
     candidates: int | None = key(
-        None, "--candidates N", "number of places compared in full (default: the technique's)", within=(1, 1_000_000)
+        None, "--candidates N", "number of places compared in full (default: the technique's)", limits=(1, 1_000_000)
     )
     follow: bool = True
     sequence: int | None = key(
-        None, "--sequence N", "number of queries matched as a sequence (default: the technique's)", within=(1, 100)
+        None, "--sequence N", "number of queries matched as a sequence (default: the technique's)", limits=(1, 100)
     )
     accept_precision: float = key(
         0.999,
         "--accept-precision P",
-        "required share of accepted matches that are correct (default: 0.999)",
-        within=(0.5, 0.999999),
+        "required fraction of accepted matches that are correct (default: 0.999)",
+        limits=(0.5, 0.999999),
     )
-    min_score: float | None = key(None, "--min-score S", "minimum score of an accepted match", within=(0, 1))
+    min_score: float | None = key(None, "--min-score S", "minimum score of an accepted match", limits=(0, 1))
     min_margin: float | None = key(
-        None, "--min-margin M", "minimum margin of an accepted match over the best place elsewhere", within=(0, 1)
+        None, "--min-margin M", "minimum margin of an accepted match over the best place elsewhere", limits=(0, 1)
     )
     neighbour_m: float = bounded_key(0, 10_000, default=50.0)
     reach_m_s: float | None = key(
         None,
         "--reach-m-s V",
-        "search only the area that can be reached at this speed (default: the whole map)",
-        within=(0.1, 100),
+        "maximum speed in m/s: search only the area within reach (default: the whole map)",
+        limits=(0.1, 100),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class MemoryConfig:
     budget_mb: float | None = key(
-        None, "--budget-mb MB", "memory limit for the index in MB (default: the board's)", within=BUDGET_RANGE_MB
+        None, "--budget-mb MB", "memory limit for the index in MB (default: the board's)", limits=BUDGET_RANGE_MB
     )
 
 
@@ -170,9 +170,7 @@ class MavlinkConfig:
     )
     component_id: int = bounded_key(1, 255, default=197)
     system_id: int | None = bounded_key(1, 255, default=None)
-    send_fixes: bool = key(
-        True, "--dry-run", "send no positions; do, log and announce everything else as in a flight", sets=False
-    )
+    send_fixes: bool = key(True, "--dry-run", "do everything as in a flight, but send no positions", sets=False)
     max_fix_age_s: float = bounded_key(0.1, 5, default=1.0)
     min_accuracy_m: float = bounded_key(1, 10_000, default=5.0)
     source_sets: SourceSetsConfig = SourceSetsConfig()
@@ -206,7 +204,7 @@ class Config:
 
     board: str = key("this", "--board NAME", "hardware profile (default: this computer)")
     map: str | None = key(None, "--map MAP", "map file")
-    technique: str | None = key(None, "--technique NAME", "require this technique")
+    technique: str | None = key(None, "--technique NAME", "fail unless the map uses this technique")
     source: SourceConfig = SourceConfig()
     match: MatchConfig = MatchConfig()
     memory: MemoryConfig = MemoryConfig()
@@ -276,17 +274,17 @@ def build(cls: type[T], mapping: dict[str, Any], where: str, prefix: str = "") -
 
 def _convert(value: Any, hint: Any, rules: Key, where: str, name: str) -> Any:
     kind, what = _get_class(hint), f"{where}: `{name}`"
-    limits: Any = rules.within
+    limits: Any = rules.limits
     if value is None and isinstance(hint, types.UnionType):
         return None
     if is_dataclass(kind):
         if not isinstance(value, dict):
-            raise ConfigError(f"{what} is a section: write its keys below it and indent them.")
+            raise ConfigError(f"{what} must be a section: indent its keys below it.")
         return build(kind, value, where, f"{name}.")
     if value is None:
-        raise ConfigError(f"{what} has no value: give it one.")
+        raise ConfigError(f"{what} has no value: add one.")
     if isinstance(value, int) and abs(value) > _MAX_INTEGER:
-        raise ConfigError(f"{what} has too many digits: write a smaller number.")
+        raise ConfigError(f"{what} has too many digits: use a smaller number.")
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if isinstance(value, str) and _NOT_IN_NAMES.search(value):
@@ -294,10 +292,10 @@ def _convert(value: Any, hint: Any, rules: Key, where: str, name: str) -> Any:
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise ConfigError(f"{what} must be {_TYPE_NAMES.get(kind, kind)}, not {value!r:.{_MAX_VALUE_CHARS}}.")
     if limits and not limits[0] <= value <= limits[1]:
-        raise ConfigError(f"{what} is {value:g}; it must be between {limits[0]:g} and {limits[1]:g}.")
+        raise ConfigError(f"{what} is {value:g}, but must be between {limits[0]:g} and {limits[1]:g}.")
     if rules.choices and value not in rules.choices:
         allowed = f"{', '.join(rules.choices[:-1])} or {rules.choices[-1]}"
-        raise ConfigError(f"{what} is `{value:.{_MAX_VALUE_CHARS}}`: write {allowed}.")
+        raise ConfigError(f"{what} is `{value:.{_MAX_VALUE_CHARS}}`, but must be {allowed}.")
     return value
 
 

@@ -25,7 +25,7 @@ class PartSpec:
 
 
 def find_nearest_height(height_ratios: Sequence[float], height_ratio: float) -> float:
-    """Return the member of `height_ratios` that is nearest to `height_ratio` by their quotient."""
+    """Return the member of `height_ratios` nearest to `height_ratio` on a logarithmic scale."""
     return min(height_ratios, key=lambda ratio: abs(math.log(ratio / height_ratio)))
 
 
@@ -78,7 +78,7 @@ class Descriptor:
     """The descriptor of one image.
 
     `coarse`: becomes one row of the index in RAM (see `Technique.pack`). `fine`: stays in the map file and is read only
-    for candidates (None: the technique has none). `quality`: share of the image that has usable content, 0..1.
+    for candidates (None: the technique has none). `quality`: usable fraction of the image, 0..1.
     For queries of techniques that need it: `regions`, the descriptors of its regions; `good`, bool, True for regions to
     compare; `picture`, which is encoded again at other rotations.
     """
@@ -94,8 +94,8 @@ class Descriptor:
 @dataclass(frozen=True, slots=True)
 class Picture:
     """The prepared image from which a descriptor was made. `grey`: float32 (side, side), None if the image is never
-    rotated. `allowed`: bool (side, side), True for pixels that may be used (None: all). `seen`: bool, one for each
-    block of cells, True if all of its pixels are allowed."""
+    rotated. `allowed`: bool (side, side), True for pixels that may be used (None: all). `seen`: bool, for each block of
+    cells, True if all of its pixels are allowed."""
 
     grey: np.ndarray | None
     allowed: np.ndarray | None
@@ -106,7 +106,7 @@ class Picture:
 class Support:
     """Support from all regions of query and place for one displacement, `FineMatch.shift_cells`.
 
-    `back`: share (0..1) of the place's regions whose most similar region in the query is at this displacement.
+    `back`: fraction (0..1) of the place's regions whose most similar region in the query is at this displacement.
     `likeness`: mean cosine similarity of each region of the query to the most similar region anywhere in the place.
     `log_rank`: for each region of the query, the place's regions are ranked by similarity to it; this is the mean
     natural logarithm of the rank (from 1) of the region at this displacement.
@@ -125,10 +125,10 @@ class FineMatch:
     cells of the place. `covariance_cells2`: covariance (var x, cov xy, var y) of this offset.
     `rotation_deg`: rotation of the camera since the place was mapped, clockwise, 0..360.
     `height_ratio`: height of the camera above ground, divided by its height when the place was mapped.
-    `coverage`: share (0..1) of the place's regions that agree with this shift, each counted once.
+    `coverage`: fraction (0..1) of the place's regions that agree with this shift, each counted once.
     `support`: further measures of the agreement with this shift.
-    `structure`: how well the structures in both images agree at this shift; for a camera that looks straight down,
-    how much better than at other shifts, in standard deviations (see `techniques.overlay`).
+    `structure`: how well the structures of both images (their regions minus the mean of their surroundings) agree at
+    this shift; looking down, how much better than at other shifts, in standard deviations (see `techniques.overlay`).
     `votes`: `score` before the structures were included."""
 
     score: float = field(kw_only=False)
@@ -169,7 +169,7 @@ class Perspective:
 
 class Technique(Protocol):
     """A place recognition technique. It encodes images (`encode`), compares a query with all places by their coarse
-    parts (`score_places`), then with some by their fine parts (`match`). Some methods are needed only with an ability:
+    parts (`score_places`), then with some by their fine parts (`match`). Some methods are needed only for an ability:
     `match` with `spec.fine`, `pack` with `spec.packed`, `score_quickly` with `spec.max_matches`, and `match_rotated`,
     `match_at_rest` and `measure_perspective` with `spec.looks_down`."""
 
@@ -212,8 +212,8 @@ class Technique(Protocol):
     def score_quickly(
         self, query: Descriptor, fine: np.ndarray, hypotheses: Sequence[int] | None
     ) -> tuple[float, list[int] | None]:
-        """Estimate the score that `match` would return, from a part of the query's regions. Return it and the best
-        hypothesis, as a list to pass to `match` (None: there are no hypotheses)."""
+        """Estimate the score that `match` would return, from a part of the query's regions. Return the
+        estimate and the best hypothesis, as a list for `match` (None: there are no hypotheses)."""
 
     def match_rotated(self, query: Descriptor, fine: np.ndarray, match: FineMatch) -> FineMatch:
         """Compare the query with the place of a `match` again, at the same height but only at other rotations."""
@@ -222,4 +222,4 @@ class Technique(Protocol):
         """Measure the perspective of the query over the place of a `match`; None if too few regions agree."""
 
     def match_at_rest(self, query: Descriptor, fine: np.ndarray) -> FineMatch:
-        """Compare the query with a place as if taken from the same height and without rotation."""
+        """Compare the query with a place at the place's own height and rotation, as for a camera that has not moved."""

@@ -41,8 +41,7 @@ def find_model(file: str) -> Path | None:
 
 def open_file(path: str | Path, max_bytes: int) -> BinaryIO:
     """Open a regular file of at most `max_bytes` for reading, without blocking. Raises OSError, with a `strerror` that
-    fits into a sentence, also for a larger file, a pipe (it would wait for a writer) and a device (it may never
-    end)."""
+    can end a sentence, also for a larger file, a pipe (it would wait for a writer) and a device (it may never end)."""
     handle = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     try:
         status = os.fstat(handle.fileno())

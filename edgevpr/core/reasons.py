@@ -17,7 +17,7 @@ _FIGURES = (
     "confidence {confidence:probability}, {min_confidence:probability} needed: ",
     "{regions_ratio:.1f} times as many regions agree as for the runner-up ({regions_share:.0%})",
     ", {landmarks:.0f} landmarks agree",
-    ", against {rival_landmarks:.0f} for a place elsewhere",
+    ", against {rival_landmarks:.0f} for another place",
     ", {landmarks_ratio:.2f} times as many landmarks as for the runner-up",
     ", {coverage_share:.1%} of the place agrees",
 )
@@ -42,13 +42,13 @@ class ReasonCode(Code):
     # Match accepted
     ACCEPTED_BY_CONFIDENCE = "accepted", *_FIGURES
     ACCEPTED_BY_SCORE = "accepted", "score {score:.3f}, {margin:.3f} ahead of the best place elsewhere"
-    ACCEPTED_WITHOUT_RIVAL = "accepted", "score {score:.3f}; there is no place elsewhere to compare with"
+    ACCEPTED_WITHOUT_RIVAL = "accepted", "score {score:.3f}; there is no other place to compare with"
 
     # Image not searched
     NOT_SEARCHED = "not searched"
     IMAGES_UNCHANGED = "camera frozen: images do not change"
     IMAGES_REPEATED = "camera frozen: images repeat"
-    AGE_UNKNOWN = "age of images unknown", "{summary}: they do not fit the aircraft's motion, so none is used"
+    AGE_UNKNOWN = "age of images unknown", "{summary}: they do not match the aircraft's motion, so none are used"
     LOW_TEXTURE = "too little texture in the image", "{summary}: {usable_share:.0%} usable, {min_share:.0%} needed"
     TILTED = "the image is not levelled", "{summary}: it is tilted {tilt_deg:.0f} degrees"
     TILTED_WITHOUT_HEADING = "the image is not levelled", "{summary}: tilted {tilt_deg:.0f} degrees, heading unknown"
@@ -65,15 +65,15 @@ class ReasonCode(Code):
     # Match refused
     LOW_SCORE = "not similar enough to any place", "{summary}: score {score:.3f}, {min_score:.3f} needed"
     LOW_MARGIN = "margin over the best place elsewhere too small", "{summary}: {margin:.3f}, {min_margin:.3f} needed"
-    NO_RIVAL = "no place elsewhere to compare with", "{summary}: the score alone is not enough"
+    NO_RIVAL = "no other place to compare with", "{summary}: the score alone is not enough"
     PLACE_UNREAD = "an unreadable place may be the correct one"
     NOT_CALIBRATED = "map is not calibrated", "{summary}: no confidence available"
     LOW_CONFIDENCE = "confidence too low", "{summary}: ", *_FIGURES
-    ELSEWHERE_AGREES_BETTER = "a place elsewhere matches better", "{summary}: ", *_FIGURES
+    ELSEWHERE_AGREES_BETTER = "another place matches better", "{summary}: ", *_FIGURES
     TRACK_CONTRADICTS = "the track filter contradicts the match", "{summary}: ", *_FIGURES
     ROTATION_AMBIGUOUS = "the same place matches nearly as well at another rotation", "{summary}: ", *_FIGURES
     ELSEWHERE_AT_REST = (
-        "places elsewhere match without any shift too",
+        "other places also match without any shift",
         "{summary}, as an overlay in the image would make them: mask the overlay (`source.mask`)",
     )
     LANDMARKS_DISAGREE = "landmarks and regions disagree on the offset", "{summary}: {landmarks:.0f} support another"
@@ -107,10 +107,13 @@ class ReasonCode(Code):
         "not needed: the autopilot is {off_m:.1f} m from our position, which is accurate to {accuracy_m:.1f} m",
     )
     HELD_ROTATED = "held back: contradicts compass", "held back: rotated {rotation_deg:.0f} degrees from the compass"
-    HELD_OFF_GPS = "held back: far from GPS", "held back: {distance_m:.0f} m from the position by GPS and earlier fixes"
+    HELD_OFF_GPS = (
+        "held back: far from GPS",
+        "held back: {distance_m:.0f} m from the position by GPS and earlier fixes",
+    )
     HELD_OFF_PATH = (
         "held back: far from the predicted position",
-        "held back: {distance_m:.0f} m from the prediction, accurate to {accuracy_m:.0f} m: another fix must agree",
+        "held back: {distance_m:.0f} m from the predicted position (+-{accuracy_m:.0f} m): another fix must agree",
     )
     PAUSED = "not sent: paused by the ground station"
     PARAMETER_DANGEROUS = "not sent: a parameter is dangerous", "not sent: set {changes}. {why}"
@@ -120,14 +123,14 @@ class ReasonCode(Code):
     FRAME_TOO_OLD = "its frame is too old", "its frame is {age_s:.1f} s old, and the limit is {limit_s:g} s"
     SUPERSEDED = "replaced by a newer fix"
     NO_AUTOPILOT = "no autopilot to receive it", "{summary} within {limit_s:g} s"
-    CLOCK_UNKNOWN = "the autopilot's clock was not known", "{summary} within {limit_s:g} s"
+    CLOCK_UNKNOWN = "the autopilot's time was not received", "{summary} within {limit_s:g} s"
     NOT_ENCODABLE = "it cannot be encoded in its MAVLink message", "{summary} ({problem})"
     LINK_LOST = "the link was lost before it was sent"
 
     # Fix without an answer
     NO_ANSWER = "it got no answer", "{summary} within {limit_s:g} s"
-    LINK_LOST_BEFORE_ANSWER = "the link was lost before its answer came"
-    ENDED_BEFORE_ANSWER = "the flight ended before its answer came"
+    LINK_LOST_BEFORE_ANSWER = "the link was lost before its answer arrived"
+    ENDED_BEFORE_ANSWER = "the flight ended before its answer arrived"
     AUTOPILOT_REPLACED = "another autopilot has taken its place"
     AUTOPILOT_RESTARTED = "the autopilot has restarted"
 
@@ -150,7 +153,7 @@ class ReasonCode(Code):
     NO_COMMAND_ANSWERED = (
         "signing? system id?",
         "it answers none of our commands: does its port accept only signed messages, does another vehicle have its ",
-        "system id, or does the line carry nothing towards it?",
+        "system id, or does the line carry no data towards it?",
     )
     FIXES_NOT_ANSWERED = (
         "no command 43003?",
@@ -172,7 +175,7 @@ class ReasonCode(Code):
     IMAGES_CHANGE_AGAIN = "camera works again: images change"
     AGE_KNOWN = "age of images known again"
     DELAY_FOUND = "images are late: corrected", "images are {delay_s:.1f} s older than their timestamps: corrected"
-    DELAY_GONE = "images are as old as their timestamps say"
+    DELAY_GONE = "image timestamps are correct again"
     IMAGES_ROTATED = (
         "images are rotated",
         "images are rotated {rotation_deg:.0f} degrees from the heading: if the compass is right, ",
@@ -205,7 +208,7 @@ class ReasonCode(Code):
     COMMAND_WITHOUT_296 = "command 43003", "command 43003, because it has no {parameter} for message 296 (PX4 1.18 has)"
     COMMAND_FOR_296 = (
         "command 43003",
-        "command 43003, because its {parameter} does not let it fuse message 296: set it, and reboot the autopilot",
+        "command 43003, because its {parameter} does not let it fuse message 296: change it, and reboot the autopilot",
     )
     COMMAND_TO_ANY = "command 43003, the only channel used with unknown firmware"
     PARAMETER_WEAK = "a parameter should be changed", "set {changes}. {why}"

@@ -41,10 +41,10 @@ def escape_unprintable(text: str, keep: str = "") -> str:
     return "".join(char if char.isprintable() or char in keep else _escape_character(char) for char in text)
 
 
-def _escape_character(char: str) -> str:
-    if "\udc80" <= char <= "\udcff":  # Python's surrogate for a byte that is not UTF-8
-        return f"\\x{ord(char) - 0xDC00:02x}"
-    return char.encode("unicode_escape").decode("ascii")
+def _escape_character(character: str) -> str:
+    if "\udc80" <= character <= "\udcff":  # Python's surrogate for a byte that is not UTF-8
+        return f"\\x{ord(character) - 0xDC00:02x}"
+    return character.encode("unicode_escape").decode("ascii")
 
 
 def redact_passwords(text: str) -> str:
@@ -139,24 +139,24 @@ def progress(
         yield from iterable
         return
     stream = stream or sys.stderr
-    terminal = stream.isatty()
+    is_terminal = stream.isatty()
     last_step, width, began_s = None, 0, clock()
     last_s = began_s
     for done, item in enumerate(iterable, start=1):
         yield item
         if total:
             percent = 100 * done // total
-            step = percent if terminal else percent // 10
+            step = percent if is_terminal else percent // 10
             text = f"{label}  {done}/{total}  {percent} %" + _format_time_left(clock() - began_s, done, total)
         else:
-            step, text = done // (1 if terminal else 100), f"{label}  {done}"
+            step, text = done // (1 if is_terminal else 100), f"{label}  {done}"
         if step != last_step or clock() - last_s >= _MAX_SILENCE_S:
             last_step, last_s = step, clock()
             # The cursor returns to the start of the line, so an error message overwrites it.
-            stream.write(f"{text:<{width}}\r" if terminal else f"{text}\n")
+            stream.write(f"{text:<{width}}\r" if is_terminal else f"{text}\n")
             width = len(text)
             stream.flush()
-    if terminal and last_step is not None:
+    if is_terminal and last_step is not None:
         stream.write("\n")
 
 

@@ -11,7 +11,7 @@ from edgevpr.core.reasons import Reason
 # ArduPilot treats an older frame as 5 s old and would correct the position by too little, so no such fix is sent.
 MAX_FIX_AGE_S = 5.0
 _MAX_REPORT_AGE_S = 1.0
-FRAME_TIME_SD_S = 0.03  # standard deviation of a frame's time: exposure and transfer times of a camera vary
+FRAME_TIME_SD_S = 0.03  # standard deviation of a frame's time, because exposure and transfer times vary
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +176,7 @@ class StageCost:
         return StageCost(self.wall_s * times, self.cpu_s * times)
 
     def utilisation(self, cores: int) -> float:
-        """Return U in equation 5.1 of the thesis: the share of all `cores` that was busy, 0..1."""
+        """Return U in equation 5.1 of the thesis: the busy fraction of all `cores`, 0..1."""
         return min(1.0, self.cpu_s / (self.wall_s * cores)) if self.wall_s > 0 else 0.0
 
 

@@ -43,7 +43,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     try:
         data = read_file(path, MAX_FILE_BYTES)
     except OSError as error:
-        raise ConfigError(f"{path} cannot be read ({error.strerror}): give the path of a YAML file.") from error
+        raise ConfigError(f"{path} cannot be read ({error.strerror}): pass the path of a YAML file.") from error
     return parse_yaml(data, path)
 
 
@@ -56,7 +56,7 @@ def parse_yaml(data: bytes, path: str | Path) -> dict[str, Any]:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or str(error)
-        raise ConfigError(f"{path}{where} is not valid YAML ({problem}): correct it there.") from error
+        raise ConfigError(f"{path}{where} is not valid YAML ({problem}): correct it.") from error
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -64,7 +64,7 @@ def parse_yaml(data: bytes, path: str | Path) -> dict[str, Any]:
     return content
 
 
-# Commands read some files several times, above all the boards, and PyYAML needs 3 to 8 ms each on a workstation.
+# Commands read some files several times, mostly board profiles, and PyYAML needs 3 to 8 ms each on a workstation.
 @lru_cache(maxsize=32)
 def _load(text: str) -> Any:
     return yaml.load(text, _StrictLoader)

@@ -31,8 +31,8 @@ def test_config_file_holds_the_default_of_every_key():
 
 def test_config_file_says_the_limits_of_every_key():
     texts, unsaid = explanations(), []
-    for key in (key for key in list_keys() if key.within):
-        limits = " to ".join(f"{limit:.12g}" for limit in key.within)
+    for key in (key for key in list_keys() if key.limits):
+        limits = " to ".join(f"{limit:.12g}" for limit in key.limits)
         if limits not in (texts.get(key.name) or texts[key.name.rpartition(".")[0]]):
             unsaid.append(f"{key.name}: {limits}")
     assert not unsaid

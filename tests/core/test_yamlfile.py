@@ -58,9 +58,9 @@ def test_read_yaml_refuses_deep_nesting(level, refused):
         ("9" * 5000, "is not valid YAML"),  # which Python itself refuses
         ("0x" + "f" * 5000, "too many digits"),
         ("-1" + ":59" * 400, "too many digits"),
-        ("1" + "0" * 30 + ".0", "it must be between"),
-        ("1.0e+400", "`source.rate_hz` is inf; it must be between"),
-        (".nan", "`source.rate_hz` is nan; it must be between"),
+        ("1" + "0" * 30 + ".0", "but must be between"),
+        ("1.0e+400", "`source.rate_hz` is inf, but must be between"),
+        (".nan", "`source.rate_hz` is nan, but must be between"),
     ],
 )
 def test_load_config_refuses_a_number_of_hundreds_of_digits(number, says, refused):
