@@ -34,7 +34,7 @@ from edgevpr.power.boards import load_board, resolve_board
 from edgevpr.runtime.recognise.opening import open_recogniser
 from edgevpr.runtime.recognise.recognition import Recognition
 
-Progress = Callable[[int, int, str], None]  # called with the number done, the total, and the name of the work
+Progress = Callable[[int, int, str], None]  # called with the number of items done, their total, and a label
 T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
@@ -152,11 +152,11 @@ class Map:
         numbers = {"heading_deg": heading_deg, "height_m": height_m, "roll_deg": roll_deg, "pitch_deg": pitch_deg}
         for name, value in {**numbers, "t_s": t_s}.items():
             if value is not None and not (isinstance(value, int | float | np.number) and math.isfinite(value)):
-                raise UsageError(f"{name} is {value!r}: give a finite number, or None if it is unknown.")
+                raise UsageError(f"{name} is {value!r}, but must be a finite number, or None if unknown.")
         if near is not None and not isinstance(near, Position):
-            raise UsageError(f"near is {near!r}: give edgevpr.core.types.Position(lat_deg, lon_deg).")
+            raise UsageError(f"near is {near!r}, but must be an edgevpr.core.types.Position(lat_deg, lon_deg).")
         if self._needs_height and height_m is None:
-            raise UsageError("The map was opened with a lens or field of view: give the height_m of each picture.")
+            raise UsageError("The map was opened with a lens or field of view: pass height_m with each picture.")
         frame = Frame(
             image=image,
             name="",
@@ -167,7 +167,7 @@ class Map:
             pitch_deg=pitch_deg,
             height_m=height_m,
         )
-        # Products of small matrices gain nothing from more threads, which spin: measured, eight times the CPU time.
+        # More threads do not speed up products of small matrices, but spin: measured, eight times the CPU time.
         with self._threads.limit(limits=1, user_api="blas"):
             event = self._recogniser.step(frame)
         if event.failed:
@@ -208,8 +208,8 @@ def build(
 
     `images`: a folder of images or a video, `FlightPictures` to specify more, or `OrthophotoGrid` for an orthophoto.
     `camera`: "nadir" or "forward". `technique`: name (None: chosen automatically). `config`: flight configuration file
-    (None: the defaults). Images that cannot be used are left out with a warning; a refinement or calibration that is
-    not possible causes a warning too. Raises EdgevprError.
+    (None: the defaults). Images that cannot be used are left out with a warning; so is a refinement or
+    calibration that is not possible. Raises EdgevprError.
     """
     source = images if isinstance(images, FlightPictures | OrthophotoGrid) else FlightPictures(source=_to_path(images))
     plan = MapPlan(
@@ -235,13 +235,13 @@ def _wrap_progress(progress: Progress) -> Any:
 
 def _to_path(path: object) -> str:
     if not isinstance(path, str | os.PathLike):
-        raise UsageError(f"{path!r} is not a path: give a string or a pathlib.Path.")
+        raise UsageError(f"{path!r} is not a path: pass a string or a pathlib.Path.")
     return os.fspath(path)
 
 
 def _check_image(image: object) -> None:
     """Raise ImageError for anything that is not an image."""
-    hint = "give a NumPy array of uint8, (H, W) grey or (H, W, 3) blue, green, red, as cv2.imread returns"
+    hint = "pass a NumPy array of uint8, (H, W) grey or (H, W, 3) blue, green, red, as cv2.imread returns"
     if not isinstance(image, np.ndarray):
         cause = " (cv2.imread returns None for an unreadable file)" if image is None else ""
         raise ImageError(f"The picture has the type {type(image).__name__}: {hint}{cause}.")

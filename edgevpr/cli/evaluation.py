@@ -1,6 +1,6 @@
 """`edgevpr eval`: measure techniques, or stored similarities, on data sets with ground truth.
 
-In this module a set is a data set, and a row is a technique with its settings: one row of the printed tables.
+In this module a set is a data set, and a row of the printed tables is one technique with its settings.
 """
 
 from argparse import Namespace
@@ -36,7 +36,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--query", metavar="FOLDER", help="folder of query images")
     parser.add_argument("--ref", metavar="FOLDER", help="folder of reference images")
     parser.add_argument("--ground-truth", metavar="FILE", help="CSV: query_file,ref_files (default: see --within-m)")
-    text = "references this near to a query, in metres, are correct (default: 25)"
+    text = "references within this distance of a query, in metres, are correct (default: 25)"
     parser.add_argument("--within-m", type=parse_positive, default=25.0, metavar="M", help=text)
     parser.add_argument("--similarity", nargs="+", metavar="FILE", help="evaluate stored similarity matrices (.npy)")
     text = f"vector formats to evaluate: {', '.join(FORMS)} (default: float)"
@@ -79,7 +79,7 @@ def run_eval(args: Namespace) -> int:
         f"{sanitize(name)}\n\n{format_results(results)}\n" for name, results in outcome.measured.items() if results
     ]
     print_result(content, args.json, "\n".join(tables))
-    print_notes(*(f"{row} was not measured on {name}: {error}" for (name, row), error in outcome.failed.items()))
+    print_notes(*(f"{row} was not evaluated on {name}: {error}" for (name, row), error in outcome.failed.items()))
     return 1 if outcome.failed else 0
 
 
@@ -90,14 +90,14 @@ def _measure_similarities(args: Namespace) -> int:
     from edgevpr.lab.evaluate.tables import format_results
 
     if not args.ground_truth:
-        raise UsageError("Give the ground truth of the stored similarities with --ground-truth.")
+        raise UsageError("--similarity also needs --ground-truth, the ground truth of the stored similarities.")
     truth = read_truth(args.ground_truth)
     if args.query:
         truth = add_unscored(truth, list_names(args.query))
     references = list_names(args.ref) if args.ref else None
     results = [measure(Path(file).stem, read_similarities(file), truth, references) for file in args.similarity]
-    measured = {result.technique: asdict(result) for result in results}
-    print_result({**describe_origin(), "similarities": measured}, args.json, format_results(results))
+    qualities = {result.technique: asdict(result) for result in results}
+    print_result({**describe_origin(), "similarities": qualities}, args.json, format_results(results))
     return 0
 
 
@@ -106,12 +106,12 @@ def _open_sets(args: Namespace) -> "dict[str, Dataset]":
     from edgevpr.lab.evaluate.dataset import load_dataset, match_positions, open_folder
 
     if not (args.data or (args.query and args.ref)):
-        raise UsageError("Give data sets with --data, or with --query and --ref, or similarities with --similarity.")
+        raise UsageError("Pass data sets with --data, or with --query and --ref, or similarities with --similarity.")
     if args.data and args.ground_truth:
         raise UsageError("--ground-truth applies only to --query and --ref: a folder of --data has its own.")
     sets = {}
     if args.query and args.ref:
-        query, ref = (Path(side).resolve() for side in (args.query, args.ref))
+        query, ref = (Path(folder).resolve() for folder in (args.query, args.ref))
         truth = args.ground_truth
         dataset = load_dataset(query, ref, truth) if truth else match_positions(query, ref, args.within_m)
         sets[f"{query.name} on {ref.name}"] = dataset
@@ -137,14 +137,14 @@ def _list_rows(args: Namespace) -> dict[str, tuple[str, dict[str, str]]]:
     for key, value in parse_parameters(args.param).items():
         name, _, parameter = key.partition(".")
         if name not in settings or not parameter:
-            raise UsageError(f"--param {key}: write TECHNIQUE.KEY=VALUE with a technique from --techniques.")
+            raise UsageError(f"--param {key} must be TECHNIQUE.KEY=VALUE, with a technique from --techniques.")
         settings[name][parameter] = value
     if any("camera" in techniques.read_parameters(name) and "camera" not in settings[name] for name in names):
-        print_notes("camera assumed to look ahead: if it looks straight down, give `--camera nadir`")
+        print_notes("assuming that the camera faces ahead: pass `--camera nadir` if it faces straight down")
     rows = {}
     for name in names:
         has_forms = "form" in techniques.read_parameters(name) and "form" not in settings[name]
         for form in forms if has_forms else [None]:
-            chosen = {**settings[name], "form": form} if form else settings[name]
-            rows[techniques.format_name(name, chosen.get("form"))] = name, chosen
+            row_settings = {**settings[name], "form": form} if form else settings[name]
+            rows[techniques.format_name(name, row_settings.get("form"))] = name, row_settings
     return rows

@@ -143,24 +143,24 @@ def run_check(args: Namespace) -> int:
 
 
 def run_doctor(args: Namespace) -> int:
-    """Run `doctor`: check the autopilot and this computer, and print what is fine, what is wrong and what to change."""
+    """Run `doctor`: check the autopilot and this computer, and print what is right, and what to change."""
     from edgevpr.mavlink.address import parse_link
     from edgevpr.runtime.service.doctor import check_setup
 
     config = make_config(args, args.config)
     if config.mavlink.link is None:
-        raise UsageError("No link to the autopilot is configured: give one with --link, or in --config.")
+        raise UsageError("No link to the autopilot is configured: pass one with --link, or in --config.")
     address = parse_link(config.mavlink.link)
     findings, reading = check_setup(config, address)
     return _show_findings(findings, args.json, link=str(address), reading=reading and asdict(reading))
 
 
-def _show_findings(findings: "Sequence[Finding]", as_json: bool, **others: Any) -> int:
-    """Print the findings (in JSON together with the fields `others`) and return the exit code."""
+def _show_findings(findings: "Sequence[Finding]", as_json: bool, **extra_fields: Any) -> int:
+    """Print the findings (in JSON together with `extra_fields`) and return the exit code."""
     from edgevpr.runtime.service.finding import format_findings
 
     is_ok, fields = all(finding.ok for finding in findings), [finding.fields() for finding in findings]
-    print_result({**others, "ok": is_ok, "findings": fields}, as_json, format_findings(findings))
+    print_result({**extra_fields, "ok": is_ok, "findings": fields}, as_json, format_findings(findings))
     return max(finding.exit_code for finding in findings)
 
 

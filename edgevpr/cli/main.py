@@ -67,14 +67,14 @@ def _run(argv: list[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        what = f"{error.filename}: " if error.filename else ""
+        prefix = f"{error.filename}: " if error.filename else ""
         return _report_failure(
-            args, error, f"{what}{error.strerror or error}: check the path, its permissions and the disk.", 1
+            args, error, f"{prefix}{error.strerror or error}: check the path, its permissions and the disk.", 1
         )
     except ImportError as error:
-        return _report_failure(args, error, f"{error}: package missing or broken: reinstall edgevpr (64-bit OS).", 1)
+        return _report_failure(args, error, f"{error}: package missing or broken: reinstall edgevpr on a 64-bit OS.", 1)
     except KeyboardInterrupt:
-        print("edgevpr: stopped; everything confirmed so far has been kept.", file=sys.stderr)
+        print("edgevpr: stopped; all output confirmed so far is kept.", file=sys.stderr)
         return 130
 
 
@@ -85,7 +85,7 @@ def _report_failure(args: argparse.Namespace, error: Exception, sentence: str, e
     return exit_code
 
 
-@cache  # building it takes two thirds of the time of a short command, and one process may run many
+@cache  # building it takes two thirds of a short command's time, and one process may run many commands
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     parser = Parser(prog="edgevpr", description="Visual place recognition for the companion computer of a small drone.")

@@ -42,9 +42,9 @@ def add(commands: Any) -> None:
     """Add the commands and their flags."""
     maps = add_group(commands, "map", "build, refine, calibrate, inspect, check, repair, merge and cut maps")
 
-    def add_to_map(name: str, run: Callable[[Namespace], int], text: str, more: str | None = None) -> ArgumentParser:
+    def add_to_map(name: str, run: Callable[[Namespace], int], text: str, map_help: str = "") -> ArgumentParser:
         parser = add_command(maps, name, run, text)
-        parser.add_argument("map", metavar="MAP", help=more)
+        parser.add_argument("map", metavar="MAP", help=map_help or None)
         return parser
 
     build = add_to_map("build", run_map_build, "build a map from images or from an orthophoto", "map to write (.gpkg)")
@@ -57,13 +57,13 @@ def add(commands: Any) -> None:
     add_json(move)
     calibrate = add_to_map("calibrate", run_map_calibrate, "calibrate match confidence from the map's own images")
     _add_pictures(calibrate)
-    calibrate.add_argument("--config", metavar="FILE", help="configuration of the flight (camera, mask, precision)")
+    calibrate.add_argument("--config", metavar="FILE", help="flight configuration (only camera, mask and precision)")
     add_keys(calibrate, "source.mask", "source.lens", "source.fov_deg", "source.up_deg")
     add_json(calibrate)
     info = add_to_map("info", run_map_info, "print what a map contains, or write it as an HTML page")
     info.add_argument("--page", metavar="FILE", help="write an HTML page that opens offline")
     add_map_images(info)
-    info.add_argument("--config", metavar="FILE", help="configuration of the mapping flight (lens)")
+    info.add_argument("--config", metavar="FILE", help="configuration of the mapping flight (only its lens)")
     add_keys(info, "source.lens", "source.fov_deg", "source.up_deg")
     add_json(info)
     add_json(add_to_map("check", run_map_check, "read the whole map and report what is damaged"))
@@ -73,7 +73,7 @@ def add(commands: Any) -> None:
     merge.add_argument("maps", metavar="MAP", nargs="+")
     add_json(merge)
     subset.add(add_to_map)
-    salience = add_command(commands, "salience", run_salience, "print how memorable each image is")
+    salience = add_command(commands, "salience", run_salience, "print how memorable an image is")
     salience.add_argument("image", metavar="IMAGE")
     salience.add_argument("--config", metavar="FILE", help="configuration file; its section `salience` is used")
     add_json(salience)
@@ -84,7 +84,7 @@ def _add_build(build: ArgumentParser) -> None:
     build.add_argument("--technique", metavar="NAME", help="technique (default: chosen for the board)")
     add_parameters(build, "set a parameter of the technique")
     build.add_argument("--board", default="this", metavar="NAME", help="board to plan for (default: this computer)")
-    build.add_argument("--config", metavar="FILE", help="configuration of the flight (camera, mask, salience)")
+    build.add_argument("--config", metavar="FILE", help="flight configuration (only camera, mask and salience)")
     add_keys(build, "source.camera", "source.mask", "source.lens", "source.fov_deg", "source.up_deg", "salience.use")
     build.add_argument("--rate-hz", type=parse_positive, metavar="HZ", help="places per second of a video")
     build.add_argument("--no-refine", dest="refine", action="store_false", help="keep the recorded positions")
@@ -114,7 +114,7 @@ def _add_pictures(parser: ArgumentParser) -> None:
     flags.add_argument(
         "--area",
         metavar="AREA",
-        help="area to map: a mission (its path, with a footprint on either side), or LAT,LON,RADIUS_M",
+        help="area to map: a mission (its path and a footprint on either side), or LAT,LON,RADIUS_M",
     )
 
 
@@ -131,9 +131,9 @@ def _parse_pictures(args: Namespace) -> "FlightPictures | OrthophotoGrid":
     from edgevpr.mapmaking.pictures import FlightPictures, OrthophotoGrid
 
     if (args.source is None) == (args.orthophoto is None):
-        raise UsageError("Give either --images (pictures of a flight) or --orthophoto: a map is built from one.")
-    others = _ORTHOPHOTO_FLAGS if args.orthophoto is None else _RECORDING_FLAGS
-    if misplaced := [name for name in others if getattr(args, name, None) is not None]:
+        raise UsageError("Pass either --images (pictures of a flight) or --orthophoto: a map is built from one.")
+    inapplicable = _ORTHOPHOTO_FLAGS if args.orthophoto is None else _RECORDING_FLAGS
+    if misplaced := [name for name in inapplicable if getattr(args, name, None) is not None]:
         source = "--orthophoto" if args.orthophoto is None else "--images"
         raise UsageError(f"--{misplaced[0].replace('_', '-')} applies only to {source}: leave it out.")
     if args.source is not None:
@@ -150,7 +150,7 @@ def run_map_build(args: Namespace) -> int:
     from edgevpr.mapmaking.making import MapPlan, make_map
 
     config = make_config(args, args.config)
-    order = MapPlan(
+    plan = MapPlan(
         path=args.map,
         pictures=_parse_pictures(args),
         technique=args.technique,
@@ -161,7 +161,7 @@ def run_map_build(args: Namespace) -> int:
         calibrate=args.calibrate,
     )
     unusable: list[ImageError] = []
-    made = make_map(order, config, lambda error: skip_image(error, unusable), progress)
+    made = make_map(plan, config, lambda error: skip_image(error, unusable), progress)
     parts = {
         "covered": made.covered and asdict(made.covered),
         "refined": made.refined and asdict(made.refined),

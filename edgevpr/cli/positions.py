@@ -22,7 +22,7 @@ def add(commands: Any) -> None:
         "--offset-s",
         type=float,
         metavar="S",
-        help="seconds to add to the camera's clock (default: the time zone that fits) or to the times of subtitles",
+        help="seconds to add to the camera's clock (default: inferred time-zone offset) or to the times of subtitles",
     )
     text = "file to write (default: positions.csv in the folder, or VIDEO.csv)"
     parser.add_argument("--out", metavar="CSV", help=text)
@@ -39,10 +39,10 @@ def run_positions(args: Namespace) -> int:
 
     source, is_folder = Path(args.images), Path(args.images).is_dir()
     if not source.exists():
-        raise UsageError(f"{source} does not exist: give the folder of the images or the video file.")
+        raise UsageError(f"{source} does not exist: pass the folder of the images or the video file.")
     out = Path(args.out) if args.out else source / "positions.csv" if is_folder else source.with_suffix(".csv")
     if out.exists():
-        raise UsageError(f"{out} already exists: move it away, or give another file with --out.")
+        raise UsageError(f"{out} already exists: move it away, or pass another file with --out.")
     with show_elapsed(f"reading {args.record}"):
         record = read_record(Path(args.record))
     placed = (place_pictures if is_folder else place_video)(record, source, args.offset_s)
@@ -52,7 +52,7 @@ def run_positions(args: Namespace) -> int:
         else:
             write_positions(out, placed.tags)
     except OSError as error:
-        raise UsageError(f"{out} cannot be written ({error.strerror}): give another file with --out.") from error
+        raise UsageError(f"{out} cannot be written ({error.strerror}): pass another file with --out.") from error
     fields = {
         "record": record.kind,
         "how": placed.how,

@@ -42,9 +42,9 @@ def run_profile(args: Namespace) -> int:
         return 0
     config = make_config(args)
     board = resolve_board(load_board(args.board), config.source, config.memory)
-    list_preferred(board)  # raises if the profile names a technique that does not exist
+    list_preferred(board)  # raises if the profile lists a technique that does not exist
     plan, trials = _make_plan(args, config, board)
-    results = progress(run_trials(trials, board.threads), len(trials), "trying techniques")
+    results = progress(run_trials(trials, board.threads), len(trials), "running techniques")
     estimate = estimate_flight(board, results, plan)
     print_result(estimate, args.json, format_table(estimate))
     return 0
@@ -68,7 +68,7 @@ def _make_plan(args: Namespace, config: Config, board: "Board") -> "tuple[Flight
     else:
         trials = list_trials(
             techniques.list_techniques(),
-            settings={n: make_camera_setting(n, camera) for n in techniques.list_techniques()},
+            settings={name: make_camera_setting(name, camera) for name in techniques.list_techniques()},
         )
     plan = FlightPlan(
         places=places,

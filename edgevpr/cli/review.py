@@ -38,21 +38,21 @@ def run_report(args: Namespace) -> int:
     from edgevpr.review.album import make_album, make_map_album
     from edgevpr.review.logged import get_text, read_flight
     from edgevpr.review.page import make_flight_page
-    from edgevpr.review.webpage import read_ground
+    from edgevpr.review.webpage import read_located_places
     from edgevpr.runtime.flight.recording import find_recording, list_frames
 
     flight = read_flight(args.log)
     folder = find_recording(get_text(flight.start, "recording"), args.log)
     frames = make_album(args.images, list_frames(folder) if folder else {})
     ground: list[Place] = []
-    no_ground = "The log does not name a map: give it with --map."
+    no_ground = "The log does not name a map: pass one with --map."
     if path := args.map or get_text(flight.start, "map"):
         try:
-            ground, no_ground = read_ground(path), ""
+            ground, no_ground = read_located_places(path), ""
         except EdgevprError as error:
             if args.map:
                 raise
-            no_ground = f"The map of the flight is not drawn: {error} If the map has moved, give its path with --map."
+            no_ground = f"The map of the flight is not drawn: {error} If it has moved, pass its path with --map."
     references = make_map_album(args.map_images, ground)
     page = make_flight_page(flight, ground, frames, references, no_ground)
     write_output(args.out, args.log, lambda out: out.write(page))

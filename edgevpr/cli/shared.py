@@ -1,4 +1,4 @@
-"""Code that the commands share: flags, the configuration made from them, and the printing of results and errors."""
+"""Code shared by the commands: flags, the configuration made from them, and the printing of results and errors."""
 
 import json
 import re
@@ -87,8 +87,8 @@ def add_positions(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--positions",
         metavar="CSV",
-        help="file,lat,lon[,alt,yaw_deg,roll_deg,pitch_deg,height_m,time] (default: positions.csv next to the images); "
-        "for a video: time,lat,lon[,...], with time in seconds from its first frame; see `edgevpr positions`",
+        help="CSV file with the columns file,lat,lon[,alt,yaw_deg,roll_deg,pitch_deg,height_m,time] (default: "
+        "positions.csv next to the images); for a video: time,lat,lon[,...], with time in seconds from its first frame",
     )
 
 
@@ -104,11 +104,11 @@ def add_map_images(parser: ArgumentParser) -> None:
 
 
 def add_known(parser: ArgumentParser) -> None:
-    """Add the flag for what is known for recorded queries; `hints.parse_known_fields` parses its value."""
+    """Add the flag for prior knowledge about recorded queries; `hints.parse_known_fields` parses its value."""
     parser.add_argument(
         "--known",
         metavar="A,B",
-        help="what is known for each query, as in flight: heading (yaw_deg in positions.csv), height (height_m of "
+        help="prior knowledge about each query, as in flight: heading (yaw_deg in positions.csv), height (height_m of "
         "queries and places, or the map's height), reach (a position within 300 m)",
     )
 
@@ -145,7 +145,7 @@ def parse_parameters(pairs: list[str]) -> dict[str, str]:
     """Parse ["gt=0.4"] into {"gt": "0.4"}. Raises UsageError for any other format."""
     for pair in pairs:
         if "=" not in pair:
-            raise UsageError(f"--param {pair}: write KEY=VALUE, for example gt=0.4.")
+            raise UsageError(f"--param {pair} must be KEY=VALUE, for example gt=0.4.")
     return dict(pair.split("=", 1) for pair in pairs)
 
 
@@ -169,7 +169,7 @@ def report_unusable(unusable: list[ImageError]) -> int:
 
 def print_result(value: Any, as_json: bool, text: str | Iterable[str] | None = None) -> None:
     """Print a result, a dataclass or a dictionary: as JSON for programs, or as `text` for people. Lines of `text` are
-    sanitized; a single string is printed as it is. `text` None: print a line for each field."""
+    sanitized; a single string is printed unchanged. `text` None: print a line for each field."""
     fields = asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
     if as_json:
         print(json.dumps(fields, indent=2, default=str))
@@ -180,7 +180,7 @@ def print_result(value: Any, as_json: bool, text: str | Iterable[str] | None = N
 
 def describe_lost_calibration(path: str, is_lost: bool) -> list[str]:
     """Return a line on what to do with a map whose calibration `is_lost` by merging or cutting; else no lines."""
-    problem = "not calibrated: the calibrations of its parts do not apply to it, so the shipped one is used"
+    problem = "not calibrated: the calibrations of its parts do not apply to it, so the default one is used"
     return [f"  {problem}; run edgevpr map calibrate {path}"] if is_lost else []
 
 
@@ -240,7 +240,7 @@ def check_output(target: str, source: str) -> Path:
 
     path = Path(target)
     if path.exists() and Path(source).exists() and path.samefile(source):
-        raise UsageError(f"{target} is the input file: give another output file.")
+        raise UsageError(f"{target} is the input file: pass another output file.")
     require_folder(path)
     return path
 

@@ -38,7 +38,7 @@ def add(commands: Any) -> None:
 
 def _parse_seed(text: str) -> int:
     if not text.isdecimal():
-        raise ArgumentTypeError(f"`{text}` is not a whole number from 0 on")
+        raise ArgumentTypeError(f"`{text}` is not a whole number of 0 or more")
     return int(text)
 
 
@@ -61,14 +61,14 @@ def run_simulate_flight(args: Namespace) -> int:
     for name, (default, low, high, _) in _NUMBER_FLAGS.items():
         numbers[name] = value = default if getattr(args, name) is None else getattr(args, name)
         if value is not None and not low <= value <= high:  # false for NaN
-            raise UsageError(f"--{name.replace('_', '-')} is {value:g}: give {low:g} to {high:g}.")
+            raise UsageError(f"--{name.replace('_', '-')} is {value:g}, but must be between {low:g} and {high:g}.")
     shots = read_shots(args.track, numbers["height_m"], numbers["every_m"])
     taken = write_overflight(Path(args.out), Orthophoto(args.orthophoto), shots, numbers["fov_deg"], args.seed)
     if not (written := sum(1 for _ in progress(taken, len(shots), "flying"))):
-        raise UsageError(f"{args.orthophoto} does not cover any whole image along {args.track}: none was written.")
+        raise UsageError(f"{args.orthophoto} covers no complete image along {args.track}: no images were written.")
     print(f"{args.out}: {written} images in images/, their positions in positions.csv")
     if beyond := len(shots) - written:
-        print(f"{beyond} left out: they would show ground beyond the orthophoto")
+        print(f"{beyond} images left out: they would show ground beyond the orthophoto")
     return 0
 
 

@@ -14,9 +14,9 @@ from edgevpr.core.text import escape_unprintable, format_probability
 
 _STATUS_FILE = "/run/edgevpr/status.json"
 _REFRESH_S = 1.0  # the flight writes its status once a second
-_LATE_STATUS_S = 2.5  # older: a warning is shown; a slow frame may delay a status
-_STALE_STATUS_S = 10.0  # older: --once assumes that the flight was killed
-_COARSE_AGE_S = 3.0  # older pictures: the age is shown in whole seconds
+_LATE_STATUS_S = 2.5  # a warning is shown for an older status; a slow frame may delay one
+_STALE_STATUS_S = 10.0  # --once takes the flight for killed if its status is older
+_COARSE_AGE_S = 3.0  # the age of older pictures is shown in whole seconds
 _CLEAR = "\x1b[H\x1b[J"
 _CHANNELS = {"COMMAND": "command 43003", "SENSOR": "message 296"}  # other channels are shown by their own names
 
@@ -56,10 +56,10 @@ def run_top(args: Namespace) -> int:
 
 
 def _explain_no_flight(file: str) -> tuple[str, str]:
-    """Return two lines for the user if no flight writes its status to `file`."""
+    """Return two lines for the case that no flight writes its status to `file`."""
     return (
         f"No running flight writes its status to {file}:",
-        "start one (edgevpr run) with `status: {file: PATH}` in its configuration, and give that PATH with --file.",
+        "start one (edgevpr run) with `status: {file: PATH}` in its configuration, and pass that PATH with --file.",
     )
 
 
@@ -68,7 +68,7 @@ def format_status(status: dict[str, Any]) -> list[str]:
     age_s, heat = status["latency_s"], _format_optional("{:.0f} °C", status["temperature_c"])
     template = ", {:.2f} s old" if (age_s or 0) < _COARSE_AGE_S else ", newest image {:.0f} s old"
     latency = _format_optional(template, age_s)
-    hot, throttled = ", hot" * bool(status["hot"]), ", throttled" * bool(status["throttled"])
+    hot_text, throttled_text = ", hot" * bool(status["hot"]), ", throttled" * bool(status["throttled"])
     ram = f"{status['machine_ram_mb']:.0f} of {status['machine_ram_total_mb']:.0f} MB by all programs"
     rows = [
         ("edgevpr", f"{status['version']}, {status['elapsed_s']:.0f} s of flight, {status['health'].lower()}"),
@@ -77,7 +77,7 @@ def format_status(status: dict[str, Any]) -> list[str]:
         ("queries", f"{status['queries']}, {status['accepted']} accepted, {status['failed']} failed"),
         ("CPU", f"{status['machine_cpu_share']:.0%} by all programs"),
         ("RAM", f"{status['rss_mb']:.0f} MB, {ram}"),
-        ("heat", f"{heat or 'unknown'}{hot}{throttled}"),
+        ("heat", f"{heat or 'unknown'}{hot_text}{throttled_text}"),
         ("supply", {None: "unknown", False: "fine", True: "under-voltage"}[status["under_voltage"]]),
         ("charge", f"{status['used_mah']:.2f} mAh"),
         ("match", _format_query(status["match"], status["t_mono_s"])),

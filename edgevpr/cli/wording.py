@@ -29,8 +29,8 @@ _OTHER_SEASON_NOTE = (
 _MAX_DIFFERENCES = 20  # maximum number of replay differences printed
 
 
-def format_build(path: str, made: "BuiltMap", is_cut: bool) -> Iterator[str]:
-    """Yield what `map build` has made, and what to expect from the map. `is_cut`: it was cut from an orthophoto."""
+def format_build(path: str, made: "BuiltMap", from_orthophoto: bool) -> Iterator[str]:
+    """Yield what `map build` has made, and what to expect from the map. `from_orthophoto`: it was cut from one."""
     result = made.result
     yield f"{path}: {result.added} places added ({result.without_position} without a position), {made.places} in total"
     if result.already_here:
@@ -51,7 +51,7 @@ def format_build(path: str, made: "BuiltMap", is_cut: bool) -> Iterator[str]:
         yield from format_refinement(path, made.refined)
     if made.calibration:
         yield f"expect: {made.calibration.described()}"
-        if is_cut:
+        if from_orthophoto:
             yield f"  {_OTHER_SEASON_NOTE}"
     yield from (f"  {sentence}" for sentence in made.not_done)
     if made.places and not made.with_position:
@@ -73,8 +73,8 @@ def format_refinement(path: str, refined: "Refinement") -> Iterator[str]:
         yield f"  surveyed    {refined.surveyed} cut from an orthophoto keep their position"
     if not_tied := refined.places - refined.without_position - refined.surveyed - refined.refined:
         yield f"  not linked  {not_tied} keep their recorded position: a fix there is only as accurate as the spacing"
-    for place_id, image, off_m in refined.contradictory:
-        yield f"  GPS tag     place {place_id} ({sanitize(image)}): recorded {off_m:.0f} m from its image's position"
+    for place_id, image, distance_m in refined.contradictory:
+        yield f"  GPS tag     place {place_id} ({sanitize(image)}): recorded {distance_m:.0f} m from its true position"
 
 
 def format_info(info: "MapInfo", confidence: str | None, ram_mb: float) -> Iterator[str]:
@@ -119,14 +119,14 @@ def format_check(result: "MapCheck") -> Iterator[str]:
 
 
 def format_replay(replay: "ReplayResult", lines: "LineComparison", packets: "PacketComparison") -> Iterator[str]:
-    """Yield how a replay differs from its flight: in `lines` of the log, in `packets` sent, and in how it ends."""
+    """Yield how a replay differs from its flight: in the `lines` of its log, the `packets` it sent, and its end."""
     yield from _limit_differences([*map(_format_difference, lines.others), *packets.others])
-    yield from (f"The program differs: {name} was {then}, is {now}" for name, (then, now) in lines.program.items())
+    yield from (f"The program differs: {name} was {old}, is {new}" for name, (old, new) in lines.program.items())
     yield f"{sum(line.get('kind') == 'query' for line in replay.lines)} queries replayed"
     yield f"log      {lines.alike} lines are equal, {len(lines.others)} differ"
     yield f"MAVLink  {packets.alike} packets are equal, {len(packets.others)} differ"
     if replay.guessed:
-        yield f"{replay.guessed} inputs were not recorded where this version reads them, so values were guessed."
+        yield f"{replay.guessed} inputs were not recorded where this version reads them, so their values were guessed."
     if replay.why_ended:
         yield f"The replay ended before the flight: {replay.why_ended}; the flight has {lines.after} more lines."
     elif lines.after:
@@ -142,4 +142,4 @@ def _format_difference(difference: dict[str, Any]) -> str:
     where = f"{difference['t_mono_s']:.3f} s, {difference['query'] or difference['kind']}"
     if "only_in" in difference:
         return f"{where}: only in the {difference['only_in']}"
-    return f"{where}: {', '.join(f'{name} was {then}, is {now}' for name, (then, now) in difference['fields'].items())}"
+    return f"{where}: {', '.join(f'{name} was {old}, is {new}' for name, (old, new) in difference['fields'].items())}"

@@ -84,7 +84,7 @@ def test_map_build_makes_a_map_that_it_cannot_calibrate(flight, tmp_path, capsys
     [
         (["--images", "FLIGHT/other"], 2, "pictures of only 0 places were found"),
         (["--images", "FLIGHT/absent"], 1, "There is nothing at"),
-        ([], 2, "Give either --images"),
+        ([], 2, "Pass either --images"),
         (["--images", "FLIGHT/ref", "--positions", "FLIGHT/absent.csv"], 2, "absent.csv"),
     ],
 )

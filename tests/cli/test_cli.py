@@ -120,7 +120,7 @@ def test_main_exits_with_2_and_a_sentence_if_the_request_is_wrong(capsys, flight
         (["run", "--map", valley], "no source of frames"),
         (["run", "--source", query], "no map"),
         (["map", "build", tmp_path / "m.gpkg", "--images", query, "--technique", "sift"], "There is no technique"),
-        (["map", "build", tmp_path / "m.gpkg", "--images", query, "--param", "gt"], "write KEY=VALUE"),
+        (["map", "build", tmp_path / "m.gpkg", "--images", query, "--param", "gt"], "must be KEY=VALUE"),
         (["map", "build", tmp_path / "m.gpkg", "--images", query, "--positions", wrong_row], "line 2: lat is `91`"),
         (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row, "--techniques", ","], "is empty"),
         (["eval", "--query", query, "--ref", query, "--ground-truth", wrong_row], "lacks the column `query_file`"),

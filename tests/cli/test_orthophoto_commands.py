@@ -61,7 +61,7 @@ def test_map_build_of_an_orthophoto_finds_a_flight_over_it(tmp_path, ground, tra
 @pytest.mark.parametrize(
     ("flags", "code", "said"),
     [
-        ([], 2, "Give either --images (pictures of a flight) or --orthophoto"),
+        ([], 2, "Pass either --images (pictures of a flight) or --orthophoto"),
         (["--images", "x", "--footprint-m", "80"], 2, "--footprint-m applies only to --orthophoto: leave it out."),
         (["--orthophoto", "GROUND"], 2, "needs --footprint-m"),
         (
@@ -83,9 +83,12 @@ def test_map_build_refuses_a_wrong_request(tmp_path, ground, capsys, flags, code
     [
         (["--track", "t"], "--track applies only to --orthophoto"),
         (["--orthophoto", "GROUND"], "needs --track"),
-        (["--orthophoto", "GROUND", "--track", "TRACK"], "give --height-m"),
-        (["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "0"], "--height-m is 0: give 1 to 10000."),
-        (["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "900"], "none was written"),
+        (["--orthophoto", "GROUND", "--track", "TRACK"], "pass --height-m"),
+        (
+            ["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "0"],
+            "--height-m is 0, but must be between 1 and 10000.",
+        ),
+        (["--orthophoto", "GROUND", "--track", "TRACK", "--height-m", "900"], "no images were written"),
         (["--fov-deg", "66"], "--fov-deg applies only to --orthophoto"),
     ],
 )
