@@ -1,4 +1,4 @@
-"""The pictures of a page: found by their names in a log or a map, and scaled down to fit into one file."""
+"""The pictures of a page: looked up by their names in a log or a map, and scaled down to fit into one file."""
 
 import re
 from base64 import b64encode
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
 _SIDES_PX = (480, 320, 240, 160, 112)  # longest sides of a small picture: the largest that fits is used
-_MIN_BYTES = 2500  # size of the data: address of a picture with the smallest side
-_MAX_HEADING_ERROR_DEG = 45.0  # between the tops of a picture and its place: more is a contradiction
-_CUT_PX = 512  # side of a picture cut from an orthophoto, as in the map build
+_MIN_BYTES = 2500  # typical size of the data: URL of a picture with the smallest side
+_MAX_HEADING_ERROR_DEG = 45.0  # maximum angle between the tops of a picture and of its place
+_CUT_PX = 512  # side of a picture cut from an orthophoto, as in `map build`
 
 _FRAME_NAME = re.compile(r"frame \d{6} t=(\d+\.\d+) s")  # the names that `VideoSource` gives
 
@@ -49,7 +49,7 @@ class Album:
 
     def __init__(self, *finders: Finder) -> None:
         self._finders = finders
-        self._kept: dict[str, bytes] = {}
+        self._copies: dict[str, bytes] = {}
 
     def __bool__(self) -> bool:
         """Return True if the album has any finder."""
@@ -57,10 +57,10 @@ class Album:
 
     def find_image(self, name: str) -> Image | None:
         """Return the picture `name`, uint8 (H, W[, 3]); None if no such picture can be read."""
-        if name in self._kept:
+        if name in self._copies:
             from edgevpr.frames.images import decode_jpeg
 
-            return decode_jpeg(self._kept[name])
+            return decode_jpeg(self._copies[name])
         picture = self._find(name)
         return picture.image if picture else None
 
@@ -71,8 +71,8 @@ class Album:
             return None
         from edgevpr.frames.images import encode_small_jpeg
 
-        # Photographs are slow to decode: keep a small copy, so that the file is not read again.
-        self._kept[place.source_image] = encode_small_jpeg(picture.image, _SIDES_PX[0])
+        # Photographs are slow to decode, so a small copy replaces the second read of the file.
+        self._copies[place.source_image] = encode_small_jpeg(picture.image, _SIDES_PX[0])
         tag = picture.tag() if lens and picture.tag else None
         if lens is None or tag is None:
             return picture
@@ -83,19 +83,19 @@ class Album:
         return AlbumPicture(level.image, level.mask)
 
     def align_picture(self, place: Place, lens: "Lens | None") -> AlbumPicture | None:
-        """Return the picture of a place in the orientation of its pose: levelled, with its top to the north, as in a
-        map built with the `lens`, or unchanged. None if it is not found or its heading contradicts both."""
+        """Return the picture of a place in the orientation of its pose: either levelled and north-up (as in a map built
+        with the `lens`) or as taken. None if it is not found or its heading contradicts both."""
         picture = self._find(place.source_image)
         tag = picture.tag() if picture and picture.tag else None
         if not tag or tag.heading_deg is None or not place.pose:
             return self.level_picture(place, lens)
-        is_raw, is_level = (
+        is_as_taken, is_level = (
             abs(wrap_deg(place.pose.up_deg - up_deg)) < _MAX_HEADING_ERROR_DEG
             for up_deg in (tag.heading_deg + (lens.up_deg if lens else 0.0), 0.0)
         )
         if lens and is_level:
             return self.level_picture(place, lens)
-        return picture if is_raw else None
+        return picture if is_as_taken else None
 
     def _find(self, name: str) -> AlbumPicture | None:
         return next((picture for finder in self._finders if (picture := finder(name))), None)
@@ -111,7 +111,7 @@ def _read_picture(path: Path, tag: Callable[[], GeoTag | None] | None = None) ->
 
 
 def _find_in_folder(folder: Path, name: str) -> AlbumPicture | None:
-    # A log from somebody else may name any file on this machine: show only files in the folder.
+    # A log from someone else may name any file on this machine, so show only files in the folder.
     path = folder / Path(name).name
     return _read_picture(path, lambda: _read_folder_tags(folder).get(path))
 
@@ -136,7 +136,7 @@ class _VideoFinder:
         table = find_track(video)
         self._track = read_track(table) if table else None
         self._open = partial(open_source, str(video), live=False)
-        self._source, self._passed = self._open(), ""
+        self._source, self._last_name = self._open(), ""
 
     def __call__(self, name: str) -> AlbumPicture | None:
         from edgevpr.frames.source import read_to_end
@@ -144,11 +144,11 @@ class _VideoFinder:
         match = _FRAME_NAME.fullmatch(name)
         if not match:
             return None
-        if name <= self._passed:  # names sort in the order of the video, which can only be read forwards
+        if name <= self._last_name:  # names sort in the order of the video, which can only be read forwards
             self._source.close()
-            self._source, self._passed = self._open(), ""
+            self._source, self._last_name = self._open(), ""
         for frame in filter(None, read_to_end(self._source, lambda error: None)):
-            self._passed = frame.name
+            self._last_name = frame.name
             if frame.name >= name:
                 tag = partial(self._track.interpolate_tag, float(match[1])) if self._track else None
                 return AlbumPicture(frame.image, tag=tag) if frame.name == name else None
@@ -182,7 +182,7 @@ def make_album(sources: Sequence[str | Path], recorded: Mapping[str, Path] = Map
         return Album(*finders, _VideoFinder(Path(sources[0])))
     for folder in map(Path, sources):
         if not folder.is_dir():
-            raise UsageError(f"{folder} does not exist: give a folder of images, or a video.")
+            raise UsageError(f"{folder} does not exist: pass a folder of images, or a video.")
         finders.append(partial(_find_in_folder, folder.resolve()))
     return Album(*finders)
 
@@ -198,27 +198,27 @@ def make_map_album(sources: Sequence[str | Path], places: Sequence[Place]) -> Al
 def embed_pictures(
     steps: Sequence[Sequence[Key]], albums: Mapping[str, Album], budget_bytes: float
 ) -> tuple[dict[Key, str], str]:
-    """Load the pictures of all steps as data: addresses of at most `budget_bytes` together. Each is as large as its
-    share of the budget allows; if that is too little, only every second, third, ... step has pictures. Returns the
-    addresses by key, and a sentence on what is left out ("": nothing)."""
+    """Load the pictures of all steps as data: URLs of at most `budget_bytes` together. Each is as large as its part
+    of the budget allows; if that is too little, only every second, third, ... step has pictures. Returns the URLs by
+    key, and a sentence on what is left out ("": nothing)."""
     from edgevpr.frames.images import encode_small_webp
 
     keys = list(dict.fromkeys(key for step in steps for key in step if albums[key[0]]))
     every = max(1, -(-len(keys) * _MIN_BYTES // max(1, int(budget_bytes))))
     keys = list(dict.fromkeys(key for step in steps[::every] for key in step if albums[key[0]]))
     pictures: dict[Key, str] = {}
-    some_left_out = every > 1
+    is_incomplete = every > 1
     for number, (album, name) in enumerate(progress(keys, len(keys), "pictures")):
         image = albums[album].find_image(name)
         if image is None:
             continue
         for side_px in _SIDES_PX:
-            address = f"data:image/webp;base64,{b64encode(encode_small_webp(image, side_px)).decode()}"
-            if len(address) <= budget_bytes / (len(keys) - number):
+            url = f"data:image/webp;base64,{b64encode(encode_small_webp(image, side_px)).decode()}"
+            if len(url) <= budget_bytes / (len(keys) - number):
                 break
-        if len(address) <= budget_bytes:
-            pictures[album, name] = address
-            budget_bytes -= len(address)
+        if len(url) <= budget_bytes:
+            pictures[album, name] = url
+            budget_bytes -= len(url)
         else:
-            some_left_out = True
-    return pictures, "Only some steps have pictures: the page would be too large with more." * some_left_out
+            is_incomplete = True
+    return pictures, "Only some steps have pictures: the page would be too large with more." * is_incomplete

@@ -1,5 +1,5 @@
 """Compares a flight with its replay, for `edgevpr replay`: the lines of both logs, and byte by byte the packets sent on
-the link. In the names of this module, "then" is the flight and "now" its replay."""
+the link."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -30,18 +30,18 @@ class LineComparison:
     program: Changes = field(default_factory=dict)
 
 
-def compare_lines(then: Iterable[Line], now: Iterable[Line]) -> LineComparison:
+def compare_lines(flown: Iterable[Line], replayed: Iterable[Line]) -> LineComparison:
     """Compare a flight's log with that of its replay, line by line."""
-    then, now, result = list(then), list(now), LineComparison(after=max(0, len(then) - len(now)))
-    for before, after in zip(then, now, strict=False):
-        fields = dict(_compare_values(before, after))
-        if before.get("kind") == "start":
+    flown, replayed, result = list(flown), list(replayed), LineComparison(after=max(0, len(flown) - len(replayed)))
+    for flown_line, replayed_line in zip(flown, replayed, strict=False):
+        fields = dict(_compare_values(flown_line, replayed_line))
+        if flown_line.get("kind") == "start":
             result.program = {name: fields.pop(name) for name in [*fields] if name.partition(".")[0] in _PROGRAM_FIELDS}
         if fields:
-            result.others.append({**_identify_line(before), "fields": fields})
+            result.others.append({**_identify_line(flown_line), "fields": fields})
         else:
             result.alike += 1
-    result.others += [{**_identify_line(line), "only_in": "replay"} for line in now[len(then) :]]
+    result.others += [{**_identify_line(line), "only_in": "replay"} for line in replayed[len(flown) :]]
     return result
 
 
@@ -49,12 +49,12 @@ def _identify_line(line: Line) -> Line:
     return {"kind": line.get("kind"), "t_mono_s": line.get("t_mono_s") or 0.0, "query": line.get("query")}
 
 
-def _compare_values(then: Any, now: Any, name: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
-    if isinstance(then, dict) and isinstance(now, dict):
-        for key in then | now:
-            yield from _compare_values(then.get(key), now.get(key), f"{name}.{key}" if name else key)
-    elif then != now or type(then) is not type(now):
-        yield name, (then, now)
+def _compare_values(flown: Any, replayed: Any, name: str = "") -> Iterator[tuple[str, tuple[Any, Any]]]:
+    if isinstance(flown, dict) and isinstance(replayed, dict):
+        for key in flown | replayed:
+            yield from _compare_values(flown.get(key), replayed.get(key), f"{name}.{key}" if name else key)
+    elif flown != replayed or type(flown) is not type(replayed):
+        yield name, (flown, replayed)
 
 
 @dataclass(slots=True)
@@ -65,16 +65,16 @@ class PacketComparison:
     alike: int = 0
     others: list[str] = field(default_factory=list)
 
-    def compare(self, t_s: float, then: bytes | None, now: bytes | None) -> None:
+    def compare(self, t_s: float, flown: bytes | None, replayed: bytes | None) -> None:
         """Compare two packets (None: none was sent) at the time `t_s` on the flight's clock."""
-        if then and now and _strip_sequence(then) == _strip_sequence(now):
+        if flown and replayed and _strip_sequence(flown) == _strip_sequence(replayed):
             self.alike += 1
-        elif then or now:
-            self.others.append(f"{t_s:.3f} s: sent {_describe_packet(then)}, now {_describe_packet(now)}")
+        elif flown or replayed:
+            self.others.append(f"{t_s:.3f} s: flight {_describe_packet(flown)}, replay {_describe_packet(replayed)}")
 
 
 def _describe_packet(packet: bytes | None) -> str:
-    return str(mavlink.MAVLink(None).parse_buffer(packet)[0]) if packet else "nothing"
+    return str(mavlink.MAVLink(None).parse_buffer(packet)[0]) if packet else "no packet"
 
 
 def _strip_sequence(packet: bytes) -> bytes:

@@ -14,10 +14,10 @@ from edgevpr.runtime.flight.flightlog import select_last_flight
 _log = logging.getLogger(__name__)
 
 Point = tuple[float, float]  # latitude and longitude, degrees
-_MAX_REPORT_AGE_S = 1.0  # an autopilot report is used only for frames at most this far away in time
-_REASON_FIELDS = ("note", "why")  # fields that hold a reason: the first present is shown
+_MAX_REPORT_AGE_S = 1.0  # maximum time between a frame and the autopilot report used for it
+_REASON_FIELDS = ("note", "why")  # fields that hold a reason: the first one present is shown
 _TEXT_FIELDS = ("said", "state", "problem")  # fields that hold a text for people: shown if there is no reason
-_MAX_NUMBER = 1e15  # larger numbers are damage; the comparison also excludes NaN and integers too large for a float
+_MAX_NUMBER = 1e15  # larger numbers are damaged; comparing also excludes NaN and integers too large for a float
 
 
 class FixOutcome(Enum):
@@ -94,7 +94,7 @@ class LoggedFlight:
 
 
 def read_flight(path: str | Path) -> LoggedFlight:
-    """Read the last flight in the log `path`, and warn if any of its files are missing. Its first timestamp is taken as
+    """Read the last flight in the log `path`, and warn if any of its files are missing. Its first timestamp is
     its start. Raises UsageError if the file does not exist, and EdgevprError if it has no line of a flight (see
     `flightlog.select_last_flight`)."""
     lines = select_last_flight(path)
@@ -138,7 +138,7 @@ def _read_query(line: dict[str, Any], t_s: float) -> LoggedQuery:
     gps_position = _locate_gps(line, t_frame_s)
     has_link = _is_fresh(get_number(line, "vehicle", "t_received_s"), t_frame_s)
     autopilot_position = get_point(line, "vehicle") if has_link else None
-    # The confidence by which a match was judged: its own or, if higher, that of the flight so far.
+    # The confidence that a match was judged by: its own or, if higher, that given the flight so far.
     confidences = get_number(line, "confidence"), get_number(line, "track", "confidence")
     place, fix = get_number(line, "place"), get_value(line, "fix")
     has_gps = get_value(line, "vehicle", "has_gps") is True
@@ -197,11 +197,11 @@ def _read_text(line: dict[str, Any]) -> str:
     reasons = [str(reason) for key in _REASON_FIELDS if (reason := read_reason(line.get(key)))]
     text = next(iter([*reasons, *(value for key in _TEXT_FIELDS if (value := get_text(line, key)))]), None)
     match line:
-        case {"from": dict() as before, "to": dict() as after}:  # a change by the governor
-            changed = [f"{key} {before.get(key)} to {now}" for key, now in after.items() if before.get(key) != now]
+        case {"from": dict() as old, "to": dict() as new}:  # a change by the governor
+            changed = [f"{key} {old.get(key)} to {value}" for key, value in new.items() if old.get(key) != value]
             return f"{', '.join(changed)}: {text}"
     hidden = {"kind", "time", "t_mono_s"}
-    return text or ", ".join(f"{key} {field_value}" for key, field_value in line.items() if key not in hidden)
+    return text or ", ".join(f"{key} {value}" for key, value in line.items() if key not in hidden)
 
 
 def get_value(record: Any, *keys: str) -> Any:

@@ -19,22 +19,22 @@ from edgevpr.review.webpage import UNKNOWN, Layer, Section, Step, format_number,
 if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
-MAX_QUERIES = 100  # images of a map that are matched against the places elsewhere; each takes half a second
+MAX_QUERIES = 100  # images of a map that are matched against the other places; each takes half a second
 _QUALITY_CLASSES = {"low": 0.4, "fair": 0.6, "good": 0.8, "best": 1.01}  # upper limits of the classes
 _MAX_HARD_CONFIDENCE = 0.5  # maximum mean confidence of a place that is hard to recognise
 _CELLS_PER_FOOTPRINT = 24  # resolution of the coverage grid
 _MAX_CELLS = 4_000_000  # of the coverage grid
-_COVERED_SHARE = 0.75  # of a footprint: the short side of a 4:3 picture
+_COVERED_FOOTPRINTS = 0.75  # the short side of a 4:3 picture
 _MIN_GAP_FOOTPRINTS = 0.15  # narrower gaps are ignored
 _MAX_GAP_FOOTPRINTS = 1.0  # wider gaps that are open to one side are outside the map
 _NOTES = (
     "Coverage gaps are between pictures that do not touch: each picture is assumed to show at least a square of three "
     "quarters of its long side.",
-    "A GPS tag is inconsistent if it is four times farther from its picture than is usual in this map.",
+    "A GPS tag is inconsistent if it is four times as far from its picture as usual in this map.",
 )
 _NO_PICTURES = (
-    "Look-alikes are searched only with --map-images, in a `cohog` map whose places were built from these images with "
-    "the lens given by --config."
+    "Look-alikes are only searched for with --map-images, in a `cohog` map whose places were built from these images "
+    "with the lens given by --config."
 )
 
 
@@ -113,7 +113,7 @@ def _make_steps(
             "without a position": not position,
         }
         sd_m = float(np.sqrt(sum(pose.covariance_m2[::2]) / 2)) if pose else None
-        texts = [f"quality {place.quality:.2f}: usable share of its image"]
+        texts = [f"quality {place.quality:.2f}: usable fraction of its image"]
         texts += (
             [f"position accurate to {format_number(sd_m, 'm')}; its image shows {pose.footprint_m:.3g} m of ground"]
             if pose
@@ -166,22 +166,22 @@ def find_gaps(ground: Sequence[Place]) -> tuple[list[list[Point]], float, float]
     from edgevpr.frames.images import cv2
 
     origin = to_point(posed[0][0])
-    middles = np.array([offset_m(*origin, *to_point(place)) for place, _ in posed])
+    centres_m = np.array([offset_m(*origin, *to_point(place)) for place, _ in posed])
     footprint_m = float(np.median([pose.footprint_m for _, pose in posed]))
-    low, high = middles.min(axis=0) - 2 * footprint_m, middles.max(axis=0) + 2 * footprint_m
+    low, high = centres_m.min(axis=0) - 2 * footprint_m, centres_m.max(axis=0) + 2 * footprint_m
     cell_m = max(footprint_m / _CELLS_PER_FOOTPRINT, float(np.sqrt(np.prod(high - low) / _MAX_CELLS)))
     covered = np.zeros(np.ceil((high - low) / cell_m).astype(int)[::-1], np.uint8)
-    square = np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]]) * _COVERED_SHARE / 2
-    for middle, (_, pose) in zip(middles, posed, strict=True):
-        corners = (middle - low)[:, None] + picture_axes(pose.up_deg) @ square * pose.footprint_m
+    square = np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]]) * _COVERED_FOOTPRINTS / 2
+    for centre_m, (_, pose) in zip(centres_m, posed, strict=True):
+        corners = (centre_m - low)[:, None] + picture_axes(pose.up_deg) @ square * pose.footprint_m
         cv2.fillConvexPoly(covered, np.rint(corners.T / cell_m).astype(np.int32), (1,))
     opening_kernel, closing_kernel = (
-        cv2.getStructuringElement(cv2.MORPH_ELLIPSE, [max(1, round(share * footprint_m / cell_m))] * 2)
-        for share in (_MIN_GAP_FOOTPRINTS, _MAX_GAP_FOOTPRINTS)
+        cv2.getStructuringElement(cv2.MORPH_ELLIPSE, [max(1, round(footprints * footprint_m / cell_m))] * 2)
+        for footprints in (_MIN_GAP_FOOTPRINTS, _MAX_GAP_FOOTPRINTS)
     )
     closed = cv2.morphologyEx(covered, cv2.MORPH_CLOSE, closing_kernel)
     contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(closed, contours, -1, (1,), cv2.FILLED)  # enclosed gaps count however wide they are
+    cv2.drawContours(closed, contours, -1, (1,), cv2.FILLED)  # enclosed gaps of any width count
     uncovered = cv2.morphologyEx(closed & (1 - covered), cv2.MORPH_OPEN, opening_kernel)
     outlines, _ = cv2.findContours(uncovered, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     gaps = [[offset_position(*origin, *(low + cell_m * point)) for point in outline[:, 0]] for outline in outlines]

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from edgevpr.frames.level import Lens
 
 _MAX_REMARKS = 200
-_MAX_GPS_ERROR_M = 15.0  # smaller distances are receiver error and not dangerous
+_MAX_GPS_ERROR_M = 15.0  # smaller distances are within the receiver's error, and not dangerous
 _FIX_COLOURS = {
     FixOutcome.ACCEPTED: "taken",
     FixOutcome.UNANSWERED: "unanswered",
@@ -52,7 +52,7 @@ _HEAD_FIELDS = (("map", "map"), ("technique", "technique"), ("board", "board"), 
 def make_flight_page(
     flight: LoggedFlight, places: Sequence[Place], frames: Album, references: Album, no_places: str = ""
 ) -> str:
-    """Return the whole page. `places`: the map's places. `frames`: album of the flight's pictures; `references`: album
+    """Return the page. `places`: the map's places. `frames`: album of the flight's pictures; `references`: album
     of the map's. `no_places`: a sentence on why `places` is empty."""
     queries = flight.queries
     time = get_text(flight.start, "time") or next((get_text(query.line, "time") for query in queries), None)
@@ -140,7 +140,7 @@ def _format_place(query: LoggedQuery) -> str:
         return "no place found"
     score = format_number(get_number(query.line, "score"))
     confidence = "" if query.confidence is None else f", confidence {format_probability(query.confidence)}"
-    return f"place {query.place} ({query.reference_image or 'without a name'}), score {score}{confidence}"
+    return f"place {query.place} ({query.reference_image or 'unnamed'}), score {score}{confidence}"
 
 
 def _format_position(query: LoggedQuery) -> str:
@@ -165,20 +165,20 @@ def _read_lens(start: Mapping[str, Any]) -> "Lens | None":
 def _compute_figures(flight: LoggedFlight) -> dict[str, str]:
     """Return the figures of a flight by name."""
     queries, accepted = flight.queries, [query for query in flight.queries if query.accepted]
-    share = f" ({len(accepted) / len(queries):.0%})" if queries else ""
+    percentage = f" ({len(accepted) / len(queries):.0%})" if queries else ""
     off_m = [query.off_m for query in accepted if query.off_m is not None]
     accuracies_m = [query.accuracy_m for query in accepted if query.accuracy_m is not None]
     outcomes = Counter(query.fix.outcome for query in queries if query.fix)
     between = f" and {len(flight.between)} between matches" if flight.between else ""
-    ends_s = [0.0, *(query.t_s for query in accepted), flight.span_s]
+    match_times_s = [0.0, *(query.t_s for query in accepted), flight.span_s]
     return {
         "queries": str(len(queries)),
-        "accepted": f"{len(accepted)}{share}",
+        "accepted": f"{len(accepted)}{percentage}",
         "accuracy, median": format_number(median(accuracies_m) if accuracies_m else None, "m"),
         "from GPS, median": format_number(median(off_m) if off_m else None, "m"),
         "from GPS, maximum": format_number(max(off_m, default=None), "m"),
-        "frames not usable": str(flight.unusable) if flight.unusable else UNKNOWN,
-        "longest without a match": format_number(max(after_s - t_s for t_s, after_s in pairwise(ends_s)), "s"),
+        "unusable frames": str(flight.unusable) if flight.unusable else UNKNOWN,
+        "longest time without a match": format_number(max(end - start for start, end in pairwise(match_times_s)), "s"),
         "fixes sent": f"{sum(outcomes[outcome] for outcome in SENT_OUTCOMES)}{between}",
         "fixes accepted": str(outcomes[FixOutcome.ACCEPTED]),
         "charge": format_number(_find_highest(flight, "totals", "used_mah"), "mAh"),
@@ -206,15 +206,15 @@ def _list_warnings(flight: LoggedFlight, has_map_places: bool, no_places: str) -
         ),
         (not no_places, no_places),
     ]
-    return [sentence for is_known, sentence in warnings if not is_known]
+    return [sentence for is_fine, sentence in warnings if not is_fine]
 
 
 def _make_charts(flight: LoggedFlight) -> list[Chart]:
-    def line(name: str, colour: str, factor: float, *keys: str) -> tuple[str, str, Form, list[tuple[float, float]]]:
+    def make_line(name: str, colour: str, scale: float, *keys: str) -> tuple[str, str, Form, list[tuple[float, float]]]:
         values = [(query.t_s, get_number(query.line, *keys)) for query in flight.queries]
-        return name, colour, "line", [(t_s, factor * value) for t_s, value in values if value is not None]
+        return name, colour, "line", [(t_s, scale * value) for t_s, value in values if value is not None]
 
-    def dots(
+    def make_dots(
         name: str, colour: str, values: Sequence[float | None]
     ) -> tuple[str, str, Form, list[tuple[float, float]]]:
         pairs = zip(flight.queries, values, strict=True)
@@ -223,22 +223,22 @@ def _make_charts(flight: LoggedFlight) -> list[Chart]:
     queries = flight.queries
     return [
         Chart("Confidence", "", [
-            dots("accepted", "accepted", [query.confidence if query.accepted else None for query in queries]),
-            dots("refused", "refused", [None if query.accepted else query.confidence for query in queries]),
+            make_dots("accepted", "accepted", [query.confidence if query.accepted else None for query in queries]),
+            make_dots("refused", "refused", [None if query.accepted else query.confidence for query in queries]),
         ]),
         Chart("Position", "m", [
-            dots("from GPS", "gps", [query.off_m for query in queries]),
-            dots("accuracy, 1 sigma", "accepted", [query.accuracy_m for query in queries]),
+            make_dots("from GPS", "gps", [query.off_m for query in queries]),
+            make_dots("accuracy, 1 sigma", "accepted", [query.accuracy_m for query in queries]),
         ]),
         Chart("Time per query", "ms", [
-            line("encode", "gps", 1e3, "costs", "t_encode_s"),
-            line("match", "accepted", 1e3, "costs", "t_match_s"),
-            line("CPU", "taken", 1e3, "costs", "cpu_s"),
+            make_line("encode", "gps", 1e3, "costs", "t_encode_s"),
+            make_line("match", "accepted", 1e3, "costs", "t_match_s"),
+            make_line("CPU", "taken", 1e3, "costs", "cpu_s"),
         ]),
-        Chart("RAM", "MB", [line("", "accepted", 1, "costs", "rss_mb")]),
-        Chart("Charge", "mAh", [line("", "accepted", 1, "totals", "used_mah")]),
-        Chart("Temperature", "°C", [line("", "refused", 1, "board", "temperature_c")]),
-        Chart("Age of the newest picture", "ms", [line("", "accepted", 1e3, "totals", "latency_s")]),
+        Chart("RAM", "MB", [make_line("", "accepted", 1, "costs", "rss_mb")]),
+        Chart("Charge", "mAh", [make_line("", "accepted", 1, "totals", "used_mah")]),
+        Chart("Temperature", "°C", [make_line("", "refused", 1, "board", "temperature_c")]),
+        Chart("Age of the newest picture", "ms", [make_line("", "accepted", 1e3, "totals", "latency_s")]),
     ]  # fmt: skip
 
 

@@ -51,7 +51,7 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
     notes = read_tape(folder / TAPE)
     note = next(notes, None)
     if not (note and note[0] == "flight" and isinstance(note[1], dict)):
-        raise EdgevprError(f"{folder / TAPE} is not a flight tape or is cut off in its first line: nothing to replay.")
+        raise EdgevprError(f"{folder / TAPE} is not a flight tape, or ends within its first line: nothing to replay.")
     header = note[1]
     if header["config"].get("mavlink", {}).get("ground"):
         raise UsageError(
@@ -61,7 +61,7 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
     config = build(Config, _drop_unknown_settings(header["config"]), str(folder))
     place_map = place_map or config.map
     if place_map and not Path(place_map).exists():
-        raise UsageError(f"{place_map}, the map of the flight, does not exist: give its path with --map.")
+        raise UsageError(f"{place_map}, the map of the flight, does not exist: pass its path with --map.")
     playback = Playback(notes)
     recorded = build(Board, header["board"], "the board of the flight")
     board = resolve_board(recorded, config.source, config.memory)
@@ -99,8 +99,8 @@ def replay(log: str | Path, place_map: str | None = None) -> ReplayResult:
 
 @contextmanager
 def _silence_log() -> Iterator[None]:
-    """Context manager that suppresses the messages of the replayed flight, which were printed in the flight, except
-    errors; with --debug it suppresses none."""
+    """Context manager that suppresses the messages of the replayed flight except errors, because they were printed in
+    the flight; with --debug it suppresses none."""
     logging.disable(logging.NOTSET if _log.isEnabledFor(logging.DEBUG) else logging.WARNING)
     try:
         yield
@@ -121,11 +121,11 @@ def _drop_unknown_settings(config: dict[str, Any], prefix: str = "") -> dict[str
     """Return the settings of a recorded flight without those that this version no longer has, with a warning."""
     kept, known = {}, {key.name for key in list_keys()}
     for name, value in config.items():
-        dotted = f"{prefix}{name}"
-        if dotted in known:
+        key_name = f"{prefix}{name}"
+        if key_name in known:
             kept[name] = value
         elif isinstance(value, dict):
-            kept |= {name: section} if (section := _drop_unknown_settings(value, f"{dotted}.")) else {}
+            kept |= {name: section} if (section := _drop_unknown_settings(value, f"{key_name}.")) else {}
         elif value not in (None, False):
-            _log.warning("the flight had the setting `%s`, which this version of edgevpr does not recognise", dotted)
+            _log.warning("the flight had the setting `%s`, which this version of edgevpr does not recognise", key_name)
     return kept

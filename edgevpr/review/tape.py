@@ -44,22 +44,22 @@ class ReplayedDriver:
 
     def __init__(self, playback: "Playback", _: LinkAddress, conversation: Conversation, turns: Turns) -> None:
         self._playback, self._conversation, self._turns = playback, conversation, turns
-        self._leaving: deque[FixTransmission] = deque()
+        self._outgoing: deque[FixTransmission] = deque()
 
     def start(self) -> None:
-        """From now on let the playback perform the link's turns."""
+        """Let the playback perform the link's turns from now on."""
         self._playback.perform_turn = self._perform
 
     def state(self) -> PortState:
         """Return the state that the port had in the flight."""
-        connected, trouble, *_ = self._playback.read("port", lambda: (False, None))  # an older tape has a third value
+        connected, trouble, *_ = self._playback.read("port", lambda: (False, None))  # older tapes have a third value
         return connected, trouble
 
     def wake(self) -> None:
         """Do nothing: the tape determines when packets are sent."""
 
     def close(self) -> None:
-        """Do nothing: everything that closing does is on the tape."""
+        """Do nothing: the steps of closing are on the tape."""
 
     def _perform(self, t_s: float, steps: list[Note]) -> None:
         """Repeat the `steps` of a turn at the time `t_s`."""
@@ -81,22 +81,22 @@ class ReplayedDriver:
                     conversation.handle(b64decode(data), now_s, tuple(sender) if sender else None)
                 except Exception:  # as in the flight, where the link was lost
                     _log.debug("the link failed", exc_info=True)
-            case ["said", then]:
+            case ["said", flown]:
                 packet, transmission = conversation.next_packet() or (None, None)
-                self._leaving += [transmission] if transmission else []
-                self._playback.packets.compare(now_s, b64decode(then) if then else None, packet)
+                self._outgoing += [transmission] if transmission else []
+                self._playback.packets.compare(now_s, b64decode(flown) if flown else None, packet)
             case ["departed", count]:
-                departed = [self._leaving.popleft() for _ in range(min(count, len(self._leaving)))]
+                departed = [self._outgoing.popleft() for _ in range(min(count, len(self._outgoing)))]
                 for transmission in departed:
                     transmission.settle(True)
                 conversation.count_sent_fixes(departed)
             case ["lost" | "closed" as event, *count]:
-                for transmission in self._leaving:
+                for transmission in self._outgoing:
                     transmission.settle(False, LOST)
-                self._leaving.clear()
+                self._outgoing.clear()
                 conversation.handle_port_loss(*count) if event == "lost" else conversation.end()
             case _:
-                raise EdgevprError(f"The tape has an unknown link event, {step}: replay it with the version that flew.")
+                raise EdgevprError(f"The tape has an unknown link event, {step}: use the version that recorded it.")
 
 
 class ReplayedSigning(Signing):
@@ -152,7 +152,7 @@ class Playback(Tape):
         self.guessed = 0
         self.t_s = 0.0  # time of the newest turn or clock reading
         self._notes, self._index = list(notes), 0
-        self._known: dict[str, Any] = {}
+        self._newest_values: dict[str, Any] = {}
         self._is_stopping = False
 
     def read(self, kind: str, measure: Callable[[], Any]) -> Any:
@@ -161,7 +161,7 @@ class Playback(Tape):
         if self._peek_kind() == "stopped":
             self._index += 1
             self._is_stopping = True
-        # A flight that was stopped may have read more values while cleaning up: these are returned first.
+        # A stopped flight may have read more values while it cleaned up: they are returned first.
         if self._is_stopping and self._peek_kind() != kind:
             self._is_stopping = False
             raise StopNow
@@ -175,7 +175,7 @@ class Playback(Tape):
         self._index += 1
         if head == "stopped":
             raise StopNow
-        value = self._known[kind] = values[0]
+        value = self._newest_values[kind] = values[0]
         if _is_time(kind):
             self.t_s = max(self.t_s, value)
         return value
@@ -200,8 +200,8 @@ class Playback(Tape):
     def _has_answer(self, kind: str) -> bool:
         """Return True if a value of `kind`, or the end of the flight, comes before the next frame. Return False for a
         clock, because no notes are skipped to read one."""
-        until = (kind, "stopped", "frame")
-        first = next((note[0] for note in islice(self._notes, self._index, None) if note[0] in until), None)
+        end_kinds = (kind, "stopped", "frame")
+        first = next((note[0] for note in islice(self._notes, self._index, None) if note[0] in end_kinds), None)
         return first in (kind, "stopped") and kind not in _CLOCKS
 
     def _guess(self, kind: str, measure: Callable[[], Any]) -> Any:
@@ -210,8 +210,8 @@ class Playback(Tape):
         if _is_time(kind):
             return self.t_s
         if kind in _CLOCKS:
-            return self._known.get(kind, 0.0)
-        return self._known[kind] if kind in self._known else measure()
+            return self._newest_values.get(kind, 0.0)
+        return self._newest_values[kind] if kind in self._newest_values else measure()
 
 
 def _is_time(kind: str) -> bool:

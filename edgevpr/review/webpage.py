@@ -27,14 +27,14 @@ Form = Literal["dots", "line", "area"]
 
 UNKNOWN = "–"
 MAX_PAGE_BYTES = 15_000_000
-_MAX_TEXT_BYTES = 3_000_000  # texts of all steps together
-_SPARE_BYTES = 400_000  # for style, script and the HTML around them
-_MAX_PLACES = 6000  # of more places, every second, third, ... is drawn
+_MAX_TEXT_BYTES = 3_000_000  # limit for the texts of all steps together
+_SPARE_BYTES = 400_000  # reserved for style, script and the HTML around them
+_MAX_PLACES = 6000  # if there are more places, only every second, third, ... is drawn
 _MARGIN_M = 30.0  # margin around the drawing if no footprint is known
 
 _NO_PICTURE = (
     "No image from --map-images is drawn on the ground: none belongs to this map, or their headings contradict it. "
-    "Give the images that the map was built from, with their positions.csv, and the lens used in the build."
+    "Pass the images that the map was built from, with their positions.csv, and the lens used in the build."
 )
 _NO_IMAGES = "With --map-images the page shows the map's own pictures under the drawing."
 
@@ -45,7 +45,7 @@ _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">
 <meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="light dark">
 <link rel="icon" href="data:,"><title>edgevpr</title><style>{style}</style></head>
-<body><noscript>This page is drawn by its own script: allow scripts to see it.</noscript>
+<body><noscript>A script draws this page: allow scripts to see it.</noscript>
 <script type="application/json" id="page">{data}</script><script>{script}</script></body></html>
 """
 
@@ -80,7 +80,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """A chart over time of values in `unit` ("": shares, up to 1). `series`: for each, the name in the legend, the
+    """A chart over time of values in `unit` ("": fractions, 0..1). `series`: for each, the name in the legend, the
     colour, the form ("dots" are not joined) and the points (t_s, value)."""
 
     title: str
@@ -98,7 +98,7 @@ class Section:
     folded: str = ""
 
 
-def read_ground(path: str | Path) -> list[Place]:
+def read_located_places(path: str | Path) -> list[Place]:
     """Read the places with a position from the map file `path`. Raises EdgevprError for a map that is unreadable or
     damaged."""
     with PlaceMap.open(path) as place_map:
@@ -120,7 +120,7 @@ def make_layer(steps: Sequence[Step], name: str, colour: str, form: Form = "dots
 def make_page(
     head: Mapping[str, Any],
     steps: Sequence[Step],
-    ground: Sequence[Place],
+    places: Sequence[Place],
     layers: Sequence[Layer],
     albums: Mapping[str, Album],
     *,
@@ -129,29 +129,29 @@ def make_page(
     charts: Sequence[Chart] = (),
     sections: Sequence[Section] = (),
 ) -> str:
-    """Return a whole page of at most `MAX_PAGE_BYTES`. `head`: its title, texts below it (`known`), `figures` by name,
-    `warnings`, and the length of the time axis `span_s` (None: steps have no times). `ground`: places drawn below the
+    """Return a page of at most `MAX_PAGE_BYTES`. `head`: its title, texts below it (`known`), `figures` by name,
+    `warnings`, and the length of the time axis `span_s` (None: steps have no times). `places`: drawn below the
     `layers`. `albums`: albums by the names that steps use; "place" is the map's. `lens`: lens of the map's camera
     (None: unknown). `notes`: sentences below the drawing."""
-    notes, rest = list(notes), {**head, "charts": list(map(asdict, charts)), "sections": list(map(asdict, sections))}
-    rest["figures"] = [(name, text) for name, text in head["figures"].items() if text != UNKNOWN]
-    drawing = _Drawing(ground, layers, steps)
+    notes, figures = list(notes), [(name, text) for name, text in head["figures"].items() if text != UNKNOWN]
+    content = {**head, "charts": list(map(asdict, charts)), "sections": list(map(asdict, sections)), "figures": figures}
+    drawing = _Drawing(places, layers, steps)
     counts = Counter(group for step in steps for group in step.groups)
     colours = {group: colour for step in steps for group, colour in step.groups.items()}
-    rest["groups"] = [(group, colours[group], count) for group, count in counts.most_common()]
-    numbers = {group: number for number, (group, *_) in enumerate(rest["groups"])}
+    content["groups"] = [(group, colours[group], count) for group, count in counts.most_common()]
+    numbers = {group: number for number, (group, *_) in enumerate(content["groups"])}
     rows = [_serialise_step(step, drawing, numbers) for step in steps]
     if (every := -(-len(_dump(rows)) // _MAX_TEXT_BYTES)) > 1:
         steps, rows = steps[::every], rows[::every]
         notes.append(f"The page would be too large with all steps: one in {every} is shown.")
-    shown = ground[:: -(-len(ground) // _MAX_PLACES) or 1]
+    subset = places[:: -(-len(places) // _MAX_PLACES) or 1]
     keys = [[picture[:2] for picture in step.pictures] for step in steps]
-    keys += [[("ground", place.source_image)] for place in shown if place.pose]
-    levelled = _make_ground_album(albums["place"], shown, lens)
-    budget_bytes = MAX_PAGE_BYTES - _SPARE_BYTES - len(_dump([rest, rows, drawing.layers]))
-    pictures, left_out = embed_pictures(keys, {**albums, "ground": levelled}, budget_bytes)
+    keys += [[("ground", place.source_image)] for place in subset if place.pose]
+    ground_album = _make_ground_album(albums["place"], subset, lens)
+    budget_bytes = MAX_PAGE_BYTES - _SPARE_BYTES - len(_dump([content, rows, drawing.layers]))
+    pictures, left_out = embed_pictures(keys, {**albums, "ground": ground_album}, budget_bytes)
     notes += [left_out] if left_out else []
-    if any(place.pose for place in shown) and not any(album == "ground" for album, _ in pictures):
+    if any(place.pose for place in subset) and not any(album == "ground" for album, _ in pictures):
         notes.append(_NO_PICTURE if albums["place"] else _NO_IMAGES)
     indices = {key: index for index, key in enumerate(pictures)}
     for step, row in zip(steps, rows, strict=True):
@@ -159,10 +159,10 @@ def make_page(
             (caption, indices[album, name]) for album, name, caption in step.pictures if (album, name) in indices
         ]
     squares = [
-        (*square, indices.get(("ground", place.source_image))) for place in shown if (square := drawing.square(place))
+        (*square, indices.get(("ground", place.source_image))) for place in subset if (square := drawing.square(place))
     ]
     return _render({
-        **rest,
+        **content,
         "notes": notes,
         "steps": rows,
         "pictures": list(pictures.values()),
@@ -174,7 +174,7 @@ class _Drawing:
     """Converts positions to points of the drawing: metres right of and below the first position, with north up. `box`:
     bounding box (left, top, width, height) of the drawing; None: nothing has a position."""
 
-    def __init__(self, ground: Sequence[Place], layers: Sequence[Layer], steps: Sequence[Step]) -> None:
+    def __init__(self, places: Sequence[Place], layers: Sequence[Layer], steps: Sequence[Step]) -> None:
         layers = [layer for layer in layers if any(layer.polylines)]
         points = [point for layer in layers for line in layer.polylines for point in line]
         points += [point for step in steps for point in step.points.values()]
@@ -182,7 +182,7 @@ class _Drawing:
         self.box: list[float] | None = None
         if points:
             drawn = np.array([self.convert(point) for point in points])
-            margin_m = max((place.pose.footprint_m for place in ground if place.pose), default=_MARGIN_M)
+            margin_m = max((place.pose.footprint_m for place in places if place.pose), default=_MARGIN_M)
             low, high = drawn.min(axis=0) - margin_m, drawn.max(axis=0) + margin_m
             self.box = [round(edge_m, 2) for edge_m in (*low.tolist(), *(high - low).tolist())]
         self.layers = [

@@ -36,7 +36,7 @@ def made(flown, tmp_path_factory):
 
 def test_make_flight_page_of_a_real_flight_has_all_parts(made):
     data = data_of(made.read_text("utf-8"))
-    assert "longest without a match" in dict(data["figures"])
+    assert "longest time without a match" in dict(data["figures"])
     assert {"places", "accepted", "taken", "autopilot", "gps"} <= {each["colour"] for each in data["ground"]["layers"]}
     drawn = [chart["title"] for chart in data["charts"] if any(points for *_, points in chart["series"])]
     assert drawn[:5] == ["Confidence", "Position", "Time per query", "RAM", "Charge"]
@@ -100,11 +100,11 @@ def test_report_makes_a_page_without_the_map(flown, tmp_path):
 @pytest.mark.parametrize(
     ("argv", "code", "said"),
     [
-        (["LOG", "--out", "LOG"], 2, "give another output file"),
+        (["LOG", "--out", "LOG"], 2, "pass another output file"),
         (["LOG", "--out", "no/such/out.html"], 2, "its folder does not exist: create it first"),
         (["gone", "--out", "out.html"], 2, "there is no such flight log"),
         (["LOG", "--out", "out.html", "--map", "gone.gpkg"], 1, "There is no map"),
-        (["LOG", "--out", "out.html", "--images", "gone"], 2, "does not exist: give a folder"),
+        (["LOG", "--out", "out.html", "--images", "gone"], 2, "does not exist: pass a folder"),
         (["empty", "--out", "out.html"], 1, "contains no flight-log lines"),
     ],
 )
