@@ -1,6 +1,6 @@
 """Reads a data set: a folder of queries, a folder of references (the images to map), and a ground truth that lists the
-correct references of each query; a query without any is off the map. `open_folder` recognises the layouts in which data
-sets are published by their files:
+correct references of each query; a query without any is off the map. `open_folder` recognises these layouts of
+published data sets by their files:
 
 * query/, ref/ and ground_truth.csv: edgevpr's own layout.
 * database/ and queries/, or images/test/ with both: file names like @EASTING@NORTHING@...jpg, in UTM metres (Pitts30k,
@@ -26,7 +26,7 @@ from edgevpr.frames.source import read_tags
 
 _MAX_FILE_BYTES = 100_000_000  # a million queries
 _LAYOUTS = "query/, ref/ and ground_truth.csv or positions.csv; or database/ and queries/"
-_SCORED_STATUSES = ("ok", "novel")  # statuses of a query; novel: its place is not in the map
+_SCORED_STATUSES = ("ok", "novel")  # statuses of a scored query; novel: its place is not in the map
 # Maps the file name of each query, in file order, to the file names of its correct references (none: the query is off
 # the map) and of the ignored ones, where a match counts as neither correct nor wrong. None: the query is not scored.
 GroundTruth = dict[str, tuple[frozenset[str], frozenset[str]] | None]
@@ -34,8 +34,8 @@ GroundTruth = dict[str, tuple[frozenset[str], frozenset[str]] | None]
 
 @dataclass(frozen=True, slots=True)
 class ScoredQuery:
-    """A query that is scored: the `path` of its image, and the file names of the correct references, `right` (none: its
-    place is not in the map), and of those `ignored`, where a match counts as neither correct nor wrong."""
+    """A query that is scored: the `path` of its image, the file names of the correct references, `right` (none: its
+    place is not in the map), and those of the `ignored` ones, where a match counts as neither correct nor wrong."""
 
     path: Path
     right: frozenset[str]
@@ -115,7 +115,7 @@ def _read_rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
                 )
             yield where, {column: value.strip() for column, value in row.items()}
     except OSError as error:
-        raise UsageError(f"{path} cannot be read ({error.strerror}): give the path of a CSV file.") from error
+        raise UsageError(f"{path} cannot be read ({error.strerror}): pass the path of a CSV file.") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{path} is not a UTF-8 CSV file ({error}): save it as one.") from error
 
@@ -128,9 +128,9 @@ def open_folder(folder: str | Path, within_m: float) -> Dataset:
     query, ref = folder / "query", folder / "ref"
     if (truth := folder / "ground_truth.csv").is_file():
         return load_dataset(query, ref, truth)
-    for outer in (folder, folder / "test", folder / "images" / "test"):
-        if (outer / "database").is_dir() and (outer / "queries").is_dir():
-            return _read_utm_names(outer / "queries", outer / "database", within_m)
+    for parent in (folder, folder / "test", folder / "images" / "test"):
+        if (parent / "database").is_dir() and (parent / "queries").is_dir():
+            return _read_utm_names(parent / "queries", parent / "database", within_m)
     if query.is_dir() and ref.is_dir():
         return match_positions(query, ref, within_m)
     raise UsageError(f"{folder} does not have the layout of a data set: it needs {_LAYOUTS}.")
@@ -144,7 +144,7 @@ def match_positions(query_dir: Path, ref_dir: Path, within_m: float) -> Dataset:
         for folder in (query_dir, ref_dir)
     )
     if not queries or not references:
-        raise UsageError("No positions and no ground truth found: give --ground-truth, or add a positions.csv.")
+        raise UsageError("No positions and no ground truth found: pass --ground-truth, or add a positions.csv.")
     query_deg, reference_deg = (
         np.array([(position.lat_deg, position.lon_deg) for position in positions.values()])
         for positions in (queries, references)
@@ -181,5 +181,5 @@ def _find_near(
         near = np.flatnonzero(np.hypot(*(reference_m - position_m).T) <= within_m)
         truth[decode_name(path.name)] = frozenset(names[index] for index in near), frozenset()
     if not any(answers and answers[0] for answers in truth.values()):
-        raise UsageError(f"No query was taken within {within_m:g} m of a reference: give a larger --within-m.")
+        raise UsageError(f"No query was taken within {within_m:g} m of a reference: pass a larger --within-m.")
     return truth

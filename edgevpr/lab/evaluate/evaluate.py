@@ -56,8 +56,8 @@ class MatchOptions:
     """Options of matching. `candidates`: number of places to compare in full (None: the technique's own number, as in
     flight). `exact`: compare all places in full, without a scan. `sequence`: number of successive queries, in the order
     of their names, to match together (None: the technique's own number). `follow`: track the queries with the place
-    filter, as frames of one flight. `known`: what is known about each query besides its image, such as "heading,height"
-    (see `hints.RecordedPrior`; None: nothing)."""
+    filter, as frames of one flight. `known`: prior knowledge about each query, such as "heading,height" (see
+    `hints.RecordedPrior`; None: none)."""
 
     candidates: int | None = None
     sequence: int | None = None
@@ -107,10 +107,10 @@ def answer_queries(
     frames = progress(read_frames(source), source.total, f"{spec.name}: references")
     with open_temporary_map(frames, technique, dataset.ref_dir, progress) as (place_map, index, not_done):
         rule = make_accept_rule(technique, MatchConfig(), sequence, read_calibration_for(place_map))
-        follows = options.follow and sequence == 1 and rule.confidence_rule is not None
+        tracks_flight = options.follow and sequence == 1 and rule.confidence_rule is not None
         candidates = None if options.exact else options.candidates or technique.candidates
 
-        def make_recogniser(length: int, follows: bool) -> Recogniser:
+        def make_recogniser(length: int, tracks_flight: bool) -> Recogniser:
             return Recogniser(
                 FrameEncoder(technique=technique, gate=gate),
                 place_map,
@@ -118,18 +118,18 @@ def answer_queries(
                 meter,
                 settings=MatchSettings(candidates=candidates),
                 prior=prior,
-                place_filter=PlaceFilter(place_map, max_speed_m_s=None, is_live=False) if follows else None,
+                place_filter=PlaceFilter(place_map, max_speed_m_s=None, is_live=False) if tracks_flight else None,
             )
 
         scored = {query.path.name: query for query in dataset.queries}
         paths = [query.path for query in dataset.queries]
-        # Run one query without counting it, because the first one pays for lazy imports and a cold disk.
+        # Run one query without measuring it, because the first one is slowed down by lazy imports and a cold disk.
         _recognise(make_recogniser(1, False), paths[0], _NO_TAG)
         if gate:
             gate.reset()
-        if sequence > 1 or follows:  # a sequence includes the queries that are not scored
+        if sequence > 1 or tracks_flight:  # a sequence includes the queries that are not scored
             paths = list_images(paths[0].parent)
-        recogniser, answers = make_recogniser(sequence, follows), []
+        recogniser, answers = make_recogniser(sequence, tracks_flight), []
         for path in progress(paths, len(paths), f"{spec.name}: queries"):
             event = _recognise(recogniser, path, tags.get(path, _NO_TAG))
             if query := scored.get(path.name):
@@ -217,13 +217,13 @@ def read_prior(
     text: str | None, dataset: Dataset, spec: TechniqueSpec, sequence: int | None
 ) -> tuple[RecordedPrior | None, dict[Path, GeoTag]]:
     """Return the prior that narrows the search for each query of a data set, and the tags of the queries by path.
-    `text` lists what is known ("heading,height"; None: nothing). The map height is the median height of its pictures.
+    `text` lists the data to use ("heading,height"; None: none). The map height is the median height of its pictures.
     `sequence`: see `MatchOptions`. Raises UsageError if `text` is invalid, or if no query has what it lists."""
     if not (parts := parse_known_fields(text)):
         return None, {}
     queries, places = read_tags(dataset.queries[0].path.parent), read_tags(dataset.ref_dir)
-    if why := explain_why_unusable(parts, queries.values(), places.values(), sequence or spec.sequence):
-        raise UsageError(why)
+    if problem := explain_why_unusable(parts, queries.values(), places.values(), sequence or spec.sequence):
+        raise UsageError(problem)
     query_heights_m, map_heights_m = (
         [tag.height_m for tag in tags.values() if tag.height_m is not None and tag.height_m > 0]
         for tags in (queries, places)

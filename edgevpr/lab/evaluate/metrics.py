@@ -4,7 +4,7 @@ every query.
 `scores`, float (N,), is the score of each query's best match, -inf if it has none. `ranks`, float (N,), is the rank,
 from 0, of its first correct reference, infinite if there is none. `has_match`, bool (N,), is True if its place is in
 the map. A match is accepted if its score reaches the threshold. Each threshold gives one point of the precision-recall
-curve: precision is the share of accepted matches that are correct, and recall the share of correct matches that are
+curve: precision is the fraction of accepted matches that are correct, recall the fraction of correct matches that are
 accepted. Numbers like (2.1) are equations of the thesis.
 """
 
@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 Interval = tuple[float, float]  # lower end, upper end
-_SIGMAS_95 = 1.959964  # 95 % of a normal distribution lie within this many standard deviations
+_SIGMAS_95 = 1.959964  # 95 % of a normal distribution lies within this many standard deviations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figures:
-    """Quality figures of `queries` queries; all shares are 0..1, and each recall has its 95 % confidence interval.
+    """Quality figures of `queries` queries; all fractions are 0..1, and each recall has its 95 % confidence interval.
 
     `auc_from_zero` is the area under the curve with an extra first point at recall 0, as in scikit-learn and VPR-Bench;
     `auc_2_3` is the area by equation 2.3; `ep` is the extended precision (2.4). Recall at 100 % precision is relative
@@ -50,7 +50,7 @@ class Figures:
 class Quality(Figures):
     """Quality of a technique on a data set: the figures of all scored queries.
 
-    `queries_off_map` of them have no place in the map, so every match of theirs is wrong. `with_match` are the figures
+    `queries_off_map` of them have no place in the map, so all their matches are wrong. `with_match` are the figures
     of the others alone (None: these are all queries, or there are none). `unscored` queries have no ground truth."""
 
     technique: str
@@ -66,7 +66,7 @@ class TechniqueResult(Quality):
 
     `accepted`, `accepted_wrong`, `accepted_off_map`, `accepted_elsewhere` and `discarded` count queries by the fields
     of `evaluate.QueryAnswer`; a discarded query counts as missed. Times are means over the queries: `t_match_s` is for
-    all references, `t_match_per_ref_s` for one. `u_encode` and `u_match` are the shares of all cores that were busy,
+    all references, `t_match_per_ref_s` for one. `u_encode` and `u_match` are the busy fractions of all cores,
     0..1 (5.1). `descriptor_bytes` and `fine_bytes` are the RAM and disk space per place, as in `profile`. `ah_total` is
     the charge drawn from the battery pack for all queries, in Ah (5.7); `ah_assumes` states board, pack and efficiency.
     `sequence`: number of queries matched together. `known`: see `evaluate.MatchOptions`. `weights`: origin of the
@@ -97,7 +97,7 @@ class TechniqueResult(Quality):
 
 
 def rank_of_first_correct(ranked: np.ndarray, right: np.ndarray) -> float:
-    """Return the rank, from 0, of the first correct reference; infinite if there is none. `ranked` are the numbers of
+    """Return the rank, from 0, of the first correct reference; infinite if there is none. `ranked` are the indices of
     references, best first. `right`, bool (references,), is True for correct references."""
     hits = np.flatnonzero(right[ranked])
     return float(hits[0]) if len(hits) else math.inf
@@ -110,8 +110,8 @@ def precision_recall(scores: np.ndarray, correct: np.ndarray) -> tuple[np.ndarra
     order = np.argsort(-scores, kind="stable")[: np.count_nonzero(scores > -math.inf)]
     if not len(order):
         return np.zeros(1), np.zeros(1)
-    falling = scores[order]
-    last = np.append(np.flatnonzero(falling[1:] != falling[:-1]), len(order) - 1)
+    sorted_scores = scores[order]
+    last = np.append(np.flatnonzero(sorted_scores[1:] != sorted_scores[:-1]), len(order) - 1)
     true_positives = np.cumsum(correct[order])[last]
     accepted = last + 1
     return true_positives / accepted, true_positives / max(int(correct.sum()), 1)
@@ -159,10 +159,10 @@ def pcu(precision: float, t_encode_s: float, t_encode_max_s: float) -> float:
 
 
 def wilson_interval(hits: np.ndarray) -> Interval:
-    """Return the 95 % confidence interval of the share of `hits`, bool (N,), by Wilson's score (1927)."""
-    share, spread = float(np.mean(hits)), _SIGMAS_95**2 / len(hits)
-    half = math.sqrt(spread * (share * (1 - share) + spread / 4))
-    return max(0.0, (share + spread / 2 - half) / (1 + spread)), min(1.0, (share + spread / 2 + half) / (1 + spread))
+    """Return the 95 % confidence interval of the fraction of `hits`, bool (N,), by Wilson's score (1927)."""
+    mean, spread = float(np.mean(hits)), _SIGMAS_95**2 / len(hits)
+    half = math.sqrt(spread * (mean * (1 - mean) + spread / 4))
+    return max(0.0, (mean + spread / 2 - half) / (1 + spread)), min(1.0, (mean + spread / 2 + half) / (1 + spread))
 
 
 def compute_figures(scores: np.ndarray, ranks: np.ndarray, has_match: np.ndarray) -> Figures:

@@ -39,7 +39,7 @@ class Measurements:
                 }
                 for name, result in results
             ],
-            "failed": [{"set": name, "row": row, "why": str(why)} for (name, row), why in self.failed.items()],
+            "failed": [{"set": name, "row": row, "why": str(error)} for (name, row), error in self.failed.items()],
         }
 
 

@@ -21,12 +21,12 @@ def read_similarities(path: str | Path) -> Doubles:
     try:
         scores = np.load(path, allow_pickle=False)
     except OSError as error:
-        raise UsageError(f"{path} cannot be read ({error.strerror or error}): give a .npy file.") from error
+        raise UsageError(f"{path} cannot be read ({error.strerror or error}): pass a .npy file.") from error
     except (ValueError, EOFError) as error:
-        raise UsageError(f"{path} contains no similarities ({error}): give a .npy file.") from error
+        raise UsageError(f"{path} contains no similarities ({error}): pass a .npy file.") from error
     is_matrix = isinstance(scores, np.ndarray) and scores.ndim == 2 and scores.dtype.kind in "biuf"
     if not is_matrix or np.isnan(scores).any():
-        raise UsageError(f"{path} must be a matrix of numbers, no NaN: one row per query, one column per reference.")
+        raise UsageError(f"{path} must be a matrix without NaN: one row per query, one column per reference.")
     return np.asarray(scores, np.float64)
 
 
@@ -42,22 +42,22 @@ def measure(label: str, scores: Doubles, truth: GroundTruth, references: Sequenc
     """Compute the quality of `scores`, float (queries, references); `label` is their name in messages. Rows are the
     queries of `truth`, in its order, and columns are `references` (None: all names in `truth`, in natural order).
     Raises UsageError if the numbers do not match."""
-    named = frozenset[str]().union(*(names for answers in truth.values() for names in answers or ()))
-    names = list(references or sorted(named, key=make_sort_key))
-    if scores.shape != (len(truth), len(names)) or not named <= set(names):
+    truth_names = frozenset[str]().union(*(names for answers in truth.values() for names in answers or ()))
+    names = list(references or sorted(truth_names, key=make_sort_key))
+    if scores.shape != (len(truth), len(names)) or not truth_names <= set(names):
         raise UsageError(
             f"{label} has scores for {scores.shape[0]} queries and {scores.shape[1]} references, but the ground truth "
-            f"has {len(truth)} and {len(names)}: give the matching file, or all images with --query and --ref."
+            f"has {len(truth)} and {len(names)}: pass the matching file, or all images with --query and --ref."
         )
-    best = []
+    rows = []
     for row, answers in zip(scores, truth.values(), strict=True):
         if answers:
             right, ignored = (np.array([name in group for name in names], bool) for group in answers)
             ranked = np.argsort(-row, kind="stable")
             ranked = ranked[~ignored[ranked]]
             score = row[ranked[0]] if len(ranked) else -math.inf
-            best.append((score, rank_of_first_correct(ranked, right), bool(right.any())))
-    if not best:
-        raise UsageError(f"{label}: the ground truth scores none of its queries: give the matching ground truth.")
-    columns = map(np.array, zip(*best, strict=True))
-    return Quality(technique=label, references=len(names), unscored=len(truth) - len(best), **compute_quality(*columns))
+            rows.append((score, rank_of_first_correct(ranked, right), bool(right.any())))
+    if not rows:
+        raise UsageError(f"{label}: the ground truth scores none of its queries: pass the matching ground truth.")
+    columns = map(np.array, zip(*rows, strict=True))
+    return Quality(technique=label, references=len(names), unscored=len(truth) - len(rows), **compute_quality(*columns))

@@ -13,20 +13,20 @@ ABOUT_FIGURES = (
     "95 %: Wilson score interval.",
     "AUC: area under the precision-recall curve from recall 0 (scikit-learn, VPR-Bench); AUC 2.3: by equation 2.3 of "
     "the thesis, from the first point of the curve.",
-    "R@100%P, right: share of the correct best matches (VPR-Bench); R@100%P, in map: share of the queries whose place "
+    "R@100%P, right: fraction of the correct best matches (VPR-Bench); R@100%P, in map: of the queries whose place "
     "is in the map (VPR_Tutorial).",
 )
 
 
-def format_share(share: float | Interval | None) -> str:
-    """Return a share (0..1) or an interval as text; "-" for None (unknown)."""
-    if isinstance(share, Sequence):  # JSON has no tuples
-        return f"{share[0]:.2f}-{share[1]:.2f}"
-    return "-" if share is None else f"{share:.3f}"
+def format_fraction(fraction: float | Interval | None) -> str:
+    """Return a fraction (0..1) or an interval as text; "-" for None (unknown)."""
+    if isinstance(fraction, Sequence):  # JSON has no tuples
+        return f"{fraction[0]:.2f}-{fraction[1]:.2f}"
+    return "-" if fraction is None else f"{fraction:.3f}"
 
 
-def _make_share_column(heading: str, field: str) -> Column:
-    return heading, lambda result: format_share(getattr(result, field, None))
+def _make_fraction_column(heading: str, field: str) -> Column:
+    return heading, lambda result: format_fraction(getattr(result, field, None))
 
 
 def _count_off_map(result: Figures) -> str:
@@ -41,24 +41,24 @@ def _count_accepted(result: Figures) -> str:
 
 RECALLS: tuple[Column, ...] = (
     ("queries", lambda figures: str(figures.queries)),
-    _make_share_column("recall@1", "recall_at_1"),
-    _make_share_column("95 %", "recall_at_1_interval"),
-    _make_share_column("@5", "recall_at_5"),
-    _make_share_column("95 %", "recall_at_5_interval"),
-    _make_share_column("@10", "recall_at_10"),
-    _make_share_column("95 %", "recall_at_10_interval"),
+    _make_fraction_column("recall@1", "recall_at_1"),
+    _make_fraction_column("95 %", "recall_at_1_interval"),
+    _make_fraction_column("@5", "recall_at_5"),
+    _make_fraction_column("95 %", "recall_at_5_interval"),
+    _make_fraction_column("@10", "recall_at_10"),
+    _make_fraction_column("95 %", "recall_at_10_interval"),
 )
 CURVE: tuple[Column, ...] = (
-    _make_share_column("AUC", "auc_from_zero"),
-    _make_share_column("AUC 2.3", "auc_2_3"),
-    _make_share_column("P@100%R", "precision_at_100_recall"),
-    _make_share_column("R@100%P, right", "recall_at_100_precision_vpr_bench"),
-    _make_share_column("R@100%P, in map", "recall_at_100_precision_vpr_tutorial"),
-    _make_share_column("EP", "ep"),
-    _make_share_column("ROC", "roc_auc"),
+    _make_fraction_column("AUC", "auc_from_zero"),
+    _make_fraction_column("AUC 2.3", "auc_2_3"),
+    _make_fraction_column("P@100%R", "precision_at_100_recall"),
+    _make_fraction_column("R@100%P, right", "recall_at_100_precision_vpr_bench"),
+    _make_fraction_column("R@100%P, in map", "recall_at_100_precision_vpr_tutorial"),
+    _make_fraction_column("EP", "ep"),
+    _make_fraction_column("ROC", "roc_auc"),
 )
 DECISIONS: tuple[Column, ...] = (
-    _make_share_column("PCU", "pcu"),
+    _make_fraction_column("PCU", "pcu"),
     ("accepted (wrong)", _count_accepted),
     ("off the map", _count_off_map),
 )
@@ -118,7 +118,7 @@ def _list_notes_on_techniques(results: Sequence[TechniqueResult]) -> Iterator[st
         if result.sequence > 1:
             yield f"{result.technique} matched sequences of {result.sequence} queries."
         if result.known:
-            yield f"{result.technique} was given for each query: {result.known}."
+            yield f"{result.technique} used with each query: {result.known}."
         if result.discarded:
             yield f"{result.technique}: {result.discarded} queries were discarded as not memorable and count as missed."
         yield from (f"{result.technique}: {sentence}" for sentence in result.not_done)

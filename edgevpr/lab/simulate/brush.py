@@ -47,7 +47,7 @@ class Scene:
         return columns[None] * self.metres_per_pixel, ((self.shape[0] - rows) * self.metres_per_pixel)[:, None]
 
     def polygon(self, box: Box, points_m: ArrayLike) -> Floats:
-        """Return the share of each pixel of a box that a polygon covers, float32 (H, W), with antialiased edges."""
+        """Return the fraction of each pixel of a box that a polygon covers, float32 (H, W), with antialiased edges."""
         cover = np.zeros_like(self.height_cm[box], np.uint8)
         corners = (self.pixels(points_m) - (box[1].start, box[0].start)) * 16
         cv2.fillPoly(cover, [corners.round().astype(np.int32)], 255, cv2.LINE_AA, 4)
@@ -55,18 +55,18 @@ class Scene:
 
     def distance_m(self, box: Box, line_m: ArrayLike) -> Floats:
         """Return the distance of each pixel in a box from a polyline, float32 (H, W) in metres."""
-        away = np.full_like(self.height_cm[box], 255, np.uint8)
+        background_mask = np.full_like(self.height_cm[box], 255, np.uint8)
         points = self.pixels(line_m) - (box[1].start, box[0].start)
-        cv2.polylines(away, [points.round().astype(np.int32)], False, 0)
-        return cv2.distanceTransform(away, cv2.DIST_L2, 5) * self.metres_per_pixel
+        cv2.polylines(background_mask, [points.round().astype(np.int32)], False, 0)
+        return cv2.distanceTransform(background_mask, cv2.DIST_L2, 5) * self.metres_per_pixel
 
     def paint(self, box: Box, cover: Array, colour: ArrayLike) -> None:
         """Paint a colour, (3,) or (H, W, 3) BGR, over a box with the opacity `cover`, (H, W), 0..1."""
-        touched = cover > 0
-        below = self.albedo[box][touched].astype(np.float32)
-        above = np.asarray(colour, np.float32)
-        above = above[touched] if above.ndim == 3 else above
-        self.albedo[box][touched] = np.clip(below + cover[touched][:, None] * (above - below), 0, 255)
+        is_painted = cover > 0
+        old = self.albedo[box][is_painted].astype(np.float32)
+        new = np.asarray(colour, np.float32)
+        new = new[is_painted] if new.ndim == 3 else new
+        self.albedo[box][is_painted] = np.clip(old + cover[is_painted][:, None] * (new - old), 0, 255)
 
 
 def make_noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float, octaves: int = 3) -> Singles:
@@ -84,10 +84,10 @@ def make_noise(rng: np.random.Generator, shape: tuple[int, int], first_px: float
     return total
 
 
-def mix_colours(low: tuple[int, int, int], high: tuple[int, int, int], share: Array) -> Array:
-    """Blend two colours by `share` (H, W), 0 for `low` and 1 for `high`: float32 (H, W, 3)."""
+def mix_colours(low: tuple[int, int, int], high: tuple[int, int, int], weight: Array) -> Array:
+    """Blend two colours by `weight` (H, W), 0 for `low` and 1 for `high`: float32 (H, W, 3)."""
     first, last = np.asarray(low, np.float32), np.asarray(high, np.float32)
-    mixed: Array = first + share[..., None] * (last - first)
+    mixed: Array = first + weight[..., None] * (last - first)
     return mixed
 
 
@@ -161,9 +161,9 @@ def cut_parcels(
     polygons (N, 2), and the cuts, each as a level and its two ends (2, 2). A cut of level 0 crosses the whole land, one
     of level 1 half of it, one of level 2 a quarter, and so on."""
     fields, cuts = [], []
-    todo = [(0, np.array([(-20, -20), (width_m + 20, -20), (width_m + 20, depth_m + 20), (-20, depth_m + 20)]))]
-    while todo:
-        level, piece = todo.pop()
+    pending = [(0, np.array([(-20, -20), (width_m + 20, -20), (width_m + 20, depth_m + 20), (-20, depth_m + 20)]))]
+    while pending:
+        level, piece = pending.pop()
         x, y = piece.T
         area_m2 = abs(float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))) / 2
         if area_m2 < field_m2 * rng.uniform(0.7, 1.8):
@@ -171,10 +171,10 @@ def cut_parcels(
             continue
         side = find_longest_side(piece)
         angle = np.arctan2(side[1], side[0]) + np.pi / 2 + rng.normal(0, 0.16)
-        through = piece.mean(axis=0) + rng.uniform(-0.2, 0.2) * side
-        halves, line = _cut(piece, through, rotate_axes(angle)[1])
+        point = piece.mean(axis=0) + rng.uniform(-0.2, 0.2) * side
+        halves, line = _cut(piece, point, rotate_axes(angle)[1])
         cuts.append((level, line))
-        todo += [(level + 1, half) for half in halves]
+        pending += [(level + 1, half) for half in halves]
     return fields, cuts
 
 
@@ -186,14 +186,14 @@ def find_longest_side(polygon: Doubles) -> Doubles:
 
 
 class LineBender:
-    """Bends straight lines by about `by_m` metres. Nearby points move together."""
+    """Bends straight lines by about `amplitude_m` metres. Nearby points move together."""
 
-    def __init__(self, rng: np.random.Generator, width_m: float, depth_m: float, by_m: float) -> None:
+    def __init__(self, rng: np.random.Generator, width_m: float, depth_m: float, amplitude_m: float) -> None:
         shape = int(depth_m / _GRID_M) + 8, int(width_m / _GRID_M) + 8
-        self._shift_m = by_m * np.stack([make_noise(rng, shape, 7, 1), make_noise(rng, shape, 7, 1)], axis=-1)
+        self._shift_m = amplitude_m * np.stack([make_noise(rng, shape, 7, 1), make_noise(rng, shape, 7, 1)], axis=-1)
 
     def __call__(self, points_m: Doubles, closed: bool) -> Doubles:
-        """Return the bent line through the points, as a chain of short segments; `closed` joins its ends."""
+        """Return the bent line point the points, as a chain of short segments; `closed` joins its ends."""
         ends_m = np.roll(points_m, -1, axis=0) if closed else points_m[1:]
         chain = [
             np.linspace(a, b, max(2, int(np.hypot(*(b - a)) / 5)), endpoint=False)
@@ -209,9 +209,9 @@ class LineBender:
         return bent_m
 
 
-def _cut(piece: Doubles, through: Doubles, across: Doubles) -> tuple[list[Doubles], Doubles]:
-    """Cut a convex polygon at a point, perpendicular to `across`; return the halves and the ends of the cut (2, 2)."""
-    side = (piece - through) @ across
+def _cut(piece: Doubles, point: Doubles, normal: Doubles) -> tuple[list[Doubles], Doubles]:
+    """Cut a convex polygon at `point`, perpendicular to `normal`; return the halves and the ends of the cut (2, 2)."""
+    side = (piece - point) @ normal
     halves: tuple[list[Doubles], list[Doubles]] = ([], [])
     line: list[Doubles] = []
     for start, end, s, t in zip(piece, np.roll(piece, -1, axis=0), side, np.roll(side, -1), strict=True):

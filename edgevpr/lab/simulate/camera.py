@@ -10,13 +10,13 @@ from edgevpr.core.arrays import Array, Doubles, Image
 from edgevpr.lab.simulate.brush import Scene, make_noise, smooth_step
 
 _MAX_SHADOW_M = 30.0
-_STRIP_ROWS = 256  # rows lit at a time: the working memory stays small
+_STRIP_ROWS = 256  # rows lit at a time, to limit the working memory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Light:
     """Lighting by time of day and weather. `warmth` shifts sunlight from blue (-1) to orange (+1). `cloud_frac` is the
-    share (0..1) of the ground in cloud shadow, and `haze_frac` the share of grey haze in the picture. `exposure` is a
+    fraction (0..1) of the ground in cloud shadow, and `haze_frac` that of grey haze in the picture. `exposure` is a
     brightness factor, `gamma` an exponent."""
 
     sun_azimuth_deg: float
@@ -106,12 +106,12 @@ def _cast_shadows(scene: Scene, towards_sun: tuple[float, float], steepness: flo
         farther: Array = cv2.warpAffine(blocking, shift, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         blocking = np.maximum(blocking, cv2.subtract(farther, np.array(steps * drop_cm), farther), out=farther)
         steps *= 2
-    hidden = cv2.compare(blocking, cv2.add(scene.height_cm, np.array(25.0)), cv2.CMP_GT)
-    return cv2.GaussianBlur(hidden, (5, 5), 0)
+    shadow = cv2.compare(blocking, cv2.add(scene.height_cm, np.array(25.0)), cv2.CMP_GT)
+    return cv2.GaussianBlur(shadow, (5, 5), 0)
 
 
 def _make_clouds(scene: Scene, cloud_frac: float, seed: int) -> Array:
-    """Return the share of sunlight that clouds block, uint8 (H, W); 255 is all of it."""
+    """Return the fraction of sunlight that clouds block, uint8 (H, W); 255 is all of it."""
     coarse = make_noise(np.random.default_rng(seed), (64, 64), 16, 3)
     edge = float(np.quantile(coarse, 1 - cloud_frac)) + (0.25 if cloud_frac == 0 else 0)
     cover = (150 * smooth_step(coarse, edge - 0.25, edge + 0.25)).astype(np.uint8)

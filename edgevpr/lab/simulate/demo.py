@@ -32,21 +32,21 @@ from edgevpr.review.logged import LoggedQuery, read_flight
 _SEED = 1
 _INTERVAL_S = 0.2  # between pictures of the later flight, which is replayed at the times of its pictures
 _CAMERA = ("--camera", "nadir", "--fov-deg", 66)  # of the generated flights
-# A place is correct if the two pictures share 30 % of their ground. From a height of 80 m a picture is 78 m long.
+# A place is correct if the two pictures overlap by 30 %. From a height of 80 m a picture shows 78 m of ground.
 MAX_CORRECT_M = 55.0
 _PICTURE_PX = (1600, 1050)
 # Colours (blue, green, red) of the places, of the later flight, and of matches by outcome.
-_MAPPED = (255, 255, 255)
-_LATER = (10, 214, 255)
-_CORRECT = (91, 191, 47)
-_WRONG = (59, 56, 229)
-_REJECTED = (36, 165, 245)
+_MAPPED_COLOUR = (255, 255, 255)
+_LATER_COLOUR = (10, 214, 255)
+_CORRECT_COLOUR = (91, 191, 47)
+_WRONG_COLOUR = (59, 56, 229)
+_REJECTED_COLOUR = (36, 165, 245)
 _LEGEND = {
-    "places of flight 1": _MAPPED,
-    "flight 2": _LATER,
-    "accepted": _CORRECT,
-    "accepted, wrong": _WRONG,
-    "rejected: no position is sent": _REJECTED,
+    "places of flight 1": _MAPPED_COLOUR,
+    "flight 2": _LATER_COLOUR,
+    "accepted": _CORRECT_COLOUR,
+    "accepted, wrong": _WRONG_COLOUR,
+    "rejected: no position is sent": _REJECTED_COLOUR,
 }
 
 
@@ -60,8 +60,8 @@ def run_demo(folder: str | Path) -> str:
     folder = Path(folder)
     map_path, log_path, picture_path = (folder / name for name in ("map.gpkg", "flight.jsonl", "demo.png"))
     first, second = folder / "flight-1", folder / "flight-2"
-    for old in (*folder.glob("map.gpkg*"), log_path, picture_path):
-        old.unlink(missing_ok=True)
+    for old_file in (*folder.glob("map.gpkg*"), log_path, picture_path):
+        old_file.unlink(missing_ok=True)
     scene = make_scene(_SEED, SCENE_WIDTH_M, SCENE_DEPTH_M)
     mapping, later = plan_mapping_flight(_SEED), replace(plan_later_flight(_SEED), interval_s=_INTERVAL_S)
     for out, flight, label in ((first, mapping, "flight 1, to map     "), (second, later, "flight 2, hours later")):
@@ -85,12 +85,12 @@ def run_command(*words: object) -> None:
         raise EdgevprError(f"`edgevpr {' '.join(command)}` failed with exit code {code}: see its message above.")
 
 
-def read_queries(log_path: Path, mapped: Path, flown: Path) -> tuple[list[LoggedQuery], list[LatLon]]:
-    """Read the queries of a flight log, with true positions from the positions.csv in `flown`, and the positions of the
-    places from the one in `mapped`."""
+def read_queries(log_path: Path, mapping_folder: Path, later_folder: Path) -> tuple[list[LoggedQuery], list[LatLon]]:
+    """Read the queries of a flight log, with true positions from the positions.csv in `later_folder`, and the
+    positions of the places from the one in `mapping_folder`."""
     true_positions, places = (
         {name: (tag.position.lat_deg, tag.position.lon_deg) for name, tag in tags.items() if tag.position}
-        for tags in (read_positions(folder / "positions.csv") for folder in (flown, mapped))
+        for tags in (read_positions(folder / "positions.csv") for folder in (later_folder, mapping_folder))
     )
     queries = [
         replace(query, gps_position=true_positions[query.name], true_position=true_positions[query.name])
@@ -128,8 +128,8 @@ largest {max(errors_m):.1f} m (accepted queries; places are 21 m apart)"""
 
 def _choose_colour(query: LoggedQuery) -> tuple[int, int, int]:
     if not query.accepted:
-        return _REJECTED
-    return _CORRECT if is_correct(query) else _WRONG
+        return _REJECTED_COLOUR
+    return _CORRECT_COLOUR if is_correct(query) else _WRONG_COLOUR
 
 
 def _draw(path: Path, ground: Image, mapping: GeneratedFlight, queries: Sequence[LoggedQuery]) -> None:
@@ -150,10 +150,10 @@ def _draw(path: Path, ground: Image, mapping: GeneratedFlight, queries: Sequence
     matches = [query for query in queries if query.true_position and query.place_position]
     query_px = pixels([to_metres(*query.true_position) for query in matches if query.true_position])
     place_px = pixels([to_metres(*query.place_position) for query in matches if query.place_position])
-    for track, colour in ((mapped_px, _MAPPED), (query_px, _LATER)):
+    for track, colour in ((mapped_px, _MAPPED_COLOUR), (query_px, _LATER_COLOUR)):
         cv2.polylines(picture, [np.array(track)], False, colour, 2, cv2.LINE_AA)
     for place in mapped_px:
-        cv2.circle(picture, place, 4, _MAPPED, -1, cv2.LINE_AA)
+        cv2.circle(picture, place, 4, _MAPPED_COLOUR, -1, cv2.LINE_AA)
     for query, start, end in zip(matches, query_px, place_px, strict=True):
         cv2.line(picture, start, end, _choose_colour(query), 3 if query.accepted else 1, cv2.LINE_AA)
         cv2.circle(picture, start, 7, _choose_colour(query), -1, cv2.LINE_AA)

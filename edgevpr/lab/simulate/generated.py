@@ -67,9 +67,9 @@ def plan_later_flight(seed: int) -> GeneratedFlight:
     """Plan 40 pictures on a cloudy, hazy afternoon: back along the fourth leg, out along the third one, and on over
     land that is not mapped, with slow deviations in position, height, heading and tilt."""
     rng = np.random.default_rng((seed, 2))
-    back_m = np.arange(_LEG_END_M - 6, _LEG_START_M, -21.0)
+    return_m = np.arange(_LEG_END_M - 6, _LEG_START_M, -21.0)
     out_m = np.arange(_LEG_START_M + 8, SCENE_WIDTH_M - 62, 19.0)
-    legs = [(east, _LEGS_NORTH_M[3], 270.0) for east in back_m] + [(east, _LEGS_NORTH_M[2], 90.0) for east in out_m]
+    legs = [(east, _LEGS_NORTH_M[3], 270.0) for east in return_m] + [(east, _LEGS_NORTH_M[2], 90.0) for east in out_m]
     drifts = np.stack([make_oscillation(rng, len(legs)) for _ in range(5)], axis=1).tolist()
     poses = tuple(
         CameraPose(
@@ -95,7 +95,7 @@ def write_flight(folder: str | Path, scene: Scene, flight: GeneratedFlight) -> I
     ground = light_scene(scene, flight.light, flight.seed)
     rng = np.random.default_rng((flight.seed, 3))
 
-    def shots() -> Iterator[tuple[GeoTag, Image]]:
+    def take_shots() -> Iterator[tuple[GeoTag, Image]]:
         for number, pose in enumerate(flight.poses):
             tag = GeoTag(
                 position=to_position(pose),
@@ -107,7 +107,7 @@ def write_flight(folder: str | Path, scene: Scene, flight: GeneratedFlight) -> I
             )
             yield tag, photograph(ground, scene.metres_per_pixel, pose, flight.camera, flight.light, rng)
 
-    return write_shots(Path(folder), shots(), flight.camera.jpeg_quality)
+    return write_shots(Path(folder), take_shots(), flight.camera.jpeg_quality)
 
 
 def write_shots(folder: Path, shots: Iterable[tuple[GeoTag, Image | None]], quality: int) -> Iterator[str]:

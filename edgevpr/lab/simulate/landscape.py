@@ -51,7 +51,7 @@ def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: floa
     canvas = Scene(np.full((*shape, 3), _GRASS, np.uint8), np.full(shape, BASE_CM, np.uint16), metres_per_pixel)
     river_m = make_winding(rng, (width_m * 0.55, depth_m * 1.1), (width_m * 0.45, -depth_m * 0.1), 30)
     road_m = make_winding(rng, (-width_m * 0.1, depth_m * 0.42), (width_m * 1.1, depth_m * 0.60), 14)
-    bend = LineBender(rng, width_m, depth_m, by_m=2.5)
+    bend = LineBender(rng, width_m, depth_m, amplitude_m=2.5)
     fields, cuts = cut_parcels(rng, width_m, depth_m, field_m2=7500)
     trees = [_paint_field(rng, canvas, bend(field_m, closed=True)) for field_m in fields]
     trees += [_paint_border(rng, canvas, bend(cut_m, closed=False), level) for level, cut_m in cuts]
@@ -59,7 +59,7 @@ def make_scene(seed: int, width_m: float, depth_m: float, metres_per_pixel: floa
     _paint_road(rng, canvas, road_m)
     yards_m = _paint_farms(rng, canvas, road_m, river_m)
     _vary_brightness(rng, canvas)
-    _paint_trees(rng, canvas, np.concatenate(trees), keep_off_m=((road_m, 4.0), (river_m, 7.0), (yards_m, 19.0)))
+    _paint_trees(rng, canvas, np.concatenate(trees), clearances_m=((road_m, 4.0), (river_m, 7.0), (yards_m, 19.0)))
     return canvas
 
 
@@ -102,12 +102,12 @@ def _make_trees(rng: np.random.Generator, line_m: Doubles, step_m: float, spread
 def _paint_river(rng: np.random.Generator, canvas: Scene, line_m: Doubles) -> Doubles:
     box = canvas.box(line_m, 24.0)
     shape = canvas.height_cm[box].shape
-    wide = make_noise(rng, shape, 40 / canvas.metres_per_pixel, 2)
+    coarse = make_noise(rng, shape, 40 / canvas.metres_per_pixel, 2)
     fine = make_noise(rng, shape, 5 / canvas.metres_per_pixel)
-    distance_m = canvas.distance_m(box, line_m) + 1.3 * wide + 0.5 * fine
+    distance_m = canvas.distance_m(box, line_m) + 1.3 * coarse + 0.5 * fine
     canvas.paint(box, 0.85 * smooth_step(distance_m, 15, 9), _LUSH)
     canvas.paint(box, smooth_step(distance_m, 7.2, 6.2) * smooth_step(fine, -3, 1), _GRAVEL)
-    bars = smooth_step(wide + 0.3 * fine, 1.2, 1.5) * smooth_step(distance_m, 1.0, 2.5)
+    bars = smooth_step(coarse + 0.3 * fine, 1.2, 1.5) * smooth_step(distance_m, 1.0, 2.5)
     water = smooth_step(distance_m, 5.6, 5.0) * (1 - bars)
     canvas.paint(box, water, _WATER)
     canvas.paint(box, water * (0.15 * smooth_step(distance_m, 2, 5.5) + 0.08 * smooth_step(fine, 0, 2)), _STONE)
@@ -134,8 +134,8 @@ def _paint_farms(rng: np.random.Generator, canvas: Scene, road_m: Doubles, river
     """Paint farms beside the road, away from the river; return the centres of their yards, (N, 2) metres."""
     yards = []
     for index in range(18, len(road_m) - 18, 13):
-        ahead = road_m[index + 1] - road_m[index]
-        turn_rad = float(np.arctan2(ahead[1], ahead[0])) + rng.normal(0, 0.12)
+        direction = road_m[index + 1] - road_m[index]
+        turn_rad = float(np.arctan2(direction[1], direction[0])) + rng.normal(0, 0.12)
         along, across = rotate_axes(turn_rad)
         centre = road_m[index] + across * rng.choice([-1, 1]) * 24 + along * rng.normal(0, 4)
         if np.hypot(*(river_m - centre).T).min() > 42 and rng.random() < 0.7:
@@ -169,21 +169,21 @@ def _paint_farm(rng: np.random.Generator, canvas: Scene, yard_centre: Doubles, t
 
 def _vary_brightness(rng: np.random.Generator, canvas: Scene) -> None:
     """Vary the brightness of the ground in patches of 60 m, 5 m and 1 m, because real ground is never uniform."""
-    for share, bump_m in ((0.06, 60.0), (0.07, 5.0), (0.08, 1.0)):
+    for contrast, bump_m in ((0.06, 60.0), (0.07, 5.0), (0.08, 1.0)):
         bump_px = max(bump_m / canvas.metres_per_pixel, 2.0)
         coarse = max(2, int(bump_px / 8))
         change = make_noise(rng, (canvas.shape[0] // coarse + 1, canvas.shape[1] // coarse + 1), bump_px / coarse, 3)
-        change = np.clip(128 * (1 + share * change), 0, 255).astype(np.uint8)
+        change = np.clip(128 * (1 + contrast * change), 0, 255).astype(np.uint8)
         change = cv2.resize(change, canvas.shape[::-1], interpolation=cv2.INTER_LINEAR)
         for channel in range(3):
             canvas.albedo[..., channel] = cv2.multiply(canvas.albedo[..., channel], change, scale=1 / 128)
 
 
 def _paint_trees(
-    rng: np.random.Generator, canvas: Scene, trees: Doubles, keep_off_m: Iterable[tuple[Doubles, float]]
+    rng: np.random.Generator, canvas: Scene, trees: Doubles, clearances_m: Iterable[tuple[Doubles, float]]
 ) -> None:
-    """Paint the trees that are further from each line of points in `keep_off_m` than its clearance in metres."""
-    for line_m, clear_m in keep_off_m:
+    """Paint the trees that are further from each line of points in `clearances_m` than its clearance, in metres."""
+    for line_m, clear_m in clearances_m:
         gap_m = np.hypot(*(trees[:, None, :2] - line_m[None]).T).T
         trees = trees[(gap_m > clear_m).all(axis=1)]
     domes: dict[int, list[Singles]] = {}
@@ -207,10 +207,10 @@ def _texture_plough(patches: Singles, tufts: Singles, across_m: Array) -> FieldT
 
 def _texture_cereal(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
     wheels = smooth_step(np.abs(np.abs(across_m % 15 - 7.5) - 0.9), 0.45, 0.15)
-    laid = smooth_step(patches + 0.5 * tufts, 1.2, 1.7)
+    lodged = smooth_step(patches + 0.5 * tufts, 1.2, 1.7)
     drilled = np.sin(across_m * (2 * np.pi / 0.9))
-    share = 0.6 * wheels + 0.2 * smooth_step(tufts - 0.6 * patches + 0.4 * drilled, -1.5, 2.5) + 0.2 * laid
-    return mix_colours(_STRAW, _SOIL, share), 50 - 35 * wheels - 12 * laid + 3 * tufts
+    weight = 0.6 * wheels + 0.2 * smooth_step(tufts - 0.6 * patches + 0.4 * drilled, -1.5, 2.5) + 0.2 * lodged
+    return mix_colours(_STRAW, _SOIL, weight), 50 - 35 * wheels - 12 * lodged + 3 * tufts
 
 
 def _texture_row_crop(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
@@ -222,8 +222,8 @@ def _texture_row_crop(patches: Singles, tufts: Singles, across_m: Array) -> Fiel
 def _texture_meadow(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
     swath = smooth_step(np.sin(across_m * (2 * np.pi / 6.5)), -0.5, 0.5)
     heap = smooth_step(np.abs(across_m % 6.5 - 3.2) + 0.15 * tufts, 0.8, 0.3)
-    share = 0.15 + 0.3 * swath + 0.12 * patches + 0.2 * tufts + 0.2 * heap
-    return mix_colours(_GRASS, _DRY, share), 8 * heap + 2 * tufts
+    weight = 0.15 + 0.3 * swath + 0.12 * patches + 0.2 * tufts + 0.2 * heap
+    return mix_colours(_GRASS, _DRY, weight), 8 * heap + 2 * tufts
 
 
 def _texture_pasture(patches: Singles, tufts: Singles, across_m: Array) -> FieldTexture:
@@ -288,6 +288,6 @@ def _make_tree_rows(
     return _grow_trees(rng, points_m[np.array(inside, bool)], radius_m, (1.6, 2.6))
 
 
-def _grow_trees(rng: np.random.Generator, points_m: Doubles, radius_m: float, slender: tuple[float, float]) -> Doubles:
+def _grow_trees(rng: np.random.Generator, points_m: Doubles, radius_m: float, aspects: tuple[float, float]) -> Doubles:
     radius = radius_m * rng.uniform(0.6, 1.35, len(points_m))
-    return np.column_stack((points_m, radius, radius * rng.uniform(*slender, len(points_m))))
+    return np.column_stack((points_m, radius, radius * rng.uniform(*aspects, len(points_m))))

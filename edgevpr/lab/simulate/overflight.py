@@ -37,21 +37,21 @@ def read_shots(path: str | Path, height_m: float | None, every_m: float) -> list
         shots = _plan_mission_shots(path, every_m)
     if not shots:
         raise UsageError(f"{path} contains no track: it needs waypoints, or rows with lat and lon.")
-    places = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
-    timed, t_s, course_deg = [], _START_UTC_S, 0.0
+    points_deg = [(shot.position.lat_deg, shot.position.lon_deg) for shot in shots if shot.position]
+    timed_shots, t_s, course_deg = [], _START_UTC_S, 0.0
     for number, shot in enumerate(shots):
         shot_height_m = height_m or shot.height_m
         if not (shot_height_m and shot_height_m > 0):
-            raise UsageError(f"{path} lacks heights above ground (height_m > 0): give --height-m.")
+            raise UsageError(f"{path} lacks heights above ground (height_m > 0): pass --height-m.")
         # The first picture has the course from its own position to the second one.
-        start, end = places[max(0, number - 1)], places[number or min(1, len(places) - 1)]
+        start, end = points_deg[max(0, number - 1)], points_deg[number or min(1, len(points_deg) - 1)]
         if (step_m := float(distance_m(*start, *end))) > 0:
             east_m, north_m = offset_m(*start, *end)
             course_deg = float(np.degrees(np.arctan2(east_m, north_m)) % 360)
         t_s += step_m / SPEED_M_S if number else 0.0
         heading_deg = course_deg if shot.heading_deg is None else shot.heading_deg
-        timed.append(replace(shot, height_m=shot_height_m, heading_deg=heading_deg, t_utc_s=t_s))
-    return timed
+        timed_shots.append(replace(shot, height_m=shot_height_m, heading_deg=heading_deg, t_utc_s=t_s))
+    return timed_shots
 
 
 def _plan_mission_shots(path: str | Path, every_m: float) -> list[GeoTag]:
@@ -62,8 +62,8 @@ def _plan_mission_shots(path: str | Path, every_m: float) -> list[GeoTag]:
     track_m = np.append(0, np.cumsum(distance_m(lat_deg[:-1], lon_deg[:-1], lat_deg[1:], lon_deg[1:])))
     shot_m = np.arange(0, track_m[-1] + 1e-6, every_m)  # along the track
     waypoint_m = np.array([wp.height_m for wp in waypoints], float)  # heights; NaN for home and landings
-    known = np.isfinite(waypoint_m)
-    heights_m = np.interp(shot_m, track_m[known], waypoint_m[known]).tolist() if known.any() else [None] * len(shot_m)
+    valid = np.isfinite(waypoint_m)
+    heights_m = np.interp(shot_m, track_m[valid], waypoint_m[valid]).tolist() if valid.any() else [None] * len(shot_m)
     places = zip(*(np.interp(shot_m, track_m, degrees).tolist() for degrees in (lat_deg, lon_deg)), strict=True)
     return [GeoTag(position=Position(*place), height_m=height) for place, height in zip(places, heights_m, strict=True)]
 
@@ -92,7 +92,7 @@ def photograph_ground(
     if corners_m is None or (reach_m := float(np.abs(corners_m).max())) > _MAX_CORNER_HEIGHTS * pose.height_m:
         raise UsageError(
             f"At roll {pose.roll_deg:.0f} and pitch {pose.pitch_deg:.0f} degrees the picture shows the horizon, which "
-            "an orthophoto does not contain: use smaller angles, or give a smaller --fov-deg."
+            "an orthophoto does not contain: use smaller angles, or pass a smaller --fov-deg."
         )
     side_px = int(np.ceil(2 * reach_m * camera.focal_px / pose.height_m)) + 4
     metres_per_pixel = pose.height_m / camera.focal_px

@@ -45,7 +45,7 @@ def test_measure_gives_the_published_figures_of_eight_matrices(capsys):
     [
         (np.zeros((2, 3)), "scores for 2 queries and 3 references, but the ground truth has 3 and 3"),
         (np.zeros(3), "one row per query"),
-        (np.full((3, 3), np.nan), "no NaN"),
+        (np.full((3, 3), np.nan), "without NaN"),
         (np.array([[None]]), "contains no similarities"),
         (b"rubbish", "contains no similarities"),
     ],
