@@ -130,8 +130,8 @@ def configuration() -> str:
 def details(key: Key, default: str) -> str:
     """Return type, default, limits and flag of a key."""
     facts = [KINDS[key.kind], f"default `{default}`"]
-    if key.within:
-        facts.append(f"{key.within[0]:g} to {key.within[1]:g}")
+    if key.limits:
+        facts.append(f"{key.limits[0]:g} to {key.limits[1]:g}")
     if key.flags:
         facts.append(f"flag {', '.join(f'`{name}`' for name in key.flags)}")
     return f"*{'; '.join(facts)}*"
