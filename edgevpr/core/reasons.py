@@ -82,7 +82,7 @@ class ReasonCode(Code):
         "the image looks tilted, but its tilt is unknown",
         "{summary}: about {tilt_deg:.0f} degrees; set `source.mount_ahead_deg`, or record roll and pitch",
     )
-    POSITIONS_DISAGREE = "places that show the same ground disagree on the position", "{summary} by {apart_m:.0f} m"
+    POSITIONS_DISAGREE = "places that show the same ground disagree on the position", "{summary} by {distance_m:.0f} m"
     SEQUENCE_INCOMPLETE = "the sequence is not complete yet", "{summary}: {queries:.0f} queries of {min_queries:.0f}"
     NEWEST_DISAGREES = "the newest query resembles other places more"
     NEWEST_ELSEWHERE = "the newest queries show different ground from the earlier ones"
@@ -104,7 +104,7 @@ class ReasonCode(Code):
     MAP_CONTRADICTS_GPS = "not sent: the map has contradicted GPS since the first match"
     NOT_BETTER = (
         "not needed: the autopilot's position is as good",
-        "not needed: the autopilot is {off_m:.1f} m from our position, which is accurate to {accuracy_m:.1f} m",
+        "not needed: the autopilot is {distance_m:.1f} m from our position, which is accurate to {accuracy_m:.1f} m",
     )
     HELD_ROTATED = "held back: contradicts compass", "held back: rotated {rotation_deg:.0f} degrees from the compass"
     HELD_OFF_GPS = (

@@ -186,14 +186,15 @@ NO_COST = StageCost(0.0, 0.0)
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepCosts:
     """Costs of the steps of a query: `read` the image, `prepare` it (level it), test its salience (`gate`), `encode`
-    it, measure the motion since the previous frame (`stride`), `scan` all places, `compare` the candidates, `verify`
-    the best one by landmarks, `locate` the aircraft. A step not reached costs nothing; only flights read and stride."""
+    it, measure the motion since the previous frame (`odometry`), `scan` all places, `compare` the candidates, `verify`
+    the best one by landmarks, `locate` the aircraft. A step not reached costs nothing; only flights `read` and measure
+    `odometry`."""
 
     read: StageCost = NO_COST
     prepare: StageCost = NO_COST
     gate: StageCost = NO_COST
     encode: StageCost = NO_COST
-    stride: StageCost = NO_COST
+    odometry: StageCost = NO_COST
     scan: StageCost = NO_COST
     compare: StageCost = NO_COST
     verify: StageCost = NO_COST
@@ -207,7 +208,7 @@ class StepCosts:
     @property
     def match(self) -> StageCost:
         """Cost of matching as defined in the thesis: all steps after encoding."""
-        return self.stride + self.scan + self.compare + self.verify + self.locate
+        return self.odometry + self.scan + self.compare + self.verify + self.locate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -66,7 +66,7 @@ def test_match_reports_what_has_narrowed_each_query(capsys, tmp_path):
     [
         ("heading", True, (), "`heading` needs yaw_deg, but no query has it"),
         ("height,reach", False, (), "`reach` needs lat and lon, but no place has it"),
-        ("height,speed", True, (), "`known` names `speed`: use some of heading, height, reach"),
+        ("height,speed", True, (), "`known` contains `speed`, but must be a list of heading, height, reach"),
         ("height", True, ("--sequence", "2"), "2 queries are matched together"),
     ],
 )

@@ -9,26 +9,26 @@ from edgevpr.core.arrays import Doubles
 from edgevpr.runtime.recognise.locate import mahalanobis
 
 GRAVITY_M_S2 = 9.80665
-# Time constant of the attitude error of an autopilot that dead-reckons. Only pictures show this error, and not all do:
+# Time constant of the attitude error of an autopilot that dead-reckons. Only some pictures show this error:
 # if its variance grew without limit, every fix would be attributed to it.
 _ATTITUDE_ERROR_TIME_S = 20.0
-# With poor gyros the attitude error wanders up to nine times as fast as with good ones: in PX4's simulator by 0.1 in
-# eight seconds after GPS was lost. The gyros are judged by the mean square of the attitude errors in the last twenty
+# With poor gyros the attitude error drifts up to nine times as fast as with good ones: in PX4's simulator by 0.1 in
+# eight seconds after GPS was lost. The gyros are rated by the mean square of the attitude errors in the last twenty
 # pictures, divided by their variances: 0.2 in ArduPilot's simulator, 1.3 in PX4's.
 _MAX_NOISE_FACTOR = 8.0
 _ATTITUDE_ERROR_GAIN = 0.05
 _CALM_ERROR = 0.3
 _TYPICAL_ATTITUDE_ERROR_SD = 0.024
 _ROUGH_ERROR = 0.8
-# An autopilot that starts to dead-reckon mistakes a new wind for a turn: its attitude error wanders this many times
-# faster, for about this long. In simulation, an ArduPilot plane's was 4.5 degrees after ten seconds.
+# An autopilot that starts to dead-reckon mistakes a change of wind for a turn: its attitude error drifts this many
+# times faster, for about this long. In simulation, an ArduPilot plane's was 4.5 degrees after ten seconds.
 _GPS_LOSS_NOISE_FACTOR = 6.0
 _GPS_LOSS_TIME_S = 10.0
 _MAX_INNOVATION_SIGMA = 4.0  # odometry that differs by more is not used
 _ODOMETRY_SD = 0.05  # error of scale and direction of all odometry steps
 _ODOMETRY_NOISE = 0.003  # random change of that error in one second
-# Its heading then goes wrong too, so the direction of odometry changes this many times faster: by 6 degrees in 3 s on
-# an ArduPilot plane. The rotation of a match shows it (radians: standard deviation, and the largest that is used).
+# Its heading then drifts too, so the direction of odometry changes this many times faster: by 6 degrees in 3 s on
+# an ArduPilot plane. The rotation of a match measures it (radians: standard deviation, and the largest that is used).
 _GPS_LOSS_TURN_FACTOR = 10.0
 _ROTATION_SD_RAD = 0.035
 _MAX_ROTATION_RAD = 0.3
@@ -53,7 +53,7 @@ class Drift:
     position_noise: float
     velocity_noise: float
     acceleration_noise: float
-    is_inertial: bool  # the path is integrated from accelerations, so an attitude error is one of its acceleration
+    is_inertial: bool  # the path is integrated from accelerations, so an attitude error causes an acceleration error
     # The autopilot follows our positions closely and mistakes their errors for motion, so its attitude is assumed to be
     # poor when GPS is lost, until pictures show that it is good.
     attitude_follows_positions: bool = False
@@ -75,7 +75,7 @@ INERTIAL_PX4 = replace(INERTIAL, attitude_follows_positions=True)
 
 @dataclass(frozen=True, slots=True)
 class OdometryMeasurement:
-    """A step of visual odometry (see `recognise.odometry`): the displacement `moved_m` (2,), by how much it exceeds
+    """A step of visual odometry (see `recognise.odometry`): the displacement `moved_m` (2,), its difference from
     that of the path, `error_m` (2,), and the standard deviation `sd_m` of each axis."""
 
     moved_m: Doubles
@@ -85,7 +85,7 @@ class OdometryMeasurement:
 
 class DriftFilter:
     """Kalman filter that estimates the errors of one path. `drift` is the size of these errors, `map_sd_m` the standard
-    deviation, of one axis, of the error that all fixes share.
+    deviation, of one axis, of the error common to all fixes.
 
     The state has six parts, each east and north:
     - `c` (m): the offset from the path to the aircraft
@@ -97,7 +97,7 @@ class DriftFilter:
 
     A frame may have been taken seconds ago: it is compared with the path at that time. An attitude error shifts its
     `f`, and so its fix, by minus `b` times `attitude_gain_s2`: the height above ground divided by gravity (0: the
-    picture does not depend on the attitude). Odometry carries `f` from one frame to the next, with the errors of both.
+    picture does not depend on the attitude). Odometry propagates `f` to the next frame, with the errors of both.
     """
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
@@ -118,8 +118,8 @@ class DriftFilter:
 
     @property
     def attitude_error_sd(self) -> float:
-        """Standard deviation of the reported attitude, as a tangent, as the last images show it; 0 if they show no more
-        than their own errors."""
+        """Standard deviation of the reported attitude, as a tangent, measured in the last images; 0 if it is within
+        their own errors."""
         return self._attitude_error_sd * math.sqrt(max(0.0, self._attitude_error - _CALM_ERROR))
 
     def predict(self, step_s: float) -> None:
@@ -132,18 +132,20 @@ class DriftFilter:
         else:
             move[_B, _B] = math.exp(-step_s / _ATTITUDE_ERROR_TIME_S) * _EYE
         drift = self._drift
-        # How poor the gyros are, judged by the attitude errors seen in pictures. Poor gyros also give a poor heading.
-        share = (self._attitude_error - _CALM_ERROR) / (_ROUGH_ERROR - _CALM_ERROR)
-        rough = 1.0 + _MAX_NOISE_FACTOR * min(1.0, max(0.0, share)) * drift.is_inertial
-        wander = drift.acceleration_noise * (rough + _GPS_LOSS_NOISE_FACTOR * self._gps_loss)
-        noise = np.repeat((drift.position_noise, drift.velocity_noise, wander, 0.0, 0.0, _ODOMETRY_NOISE * rough), 2)
+        # How poor the gyros are, from the attitude errors measured in pictures. Poor gyros also cause a poor heading.
+        roughness = (self._attitude_error - _CALM_ERROR) / (_ROUGH_ERROR - _CALM_ERROR)
+        factor = 1.0 + _MAX_NOISE_FACTOR * min(1.0, max(0.0, roughness)) * drift.is_inertial
+        random_walk = drift.acceleration_noise * (factor + _GPS_LOSS_NOISE_FACTOR * self._gps_loss)
+        noise = np.repeat(
+            (drift.position_noise, drift.velocity_noise, random_walk, 0.0, 0.0, _ODOMETRY_NOISE * factor), 2
+        )
         noise[_TURN] += _ODOMETRY_NOISE * _GPS_LOSS_TURN_FACTOR * self._gps_loss
         self._x = move @ self._x
         self._p = move @ self._p @ move.T + step_s * np.diag(np.square(noise))
         self._gps_loss *= math.exp(-step_s / _GPS_LOSS_TIME_S)
 
     def lose_gps(self) -> None:
-        """Process the loss of GPS: the velocity error becomes more uncertain, since nothing corrects it any more, and
+        """Process the loss of GPS: the velocity error becomes more uncertain, because nothing corrects it any more, and
         so does the attitude error of an autopilot that dead-reckons."""
         self._p[_S, _S] += self._drift.velocity_sd**2 * _EYE
         self._gps_loss = 0.0 if self._drift.is_inertial else 1.0
@@ -184,7 +186,7 @@ class DriftFilter:
 
     def correct_by_rotation(self, rotation: float) -> None:
         """Correct the direction of odometry by a match whose picture is rotated by `rotation` (radians, clockwise)
-        against the compass. A large rotation is ignored, since odometry then contradicts the path and is not used.
+        against the compass. A large rotation is ignored: odometry then contradicts the path and is not used.
         Rotations are also ignored if the path is integrated from accelerations: it then has the same compass error."""
         if abs(rotation) <= _MAX_ROTATION_RAD and not self._drift.is_inertial:
             matrix = np.zeros((1, _SIZE))
@@ -195,15 +197,15 @@ class DriftFilter:
         """Correct the state by the fix of the last frame: its offset (2,) from the path and covariance (2, 2)."""
         self._correct(_FIX, offset_m, covariance_m2)
 
-    def correct_by_attitude_error(self, over_height: Doubles, sd: float) -> None:
-        """Correct the state by the attitude error that a picture shows (see `recognise.perspective`). If pictures show
-        more than their own standard deviation, the gyros are poor and the error wanders faster."""
-        normalized = float(np.mean(np.square(over_height))) / sd**2
+    def correct_by_attitude_error(self, nadir_shift: Doubles, sd: float) -> None:
+        """Correct the state by the attitude error measured in a picture (see `recognise.perspective`). If pictures show
+        more than their own standard deviation, the gyros are poor and the error drifts faster."""
+        normalized = float(np.mean(np.square(nadir_shift))) / sd**2
         self._attitude_error += _ATTITUDE_ERROR_GAIN * (normalized - self._attitude_error)
         self._attitude_error_sd += _ATTITUDE_ERROR_GAIN * (sd - self._attitude_error_sd)
         matrix = np.zeros((2, _SIZE))
         matrix[:, _B] = _EYE / GRAVITY_M_S2
-        self._correct(matrix, over_height, sd**2 * _EYE)
+        self._correct(matrix, nadir_shift, sd**2 * _EYE)
 
     def reset_to_fix(self, offset_m: Doubles, covariance_m2: Doubles) -> None:
         """Discard the position, then correct the state by a fix that contradicts it."""
@@ -236,7 +238,7 @@ class DriftFilter:
         return matrix
 
     def _begin_frame(self) -> None:
-        """Set `f` to where the aircraft was when the last frame was taken."""
+        """Set `f` to the aircraft's offset when the last frame was taken."""
         position, variance_m2 = self._frame
         transition = np.eye(_SIZE)
         transition[_F] = position

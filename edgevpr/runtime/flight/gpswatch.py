@@ -1,4 +1,4 @@
-"""Compares GPS with the matches. A GPS that is wrong is not used for navigation."""
+"""Compares GPS with the matches. A wrong GPS is not used for navigation."""
 
 import math
 
@@ -18,18 +18,18 @@ from edgevpr.runtime.recognise.recognition import Recognition
 # receiver errors last for minutes, so averaging does not reduce them. With a standard deviation of 5 m for the map,
 # the limit is 23 m for good matches and a good receiver.
 _MAX_GPS_SIGMA = 4.0
-_MIN_GPS_ERROR_M = 15.0  # a smaller error is harmless, and may be a few bad seconds of the receiver
+_MIN_GPS_ERROR_M = 15.0  # a smaller error is harmless, and may last only a few seconds
 # Deviation from the mean offset between matches and GPS, which cancels lasting errors of map and receiver.
 _MAX_MOVE_SIGMA = 3.5
 _MIN_MOVE_M = 7.0
 _MIN_MEAN_MATCHES = 10
 _MAX_MEAN_MATCHES = 60
-_MIN_MATCHES_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; takes 3 s at 1 Hz
+_MIN_MATCHES_IN_A_ROW = 3  # one match in a hundred may be wrong, and wrong ones hardly ever agree; 3 s at 1 Hz
 _MAX_MATCH_AGE_S = 30.0  # of the matches in a row
 _MIN_RECENT_MATCHES = 5  # contradicting matches, with or without agreeing ones between them
 _RECENT_WINDOW_S = 20.0
-_MAX_DRIFT_M_S = 10.0  # how fast the offset from GPS may change while a spoofer leads the receiver away
-_REPORT_FACTOR = 2.0  # times the distance that was last reported
+_MAX_DRIFT_M_S = 10.0  # largest rate of the offset from GPS while a spoofer leads the receiver away
+_REPORT_FACTOR = 2.0  # increase of the distance after which it is reported again
 
 
 class GpsWatch:
@@ -37,11 +37,10 @@ class GpsWatch:
     when they agree again. Every comparison is sent to the autopilot, and navigation does not use a GPS that is wrong.
 
     GPS `is_wrong` after three matches in a row contradict it, at different places and with about the same offset from
-    GPS; it is right again after three matches in a row agree with it. A match contradicts GPS if its offset
-    from GPS is large, or differs from the mean of earlier matches. While the aircraft hovers, the same place
-    counts again if it agreed with GPS before. Intermittent jamming is detected by five contradicting matches
-    within twenty seconds, and GPS stays wrong until there are fewer. `map_sd_m` is the standard deviation of
-    the error that all matches share."""
+    GPS; it is right again after three matches in a row agree with it. A match contradicts GPS if its offset from GPS is
+    large, or differs from the mean of earlier matches. While the aircraft hovers, the same place counts again if it
+    agreed with GPS before. Intermittent jamming is detected by five contradicting matches within twenty seconds, and
+    GPS stays wrong until there are fewer. `map_sd_m` is the standard deviation of the error that all matches share."""
 
     def __init__(self, map_sd_m: float, notifier: Notifier, autopilot: AutopilotOutput | None) -> None:
         self._map_sd_m, self._notifier, self._autopilot = map_sd_m, notifier, autopilot
@@ -51,7 +50,7 @@ class GpsWatch:
         self._mean_error_m, self._mean_count = np.zeros(2), 0  # of the matches that agreed, and their number
         self._agreed_places: set[int] = set()  # places of the last match that agreed
         self._reported_m = math.inf  # the distance that was last reported
-        self._have_agreed = False  # whether GPS and map have agreed in this flight
+        self._have_agreed = False  # GPS and map have agreed in this flight
         self.is_wrong = False
 
     def reset(self) -> None:
@@ -125,7 +124,7 @@ def _compute_attitude_error(match: PositionedMatch) -> float:
     """Return the tangent of the smallest attitude error that the picture of a match shows. It shifts the match from GPS
     by this fraction of the height."""
     error = match.attitude_error
-    return max(0.0, math.hypot(*error.over_height) - error.sd) if error else 0.0
+    return max(0.0, math.hypot(*error.nadir_shift) - error.sd) if error else 0.0
 
 
 def _is_beyond(error_m: Doubles, *limits_m: float) -> bool:

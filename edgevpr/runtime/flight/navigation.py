@@ -1,4 +1,4 @@
-"""Estimates the aircraft's position at any moment, from its `path` and the filter of the path's errors (`drift`)."""
+"""Estimates the aircraft's position at any time, from its `path` and the filter of the path's errors (`drift`)."""
 
 import math
 from dataclasses import dataclass
@@ -24,15 +24,15 @@ _GPS_VELOCITY_SD_M_S = 0.3
 _UNKNOWN_POSITION_SD_M = 1e4
 _UNKNOWN_VELOCITY_SD_M_S = 10.0  # while only a fix is known
 _MAX_TRACKING_GAP_S = 4.0  # since the last odometry step, and between two queries
-_MAX_REPETITION_FACTOR = 16.0  # fixes over the same ground that count as one
+_MAX_REPETITION_FACTOR = 16.0  # number of fixes over the same ground that count as one
 # Between matches the ground may rise or fall, which makes the scale of odometry wrong. The zooms between successive
 # pictures add up to that change. An attitude error of two degrees adds up to a zoom of 0.1 over 300 m at a height of
 # 100 m, so a smaller zoom proves nothing. After a gap the change is unknown: 0.3 is a valley 30 m deep below 100 m.
 _ZOOM_DEAD_BAND = 0.1
 _MAX_ODOMETRY_GAP_S = 5.0
 _SCALE_SD_AFTER_GAP = 0.3
-_MAX_RECEIVER_SIGMA = 5.0  # a receiver that is farther from our position is not used to correct it
-# A steady receiver that contradicts our position for this long is right, unless a recent match proves ours.
+_MAX_RECEIVER_SIGMA = 5.0  # a receiver farther from our position is not used to correct it
+# A steady receiver that contradicts our position for this long is correct, unless a recent match proves our position.
 _GPS_OVERRULES_S = 2.0
 _MIN_STEADY_S = 1.0
 
@@ -52,11 +52,11 @@ class NavState:
 class Navigation:
     """Estimates the aircraft's position from the autopilot's motion and our fixes. `drift`: the path is integrated from
     the autopilot's velocities (`DEAD_RECKONING`) or from accelerations (`INERTIAL`, `INERTIAL_PX4`). `map_sd_m` is the
-    standard deviation, of one axis, of the error that all fixes share.
+    standard deviation, of one axis, of the error common to all fixes.
 
     Accelerations are used with a continuous channel, where the autopilot's estimate may come from our positions: GPS
     is then the position that the receiver itself reports. `has_gps`: there is a trusted GPS. `is_in_doubt`: a GPS
-    contradicts our position, and no recent match proves ours."""
+    contradicts our position, and no recent match proves it."""
 
     def __init__(self, drift: Drift, map_sd_m: float) -> None:
         self._drift = drift
@@ -72,32 +72,32 @@ class Navigation:
 
     @property
     def last_fix_s(self) -> float:
-        """Time of the last match accepted as a fix; -inf if there was none."""
+        """Time of the last match accepted as a fix; -inf before the first."""
         return self._last_fix_s
 
     @property
     def last_vision_s(self) -> float:
-        """Time of the last fix or odometry step; -inf if there was none."""
+        """Time of the last fix or odometry step; -inf before the first."""
         return max(self._last_fix_s, self._last_odometry_s)
 
     @property
     def last_gps_s(self) -> float:
-        """Time of the last GPS position that was used; -inf if there was none."""
+        """Time of the last GPS position that was used; -inf before the first."""
         return self._last_gps_s
 
     @property
     def attitude_error_sd(self) -> float:
-        """Standard deviation of the reported attitude, as a tangent, as images show it (0: they show no error)."""
+        """Standard deviation of the reported attitude, as a tangent, measured in images (0: they show no error)."""
         return self._filter.attitude_error_sd
 
     @property
     def path_velocity_m_s(self) -> Doubles | None:
-        """Current velocity (2,) of the path, not corrected by any match; None if unknown."""
+        """Current velocity (2,) of the path, without corrections from matches; None if unknown."""
         return self._valid_path.now.velocity_m_s if self._valid_path else None
 
     def is_tracked(self, t_s: float) -> bool:
         """Return True if visual odometry tracks the path without contradiction, and queries are frequent enough that
-        several would soon show an error of the path."""
+        several would soon reveal an error of the path."""
         return max(t_s - self._last_odometry_s, self._query_interval_s) <= _MAX_TRACKING_GAP_S
 
     def add_report(self, vehicle: Vehicle, trusts_gps: bool = True, is_estimate_ours: bool = False) -> None:
@@ -158,7 +158,7 @@ class Navigation:
             self._filter.correct_by_gps(offset_m, sd_m, error_m_s, sd_m_s, age_s)
 
     def _handle_contradiction(self, receiver: Receiver, now_s: float) -> None:
-        """Process a receiver that contradicts our position: if it persists and no match proves ours, restart there."""
+        """Process a receiver that contradicts our position: restart there if this persists and no match proves ours."""
         self.has_gps, self.is_in_doubt = False, now_s - self._last_fix_s > MATCH_PROOF_S
         if self._contradicted_since_s is None:
             self._contradicted_since_s = now_s
@@ -252,13 +252,13 @@ class Navigation:
             correct = self._filter.reset_to_fix if verdict.overrules_path else self._filter.correct_by_fix
             correct(fix.offset_m, self._repetition_factor(fix) * match.covariance_m2)
             if match.frame.attitude_gain_s2 and (error := match.attitude_error):
-                self._filter.correct_by_attitude_error(np.array(error.over_height), error.sd)
+                self._filter.correct_by_attitude_error(np.array(error.nadir_shift), error.sd)
             self._last_fix_s = max(self._last_fix_s, match.t_s)
             self._odometry_since_fix = _OdometrySinceFix(self._last_fix_s)
 
     def _repetition_factor(self, fix: PredictedFix) -> float:
         """Return the factor for the covariance of a fix: the closer it is to the last fix, the more of its error is
-        repeated. It is 1 without odometry, since only odometry propagates the last fix."""
+        repeated. It is 1 without odometry, because only odometry propagates the last fix."""
         fix_m, last_fix_m = fix.path_point_m + fix.offset_m, self._last_fix_m
         self._last_fix_m = fix_m
         length_m = fix.match.frame.correlation_length_m

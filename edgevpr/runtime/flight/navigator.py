@@ -1,5 +1,5 @@
 """Decides which positions to send to the autopilot, given the vehicle's motion from the link and the matches from the
-loop. Through a continuous channel (GPS_INPUT, ODOMETRY) a position is sent many times a second, otherwise single fixes.
+loop: through a continuous channel (GPS_INPUT, ODOMETRY) a position many times a second, otherwise single fixes.
 The link calls it in its own thread, the loop of `flight` (through `autopilot`) in the main one, each within a turn
 (`mavlink/turns.py`), so it needs no lock."""
 
@@ -33,23 +33,23 @@ from edgevpr.runtime.flight.slew import Slew
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _MAX_ERROR_M = 50.0  # a position with a larger error is not sent
-_MAX_INTERIM_S = 60.0  # how long single fixes are sent without a match after the last match, odometry or GPS
+_MAX_INTERIM_S = 60.0  # single fixes without a match are sent for this long after the last match, odometry or GPS
 # From accelerations alone we know no more than the autopilot, which has them too. So a continuous position ends this
 # long after the last picture with a match or odometry or, until there is one, this long after GPS: sent for half a
 # minute, it led a PX4 copter 246 m away, and for ten seconds 46 m (without our positions: 25 m).
 _MAX_BLIND_S = 10.0
-_PX4_MAX_BLIND_S = 5.0  # PX4 then dead-reckons as long again: 10 s of tilted accelerations led it 70 m away
+_PX4_MAX_BLIND_S = 5.0  # PX4 then dead-reckons for another 5 s: 10 s of tilted accelerations led it 70 m away
 _MAX_SINCE_GPS_S = 3.0
 _ALT_SD_M = 3.0
 # An autopilot treats the ten positions of a second as independent. Their errors are correlated for about five seconds:
-# fifty of them carry the information of one, so each claims its error times this. Without it, they outweighed the
-# gyros: an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute.
-# A smaller factor would be closer to the true error, but lets the loop run away: benchmarks/results/loop.md.
+# fifty of them carry the information of one, so the claimed error is multiplied by this. Without it, they outweighed
+# the gyros: an ArduPilot copter tilted with our errors, which made our errors larger, and was lost after a minute. A
+# smaller factor would be closer to the true error, but makes the loop unstable: benchmarks/results/loop.md.
 CORRELATION_FACTOR = math.sqrt(50)
 _PX4_CORRELATION_FACTOR = 1.5
 _ATTITUDE_ERROR_VALID_S = 5.0
 _PX4_CHANNELS = Channel.SENSOR, Channel.VISION
-# From the first to the second of these times after a lost receiver has become steady, "no fix" is sent as GPS_INPUT, so
+# Between these two times after a lost receiver has become steady, "no fix" is sent as GPS_INPUT, so
 # that ArduPilot returns to its receiver at once (AP_GPS::update_primary).
 _GPS_BACK_FROM_S = 1.0
 _GPS_BACK_UNTIL_S = 3.0
@@ -71,14 +71,14 @@ def _withhold(code: ReasonCode) -> Advice:
 
 
 class Navigator(Listener):
-    """Navigates for one autopilot: estimates the aircraft's position, and decides what is sent. `map_sd_m` is the
-    standard deviation of the error that all fixes share, `every_s` the time between two queries. With `is_muted`, in a
-    dry run, it only gives advice. `is_level`: the camera is on a gimbal and stays level at any attitude. `age`
+    """Navigates for one autopilot: estimates the aircraft's position, and decides what to send. `map_sd_m` is the
+    standard deviation of the error common to all fixes, `interval_s` the time between queries. With `is_muted`,
+    in a dry run, it only gives advice. `is_level`: the camera is on a gimbal and stays level at any attitude. `age`
     estimates the hidden delay of the pictures from the reported motion."""
 
-    def __init__(self, map_sd_m: float, every_s: float, is_muted: bool = False, is_level: bool = False) -> None:
+    def __init__(self, map_sd_m: float, interval_s: float, is_muted: bool = False, is_level: bool = False) -> None:
         self._is_muted, self._is_level = is_muted, is_level
-        self._map_sd_m, self._fix_interval_s = map_sd_m, min(every_s, INTERIM_FIX_INTERVAL_S)
+        self._map_sd_m, self._fix_interval_s = map_sd_m, min(interval_s, INTERIM_FIX_INTERVAL_S)
         self._navigation = Navigation(DEAD_RECKONING, map_sd_m)
         self._consistency, self.age = Consistency(), AgeWatch()
         self._slew = Slew()
@@ -89,7 +89,7 @@ class Navigator(Listener):
         self.output = Output.STARTING  # what a continuous channel carries
         self._watch, self._sent_s = OutputWatch(), -math.inf
         self._height_ratio, self._height_ratio_sd = 1.0, 0.0
-        self._shared_sd_m = map_sd_m  # standard deviation of the error that the last fixes share
+        self._shared_sd_m = map_sd_m  # standard deviation of the error common to the last fixes
 
     @property
     def has_gps(self) -> bool:
@@ -101,7 +101,7 @@ class Navigator(Listener):
         self._trusts_gps = is_trusted
 
     def distrust_map(self, is_distrusted: bool) -> None:
-        """Set whether the map has contradicted GPS since the first match. One of them is wrong, and nothing shows
+        """Set whether the map has contradicted GPS since the first match. One of them is wrong, and it is unknown
         which: no position is sent, even after GPS is lost."""
         self._distrusts_map = is_distrusted
 
@@ -109,7 +109,7 @@ class Navigator(Listener):
         return self._trusts_gps
 
     def correct_height(self, ratio: float, ratio_sd: float = 0.0) -> None:
-        """Set the ratio of visual height to the autopilot's height above ground (1.0: they agree). Odometry
+        """Set the ratio of visual height to the autopilot's height above ground (1.0: equal). Odometry
         is scaled by it. The ground may change back at any time, so the claimed error contains the deviation from 1.0
         or `ratio_sd`, the relative error of the ratio, if that is larger."""
         self._height_ratio, self._height_ratio_sd = ratio, ratio_sd
@@ -122,7 +122,7 @@ class Navigator(Listener):
             self.reset_navigation()
 
     def reset_navigation(self) -> None:
-        """Restart at the autopilot's position, since later fixes have different errors than earlier ones."""
+        """Restart at the autopilot's position, because later fixes have different errors from earlier ones."""
         self._navigation, self._consistency = Navigation(_choose_drift(self._channel), self._map_sd_m), Consistency()
         self._watch = OutputWatch()
 
@@ -154,7 +154,7 @@ class Navigator(Listener):
             self._navigation.add_frame(frame, is_query)
 
     def report_accuracy(self, event: Recognition) -> Recognition:
-        """Return an event with the accuracy of its match in flight: it includes the errors of attitude and time."""
+        """Return an event with the accuracy of its match in flight, which includes the errors of attitude and time."""
         frame, vehicle = self._measure(event), event.vehicle or self._vehicle
         if frame is None or vehicle is None or event.accuracy_m is None:
             return event
@@ -162,7 +162,7 @@ class Navigator(Listener):
         return replace(event, accuracy_m=flown_accuracy_m(event, vehicle, frame, attitude_sd))
 
     def advise(self, event: Recognition, now_s: float) -> Advice:
-        """Process an accepted match, and advise what to send for it. Raises ValueError for a position off the Earth."""
+        """Process an accepted match, and advise what to send for it. Raises ValueError for an invalid position."""
         frame = self._measure(event)
         match = position_match(event, frame) if frame else None
         if match is None:
@@ -190,7 +190,7 @@ class Navigator(Listener):
         return self._advise_improvement(vehicle, vehicle.velocity_m_s, now_s)
 
     def make_interim_fix(self, now_s: float) -> Fix | None:
-        """Return a fix predicted from earlier matches, for times when none is accepted; None if it would not
+        """Return a fix predicted from earlier matches, for times without accepted matches; None if it would not
         improve the autopilot's position, or the last match contradicts the prediction."""
         vehicle = self._vehicle
         if self._is_muted or self._channel is not Channel.COMMAND or self.age.is_unknown:
@@ -204,7 +204,7 @@ class Navigator(Listener):
         return self._advise_improvement(vehicle, vehicle.velocity_m_s, now_s).fix
 
     def knows_position(self, now_s: float) -> bool:
-        """Return True if the position is known well enough to be sent through a continuous channel."""
+        """Return True if the position is accurate enough for a continuous channel."""
         return self._estimate(now_s) is not None
 
     def accuracy_m(self, now_s: float) -> float | None:
@@ -213,7 +213,7 @@ class Navigator(Listener):
         return None if estimate is None else self._claimed_m(estimate)
 
     def estimate_state(self, t_s: float) -> MotionState | None:
-        """Return position and motion at `t_s` for a continuous channel; None if they are not known well enough. `t_s`
+        """Return position and motion at `t_s` for a continuous channel; None if they are not accurate enough. `t_s`
         must be later than in the last call."""
         if self._is_muted:
             return None
@@ -227,19 +227,19 @@ class Navigator(Listener):
         lat_deg, lon_deg, lag_m = self._slew.follow(estimate)
         east, north = estimate.velocity_m_s
         attitude, factor = self._attitude, self._correlation_factor(t_s)
-        is_reserve, receiver = self.output is Output.RESERVE, vehicle.gps
+        is_fallback, receiver = self.output is Output.RESERVE, vehicle.gps
         return MotionState(
             t_mono_s=t_s,
             lat_deg=lat_deg,
             lon_deg=lon_deg,
             # The autopilot's own altitude may come from us, so with a receiver its altitude is sent.
-            alt_m=receiver.alt_m if is_reserve and receiver and receiver.alt_m is not None else vehicle.alt_m,
+            alt_m=receiver.alt_m if is_fallback and receiver and receiver.alt_m is not None else vehicle.alt_m,
             velocity_m_s=(east, north, vehicle.sink_m_s or 0.0),
             accuracy_m=factor * math.hypot(self._claimed_m(estimate), lag_m),
             alt_accuracy_m=_ALT_SD_M,
             speed_accuracy_m_s=factor * estimate.speed_accuracy_m_s,
             attitude=None if attitude is None else _in_radians(attitude),
-            is_reserve=is_reserve,
+            is_fallback=is_fallback,
         )
 
     def _next_output(self, vehicle: Vehicle | None, estimate: NavState | None) -> Output:
@@ -283,7 +283,7 @@ class Navigator(Listener):
             return None
         last_vision_s, last_gps_s = self._navigation.last_vision_s, self._navigation.last_gps_s
         if self._channel.is_continuous:
-            # A channel beside GPS was sending before GPS was lost, and continues without a gap. PX4's starts now.
+            # A channel used with GPS was sending before GPS was lost, and continues without a gap. PX4's starts now.
             is_gps_recent = self._channel.is_beside_gps and t_s - last_gps_s <= _MAX_SINCE_GPS_S
             max_blind_s = _PX4_MAX_BLIND_S if self._channel in _PX4_CHANNELS else _MAX_BLIND_S
             is_known = t_s - last_vision_s <= max_blind_s or is_gps_recent
@@ -306,13 +306,13 @@ class Navigator(Listener):
         east_m_s, north_m_s = velocity_m_s
         age_s = now_s - vehicle.t_received_s
         theirs_deg = offset_position(vehicle.lat_deg, vehicle.lon_deg, age_s * east_m_s, age_s * north_m_s)
-        off_m = float(distance_m(*theirs_deg, ours.lat_deg, ours.lon_deg))
-        # Mean square errors: our estimate's is 2 * accuracy_m**2 (two axes), the autopilot's is larger by off_m**2.
-        if off_m**2 <= 2 * estimate.accuracy_m**2:
-            figures = {"off_m": off_m, "accuracy_m": estimate.accuracy_m}
+        error_m = float(distance_m(*theirs_deg, ours.lat_deg, ours.lon_deg))
+        # Mean square errors: our estimate's is 2 * accuracy_m**2 (two axes), the autopilot's is larger by error_m**2.
+        if error_m**2 <= 2 * estimate.accuracy_m**2:
+            figures = {"distance_m": error_m, "accuracy_m": estimate.accuracy_m}
             return Advice(None, Reason(ReasonCode.NOT_BETTER, figures))
-        # Lead by the drift of half the time to the next fix, so that the autopilot is right in the middle of it. Now it
-        # is off by this lead, in one direction: half of its square is added to the variance of each axis.
+        # Lead by the drift of half the time to the next fix, so that the autopilot is correct halfway. Now it
+        # is wrong by this lead, in one direction: half of its square is added to the variance of each axis.
         lead_m = [self._fix_interval_s / 2 * drift_m_s for drift_m_s in self._navigation.path_drift_m_s()]
         sent_deg = offset_position(ours.lat_deg, ours.lon_deg, *lead_m)
         return Advice(Fix(*sent_deg, math.hypot(claimed_m, math.hypot(*lead_m) / math.sqrt(2)), now_s))
@@ -324,12 +324,12 @@ class Navigator(Listener):
         return _PX4_CORRELATION_FACTOR if self._channel in _PX4_CHANNELS and is_independent else CORRELATION_FACTOR
 
     def _claimed_m(self, estimate: NavState) -> float:
-        """Return the accuracy to claim for an estimate: never better than the error that all fixes share."""
+        """Return the accuracy to claim for an estimate: never better than the error common to all fixes."""
         return max(self._shared_sd_m, estimate.accuracy_m)
 
 
 def _choose_drift(channel: Channel) -> Drift:
-    """Return the path errors for an autopilot that gets positions through a channel."""
+    """Return the path errors for an autopilot that receives positions through a channel."""
     if channel in _PX4_CHANNELS:
         return INERTIAL_PX4
     return INERTIAL if channel.is_continuous else DEAD_RECKONING

@@ -1,11 +1,11 @@
 """The agreement of two images: how many of their landmarks coincide after one rotation, one scaling and one shift.
 
-Ahead, near and far landmarks shift by different amounts, so fewer agree, and they can only support a match. Points are
-complex numbers here, x + iy (right, down), as shares of the longest side from the image's centre. A similarity from
-query to place is two complex numbers: a point is multiplied by the first (rotation and scale), then the second (the
-shift) is added.
+With a forward-looking camera, near and far landmarks shift by different amounts, so fewer agree, and they can only
+support a match. Points are complex numbers here, x + iy (right, down) from the image's centre, as fractions of the
+longest side. A similarity from query to place is two complex numbers: a point is multiplied by the first (rotation and
+scale), then the second (the shift) is added.
 
-Two landmarks match if each is the one most similar to the other (mutual nearest neighbours). Each pair of the best
+Two landmarks match if each is the most similar to the other (mutual nearest neighbours). Each pair of the best
 matches defines a similarity, and the one that fits the most matches is used. Nothing is random: the same images give
 the same result.
 """
@@ -19,13 +19,13 @@ from edgevpr.core.arrays import Array, Bools, Bytes, Covariance, Singles
 from edgevpr.core.geodesy import fit_similarity, wrap_deg
 from edgevpr.runtime.recognise.landmarks import Landmarks
 
-# Inliers that confirm and prove an agreement. Of 14,799 pairs of a query and a place of another site, expected on the
+# Inliers that confirm and prove an agreement. Of 14,799 pairs of a query and a place of another site, expected at the
 # overlay of their match, 31 had four inliers, 7 five, 3 six and none more. Of 50,940 expected on a random overlay, 111
 # had four, 22 five and 2 six. So fewer than one in 10,000 has eight by chance. Without an expectation, 3 of 2500 had
 # seven.
 MIN_CONFIRMED_INLIERS = 8
 MIN_PROVEN_INLIERS = 10
-# Largest deviations from the expected shift (share of the longest side), rotation (degrees) and scale (a factor).
+# Largest deviations from the expected shift (fraction of the longest side), rotation (degrees) and scale (a factor).
 _MAX_SHIFT_SHARE = 3.5 / 32
 _MAX_TURN_DEG = 25.0
 _MAX_SCALE = 1.35
@@ -37,17 +37,17 @@ _SIZE_TOLERANCE = 1.2  # one level of the image pyramid: sizes are not known mor
 _MAX_DIFFERENT_BITS = 64  # of 256 may differ; among unrelated landmarks about one pair in a thousand differs in so few
 _TOLERANCE_SHARE = 10 / 640  # of the longest side: about how far relief and tilt move a landmark
 _BEST_MATCHES = 60  # number of best matches whose pairs each define a similarity to try
-_MIN_DISTANCE_SHARE = 0.06  # of the longest side; closer landmarks hardly constrain the rotation
+_MIN_DISTANCE_SHARE = 0.06  # of the longest side; landmarks closer together hardly constrain the rotation
 _MIN_INLIERS = 3
-# Relief and tilt move neighbouring landmarks alike, so this many count as one independent landmark. With this value,
+# Relief and tilt move neighbouring landmarks together, so this many count as one independent landmark. With this value,
 # half of the errors on aerial_caliterra and aerial_garfield28 are within the 50 % bound of the covariance.
 _DEPENDENT_LANDMARKS = 40.0
 
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """Guess of how one image lies on another, such as the query on a place. `shift_share` (dx, dy), `rotation_deg`
-    and `scale` (None: unknown) are as in `Agreement`."""
+    """Estimated transformation of one image onto another, such as of the query onto a place. `shift_share`,
+    `rotation_deg` and `scale` (None: unknown) are as in `Agreement`."""
 
     shift_share: tuple[float, float]
     rotation_deg: float
@@ -60,11 +60,11 @@ class Overlay:
 
     @property
     def relative_pose(self) -> tuple[complex, complex]:
-        """Relative pose of the query as in a tie of `mapmaking.graph`: its offset, right + i up, and the logarithm of
+        """Relative pose of the query, as used in `mapmaking.graph`: its offset, right + i up, and the logarithm of
         its scale + i times its counter-clockwise rotation."""
         dx, dy = self.shift_share
-        turned = np.radians(wrap_deg(self.rotation_deg))
-        return complex(dx, -dy), complex(np.log(self.scale or 1.0), -turned)
+        clockwise = np.radians(wrap_deg(self.rotation_deg))
+        return complex(dx, -dy), complex(np.log(self.scale or 1.0), -clockwise)
 
 
 def compose_overlays(one: Overlay, other: Overlay) -> Overlay:
@@ -79,13 +79,13 @@ def compose_overlays(one: Overlay, other: Overlay) -> Overlay:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
     """Result of comparing the landmarks of query and place. `matched` is the number of landmarks that match, `inliers`
-    the number of those that coincide, and `possible` the number of landmarks of the image that has fewer.
+    the number of those that coincide, and `possible` the smaller of the two images' landmark counts.
 
     To overlay the query on the place, rotate it by `rotation_deg` (clockwise, 0..360) about its centre, scale it by
     `scale` (above 1 if it was taken from higher up), and shift its centre from the place's centre by `shift_share` (dx
-    right, dy down), as shares of the place's longest side. `covariance_share2` (var x, cov xy, var y) is the covariance
-    of the shift. All four are None without inliers. `is_expected` is False if the landmarks agree on an overlay other
-    than the expected one. `inlier_points`: inliers in query and place, complex (n,).
+    right, dy down), as fractions of the place's longest side. `covariance_share2` (var x, cov xy, var y) is its
+    covariance. All four are None without inliers. `is_expected` is False if the landmarks agree on an overlay other
+    than the expected one. `inlier_points`: the inliers in query and place, complex (n,) each.
     """
 
     inliers: int
@@ -99,8 +99,8 @@ class Agreement:
     inlier_points: tuple[Array, Array] | None = field(default=None, repr=False, compare=False)
 
     @property
-    def is_at_rest(self) -> bool:
-        """True if the images coincide without shift, rotation or scaling, as an on-screen display does."""
+    def is_unshifted(self) -> bool:
+        """True if the images coincide without shift, rotation or scaling, as they do in an on-screen display."""
         if self.shift_share is None or self.rotation_deg is None or self.scale is None:
             return False
         rotation_deg = min(self.rotation_deg, 360 - self.rotation_deg)
@@ -108,25 +108,25 @@ class Agreement:
 
 
 def compare_near(query: Landmarks, place: Landmarks, expected: Overlay) -> Agreement:
-    """Compare two images near the `expected` overlay. If few landmarks agree there and many on another overlay,
+    """Compare two images near the `expected` overlay. If few landmarks agree there but many agree on another overlay,
     return the agreement on that one, with `is_expected` False."""
     agreement = measure_agreement(query, place, expected)
     if agreement.inliers >= MIN_CONFIRMED_INLIERS:
         return agreement
     other = measure_agreement(query, place)
-    if other.inliers < MIN_PROVEN_INLIERS or other.is_at_rest or other.shift_share is None:
-        return agreement  # landmarks at rest may belong to an on-screen display, not to the ground
+    if other.inliers < MIN_PROVEN_INLIERS or other.is_unshifted or other.shift_share is None:
+        return agreement  # unshifted landmarks may belong to an on-screen display, not to the ground
     similarity = Overlay(other.shift_share, other.rotation_deg or 0.0, other.scale)
     is_near = _is_near(similarity.turn_scale, complex(*similarity.shift_share), expected)
     return agreement if is_near else replace(other, is_expected=False)
 
 
 def measure_agreement(query: Landmarks, place: Landmarks, expected: Overlay | None = None) -> Agreement:
-    """Compare the landmarks of two images, only near the `expected` overlay (None: on any overlay)."""
+    """Compare the landmarks of two images, only near the `expected` overlay (None: under any overlay)."""
     possible = min(len(query), len(place))
-    nothing = Agreement(inliers=0, matched=0, possible=possible)
+    no_agreement = Agreement(inliers=0, matched=0, possible=possible)
     if possible < _MIN_INLIERS:
-        return nothing
+        return no_agreement
     query_points, place_points = _to_complex(query), _to_complex(place)
     bit_counts = _count_differing_bits(query.bits, place.bits)
     if expected is not None:
@@ -138,22 +138,22 @@ def measure_agreement(query: Landmarks, place: Landmarks, expected: Overlay | No
     mutual = mutual[np.argsort(least[mutual], kind="stable")]
     query_points, place_points = query_points[mutual].astype(complex), place_points[best[mutual]].astype(complex)
     similarity = _find_best(query_points, place_points, expected)
-    nothing = replace(nothing, matched=len(mutual))
+    no_agreement = replace(no_agreement, matched=len(mutual))
     if similarity is None:
-        return nothing
+        return no_agreement
     for _ in range(3):
         is_inlier = np.abs(similarity[0] * query_points + similarity[1] - place_points) <= _TOLERANCE_SHARE
         if np.count_nonzero(is_inlier) < _MIN_INLIERS:
-            return nothing
+            return no_agreement
         similarity = fit_similarity(query_points[is_inlier], place_points[is_inlier])
     is_inlier = np.abs(similarity[0] * query_points + similarity[1] - place_points) <= _TOLERANCE_SHARE
     inliers = int(np.count_nonzero(is_inlier))
     if inliers < _MIN_INLIERS or not _is_near(*similarity, expected):
-        return nothing
+        return no_agreement
     turn_scale, shift = similarity
     variance = _estimate_variance(query_points[is_inlier], place_points[is_inlier], turn_scale, shift)
     return replace(
-        nothing,
+        no_agreement,
         inliers=inliers,
         shift_share=(float(shift.real), float(shift.imag)),
         rotation_deg=float(np.angle(turn_scale, deg=True)) % 360,
@@ -177,8 +177,8 @@ def _count_differing_bits(one: Bytes, other: Bytes) -> Singles:
 def _find_pairs(
     query: Landmarks, place: Landmarks, query_points: Array, place_points: Array, expected: Overlay
 ) -> Bools:
-    """Return bool (N, M): True if a landmark of the query can be that landmark of the place, judged by position,
-    direction and size, on an overlay near the `expected` one. The points are complex (N,) and (M,)."""
+    """Return bool (N, M): True if a landmark of the query can be that landmark of the place, judging by position,
+    direction and size under an overlay near the `expected` one. The points are complex (N,) and (M,)."""
     factor = _MAX_UNKNOWN_SCALE if expected.scale is None else _MAX_SCALE
     expected_points = expected.turn_scale * query_points + np.complex64(complex(*expected.shift_share))
     tolerance = _MAX_SHIFT_SHARE + np.abs(query_points) * (factor - 1 + np.radians(_MAX_TURN_DEG) / 2)
@@ -190,16 +190,16 @@ def _find_pairs(
 
 
 def _is_near(turn_scale: Any, shift: Any, expected: Overlay | None) -> Bools:
-    """Return True for a similarity near the expected overlay (None: with a plausible scale). `turn_scale` and `shift`
-    are its complex numbers, or arrays of them; the result has their shape."""
+    """Return True for a similarity near the expected overlay (None: for one of plausible scale). `turn_scale` and
+    `shift` are its complex numbers, or arrays of them; the result has the same shape."""
     if expected is None:  # only the scale is limited
         least, most = _SCALE_LIMITS
         return np.asarray((np.abs(turn_scale) >= least) & (np.abs(turn_scale) <= most))
     difference = turn_scale / expected.turn_scale
-    rotation_deg, stretched = np.abs(np.angle(difference, deg=True)), np.abs(np.log(np.abs(difference)))
+    rotation_deg, log_scale = np.abs(np.angle(difference, deg=True)), np.abs(np.log(np.abs(difference)))
     most = np.log(_MAX_UNKNOWN_SCALE if expected.scale is None else _MAX_SCALE)
     is_shift_near = np.abs(shift - complex(*expected.shift_share)) <= _MAX_SHIFT_SHARE
-    return np.asarray((rotation_deg <= _MAX_TURN_DEG) & (stretched <= most) & is_shift_near)
+    return np.asarray((rotation_deg <= _MAX_TURN_DEG) & (log_scale <= most) & is_shift_near)
 
 
 def _find_best(query_points: Array, place_points: Array, expected: Overlay | None) -> tuple[complex, complex] | None:

@@ -5,7 +5,7 @@ Positions are in the plane of the map: metres east and north of a fixed origin o
 has recognised), or near one of at most 64 hypotheses: Gaussian positions. Being lost has its own probability.
 
 The probabilities from a single query are divided by the prior they were computed with, which gives likelihoods. So
-without history, the result is that of the query. Three rules limit the influence of history:
+without history, the result is that of the query alone. Three rules limit the influence of history:
 
 * Between two queries the aircraft may have left the map or be anywhere, so the newest query must always agree.
 * Pictures of the same ground are no new evidence. A hypothesis stores the evidence already counted (`credited`) for
@@ -34,13 +34,13 @@ _MAX_HYPOTHESES = 64
 _LEAVE_CHANCE = 0.01
 _JUMP_CHANCE = 0.01
 _ENTER_CHANCE = 0.02
-_MISS_LIKELIHOOD = 0.2  # of a query that misses the place below the aircraft, relative to one off the map
+_MISS_LIKELIHOOD = 0.2  # of a query that misses the place below the aircraft, relative to a query off the map
 _RESEMBLANCE = 0.1  # probability that ground outside the map, once mistaken for a place, also resembles the next ones
-_MIN_NONE_PROBABILITY = 1e-4  # least probability that no candidate is right
+_MIN_NONE_PROBABILITY = 1e-4  # lowest probability that no candidate is correct
 _CV_PROBABILITY = 0.75  # of constant velocity
-_CV_SD = 0.5  # in spacings of the map, and as a share of the displacement
+_CV_SD = 0.5  # in spacings of the map, and as a fraction of the displacement
 # Odometry of the autopilot and of the camera: the probability that it is right, and its standard deviation in spacings
-# and as a share of the displacement.
+# and as a fraction of the displacement.
 _REPORTED_ODOMETRY = (0.6, 0.25, 0.15)
 _VISUAL_ODOMETRY = (0.98, 0.05, 0.05)
 _REACH_SIGMAS = 1.5  # the reach in standard deviations
@@ -49,36 +49,36 @@ _SAME_POSITION_SIGMAS = 2.0  # of a position: a shorter displacement may be zero
 _MIN_WEIGHT = 1e-9  # a hypothesis with less weight is dropped
 _MIN_DIVISOR = 1e-300  # instead of zero
 _MAX_DISTANCE = 1e8  # metres or places: farther than any two points on the Earth
-_MIN_SD = 0.25  # least standard deviation of a position, in spacings of the map
-_UNIT_VARIANCE = 1 / (2 * np.pi)  # of a Gaussian with the density 1 in its middle: second axis of ordinal maps
+_MIN_SD = 0.25  # smallest standard deviation of a position, in spacings of the map
+_UNIT_VARIANCE = 1 / (2 * np.pi)  # of a Gaussian with density 1 at its mean: second axis of ordinal maps
 DEFAULT_MAX_SPEED_M_S = 30.0  # unless the configuration sets another speed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
     """Motion of the aircraft since the previous query, in metres or places: `reach` is the farthest it can have moved
-    in `elapsed_s` seconds, and `displacement` (2,) the motion measured by odometry (None: unknown): that of the camera
-    (`is_visual`) or of the autopilot."""
+    in `elapsed_s` seconds, and `displacement` (2,) the motion measured by the odometry of the camera (`is_visual`) or
+    of the autopilot (None: unknown)."""
 
     reach: float
     elapsed_s: float
     displacement: Doubles | None = None
     is_visual: bool = False
 
-    def new_ground_share(self, spacing: float) -> float:
-        """Return the share (0..1) of the ground in the picture that is new; 1 without visual odometry."""
-        moved = self.displacement
-        return min(1.0, float(np.hypot(*moved)) / spacing) if self.is_visual and moved is not None else 1.0
+    def new_ground_fraction(self, spacing: float) -> float:
+        """Return the fraction (0..1) of the ground in the picture that is new; 1 without visual odometry."""
+        step = self.displacement
+        return min(1.0, float(np.hypot(*step)) / spacing) if self.is_visual and step is not None else 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Hypotheses:
-    """M possible positions of the aircraft: weights `w` (M,), positions `at` (M, 2) with `covariance` (M, 2, 2),
+    """M possible positions of the aircraft: `weight` (M,), `position` (M, 2) with its `covariance` (M, 2, 2),
     `velocity` (M, 2) in map units per second (NaN: unknown), and `heading` (M, 2), a vector north and east (0:
     unknown). `credited` (M,): logarithm of the likelihood ratio already counted around `anchor` (M, 2)."""
 
-    w: Doubles
-    at: Doubles
+    weight: Doubles
+    position: Doubles
     covariance: Doubles
     velocity: Doubles
     heading: Doubles
@@ -91,13 +91,13 @@ class _Hypotheses:
 
 @dataclass(frozen=True, slots=True)
 class _Prediction:
-    """One possible motion of each of M hypotheses: its probability `share` (M,), and the new position `at` (M, 2) with
-    its `covariance` (M, 2, 2). The density is at least `least` everywhere."""
+    """One possible motion of each of M hypotheses: its `probability` (M,), and the new `position` (M, 2) with its
+    `covariance` (M, 2, 2). The density is at least `min_density` everywhere."""
 
-    share: Doubles
-    at: Doubles
+    probability: Doubles
+    position: Doubles
     covariance: Doubles
-    least: float = 0.0
+    min_density: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,80 +117,80 @@ class MapScale:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proposals:
-    """The K positions proposed by one query alone. `p` (K,) is the probability of each; the remainder to 1 is that of
-    none. Their prior: the aircraft is off the map with probability 1/2, otherwise equally likely at any place.
-    `at` (K, 2) is the position with its `covariance` (K, 2, 2), and `heading_deg` (K,) the heading (NaN: unknown)."""
+    """The K positions proposed by one query alone. `probability` (K,) is that of each; the remainder to 1 is that of
+    none of them. Prior: the aircraft is off the map with probability 1/2, otherwise equally likely at any place.
+    `covariance` (K, 2, 2) is that of the `position` (K, 2). `heading_deg` (K,): NaN if unknown."""
 
-    p: Doubles
-    at: Doubles
+    probability: Doubles
+    position: Doubles
     covariance: Doubles
     heading_deg: Doubles
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Posterior:
-    """Belief after a query: the probability of being `lost`, the probability `p` (K,) of each candidate of the query,
-    and an estimate of the position: `at` (2,), its `covariance` (2, 2), and the heading (None: unknown). `mass` is the
-    probability of all hypotheses near it; without any, the estimate is NaN."""
+    """Belief after a query: the probability of being `lost`, the `probability` (K,) of each candidate of the query,
+    and an estimate of the `position` (2,), its `covariance` (2, 2), and the heading (None: unknown). `mass` is the
+    total probability of the hypotheses near it; without any, the estimate is NaN."""
 
     lost: float
-    p: Doubles
+    probability: Doubles
     mass: float = 0.0
-    at: Doubles = field(default_factory=lambda: np.full(2, np.nan))
+    position: Doubles = field(default_factory=lambda: np.full(2, np.nan))
     covariance: Doubles = field(default_factory=lambda: np.full((2, 2), np.nan))
     heading_deg: float | None = None
 
 
 class Belief:
-    """Belief of one flight over one map. It starts out lost; `update` is called once for each query."""
+    """Belief of one flight over one map, initially lost. Call `update` once for each query."""
 
     def __init__(self, scale: MapScale) -> None:
         self._scale = scale
         self._strongest, self._lost, self._enters = 0.0, 1.0, 0.5  # as in the prior of the proposals
-        shapes = {"w": 0, "at": (0, 2), "covariance": (0, 2, 2), "velocity": (0, 2), "heading": (0, 2)}
+        shapes = {"weight": 0, "position": (0, 2), "covariance": (0, 2, 2), "velocity": (0, 2), "heading": (0, 2)}
         shapes |= {"credited": 0, "anchor": (0, 2)}
         self._now = _Hypotheses(**{name: np.zeros(shape) for name, shape in shapes.items()})
 
     def update(self, proposed: Proposals | None, motion: Motion, places: int) -> Posterior:
-        """Update the belief with the candidates that a query proposes (None: its picture shows too little; those that
-        are not finite are ignored), the motion since the previous query, and the number of places in the map."""
-        odds = (1 - self._lost) / max(self._lost, _MIN_WEIGHT)
+        """Update the belief with the candidates that a query proposes (None: too little texture in its picture; those
+        that are not finite are ignored), the motion since the previous query, and the number of places in the map."""
+        odds = (1 - self._lost) / max(self._lost, _MIN_WEIGHT)  # of not being lost
         now, lost, appears = self._apply_transitions()
         moves = self._predict_motions(now, motion, places)
-        p = np.zeros(0 if proposed is None else len(proposed.p))
-        numbers: Ints = np.zeros(0, int)
+        probability = np.zeros(0 if proposed is None else len(proposed.probability))
+        indices: Ints = np.zeros(0, int)
         if proposed is None:
             lost += appears  # an aircraft that enters the map now is at an unknown place
             updated = _keep_missed(now, moves, 1.0)
         else:
             self._enters = _ENTER_CHANCE
-            numbers, proposed = _select_usable(proposed, self._scale)
+            indices, proposed = _select_usable(proposed, self._scale)
             found, likelihood, staleness, factor = self._weigh(proposed, now, moves, motion.elapsed_s, appears, places)
             lost *= likelihood
-            # Nor are repeated misses over the same ground new evidence.
-            missed = _keep_missed(now, moves, _MISS_LIKELIHOOD ** motion.new_ground_share(self._scale.spacing))
-            # A lost aircraft that sees the same ground again has not moved either, so staying is no evidence for it.
-            kept = (factor * odds * lost - float(missed.w.sum())) / max(float(found.w.sum()), _MIN_WEIGHT)
-            found = replace(found, w=found.w * max(1.0, kept) ** staleness)
+            # Repeated misses over the same ground are not new evidence either.
+            missed = _keep_missed(now, moves, _MISS_LIKELIHOOD ** motion.new_ground_fraction(self._scale.spacing))
+            # A lost aircraft that sees the same ground again has not moved either: this is no evidence of being lost.
+            min_gain = (factor * odds * lost - float(missed.weight.sum())) / max(float(found.weight.sum()), _MIN_WEIGHT)
+            found = replace(found, weight=found.weight * max(1.0, min_gain) ** staleness)
             pairs = {name: (getattr(found, name), getattr(missed, name)) for name in _Hypotheses.__slots__}
             updated = _Hypotheses(**{name: np.concatenate(pair) for name, pair in pairs.items()})
-        share = updated.w / (lost + float(updated.w.sum()))
-        p[numbers] = share[: len(numbers)]
-        strongest = np.argsort(-share, kind="stable")[:_MAX_HYPOTHESES]
-        self._now = replace(updated, w=share)[strongest[share[strongest] > _MIN_WEIGHT]]
-        self._lost = max(0.0, 1 - float(self._now.w.sum()))
-        return self._make_posterior(p)
+        weight = updated.weight / (lost + float(updated.weight.sum()))
+        probability[indices] = weight[: len(indices)]
+        strongest = np.argsort(-weight, kind="stable")[:_MAX_HYPOTHESES]
+        self._now = replace(updated, weight=weight)[strongest[weight[strongest] > _MIN_WEIGHT]]
+        self._lost = max(0.0, 1 - float(self._now.weight.sum()))
+        return self._make_posterior(probability)
 
     def _apply_transitions(self) -> tuple[_Hypotheses, float, float]:
         """Apply the probabilities of leaving, entering and jumping between two queries. Return the hypotheses, the
         probability of being lost, and that of having entered or jumped to any place."""
-        on_map = float(self._now.w.sum())
+        on_map = float(self._now.weight.sum())
         lost = (1 - self._enters) * self._lost + _LEAVE_CHANCE * on_map
         stays = 1 - _LEAVE_CHANCE - _JUMP_CHANCE
         leaked = max(0.0, math.log(max(lost, _MIN_DIVISOR) / max(stays * self._lost, _MIN_DIVISOR)))
         self._strongest = max(0.0, self._strongest - leaked)
         credited = np.maximum(self._now.credited - leaked, 0)
-        now = replace(self._now, w=stays * self._now.w, credited=credited)
+        now = replace(self._now, weight=stays * self._now.weight, credited=credited)
         return now, lost, self._enters * self._lost + _JUMP_CHANCE * on_map
 
     def _predict_motions(self, now: _Hypotheses, motion: Motion, places: int) -> list[_Prediction]:
@@ -203,18 +203,19 @@ class Belief:
         has_velocity = ~np.isnan(now.velocity[:, 0])
         step = np.where(has_velocity[:, None], now.velocity, 0) * motion.elapsed_s
         step *= (motion.reach / np.maximum(np.hypot(*step.T), max(motion.reach, _MIN_DIVISOR)))[:, None]
-        left, mean_move, sd = np.ones(len(now.w)), np.zeros(2), max(reach / _REACH_SIGMAS, _CV_SD * scale.spacing)
+        remaining, mean_move = np.ones(len(now.weight)), np.zeros(2)
+        sd = max(reach / _REACH_SIGMAS, _CV_SD * scale.spacing)
         if (moved := motion.displacement) is not None:
-            share, least_sd, sd_share = _VISUAL_ODOMETRY if motion.is_visual else _REPORTED_ODOMETRY
-            spread = (sd_share**2 * moved @ moved + (least_sd * scale.spacing) ** 2) * np.eye(2)
-            moves.append(_Prediction(share * left, now.at + moved, now.covariance + spread))
+            probability, min_sd, relative_sd = _VISUAL_ODOMETRY if motion.is_visual else _REPORTED_ODOMETRY
+            spread = (relative_sd**2 * moved @ moved + (min_sd * scale.spacing) ** 2) * np.eye(2)
+            moves.append(_Prediction(probability * remaining, now.position + moved, now.covariance + spread))
             # Odometry wrong by a factor of two has an error as large as the displacement itself.
-            left, mean_move, sd = (1 - share) * left, moved, min(sd, scale.spacing + math.hypot(*moved))
+            remaining, mean_move, sd = (1 - probability) * remaining, moved, min(sd, scale.spacing + math.hypot(*moved))
         variance = (_CV_SD * scale.spacing) ** 2 + (_CV_SD * np.hypot(*step.T)) ** 2 / 2
         cv_covariance = now.covariance + variance[:, None, None] * np.eye(2)
-        moves.append(_Prediction(_CV_PROBABILITY * has_velocity * left, now.at + step, cv_covariance))
-        left, anywhere = (1 - _CV_PROBABILITY * has_velocity) * left, now.covariance + sd**2 * np.eye(2)
-        moves.append(_Prediction(left, now.at + mean_move, anywhere, is_everywhere / area))
+        moves.append(_Prediction(_CV_PROBABILITY * has_velocity * remaining, now.position + step, cv_covariance))
+        remaining, anywhere = (1 - _CV_PROBABILITY * has_velocity) * remaining, now.covariance + sd**2 * np.eye(2)
+        moves.append(_Prediction(remaining, now.position + mean_move, anywhere, is_everywhere / area))
         return moves
 
     def _weigh(
@@ -230,104 +231,107 @@ class Belief:
 
         * one hypothesis for each candidate,
         * the likelihood of the query if lost, relative to that on ground that never resembles the map,
-        * the share (0..1) of the weight that comes from pictures of the same ground as the previous query,
+        * the fraction (0..1) of the weight that comes from pictures of the same ground as the previous query,
         * the factor, at most 1, by which the odds of not being lost shrink if this query is weaker evidence there.
         """
-        scale, at, cov = self._scale, proposed.at, proposed.covariance
-        rest = max(_MIN_NONE_PROBABILITY, 1 - float(proposed.p.sum()))
-        ratio = np.log(np.maximum(proposed.p, _MIN_DIVISOR) * places / rest)
+        scale, position, cov = self._scale, proposed.position, proposed.covariance
+        rest = max(_MIN_NONE_PROBABILITY, 1 - float(proposed.probability.sum()))
+        ratio = np.log(np.maximum(proposed.probability, _MIN_DIVISOR) * places / rest)
         appeared = appears / places * np.exp(ratio)
 
         # A picture of the same ground repeats the previous evidence. This holds for a lost aircraft as well.
         strongest, before = max(0.0, float(ratio.max(initial=0))), self._strongest
         repeated, self._strongest = min(before, strongest), strongest
         sd = np.sqrt(cov[:, 0, 0] if scale.is_ordinal else np.trace(cov, axis1=1, axis2=2) / 2)
-        fresh = np.clip((compute_distances(now.anchor, at) - _SAME_POSITION_SIGMAS * sd) / scale.spacing, 0, 1)
-        evidence = np.exp(ratio + (1 - fresh) * (repeated - now.credited[:, None])) * (scale.cell * now.w[:, None])
+        fresh = np.clip((compute_distances(now.anchor, position) - _SAME_POSITION_SIGMAS * sd) / scale.spacing, 0, 1)
+        evidence = np.exp(ratio + (1 - fresh) * (repeated - now.credited[:, None])) * (scale.cell * now.weight[:, None])
         # For each motion, the weight (M, K) that each hypothesis gives each candidate.
-        weights = [move.share[:, None] * evidence * _compute_density(move, at, cov, scale.is_ordinal) for move in moves]
+        weights = [
+            move.probability[:, None] * evidence * _compute_density(move, position, cov, scale.is_ordinal)
+            for move in moves
+        ]
         weight = sum(moved.sum(0) for moved in weights)
-        origin = sum(weights) / np.maximum(weight, _MIN_DIVISOR)  # (M, K): part of a candidate's weight
+        origin = sum(weights) / np.maximum(weight, _MIN_DIVISOR)  # (M, K): fraction of a candidate's weight
         stale = origin * (1 - fresh)
         staleness = float(weight @ stale.sum(0)) / max(_MIN_DIVISOR, float((weight + appeared).sum()))
         newest = float(ratio[stale.sum(0) > 0.5].max(initial=-math.inf))
         odds_factor = math.exp(min(0.0, newest - before))
-        agreement = float(weight.sum()) * rest / max(_MIN_DIVISOR, float(now.w.sum() * proposed.p.sum()))
-        likelihood = (1 - _RESEMBLANCE + _RESEMBLANCE * agreement) ** (1 - staleness) if len(now.w) else 1.0
+        agreement = float(weight.sum()) * rest / max(_MIN_DIVISOR, float(now.weight.sum() * proposed.probability.sum()))
+        likelihood = (1 - _RESEMBLANCE + _RESEMBLANCE * agreement) ** (1 - staleness) if len(now.weight) else 1.0
 
-        predicted_at, predicted_cov = mix_gaussians(
+        predicted_position, predicted_cov = mix_gaussians(
             np.concatenate(weights).T / np.maximum(weight, _MIN_DIVISOR)[:, None],
-            np.concatenate([move.at for move in moves]),
+            np.concatenate([move.position for move in moves]),
             np.concatenate([move.covariance for move in moves]),
         )
-        fused_at, fused_cov = fuse_positions(at, cov, predicted_at, predicted_cov)
+        fused_position, fused_cov = fuse_positions(position, cov, predicted_position, predicted_cov)
         gain = np.where(np.isnan(now.velocity[:, :1]), 1.0, _NEWEST_WEIGHT)
-        kept = (1 - gain) * np.nan_to_num(now.velocity) - gain * now.at / elapsed_s
-        velocity = (origin.T @ gain) * at / elapsed_s + origin.T @ kept
-        anchor = (1 - stale.sum(0))[:, None] * at + stale.T @ now.anchor
+        kept = (1 - gain) * np.nan_to_num(now.velocity) - gain * now.position / elapsed_s
+        velocity = (origin.T @ gain) * position / elapsed_s + origin.T @ kept
+        anchor = (1 - stale.sum(0))[:, None] * position + stale.T @ now.anchor
         is_continued, heading = (weight > appeared)[:, None], np.radians(proposed.heading_deg)
         hypotheses = _Hypotheses(
-            w=math.exp(-staleness * repeated) * (weight + appeared),
-            at=np.where(is_continued, fused_at, at),
+            weight=math.exp(-staleness * repeated) * (weight + appeared),
+            position=np.where(is_continued, fused_position, position),
             covariance=np.where(is_continued[..., None], fused_cov, cov),
             velocity=np.where(is_continued, velocity, np.nan),
             heading=np.nan_to_num(np.stack([np.cos(heading), np.sin(heading)], 1)),
             credited=np.maximum(ratio, 0),
-            anchor=np.where(is_continued, anchor, at),
+            anchor=np.where(is_continued, anchor, position),
         )
         return hypotheses, likelihood, staleness, odds_factor
 
-    def _make_posterior(self, p: Doubles) -> Posterior:
+    def _make_posterior(self, probability: Doubles) -> Posterior:
         """Return the belief with an estimate: the weighted mean of the hypotheses around the one whose
         neighbourhood has the most weight."""
         now = self._now
-        if not len(now.w):
-            return Posterior(lost=self._lost, p=p)
-        is_near = compute_distances(now.at, now.at) <= self._scale.near
-        chosen = is_near[(is_near @ now.w).argmax()]
-        mass = float(now.w[chosen].sum())
-        share = now.w[chosen] / mass
-        (at,), (covariance,) = mix_gaussians(share[None], now.at[chosen], now.covariance[chosen])
-        north, east = (share @ now.heading[chosen]).tolist()
+        if not len(now.weight):
+            return Posterior(lost=self._lost, probability=probability)
+        is_near = compute_distances(now.position, now.position) <= self._scale.near
+        chosen = is_near[(is_near @ now.weight).argmax()]
+        mass = float(now.weight[chosen].sum())
+        weight = now.weight[chosen] / mass
+        (position,), (covariance,) = mix_gaussians(weight[None], now.position[chosen], now.covariance[chosen])
+        north, east = (weight @ now.heading[chosen]).tolist()
         heading_deg = math.degrees(math.atan2(east, north)) % 360 if math.hypot(north, east) > 0.5 else None
-        return Posterior(lost=self._lost, p=p, mass=mass, at=at, covariance=covariance, heading_deg=heading_deg)
+        estimate = Posterior(lost=self._lost, probability=probability, mass=mass, position=position)
+        return replace(estimate, covariance=covariance, heading_deg=heading_deg)
 
 
 def _keep_missed(now: _Hypotheses, moves: list[_Prediction], likelihood: float) -> _Hypotheses:
-    """Return the moved hypotheses for the case that the query proposes none of them: `w` times this likelihood."""
-    share = np.stack([move.share for move in moves], 1)[..., None]
-    at = np.stack([move.at for move in moves], 1)
+    """Return the moved hypotheses if the query proposes none of them, with the weight multiplied by this likelihood."""
+    probability = np.stack([move.probability for move in moves], 1)[..., None]
+    position = np.stack([move.position for move in moves], 1)
     covariance = np.stack([move.covariance for move in moves], 1)
-    mean = (share * at).sum(1)
-    offsets = at - mean[:, None]
-    spread = (share[..., None] * (covariance + offsets[..., :, None] * offsets[..., None, :])).sum(1)
-    return replace(now, w=likelihood * now.w, at=mean, covariance=spread)
+    mean = (probability * position).sum(1)
+    offsets = position - mean[:, None]
+    spread = (probability[..., None] * (covariance + offsets[..., :, None] * offsets[..., None, :])).sum(1)
+    return replace(now, weight=likelihood * now.weight, position=mean, covariance=spread)
 
 
-def _compute_density(move: _Prediction, at: Doubles, covariance: Doubles, is_ordinal: bool) -> Doubles:
-    """Return the density (M, K) at positions `at` (K, 2) with `covariance` (K, 2, 2), after M hypotheses have moved."""
+def _compute_density(move: _Prediction, position: Doubles, covariance: Doubles, is_ordinal: bool) -> Doubles:
+    """Return the density (M, K) at K positions (K, 2) with `covariance` (K, 2, 2), after M hypotheses have moved."""
     xx, xy, yy = (move.covariance[:, None, i, j] + covariance[None, :, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    dx, dy = (at[None, :, i] - move.at[:, None, i] for i in (0, 1))
+    dx, dy = (position[None, :, i] - move.position[:, None, i] for i in (0, 1))
     if is_ordinal:
         xy, yy, dy = np.zeros(()), np.full((), _UNIT_VARIANCE), np.zeros(())
     determinant = np.maximum(xx * yy - xy * xy, MIN_VARIANCE_RATIO * xx * yy)
     squared = (yy * (dx * dx) - 2 * xy * (dx * dy) + xx * (dy * dy)) / determinant
     gaussian: Doubles = np.exp(-np.maximum(squared, 0) / 2) / (2 * np.pi * np.sqrt(determinant))
-    return np.maximum(gaussian, move.least)
+    return np.maximum(gaussian, move.min_density)
 
 
 def _select_usable(proposed: Proposals, scale: MapScale) -> tuple[Ints, Proposals]:
     """Return the indices of the likeliest finite proposals, and those proposals, with covariances made invertible and
     probabilities scaled to sum to at most 1."""
-    is_near = (np.abs(proposed.at) < _MAX_DISTANCE).all(1) & (np.abs(proposed.covariance) < _MAX_DISTANCE**2).all(
-        (1, 2)
-    )
-    numbers = np.flatnonzero((proposed.p > 0) & (proposed.p < np.inf) & is_near)
-    numbers = numbers[np.argsort(-proposed.p[numbers], kind="stable")[:_MAX_HYPOTHESES]]
-    p = proposed.p[numbers]
-    return numbers, Proposals(
-        p=p / max(1.0, float(p.sum())),
-        at=proposed.at[numbers],
-        covariance=regularize_covariance(proposed.covariance[numbers], (_MIN_SD * scale.spacing) ** 2),
-        heading_deg=proposed.heading_deg[numbers],
+    is_near = (np.abs(proposed.position) < _MAX_DISTANCE).all(1)
+    is_near &= (np.abs(proposed.covariance) < _MAX_DISTANCE**2).all((1, 2))
+    indices = np.flatnonzero((proposed.probability > 0) & (proposed.probability < np.inf) & is_near)
+    indices = indices[np.argsort(-proposed.probability[indices], kind="stable")[:_MAX_HYPOTHESES]]
+    probability = proposed.probability[indices]
+    return indices, Proposals(
+        probability=probability / max(1.0, float(probability.sum())),
+        position=proposed.position[indices],
+        covariance=regularize_covariance(proposed.covariance[indices], (_MIN_SD * scale.spacing) ** 2),
+        heading_deg=proposed.heading_deg[indices],
     )

@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 class MapCalibration:
     """Calibration of a map: the result of querying it with `asked` altered images of its own places. `models` maps
     kinds of evidence to the models adapted to the map, and `made` is the date. At the `precision` for which the map
-    was calibrated, the share `accepted` of the images is accepted. `accepted_wrong` of these matches are wrong,
+    was calibrated, the fraction `accepted` of the images is accepted. `accepted_wrong` of these matches are wrong,
     including queries of places that were left out of the map for the test. `recognisable` maps the number of each
     tested place to the mean confidence (0..1) of its correct matches. `look_alikes`: None for a camera looking down."""
 
@@ -39,7 +39,7 @@ class MapCalibration:
 
     @property
     def hardly_recognisable(self) -> float:
-        """Share of the tested places that are hard to recognise."""
+        """Fraction of the tested places that are hard to recognise."""
         return sum(mean < _MIN_CONFIDENCE for mean in self.recognisable.values()) / max(len(self.recognisable), 1)
 
     @property
@@ -49,8 +49,8 @@ class MapCalibration:
 
     def figures(self) -> dict[str, Any]:
         """Return the figures as a dict for JSON."""
-        kept = ("made", "asked", "precision", "accepted_wrong", "looks_alike")
-        return {name: getattr(self, name) for name in kept} | {
+        names = ("made", "asked", "precision", "accepted_wrong", "looks_alike")
+        return {name: getattr(self, name) for name in names} | {
             "made_of": [model.made_of for model in self.models.values()],
             "places_asked": len(self.recognisable),
             "accepted": round(self.accepted, 4),
@@ -61,17 +61,17 @@ class MapCalibration:
     def described(self) -> str:
         """Describe the calibration in one sentence: accepted and wrong matches, and places hard to recognise."""
         wrong = f"{self.accepted_wrong or 'no'} wrong match{'es were' if self.accepted_wrong > 1 else ' was'} accepted"
-        alike = "; most of this map looks alike: expect few fixes over it" if self.looks_alike else ""
+        warning = "; most of this map looks alike: expect few fixes over it" if self.looks_alike else ""
         return (
             f"of {self.asked} altered copies of its own images {100 * self.accepted:.0f} % were accepted, at a "
             f"precision of {100 * self.precision:.6g} %; {wrong}; {100 * self.hardly_recognisable:.0f} % of "
-            f"{len(self.recognisable)} places are hard to recognise{alike}"
+            f"{len(self.recognisable)} places are hard to recognise{warning}"
         )
 
 
 def require_usable(kind: str, model: Model) -> None:
     """Check a model read from a map. Raises ValueError for an unknown kind or name of evidence, which another version
-    of edgevpr may use, and ValueError or ArithmeticError for figures that give no confidence."""
+    of edgevpr may use, and ValueError or ArithmeticError for figures that result in no confidence."""
     known = MAP_FIGURES.get(kind, ()) + PLACE_FIGURES.get(kind, ())
     names = {*model.of_map.names, *model.of_place.names}
     if unknown := names.difference(known):
@@ -87,24 +87,24 @@ def read_calibration_for(place_map: PlaceMap) -> MapCalibration | None:
         text = place_map.calibration
         if text is None:
             return None
-        found = read_calibration(text)
-        for kind, model in found.models.items():
+        calibration = read_calibration(text)
+        for kind, model in calibration.models.items():
             require_usable(kind, model)
     except (ValueError, ArithmeticError, KeyError, TypeError, AttributeError, MapError) as error:
         _log.warning(
-            "%s: the calibration cannot be used (%s), so the shipped one is: run `edgevpr map calibrate`",
+            "%s: its calibration is unusable (%s); the default confidence model is used: run `edgevpr map calibrate`",
             place_map.path,
             error,
         )
         return None
-    return found
+    return calibration
 
 
 def explain_not_calibrated(places: int) -> str:
     """Return a sentence on why a map with this number of places is not calibrated."""
     if places < MIN_PLACES:
-        return f"not calibrated ({places} places: fewer than {MIN_PLACES}): the shipped confidence is used"
-    return "not calibrated: the shipped confidence is used; `edgevpr map calibrate` adapts it to the map"
+        return f"not calibrated ({places} places, fewer than {MIN_PLACES}): the default confidence model is used"
+    return "not calibrated: the default confidence model is used; `edgevpr map calibrate` adapts it to the map"
 
 
 def format_calibration(calibration: MapCalibration) -> str:
@@ -119,13 +119,13 @@ def read_calibration(text: str) -> MapCalibration:
     body = text[_CHECKSUM_DIGITS:]
     if text != _checksum(body) + body:
         raise ValueError("its checksum is wrong")
-    found = json.loads(body)
-    found["models"] = {kind: parse_model(model) for kind, model in found["models"].items()}
-    found["recognisable"] = {int(place_id): mean for place_id, mean in found["recognisable"].items()}
-    if (alike := found.get("look_alikes")) is not None:
-        places = {int(place_id): LookAlike(**each) for place_id, each in alike["places"].items()}
-        found["look_alikes"] = LookAlikes(bool(alike["overlap"]), places)
-    return MapCalibration(**found)
+    fields = json.loads(body)
+    fields["models"] = {kind: parse_model(model) for kind, model in fields["models"].items()}
+    fields["recognisable"] = {int(place_id): mean for place_id, mean in fields["recognisable"].items()}
+    if (look_alikes := fields.get("look_alikes")) is not None:
+        places = {int(place_id): LookAlike(**look_alike) for place_id, look_alike in look_alikes["places"].items()}
+        fields["look_alikes"] = LookAlikes(bool(look_alikes["overlap"]), places)
+    return MapCalibration(**fields)
 
 
 def _checksum(body: str) -> str:

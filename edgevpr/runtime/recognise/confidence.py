@@ -1,14 +1,14 @@
 """The confidence model: converts the evidence for a match (see `evidence`) to the probability that it is correct.
 
 A match can be wrong in two ways: the query shows ground outside the map, or it shows the map but the best place is not
-the right one. Chance agreement is much the same in every map, but maps differ in how much their places look alike. So
-there is one logistic regression for each of the two errors. Both are shipped, and are adapted to a map that is large
-enough (see `calibrate`).
+the correct one. Chance agreement is much the same in every map, but maps differ in how much their places look alike. So
+there is one logistic regression for each of the two errors. Both come with edgevpr, and are adapted to a map that is
+large enough (see `calibrate`).
 
 The distribution of the logits of wrong matches was measured on many sites: the highest follow an exponential
 distribution (peaks over threshold: Pickands 1975). The *chance* of a match is the probability that a wrong match has
-logits as high, summed over both errors. For a precision p, matches with a chance of at most 1 - p are accepted. The
-confidence is a logistic function of the logarithm of the chance (Platt 1999).
+logits at least as high, summed over both errors. For a precision p, matches with a chance of at most 1 - p are
+accepted. The confidence is a logistic function of the logarithm of the chance (Platt 1999).
 """
 
 import json
@@ -24,14 +24,14 @@ from edgevpr.core.files import find_shipped, read_file
 Figures = Mapping[str, float]  # figures of the evidence for a match, by name
 
 _MAX_FILE_BYTES = 100_000
-_MAX_LOGIT = 40.0  # limit of a logit: beyond it, a probability is 0 or 1 in float64
-# Safety factors on the share of matches that may be wrong, because a chance is an estimate. Without them one tunnel of
+_MAX_LOGIT = 40.0  # beyond it, a probability is 0 or 1 in float64
+# Safety factors on the permitted fraction of wrong matches, because a chance is an estimate. Without them one tunnel of
 # nordland_tiny was mistaken for another, and a foreign picture for a place of aerial_swindale; with a model that is not
 # adapted to its map, also foreign pictures for the five places of grief_michigan_monthly.
 _ADAPTED_FACTOR = 0.5
 _SHIPPED_FACTOR = 0.1
-_MIN_CHANCE = 1e-15  # least chance, so that its logarithm exists
-# A chance is multiplied by the share of rotations tried to this power. It would be 1 if rotations were independent, but
+_MIN_CHANCE = 1e-15  # so that the logarithm exists
+# A chance is multiplied by this power of the fraction of rotations tried. It would be 1 if they were independent, but
 # streets and furrows have directions. Of 2,015 foreign and mirrored pictures, queried with random headings in the maps
 # of sat_marash and aerial_garfield28, 3 had a chance below 1 % without this factor, and 12 one below 30 %.
 _ROTATIONS_EXPONENT = 2 / 3
@@ -55,7 +55,7 @@ class Logistic:
 
 @dataclass(frozen=True, slots=True)
 class Tail:
-    """Distribution of the highest logits of wrong matches. The share of all matches that are wrong and have a logit
+    """Distribution of the highest logits of wrong matches. The fraction of all matches that are wrong and have a logit
     above `start` is `share`; above `start` + n * `scale` it is `share` times exp(-n)."""
 
     start: float
@@ -63,7 +63,7 @@ class Tail:
     scale: float
 
     def compute_exceedance(self, logit: float) -> float:
-        """Return the share of all matches that are wrong and have a logit above this one; at most 1."""
+        """Return the fraction of all matches that are wrong and have a logit above this one; at most 1."""
         return math.exp(min(0.0, math.log(self.share) + (self.start - logit) / self.scale))
 
 
@@ -87,7 +87,7 @@ class Scale:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Model:
     """Computes the confidence of the matches of one technique and kind of evidence. `of_map` is the regression on
-    whether the query shows ground of the map, `of_place` on whether the best place is the right one, and `scale`
+    whether the query shows ground of the map, `of_place` on whether the best place is the correct one, and `scale`
     converts their logits. `adapted_scale` replaces `scale` once the model is adapted to a map (None: this model is
     adapted). `made` is its date, `made_of` describes the data it was fitted to in words, and `matches` is the number of
     matches from many sites that the scale was fitted to."""
@@ -101,7 +101,7 @@ class Model:
     matches: int
 
     def chance(self, evidence: Figures) -> float:
-        """Return the probability (0..1) that a wrong match has as much evidence; 1 if any figure is not finite. If the
+        """Return the probability that a wrong match has at least this evidence; 1 if a figure is not finite. If the
         heading is known, fewer rotations are tried than in calibration, and `tried` lowers the chance accordingly."""
         of_map, of_place = self.of_map.logit(evidence), self.of_place.logit(evidence)
         if not (math.isfinite(of_map) and math.isfinite(of_place)):
@@ -124,14 +124,14 @@ class Model:
         return self.scale.confidence(self.scale.off_map.compute_exceedance(logit) if math.isfinite(logit) else 1.0)
 
     def threshold(self, precision: float) -> float:
-        """Return the confidence at and above which the share `precision` (below 1) of the matches is correct. A model
-        that is not adapted to its map does not reflect how alike its places look, so its threshold is higher."""
-        wrong = 1 - precision
-        return self.scale.confidence(wrong * (_ADAPTED_FACTOR if self.adapted_scale is None else _SHIPPED_FACTOR))
+        """Return the lowest confidence for which the fraction `precision` (below 1) of the matches is correct. A model
+        that is not adapted to its map does not reflect how similar its places look, so its threshold is higher."""
+        max_wrong = 1 - precision
+        return self.scale.confidence(max_wrong * (_ADAPTED_FACTOR if self.adapted_scale is None else _SHIPPED_FACTOR))
 
 
 def parse_model(stored: Mapping[str, Any]) -> Model:
-    """Make a model from decoded JSON. Raises KeyError or TypeError for other contents."""
+    """Make a model from decoded JSON. Raises KeyError or TypeError for invalid contents."""
     scales = {name: stored[name] and _make_scale(**stored[name]) for name in ("scale", "adapted_scale")}
     regressions = {name: _make_logistic(**stored[name]) for name in ("of_map", "of_place")}
     return Model(**{**stored, **regressions, **scales})
@@ -139,12 +139,12 @@ def parse_model(stored: Mapping[str, Any]) -> Model:
 
 @lru_cache
 def read_shipped_model(kind: str) -> Model:
-    """Return the shipped model for a kind of evidence (see `evidence`). Raises ModelError if its file is unusable."""
+    """Return the default model for a kind of evidence (see `evidence`). Raises ModelError if its file is unusable."""
     path = find_shipped("models") / f"confidence_{kind}.json"
     try:
         return parse_model(json.loads(read_file(path, _MAX_FILE_BYTES)))
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ModelError(f"{path} cannot be used ({error}): install edgevpr again.") from error
+        raise ModelError(f"{path} is unusable ({error}): reinstall edgevpr.") from error
 
 
 def _make_logistic(names: list[str], weights: list[float], scales: list[float], bias: float) -> Logistic:

@@ -42,7 +42,7 @@ from edgevpr.runtime.recognise.judge import (
     AcceptRule,
     Findings,
     Verdict,
-    is_at_rest,
+    is_unshifted,
     judge,
 )
 from edgevpr.runtime.recognise.landmarks import PLACE_LANDMARKS, QUERY_LANDMARKS, Landmarks, unpack_bytes
@@ -53,16 +53,16 @@ from edgevpr.runtime.recognise.relief import Relief
 from edgevpr.runtime.recognise.tilted import measure_again
 
 _MAX_SAME_GROUND = 12  # places that may show the same ground: as many overlap on kite_ochota, which has no positions
-# Least share of the best place's votes for a place elsewhere to count as at rest. With an on-screen display, nearly all
-# places have 0.15 to 0.9 of them; on smooth ground some are at rest by chance with up to 0.065.
-_MIN_REST_VOTES_SHARE = 0.15
+# Votes of a place elsewhere, relative to the best place, to count as unshifted. With an on-screen display, nearly all
+# places have 0.15 to 0.9; over smooth ground some are unshifted by chance, with up to 0.065.
+_MIN_UNSHIFTED_VOTES_RATIO = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matcher:
     """An index to search, the rule for accepting its matches, and the search over sequences of queries (None: each
-    query is ranked alone). They belong together: another form of the vectors in RAM gives other scores, so it needs
-    other limits. `layers` are those of the index (None: those of the map)."""
+    query is ranked alone). They belong together: the scores, and so the limits, depend on the form of the vectors in
+    RAM. `layers` are those of the index (None: those of the map)."""
 
     index: PlaceIndex = field(kw_only=False)
     rule: AcceptRule = field(kw_only=False)
@@ -73,8 +73,8 @@ class Matcher:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchSettings:
     """Settings of the recogniser. `candidates` places are compared (None: all in full, see `places.retrieve.compare`).
-    `verify` enables the check of landmarks; with `all_evidence` they are also compared if they decide nothing, to fit
-    a model. The accuracy of a position is never below `min_accuracy_m` (1-sigma)."""
+    `verify` enables the landmark check. With `all_evidence`, landmarks are compared even where they decide nothing, to
+    fit a model. The accuracy of a position is never below `min_accuracy_m` (1 sigma)."""
 
     candidates: int | None = None
     verify: bool = True
@@ -97,17 +97,17 @@ class Verifier:
         return self._encoder.detect_landmarks(self._picture, count)
 
     def compare_best(self, ranking: Ranking) -> Agreement | None:
-        """Compare the landmarks of the query with those of the best place, near the overlay given by its match. None if
-        the place has no landmarks, or its match no shift or rotation."""
+        """Compare the landmarks of query and best place, near the overlay given by the match. Return None if the place
+        has no landmarks, or its match has no shift."""
         expected, landmarks = self._load_place(ranking, int(ranking.slots[0]))
         return compare_near(self.landmarks, landmarks, expected) if expected and landmarks is not None else None
 
     def count_inliers(self, ranking: Ranking) -> int:
         """Return the number of landmarks of the query and the best place that agree on the overlay of its match: 0 if
-        those of the place are unknown, or if they are at rest, as an on-screen display is."""
+        those of the place are unknown, or if they are unshifted, as in an on-screen display."""
         expected, landmarks = self._load_place(ranking, int(ranking.slots[0]))
         agreement = None if landmarks is None else measure_agreement(self.landmarks, landmarks, expected)
-        return 0 if agreement is None or agreement.is_at_rest else agreement.inliers
+        return 0 if agreement is None or agreement.is_unshifted else agreement.inliers
 
     def count_rival(
         self,
@@ -117,8 +117,8 @@ class Verifier:
         max_slots: int = MAX_NEIGHBOUR_SLOTS,
     ) -> int:
         """Return the number of landmarks of the query and of the best place elsewhere (see `outside_neighbourhood`)
-        that agree on the overlay of its match: 0 if there is no place elsewhere, the largest possible number if its
-        landmarks are unknown. Places with the numbers `same_ground` are not elsewhere."""
+        that agree on the overlay of its match: 0 if there is no such place, the largest possible number if its
+        landmarks are unknown. Places with the numbers `same_ground` do not count as elsewhere."""
         slots, best = ranking.slots, int(ranking.slots[0])
         rivals = slots[outside_neighbourhood(self._index, best, slots, neighbour_m, same_ground, max_slots)]
         if not len(rivals):
@@ -129,7 +129,7 @@ class Verifier:
     def find_same_ground(self, ranking: Ranking) -> tuple[int, ...]:
         """Return the numbers of the compared places that show the same ground as the best one: the landmarks of both
         agree on the overlay that follows from their matches. Only the first few places are tried. Empty if the best
-        place has a position, since distances then show this."""
+        place has a position: distances are used then."""
         slots = ranking.compared_slots[:_MAX_SAME_GROUND]
         if not slots or not np.isnan(self._index.lat_deg[slots[0]]):
             return ()
@@ -142,7 +142,7 @@ class Verifier:
             for place_id, (other, landmarks) in others.items()
             if other and landmarks
         }
-        return tuple(place_id for place_id, found in agreements.items() if found.inliers >= MIN_CONFIRMED_INLIERS)
+        return tuple(place_id for place_id, pair in agreements.items() if pair.inliers >= MIN_CONFIRMED_INLIERS)
 
     def _load_place(self, ranking: Ranking, slot: int) -> tuple[Overlay | None, Landmarks | None]:
         """Return the overlay of the query on the place in row `slot`, from its match, and the place's landmarks (None:
@@ -150,7 +150,7 @@ class Verifier:
         match, cells = ranking.compared.get(slot), self._spec.cells
         if match is None or match.shift_cells is None or cells is None:
             return None, None
-        width, height = self._sides
+        width, height = self._square_sides
         dx, dy = match.shift_cells
         shift_share = dx * width / cells, dy * height / cells
         expected = Overlay(shift_share, match.rotation_deg or 0.0, match.height_ratio)
@@ -164,8 +164,8 @@ class Verifier:
         return expected, None
 
     @property
-    def _sides(self) -> tuple[float, float]:
-        """Width and height of the technique's square in the picture, as shares of the picture's longest side."""
+    def _square_sides(self) -> tuple[float, float]:
+        """Width and height of the technique's square in the picture, as fractions of the picture's longest side."""
         if self._spec.looks_down:  # the picture was padded to the square, not stretched
             return 1.0, 1.0
         height, width = self._picture.image.shape[:2]
@@ -188,8 +188,8 @@ class Decision:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decider:
-    """Decides on rankings of the places of a `matcher`. `accuracy_m` is that of a place's position used as
-    a fix; `common_tilt` and `relief` are measured from the matches accepted so far."""
+    """Decides whether to accept the best place of a ranking. `accuracy_m` is that of a place's position used as
+    a fix; `common_tilt` and `relief` are estimated from the matches accepted so far."""
 
     place_map: PlaceMap
     technique: Technique
@@ -201,7 +201,7 @@ class Decider:
     relief: Relief = field(default_factory=Relief)
 
     def make_query(self, descriptor: Descriptor, expected: Expectation) -> Query:
-        """Return the query for a descriptor over the places of the matcher."""
+        """Return the query with a descriptor over the places of the matcher."""
         technique, place_map, index = self.technique, self.place_map, self.matcher.index
         return Query(technique=technique, descriptor=descriptor, place_map=place_map, index=index, expected=expected)
 
@@ -213,44 +213,45 @@ class Decider:
         verifier: Verifier,
         place_filter: PlaceFilter | None,
     ) -> Decision:
-        """Judge the best place of a ranking by its landmarks, the places around it, and the flight so far. If the
+        """Judge the best place of a ranking from its landmarks, the places around it, and the flight so far. If the
         flight so far makes another place more likely, judge that one."""
         index, rule, search, track = self.matcher.index, self.matcher.rule, self.matcher.search, None
-        by_confidence = rule.confidence_rule
-        best, found = self._gather_findings(ranking, query, verifier)
-        if place_filter and by_confidence and found.evidence:
+        confidence_rule = rule.confidence_rule
+        best, findings = self._gather_findings(ranking, query, verifier)
+        if place_filter and confidence_rule and findings.evidence:
             with self.meter.step("locate"):
-                track = place_filter.update(ranking, index, found.evidence, by_confidence, found.located)
+                track = place_filter.update(ranking, index, findings.evidence, confidence_rule, findings.located)
             if track.slot is not None and track.prefers_other(int(ranking.slots[0])):
                 ranking = ranking.promote(track.slot)
-                best, found = self._gather_findings(ranking, query, verifier)
-        found = replace(found, track_confidence=track.confidence if track else None)
-        verdict = judge(found, index, rule, search)
+                best, findings = self._gather_findings(ranking, query, verifier)
+        findings = replace(findings, track_confidence=track.confidence if track else None)
+        verdict = judge(findings, index, rule, search)
         if verdict.accepted and self.technique.spec.looks_down and search is None:
             heading_deg = best.place.heading_deg
             is_heading_known = hints is not None and hints.heading_deg is not None and heading_deg is not None
-            at_rest_elsewhere = self._share_at_rest_elsewhere(best, ranking, query)
-            lead_over_rotated = None if is_heading_known else self._lead_over_rotated(best, found.evidence, query)
-            # Last: it encodes another image, and a technique caches the views of its latest image only.
+            unshifted_fraction = self._measure_unshifted_fraction(best, ranking, query)
+            lead = None if is_heading_known else self._compute_rotation_lead(best, findings.evidence, query)
+            # Last, because it encodes another image, and a technique caches only the views of its latest image.
             perspective = self._measure_perspective(best, query)
             tilt = convert_to_tilt(perspective, query.view.focal)
-            if query.view.is_tilt_known and self.common_tilt.shown.is_clear:
-                tilt = max(tilt, self.common_tilt.shown, key=lambda shown: shown.tangent * shown.is_clear)
-            found = replace(
-                found,
-                # A few regions are no reason to refuse a recorded tilt; a contradiction adds to the reported error.
+            if query.view.is_tilt_known and self.common_tilt.mean.is_clear:
+                tilt = max(tilt, self.common_tilt.mean, key=lambda measured: measured.tangent * measured.is_clear)
+            findings = replace(
+                findings,
+                # A few regions cannot refute a recorded tilt; a contradiction only adds to the reported error.
                 tilt=None if query.view.is_tilt_known else tilt,
-                located=add_tilt_covariance(found.located, tilt, query.view) if found.located else None,
-                at_rest_elsewhere=at_rest_elsewhere,
-                lead_over_rotated=lead_over_rotated,
+                located=add_tilt_covariance(findings.located, tilt, query.view) if findings.located else None,
+                unshifted_fraction=unshifted_fraction,
+                lead_over_other_rotation=lead,
             )
-            verdict = judge(found, index, rule, search)
+            verdict = judge(findings, index, rule, search)
             if verdict.accepted and perspective and query.view.is_tilt_known:
                 self.common_tilt.add(perspective, query.view, best.place.place_id)
-            if verdict.accepted and query.view.footprint_m and found.located and found.located.footprint_m:
-                self.relief.add(found.located.footprint_m / query.view.footprint_m, best.place.place_id)
-        confidence = by_confidence.cap_confidence(found.evidence) if by_confidence and found.evidence else None
-        return Decision(verdict=verdict, hints=hints, best=best, findings=found, confidence=confidence, track=track)
+            if verdict.accepted and query.view.footprint_m and findings.located and findings.located.footprint_m:
+                self.relief.add(findings.located.footprint_m / query.view.footprint_m, best.place.place_id)
+        evidence = findings.evidence
+        confidence = confidence_rule.cap_confidence(evidence) if confidence_rule and evidence else None
+        return Decision(verdict=verdict, hints=hints, best=best, findings=findings, confidence=confidence, track=track)
 
     def _gather_findings(self, ranking: Ranking, query: EncodedFrame, verifier: Verifier) -> tuple[Candidate, Findings]:
         """Verify the best place of a ranking by landmarks, locate the aircraft from it, and gather the evidence."""
@@ -277,13 +278,13 @@ class Decider:
         if agreement and not same_ground:
             with step("verify"):
                 same_ground = verifier.find_same_ground(ranking)
-        near_m, by_confidence = rule.neighbour_m, rule.confidence_rule
-        if by_confidence:
+        near_m, confidence_rule = rule.neighbour_m, rule.confidence_rule
+        if confidence_rule:
             evidence = gather_evidence(
                 ranking, index, near_m, agreement, same_ground, looks_down=spec.looks_down, look_alikes=rule.look_alikes
             )
-        is_ahead = verifies and not spec.looks_down  # landmarks then only support a match: compare if undecided
-        if is_ahead and by_confidence and evidence and (all_evidence or by_confidence.is_undecided(evidence)):
+        is_ahead = verifies and not spec.looks_down  # landmarks can then only support a match
+        if is_ahead and confidence_rule and evidence and (all_evidence or confidence_rule.is_undecided(evidence)):
             with step("verify"):
                 inliers = verifier.count_inliers(ranking)
                 rival = verifier.count_rival(ranking, near_m, max_slots=count_neighbours(rule.look_alikes))
@@ -294,9 +295,8 @@ class Decider:
             evidence = replace(evidence, rival=log_count(rival))
         return best, Findings(ranking, agreement=agreement, located=located, evidence=evidence)
 
-    def _lead_over_rotated(self, best: Candidate, evidence: Evidence | None, query: EncodedFrame) -> float | None:
-        """Return the lead, as in the evidence, over the same place with the picture at another rotation (None: there
-        is no evidence)."""
+    def _compute_rotation_lead(self, best: Candidate, evidence: Evidence | None, query: EncodedFrame) -> float | None:
+        """Return the lead over the same place with the picture at another rotation; None without evidence."""
         if evidence is None:
             return None
         with self.meter.step("compare"):
@@ -306,19 +306,20 @@ class Decider:
             )
 
     def _measure_perspective(self, best: Candidate, query: EncodedFrame) -> Perspective | None:
-        """Measure the perspective of the query over the place (None: too few regions agree)."""
+        """Measure the perspective of the query over the place; None if too few regions agree."""
         with self.meter.step("compare"):
             fine, _ = self.place_map.read_fine_part(best.place.place_id)
-            found = self.technique.measure_perspective(query.descriptor, fine, best.match)
-            return found and measure_again(query.picture, self.technique, fine, found)
+            perspective = self.technique.measure_perspective(query.descriptor, fine, best.match)
+            return perspective and measure_again(query.picture, self.technique, fine, perspective)
 
-    def _share_at_rest_elsewhere(self, candidate: Candidate, ranking: Ranking, encoded: EncodedFrame) -> float:
-        """Return the share of a few places elsewhere that agree with the query at rest; 0 if the best one does not."""
+    def _measure_unshifted_fraction(self, candidate: Candidate, ranking: Ranking, encoded: EncodedFrame) -> float:
+        """Return the fraction of a few places elsewhere that are unshifted too; 0 if the best place is shifted."""
         best = candidate.match
-        if not is_at_rest(best):
+        if not is_unshifted(best):
             return 0.0
         with self.meter.step("compare"):
             query = self.make_query(encoded.descriptor, NO_EXPECTATION)
             matches = match_unmoved_places(query, int(ranking.slots[0]), self.accuracy_m)
-        least = _MIN_REST_VOTES_SHARE * compute_share(best)
-        return sum(is_at_rest(match) and compute_share(match) >= least for match in matches) / max(len(matches), 1)
+        min_votes = _MIN_UNSHIFTED_VOTES_RATIO * compute_share(best)
+        unshifted = [match for match in matches if is_unshifted(match) and compute_share(match) >= min_votes]
+        return len(unshifted) / max(len(matches), 1)

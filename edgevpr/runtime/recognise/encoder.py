@@ -36,7 +36,7 @@ class EncodedFrame:
 
     @property
     def view(self) -> View:
-        """View of the image: how it lies on the ground."""
+        """View of the image: where on the ground it is, and at which scale."""
         return self.picture.view
 
 
@@ -68,7 +68,7 @@ class FrameEncoder:
         scale: float = 1.0,
         metered: Callable[[str], AbstractContextManager[None]] = lambda step: nullcontext(),
     ) -> EncodedFrame:
-        """Prepare, judge and encode a frame. `metered` makes the context in which the step of a given name is run.
+        """Prepare, judge and encode a frame. `metered` returns a context that measures the step with the given name.
         Raises the errors of the technique and the gate."""
         with metered("prepare"):
             picture = self.prepare(frame, vehicle, layers=layers, scale=scale)
@@ -79,7 +79,7 @@ class FrameEncoder:
         return EncodedFrame(frame=frame, vehicle=vehicle, picture=picture, salience=salience, descriptor=descriptor)
 
     def detect_landmarks(self, picture: LevelledImage, count: int = PLACE_LANDMARKS) -> Landmarks:
-        """Find the `count` best landmarks of an image, scaled to the size used for the landmarks of places."""
+        """Detect the `count` best landmarks of an image, scaled to the size used for the landmarks of places."""
         longest_px = DOWN_PX if self.technique.spec.looks_down else AHEAD_PX
         return detect_landmarks(picture.image, picture.mask, count, longest_px)
 
@@ -88,15 +88,15 @@ class FrameEncoder:
         return pack_bytes(self.detect_landmarks(picture)) if self.technique.spec.cells else None
 
     def replace_mount(self, mount: Mount) -> "FrameEncoder":
-        """Return this encoder for a camera that is mounted at the angles `mount` from straight down."""
+        """Return this encoder with the camera mounted at the angles `mount` from straight down."""
         if not isinstance(self.levelling, Levelling):
             return self
         return replace(self, levelling=self.levelling.replace_mount(mount))
 
 
 def explain_failure(error: Exception | None) -> Reason:
-    """Return why a frame failed. None: there was no error, and no search. An error that is not edgevpr's own comes from
-    a fault in a technique or a library."""
+    """Return the reason why a frame was not recognised; `error` is None if it was not searched. An error that is not
+    edgevpr's own comes from a fault in a technique or a library."""
     match error:
         case None:
             return NOT_SEARCHED

@@ -5,18 +5,18 @@ that looks ahead (AHEAD, and AHEAD_PROVEN where landmarks support the match). A 
 place's neighbourhood. Regions *agree* if they show the same shift between query and place. A larger figure supports the
 match, except `rank_gap`.
 
-* agree: logarithm of the share of regions that agree (see `compute_share`)
+* agree: logarithm of the fraction of regions that agree (see `compute_share`)
 * lead: `agree` minus the largest `agree` of a place elsewhere
-* coverage: logarithm of the share of the place's regions that agree, each counted once
-* structure: `FineMatch.structure`
+* coverage: logarithm of the fraction of the place's regions that agree, each counted once
+* structure: `FineMatch.structure`, how well the structures in both images agree
 * likeness: `Support.likeness` (ahead)
-* rank_gap: mean logarithm of the rank of the regions (see `Support`), minus the least of all places compared (ahead)
+* rank_gap: mean logarithm of the rank of the regions (see `Support`), minus the smallest of all places compared (ahead)
 * landmarks: logarithm of one plus the number of landmarks that agree as expected (ahead, no model uses it)
 * proof: result of `log_inlier_ratio` (ahead)
 * twin: agreement of the place with the place of the map that looks most like it (see `LookAlike`), minus the agreement
   of pictures of its own ground; if it is 0 or more, the two are *twins* (ahead). No model uses `twin` or `apart`
 * apart: `agree` minus the agreement of these two places with each other (ahead, in a map of single views)
-* tried: `Ranking.tried`, which is no input of a regression (see `Model.chance`)
+* tried: `Ranking.tried`, which is not an input of a regression (see `Model.chance`)
 """
 
 import math
@@ -41,11 +41,11 @@ _PLACE_FIGURES_AHEAD = ("lead", "coverage", "rank_gap", "structure")
 # Names of the figures that decide whether a query shows ground of the map, and which of its places it shows.
 MAP_FIGURES = {AHEAD: _MAP_FIGURES_AHEAD, AHEAD_PROVEN: _MAP_FIGURES_AHEAD, **_DOWN_FIGURES}
 PLACE_FIGURES = {AHEAD: _PLACE_FIGURES_AHEAD, AHEAD_PROVEN: (*_PLACE_FIGURES_AHEAD, "proof"), **_DOWN_FIGURES}
-_MIN_SHARE = 1e-3  # so that its logarithm exists
-# As many landmarks may agree with a place that only looks alike. Smaller numbers are noise, and count as this one.
+_MIN_FRACTION = 1e-3  # so that the logarithm exists
+# This many landmarks may agree with a place that only looks similar. Smaller numbers are noise, and count as this one.
 CHANCE_INLIERS = 8
 CHANCE_SHARE = 0.07  # reached by pictures of ground outside the map; used if there is no place elsewhere
-# If a place leads by a smaller factor, its landmarks must distinguish it from the best one elsewhere.
+# If a place leads by a smaller factor, its landmarks must distinguish it from the best place elsewhere.
 SMALL_LEAD = math.log(1.5)
 _MIN_LEAD = math.log(1.05)
 # Ahead, the largest advantage in rank that the regions of another place may have. Chosen on corridor, where one match
@@ -88,19 +88,19 @@ class Evidence:
 
     @property
     def has_twin(self) -> bool:
-        """True if the match may show another place that looks alike: at least half as many landmarks agree with a place
+        """True if the match may show another, similar place: at least half as many landmarks agree with a place
         elsewhere, or the place has a twin in the map and the lead is not large."""
-        is_alike = self.rival is not None and _to_count(self.landmarks or 0.0) < 2 * _to_count(self.rival)
-        return is_alike or (self.twin is not None and self.twin >= 0 and self.lead < _MIN_LEAD_OVER_TWIN)
+        is_similar = self.rival is not None and _to_count(self.landmarks or 0.0) < 2 * _to_count(self.rival)
+        return is_similar or (self.twin is not None and self.twin >= 0 and self.lead < _MIN_LEAD_OVER_TWIN)
 
     @property
     def is_unambiguous(self) -> bool:
-        """True if no place elsewhere agrees about as well, judged by regions, landmarks and known look-alikes."""
+        """True if no place elsewhere agrees about as well, judging by regions, landmarks and known look-alikes."""
         return self.lead >= _MIN_LEAD and not self.has_twin
 
     @property
     def needs_landmarks(self) -> bool:
-        """True if the regions alone cannot prove a match (ahead), and its landmarks do not either:
+        """True if neither the regions nor the landmarks prove a match (ahead):
 
         * The place has a small lead: ground outside the map may look like the map.
         * It has a small lead, and the regions of another place rank better: twice as many landmarks must agree.
@@ -134,8 +134,8 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class LookAlike:
-    """The place elsewhere that looks most like a place: its number, and the logarithm of the share of regions of both
-    that agree. `own`: the same for pictures of the place's own ground, or by chance if there are none."""
+    """The place elsewhere that looks most like a place: its number, and the logarithm of the fraction of regions of
+    both that agree. `own`: the same for pictures of the place's own ground, or the chance level if there are none."""
 
     other_id: int
     agree: float
@@ -176,8 +176,8 @@ def gather_evidence(
     """Return the evidence for the best place; None if no place was compared or, ahead, a match has no `support`.
 
     If the camera `looks_down`, `agreement` is that of the landmarks (None: not compared), and places with the numbers
-    `same_ground` show the same ground as the best one, so they are not elsewhere. `look_alikes` are those of the map
-    (None: unknown).
+    `same_ground` show the same ground as the best one, so they do not count as elsewhere. `look_alikes` are those of
+    the map (None: unknown).
     """
     matches = {slot: ranking.compared[slot] for slot in ranking.compared_slots}
     support = {slot: match.support for slot, match in matches.items() if match.support}
@@ -209,7 +209,7 @@ def gather_evidence(
         return replace(evidence, twin=look_alike.agree - look_alike.own, apart=apart)
     if agreement is None:
         return evidence
-    is_valid = agreement.is_expected and not agreement.is_at_rest
+    is_valid = agreement.is_expected and not agreement.is_unshifted
     return replace(evidence, landmarks=log_count(agreement.inliers if is_valid else 0))
 
 
@@ -226,8 +226,8 @@ def log_inlier_ratio(inliers: int, rival: int) -> float:
 
 
 def compute_share(match: FineMatch) -> float:
-    """Return the share of regions that agree on a shift: ahead, the geometric mean of the shares of the query's and of
-    the place's regions; down, `FineMatch.votes`, which also counts how well the layouts agree."""
+    """Return the fraction of regions that agree on a shift: ahead, the geometric mean of that of the query's and that
+    of the place's regions; down, `FineMatch.votes`, which also counts how well the layouts agree."""
     if match.support is not None:
         return math.sqrt(match.score * match.support.back)
     return match.score if match.votes is None else match.votes
@@ -243,5 +243,5 @@ def _to_count(logarithm: float) -> int:
 
 
 def log_share(share: float) -> float:
-    """Return the logarithm of a share, as in the evidence."""
-    return math.log(max(share, _MIN_SHARE))
+    """Return the logarithm of a fraction, as in the evidence."""
+    return math.log(max(share, _MIN_FRACTION))

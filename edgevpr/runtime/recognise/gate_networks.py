@@ -4,10 +4,10 @@ other, an object detector, finds the pixels that show nothing movable (thesis 3.
 `models/recipes/train_matchability.py` trains a network with another definition of memorability: how likely a crop is to
 be found again in another image.
 
-Each family of detectors has a decoder here. Its arguments are the outputs in the order of the card and the input's
+Each family of detectors has a decoder here. Its arguments are the outputs in the card's order and the input's
 (height, width) in pixels, and it returns
 
-* `boxes`, float32 (N, 4): left, top, right, bottom as shares of the input; they may reach beyond it,
+* `boxes`, float32 (N, 4): left, top, right, bottom as fractions of the input; they may extend beyond it,
 * `scores`, float32 (N, C): the score of each class, 0..1.
 """
 
@@ -24,7 +24,7 @@ from edgevpr.techniques.session import compute_fill_shares, open_session, prepar
 CROPS = 5  # along each side; the thesis's C is 5x5
 _TEST_SEED = 7
 _STRIDES_PX = (8, 16, 32)  # of the grids of yolox
-_MAX_LOG = 20.0  # of the side of a box in cells; the exponential of more would overflow
+_MAX_LOG = 20.0  # of the side of a box in cells; a larger one would overflow the exponential
 
 Decoded = tuple[Floats, Floats]
 
@@ -50,15 +50,15 @@ class Memorability:
         batches = [crops] if self._has_batches else np.split(crops, len(crops))
         results = [run_outputs(self.card, self._session, [name], batch)[0] for batch in batches]
         if any(part.size != len(batch) for part, batch in zip(results, batches, strict=True)):
-            raise ModelError(f"{self.card.path}: `{name}` must be one number per picture: correct `outputs`.")
+            raise ModelError(f"{self.card.path}: `{name}` must have one number per picture: correct `outputs`.")
         values = np.concatenate([part.ravel() for part in results]).astype(np.float32)
         if values.min() < 0 or values.max() > 1:
-            raise ModelError(f"{self.card.path}: `{name}` is {values.max():g} for a picture: it must be from 0 to 1.")
+            raise ModelError(f"{self.card.path}: `{name}` is {values.max():g} for a picture, but must be from 0 to 1.")
         return values.reshape(CROPS, CROPS)
 
 
 def prepare_crops(image: Image, rule: InputRule) -> Singles:
-    """Cut uint8 (H, W[, 3]), at least 5 pixels along each side, into crops, row by row, and prepare them for a network:
+    """Cut an image, uint8 (H, W[, 3]) of at least 5x5 pixels, into crops, row by row, and prepare them for a network:
     float32 (25, C, height, width)."""
     rows, columns = (np.array_split(np.arange(side), CROPS) for side in image.shape[:2])
     return np.concatenate(
@@ -103,12 +103,12 @@ class Detector:
                 f"{self.card.path}: the outputs are not those of a `{self._rule.family}` detector with these "
                 f"classes ({error}): correct `detector` or `outputs.boxes`."
             ) from error
-        found = boxes[scores >= self._rule.min_score]
+        boxes = boxes[scores >= self._rule.min_score]
         height, width = image.shape[:2]
         across, down = compute_fill_shares(image, rule)
         size = np.array([width / across, height / down] * 2)
-        least, most = np.floor(found[:, :2] * size[:2]), np.ceil(found[:, 2:] * size[:2])
-        return np.hstack([least, most]).clip(0, [width, height] * 2).astype(int)
+        top_left, bottom_right = np.floor(boxes[:, :2] * size[:2]), np.ceil(boxes[:, 2:] * size[:2])
+        return np.hstack([top_left, bottom_right]).clip(0, [width, height] * 2).astype(int)
 
 
 def decode_yolox(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
@@ -128,8 +128,8 @@ def decode_yolox(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded
 
 
 def decode_fastestdet(outputs: Sequence[Floats], size_px: tuple[int, int]) -> Decoded:
-    """Decode (1, 5 + C, h, w): score of an object, tanh of the centre's offset in cells, logit of the sides as shares
-    of the input, scores of the classes (FastestDet's own code; a score is objectness^0.6 times class^0.4)."""
+    """Decode (1, 5 + C, h, w): score of an object, tanh of the centre's offset in cells, logit of the sides as
+    fractions of the input, scores of the classes (FastestDet's own code; a score is objectness^0.6 times class^0.4)."""
     values = outputs[0][0]
     rows, columns = values.shape[1:]
     cells = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1)

@@ -14,16 +14,16 @@ def compute_distances(one: Doubles, other: Doubles) -> Doubles:
 
 
 def regularize_covariance(covariance: Doubles, least: float) -> Doubles:
-    """Make covariances (K, 2, 2) invertible: add the variance `least` and a small share of their trace to each axis."""
-    more: Doubles = least + MIN_VARIANCE_RATIO * np.abs(np.trace(covariance, axis1=1, axis2=2))
-    return covariance + more[:, None, None] * np.eye(2)
+    """Make covariances (K, 2, 2) invertible: add `least` and a small fraction of their trace to each variance."""
+    added: Doubles = least + MIN_VARIANCE_RATIO * np.abs(np.trace(covariance, axis1=1, axis2=2))
+    return covariance + added[:, None, None] * np.eye(2)
 
 
 def fuse_positions(one: Doubles, cov: Doubles, other: Doubles, other_cov: Doubles) -> tuple[Doubles, Doubles]:
-    """Combine K positions and K others of correlated errors by covariance intersection (Julier and Uhlmann 1997)."""
+    """Fuse K pairs of positions with correlated errors by covariance intersection (Julier and Uhlmann 1997)."""
     trace, other_trace = (np.trace(covariance, axis1=1, axis2=2) for covariance in (cov, other_cov))
-    share = (other_trace / (trace + other_trace))[:, None, None]
-    information, other_information = share * np.linalg.inv(cov), (1 - share) * np.linalg.inv(other_cov)
+    weight = (other_trace / (trace + other_trace))[:, None, None]
+    information, other_information = weight * np.linalg.inv(cov), (1 - weight) * np.linalg.inv(other_cov)
     covariance = np.linalg.inv(information + other_information)
     mean = covariance @ (information @ one[..., None] + other_information @ other[..., None])
     return mean[..., 0], covariance
@@ -32,9 +32,9 @@ def fuse_positions(one: Doubles, cov: Doubles, other: Doubles, other_cov: Double
 def mix_gaussians(weights: Doubles, means: Doubles, covariance: Doubles) -> tuple[Doubles, Doubles]:
     """Return the means (K, 2) and covariances (K, 2, 2) of K mixtures of M Gaussians with `means` (M, 2) and
     `covariance` (M, 2, 2), weighted by `weights` (K, M)."""
-    middle = means.mean(0) if len(means) else np.zeros(2)  # far from zero, squared coordinates would lose digits
-    offsets = means - middle
+    centre = means.mean(0) if len(means) else np.zeros(2)  # far from zero, squared coordinates would lose digits
+    offsets = means - centre
     second = covariance + offsets[:, :, None] * offsets[:, None]
     mean = weights @ offsets
     spread = (weights @ second.reshape(-1, 4)).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None]
-    return middle + mean, regularize_covariance(spread, _ROUNDING * float(np.abs(second).max(initial=1)))
+    return centre + mean, regularize_covariance(spread, _ROUNDING * float(np.abs(second).max(initial=1)))

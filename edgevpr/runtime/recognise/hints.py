@@ -22,19 +22,19 @@ from edgevpr.places.retrieve import Expectation
 from edgevpr.runtime.recognise.belief import DEFAULT_MAX_SPEED_M_S
 from edgevpr.runtime.recognise.locate import Located
 
-KNOWN_FIELDS = ("heading", "height", "reach")  # what may be known about a recorded query
+KNOWN_FIELDS = ("heading", "height", "reach")  # data that a recorded query may have
 RECORDED_REACH_M = 300.0  # distance that an aircraft flies in 15 s at 20 m/s
 _MAX_FIX_AGE_S = 60.0
 _TRUST_ALL = (True, True)
 _SCALE_ERROR = 1.08  # two heights whose ratio is larger differ by more than the error of a match
 _MIN_SCALE = 0.5
 _MIN_HEIGHTS = 3  # matches needed to confirm a small error of the recorded heights
-_MAX_HEIGHTS = 5  # newest matches whose heights are compared with the recorded ones
+_MAX_HEIGHTS = 5  # number of newest matches whose heights are compared with the recorded ones
 # The place filter narrows the search if its position has at least this probability. The area is large enough to contain
-# rivals of the best place: at least that of recorded queries, and at least this many distances between places.
+# rivals of the best place: its radius is at least that of recorded queries, and at least this many search margins.
 _MIN_MASS = 0.99
 _AREA_SD = 4.0
-_AREA_PLACES = 5.0
+_AREA_MARGINS = 5.0
 # Tag field and positions.csv columns required by each known field. Without any height, the map's is used.
 _REQUIRED_FIELDS = {"heading": ("heading_deg", "yaw_deg"), "reach": ("position", "lat and lon")}
 
@@ -67,8 +67,8 @@ class Hints:
         in_reach = heading_agrees = True
         if self.reach and place.position:
             centre, position = self.reach.position, place.position
-            apart_m = distance_m(centre.lat_deg, centre.lon_deg, position.lat_deg, position.lon_deg)
-            in_reach = bool(apart_m <= self.reach.radius_m)
+            error_m = distance_m(centre.lat_deg, centre.lon_deg, position.lat_deg, position.lon_deg)
+            in_reach = bool(error_m <= self.reach.radius_m)
         if self.heading_deg is not None and place.heading_deg is not None and rotation_deg is not None:
             error_deg = wrap_deg(rotation_deg - (self.heading_deg - place.heading_deg))
             heading_agrees = heading_within_deg is None or abs(error_deg) <= heading_within_deg
@@ -85,7 +85,7 @@ class RecordedPrior:
     frame has them. For the other attributes see `Prior`. `map_height_m` is the height from which the map was made
     (None: it or the height of the queries is unknown; `height` then means the map's).
 
-    Earlier queries serve only to correct heights: all recorded heights may be wrong by one factor, because of a
+    Earlier queries only correct heights: all recorded heights may be wrong by the same factor, because of a
     barometer over sloping ground or a wrong field of view. Until matches have confirmed them, all heights are searched.
     """
 
@@ -133,7 +133,7 @@ class RecordedPrior:
         footprint_m: float | None = None,
         layers: Layers | None = None,
     ) -> None:
-        """Store the error of the recorded height against an accepted match. For the arguments see `Prior.update`."""
+        """Store the error of the recorded height, from an accepted match. For the arguments see `Prior.update`."""
         ratio, pose = match.match.height_ratio, match.place.pose
         if not (accepted and ratio):
             return
@@ -143,7 +143,7 @@ class RecordedPrior:
             self._height_errors.append(self._height_error * ratio / self.height_ratio)
 
     def update_area(self, estimate: Located | None, mass: float, t_mono_s: float) -> None:
-        """Do nothing: recorded queries do not depend on each other."""
+        """Do nothing: recorded queries are independent of each other."""
 
 
 class Prior(RecordedPrior):
@@ -151,15 +151,15 @@ class Prior(RecordedPrior):
 
     `height_ratio` is the height of the camera relative to that of the map's pictures, from the last accepted match; if
     pictures are scaled by known heights, it is the error of these heights. `footprint_m` is the footprint of the layer
-    of the last match (None: unknown, or given by its height); the height ratio is relative to it. `searches_heights`:
-    also search at other heights if a query is not accepted. `reach_m_s` is the highest speed (None: positions are not
-    used as hints), `heading_within_deg` the largest error of a known heading (None: headings are not used as hints).
+    of the last match (None: unknown, or computed from its height); the height ratio is relative to it.
+    `searches_heights`: also search at other heights if a query is not accepted. `max_speed_m_s` is that of the aircraft
+    (None: positions are not hints), `heading_within_deg` the largest error of a known heading (None: nor are headings).
     `is_live` is False for recorded frames, for which the autopilot's reports do not apply.
     """
 
-    def __init__(self, reach_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
+    def __init__(self, max_speed_m_s: float | None, heading_within_deg: float | None, is_live: bool) -> None:
         super().__init__((), heading_within_deg)
-        self._reach_m_s, self._is_live = reach_m_s, is_live
+        self._max_speed_m_s, self._is_live = max_speed_m_s, is_live
         self._uses_hints = True
         self._trusted = _TRUST_ALL  # area and heading, according to the last accepted match
         self._last_fix: tuple[Position, float] | None = None  # with its time
@@ -170,9 +170,9 @@ class Prior(RecordedPrior):
         """Return the hints for a frame; None if there are none, or if hints are not trusted now.
 
         `vehicle` is the autopilot's last report. The radius of the area is the farthest that the aircraft can have
-        flown plus `margin_m`. Its centre is the autopilot's position if that has GPS (otherwise it drifts, and our own
-        fix is better), or else our last fix if at most a minute old. Without a highest speed, the area is around the
-        position from the place filter, if that is certain.
+        flown plus `margin_m`. Its centre is the autopilot's position if that has GPS (without GPS it drifts, and our
+        own fix is better), or else our last fix if at most a minute old. If no maximum speed is set, the area is around
+        the position from the place filter, if that is certain.
         """
         if not self._is_live or (vehicle and not vehicle.is_fresh(frame.t_mono_s)):
             vehicle = None
@@ -181,20 +181,20 @@ class Prior(RecordedPrior):
             start = Position(vehicle.lat_deg, vehicle.lon_deg), vehicle.t_received_s
         elif start and frame.t_mono_s - start[1] > _MAX_FIX_AGE_S:
             start = None
-        if start and self._reach_m_s:
-            reach = Reach(start[0], margin_m + self._reach_m_s * abs(frame.t_mono_s - start[1]))
-        if self._estimate and self._reach_m_s is None:
+        if start and self._max_speed_m_s:
+            reach = Reach(start[0], margin_m + self._max_speed_m_s * abs(frame.t_mono_s - start[1]))
+        if self._estimate and self._max_speed_m_s is None:
             area, t_s = self._estimate
-            if (since_s := abs(frame.t_mono_s - t_s)) <= _MAX_FIX_AGE_S:
-                least_m = max(RECORDED_REACH_M, _AREA_PLACES * margin_m)
-                reach = Reach(area.position, least_m + area.radius_m + DEFAULT_MAX_SPEED_M_S * since_s)
+            if (age_s := abs(frame.t_mono_s - t_s)) <= _MAX_FIX_AGE_S:
+                min_radius_m = max(RECORDED_REACH_M, _AREA_MARGINS * margin_m)
+                reach = Reach(area.position, min_radius_m + area.radius_m + DEFAULT_MAX_SPEED_M_S * age_s)
         heading_deg = vehicle.heading_deg if frame.heading_deg is None and vehicle else frame.heading_deg
         self._all_hints = _drop_useless(reach, None if self._heading_within_deg is None else heading_deg, index)
         return self._all_hints.select(*self._trusted) if self._all_hints and self._uses_hints else None
 
     def scale(self, height_ratios: Sequence[float]) -> float:
-        """Return the factor to scale the next picture by, so that it looks as if taken at one of the `height_ratios`:
-        between them fewer matches are found. A picture from higher up is scaled to the nearest, to keep its edges."""
+        """Return the factor that scales the next picture as if it were taken at one of the `height_ratios`, because
+        fewer matches are found between them. A picture from higher up is scaled to the nearest, to keep its edges."""
         ratio = self.height_ratio
         if not height_ratios or abs(math.log(ratio)) <= math.log(_SCALE_ERROR):
             return 1.0
@@ -210,11 +210,11 @@ class Prior(RecordedPrior):
         layers: Layers | None = None,
     ) -> None:
         """Store position and height of an accepted match; the next query uses the hints that agree with it. Until
-        there is one, queries with and without hints alternate. The query's picture was enlarged by `scale`, so by its
-        height it shows `footprint_m` of ground (None: its height is unknown). `layers` are those of the map (None: it
+        there is one, queries with and without hints alternate. The query's picture was enlarged by `scale`, so at its
+        height it shows `footprint_m` of ground (None: the height is unknown). `layers` are those of the map (None: it
         has one).
         """
-        # Over ground outside the map only every second query is searched at all heights, which takes twice as long.
+        # Outside the map, only every second query is searched at all heights, because this takes twice as long.
         self.searches_heights = accepted or not self.searches_heights
         if self._all_hints is None:
             self._uses_hints, self._trusted = True, _TRUST_ALL
@@ -250,7 +250,7 @@ def parse_known_fields(text: str | None) -> tuple[str, ...]:
     UsageError for any other text."""
     names = [] if text is None else [name.strip() for name in text.split(",")]
     if unknown := [name for name in names if name not in KNOWN_FIELDS]:
-        raise UsageError(f"`known` names `{unknown[0]}`: use some of {', '.join(KNOWN_FIELDS)}, with commas between.")
+        raise UsageError(f"`known` contains `{unknown[0]}`, but must be a list of {', '.join(KNOWN_FIELDS)}.")
     return tuple(name for name in KNOWN_FIELDS if name in names)
 
 
@@ -260,10 +260,12 @@ def explain_why_unusable(
     places: Collection[GeoTag] | Collection[Place],
     sequence: int,
 ) -> str | None:
-    """Return a sentence on why no query can use the hints in `known` (see `RecordedPrior`); None if some query can.
+    """Return a sentence on why no query can use the hints in `known` (see `RecordedPrior`); None if any query can.
     `sequence` is the number of queries that are matched together."""
     if known and sequence > 1:
-        return f"{sequence} queries are matched together, but `known` narrows single ones: leave one option out."
+        return (
+            f"{sequence} queries are matched together, but `known` applies to single queries: omit one of the options."
+        )
     for part, (field, columns) in _REQUIRED_FIELDS.items():
         for name, tags in (("query", queries), ("place", places)):
             if part in known and all(getattr(tag, field) is None for tag in tags):
@@ -272,7 +274,7 @@ def explain_why_unusable(
 
 
 def _drop_useless(reach: Reach | None, heading_deg: float | None, index: PlaceIndex) -> Hints | None:
-    """Return the hints that narrow a search of the index (None: none). An area with all places or none does not."""
+    """Return the hints that narrow a search of the index (None: no hints). An area with all places or none does not."""
     if reach and not 0 < index.find_within(reach.position, reach.radius_m).sum() < len(index):
         reach = None
     if not index.has_headings:

@@ -1,7 +1,7 @@
-"""Decides whether a match is accepted. Only this code does, and a match that is not accepted has no position.
+"""Decides whether to accept a match. Only this module does, and a match that is not accepted has no position.
 
 A place *elsewhere* is outside the neighbourhood of the best place (see `outside_neighbourhood`). The *lead* of
-the best place is how far its score is above that of the best place elsewhere.
+the best place is its score minus that of the best place elsewhere.
 """
 
 import math
@@ -22,51 +22,51 @@ from edgevpr.runtime.recognise.calibration import MapCalibration
 from edgevpr.runtime.recognise.confidence import Model, read_shipped_model
 from edgevpr.runtime.recognise.evidence import Evidence, LookAlikes, list_evidence_kinds
 from edgevpr.runtime.recognise.locate import Located
-from edgevpr.runtime.recognise.perspective import ShownTilt
+from edgevpr.runtime.recognise.perspective import ObservedTilt
 
 # There are many trajectories at other speeds, so one of them scores well by chance: half the margin over them suffices.
 # With it, no wrong sequence of the corridor set was accepted with hog, seqslam or cohog, flown as mapped, twice as fast
-# or in the opposite direction. At half the speed cohog accepted places three away from the right one.
-_MARGIN_SHARE_AT_OTHER_SPEEDS = 0.5
+# or in the opposite direction. At half the speed cohog accepted places three away from the correct one.
+_MARGIN_FACTOR_AT_OTHER_SPEEDS = 0.5
 _MAX_INDEPENDENT = 10
 
-# Looking down: if the best place and more than this share of a few places elsewhere agree without shift or rotation,
-# what agrees is an on-screen display drawn over every frame.
-_MAX_AT_REST_SHARE = 0.4
-_MAX_REST_CELLS = 0.75
-_MAX_REST_DEG = 7.5
-_MAX_REST_HEIGHT = 0.2
+# Looking down, a match is *unshifted* if query and place agree without shift, rotation or scaling. If the best place
+# and more than this fraction of a few places elsewhere are unshifted, an on-screen display is drawn over every frame.
+_MAX_UNSHIFTED_FRACTION = 0.4
+_MAX_UNSHIFTED_CELLS = 0.75
+_MAX_UNSHIFTED_DEG = 7.5
+_MAX_UNSHIFTED_HEIGHT = 0.2
 
 # A correct match with at least this score has agreeing landmarks: all 413 of them, in all aerial sets, had six or more.
-# Weaker matches, such as of grass in other light, may have none. Applied if both pictures have enough landmarks.
+# Weaker matches, such as of grass in different light, may have none. Applied if both pictures have enough landmarks.
 _MIN_CLEAR_SCORE = 0.2
 _MIN_INLIERS = 5
 _MIN_LANDMARKS = 100
-# Agreeing landmarks make up for a score below the technique's limit, down to this share of it.
-_MIN_SCORE_SHARE_WITH_LANDMARKS = 0.5
+# Agreeing landmarks make up for a score below the technique's limit, down to this fraction of it.
+_MIN_SCORE_RATIO_WITH_LANDMARKS = 0.5
 # The least lead over the same place with the picture at another rotation. On sat_marash, with unknown heading, 273 of
-# 276 correct matches have more, and two of three wrong ones less: a bridge mistaken for its other end.
-_MIN_LEAD_OVER_ROTATED = math.log(1.75)
-_MAX_TWIN_CONFIDENCE = 0.5  # highest confidence if a place elsewhere agrees as well
+# 276 correct matches have more, and two of three wrong ones have less: a bridge mistaken for its other end.
+_MIN_LEAD_OVER_OTHER_ROTATION = math.log(1.75)
+_MAX_TWIN_CONFIDENCE = 0.5  # highest confidence if a place elsewhere agrees equally well
 # Highest confidence, looking ahead, if required landmarks do not agree: of 111 queries of corridor in a map without
-# their part of it, 12 were accepted from regions alone.
+# that part of it, 12 were accepted from regions alone.
 _MAX_UNPROVEN_CONFIDENCE = 0.9
 # Least probability for acceptance, at any precision: from the match alone, and from the flight so far.
 _MIN_CONFIDENCE = 0.9
 _MIN_TRACK_CONFIDENCE = 0.99
-# If the flight so far raises the odds of a match by this factor, a confidence of the precision suffices. A match alone
-# often needs more, because the wrong match that looks best by chance must be refused; earlier queries are independent
-# of that chance. In seven flights along corridor, the seasons and nordland_tiny, and over some 200 foreign pictures for
-# each, this accepted no more wrong matches; of nordland_tiny's queries 0.59 instead of 0.47 are accepted.
-_MIN_ODDS_RAISED = 10.0
+# If the flight so far raises the odds of a match by this factor, a confidence equal to the required precision suffices.
+# A match alone often needs more, because the wrong match that looks best by chance must be refused; earlier queries are
+# independent of it. In seven flights along corridor, the seasons and nordland_tiny, and over some 200 foreign pictures
+# for each, this accepted no more wrong matches; of nordland_tiny's queries 0.59 instead of 0.47 are accepted.
+_MIN_ODDS_RATIO = 10.0
 _MAX_TILT_SHOWN_DEG = 60.0  # if not recorded; a smaller tilt adds to the reported error (kite_ochota sways by 20)
 _MIN_TRACK_SUPPORT = 0.5  # least probability from the flight so far, for a confident match
 
 
 @dataclass(frozen=True, slots=True)
 class ConfidenceRule:
-    """Acceptance by confidence. `models` gives a model for each kind of evidence. A match is accepted if its confidence
-    is at least the model's threshold for `precision`, the share of accepted matches that must be right."""
+    """Acceptance by confidence. `models` has a model for each kind of evidence. A match is accepted if its confidence
+    is at least the model's threshold for `precision`, the required fraction of accepted matches that are correct."""
 
     models: Mapping[str, Model]
     precision: float
@@ -80,11 +80,11 @@ class ConfidenceRule:
         return min(confidence, _MAX_UNPROVEN_CONFIDENCE) if evidence.needs_landmarks else confidence
 
     def cap_confidence(self, evidence: Evidence) -> float:
-        """Return the confidence to report: at most what the data that its model was fitted to support."""
+        """Return the confidence to report: at most the highest that the model's training data support."""
         return min(self.confidence(evidence), self.models[evidence.kind].max_reported)
 
     def compute_map_confidence(self, evidence: Evidence) -> float:
-        """Return the probability that the query of this evidence shows ground of the map."""
+        """Return the probability that the query with this evidence shows ground of the map."""
         return self.models[evidence.kind].map_confidence(evidence.figures())
 
     def is_undecided(self, evidence: Evidence) -> bool:
@@ -121,15 +121,15 @@ class AcceptRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """Everything known about the best place of a `ranking` when it is judged.
+    """What is known about the best place of a `ranking` when it is judged.
 
     `agreement`: that of the landmarks of query and place (None: not compared). `located`: the position computed from
-    the best places (None: only that of the best place is known); the places it was computed from are not elsewhere.
+    the best places (None: only that of the best place is known); these places do not count as elsewhere.
     `evidence`: that of the match (None: the rule needs none). `track_confidence`: probability of the place from the
-    flight so far (None: the query is judged alone). `lead_over_rotated`: the lead, as in the evidence, over the same
-    place with the picture at another rotation (None: not compared). `at_rest_elsewhere`: the share of a few places
-    elsewhere that agree at rest, if the best one does too (else 0). `tilt`: tilt of the query relative to the place
-    (None: not measured).
+    flight so far (None: the query is judged alone). `lead_over_other_rotation`: the lead, as in the evidence, over the
+    same place with the picture at another rotation (None: not compared). `unshifted_fraction`: the fraction of a few
+    places elsewhere that are unshifted, if the best one is too (else 0). `tilt`: tilt of the query relative to the
+    place (None: not measured).
     """
 
     ranking: Ranking = field(kw_only=False)
@@ -137,14 +137,14 @@ class Findings:
     located: Located | None = None
     evidence: Evidence | None = None
     track_confidence: float | None = None
-    lead_over_rotated: float | None = None
-    at_rest_elsewhere: float = 0.0
-    tilt: ShownTilt | None = None
+    lead_over_other_rotation: float | None = None
+    unshifted_fraction: float = 0.0
+    tilt: ObservedTilt | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Decision on the best place: whether it is accepted, and why or why not."""
+    """Decision on the best place: whether it is accepted, and the reason."""
 
     accepted: bool
     reason: Reason
@@ -158,7 +158,7 @@ def make_accept_rule(
     sequence of `length` queries is judged by limits; its margin is that of one query over the square root of its length
     (at most 10, because queries of the same ground are not independent)."""
     kinds = list_evidence_kinds(technique.spec) if length == 1 else ()
-    # With a confidence no lead is needed: the flight so far may decide between two similar places.
+    # With a confidence, no lead is needed: the flight so far may decide between two similar places.
     min_score, min_margin = (0.0, -math.inf) if kinds else (technique.min_score, technique.min_margin)
     if min_margin < 1:  # a margin of 1 or more accepts nothing, even in sequences
         min_margin /= math.sqrt(min(length, _MAX_INDEPENDENT))
@@ -170,13 +170,13 @@ def make_accept_rule(
         neighbour_m=config.neighbour_m,
         min_quality=technique.min_quality,
         confidence_rule=ConfidenceRule(models, config.accept_precision) if kinds else None,
-        min_verify_score=_MIN_SCORE_SHARE_WITH_LANDMARKS * technique.min_score,
+        min_verify_score=_MIN_SCORE_RATIO_WITH_LANDMARKS * technique.min_score,
         look_alikes=calibration.look_alikes if calibration and kinds else None,
     )
 
 
 def check_texture(query: Descriptor, min_quality: float) -> Reason | None:
-    """Return the reason to refuse a picture with too little texture, such as of a covered lens or bare sky; None if its
+    """Return the reason to refuse a picture with too little texture, as of a covered lens or an empty sky; None if its
     quality is at least `min_quality`. A few textured regions can agree on a place by chance."""
     if query.quality >= min_quality:  # False for NaN
         return None
@@ -184,7 +184,7 @@ def check_texture(query: Descriptor, min_quality: float) -> Reason | None:
 
 
 def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch | None = None) -> Verdict:
-    """Decide whether the best place of a ranking is accepted. `search` is the search over sequences that made the
+    """Decide whether to accept the best place of a ranking. `search` is the search over sequences that made the
     ranking (None: the query was ranked alone)."""
     if search and search.frames < search.length:
         return _refuse(ReasonCode.SEQUENCE_INCOMPLETE, queries=search.frames, min_queries=search.length)
@@ -205,7 +205,7 @@ def judge(findings: Findings, index: PlaceIndex, rule: AcceptRule, search: Seque
         verdict = Verdict(True, Reason(ReasonCode.ACCEPTED_BY_SCORE, {"score": score, "margin": lead}))
     if not verdict.accepted:
         return verdict
-    if findings.at_rest_elsewhere > _MAX_AT_REST_SHARE:
+    if findings.unshifted_fraction > _MAX_UNSHIFTED_FRACTION:
         return _refuse(ReasonCode.ELSEWHERE_AT_REST)
     if agreement is not None and (objection := _check_landmarks(agreement, score)):
         return Verdict(False, objection)
@@ -221,11 +221,11 @@ def _refuse(code: ReasonCode, **parameters: float) -> Verdict:
 
 
 def _check_limits(score: float, lead: float | None, rule: AcceptRule) -> Reason | None:
-    """Return the reason if a match fails the least score or the least lead of `rule`, else None. A `lead` of None:
-    there is no place elsewhere."""
-    least = max(rule.min_score, rule.min_verify_score if rule.confidence_rule else 0.0)
-    if not score >= least:  # `not >=` refuses NaN as well
-        return Reason(ReasonCode.LOW_SCORE, {"score": score, "min_score": least})
+    """Return the reason if a match is below the least score or lead of `rule`, else None. `lead` is None if there is no
+    place elsewhere."""
+    min_score = max(rule.min_score, rule.min_verify_score if rule.confidence_rule else 0.0)
+    if not score >= min_score:  # `not >=` refuses NaN as well
+        return Reason(ReasonCode.LOW_SCORE, {"score": score, "min_score": min_score})
     if lead is None and rule.min_score == 0 and rule.confidence_rule is None:
         return Reason(ReasonCode.NO_RIVAL)
     if lead is not None and not lead >= rule.min_margin:
@@ -235,7 +235,7 @@ def _check_limits(score: float, lead: float | None, rule: AcceptRule) -> Reason 
 
 def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
     """Decide by the confidence of the match or, if known, by the probability of the place from the flight so far."""
-    evidence, track = findings.evidence, findings.track_confidence
+    evidence, track, rotation_lead = findings.evidence, findings.track_confidence, findings.lead_over_other_rotation
     if evidence is None:
         return _refuse(ReasonCode.NOT_CALIBRATED)
     confidence, needed, reported = rule.confidence(evidence), rule.threshold(evidence), rule.cap_confidence(evidence)
@@ -248,20 +248,20 @@ def _judge_confidence(rule: ConfidenceRule, findings: Findings) -> Verdict:
         code = ReasonCode.ELSEWHERE_AGREES_BETTER
     elif track is not None and track < _MIN_TRACK_SUPPORT:
         code = ReasonCode.TRACK_CONTRADICTS
-    elif findings.lead_over_rotated is not None and findings.lead_over_rotated < _MIN_LEAD_OVER_ROTATED:
+    elif rotation_lead is not None and rotation_lead < _MIN_LEAD_OVER_OTHER_ROTATION:
         code = ReasonCode.ROTATION_AMBIGUOUS
     return Verdict(code is ReasonCode.ACCEPTED_BY_CONFIDENCE, Reason(code, figures))
 
 
 def _is_track_confident(track: float, confidence: float, needed: float, precision: float) -> bool:
     """Return True if `track`, the probability of a place from the flight so far, is high enough. `confidence` is that
-    of its match alone, `needed` the confidence required of a match alone."""
-    is_raised = track * (1 - confidence) >= _MIN_ODDS_RAISED * confidence * (1 - track)
-    return track >= max(_MIN_TRACK_CONFIDENCE, min(needed, precision) if is_raised else needed)
+    of its match alone, `needed` what a match alone needs, and `precision` that of the `ConfidenceRule`."""
+    raises_odds = track * (1 - confidence) >= _MIN_ODDS_RATIO * confidence * (1 - track)
+    return track >= max(_MIN_TRACK_CONFIDENCE, min(needed, precision) if raises_odds else needed)
 
 
 def _check_landmarks(agreement: Agreement, score: float) -> Reason | None:
-    """Return the reason if the landmarks show that the query is not at the best place, None if they do not."""
+    """Return the reason if the landmarks contradict the best place, or too few agree for its score; else None."""
     if not agreement.is_expected:
         return Reason(ReasonCode.LANDMARKS_DISAGREE, {"landmarks": agreement.inliers})
     if score >= _MIN_CLEAR_SCORE and agreement.inliers < _MIN_INLIERS and agreement.possible >= _MIN_LANDMARKS:
@@ -269,14 +269,14 @@ def _check_landmarks(agreement: Agreement, score: float) -> Reason | None:
     return None
 
 
-def is_at_rest(match: FineMatch) -> bool:
+def is_unshifted(match: FineMatch) -> bool:
     """Return True if a match has hardly any shift, rotation or height difference."""
     if match.rotation_deg is None or match.shift_cells is None:
         return False
-    off_deg = abs(wrap_deg(match.rotation_deg))
-    if off_deg > _MAX_REST_DEG or abs((match.height_ratio or 1.0) - 1) > _MAX_REST_HEIGHT:
+    rotation_deg = abs(wrap_deg(match.rotation_deg))
+    if rotation_deg > _MAX_UNSHIFTED_DEG or abs((match.height_ratio or 1.0) - 1) > _MAX_UNSHIFTED_HEIGHT:
         return False
-    return max(map(abs, match.shift_cells)) <= _MAX_REST_CELLS
+    return max(map(abs, match.shift_cells)) <= _MAX_UNSHIFTED_CELLS
 
 
 def _check_sequence(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, search: SequenceSearch) -> Reason | None:
@@ -288,7 +288,7 @@ def _check_sequence(ranking: Ranking, index: PlaceIndex, rule: AcceptRule, searc
     if not search.is_continued(~is_elsewhere, rule.min_score):
         return Reason(ReasonCode.NEWEST_ELSEWHERE)
     lead = float(ranking.scores[0]) - float(search.rivals[is_elsewhere].max(initial=0))
-    needed = _MARGIN_SHARE_AT_OTHER_SPEEDS * rule.min_margin
+    needed = _MARGIN_FACTOR_AT_OTHER_SPEEDS * rule.min_margin
     if not lead >= needed:
         return Reason(ReasonCode.LOW_MARGIN_AT_OTHER_SPEED, {"margin": lead, "min_margin": needed})
     return None

@@ -1,7 +1,7 @@
 """Landmarks of an image: points that can be found again in another image of the same ground, each described by 256
 bits. `agreement` compares those of query and place.
 
-The points are FAST corners and the bits are ORB descriptions (Rublee et al. 2011). A place keeps few of them, spread
+The points are FAST corners and the bits are ORB descriptors (Rublee et al. 2011). A place keeps few of them, spread
 over the image. A query has more, so that most of the place's visible points are among them.
 """
 
@@ -15,7 +15,7 @@ from edgevpr.core.arrays import Bytes, Image, Ints, Mask, Singles
 
 PLACE_LANDMARKS = 250
 QUERY_LANDMARKS = 1000
-# Ahead, smaller images work as well: across seasons, more correct matches agree than at 640 pixels.
+# Ahead, smaller images work at least as well: across seasons, more correct matches agree than at 640 pixels.
 DOWN_PX = 640  # longest side
 AHEAD_PX = 320
 _MIN_CORNERS = 4 * PLACE_LANDMARKS  # least number of corners to choose from
@@ -29,16 +29,16 @@ _MIN_DISTANCE_PX = 3.0  # a corner found on several levels of the pyramid is one
 _VERSION = 1
 _HEADER = struct.Struct("<BH")
 _STORED_DTYPE = np.dtype([("x", "<u2"), ("y", "<u2"), ("angle", "u1"), ("size", "u1"), ("bits", "u1", 32)])
-_SIZE_RESOLUTION = 0.001  # resolution of stored sizes, as a share of the longest side
+_SIZE_RESOLUTION = 0.001  # resolution of stored sizes, as a fraction of the longest side
 
 
 @dataclass(frozen=True, slots=True)
 class Landmarks:
     """K points of an image, best first.
 
-    `points` float32 (K, 2): x to the right and y down from the middle, as shares of the longest side, so that images
-    of different sizes compare. `angle_deg` float32 (K,): direction of each, clockwise from the right. `size` float32
-    (K,): width of the patch that describes it, as a share of the longest side. `bits` uint8 (K, 32): the description.
+    `points` float32 (K, 2): x to the right and y down from the centre, as fractions of the longest side, so that images
+    of different sizes are comparable. `angle_deg` float32 (K,): direction, clockwise from the right. `size` float32
+    (K,): width of the described patch, as a fraction of the longest side. `bits` uint8 (K, 32): the descriptor.
     """
 
     points: Singles
@@ -49,16 +49,16 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self.points)
 
-    def best(self, most: int) -> "Landmarks":
-        """Return the `most` best landmarks."""
-        return Landmarks(self.points[:most], self.angle_deg[:most], self.size[:most], self.bits[:most])
+    def best(self, count: int) -> "Landmarks":
+        """Return the `count` best landmarks."""
+        return Landmarks(self.points[:count], self.angle_deg[:count], self.size[:count], self.bits[:count])
 
 
 def detect_landmarks(
-    image: Image, mask: Mask | None = None, most: int = PLACE_LANDMARKS, longest_px: int = DOWN_PX
+    image: Image, mask: Mask | None = None, count: int = PLACE_LANDMARKS, longest_px: int = DOWN_PX
 ) -> Landmarks:
-    """Find the `most` best landmarks of a uint8 image, (H, W) grey or (H, W, 3) BGR, scaled to `longest_px` along its
-    longest side, best first: none without corners, or in an image smaller than a patch. No patch covers a pixel where
+    """Detect the `count` best landmarks of a uint8 image, (H, W) grey or (H, W, 3) BGR, scaled to `longest_px` along
+    its longest side, best first; none if it has no corners or is smaller than a patch. No patch covers a pixel where
     `mask`, bool (H, W), is False."""
     height, width = image.shape[:2]
     scale = longest_px / max(height, width)
@@ -70,7 +70,7 @@ def detect_landmarks(
         allowed = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         allowed = cv2.erode(allowed, np.ones((_PATCH_PX, _PATCH_PX), np.uint8), borderValue=1)
     orb = cv2.ORB.create(
-        max(most, _MIN_CORNERS), _LEVEL_FACTOR, _LEVELS, fastThreshold=_MIN_CONTRAST, patchSize=_PATCH_PX
+        max(count, _MIN_CORNERS), _LEVEL_FACTOR, _LEVELS, fastThreshold=_MIN_CONTRAST, patchSize=_PATCH_PX
     )
     keypoints, bits = orb.detectAndCompute(grey, allowed) if min(size) > 2 * _PATCH_PX else ((), None)
     if bits is None:
@@ -78,19 +78,19 @@ def detect_landmarks(
         return Landmarks(np.empty((0, 2), np.float32), none, none, np.empty((0, 32), np.uint8))
     points_px: Singles = np.array([point.pt for point in keypoints], np.float32)
     order = np.argsort([-point.response for point in keypoints], kind="stable")
-    chosen = order[_select_spread(points_px[order], most, longest_px / _CELLS)]
-    middle = (np.array(size, np.float32) - 1) / 2
+    chosen = order[_select_spread(points_px[order], count, longest_px / _CELLS)]
+    centre = (np.array(size, np.float32) - 1) / 2
     width_px = np.array([point.size for point in keypoints], np.float32)
     return Landmarks(
-        np.asarray(((points_px - middle) / longest_px)[chosen], np.float32),
+        np.asarray(((points_px - centre) / longest_px)[chosen], np.float32),
         np.array([point.angle for point in keypoints], np.float32)[chosen],
         np.asarray(width_px[chosen] / longest_px, np.float32),
         np.asarray(bits[chosen], np.uint8),
     )
 
 
-def _select_spread(points_px: Singles, most: int, cell_px: float) -> Ints:
-    """Return the indices of at most `most` of the points (K, 2), given best first, spread over the image: the best
+def _select_spread(points_px: Singles, count: int, cell_px: float) -> Ints:
+    """Return the indices of at most `count` of the points (K, 2), ordered best first, spread over the image: the best
     one in every cell of a grid, then the second best, and so on."""
     # Keep only the best of several points at one corner.
     _, first = np.unique(np.rint(points_px / _MIN_DISTANCE_PX).astype(int), axis=0, return_index=True)
@@ -101,7 +101,7 @@ def _select_spread(points_px: Singles, most: int, cell_px: float) -> Ints:
     starts = np.searchsorted(ordered, ordered)
     rank = np.empty(len(kept), int)
     rank[by_cell] = np.arange(len(kept)) - starts
-    return kept[np.argsort(rank, kind="stable")[:most]]
+    return kept[np.argsort(rank, kind="stable")[:count]]
 
 
 def pack_bytes(landmarks: Landmarks) -> bytes:
@@ -119,7 +119,7 @@ def unpack_bytes(blob: bytes) -> Landmarks:
     """Decode landmarks from the bytes of `pack_bytes`. Raises ValueError for anything else."""
     version, count = _HEADER.unpack(blob[: _HEADER.size].ljust(_HEADER.size, b"\0"))
     if version != _VERSION or len(blob) != _HEADER.size + count * _STORED_DTYPE.itemsize:
-        raise ValueError("its landmarks have a form that this edgevpr does not know")
+        raise ValueError("its landmarks have a format that this version of edgevpr does not recognise")
     stored = np.frombuffer(blob, _STORED_DTYPE, offset=_HEADER.size)
     points = np.stack([stored["x"], stored["y"]], axis=1).astype(np.float64) / 65535 - 0.5
     return Landmarks(

@@ -31,11 +31,11 @@ from edgevpr.places.layers import Layers
 from edgevpr.runtime.recognise.relief import compute_nadir_sd
 
 GPS_SD_M = 5.0  # standard deviation of a recorded position along one axis, unless a better one is known
-# Distance, as a share of the footprint, from the image's middle to the point below an aircraft tilted by 3 degrees.
+# Distance, as a fraction of the footprint, from the image's centre to the point below an aircraft tilted by 3 degrees.
 # Chosen on generated flights and aerial_swindale.
 TILT_SD_WITHOUT_ATTITUDE = 0.04
-_MAX_OFFSET_WITHOUT_HEADING = 0.25  # of the longest side: farther away, the image shows other ground
-_MAX_FIELD_DIFFERENCE_DEG = 5.0  # data sheets round it
+_MAX_OFFSET_WITHOUT_HEADING = 0.25  # of the longest side: beyond it, the image shows other ground
+_MAX_FOV_DIFFERENCE_DEG = 5.0  # data sheets round the field of view
 
 _log = logging.getLogger(__name__)
 
@@ -43,8 +43,8 @@ _log = logging.getLogger(__name__)
 @dataclass(slots=True, kw_only=True)
 class Levelling:
     """Levels the images of a camera that looks straight down, see `frames.level`. Without a `lens` they are not
-    warped, and only the distance on the ground from the point below the camera to the image's centre is computed,
-    from the `mount` of the camera; a `lens` has its own mount.
+    warped: only the distance on the ground from the point below the camera to the image's centre is computed,
+    from the `mount` of the camera. A `lens` has its own mount.
 
     With `below`, for places, the point below the camera becomes the centre. `on_gimbal`: a gimbal keeps the camera
     level. `is_live` is False for recorded frames, for which the autopilot's reports do not apply.
@@ -71,9 +71,9 @@ class Levelling:
         scale: float = 1.0,
     ) -> LevelledImage:
         """Level the image of a frame. `vehicle` is the autopilot's report (None: unknown). `overlay`, bool (H, W), is
-        False where the image shows no ground (None: nowhere). Its longest side is scaled to the length on the ground
-        of the places to search, chosen from their `layers` (None: no scaling). It shows `scale` times as much ground as
-        expected at its height or, if that is unknown, as the images of the map."""
+        False where the image shows no ground (None: it shows ground everywhere). The image's longest side is scaled to
+        the footprint of the places to search, chosen from their `layers` (None: no scaling). It shows `scale` times as
+        much ground as expected at its height or, if that is unknown, as the images of the map."""
         if vehicle and not (self.is_live and vehicle.is_fresh(frame.t_mono_s)):
             vehicle = None
         if vehicle and self.on_gimbal:
@@ -82,8 +82,8 @@ class Levelling:
             return enlarge_image(
                 LevelledImage(frame.image, overlay, estimate_tilted_view(frame, vehicle, self.mount)), scale
             )
-        own_m = compute_footprint(frame, vehicle, self.lens) if layers else None
-        footprint_m = layers.choose_footprint(own_m and scale * own_m) if layers else None
+        full_m = compute_footprint(frame, vehicle, self.lens) if layers else None
+        footprint_m = layers.choose_footprint(full_m and scale * full_m) if layers else None
         picture = level_image(frame, vehicle, self.lens, footprint_m, overlay=overlay, below=self.below, scale=scale)
         if picture.view.reason and not self._has_warned:
             self._has_warned = True
@@ -105,7 +105,7 @@ class Undistortion:
 def make_levelling(
     config: SourceConfig, technique: Technique, *, below: bool = False
 ) -> Levelling | Undistortion | None:
-    """Make the preparation of images for a configuration. None: there is none, for a camera without a known lens that
+    """Make the image preparation for a configuration; None for a camera without a known lens that
     looks ahead or is on a gimbal. Raises ConfigError for an unusable lens calibration, and UsageError for a field of
     view that contradicts it."""
     if technique.spec.parameters.get("camera") != "nadir":
@@ -137,23 +137,23 @@ def load_calibrated_lens(config: SourceConfig) -> CalibratedLens | None:
         return None
     lens = read_lens(config.lens)
     full_fov_deg = compute_lens_view(lens, lens.size_px).full_fov_deg
-    if config.fov_deg is not None and abs(config.fov_deg - full_fov_deg) > _MAX_FIELD_DIFFERENCE_DEG:
+    if config.fov_deg is not None and abs(config.fov_deg - full_fov_deg) > _MAX_FOV_DIFFERENCE_DEG:
         raise UsageError(
-            f"`source.fov_deg` is {config.fov_deg:g}, but it is {full_fov_deg:.0f} in {config.lens}: leave `fov_deg` "
-            "out, or give the calibration of this camera."
+            f"`source.fov_deg` is {config.fov_deg:g}, but it is {full_fov_deg:.0f} in {config.lens}: remove `fov_deg`, "
+            "or use the calibration of this camera."
         )
     return lens
 
 
 def set_picture_heading(frame: Frame, view: View) -> Frame:
-    """Return the frame with the heading of the top of its levelled image, if known. The hints use it."""
+    """Return the frame with the heading of the top of its levelled image, if known. The hints use this heading."""
     return frame if view.up_deg is None else replace(frame, heading_deg=view.up_deg)
 
 
 def centre_place(frame: Frame, view: View) -> Frame:
-    """Convert a frame to the form that a place stores. Its heading becomes that of the levelled image. Its position,
-    if any, becomes that of the image's centre instead of the aircraft's, if that can be computed. With a known
-    height and heading it gets a pose."""
+    """Convert a frame to the form stored for a place. Its heading becomes that of the levelled image. Its position,
+    if any, becomes that of the image's centre instead of the aircraft, if that can be computed. With a known
+    height and heading, a pose is added."""
     frame = set_picture_heading(frame, view)
     if view.nadir_offset and view.up_deg is None and math.hypot(*view.nadir_offset) > _MAX_OFFSET_WITHOUT_HEADING:
         return replace(frame, position=None)

@@ -1,7 +1,7 @@
 """Computes the position of the aircraft, with a covariance, from the recognised places. The recogniser uses it.
 
 A match gives the shift between the centres of the pictures of query and place. If the `Pose` of the place is known (how
-its picture lies on the ground), the shift gives a position. Several places that show the same ground must give about
+its picture maps to the ground), the shift gives a position. Places that show the same ground must give about
 the same position, and their mean is more accurate. Without a pose, as ahead, the position is that of the place.
 """
 
@@ -18,20 +18,20 @@ from edgevpr.core.types import Candidate, Place, Position
 from edgevpr.frames.level import UNKNOWN_VIEW, View
 from edgevpr.runtime.recognise.agreement import MIN_CONFIRMED_INLIERS, Agreement
 from edgevpr.runtime.recognise.levelling import TILT_SD_WITHOUT_ATTITUDE
-from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, AttitudeError, ShownTilt, fit_attitude_error
+from edgevpr.runtime.recognise.perspective import TYPICAL_FOCAL, AttitudeError, ObservedTilt, fit_attitude_error
 from edgevpr.runtime.recognise.relief import UNKNOWN_HEIGHT_SD, compute_nadir_sd
 
-# Chosen on aerial_caliterra and aerial_garfield28. Standard deviations along one axis of a shift, as shares of the
+# Chosen on aerial_caliterra and aerial_garfield28. Standard deviations along one axis of a shift, as fractions of the
 # longest side, added to the covariance of a match: tilt and relief shift the parts of a picture differently.
-_VOTE_SD_SHARE = 0.016
-_LANDMARK_SD_SHARE = 0.008
-_POSE_SD = 0.03  # from the scale and rotation of a place's pose, as a share of the length of a shift
-_MEAN_VARIANCE_SHARE = 0.25  # variance of the mean of the votes, relative to that of a single vote
-_MIN_SCORE_SHARE = 0.5  # of the best score: matches with at least this score are also used
-_MAX_DIFFERENCE_SD = 4.0  # places that differ by more are not used
-_CONTRADICTION_SHARE = 0.2  # of the footprint: if two positions are farther apart, one of the places is wrong
-_MAX_CONTRADICTION = 0.4  # sum of the scores of contradicting places, relative to agreeing ones
-MAX_PLACES_CHECKED = 12  # in a dense map, as many show the same ground
+_VOTE_SD = 0.016
+_LANDMARK_SD = 0.008
+_POSE_SD = 0.03  # due to scale and rotation of a place's pose, as a fraction of the length of a shift
+_MEAN_VARIANCE_RATIO = 0.25  # variance of the mean of the votes, relative to that of a single vote
+_MIN_SCORE_RATIO = 0.5  # of the best score: matches with at least this score are also used
+_MAX_DIFFERENCE_SD = 4.0  # places whose positions differ by more are not used
+_MAX_POSITION_SPREAD = 0.2  # of the footprint: if two positions are farther apart, one of the places is wrong
+_MAX_CONTRADICTION_RATIO = 0.4  # sum of the scores of contradicting places, relative to agreeing ones
+MAX_PLACES_CHECKED = 12  # this many show the same ground in a dense map
 _MAX_PLACES_AVERAGED = 5  # of these determine the position
 
 
@@ -41,9 +41,9 @@ class Located:
     compass direction of the top of the picture. `height_ratio` is the height of the camera divided by that of the map's
     pictures, `footprint_m` the length of the longest side on the ground, and `height_m` the resulting height above the
     ground, independent of any reported one (None: unknown). `places` are the numbers of the places that agree on the
-    position. `objection` is the reason not to trust it (None: no reason). `attitude_error` is the error of the reported
-    attitude that the picture shows; the position includes its effect. `tilt_m2` is the part of both variances due to an
-    unreported tilt."""
+    position. `objection` is the reason not to trust it (None: trusted). `attitude_error` is the error of the reported
+    attitude measured in the picture; the position still contains its effect. `tilt_m2` is the part of both variances
+    due to an unreported tilt."""
 
     position: Position
     covariance_m2: Covariance
@@ -60,8 +60,8 @@ class Located:
     def accuracy_m(self) -> float:
         """Standard deviation in the direction of the largest one, metres."""
         var_east, cov, var_north = self.covariance_m2
-        middle, half = (var_east + var_north) / 2, math.hypot((var_east - var_north) / 2, cov)
-        return math.sqrt(middle + half)
+        mean, half = (var_east + var_north) / 2, math.hypot((var_east - var_north) / 2, cov)
+        return math.sqrt(mean + half)
 
     @property
     def sd_m(self) -> float:
@@ -84,7 +84,7 @@ class _PlaceEstimate:
     height_ratio: float | None
 
     def agrees_with(self, other: "_PlaceEstimate") -> bool:
-        """Return True if both positions are about the same. Relative to each other, poses are known far better than on
+        """Return True if both positions are about the same. Relative to each other, poses are far more accurate than on
         the Earth, so only half of each variance counts."""
         covariance = self.match_covariance + other.match_covariance + (self.pose_covariance + other.pose_covariance) / 2
         return mahalanobis(self.position_m - other.position_m, covariance) <= _MAX_DIFFERENCE_SD
@@ -102,10 +102,10 @@ def locate(
     agreement: Agreement | None = None,
     height_sd: float = UNKNOWN_HEIGHT_SD,
 ) -> Located | None:
-    """Return the position of the aircraft from the `places` found, best first; None if the best has no pose or its
+    """Return the position of the aircraft from the matched `places`, best first; None if the best has no pose or its
     match no shift. `cells` is the number of cells along the longest side of a picture (None: unknown, so shifts cannot
-    be converted to metres). `view` is how the query's picture lies on the ground; if the point below the aircraft is
-    unknown, the centre is used. `agreement` is that of the landmarks of the best place, which gives another shift.
+    be converted to metres). `view` is how the query's picture maps to the ground; if the point below the aircraft is
+    unknown, the centre is used. `agreement` is that of the landmarks of the best place, which gives a second shift.
     `height_sd` is `Relief.height_sd`.
 
     Of the places that show the same ground, those whose positions agree with the first are listed in the result. The
@@ -113,31 +113,32 @@ def locate(
     position far from the first contradict it; if the sum of their scores is too large, the position is not trusted.
     """
     best, pose, nadir, error = places[0].place, places[0].place.pose, view.nadir_offset or (0.0, 0.0), None
-    first = _estimate(places[0], best, cells, nadir)
+    first = _estimate_position(places[0], best, cells, nadir)
     if first is None or best.position is None or pose is None:
         return None
-    estimates = [first, *filter(None, (_estimate(place, best, cells, nadir) for place in places[1:]))]
+    estimates = [first, *filter(None, (_estimate_position(place, best, cells, nadir) for place in places[1:]))]
     if agreement and agreement.is_expected and agreement.inliers >= MIN_CONFIRMED_INLIERS:
-        first = _estimate(places[0], best, cells, nadir, agreement) or first
+        first = _estimate_position(places[0], best, cells, nadir, agreement) or first
         estimates.insert(0, first)
         if agreement.inlier_points:
             error = fit_attitude_error(*agreement.inlier_points, view, pose.up_deg + first.rotation_deg)
-    least = _MIN_SCORE_SHARE * first.score
+    min_score = _MIN_SCORE_RATIO * first.score
     agreeing = [estimate for estimate in estimates if first.agrees_with(estimate)]
-    position_m, covariance = _average([other for other in agreeing if other.score >= least][:_MAX_PLACES_AVERAGED])
+    position_m, covariance = _average([other for other in agreeing if other.score >= min_score][:_MAX_PLACES_AVERAGED])
     if view.nadir_offset_m is not None:
         position_m = position_m + view.nadir_offset_m
     else:
         tilt_sd = TILT_SD_WITHOUT_ATTITUDE if view.nadir_offset is None else compute_nadir_sd(view, height_sd)
         covariance += (tilt_sd * pose.footprint_m * (first.height_ratio or 1.0)) ** 2 * np.eye(2)
-    objection, far_m = None, _CONTRADICTION_SHARE * pose.footprint_m
+    objection, far_m = None, _MAX_POSITION_SPREAD * pose.footprint_m
     contradicting = []
     for estimate in estimates:
-        apart_m = float(np.hypot(*(estimate.position_m - first.position_m)))
-        if estimate.score >= least and apart_m > far_m:
-            contradicting.append((estimate.score, apart_m))
-    if sum(score for score, _ in contradicting) > _MAX_CONTRADICTION * sum(estimate.score for estimate in agreeing):
-        objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"apart_m": max(contradicting)[1]})
+        distance_m = float(np.hypot(*(estimate.position_m - first.position_m)))
+        if estimate.score >= min_score and distance_m > far_m:
+            contradicting.append((estimate.score, distance_m))
+    agreeing_score = sum(estimate.score for estimate in agreeing)
+    if sum(score for score, _ in contradicting) > _MAX_CONTRADICTION_RATIO * agreeing_score:
+        objection = Reason(ReasonCode.POSITIONS_DISAGREE, {"distance_m": max(contradicting)[1]})
     footprint_m = pose.footprint_m * (first.height_ratio or 1.0)
     lat_lon = offset_position(best.position.lat_deg, best.position.lon_deg, *position_m.tolist())
     return Located(
@@ -153,13 +154,13 @@ def locate(
     )
 
 
-def add_tilt_covariance(where: Located, tilt: ShownTilt, view: View) -> Located:
-    """Return the position with its covariance increased for `tilt`, the tilt of the query that levelling by its `view`
-    has not removed."""
+def add_tilt_covariance(located: Located, tilt: ObservedTilt, view: View) -> Located:
+    """Return the position with its covariance increased by the effect of `tilt`, which levelling by `view` has not
+    removed."""
     tangent_sd = tilt.get_sd(view.is_tilt_known)
-    tilt_m2 = (tangent_sd * (where.height_m or TYPICAL_FOCAL * (where.footprint_m or 0.0))) ** 2
-    east_m2, cross_m2, north_m2 = where.covariance_m2
-    return replace(where, covariance_m2=(east_m2 + tilt_m2, cross_m2, north_m2 + tilt_m2), tilt_m2=tilt_m2)
+    tilt_m2 = (tangent_sd * (located.height_m or TYPICAL_FOCAL * (located.footprint_m or 0.0))) ** 2
+    east_m2, cross_m2, north_m2 = located.covariance_m2
+    return replace(located, covariance_m2=(east_m2 + tilt_m2, cross_m2, north_m2 + tilt_m2), tilt_m2=tilt_m2)
 
 
 def covariance_matrix(covariance: Covariance) -> Doubles:
@@ -174,24 +175,24 @@ def mahalanobis(step: Doubles, covariance: Doubles) -> float:
 
 def _average(estimates: list[_PlaceEstimate]) -> tuple[Doubles, Doubles]:
     """Return the mean (2,) of the positions computed from several places, and its covariance (2, 2)."""
-    match_covariance = np.linalg.inv(sum(np.linalg.inv(each.match_covariance) for each in estimates))
-    position_m = match_covariance @ sum(np.linalg.inv(each.match_covariance) @ each.position_m for each in estimates)
+    match_covariance = np.linalg.inv(sum(np.linalg.inv(place.match_covariance) for place in estimates))
+    position_m = match_covariance @ sum(np.linalg.inv(place.match_covariance) @ place.position_m for place in estimates)
     if len(estimates) > 1:
         # If places differ by more than their covariances allow, the covariances are scaled up (Birge 1932).
-        errors_m = [(each.position_m - position_m, each.match_covariance) for each in estimates]
+        errors_m = [(place.position_m - position_m, place.match_covariance) for place in estimates]
         chi2 = sum(error_m @ np.linalg.solve(covariance, error_m) for error_m, covariance in errors_m)
         match_covariance = match_covariance * max(1.0, float(chi2) / (2 * (len(estimates) - 1)))
-    # Neighbours share the errors of their poses, so averaging does not reduce these.
-    return position_m, match_covariance + np.mean([each.pose_covariance for each in estimates], axis=0)
+    # Neighbours have the same pose errors, so averaging does not reduce them.
+    return position_m, match_covariance + np.mean([place.pose_covariance for place in estimates], axis=0)
 
 
-def _estimate(
-    found: Candidate, best: Place, cells: int | None, nadir: tuple[float, float], agreement: Agreement | None = None
+def _estimate_position(
+    candidate: Candidate, best: Place, cells: int | None, nadir: tuple[float, float], agreement: Agreement | None = None
 ) -> _PlaceEstimate | None:
-    """Compute the position of the aircraft from one place, by the shift of its match or, with `agreement`, of the
+    """Compute the position of the aircraft from one place, using the shift of its match or, with `agreement`, of the
     landmarks that agree. None if the match has no shift or rotation, the place no pose, or the `best` place's picture
     is too far away to show the same ground. `cells` is as in `locate`, and `nadir` is `View.nadir_offset`."""
-    match, place, pose = found.match, found.place, found.place.pose
+    match, place, pose = candidate.match, candidate.place, candidate.place.pose
     if cells is None or match.shift_cells is None or match.rotation_deg is None:
         return None
     if place.position is None or pose is None or best.position is None or best.pose is None:
@@ -201,14 +202,14 @@ def _estimate(
         return None
     if agreement:
         rotation_deg, height_ratio = agreement.rotation_deg or 0.0, agreement.scale
-        step, landmark_share2 = np.array(agreement.shift_share), _LANDMARK_SD_SHARE**2 * np.eye(2)
+        step, landmark_share2 = np.array(agreement.shift_share), _LANDMARK_SD**2 * np.eye(2)
         covariance = covariance_matrix(agreement.covariance_share2 or (0.0, 0.0, 0.0)) + landmark_share2
     else:
         rotation_deg, height_ratio, step = match.rotation_deg, match.height_ratio, np.array(match.shift_cells) / cells
-        # The covariance of the match is that of a single vote; the mean has a fraction of it.
+        # The covariance of the match is that of a single vote; that of the mean is smaller.
         covariance = covariance_matrix(match.covariance_cells2 or (0.0, 0.0, 0.0)) / cells**2
-        covariance = covariance * _MEAN_VARIANCE_SHARE + _VOTE_SD_SHARE**2 * np.eye(2)
-    # The point below the aircraft in the place's picture: that in the query's picture, rotated, scaled and shifted.
+        covariance = covariance * _MEAN_VARIANCE_RATIO + _VOTE_SD**2 * np.eye(2)
+    # The point below the aircraft in the place's picture is that in the query's picture, rotated, scaled and shifted.
     ratio, turn = height_ratio or 1.0, math.radians(rotation_deg)
     right, up = nadir
     dx = step[0] + ratio * (right * math.cos(turn) + up * math.sin(turn))

@@ -15,7 +15,7 @@ from edgevpr.runtime.recognise.landmarks import PLACE_LANDMARKS, Landmarks
 
 # Over repetitive ground such as furrows, landmarks match at many shifts, and few of the matches agree on one.
 _MIN_INLIERS = 30
-_MIN_INLIER_SHARE = 0.4
+_MIN_INLIER_RATIO = 0.4
 _MAX_TURN_DEG = 8.0  # largest rotation, and scaling, between two levelled pictures
 _MAX_SCALE = 1.15
 _MAX_ELAPSED_S = 30.0
@@ -43,8 +43,8 @@ class OdometryStep:
     def fields(self) -> dict[str, Any]:
         """Return this step as fields of the flight log."""
         moved_m = [round(axis_m, 2) for axis_m in self.moved_m]
-        rest = {"sd_m": round(self.sd_m, 3), "inliers": self.inliers, "zoom": round(self.zoom, 4)}
-        return {"from_s": self.from_s, "moved_m": moved_m, **rest}
+        figures = {"sd_m": round(self.sd_m, 3), "inliers": self.inliers, "zoom": round(self.zoom, 4)}
+        return {"from_s": self.from_s, "moved_m": moved_m, **figures}
 
 
 class VisualOdometry:
@@ -54,17 +54,17 @@ class VisualOdometry:
         self._previous: tuple[float, View, Landmarks] | None = None
 
     def measure(self, t_s: float, view: View, landmarks: Landmarks) -> OdometryStep | None:
-        """Return the motion to a frame taken at `t_s` (None: unknown). The next motion starts from this frame."""
-        stored, self._previous = self._previous, (t_s, view, landmarks.best(PLACE_LANDMARKS))
-        if stored is None or not 0 < t_s - stored[0] <= _MAX_ELAPSED_S:
+        """Return the motion from the previous frame to this one, taken at `t_s`; None if it cannot be measured."""
+        before, self._previous = self._previous, (t_s, view, landmarks.best(PLACE_LANDMARKS))
+        if before is None or not 0 < t_s - before[0] <= _MAX_ELAPSED_S:
             return None
-        from_s, start, previous = stored
+        from_s, start, previous = before
         if start.nadir_offset is None or view.nadir_offset is None or start.up_deg is None or view.up_deg is None:
             return None
         if start.footprint_m is None or view.footprint_m is None:
             return None
         agreement = measure_agreement(landmarks, previous)
-        if agreement.inliers < max(_MIN_INLIERS, _MIN_INLIER_SHARE * agreement.matched):
+        if agreement.inliers < max(_MIN_INLIERS, _MIN_INLIER_RATIO * agreement.matched):
             return None
         if agreement.shift_share is None or agreement.rotation_deg is None or agreement.scale is None:
             return None
@@ -72,7 +72,7 @@ class VisualOdometry:
         scale = agreement.scale * start.footprint_m / view.footprint_m
         if abs(rotation_deg) > _MAX_TURN_DEG or not 1 / _MAX_SCALE < scale < _MAX_SCALE:
             return None
-        # The point below the camera in the previous picture: that of this picture, rotated, scaled and shifted.
+        # The point below the camera in the previous picture is that of this picture, rotated, scaled and shifted.
         factor = agreement.scale * complex(math.cos(turn := math.radians(agreement.rotation_deg)), math.sin(turn))
         step = factor * complex(view.nadir_offset[0], -view.nadir_offset[1]) + complex(*agreement.shift_share)
         step -= complex(start.nadir_offset[0], -start.nadir_offset[1])

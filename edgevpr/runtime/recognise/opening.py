@@ -1,4 +1,4 @@
-"""Makes a recogniser from a map, the technique it was built with, and its index in RAM. Every program starts here."""
+"""Makes a recogniser from a map, the technique that built it, and its index in RAM. Every program starts here."""
 
 import logging
 from collections.abc import Collection, Mapping
@@ -45,13 +45,13 @@ def open_recogniser(
 ) -> Recogniser:
     """Open the map, make its technique for the board (see `resolve_board`), and load the index.
 
-    With `uses_hints`, for a flight, hints narrow each query (see `hints`); otherwise only what is `known` of recorded
-    queries does (see `RecordedPrior`). With `tracks_flight`, the queries are those of one flight, in order (see
+    With `uses_hints`, for a flight, hints narrow each query (see `hints`); otherwise only the `known` data of recorded
+    queries do (see `RecordedPrior`). With `tracks_flight`, the queries are those of one flight, in order (see
     `place_filter`). `meter` measures the queries (None: use the clocks of this computer). Raises an EdgevprError
     that explains the mismatch, such as a setting that the map was not built with.
     """
     if config.map is None:
-        raise UsageError("There is no map to recognise places in: give one with --map, or `map:` in the configuration.")
+        raise UsageError("There is no map to recognise places in: set one with --map, or `map:` in the configuration.")
     source, match = config.source, config.match
     place_map = PlaceMap.open(config.map)
     with ExitStack() as on_error:
@@ -99,7 +99,7 @@ def open_salience_gate(config: SalienceConfig, threads: int = 1) -> SalienceGate
         return None
     if config.entropy > MAX_ENTROPY:
         raise ConfigError(
-            f"`salience.entropy` is {config.entropy:g}, and no picture has more than {MAX_ENTROPY:.3f}: lower it."
+            f"`salience.entropy` is {config.entropy:g}, but must be at most {MAX_ENTROPY:.3f}, the highest that exists."
         )
     memorability = detector = None
     if config.memorability > 0:
@@ -113,7 +113,9 @@ def open_salience_gate(config: SalienceConfig, threads: int = 1) -> SalienceGate
         else:
             _log.warning("`salience.detector` is not set: moving objects are not checked")
     if not (memorability or detector or config.entropy > 0):
-        raise ConfigError("`salience.use` is true, but every criterion is off: raise a threshold, or set it to false.")
+        raise ConfigError(
+            "`salience.use` is true, but every criterion is off: raise a threshold or set `use` to false."
+        )
     return SalienceGate(config, memorability, detector)
 
 
@@ -134,7 +136,7 @@ def create_technique(
     built_with, settings, threads = place_map.spec, settings or {}, board.threads if board else None
     if not techniques.is_known(built_with.name):
         raise MapError(
-            f"{place_map.path} was built with `{built_with.name}`, which this edgevpr does not have: update edgevpr, "
+            f"{place_map.path} was built with `{built_with.name}`, which this version lacks: update edgevpr, "
             "copy its network and card to your models folder ($EDGEVPR_MODELS, else ~/.local/share/edgevpr/models), or "
             f"build the map with one of {', '.join(techniques.list_techniques())}."
         )
@@ -145,7 +147,7 @@ def create_technique(
             if settings and isinstance(error, UsageError):
                 raise
             raise MapError(
-                f"{place_map.path}: its parameters cannot be used ({error}): restore a copy or build the map again."
+                f"{place_map.path}: its parameters are invalid ({error}): restore a backup or rebuild the map."
             ) from error
     else:
         technique = make_technique(threads, name, settings)
@@ -154,14 +156,14 @@ def create_technique(
 
 
 def warn_of_mismatch(place_map: PlaceMap, mask: OverlayMask | None, lens: str | None) -> None:
-    """Warn if the places of a map, which remain usable, were made with another `mask`, or if their pictures were
+    """Warn if the places of a map, which remain usable, were built with another `mask`, or if their pictures were
     undistorted with a calibration and those of the queries will not be (`lens` None)."""
     if not len(place_map):
         return
     path, built_mask, built_lens = place_map.path, place_map.mask_sha256, place_map.lens
     if built_mask != (mask.sha256 if mask else None):
         how = "without a mask" if built_mask is None else "with another mask"
-        _log.warning("%s was built %s: use the same mask for map and frames, to recognise more", path, how)
+        _log.warning("%s was built %s: use the same mask for map and frames for better recognition", path, how)
     if built_lens and not lens:
         _log.warning(
             "%s was built with `source.lens` (%s): set `source.lens` to the calibration of this camera too, unless its "

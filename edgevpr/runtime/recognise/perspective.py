@@ -1,4 +1,4 @@
-"""The tilt of a camera that its pictures show, beyond the tilt reported by the autopilot.
+"""Estimates the tilt of a camera, beyond the tilt reported by the autopilot, from its pictures.
 
 A picture is levelled with the reported attitude. If that is wrong, the picture remains tilted by the error, and one
 rotation, scaling and shift cannot align its landmarks with those of the place: a tilt moves a landmark by a term that
@@ -19,43 +19,43 @@ from edgevpr.core.geodesy import fit_similarity, picture_axes
 from edgevpr.frames.level import View
 
 _log = logging.getLogger(__name__)
-_MIN_LANDMARKS = 12  # landmarks
-_POINT_SD = 2.5 / 640  # of a landmark, as a share of the longest side
+_MIN_LANDMARKS = 12
+_POINT_SD = 2.5 / 640  # of a landmark, as a fraction of the longest side
 _SHEAR_SD = 0.01
-TYPICAL_FOCAL = 0.77  # 66 degrees across
-_UNKNOWN_TILT_SD = math.tan(math.radians(30.0))  # if too little agrees to show a tilt
+TYPICAL_FOCAL = 0.77  # 66 degrees along the longest side
+_UNKNOWN_TILT_SD = math.tan(math.radians(30.0))  # if too few regions agree to measure a tilt
 _CLEAR_SD = 3.0  # of a tilt beyond the reported one
 _CLEAR_TILT = math.tan(math.radians(5.0))
 # Of a slope: the pictures of places are tilted by a few degrees, and relief also looks like a tilt.
 _PLACE_SLOPE_SD = 0.1
-# Share by which scales differ with direction. Level views of aerial_garfield28 and aerial_caliterra have 0.07 at most,
+# Relative difference of scales with direction. Level views of aerial_garfield28 and aerial_caliterra have 0.07 at most,
 # those of 45 degrees 0.08 to 0.25; it is the square of the tangent of half the tilt.
 _CLEAR_STRETCH = 0.075
-_TILT_SD_SHARE = 0.3  # of a tilt: clear enough for what a match may claim, too little to refuse 30 degrees
-# Of a mean over several matches: slopes of the ground, which a map of an orthophoto does not show. Of each match: the
-# tilt of the place's image, as that of a map of the same camera.
+_TILT_RELATIVE_SD = 0.3  # of a tilt: it adds to the claimed error, but cannot refuse an image at 30 degrees
+# Of a mean over several matches: slopes of the ground, which a map of an orthophoto does not contain. Of each match:
+# the tilt of the place's image, as in a map made with the same camera.
 _COMMON_TILT_SD = math.tan(math.radians(2.0))
 _SINGLE_TILT_SD = math.tan(math.radians(4.0))
-_MAX_TILT = math.tan(math.radians(60.0))  # more is a wrong fit
-_COMMON_SD_SHARE = 0.15  # of a tilt: so large ones count little, which are mostly wrong
-_KEPT_SHARE = 0.98  # of a mean from match to match: a gimbal may move
-# Relief moves neighbouring landmarks alike: so many of them count as one. The place's own picture is tilted too.
+_MAX_TILT = math.tan(math.radians(60.0))  # a larger tilt is a wrong fit
+_COMMON_RELATIVE_SD = 0.15  # of a tilt: large tilts, which are mostly wrong, count little
+_DECAY = 0.98  # of earlier matches, per match: a gimbal may move
+# Relief moves neighbouring landmarks together, so this many count as one. The place's own picture is tilted too.
 _CORRELATED_LANDMARKS = 5.0
 _PLACE_TILT_SD = math.tan(math.radians(0.5))
 
 
 @dataclass(frozen=True, slots=True)
 class AttitudeError:
-    """Tilt of the camera beyond the reported attitude. `over_height` (east, north) is a share of the height above the
-    ground: the distance of the point below the camera from where the reported attitude puts it. `sd` is the standard
+    """Tilt of the camera beyond the reported attitude. `nadir_shift` (east, north) is the distance of the point below
+    the camera from its position by the reported attitude, divided by the height above ground. `sd` is the standard
     deviation of each axis."""
 
-    over_height: tuple[float, float]
+    nadir_shift: tuple[float, float]
     sd: float
 
 
 @dataclass(frozen=True, slots=True)
-class ShownTilt:
+class ObservedTilt:
     """Tilt of a levelled picture relative to that of a place, measured from both: its `tangent`, and the standard
     deviation of each axis due to the regions compared (`sd`) and to tilt and relief of the place (`place_sd`)."""
 
@@ -75,35 +75,35 @@ class ShownTilt:
 
     @property
     def is_clear(self) -> bool:
-        """True if there clearly is a tilt."""
+        """True if there is clearly a tilt."""
         return self.tangent > max(_CLEAR_SD * math.hypot(self.sd, self.place_sd), _CLEAR_TILT)
 
     def get_sd(self, is_reported: bool) -> float:
         """Return the standard deviation of the tilt used for levelling, as a tangent. A reported tilt is trusted unless
-        the pictures clearly contradict it. Without a report the whole tilt is missing, plus the error of this
-        measurement: if few regions agree, they lie close together and show too small a tilt (tilt_ariel)."""
+        the pictures clearly contradict it. An unreported tilt is wrong by all of it, plus the error of this
+        measurement: if few regions agree, they are close together and show too small a tilt (tilt_ariel)."""
         if is_reported:
             return math.hypot(self.tangent, self.sd) if self.is_clear else 0.0
         return self.tangent + self.sd
 
 
-def convert_to_tilt(found: Perspective | None, focal: float | None) -> ShownTilt:
-    """Convert a perspective (None: unknown) to a tilt. `focal` is the focal length, in shares of the longest side
+def convert_to_tilt(perspective: Perspective | None, focal: float | None) -> ObservedTilt:
+    """Convert a perspective (None: unknown) to a tilt. `focal` is the focal length as a fraction of the longest side
     (None: unknown, use that of a typical camera)."""
-    if found is None:
-        return ShownTilt(0.0, _UNKNOWN_TILT_SD)
+    if perspective is None:
+        return ObservedTilt(0.0, _UNKNOWN_TILT_SD)
     focal = focal or TYPICAL_FOCAL
-    by_slope = ShownTilt(focal * found.slope, focal * found.slope_sd, focal * _PLACE_SLOPE_SD)
-    largest, smallest = found.scales
-    by_stretch = math.sqrt((largest / smallest) ** 2 - 1)
+    from_slope = ObservedTilt(focal * perspective.slope, focal * perspective.slope_sd, focal * _PLACE_SLOPE_SD)
+    largest, smallest = perspective.scales
+    stretch_tangent = math.sqrt((largest / smallest) ** 2 - 1)
     is_stretched = (largest - smallest) / (largest + smallest) >= _CLEAR_STRETCH
-    if not is_stretched or (by_slope.is_clear and by_slope.tangent > by_stretch):
-        return by_slope
-    return ShownTilt(by_stretch, _TILT_SD_SHARE * by_stretch)
+    if not is_stretched or (from_slope.is_clear and from_slope.tangent > stretch_tangent):
+        return from_slope
+    return ObservedTilt(stretch_tangent, _TILT_RELATIVE_SD * stretch_tangent)
 
 
 class CommonTilt:
-    """The tilt beyond the reported one that all images share, in camera axes: that of a mount that is not configured.
+    """The tilt that all images have beyond the reported one, in camera axes: that of a mount that is not configured.
     It is the mean over accepted matches, because few of them show a tilt clearly (none with a narrow lens), and tilts
     due to the ground or to the images of places have a different direction each time."""
 
@@ -114,65 +114,64 @@ class CommonTilt:
         self._has_warned = False
 
     @property
-    def shown(self) -> ShownTilt:
+    def mean(self) -> ObservedTilt:
         """The mean so far."""
         if not self._weight:
-            return ShownTilt(0.0, _UNKNOWN_TILT_SD)
-        return ShownTilt(abs(self._weighted) / self._weight, self._weight**-0.5, _COMMON_TILT_SD)
+            return ObservedTilt(0.0, _UNKNOWN_TILT_SD)
+        return ObservedTilt(abs(self._weighted) / self._weight, self._weight**-0.5, _COMMON_TILT_SD)
 
-    def add(self, found: Perspective, view: View, place_id: int) -> None:
-        """Add the perspective of an accepted match; the same place again shows nothing new."""
+    def add(self, perspective: Perspective, view: View, place_id: int) -> None:
+        """Add the perspective of an accepted match. A repeat of the previous place is ignored."""
         if place_id == self._place_id or view.focal is None:
             return
         self._place_id = place_id
-        right, down = found.over_place[2, :2]
+        right, down = perspective.over_place[2, :2]
         tilt = cmath.rect(view.focal, -math.radians(view.rotation_deg)) * complex(right, down)
         if abs(tilt) > _MAX_TILT:
             return
-        sd = math.hypot(view.focal * found.slope_sd, _SINGLE_TILT_SD, _COMMON_SD_SHARE * abs(tilt))
+        sd = math.hypot(view.focal * perspective.slope_sd, _SINGLE_TILT_SD, _COMMON_RELATIVE_SD * abs(tilt))
         weight = sd**-2
-        self._weighted = _KEPT_SHARE * self._weighted + weight * tilt
-        self._weight = _KEPT_SHARE * self._weight + weight
-        if self.shown.is_clear and not self._has_warned:
+        self._weighted = _DECAY * self._weighted + weight * tilt
+        self._weight = _DECAY * self._weight + weight
+        if self.mean.is_clear and not self._has_warned:
             self._has_warned = True
             _log.warning(
                 "the camera is tilted by about %.0f degrees more than reported: set source.mount_ahead_deg and "
                 "source.mount_right_deg (until then the reported position accuracy includes this error)",
-                self.shown.deg,
+                self.mean.deg,
             )
 
 
-def fit_attitude_error(asked: Array, known: Array, view: View, up_deg: float) -> AttitudeError | None:
+def fit_attitude_error(query: Array, place: Array, view: View, up_deg: float) -> AttitudeError | None:
     """Fit the attitude error to landmarks; None if there are too few, or the view has no attitude or focal length.
 
-    `asked` and `known`, complex (n,), are the landmarks of query and place that agree, as in `agreement`. `up_deg` is
+    `query` and `place`, complex (n,), are their landmarks that agree, as in `agreement`. `up_deg` is
     the compass direction of the top of the query's levelled picture.
     """
-    count = len(asked)
+    count = len(query)
     if count < _MIN_LANDMARKS or view.nadir_offset is None or view.focal is None:
         return None
     # A ray at x + iy (focal lengths right and down of straight down) moves by t + (x Re t + y Im t)(x + iy) when the
-    # camera turns by the small angle t = right + i down. t is in units of the picture's own scale and rotation.
-    ray = (asked - complex(view.nadir_offset[0], -view.nadir_offset[1])) / view.focal
-    turn_scale, _ = fit_similarity(asked, known)
-    by_right, by_down = (turn_scale * view.focal * part * ray for part in (ray.real, ray.imag))
+    # camera rotates by the small angle t = right + i down. t is in the scale and rotation of the picture itself.
+    ray = (query - complex(view.nadir_offset[0], -view.nadir_offset[1])) / view.focal
+    turn_scale, _ = fit_similarity(query, place)
+    right_column, down_column = (turn_scale * view.focal * part * ray for part in (ray.real, ray.imag))
     # A slope of the ground also stretches and shears the picture, by a few per cent.
-    linear = (asked, 1j * asked, asked.conj(), 1j * asked.conj())
-    columns = (*linear, np.ones(count), 1j * np.ones(count), by_right, by_down)
+    linear = (query, 1j * query, query.conj(), 1j * query.conj())
+    columns = (*linear, np.ones(count), 1j * np.ones(count), right_column, down_column)
     design = np.concatenate([np.real(columns), np.imag(columns)], axis=1).T
-    observed = np.concatenate([known.real, known.imag])
+    observed = np.concatenate([place.real, place.imag])
     normal = design.T @ design
     normal[2, 2] += _POINT_SD**2 / _SHEAR_SD**2
     normal[3, 3] += _POINT_SD**2 / _SHEAR_SD**2
     try:
         inverse = np.linalg.inv(normal)
     except np.linalg.LinAlgError:
-        return None  # all landmarks on a line
+        return None  # all landmarks are on one line
     fit = inverse @ design.T @ observed
-    rest = observed - design @ fit
-    variance = (
-        float(rest @ rest) / (2 * count - len(fit)) * _CORRELATED_LANDMARKS * float(inverse[6, 6] + inverse[7, 7]) / 2
-    )
+    residual = observed - design @ fit
+    residual_variance = float(residual @ residual) / (2 * count - len(fit))
+    variance = residual_variance * _CORRELATED_LANDMARKS * float(inverse[6, 6] + inverse[7, 7]) / 2
     right, down = fit[6:]
     east, north = picture_axes(up_deg) @ (-right, down)
     return AttitudeError((float(east), float(north)), math.hypot(math.sqrt(variance), _PLACE_TILT_SD))

@@ -29,16 +29,16 @@ from edgevpr.runtime.recognise.judge import ConfidenceRule
 from edgevpr.runtime.recognise.locate import Located, covariance_matrix, to_triple
 from edgevpr.runtime.recognise.odometry import OdometryStep
 
-_TWIN_SHARE = 0.5  # of the best place's votes: from here on a twin is as likely as it, as in `Evidence.has_twin`
+_TWIN_RATIO = 0.5  # with this fraction of the best place's votes, a twin is equally likely (`Evidence.has_twin`)
 # Chosen on corridor, aerial_caliterra and aerial_garfield28.
 _SHARPNESS = 10.0  # the odds of two places are the ratio of their votes to this power
-_OTHERS_RIGHT_SHARE = 0.7  # how often the correct place is among the others if the best one is wrong
-_MAX_PROPOSED = 20  # most places that one query proposes
+_OTHERS_CORRECT_FRACTION = 0.7  # how often the correct place is among the others if the best one is wrong
+_MAX_PROPOSED = 20  # largest number of places that one query proposes
 # Largest distance that counts as one position, in places and in footprints; and what counts as more likely than not.
 _NEAR_PLACES = 3.0
 _NEAR_FOOTPRINT = 0.25
 _MIN_MAJORITY = 0.5
-_MAX_PLACES_PER_QUERY = 3.0  # highest speed where the time or the positions are unknown
+_MAX_PLACES_PER_QUERY = 3.0  # highest speed if the time or the positions are unknown
 _MAX_ELAPSED_S = 3600.0
 _MIN_SPACING_M = 5.0
 
@@ -100,8 +100,8 @@ class PlaceFilter:
         self._map, self._max_speed_m_s, self._is_live = place_map, max_speed_m_s or DEFAULT_MAX_SPEED_M_S, is_live
         self._geometry: _MapGeometry | None = None
         self._belief: Belief | None = None
-        self._next: Belief | None = None  # the belief after the last pass, until `commit`
-        self._first_view: tuple[Doubles, float] | None = None  # of the ground seen last: position, first confidence
+        self._next: Belief | None = None  # the belief after the last search pass, until `commit`
+        self._first_view: tuple[Doubles, float] | None = None  # of the ground now in view: position, first confidence
         self._next_first_view: tuple[Doubles, float] | None = None
         self._t_now_s: float | None = None
         self._t_committed_s: float | None = None
@@ -133,17 +133,18 @@ class PlaceFilter:
         self._next = copy.copy(self._belief)
         posterior = self._next.update(proposed, self._motion(geometry), len(index))
         slot, confidence = None, 0.0
-        if len(slots) and posterior.p.max() > 0:
-            best = int(posterior.p.argmax())
-            slot, at = int(slots[best]), proposed.at[best]
-            is_near = np.hypot(*(proposed.at - at).T) <= near
-            confidence = float(posterior.p[is_near].sum())
-            if confidence > _MIN_MAJORITY and np.hypot(*(posterior.at - at)) <= near:
-                confidence = max(confidence, posterior.mass)  # with hypotheses not proposed by this pass
-            confidence = self._limit_repetition(at, confidence, float(proposed.p[is_near].sum()))
+        if len(slots) and posterior.probability.max() > 0:
+            best = int(posterior.probability.argmax())
+            slot, best_position = int(slots[best]), proposed.position[best]
+            is_near = np.hypot(*(proposed.position - best_position).T) <= near
+            confidence = float(posterior.probability[is_near].sum())
+            if confidence > _MIN_MAJORITY and np.hypot(*(posterior.position - best_position)) <= near:
+                confidence = max(confidence, posterior.mass)  # includes hypotheses not proposed by this pass
+            alone = float(proposed.probability[is_near].sum())
+            confidence = self._limit_repetition(best_position, confidence, alone)
         estimate = None
         if geometry.origin and posterior.mass:
-            position = move_position(geometry.origin, *posterior.at.tolist())
+            position = move_position(geometry.origin, *posterior.position.tolist())
             covariance_m2, heading_deg = to_triple(posterior.covariance), posterior.heading_deg
             estimate = Located(position=position, covariance_m2=covariance_m2, heading_deg=heading_deg)
         return TrackEstimate(
@@ -151,7 +152,7 @@ class PlaceFilter:
         )
 
     def update_without_match(self, index: PlaceIndex) -> None:
-        """Process a picture with too little texture, which does not show whether the aircraft is over the map."""
+        """Process a picture with too little texture to tell whether the aircraft is over the map."""
         if self._geometry and self._belief:
             self._next = copy.copy(self._belief)
             self._next.update(None, self._motion(self._geometry), len(index))
@@ -171,29 +172,30 @@ class PlaceFilter:
             return make_motion(self._elapsed_s, self._max_speed_m_s, velocity_m_s, is_visual=True)
         return make_motion(self._elapsed_s, self._max_speed_m_s, self._velocity_m_s)
 
-    def _limit_repetition(self, at: Doubles, confidence: float, by_itself: float) -> float:
-        """Cap `confidence` while successive queries show the same ground: more pictures of it are no independent
-        evidence. The cap is the confidence after the first of them, or of this query alone (`by_itself`) if higher."""
+    def _limit_repetition(self, position: Doubles, confidence: float, alone: float) -> float:
+        """Cap `confidence` while successive queries show the same ground: more pictures of it are not independent
+        evidence. The cap is the higher of the confidence after the first of them and that of this query (`alone`)."""
         first = self._first_view
-        if first is None or self._geometry is None or np.hypot(*(at - first[0])) >= self._geometry.scale.spacing:
-            self._next_first_view = at, confidence
+        if first is None or self._geometry is None or np.hypot(*(position - first[0])) >= self._geometry.scale.spacing:
+            self._next_first_view = position, confidence
             return confidence
         self._next_first_view = first
-        return min(confidence, max(first[1], by_itself))
+        return min(confidence, max(first[1], alone))
 
 
 def make_motion(
-    elapsed_s: float | None, speed_max: float, velocity: tuple[float, float] | None = None, is_visual: bool = False
+    elapsed_s: float | None, max_speed: float, velocity: tuple[float, float] | None = None, is_visual: bool = False
 ) -> Motion:
-    """Return the motion in `elapsed_s` seconds, taken as one second if unknown (None) or if the clock was set back.
-    `speed_max` is the highest speed in map units per second, and `velocity` (east, north) comes from odometry (None:
-    unknown); it is ignored without a time or if it is implausibly high. For `is_visual` see `Motion`."""
+    """Return the motion in `elapsed_s` seconds, assumed to be one second if unknown (None) or if the clock was set
+    back. `max_speed` is the highest speed in map units per second, and `velocity` (east, north) comes from odometry
+    (None: unknown); it is ignored without a time or if it is implausibly high. For `is_visual` see `Motion`."""
     if elapsed_s is None or not elapsed_s > 0:
-        return Motion(reach=speed_max, elapsed_s=1.0)
-    elapsed_s, moved = min(elapsed_s, _MAX_ELAPSED_S), None
-    if velocity is not None and math.hypot(*velocity) <= 2 * speed_max:  # excludes NaN; may be twice the true speed
-        moved = elapsed_s * np.asarray(velocity, float)
-    return Motion(reach=speed_max * elapsed_s, elapsed_s=elapsed_s, displacement=moved, is_visual=is_visual)
+        return Motion(reach=max_speed, elapsed_s=1.0)
+    elapsed_s, displacement = min(elapsed_s, _MAX_ELAPSED_S), None
+    # Excludes NaN. Odometry may report twice the true speed.
+    if velocity is not None and math.hypot(*velocity) <= 2 * max_speed:
+        displacement = elapsed_s * np.asarray(velocity, float)
+    return Motion(reach=max_speed * elapsed_s, elapsed_s=elapsed_s, displacement=displacement, is_visual=is_visual)
 
 
 def _make_proposals(
@@ -206,39 +208,42 @@ def _make_proposals(
 ) -> tuple[Ints, Proposals]:
     """Return the index rows, int (K,), of the places that a query proposes, and the proposals for the belief."""
     slots: Ints = np.array(ranking.compared_slots[:_MAX_PROPOSED])
-    at = geometry.positions(slots, index)
+    positions = geometry.positions(slots, index)
     # Without a located match only the place is known, not where in its picture the aircraft is.
     spread = geometry.spread if located else max(geometry.spread, geometry.scale.near)
     covariance = np.tile((1.0 if geometry.origin is None else spread**2) * np.eye(2), (len(slots), 1, 1))
     heading_deg = np.full(len(slots), np.nan)
-    same = np.zeros(len(slots), bool)
+    is_same = np.zeros(len(slots), bool)
     if located and geometry.origin:
-        at[0] = offset_between_m(geometry.origin, located.position)
+        positions[0] = offset_between_m(geometry.origin, located.position)
         if not evidence.has_twin:  # equally likely places must have equal covariances
             covariance[0] = covariance_matrix(located.covariance_m2)
         heading_deg[0] = np.nan if located.heading_deg is None else located.heading_deg
-        same = np.isin(index.place_ids[slots], located.places) & (slots != slots[0])
+        is_same = np.isin(index.place_ids[slots], located.places) & (slots != slots[0])
     votes = np.array([compute_share(ranking.compared[slot]) for slot in slots.tolist()])
-    near = np.hypot(*(at - at[0]).T) <= geometry.scale.near
-    near[0] = True  # even if its position is unknown
+    is_near = np.hypot(*(positions - positions[0]).T) <= geometry.scale.near
+    is_near[0] = True  # even if its position is unknown
     confidence = rule.confidence(evidence)
-    left = max(0.0, rule.compute_map_confidence(evidence) - confidence)
-    p = np.zeros(len(slots))
+    others = _OTHERS_CORRECT_FRACTION * max(0.0, rule.compute_map_confidence(evidence) - confidence)
+    probability = np.zeros(len(slots))
     if evidence.has_twin:  # more votes only mean that the picture was taken closer to that place
-        votes = np.minimum(votes, _TWIN_SHARE * votes.max(initial=0))
-        p[~same] = (confidence + _OTHERS_RIGHT_SHARE * left) * _compute_shares(votes[~same])
+        votes = np.minimum(votes, _TWIN_RATIO * votes.max(initial=0))
+        probability[~is_same] = (confidence + others) * _compute_weights(votes[~is_same])
     else:
-        p[near & ~same] = confidence * _compute_shares(votes[near & ~same])
-        p[~near & ~same] = _OTHERS_RIGHT_SHARE * left * _compute_shares(votes[~near & ~same])
+        probability[is_near & ~is_same] = confidence * _compute_weights(votes[is_near & ~is_same])
+        probability[~is_near & ~is_same] = others * _compute_weights(votes[~is_near & ~is_same])
     # The probability of a place without a position is not given to other places.
-    is_placed = ~np.isnan(at[:, 0]) & ~same
-    return slots[is_placed], Proposals(
-        p=p[is_placed], at=at[is_placed], covariance=covariance[is_placed], heading_deg=heading_deg[is_placed]
+    kept = ~np.isnan(positions[:, 0]) & ~is_same
+    return slots[kept], Proposals(
+        probability=probability[kept],
+        position=positions[kept],
+        covariance=covariance[kept],
+        heading_deg=heading_deg[kept],
     )
 
 
-def _compute_shares(votes: Doubles) -> Doubles:
-    """Return the share (K,) of a probability for each of K places. `votes` (K,): `compute_share` of each."""
+def _compute_weights(votes: Doubles) -> Doubles:
+    """Return weights (K,) that distribute a probability over K places. `votes` (K,): `compute_share` of each."""
     if not len(votes):
         return votes
     weight: Doubles = (np.maximum(votes, 1e-6) / max(float(votes.max()), 1e-6)) ** _SHARPNESS

@@ -1,6 +1,6 @@
 """Recognition of one frame, stage by stage: encode, search, verify, locate, decide, and track the flight.
 
-Flights, `match`, `eval` and the probe use it. There is no link, flight log, thread or clock in here: the result
+Flights, `match`, `eval` and the probe use it. It has no link, flight log, thread or clock: the result
 depends only on the arguments. A *search pass* is one search of the map for the query of a frame. A query may
 take several, at different heights.
 """
@@ -29,13 +29,13 @@ from edgevpr.runtime.recognise.place_filter import PlaceFilter
 from edgevpr.runtime.recognise.recognition import Recognition
 
 _log = logging.getLogger(__name__)
-_LATER_PASS_SHARE = 0.4  # of the candidates, compared at each height except the first
+_LATER_PASS_FRACTION = 0.4  # fraction of the candidates compared at each height except the first
 
 
 class Recogniser:
     """Recognises places of an open map, frame after frame.
 
-    `odometry` measures the motion between frames (None: it is not measured). `prior` makes hints that narrow each query
+    `odometry` measures the motion between frames (None: not measured). `prior` makes hints that narrow each query
     (None: the whole map is searched). `place_filter` tracks the flight from query to query (None: each is judged
     alone). Between two frames, `change` sets candidates and mount for the next.
     """
@@ -59,9 +59,9 @@ class Recogniser:
         self._left_out_reported = 0  # places
         self._layers = matcher.layers or read_layers(place_map)
         self.matcher, self.index, self.rule = matcher, matcher.index, matcher.rule
-        # Places closer together than this show the same ground: neither is a rival of the other.
+        # Places closer together than this show the same ground, so they are not rivals.
         self._footprint_m = max(self._layers.footprints_m, default=0.0)
-        # 1-sigma accuracy of a place's position as a fix: the aircraft may be anywhere between two places.
+        # 1-sigma accuracy of a place's position used as a fix: the aircraft may be anywhere between two places.
         self.accuracy_m = max(settings.min_accuracy_m, matcher.index.spacing_m() or 0.0)
         self._decider = Decider(
             place_map=place_map,
@@ -171,14 +171,14 @@ class Recogniser:
 
     @property
     def _scale(self) -> float:
-        """The factor by which to enlarge the next picture."""
+        """Factor by which to enlarge the next picture."""
         return self._prior.scale(self.technique.spec.height_ratios)
 
     def _measure_odometry(self, frame: Frame, view: View, verifier: Verifier) -> OdometryStep | None:
         """Measure the motion from the previous frame to this one, if its picture is georeferenced."""
         if self._odometry is None or not view.is_georeferenced:
             return None
-        with self.meter.step("stride"):
+        with self.meter.step("odometry"):
             return self._odometry.measure(frame.t_mono_s, view, verifier.landmarks)
 
     def _decide(self, query: EncodedFrame, verifier: Verifier, odometry_step: OdometryStep | None) -> Decision:
@@ -221,17 +221,17 @@ class Recogniser:
         first = find_nearest_height(height_ratios, height_ratio)
         for ratio in height_ratios:
             if ratio != first:
-                other = self._search(query.descriptor, replace(expected, height_ratio=ratio), _LATER_PASS_SHARE)
+                other = self._search(query.descriptor, replace(expected, height_ratio=ratio), _LATER_PASS_FRACTION)
                 ranking = merge_rankings(ranking, other)
         # Matches of all passes are judged together: each may be a rival of the best one.
         return self._decider.decide(ranking, query, hints, verifier, place_filter)
 
-    def _search(self, descriptor: Descriptor, expected: Expectation, share: float = 1.0) -> Ranking:
-        """Search the map once for a query, with this `share` of the candidates. Raises what `compare_places` raises."""
+    def _search(self, descriptor: Descriptor, expected: Expectation, fraction: float = 1.0) -> Ranking:
+        """Search the map once, comparing this fraction of the candidates. Raises the errors of `compare_places`."""
         query = self._decider.make_query(descriptor, expected)
         with self.meter.step("scan"):
             self.place_map.require_unchanged()
             scanned = scan_index(query)
         with self.meter.step("compare"):
-            candidates = self.candidates and max(1, round(share * self.candidates))
+            candidates = self.candidates and max(1, round(fraction * self.candidates))
             return compare_places(query, scanned, candidates, max(self.rule.neighbour_m, self._footprint_m))

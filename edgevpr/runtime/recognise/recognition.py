@@ -33,19 +33,19 @@ class Recognition:
     odometry: OdometryStep | None = None  # since the previous frame
     hints: Hints | None = None  # used to narrow the search
     ranking: Ranking | None = None
-    best: Candidate | None = None  # the first of the ranking
+    best: Candidate | None = None  # the first place of the ranking
     agreement: Agreement | None = None  # of the landmarks
     evidence: Evidence | None = None
     confidence: float | None = None  # that the match is correct, from the evidence (None: judged by limits)
     track: TrackEstimate | None = None  # result of the place filter
     accepted: bool = False  # `best` is accepted as the place
     reason: Reason = NOT_SEARCHED  # why or why not
-    lacks_texture: bool = False  # too little to recognise; searched only to continue a sequence
+    lacks_texture: bool = False  # too little to recognise a place; searched only to continue a sequence
     failed: bool = False  # the frame, a place or the technique was unusable
     map_lost: bool = False  # the whole map cannot be read
-    left_out: tuple[tuple[int, str], ...] = ()  # places found unreadable since the last event: number and problem
+    left_out: tuple[tuple[int, str], ...] = ()  # places that became unreadable since the last event: number and problem
     located: Located | None = None  # position of the aircraft, only if the match is accepted and the place has one
-    accuracy_m: float | None = None  # the 1-sigma to send with it
+    accuracy_m: float | None = None  # 1-sigma accuracy to send with it
     steps: StepCosts = field(default_factory=StepCosts)
     cost: QueryCost = field(default_factory=QueryCost)
     fix: FixReport | None = None
@@ -77,8 +77,8 @@ def to_fields(event: Recognition, *, exact: bool = False) -> dict[str, Any]:
 
     Always present: query, place (number), reference_image, score, position (of the place), shift, covariance, rotation
     of the match (all null if no place was found), accepted, reason, accuracy_m, located (the aircraft's position; null
-    if nothing was accepted), costs. Present if known: view (how the picture lies on the ground), salience, odometry,
-    landmarks, confidence, evidence, track (of the track filter).
+    if nothing was accepted), costs. Present if known: view (how the picture maps to the ground), salience, odometry,
+    landmarks, confidence, evidence, track (of the place filter).
     """
     evidence = event.evidence and {key: round(value, 3) for key, value in event.evidence.figures().items()}
     known: dict[str, Any] = {
@@ -115,7 +115,7 @@ def _best_fields(candidate: Candidate | None) -> dict[str, Any]:
 def _landmark_fields(agreement: Agreement) -> dict[str, Any]:
     fields: dict[str, Any] = {"inliers": agreement.inliers, "matched": agreement.matched}
     if agreement.shift_share is not None:
-        fields["shift_share"] = [round(share, 4) for share in agreement.shift_share]
+        fields["shift_share"] = [round(fraction, 4) for fraction in agreement.shift_share]
         fields |= {"rotation_deg": _round(agreement.rotation_deg, 1), "scale": _round(agreement.scale, 3)}
     return fields
 
@@ -131,7 +131,7 @@ def _located_fields(located: Located) -> dict[str, Any]:
     if located.height_m is not None:
         fields["height_m"] = round(located.height_m, 1)
     if error := located.attitude_error:
-        fields["attitude_error"] = [round(value, 4) for value in (*error.over_height, error.sd)]
+        fields["attitude_error"] = [round(value, 4) for value in (*error.nadir_shift, error.sd)]
     return fields
 
 

@@ -21,7 +21,7 @@ from edgevpr.core.types import Salience
 from edgevpr.runtime.recognise.gate_networks import Detector, Memorability, interpolate_map
 from edgevpr.techniques.entropy import compute_filled_bins
 
-MAX_ENTROPY = float(np.log2(81) / 8)  # entropy / 8 bits of a disc of 81 pixels, all different
+MAX_ENTROPY = float(np.log2(81) / 8)  # entropy of a disc of 81 pixels, all different, divided by 8 bits
 GAP_FRAMES = 20  # if none of this many frames passes, the thresholds are lowered
 THRESHOLD_STEP = 0.03  # by which they are lowered in each step
 _MIN_FRAMES = 8  # needed to compute the usual entropy
@@ -34,8 +34,8 @@ _MAX_PX = 320  # of the copy used for entropy: a larger one costs more and gives
 
 @dataclass(frozen=True, slots=True)
 class SalienceVerdict:
-    """Judgement of a frame by its `scores`. `shortfall` is how far the worst one is below its threshold,
-    `criterion` is its name, and `reason` the refusal (0 and None: the frame passes)."""
+    """Judgement of a frame by its `scores`. `shortfall` is how far the worst score is below its threshold,
+    `criterion` the name of that score, and `reason` the refusal (0 and None: the frame passes)."""
 
     scores: Salience
     shortfall: float = 0.0
@@ -69,8 +69,8 @@ class SalienceGate:
         # At the start of a flight the light is unknown; half of the threshold still rejects an empty image.
         usual = self.config.entropy / 2
         if len(self._entropies) >= _MIN_FRAMES:
-            middle, high = np.percentile(self._entropies, (75, 90))
-            usual = float(middle - _USUAL_LIMIT_STEPS * max(high - middle, _MIN_STEP))
+            p75, p90 = np.percentile(self._entropies, (75, 90))
+            usual = float(p75 - _USUAL_LIMIT_STEPS * max(p90 - p75, _MIN_STEP))
         return judge_scores(scores, self.config, usual)
 
     def scores(self, image: Image) -> Salience:
@@ -86,12 +86,13 @@ class SalienceGate:
 def judge_scores(salience: Salience, config: SalienceConfig, usual: float = 1.0) -> SalienceVerdict:
     """Compare the scores of a frame (None: skipped) with their thresholds, entropy with `usual` if that is lower."""
     known = salience.scores
-    least = {name: getattr(config, name) for name in known} | {"entropy": min(config.entropy, usual)}
-    shortfalls = {name: least[name] - score for name, score in known.items() if least[name] > 0 and score is not None}
+    min_scores = {name: getattr(config, name) for name in known} | {"entropy": min(config.entropy, usual)}
+    gaps = {name: min_scores[name] - score for name, score in known.items() if score is not None}
+    shortfalls = {name: gap for name, gap in gaps.items() if min_scores[name] > 0}
     worst = max(shortfalls, key=lambda name: shortfalls[name], default=None)
     if worst is None or shortfalls[worst] <= 0:
         return SalienceVerdict(salience)
-    figures = {"measure": worst, "score": known[worst], "min_score": least[worst]}
+    figures = {"measure": worst, "score": known[worst], "min_score": min_scores[worst]}
     return SalienceVerdict(salience, shortfalls[worst], worst, Reason(ReasonCode.NOT_MEMORABLE, figures))
 
 

@@ -1,7 +1,7 @@
-"""Second measurement of a query's perspective over its place, from the image warped onto the place.
+"""Measures the perspective of a query over its place a second time, from the image warped onto the place.
 
 If an image is strongly tilted, few regions agree, because each is seen from a different side. After the image is
-warped by their homography, more of them agree and show the tilt more accurately. One more image must be encoded.
+warped by their homography, more regions agree and give the tilt more accurately. One more image must be encoded.
 """
 
 import math
@@ -15,27 +15,27 @@ from edgevpr.frames.level import LevelledImage
 
 _MAX_SIDE_PX = 512
 _MIN_SCALE = 0.1  # of the scale at the centre: pixels nearer to the horizon are masked
-# Share of the regions that agreed before. In views of 45 degrees 0.8 or more remain, over changed ground too.
-_MIN_REGIONS_SHARE = 2 / 3
-_AT_REST = FineMatch(1.0, shift_cells=(0.0, 0.0), rotation_deg=0.0, height_ratio=1.0)
+# Fraction of the regions that agreed before. In views of 45 degrees 0.8 or more remain, over changed ground too.
+_MIN_REGIONS_RATIO = 2 / 3
+_UNSHIFTED = FineMatch(1.0, shift_cells=(0.0, 0.0), rotation_deg=0.0, height_ratio=1.0)
 
 
-def measure_again(picture: LevelledImage, technique: Technique, fine: Array, found: Perspective) -> Perspective | None:
-    """Measure the perspective of an image over the place with the fine part `fine` again, starting from `found`.
-    Return None if `found` was a coincidence: fewer regions agree now."""
+def measure_again(picture: LevelledImage, technique: Technique, fine: Array, first: Perspective) -> Perspective | None:
+    """Measure the perspective of an image over the place with the fine part `fine` again, starting from the `first`
+    one. Return None if that was a coincidence: fewer regions agree now."""
     height, width = picture.image.shape[:2]
     longest, side = max(height, width), min(max(height, width), _MAX_SIDE_PX)
-    share_from_pixel = np.array([[1, 0, (1 - width) / 2], [0, 1, (1 - height) / 2], [0, 0, longest]]) / longest
-    out_from_share = np.array([[side, 0, (side - 1) / 2], [0, side, (side - 1) / 2], [0, 0, 1]])
-    out_from_pixel = out_from_share @ found.over_place @ share_from_pixel
+    fraction_from_pixel = np.array([[1, 0, (1 - width) / 2], [0, 1, (1 - height) / 2], [0, 0, longest]]) / longest
+    out_from_fraction = np.array([[side, 0, (side - 1) / 2], [0, side, (side - 1) / 2], [0, 0, 1]])
+    out_from_pixel = out_from_fraction @ first.over_place @ fraction_from_pixel
     corners = np.array([[0, width - 1, width - 1, 0], [0, 0, height - 1, height - 1], [1] * 4], float)
     corners = clip_polygon(corners, (out_from_pixel @ corners)[2] - _MIN_SCALE)
-    scale = math.sqrt(math.prod(found.scales))
+    scale = math.sqrt(math.prod(first.scales))
     warp = Homography(out_from_pixel, corners, side, longest / (side * scale))
     mask = warp.shown if picture.mask is None else warp.shown & warp.warp_mask(picture.mask)
     warped = technique.encode(warp.warp_image(picture.image), mask)
-    again = technique.measure_perspective(warped, fine, _AT_REST)
-    if again is None or again.regions < _MIN_REGIONS_SHARE * found.regions:
+    again = technique.measure_perspective(warped, fine, _UNSHIFTED)
+    if again is None or again.regions < _MIN_REGIONS_RATIO * first.regions:
         return None
-    over_place = again.over_place @ found.over_place
+    over_place = again.over_place @ first.over_place
     return Perspective(over_place / over_place[2, 2], scale * again.slope_sd, again.regions)

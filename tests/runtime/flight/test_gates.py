@@ -161,7 +161,7 @@ def test_continuous_position_claims_accuracy_and_lag_for_fifty_like_it():
     navigator = navigate(Channel.GPS_INPUT, reports={"sink_m_s": 0.7}, map_sd_m=1.0)
     navigator.handle_force(NOW_S, (0.0, 0.0, -9.8), Attitude(NOW_S, 90.0, -45.0, 180.0))
     state = navigator.estimate_state(NOW_S)
-    assert (state.t_mono_s, state.alt_m, state.alt_accuracy_m, state.is_reserve) == (NOW_S, 300.0, 3.0, False)
+    assert (state.t_mono_s, state.alt_m, state.alt_accuracy_m, state.is_fallback) == (NOW_S, 300.0, 3.0, False)
     assert (state.lat_deg, state.lon_deg) == pytest.approx(HOME)
     assert state.velocity_m_s == (3.0, 4.0, 0.7)
     assert state.attitude == pytest.approx((math.pi / 2, -math.pi / 4, math.pi))
@@ -177,7 +177,7 @@ def test_continuous_position_claims_accuracy_and_lag_for_fifty_like_it():
 )
 def test_altitude_of_a_reserve_is_that_of_the_receiver(sd_m, alt_m, expected_m):
     state = navigate(Channel.GPS_INPUT, reports=receiver(sd_m, alt_m=alt_m)).estimate_state(NOW_S)
-    assert (state.alt_m, state.is_reserve) == (expected_m, sd_m == 1.0)
+    assert (state.alt_m, state.is_fallback) == (expected_m, sd_m == 1.0)
 
 
 @pytest.mark.parametrize(
@@ -291,7 +291,7 @@ def test_fix_is_sent_where_it_improves_the_position_of_the_autopilot():
     reports = {"velocity_m_s": (10.0, -4.0), "t_received_s": NOW_S - 0.5}
     same = navigate(reports=reports, off_m=(5.0, -2.0)).advise(matched(), NOW_S)
     assert same.why.code is ReasonCode.NOT_BETTER
-    assert same.why.parameters == pytest.approx({"off_m": 0.0, "accuracy_m": 2.0}, abs=0.01)
+    assert same.why.parameters == pytest.approx({"distance_m": 0.0, "accuracy_m": 2.0}, abs=0.01)
     assert navigate(accuracy_m=3.0, off_m=(4.23, 0.0)).advise(matched(), NOW_S).fix is None
     assert navigate(accuracy_m=3.0, off_m=(4.25, 0.0)).advise(matched(), NOW_S).fix
     for every_s, ahead_m in ((1.0, (2.0, -1.5)), (0.2, (0.8, -0.6))):

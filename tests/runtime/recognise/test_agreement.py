@@ -39,7 +39,7 @@ def cut(landscape, x, y, up_deg=0.0, scale=1.0):
 
 
 def asked(image):
-    return detect_landmarks(image, most=QUERY_LANDMARKS)
+    return detect_landmarks(image, count=QUERY_LANDMARKS)
 
 
 def kept(image):

@@ -191,7 +191,7 @@ def test_compare_near_takes_no_display_and_nothing_near_for_another_overlay():
 
 
 @pytest.mark.parametrize(
-    ("shift", "rotation_deg", "scale", "is_at_rest"),
+    ("shift", "rotation_deg", "scale", "is_unshifted"),
     [
         ((10 / 640, -10 / 640), 0.0, 1.0, True),
         ((0.0157, 0.0), 0.0, 1.0, False),
@@ -205,9 +205,9 @@ def test_compare_near_takes_no_display_and_nothing_near_for_another_overlay():
         ((0.0, 0.0), 0.0, None, False),
     ],
 )
-def test_is_at_rest_without_shift_turn_or_scaling(shift, rotation_deg, scale, is_at_rest):
+def test_is_at_rest_without_shift_turn_or_scaling(shift, rotation_deg, scale, is_unshifted):
     shown = {"shift_share": shift, "rotation_deg": rotation_deg, "scale": scale}
-    assert Agreement(inliers=20, matched=20, possible=20, **shown).is_at_rest is is_at_rest
+    assert Agreement(inliers=20, matched=20, possible=20, **shown).is_unshifted is is_unshifted
 
 
 def test_compose_overlays_leads_from_one_place_to_the_other():

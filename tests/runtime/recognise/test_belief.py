@@ -19,8 +19,8 @@ def seen(at, p, sd=0.5, heading_deg=np.nan):
     at = np.asarray(at, float)
     at = np.column_stack([at, np.zeros(len(at))]) if at.ndim == 1 else at
     return Proposals(
-        p=np.asarray(p, float),
-        at=at,
+        probability=np.asarray(p, float),
+        position=at,
         covariance=np.tile(sd**2 * np.eye(2), (len(at), 1, 1)),
         heading_deg=np.full(len(at), heading_deg),
     )
@@ -47,7 +47,7 @@ def fly(belief, places, rng, p=0.8):
 
 
 def is_at(posterior, place):
-    return abs(posterior.at[0] - place) <= 2
+    return abs(posterior.position[0] - place) <= 2
 
 
 @pytest.mark.parametrize("start", ["lost", "known"])
@@ -119,7 +119,7 @@ LIES = {
 def test_odometry_helps_and_its_lies_do_not_mislead(odometry, speed_m):
     track_m = speed_m * np.column_stack([np.arange(30), 0.3 * np.arange(30)])
     posteriors = over(track_m, Belief(IN_METRES), odometry)
-    off_m = [np.hypot(*(each.at - at)) for each, at in zip(posteriors, track_m, strict=True)]
+    off_m = [np.hypot(*(each.position - at)) for each, at in zip(posteriors, track_m, strict=True)]
     assert max(off_m) < SPACING_M
     assert posteriors[-1].mass > 0.99
     assert posteriors[-1].lost < 0.01
@@ -141,7 +141,7 @@ def some(rng, count, scale):
     for each in (p, at, covariance):
         if each.size and rng.random() < 0.1:
             each.flat[rng.integers(each.size)] = rng.choice([np.nan, np.inf, -np.inf, 1e300])
-    return Proposals(p=p, at=at, covariance=covariance, heading_deg=rng.choice([np.nan, 10], count))
+    return Proposals(probability=p, position=at, covariance=covariance, heading_deg=rng.choice([np.nan, 10], count))
 
 
 @pytest.mark.parametrize("ground", [IN_ORDER, IN_METRES])
@@ -153,7 +153,7 @@ def test_any_numbers_at_all_pass(ground, places):
         velocity = rng.choice([0, 1, -3, np.nan, 1e9, np.inf], 2).tolist()
         elapsed_s = float(rng.choice([1, 1e-9, -1, np.nan, 1e6, 1e12]))
         posterior = belief.update(query, make_motion(elapsed_s, float(rng.choice([3, 1e5])), tuple(velocity)), places)
-        assert np.isfinite([*posterior.p, posterior.lost, posterior.mass]).all()
+        assert np.isfinite([*posterior.probability, posterior.lost, posterior.mass]).all()
         assert not posterior.mass or np.linalg.eigvalsh(posterior.covariance)[0] > 0
 
 

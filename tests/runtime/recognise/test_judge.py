@@ -21,12 +21,12 @@ from edgevpr.runtime.recognise.judge import (
     ConfidenceRule,
     Findings,
     check_texture,
-    is_at_rest,
+    is_unshifted,
     judge,
     make_accept_rule,
 )
 from edgevpr.runtime.recognise.locate import Located
-from edgevpr.runtime.recognise.perspective import ShownTilt
+from edgevpr.runtime.recognise.perspective import ObservedTilt
 from edgevpr.techniques import create
 
 RULE = AcceptRule(min_score=0.08, min_margin=0.03, neighbour_m=50.0)
@@ -111,15 +111,15 @@ def test_a_flight_that_decides_is_sure_itself_however_little_is_asked(followed, 
 
 @pytest.mark.parametrize(("lead", "code"), [(math.log(1.75), None), (math.log(1.74), ReasonCode.ROTATION_AMBIGUOUS)])
 def test_a_match_must_lead_over_the_picture_turned_otherwise(lead, code):
-    verdict = judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR, lead_over_rotated=lead)
+    verdict = judged(rule=sure_rule(lambda evidence: 1.0), evidence=CLEAR, lead_over_other_rotation=lead)
     assert verdict.reason.code is (code or ReasonCode.ACCEPTED_BY_CONFIDENCE)
 
 
 @pytest.mark.parametrize(
     ("known", "code"),
     [
-        ({"tilt": ShownTilt(math.tan(math.radians(60.1)), 0.0)}, ReasonCode.TILT_SHOWN),
-        ({"tilt": ShownTilt(math.tan(math.radians(59.9)), 0.0)}, ReasonCode.ACCEPTED_BY_SCORE),
+        ({"tilt": ObservedTilt(math.tan(math.radians(60.1)), 0.0)}, ReasonCode.TILT_SHOWN),
+        ({"tilt": ObservedTilt(math.tan(math.radians(59.9)), 0.0)}, ReasonCode.ACCEPTED_BY_SCORE),
         ({"located": DOUBTED}, ReasonCode.LOW_TEXTURE),
     ],
 )
@@ -224,7 +224,7 @@ def test_a_sequence_leads_over_those_at_other_speeds_by_half_the_margin(rival, a
 
 @pytest.mark.parametrize(("share", "accepted"), [(0.0, True), (0.4, True), (4 / 9, False)])
 def test_where_places_elsewhere_have_not_moved_either_all_share_a_display(share, accepted):
-    verdict = judged(at_rest_elsewhere=share)
+    verdict = judged(unshifted_fraction=share)
     assert verdict.accepted is accepted
     assert (verdict.reason.code is ReasonCode.ELSEWHERE_AT_REST) is not accepted
 
@@ -243,7 +243,7 @@ def test_where_places_elsewhere_have_not_moved_either_all_share_a_display(share,
 )
 def test_at_rest_is_what_neither_moved_nor_turned_nor_rose(shift_cells, rotation_deg, height_ratio, expected):
     match = FineMatch(0.3, shift_cells=shift_cells, rotation_deg=rotation_deg, height_ratio=height_ratio)
-    assert is_at_rest(match) is expected
+    assert is_unshifted(match) is expected
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ def ground():
 
 def test_they_are_spread_over_the_picture_and_lie_about_its_middle(ground):
     found = detect_landmarks(ground)
-    assert 100 < len(found) <= PLACE_LANDMARKS < len(detect_landmarks(ground, most=QUERY_LANDMARKS))
+    assert 100 < len(found) <= PLACE_LANDMARKS < len(detect_landmarks(ground, count=QUERY_LANDMARKS))
     assert (np.abs(found.points) <= (0.5, 0.375)).all()
     for side in (found.points[:, 0] < 0, found.points[:, 0] > 0, found.points[:, 1] < 0, found.points[:, 1] > 0):
         assert np.mean(side) > 0.2

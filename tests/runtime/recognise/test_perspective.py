@@ -45,7 +45,7 @@ def test_a_tilt_moves_the_point_under_the_camera_against_it(roll_deg, pitch_deg,
     turned = math.radians(turned_deg)
     east = along[0] * math.cos(turned) + along[1] * math.sin(turned)
     north = along[1] * math.cos(turned) - along[0] * math.sin(turned)
-    assert lean.over_height == pytest.approx((east, north), abs=0.004)
+    assert lean.nadir_shift == pytest.approx((east, north), abs=0.004)
     assert lean.sd == pytest.approx(math.tan(math.radians(0.5)), rel=0.2)  # of the place's picture
 
 
@@ -53,8 +53,8 @@ def test_it_is_as_exact_as_it_says():
     seen = (landmarks(roll_deg=2.0, noise=2 / 640, count=count) for count in (30, 60, 120, 240))
     told = [fit_attitude_error(*each, SEEN, 0.0) for each in seen]
     for lean in told:
-        assert lean.over_height[0] == pytest.approx(math.tan(math.radians(2.0)), abs=2 * lean.sd)
-        assert lean.over_height[1] == pytest.approx(0.0, abs=2 * lean.sd)
+        assert lean.nadir_shift[0] == pytest.approx(math.tan(math.radians(2.0)), abs=2 * lean.sd)
+        assert lean.nadir_shift[1] == pytest.approx(0.0, abs=2 * lean.sd)
     assert all(later.sd < before.sd for before, later in pairwise(told))
 
 
@@ -62,7 +62,7 @@ def test_the_point_under_the_camera_may_be_beside_the_middle():
     nadir_offset = (0.2, -0.1)
     view = View(nadir_offset=nadir_offset, focal=FOCAL)
     lean = fit_attitude_error(*landmarks(roll_deg=2.0, nadir_offset=nadir_offset), view, 0.0)
-    assert lean.over_height == pytest.approx((math.tan(math.radians(2.0)), 0.0), abs=0.005)
+    assert lean.nadir_shift == pytest.approx((math.tan(math.radians(2.0)), 0.0), abs=0.005)
 
 
 def test_a_slope_of_the_ground_is_no_tilt():
@@ -71,7 +71,7 @@ def test_a_slope_of_the_ground_is_no_tilt():
     beside = asked.real > -0.1  # the pictures overlap on one side only
     sheared = (known + 0.03 * asked.conj())[beside]
     lean = fit_attitude_error(asked[beside], sheared, SEEN, 0.0)
-    assert math.hypot(*lean.over_height) < 2 * lean.sd < 0.1
+    assert math.hypot(*lean.nadir_shift) < 2 * lean.sd < 0.1
 
 
 @pytest.mark.parametrize("view", [View(), View(nadir_offset=(0.0, 0.0)), View(focal=FOCAL)])
@@ -112,7 +112,7 @@ def test_pictures_show_by_how_much_the_reported_attitude_is_wrong(ground, roll_d
         right * math.cos(turned) + ahead * math.sin(turned),
         ahead * math.cos(turned) - right * math.sin(turned),
     )
-    assert lean.over_height == pytest.approx((east, north), abs=max(0.012, 2 * lean.sd))
+    assert lean.nadir_shift == pytest.approx((east, north), abs=max(0.012, 2 * lean.sd))
     assert lean.sd < 0.03
 
 
@@ -138,7 +138,7 @@ def add_matches(tilt, slope_of_ground, seed=5, count=6, place_ids=None):
         over_place[2, :2] = slope.real, slope.imag
         view = replace(SEEN, rotation_deg=turned_deg)
         common.add(Perspective(over_place, slope_sd=0.15, regions=40), view, (place_ids or range(count))[number])
-    return common.shown
+    return common.mean
 
 
 def test_common_tilt_is_that_of_the_camera():
@@ -154,4 +154,4 @@ def test_common_tilt_of_a_level_camera_is_not_clear(slope_of_ground):
 
 def test_common_tilt_counts_a_place_once():
     assert add_matches(0.15, 0, place_ids=[7] * 6).sd == add_matches(0.15, 0, count=1).sd
-    assert not CommonTilt().shown.is_clear
+    assert not CommonTilt().mean.is_clear
